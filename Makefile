@@ -31,10 +31,13 @@ test-fast: $(DEV)  ## tests of under about five seconds each
 test-slow: $(DEV)  ## the slow ones, and the page in a browser
 	$(PYTEST) -m "slow or browser"
 
-nightly: $(DEV)  ## what takes longer: the metrics at full size, the shipped models scored again, the study of splits, small
+nightly: $(DEV)  ## what takes longer: the metrics at full size, the shipped models scored again, the study of splits, small, 50 raters in browsers
 	$(BIN)/python benchmarks/metrics.py
 	$(BIN)/python recipes/mini.py --work runs/mini --verify
 	$(BIN)/python benchmarks/split_drop.py --small
+	$(BIN)/python benchmarks/preference_load.py
+	$(BIN)/python benchmarks/preference_study.py
+	PALPATE_RATERS=50 $(BIN)/python -m pytest -q tests/test_preference_raters.py
 
 coverage: $(DEV)  ## line and branch coverage of the fast tests
 	$(PYTEST) -m "not slow and not browser" --cov --cov-report=term --cov-report=xml

@@ -298,7 +298,7 @@ def tally_difference(model, truth, videos, replicates, seed, shifts=(1.0, SECOND
         )
         sets = dict(zip("ab", [draw(shared, shift) for shift in shifts], strict=True))
         result = compare(sets, draw(real, 0.0), permutations=0)
-        delta, scores = result.differences[0], (result.scores[0], result.scores[4])
+        delta, scores = result.differences[0], [s for s in result.scores if s.metric == "TMMD"]
         tally.add(delta.value, delta.interval, truth.tmmd[shifts[0]] - truth.tmmd[shifts[1]])
         unpaired = np.hypot(*[s.interval[1] - s.interval[0] for s in scores])
         ratios.append(unpaired / (delta.interval[1] - delta.interval[0]))

@@ -128,6 +128,11 @@ its own split. The split is the table's axis. Intervals: 95 %, jackknife over vi
 
 The same on real data: `palpate probe DATA --splits Orig.json NoLeak.json --train --clip openai/clip-vit-large-patch14 --preset paper -o drop.html`.
 
+On the five real clips of Touch and Go at hand (436 contact frames, 17 contacts, 5 videos of one material each) the command runs to its end in under a minute, and five videos prove
+nothing: by contact (271 train, 165 test) material accuracy is 69.9 % [26.7, 100.0] at chance 20.0; by video (257, 179) it is 0, as train lacks the materials of both test videos.
+`palpate import clips/ -o clips; palpate split clips --by contact --train 0.6 -o Orig.json; palpate split clips --by video --train 0.6 -o NoLeak.json`, then
+`palpate probe clips --splits Orig.json NoLeak.json --train --preset tiny`. Retrieval falls as well (top-10, vision by tactile: 15.2 % to 3.7 %, chance 6.1), within its interval.
+
 {chr(10).join(parts)}"""
 
 

@@ -258,7 +258,7 @@ def across(vision, touch):
     )
     centered = FeatureSet(keys.ids, keys.features - y_mean, None, keys.groups, "ridge")
     pool = min(POOL, len(keys.ids))
-    result, _ = retrieval(guess, centered, top=(1, 5), pool=pool, repeats=20)
+    result, _ = retrieval(guess, centered, top=(1, 5), pool=pool)
     return [(m.score.value, m.score.interval, m.score.details["chance"]) for m in result.top]
 
 

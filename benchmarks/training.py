@@ -9,17 +9,20 @@
 - ``overhead``: seconds of a step of the engine, over a bare PyTorch loop of the same model, batch
   and optimizer (wanted: below 1.03).
 - ``processes``: images a second of two gloo processes, one thread each, over one process with one
-  thread, at equal global batch (wanted: 1.5; it needs two free cores), and images a processor
-  second of the first process, which is what two free cores would allow without waiting.
+  thread, at equal global batch (wanted: 1.5), and images a processor second of the first process;
+  next to it the ceiling: two processes that train apart at the same time, over one.
 - ``embedding``: seconds to embed 10,000 images, over the bare forward pass (wanted: below 1.1).
 - ``memory``: peak memory of the process in a step of batch 256 of a ViT-Small in chunks of 8
   (wanted: below 6 GB), and how far loss and gradient are from the plain batch's at batch 16
   (wanted: 1e-4).
-- ``gpu``: where there is one: the models of the preset paper in float32, with TF32, and in bf16
-  with ``torch.compile``: images a second, share of the peak, memory.
+- ``gpu``: where there is one: encoder and U-Net of the preset paper in steps of the engine, in
+  float32, with TF32, in bf16, and in bf16 with ``torch.compile``: images a second, share of the
+  device's peak at that precision (H200, H100 and A100; operations as done, with those that cached
+  gradients repeat), memory.
 
 Pairs are measured in turns, and the median ratio is printed: other work on the machine then
-disturbs both. ``ratio`` is of processor seconds (one thread), which other work hardly changes.
+disturbs both. ``ratio`` is of processor seconds (one thread), which other work hardly changes; for
+``processes`` it is by the clock, since waiting for the other process takes no processor time.
 """
 
 from __future__ import annotations
@@ -29,31 +32,51 @@ import json
 import os
 import platform
 import resource
+import socket
 import subprocess
 import sys
 import tempfile
 import time
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import numpy as np
 import torch
+from torch.utils.flop_counter import FlopCounterMode
 
 from palpate.core import quiet, rng_for
+from palpate.diffusion.autoencoder import LatentStats
+from palpate.diffusion.denoiser import Denoiser, build_unet
+from palpate.diffusion.presets import preset_named
+from palpate.diffusion.training import DiffusionLoss
 from palpate.encoders.contrastive import TactileLoss, TactileModel, new_clip
 from palpate.encoders.embed import embed_images
-from palpate.encoders.encoder_set import EncoderSet, Preprocess, new_tactile
+from palpate.encoders.encoder_set import EncoderSet, Preprocess, encode_tactile, new_tactile
 from palpate.encoders.losses import ALL_PAIRS, Labels, in_chunks, three_way
 from palpate.encoders.preprocess import to_unit
 from palpate.encoders.presets import preset
 from palpate.encoders.rows import Rows, augmented, draw, numbers, unit
-from palpate.training.engine import Task, fit
-from palpate.training.options import Compute, RowOrder
+from palpate.training.engine import Losses, Task, fit
+from palpate.training.options import Compute, LoopOptions, RowOrder
 from palpate.training.steps import Step
 
 MINI = preset("mini")
+#: TFLOP/s of dense products by the data sheets (SXM), by the precision of the factors.
+PEAKS = {
+    "H200": {"float32": 67, "tf32": 495, "bf16": 989},
+    "H100 80GB HBM3": {"float32": 67, "tf32": 495, "bf16": 989},
+    "A100": {"float32": 19.5, "tf32": 156, "bf16": 312},
+}
+#: Of the part gpu: the precision of the products, and how the engine is run.
+MODES = {
+    "float32": ("float32", Compute(tf32=False, checkpoint_minutes=1e9)),
+    "tf32": ("tf32", Compute(checkpoint_minutes=1e9)),
+    "bf16": ("bf16", Compute(precision="bf16", checkpoint_minutes=1e9)),
+    "bf16 + compile": ("bf16", Compute(precision="bf16", compile=True, checkpoint_minutes=1e9)),
+}
 WORDS = ["rough", "smooth", "soft", "hard", "grained", "ribbed", "woven", "sharp", "flat", "warm"]
 
 
@@ -187,7 +210,7 @@ def overhead(steps=40):
 
 
 WORKER = """
-import sys, time, tempfile, torch
+import sys, tempfile, torch
 sys.path.insert(0, sys.argv[1])
 from training import Images, Preprocess, TactileLoss, ALL_PAIRS
 from training import clocks, engine_steps, tactile_model
@@ -198,32 +221,68 @@ rows = Images(1024)
 loss = TactileLoss(rows, rows.clip, Preprocess(64, 64), "identical-text", ALL_PAIRS)
 with tempfile.TemporaryDirectory() as folder:
     engine_steps(rows, tactile_model(), 1, loss, folder)
-began = clocks()
-with tempfile.TemporaryDirectory() as folder:
+    print("ready", flush=True)
+    sys.stdin.readline()
+    began = clocks()
     engine_steps(rows, tactile_model(), 10, loss, folder)
-if place()[0] == 0:
-    print("RESULT", place()[1], *(10 * 128 / (clocks() - began)))
+    print(place()[1], *(10 * 128 / (clocks() - began)))
 """
 
 
-def processes():
-    """Images a second of one and of two processes, in turns."""
-    rates = {1: [], 2: []}
-    with tempfile.TemporaryDirectory() as folder:
-        script = Path(folder) / "worker.py"
-        script.write_text(WORKER)
-        here = str(Path(__file__).parent)
-        for _ in range(3):
-            for n in (1, 2):
-                launch = ["-m", "torch.distributed.run", "--standalone", f"--nproc_per_node={n}"]
-                command = [sys.executable, *launch, str(script), here]
-                out = subprocess.run(command, capture_output=True, text=True, check=True).stdout
-                line = next(line for line in out.splitlines() if line.startswith("RESULT"))
-                assert line.split()[1] == str(n)
-                rates[n].append([float(rate) for rate in line.split()[2:]])
-    processor, wall = np.median(np.array(rates[2]) / np.array(rates[1]), axis=0).tolist()
-    # What two free cores allow at most, were there no waiting, and what was seen.
-    return {"wanted": "at least 1.5", "ratio_by_processor": processor, "ratio": wall, **rates}
+def rates(n, world):
+    """Images a processor second and a second of ``n`` workers at the same time, (n, 2)."""
+    with socket.socket() as free:
+        free.bind(("localhost", 0))
+        port = str(free.getsockname()[1])
+    workers = []
+    try:
+        for rank in range(n):
+            where = {"RANK": rank % world, "LOCAL_RANK": rank % world, "WORLD_SIZE": world}
+            where |= {"MASTER_ADDR": "localhost", "MASTER_PORT": port}
+            workers.append(
+                subprocess.Popen(
+                    [sys.executable, "-c", WORKER, str(Path(__file__).parent)],
+                    env=os.environ | {name: str(value) for name, value in where.items()},
+                    stdin=subprocess.PIPE,
+                    stdout=subprocess.PIPE,
+                    text=True,
+                )
+            )
+        for worker in workers:
+            assert worker.stdout.readline() == "ready\n"
+        for worker in workers:
+            worker.stdin.write("\n")
+            worker.stdin.flush()
+        lines = [[float(cell) for cell in w.communicate()[0].split()] for w in workers]
+    finally:  # when one fails, the others would wait for it
+        for worker in workers:
+            worker.kill()
+    assert {line[0] for line in lines} == {world}
+    return np.array(lines)[:, 1:]
+
+
+def processes(turns=5):
+    """Images a second of two processes that share a batch, and of two that know nothing of each
+    other, over one, in turns: the latter is what the machine allows.
+    """
+    one, two, apart = [], [], []
+    for _ in range(turns):
+        one.append(rates(1, 1)[0])
+        two.append(rates(2, 2)[0])
+        apart.append(rates(2, 1).sum(axis=0))
+    (processor, wall), (_, ceiling), (_, part) = (
+        np.median(np.array(above) / np.array(below), axis=0).tolist()
+        for above, below in ((two, one), (apart, one), (two, apart))
+    )
+    return {
+        "wanted": "at least 1.5",
+        "ratio": wall,
+        "ratio_by_processor": processor,
+        "ceiling": ceiling,
+        "ratio_to_ceiling": part,
+        "images_a_second": [np.median(rows, axis=0)[1] for rows in (one, two, apart)],
+        "turns": turns,
+    }
 
 
 def embedding(n=10_000):
@@ -243,16 +302,16 @@ def embedding(n=10_000):
     return {"wanted": "below 1.1", **in_turns(lambda: embed_images(images, encoders), bare, 3)}
 
 
-def contrastive_step(model, config, batch, chunk, device="cpu"):
+def contrastive_step(model, config, batch, chunk):
     generator = torch.Generator().manual_seed(0)
     side = config.image_size
-    pixels = torch.randn(batch, 3, side, side, generator=generator).to(device)
-    text, vision = (torch.randn(batch, 768, generator=generator).to(device) for _ in range(2))
+    pixels = torch.randn(batch, 3, side, side, generator=generator)
+    text, vision = (torch.randn(batch, 768, generator=generator) for _ in range(2))
 
     def encode(x):
         return torch.nn.functional.normalize(model(pixel_values=x).image_embeds, dim=1)
 
-    labels = Labels(torch.arange(batch, device=device))
+    labels = Labels(torch.arange(batch))
     total, _ = three_way(in_chunks(encode, pixels, chunk), text, vision, 10.0, labels)
     model.zero_grad()
     total.backward()
@@ -280,36 +339,84 @@ def memory(batch=256, chunk=8):
     }
 
 
-def gpu(batch=256):
-    """The tactile encoder of the preset paper, plain and as fast as it goes."""
-    if not torch.cuda.is_available():
-        return {"skipped": "no CUDA device here"}
-    config, rows = preset("paper").tactile_config(768), {}
-    for name, tf32, dtype, compiled, chunk in (
-        ("float32", False, None, False, 32),
-        ("tf32", True, None, False, 32),
-        ("bf16", True, torch.bfloat16, False, 64),
-        ("bf16 + compile", True, torch.bfloat16, True, 64),
-    ):
-        torch.backends.cuda.matmul.allow_tf32 = tf32
-        model = new_tactile(config, 0).cuda()
-        if compiled:
-            model.compile()
+def paper_encoder(chosen, batch, chunk):
+    """The tactile encoder, its loss against fixed partners, and the data of a batch."""
+    model = new_tactile(chosen.tactile_config(chosen.dim), 0)
+    data = {"pixels": torch.randn(batch, 3, chosen.image, chosen.image)}
+    data |= {name: torch.randn(batch, chosen.dim) for name in ("text", "vision")}
+
+    def loss(module, batch):
+        embedded = in_chunks(partial(encode_tactile, module), batch["pixels"], chunk)
+        labels = Labels(torch.arange(len(embedded), device=embedded.device))
+        return Losses(three_way(embedded, batch["text"], batch["vision"], 10.0, labels)[0])
+
+    return model, loss, lambda step: {name: rows[step.rows] for name, rows in data.items()}
+
+
+def paper_unet(chosen, batch, _):
+    """The denoiser, its loss, and the data of a batch of latents of an f4 of three channels."""
+    side, policy = chosen.size // 4, chosen.condition
+    model = Denoiser(build_unet(chosen.unet, policy, channels=3, size=side), policy)
+    latents = torch.randn(batch, 3, side, side)
+    tokens = {source: model.null_tokens(batch).clone() for source in policy.sources}
+    how = {"stats": LatentStats.of(latents), "schedule": chosen.schedule, "policy": policy}
+    loss = DiffusionLoss(latents, tokens, None, **how)
+    return model, loss, loss.load
+
+
+def gpu_steps(built, batch, compute, device, steps=8):
+    """Seconds of a step of the engine, operations of a row with all repetitions, peak memory."""
+    model, loss, load = built
+    model.to(device)
+    few = {name: rows.to(device) for name, rows in load(Step(0, np.arange(2), 0)).items()}
+    with FlopCounterMode(display=False) as counter:
+        loss(model, few).total.backward()
+    at, cuda = [], device == "cuda"
+
+    def progress(what, done, total, remark=""):
+        if cuda:
+            torch.cuda.synchronize()
+        at.append(time.perf_counter())
+
+    if cuda:
         torch.cuda.reset_peak_memory_stats()
-        for _ in range(3):
-            torch.cuda.synchronize()
-            began = time.perf_counter()
-            with torch.autocast("cuda", dtype, enabled=dtype is not None):
-                contrastive_step(model, config, batch, chunk, "cuda")
-            torch.cuda.synchronize()
-            seconds = time.perf_counter() - began
-        # Forward, its repetition and backward: four forward passes of 155.5 GFLOP an image.
-        rows[name] = {
-            "images_a_second": batch / seconds,
-            "TFLOP_a_second": 4 * 0.1555 * batch / seconds,
-            "peak_GB": torch.cuda.max_memory_allocated() / 1e9,
-        }
-    return {"device": torch.cuda.get_device_name(), "batch": batch, **rows}
+    options = LoopOptions(steps, batch, 1e-6, warmup=0, ema=0.9999)
+    with tempfile.TemporaryDirectory() as folder:
+        task = Task("benchmark", batch, load, loss)
+        fit(model, task, options, Path(folder), compute=compute, progress=progress)
+    peak = torch.cuda.max_memory_allocated() / 1e9 if cuda else None
+    return float(np.median(np.diff(at)[2:])), counter.get_total_flops() / 2, peak
+
+
+def gpu(device="cuda", encoder="paper", denoiser="paper", batches=(256, 32), chunk=32):
+    """The encoder and the U-Net of the preset paper, plain and as fast as they go.
+
+    The device, the presets and the batches are for tries without a GPU.
+    """
+    if device == "cuda" and not torch.cuda.is_available():
+        return {"skipped": "no CUDA device here"}
+    name = torch.cuda.get_device_name() if device == "cuda" else device
+    peaks = next((p for known, p in PEAKS.items() if known in name), {})
+    models = {
+        "encoder": (paper_encoder, preset(encoder), batches[0]),
+        "unet": (paper_unet, preset_named(denoiser), batches[1]),
+    }
+    result: dict = {"device": name}
+    for what, (build, chosen, batch) in models.items():
+        for mode, (peak_of, compute) in MODES.items():
+            rows = min(chunk, batch // 2)  # chunks in both counts of operations
+            built = build(chosen, batch, rows if batch > rows else None)
+            seconds, operations, memory = gpu_steps(built, batch, compute, device)
+            rate = operations * batch / seconds / 1e12
+            share = rate / peaks[peak_of] if peaks else None
+            result[f"{what}, {mode}"] = {
+                "images_a_second": batch / seconds,
+                "TFLOP_a_second": rate,
+                "share_of_peak": share,
+                "peak_GB": memory,
+                "batch": batch,
+            }
+    return result
 
 
 PARTS = {

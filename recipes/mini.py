@@ -14,7 +14,6 @@ world          seed      read by
 =============  ========  =========================================================================
 gelsight       900000    every part
 digit          900001    the autoencoder alone: the other look of the sensor
-one unit       900002    the generator alone: one gel unit, as a photo does not show which is used
 new gelsight   900050    scores: new objects, videos and gel units
 new digit      900051    scores of the autoencoder
 =============  ========  =========================================================================
@@ -41,8 +40,9 @@ from mini_scores import score_all
 from palpate.core import PalpateError, Split, digest_json, read_json, write_json
 from palpate.data.images import cached_images
 from palpate.data.manifest import Manifest
-from palpate.diffusion.autoencoder import Autoencoder
-from palpate.diffusion.autoencoder_training import train_autoencoder
+from palpate.diffusion.autoencoders import AnyAutoencoder, load_autoencoder
+from palpate.diffusion.background_training import train_background_autoencoder
+from palpate.diffusion.options import BackgroundOptions, SamplerOptions
 from palpate.diffusion.pipeline import TactilePipeline
 from palpate.diffusion.presets import MINI as DIFFUSION
 from palpate.diffusion.training import train_pipeline
@@ -53,6 +53,7 @@ from palpate.encoders.presets import preset
 from palpate.sim import PRESETS, VERSION, WorldOptions, write_world
 from palpate.studies.demo import fresh
 from palpate.studies.stages import Run
+from palpate.training.options import Compute
 
 NAME = "palpate/mini"
 #: Its table of scores is written from the cards.
@@ -62,19 +63,17 @@ _BASE = replace(PRESETS["pretrain"], contacts_per_video=3, frames_per_contact=2)
 WORLDS: dict[str, WorldOptions] = {
     "gelsight": replace(_BASE, seed=900_000, objects_per_material=150, sensors=8),
     "digit": replace(_BASE, seed=900_001, objects_per_material=30, sensors=4, look="digit"),
-    "one unit": replace(_BASE, seed=900_002, objects_per_material=100, sensors=1),
     "new gelsight": replace(_BASE, seed=900_050, objects_per_material=10),
     "new digit": replace(_BASE, seed=900_051, objects_per_material=4, look="digit"),
 }
 ENCODER = preset("mini")
 #: Passes over the data. One core sees about 400 images a second in training.
 CLIP_EPOCHS, TACTILE_EPOCHS = 14.0, 8.0
-AUTOENCODER = (
-    replace(DIFFUSION.autoencoder, steps_free=12_000, steps_quantized=1_200)
-    if DIFFUSION.autoencoder
-    else None
-)
+AUTOENCODER = BackgroundOptions(steps=6_000)
+GENERATOR = replace(DIFFUSION, loop=replace(DIFFUSION.loop, batch=32, warmup=100))
 GENERATOR_STEPS = 8_000
+#: Half the time, on CPUs that have it; the weights then depend on the kind of CPU.
+COMPUTE = Compute(precision="bf16")
 PARTS = ("worlds", "clip", "encoders", "autoencoder", "generator", "scores")
 LIMITS = (
     "Knows only the procedural world of palpate: 20 simulated materials and a simulated gel. "
@@ -246,44 +245,41 @@ class Recipe:
         )
         return EncoderSet.load(stage.folder / "encoders")
 
-    def autoencoder(self) -> Autoencoder:
-        """The VQ autoencoder, of tactile images of both looks."""
+    def autoencoder(self) -> AnyAutoencoder:
+        """The background autoencoder, of tactile images of both looks."""
         parts = [self.world(name) for name in ("gelsight", "digit")]
-        if AUTOENCODER is None:
-            raise PalpateError(
-                "The preset mini must train an autoencoder", "none", "Give it AutoencoderOptions"
-            )
-        length = lambda steps: max(1, round(steps * self.share))
-        options = replace(
-            AUTOENCODER,
-            steps_free=length(AUTOENCODER.steps_free),
-            steps_quantized=length(AUTOENCODER.steps_quantized),
-        )
+        options = replace(AUTOENCODER, steps=max(1, round(AUTOENCODER.steps * self.share)))
 
         def build(folder: Path) -> Mapping[str, Any]:
-            images = np.concatenate(
-                [
-                    cached_images(part, "tactile", DIFFUSION.size, self.cache, self.progress)
-                    for part in parts
-                ]
+            images, gels = (
+                np.concatenate(
+                    [
+                        cached_images(part, column, DIFFUSION.size, self.cache, self.progress)
+                        for part in parts
+                    ]
+                )
+                for column in ("tactile", "background")
             )
-            model = train_autoencoder(
+            model = train_background_autoencoder(
                 images,
+                gels,
                 options,
                 folder / "training",
                 seed=SEED,
                 key=digest_json([p.digest for p in parts]),
+                compute=COMPUTE,
                 progress=self.progress,
             )
             model.save(fresh(folder / "autoencoder"))
             return {"digest": model.digest}
 
         inputs = {"options": options, "seed": SEED, "train": [p.digest for p in parts]}
-        return Autoencoder.load(self.run.stage("autoencoder", inputs, build).folder / "autoencoder")
+        stage = self.run.stage("autoencoder", inputs, build)
+        return load_autoencoder(stage.folder / "autoencoder")
 
     def generator(self) -> TactilePipeline:
         """From a photo to a tactile image, in the space of the rounded encoders and autoencoder."""
-        encoders, autoencoder, train = self.encoders(), self.autoencoder(), self.world("one unit")
+        encoders, autoencoder, train = self.encoders(), self.autoencoder(), self.world("gelsight")
         encoders.halve()
         autoencoder.halve()
         steps = max(1, math.ceil(GENERATOR_STEPS * self.share))
@@ -294,18 +290,19 @@ class Recipe:
                 self._everything(train),
                 encoders,
                 autoencoder,
-                DIFFUSION,
+                GENERATOR,
                 folder / "training",
                 seed=SEED,
                 steps=steps,
                 cache=self.cache,
+                compute=COMPUTE,
                 progress=self.progress,
             )
             pipeline.save(fresh(folder / "model"))
             return {"digest": pipeline.digest, "train": len(train)}
 
         inputs = {
-            "preset": DIFFUSION,
+            "preset": replace(GENERATOR, sampler=SamplerOptions()),  # no part of the training
             "steps": steps,
             "seed": SEED,
             "vision": encoders.digest("vision"),
@@ -313,9 +310,10 @@ class Recipe:
             "autoencoder": autoencoder.digest,
             "train": train.digest,
         }
-        return TactilePipeline.from_pretrained(
+        pipeline = TactilePipeline.from_pretrained(
             self.run.stage("generator", inputs, build).folder / "model"
         )
+        return replace(pipeline, sampler=GENERATOR.sampler)
 
     def scores(self) -> dict[str, Any]:
         """Scores of the full and of the rounded models on the new worlds, as rows for the cards."""
@@ -338,9 +336,12 @@ class Recipe:
             )
             return {"rounding": rounding}
 
-        stage = self.run.stage(
-            "scores", {"models": digests, "worlds": [self.world(n).digest for n in WORLDS]}, build
-        )
+        inputs = {
+            "models": digests,
+            "sampler": GENERATOR.sampler,
+            "worlds": [self.world(name).digest for name in WORLDS],
+        }
+        stage = self.run.stage("scores", inputs, build)
         return read_json(stage.folder / "scores.json", "scores")
 
     def _samples(self) -> dict[str, Manifest]:
@@ -348,7 +349,7 @@ class Recipe:
 
     @staticmethod
     def _halve(
-        encoders: EncoderSet, autoencoder: Autoencoder, pipeline: TactilePipeline
+        encoders: EncoderSet, autoencoder: AnyAutoencoder, pipeline: TactilePipeline
     ) -> dict[str, float]:
         """Rounds all weights to 16 bits, in place; the largest relative change of a tensor of each
         model.
@@ -403,7 +404,7 @@ class Recipe:
         """
         encoders, autoencoder, pipeline = (
             EncoderSet.load(NAME),
-            Autoencoder.load(NAME),
+            load_autoencoder(NAME),
             TactilePipeline.from_pretrained(NAME),
         )
         rows = score_all(

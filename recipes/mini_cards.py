@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from palpate.core import read_json, write_text
-from palpate.diffusion.autoencoder import Autoencoder
+from palpate.diffusion.autoencoders import AnyAutoencoder
 from palpate.diffusion.pipeline import TactilePipeline
 from palpate.encoders.encoder_set import EncoderSet
 from palpate.sim import VERSION
@@ -29,18 +29,17 @@ SUMMARIES = {
         "frozen CLIP of the paper where no hub is in reach.",
     ),
     "autoencoder": (
-        "VQ f4 autoencoder of tactile images of palpate's world",
-        "A diffusers VQModel that turns a tactile image of 64 x 64 pixels into 16 x 16 codes "
-        "and back, in the place of latent diffusion's vq-f4. Trained on tactile images of "
-        "both looks of the sensor (with markers and without).",
+        "Background autoencoder of tactile images of palpate's world",
+        "It codes the difference between a tactile image of 64 x 64 pixels and the same gel "
+        "without contact as 16 x 16 positions of 8 channels, in the place of latent diffusion's "
+        "vq-f4. Trained on tactile images of both looks of the sensor (with markers and without).",
     ),
     "generator": (
         "From a photo to a tactile image of palpate's world",
-        "A latent diffusion model, conditioned on captions and photos in turn and driven by "
-        "photos, in the space of the encoders and the autoencoder next to it. It knows the "
-        "world's twenty materials and nothing else, separates rough from smooth better than "
-        "one rough material from another, and always answers for the one gel unit it has "
-        "learned.",
+        "A latent diffusion model (flow matching), conditioned on captions and photos, and driven "
+        "by photos, captions or both, in the space of the encoders and the autoencoder next to "
+        "it. It knows the world's twenty materials and nothing else. The image is made on a gel "
+        "that is given as a picture without contact, or on a stock gel.",
     ),
 }
 PAIR = (
@@ -52,14 +51,14 @@ PAIR = (
 READ = {
     "encoders": ("gelsight", "new gelsight"),
     "autoencoder": ("gelsight", "digit", "new gelsight", "new digit"),
-    "generator": ("one unit", "gelsight", "new gelsight"),
+    "generator": ("gelsight", "new gelsight"),
 }
 
 
 def ship(
     target: Path,
     encoders: EncoderSet,
-    autoencoder: Autoencoder,
+    autoencoder: AnyAutoencoder,
     pipeline: TactilePipeline,
     scores: Mapping[str, Any],
     worlds: Sequence[Mapping[str, Any]],
@@ -85,7 +84,7 @@ def ship(
         for row in rows:
             row["in 32 bits"] = before[row["score"]]
         data = [
-            {**world, "used for": _use(part, str(world["world"]))}
+            {**world, "used for": _use(str(world["world"]))}
             for world in worlds
             if world["world"] in READ[part]
         ]
@@ -135,15 +134,9 @@ def _replacing(target: Path) -> Generator[None]:
     shutil.rmtree(before, ignore_errors=True)
 
 
-def _use(part: str, world: str) -> str:
-    """What a world was used for by a part."""
-    if world.startswith("new"):
-        return "scores"
-    return (
-        "training of the encoders and the autoencoder"
-        if part == "generator" and world == "gelsight"
-        else "training"
-    )
+def _use(world: str) -> str:
+    """What a world was used for."""
+    return "scores" if world.startswith("new") else "training"
 
 
 MARKS = ("<!-- scores of the cards -->", "<!-- end of the scores -->")

@@ -321,12 +321,9 @@ def subtypes(material: str = "Metal") -> Board:
     frame, board = first_contact(options, 0) + 1, Board()
     for k, kind in enumerate(MATERIALS[material].subtypes):
         video = video_of(options, first_of(options, material, kind), 20 + k)
-        words = ", ".join(
-            word for word in video.object_of(0).surface.words if word not in ("cold", "hard")
-        )
         images = [video.vision(frame), video.tactile(frame)]
         left = GAP + k * (128 + 4 * GAP)
-        board.panel(left, GAP + 2 * LINE, images[0], f"{kind}:\n{words}")
+        board.panel(left, GAP + 2 * LINE, images[0], kind)
         board.panel(left, GAP + 2 * LINE + 128 + GAP, images[1])
     return board
 

@@ -14,7 +14,7 @@ import numpy as np
 from palpate.core import FeatureSet, PalpateError, Score
 from palpate.encoders.embed import embed_texts
 from palpate.encoders.encoder_set import EncoderSet
-from palpate.metrics.means import mean_over_groups
+from palpate.metrics.means import mean_of
 from palpate.metrics.probe import recall_by_class
 
 
@@ -58,7 +58,7 @@ def zero_shot_accuracy(
     prototypes = means / np.linalg.norm(means, axis=1, keepdims=True)
     chosen = (images.features.astype(np.float64) @ prototypes.T).argmax(axis=1)
     hit = np.array([classes[k] == label for k, label in zip(chosen, labels, strict=True)], float)
-    return mean_over_groups(
+    return mean_of(
         "zero-shot accuracy",
         hit,
         list(images.groups if images.groups is not None else images.ids),
@@ -71,4 +71,4 @@ def zero_shot_accuracy(
             "text": encoders.digest("text"),
         },
         details={"chance": 1 / len(classes), "recall": recall_by_class(hit, labels)},
-    )
+    ).score

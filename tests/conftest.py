@@ -2,14 +2,23 @@
 
 from __future__ import annotations
 
+import json
 import os
+import traceback
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
+from hypothesis import settings
 from PIL import Image
 
 from palpate.data.manifest import Manifest
+
+# A busy machine is no failure: how long an example takes is not tested.
+settings.register_profile("no deadline", deadline=None)
+settings.load_profile("no deadline")
 
 TOP = Path(__file__).resolve().parents[1]
 CHROMIUM = Path(os.environ.get("PALPATE_CHROMIUM", "/usr/bin/chromium"))
@@ -79,3 +88,40 @@ def chromium():
         browser = playwright.chromium.launch(executable_path=str(CHROMIUM), args=ARGS)
         yield browser
         browser.close()
+
+
+@pytest.fixture
+def on_two_processes(tmp_path: Path) -> Callable[[Callable[[], Any]], list[Any]]:
+    """Call a function in two forked processes that train together; returns what each returned.
+
+    They must not need polars, whose threads do not outlive a fork.
+    """
+
+    def child(rank: int, work: Callable[[], Any]) -> None:
+        from torch import distributed
+
+        from palpate.training.processes import connect
+
+        place = {"RANK": f"{rank}", "LOCAL_RANK": f"{rank}", "MASTER_ADDR": "localhost"}
+        os.environ |= {"WORLD_SIZE": "2", "LOCAL_WORLD_SIZE": "2", **place}
+        meeting = f"file://{tmp_path}/meeting"
+        distributed.init_process_group("gloo", init_method=meeting, rank=rank, world_size=2)
+        connect("cpu")
+        (tmp_path / f"returned-{rank}").write_text(json.dumps(work()))
+
+    def run(work: Callable[[], Any]) -> list[Any]:
+        children = []
+        for rank in range(2):
+            if (pid := os.fork()) == 0:
+                try:
+                    child(rank, work)
+                    os._exit(0)
+                finally:  # nothing of pytest runs in a child
+                    traceback.print_exc()
+                    os._exit(1)
+            children.append(pid)
+        assert [os.waitpid(pid, 0)[1] for pid in children] == [0, 0]
+        (tmp_path / "meeting").unlink(missing_ok=True)
+        return [json.loads((tmp_path / f"returned-{rank}").read_text()) for rank in range(2)]
+
+    return run

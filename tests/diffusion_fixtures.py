@@ -49,7 +49,7 @@ def make_pipeline(
     torch.manual_seed(0)
     assert TINY.autoencoder is not None
     policy = policy or TINY.condition_for(width)
-    unet = build_unet(TINY.unet, channels=3, size=8, width=width, background=background)
+    unet = build_unet(TINY.unet, policy, channels=3, size=8, background=3 if background else 0)
     # Make the condition matter in an untrained network.
     for name, p in unet.named_parameters():
         if "attn2" in name:

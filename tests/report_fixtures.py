@@ -1,7 +1,6 @@
 """Results and audits with everything that they can hold, for tests of the report."""
 
 import dataclasses
-import os
 from html.parser import HTMLParser
 
 import numpy as np
@@ -280,17 +279,6 @@ def pretraining_audit(names=()):
         signals=found,
         leaking_samples=310,
     )
-
-
-def many_names(folder, sources, n):
-    """``n`` file names that are links to a few pictures, so that a test can have many big ones."""
-    names = []
-    for k in range(n):
-        source = sources[k % len(sources)]
-        name = f"many{k}{source[source.rindex('.') :]}"
-        os.link(folder / source, folder / name)
-        names.append(name)
-    return names
 
 
 def gallery(folder, n, side=64, materials=("wood", "rock", "grass")):

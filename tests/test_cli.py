@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from palpate.cli import VERBS, main
+from palpate.cli import VERBS, main, terminal
 from palpate.cli.terminal import RENAMED, error_line, join_help_lines
 from palpate.core import PalpateError, Split
 
@@ -241,3 +241,17 @@ def test_split_of_a_manifest_then_audit_then_report(capsys, small_manifest, tmp_
     assert "NoLeak" in page.read_text()
     again = ("report", page.with_suffix(".json"), "-o", tmp_path / "again.html", "-q")
     assert call(capsys, *again)[0] == 0
+
+
+def test_an_error_of_all_processes_is_printed_by_the_first(monkeypatch, capsys):
+    def fails(name, args):
+        raise error
+
+    monkeypatch.setattr(terminal, "_call", fails)
+    error = PalpateError("It must hold", "not", "")
+    printed = []
+    for first, error.shared in ((False, False), (True, True), (False, True)):
+        monkeypatch.setattr(terminal, "FIRST", first)
+        assert main(["split", "x"]) == 2
+        printed.append(capsys.readouterr().err != "")
+    assert printed == [True, True, False]

@@ -1,6 +1,8 @@
 """``palpate generate``: a photo in, an image out; mistakes in one line."""
 
+import errno
 import json
+import os
 import subprocess
 import sys
 
@@ -123,3 +125,25 @@ def test_broken_photos_and_unknown_models_are_reported_before_torch_is_imported(
         command = [sys.executable, "-c", code, "generate", *args, "-o", "t.png"]
         done = subprocess.run(command, capture_output=True, text=True, check=False)
         assert done.returncode == 2, (args, done.stderr)
+
+
+def test_a_full_disk_is_one_line_and_the_next_run_goes_on(place, capsys, monkeypatch):
+    save, room = Image.Image.save, [1]
+
+    def limited(self, *args, **options):
+        if not room:
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), "somewhere")
+        room.pop()
+        return save(self, *args, **options)
+
+    monkeypatch.setattr(Image.Image, "save", limited)
+    status, out, err = call(capsys, "photos", "-o", "t", "--steps", "1", "-q")
+    assert (status, out, "Traceback" in err) == (2, "", False)
+    assert "No space left on device" in err
+    monkeypatch.undo()
+    monkeypatch.chdir(place)
+    write_shipped(place.parent / "root2", monkeypatch)
+    assert len([*(place / "t" / "images").iterdir()]) == 1
+    status, out, _ = call(capsys, "photos", "-o", "t", "--steps", "1", "--json")
+    facts = json.loads(out)
+    assert (status, facts["images"], facts["made_now"]) == (0, 2, 1)

@@ -60,7 +60,7 @@ def test_import_with_maps_classes_and_what_is_suspicious(capsys, table, tmp_path
 
 
 def test_options_of_the_format_pass_through(capsys, tag, tmp_path):
-    options = ["--labels", tag / "train.txt", "--seed", "3", "--image-format", "png"]
+    options = ["--labels", tag / "train.txt", "--image-format", "png"]
     command = ["import", tag, "-o", tmp_path / "m", *options, "--max-per-contact", "1"]
     status, out, _ = call(capsys, *command, "--json")
     assert (status, json.loads(out)["samples"]) == (0, 2)
@@ -75,12 +75,12 @@ def test_options_of_the_format_pass_through(capsys, tag, tmp_path):
 @pytest.mark.parametrize(
     ("args", "word"),
     [
-        (["--seed", "three"], "seed"),
+        (["--size", "three"], "size"),
         (["--image-format", "gif"], "gif"),
-        (["--scale", "4"], "must be left out for the format touch-and-go"),
+        (["--part", "sim"], "must be left out for the format touch-and-go"),
         (["--map", "video=a", "--map", "video=b"], "each column once"),
         (["--map", "video="], "as COLUMN=EXPRESSION"),
-        (["--format", "zip"], "auto or one of"),
+        (["--format", "zip"], "one of auto, touch-and-go"),
         (["--as", "vision"], "takes labels, image_format"),
     ],
 )

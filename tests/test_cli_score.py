@@ -103,7 +103,7 @@ def test_embeddings_load_no_torch_and_the_results_make_a_page(sets):
     code = (
         "import sys; from palpate.cli import main\n"
         "args = 'score --generated near.npz far.npz --reference real.npz -q '\n"
-        "args += '-o s.json --latex t.tex'\n"
+        "args += '-o s.json --latex t.tex --page p.html'\n"
         "assert main(args.split()) == 0\n"
         "assert not {'torch', 'transformers', 'safetensors'} & set(sys.modules)\n"
         "assert main(['report', 's.json', '-o', 'page.html', '-q']) == 0"
@@ -113,6 +113,8 @@ def test_embeddings_load_no_torch_and_the_results_make_a_page(sets):
     assert {s.subject for s in Results.load(Path("s.json")).scores} == {"near", "far", "near - far"}
     assert Path("t.tex").read_text().startswith("% palpate")
     assert Path("page.html").is_file()
+    assert "TMMD" in Path("p.html").read_text()
+    assert Path("p.json").is_file()
 
 
 def test_scores_of_pixels_need_no_torch(tmp_path):
@@ -145,6 +147,7 @@ def test_scores_of_pixels_need_no_torch(tmp_path):
         ((*PAIR, "-o", "near.npz"), ("must not replace an input",)),
         ((*PAIR, "-o", "folder"), ("folder must be writable",)),
         ((*PAIR, "--latex", "mine"), ("mine must be new",)),
+        ((*PAIR, "--page", "mine"), ("--page must end in .html",)),
         ((*PAIR, "--cache", "real.npz"), ("--cache must not be an input",)),
     ],
 )

@@ -37,8 +37,7 @@ def test_every_option_can_be_given(field):
         value = current + 1 if isinstance(current, int) else current * 0.9
     words = [str(v) for v in value] if isinstance(value, tuple) else [str(value)]
     given = options_of(f"--{field.name.replace('_', '-')}", *words)
-    implied = {"captions": "label"} if field.name == "named" else {}
-    assert given == dataclasses.replace(SMALL, **{field.name: value}, **implied)
+    assert given == dataclasses.replace(SMALL, **{field.name: value})
 
 
 def test_words_that_imply_others():

@@ -250,7 +250,7 @@ def test_features_come_back_from_their_file(tmp_path):
     again = FeatureSet.load(tmp_path / "f.npz").take(["c", "a"])
     assert (again.labels, again.groups, again.encoder) == (["g", "w"], ["u", "v"], "e")
     assert np.array_equal(again.features, x[[2, 0]])
-    with pytest.raises(PalpateError, match="without, first 'z'"):
+    with pytest.raises(PalpateError, match="missing, first 'z'"):
         features.take(["z"])
 
 

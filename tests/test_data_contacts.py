@@ -47,7 +47,6 @@ def test_presses_are_found_with_the_gel_before_them(presses, length, strength):
     video = gel_video(length, presses, strength)
     contacts = find_contacts(video)
     assert len(contacts.runs) == len(presses)
-    assert contacts.method == "detected"
     touched = {k for first, last in presses for k in range(first - 3, last + 4)}
     assert touched.isdisjoint([contacts.reference, *contacts.backgrounds])
     for found, true, background in zip(contacts.runs, presses, contacts.backgrounds, strict=True):
@@ -72,7 +71,6 @@ def test_a_declared_gel_finds_a_press_that_is_held_longer_than_the_gel_is_free()
     video = gel_video(60, ((8, 58),))
     video[8:59] = video[30]
     contacts = find_contacts(video, gel=gel_video(1, ())[0])
-    assert contacts.method == "declared"
     assert [overlap(run, (8, 58)) > 0.9 for run in contacts.runs] == [True]
     assert contacts.backgrounds[0] < 8
 
@@ -80,7 +78,6 @@ def test_a_declared_gel_finds_a_press_that_is_held_longer_than_the_gel_is_free()
 def test_a_declared_reference_is_used_and_brightness_is_no_contact():
     video = gel_video(60, ((0, 59),))
     assert find_contacts(video, reference=7).reference == 7
-    assert find_contacts(video, reference=7).method == "declared"
     energy = contact_energy(video[:1] // 2 + np.array([[40]], np.uint8), video[0] // 2)
     assert energy[0] < 0.01
 

@@ -5,9 +5,9 @@ import polars as pl
 import pytest
 
 from data_fixtures import number, tree, write_frames, write_video
-from palpate.core import PalpateError, ProblemsError, Split
+from palpate.core import PalpateError, ProblemsError
 from palpate.data.images import read_image
-from palpate.data.importing import import_dataset, validate, write_lists
+from palpate.data.importing import import_dataset, validate
 from palpate.data.listing import read_list
 
 
@@ -161,19 +161,6 @@ def test_overlaps_are_those_of_a_slow_search(tmp_path):
         slow = {i[0] for i in enumerate(spans) if any(share(i, j) for j in enumerate(spans))}
         report = validate(root / "l.csv", check="none")
         assert {int(p.where.rpartition(":")[2]) - 2 for p in report.invalid} == slow
-
-
-def test_lists_of_a_split_hold_its_samples_and_come_back(tmp_path):
-    root = recording(tmp_path / "d", "a")
-    (root / "list.csv").write_text(LIST)
-    manifest = import_dataset(root / "list.csv", tmp_path / "out").manifest
-    split = Split({i: "test" if k in (2, 7) else "train" for k, i in enumerate(manifest.ids)})
-    files = write_lists(manifest, split, tmp_path / "lists")
-    assert files[1].read_text() == "video,start,end,label,object,text\na,12,12,3,,\na,18,18,15,,\n"
-    for part, file in zip(("train", "test"), files, strict=True):
-        again = import_dataset(file, tmp_path / part, root=root).manifest
-        assert again.ids == manifest.part(split, part).ids
-        assert again.column("material") == manifest.part(split, part).column("material")
 
 
 def test_mistakes(tmp_path):

@@ -85,7 +85,7 @@ def test_mistakes_name_the_target_and_the_expression(maps, got):
     assert got in caught.value.got
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(st.text("path[]()~/'\"|:,-0 substrelct", max_size=25))
 def test_any_text_is_an_expression_or_an_error(text):
     with contextlib.suppress(PalpateError):

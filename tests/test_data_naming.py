@@ -84,7 +84,7 @@ def test_a_list_that_states_its_parts_is_audited_alone(tmp_path, capsys, monkeyp
     assert json.loads(capsys.readouterr().out)["test_samples"] == 1
     (tmp_path / "t.csv").write_text("id,video\n1,a\n2,b\n")
     assert main(["audit", "t.csv"]) == 2
-    assert "the source states 0" in capsys.readouterr().err
+    assert "the source states none" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("keyed", [False, True])

@@ -350,6 +350,17 @@ def test_unpaired_doubled_and_cut_files_of_folders(tmp_path):
     assert result.manifest.ids == ["0", "1", "3"]
 
 
+def test_names_that_are_not_utf8_are_problems(tmp_path):
+    root = tmp_path / "d"
+    for name in ("0", "1", "\udcff"):
+        write_image(root / "tactile" / f"{name}.png", 0)
+    result = import_pairs(root, tmp_path / "out", skip_bad=True)
+    assert [(p.where, p.kind) for p in result.skipped] == [
+        (r"'tactile/\udcff.png'", "bad-encoding")
+    ]
+    assert len(result.manifest) == 2
+
+
 def test_a_folder_of_one_kind_of_images(tmp_path):
     root = tmp_path / "d"
     for name in ("b/x 2.png", "b/deep/7.jpg", "a.jpg", ".hidden/1.jpg"):
@@ -382,7 +393,7 @@ def test_formats_are_recognized_or_all_that_were_looked_for_are_listed(tmp_path)
     assert all(name in str(caught.value) for name in FORMATS)
     assert "readme.txt" in caught.value.got
     for options, word in (
-        ({"format": "zip"}, r"auto or one of touch-and-go, .*pairs"),
+        ({"format": "zip"}, r"one of auto, touch-and-go, .*pairs"),
         ({"columns": {"a": "b"}}, "columns"),
     ):
         with pytest.raises(PalpateError, match=word):

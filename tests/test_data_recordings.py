@@ -3,9 +3,10 @@
 import numpy as np
 import pytest
 
-import palpate.data.recordings as recordings
+import palpate.data.formats.recordings as recordings
 from data_fixtures import tree, write_image
 from palpate.core import ProblemsError, Split
+from palpate.data.formats.base import Scan
 from palpate.data.importing import import_dataset, validate, write_lists
 from palpate.data.manifest import Manifest
 from palpate.data.reading import read_samples
@@ -69,7 +70,7 @@ def test_without_contact_frames_are_those_of_a_slow_search(tmp_path):
         for k in there:
             (root / "t").mkdir(parents=True, exist_ok=True)
             (root / "t" / f"{k}.jpg").write_bytes(b"")
-        work = recordings.Recordings(root, root, {}, {"a": contact}, "jpg", None, [])
+        work = recordings.Recordings(Scan(root), None, {}, {"a": contact}, "jpg", None)
         work.frames["a"] = {"tactile": recordings.FolderFrames(root / "t", root)}
         far = [k for k in there if not any(abs(k - c) <= 4 for c in contact)]
         far = far or [k for k in there if k not in contact]

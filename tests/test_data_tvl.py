@@ -94,8 +94,6 @@ def test_the_official_folders_join_into_sessions(official, tmp_path):
         starts = sorted(float(v.rpartition("-")[2]) for v in rows["video"].unique())
         assert joined == pytest.approx(np.mean(np.diff(starts) < 60))
         assert round(joined, 2) == expected
-    alone = read(official[0], tmp_path / "alone", check="none", session_gap=0.0).manifest.table
-    assert alone["session"].n_unique() == 279
 
 
 def test_the_official_ssvtp_rows_and_all_adjectives(official, tmp_path):
@@ -118,10 +116,8 @@ def rewrite(root: Path, dialect: str) -> None:
     for path in sorted(root.glob("data*/*.csv")):
         listed = tvl.read_list(Scan(path.parent), path)
         rows = [[cells[name] for name in COLUMNS] for _, cells in listed]
-        header: list[str] | None = list(COLUMNS)
-        if dialect == "no header":
-            header = None
-        elif dialect == "index":
+        header = list(COLUMNS)
+        if dialect == "index":
             header, rows = ["", *COLUMNS], [[str(k), *row] for k, row in enumerate(rows)]
         elif dialect == "other order":
             header, rows = list(COLUMNS[::-1]), [row[::-1] for row in rows]
@@ -137,8 +133,6 @@ def rewrite(root: Path, dialect: str) -> None:
         text = path.read_bytes().replace(b"\r\n", b"\n")
         if dialect == "windows":
             text = b"\xef\xbb\xbf" + text.replace(b"\n", b"\r\n")
-        elif dialect == "mark without header":
-            text = b"\xef\xbb\xbf" + text.split(b"\n", 1)[1]
         elif dialect == "no last newline":
             text = text.rstrip(b"\n")
         elif dialect == "capitals and blank lines":
@@ -146,8 +140,8 @@ def rewrite(root: Path, dialect: str) -> None:
         path.write_bytes(text)
 
 
-FORMS = ["no header", "index", "other order", "url is the index", "from hct", "from above", "dots"]
-FORMS += ["windows", "mark without header", "no last newline", "capitals and blank lines"]
+FORMS = ["index", "other order", "url is the index", "from hct", "from above", "dots"]
+FORMS += ["windows", "no last newline", "capitals and blank lines"]
 
 
 @pytest.mark.parametrize("dialect", FORMS)
@@ -195,23 +189,18 @@ def test_written_lists_read_back_as_the_same_split(tmp_path, make, seed):
     order = np.random.default_rng(seed).permutation(before.ids)
     split = Split({str(i): ("train", "train", "val", "test")[k % 4] for k, i in enumerate(order)})
     files = write_lists(before, split, tmp_path / "lists")
-    after = read(root, tmp_path / "after", lists=tmp_path / "lists")
-    assert after.splits["Lists"].parts == split.parts
-    assert after.manifest.digest == before.digest
-    for file in files:  # and in place
+    for file in files:
         shutil.copy(file, root / file.relative_to(tmp_path / "lists"))
-    again = read(root, tmp_path / "again")
-    assert again.splits["Orig"].parts == split.parts
-    assert again.manifest.digest == before.digest
-    assert (after.suspicious, again.suspicious) == ([], [])
-    with pytest.raises(PalpateError, match="must hold"):
-        read(root, tmp_path / "out", lists=tmp_path / "nowhere")
+    after = read(root, tmp_path / "after")
+    assert after.splits["Orig"].parts == split.parts
+    assert after.manifest.digest == before.digest
+    assert after.suspicious == []
 
 
 # --- SSVTP
 
 
-def test_ssvtp_finds_files_and_text_by_the_id_and_reports_what_disagrees(ssvtp_tree, tmp_path):
+def test_ssvtp_finds_files_and_text_by_the_id(ssvtp_tree, tmp_path):
     whole = read(ssvtp_tree, tmp_path / "whole").manifest
     vision, tactile = "images_rgb/image_{}_rgb.jpg", "images_tac/image_{}_tac.jpg"
     caption = "Fabric, coarse, deformable."
@@ -227,14 +216,12 @@ def test_ssvtp_finds_files_and_text_by_the_id_and_reports_what_disagrees(ssvtp_t
     write_csv(ssvtp_tree / "train.csv", SSVTP_COLUMNS, rows)
     result = read(ssvtp_tree, tmp_path / "result")
     assert result.manifest.digest == whole.digest
-    place = f"{ssvtp_tree / 'train.csv'}:2"
-    reported = [(p.where, p.kind, p.text.split(" row")[0]) for p in result.suspicious]
-    assert reported == [(place, "misnamed-path", "3"), (place, "two-captions", "1")]
+    assert result.suspicious == []
     assert "text/labels_<id>.txt" in result.facts["text_source"]
 
 
 @pytest.mark.parametrize(
-    "columns", [None, ("url", "caption"), ("", "tactile", "caption"), ("url",), ()]
+    "columns", [None, ("url", "caption"), ("", "tactile", "caption"), ("url",)]
 )
 def test_ssvtp_lists_of_every_width(ssvtp_tree, tmp_path, columns):
     whole = read(ssvtp_tree, tmp_path / "whole").manifest
@@ -243,8 +230,6 @@ def test_ssvtp_lists_of_every_width(ssvtp_tree, tmp_path, columns):
     path = ssvtp_tree / "train.csv"
     if columns is None:  # no list at all
         path.unlink()
-    elif columns == ():  # no header
-        write_csv(path, None, pairs)
     else:
         cells = [{"": v, "url": v, "tactile": t, "caption": ""} for v, t in pairs]
         write_csv(path, columns, [[row[name] for name in columns] for row in cells])

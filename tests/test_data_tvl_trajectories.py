@@ -25,33 +25,16 @@ def tree(tmp_path):
 # --- Contact.json, captions, contacts, sessions
 
 
-def test_without_lists_contact_json_gives_the_samples_if_requested(tree, tmp_path):
-    listed = read(tree, tmp_path / "listed").manifest
-    for path in tree.glob("data*/*.csv"):
-        path.unlink()
-    with pytest.raises(PalpateError, match="at least one usable sample"):
-        read(tree, tmp_path / "none")
-    result = read(tree, tmp_path / "result", contact=True)
-    assert result.manifest.ids == listed.ids
-    assert result.manifest.column("contact") == listed.column("contact")
-    assert set(result.manifest.column("text")) == {None}
-    assert (result.facts["text_source"], result.splits) == ("none", {})
-
-
-def test_frames_that_only_contact_json_names_are_counted_or_taken(tree, tmp_path):
-    whole = read(tree, tmp_path / "whole").manifest
+def test_frames_that_only_contact_json_names_are_counted(tree, tmp_path):
     path = tree / "data1" / "test.csv"
     path.write_text("\n".join(path.read_text().splitlines()[:-1]))
     left = read(tree, tmp_path / "a")
     (problem,) = left.suspicious
     assert (problem.kind, problem.text.split(":")[0]) == ("unlisted-contact", "1 row")
-    taken = read(tree, tmp_path / "b", contact=True)
-    assert taken.manifest.ids == whole.ids
-    (new,) = set(taken.manifest.ids) - set(left.manifest.ids)
-    assert taken.manifest.take([new]).column("text") == [None]
-    assert new not in taken.splits["Orig"].parts
-    kept = taken.manifest.take(left.manifest.ids)
-    assert left.manifest.column("contact") == kept.column("contact")
+    for path in tree.glob("data*/*.csv"):
+        path.unlink()
+    with pytest.raises(PalpateError, match="at least one usable sample"):
+        read(tree, tmp_path / "none")
 
 
 def test_frames_of_not_contact_json_are_no_samples(tree, tmp_path):
@@ -121,17 +104,12 @@ def test_contacts_are_runs_and_sessions_chains(tree, tmp_path):
     first = table.filter(table["video"] == table["video"][0])
     assert first["frame"].to_list() == [10, 11, 30, 31]
     assert [t.split("#")[1] for t in first["contact"]] == ["0001", "0001", "0002", "0002"]
-    starts = [1702596200.5, 1702596265.5, 1702596380.5]  # gaps of 65 and 115 seconds
-    for gap, sessions in ((64.9, 3), (65.0, 2), (115.0, 1)):
-        result = hct.sessions_of([f"data1/{k}-{t}" for k, t in enumerate(starts)], gap)
+    for gap, sessions in ((60.1, 2), (60.0, 1)):
+        result = hct.sessions_of([f"data1/1-{1702596200.5}", f"data1/2-{1702596200.5 + gap}"])
         assert len(set(result.values())) == sessions
     videos = [*(f"data1/9-{100 + 50 * k}" for k in range(4)), "data2/9-120", "data2/odd name"]
-    chained = hct.sessions_of(videos, 60.0)
+    chained = hct.sessions_of(videos)
     assert set(chained.values()) == {"data1/9-100", "data2/9-120", "data2/odd name"}
-    wide = read(tree, tmp_path / "b", session_gap=120.0).manifest
-    assert sorted(set(wide.column("session"))) == ["data1/7-1702596200.5", "data2/7-1702599800.5"]
-    with pytest.raises(PalpateError, match="session_gap"):
-        read(tree, tmp_path / "c", session_gap=-1.0)
 
 
 # --- Backgrounds
@@ -220,9 +198,9 @@ def test_swapped_folders_are_reported_and_fixed(tmp_path, swapped):
         right = place(video) not in swapped
         assert ("/vision/" in vision, "/tactile/" in tactile) == (right, right)
         assert background == (f"{video}/background.png" if right else "digit_background.png")
-    (_,) = write_lists(fixed, Split(dict.fromkeys(fixed.ids, "train")), tmp_path / "lists")
-    assert named(read(tmp_path, tmp_path / "c", lists=tmp_path / "lists").suspicious) == set()
-    with pytest.raises(PalpateError, match="must be report or fix"):
+    write_lists(fixed, Split(dict.fromkeys(fixed.ids, "train")), tmp_path / "hct")
+    assert named(read(tmp_path, tmp_path / "c").suspicious) == set()
+    with pytest.raises(PalpateError, match="must be one of report, fix"):
         read(tmp_path, tmp_path / "out", swap="yes")
 
 

@@ -16,8 +16,8 @@ from palpate.diffusion.autoencoder_training import (
     measure_reconstruction,
     train_autoencoder,
 )
+from palpate.diffusion.encoding import encode_latents
 from palpate.diffusion.options import AutoencoderOptions
-from palpate.diffusion.training import encode_latents
 from palpate.encoders.models import digest_tensors
 from palpate.encoders.preprocess import to_unit
 
@@ -78,10 +78,10 @@ def test_encode_is_before_quantization_and_decode_quantizes():
     unit = torch.from_numpy(images).permute(0, 3, 1, 2) / 127.5 - 1
     patches = unit.reshape(3, 3, 4, 4, 4, 4).permute(0, 1, 3, 5, 2, 4).reshape(3, 48, 4, 4)
     with torch.no_grad():
-        by_hand = model.vq.quant_conv(model.vq.encoder(patches))
+        by_hand = model.net.quant_conv(model.net.encoder(patches))
     assert torch.allclose(z, by_hand, atol=1e-6)
     # Quantize by brute force: decoding latents equals decoding their nearest codes.
-    codes = model.vq.quantize.embedding.weight.detach()
+    codes = model.net.quantize.embedding.weight.detach()
     flat = z.permute(0, 2, 3, 1).reshape(-1, 3)
     nearest = ((flat[:, None] - codes[None]) ** 2).sum(-1).argmin(1)
     assert torch.equal(model.codes(z).flatten(), nearest)
@@ -148,7 +148,7 @@ def test_an_old_bin_loads_as_weights_only(tmp_path):
     model = random_model()
     model.save(tmp_path / "vq")
     (tmp_path / "vq" / "diffusion_pytorch_model.safetensors").unlink()
-    torch.save(model.vq.state_dict(), tmp_path / "vq" / "diffusion_pytorch_model.bin")
+    torch.save(model.net.state_dict(), tmp_path / "vq" / "diffusion_pytorch_model.bin")
     assert Autoencoder.load(tmp_path / "vq").digest == model.digest
     marker = tmp_path / "ran"
     torch.save({"x": Evil(str(marker))}, tmp_path / "vq" / "diffusion_pytorch_model.bin")
@@ -228,16 +228,16 @@ def test_latents_are_encoded_once(tmp_path):
             return images[rows]
 
     rows = images.view(Rows)
-    z = encode_latents(model, rows, ids, tmp_path, key="k", batch=2)
+    z = encode_latents(model, rows, None, ids=ids, folder=tmp_path, key="k", batch=2)
     assert torch.allclose(torch.from_numpy(np.array(z)), model.encode(images), atol=1e-6)
     n = len(calls)
-    again = encode_latents(model, rows, ids, tmp_path, key="k", batch=2)
+    again = encode_latents(model, rows, None, ids=ids, folder=tmp_path, key="k", batch=2)
     assert len(calls) == n
     assert np.array_equal(z, again)
-    encode_latents(model, rows, ids, tmp_path, key="other", batch=2)
+    encode_latents(model, rows, None, ids=ids, folder=tmp_path, key="other", batch=2)
     assert len(calls) > n
     n = len(calls)
-    encode_latents(model, rows, list("abcdX"), tmp_path, key="other", batch=2)
+    encode_latents(model, rows, None, ids=[*"abcdX"], folder=tmp_path, key="other", batch=2)
     assert len(calls) > n
 
 

@@ -83,8 +83,10 @@ def test_a_resumed_folder_equals_an_uninterrupted_one(pipeline, tmp_path):
         generate(tmp_path / "in", output=tmp_path / "b", progress=stop, **common)
     with pytest.raises(PalpateError, match="half done"):
         Generated.load(tmp_path / "b")
+    there = len([*(tmp_path / "b" / "images").iterdir()])
+    assert 4 <= there < 7  # writing is behind sampling
     resumed = generate(tmp_path / "in", output=tmp_path / "b", **common)
-    assert (whole.made, resumed.made) == (7, 3)
+    assert (whole.made, resumed.made) == (7, 7 - there)
     assert contents(tmp_path / "a") == contents(tmp_path / "b")
     assert generate(tmp_path / "in", output=tmp_path / "b", model=pipeline).made == 0
 
@@ -122,6 +124,25 @@ def test_broken_photos_are_reported_at_once_or_skipped(pipeline, tmp_path):
     assert alone.path("v/4").read_bytes() == made.path("v/4").read_bytes()
 
 
+def test_many_photos_are_read_while_others_are_sampled(pipeline, tmp_path):
+    paths = write_photos(tmp_path / "in", 80)
+    order = {f"{k:02}": path for k, path in enumerate(paths)}
+    common = {"model": pipeline, "steps": 1, "output": tmp_path / "out"}
+    good = [paths[k].read_bytes() for k in (60, 70)]
+    for k in (60, 70):
+        paths[k].write_text("broken")
+    with pytest.raises(ProblemsError) as caught:
+        generate(order, **common)
+    assert [Path(p.where).name for p in caught.value.problems] == ["60.png", "70.png"]
+    made = [*(tmp_path / "out" / "images").iterdir()]
+    assert len(made) == 32, "those that were read before it"
+    for k, content in zip((60, 70), good, strict=True):
+        paths[k].write_bytes(content)
+    whole = generate(order, **common)
+    assert (whole.made, whole.ids) == (48, [*order])
+    assert generate(order, **common).made == 0
+
+
 def test_a_manifest_with_backgrounds(tmp_path):
     pipeline = make_pipeline(background=True)
     write_photos(tmp_path, 3)
@@ -133,7 +154,7 @@ def test_a_manifest_with_backgrounds(tmp_path):
         made = generate(source, model=pipeline, split=split)
         assert made.ids == ["v/0", "v/2"]
     bare = Manifest.from_rows([{k: row[k] for k in ("id", "vision")} for row in rows], tmp_path)
-    with pytest.raises(PalpateError, match="background image"):
+    with pytest.raises(PalpateError, match="background"):
         generate(bare, model=pipeline)
     with pytest.raises(PalpateError, match="photos alone"):
         generate(tmp_path / "0.png", model=pipeline)

@@ -1,19 +1,28 @@
 """The pipeline: what its images depend on, its folder, its inputs."""
 
 import json
+import shutil
 from dataclasses import replace
+from types import SimpleNamespace
 
+import diffusers
+import huggingface_hub
 import numpy as np
 import pytest
 import torch
-from diffusers import DPMSolverMultistepScheduler, UNet2DConditionModel, VQModel
+from diffusers import DiffusionPipeline, DPMSolverMultistepScheduler, UNet2DConditionModel, VQModel
+from diffusers.utils import hub_utils
+from huggingface_hub import ModelCard
 from PIL import Image
+from safetensors.torch import load_file, save_file
 
 from diffusion_fixtures import arrays, make_pipeline, photos
 from palpate.core import PalpateError
-from palpate.diffusion.autoencoder import LatentStats
+from palpate.diffusion.autoencoder import BackgroundAutoencoder, LatentStats
+from palpate.diffusion.autoencoder_training import build_autoencoder
 from palpate.diffusion.options import ConditionPolicy
 from palpate.diffusion.pipeline import TactilePipeline
+from palpate.diffusion.presets import TINY
 from palpate.encoders.contrastive import new_clip
 from palpate.encoders.encoder_set import EncoderSet
 from palpate.encoders.presets import preset
@@ -65,7 +74,7 @@ def test_photos_in_any_form_give_the_same_images(tmp_path):
 
 def test_text_and_vision_embeddings_fill_the_same_slot():
     pipeline, c = make_pipeline(), torch.randn(2, 6)
-    made = [pipeline.sample(c, ["x", "y"], seed=0, source=s) for s in ("text", "vision")]
+    made = [pipeline.sample(a, ["x", "y"], seed=0, texts=b) for a, b in ((c, None), (None, c))]
     assert np.array_equal(*made)  # gap="none": the paper's bridge
 
 
@@ -120,12 +129,12 @@ def test_the_digest_names_what_images_depend_on():
 def test_the_background_variant_uses_its_background():
     pipeline = make_pipeline(background=True)
     ground = photos(2, 32)
-    a, b = (arrays(pipeline(photos(2), background=g)) for g in (ground, ground[::-1].copy()))
+    a, b = (arrays(pipeline(photos(2), gel=g)) for g in (ground, ground[::-1].copy()))
     assert not np.array_equal(a, b)
-    with pytest.raises(PalpateError, match="`background` must be given for a generator w/ BG"):
+    with pytest.raises(PalpateError, match="`background` must be given for a generator that sees"):
         pipeline(photos(2))
     with pytest.raises(PalpateError, match="and only for one"):
-        make_pipeline()(photos(2), background=ground)
+        make_pipeline()(photos(2), gel=ground)
     with pytest.raises(PalpateError, match="one image of 32 pixels square per photo"):
         pipeline.sample(torch.randn(2, 6), ["a", "b"], seed=0, background=ground[:, :16])
 
@@ -139,6 +148,7 @@ def test_the_background_variant_uses_its_background():
         (lambda p: p(photos(1), steps=1001), "`steps` must lie in 1 to 1000"),
         (lambda p: p.sampler_with(batch=0), "`batch` must be at least 1"),
         (lambda p: p(photos(2), ids=["a"]), "Every id needs one condition"),
+        (lambda p: p(photos(2), generator=[torch.Generator()]), r"`generator` .*Got 1 for 2"),
         (lambda p: p(photos(1) / 255), "`images` must be uint8"),
         (lambda p: p(7), "`images` must be files, PIL images"),
         (lambda p: p("nowhere.jpg"), "nowhere.jpg: no such file"),
@@ -148,6 +158,19 @@ def test_the_background_variant_uses_its_background():
 def test_mistakes_are_explained(call, message):
     with pytest.raises(PalpateError, match=message):
         call(make_pipeline())
+
+
+def test_an_autoencoder_of_other_channels_is_rejected(tmp_path):
+    pipeline = without_encoders(make_pipeline())
+    assert TINY.autoencoder is not None
+    other = build_autoencoder(replace(TINY.autoencoder, channels=4)).eval()
+    with pytest.raises(PalpateError, match=r"one for the autoencoder: 4 channels .* Got \[3\]"):
+        replace(pipeline, autoencoder=other)
+    pipeline.save(tmp_path / "p")
+    shutil.rmtree(tmp_path / "p" / "autoencoder")
+    other.save(tmp_path / "p" / "autoencoder")
+    with pytest.raises(PalpateError, match="one for the autoencoder: 4 channels"):
+        TactilePipeline.from_pretrained(tmp_path / "p")
 
 
 def test_guidance_needs_condition_dropout():
@@ -168,6 +191,9 @@ def test_a_changed_folder_is_rejected(tmp_path):
         ({k: v for k, v in about.items() if k != "sampler"}, "no sampler"),
         (about | {"sampler": {"methods": "ddim"}}, "must be as palpate writes them"),
         (about | {"size": None}, "must be as palpate writes them"),
+        (about | {"size": 30}, "must be one for the autoencoder"),
+        (about | {"condition": about["condition"] | {"taus": 1}}, "unexpected .* 'taus'"),
+        (about | {"format": "palpate-pipeline/3"}, "must have the format palpate-pipeline/2"),
         ([], "must be a JSON object"),
     ]
     for content, message in cases:
@@ -176,3 +202,192 @@ def test_a_changed_folder_is_rejected(tmp_path):
             TactilePipeline.from_pretrained(tmp_path / "p")
     with pytest.raises(PalpateError, match="no folder"):
         TactilePipeline.from_pretrained(tmp_path / "nowhere")
+
+
+@pytest.mark.parametrize("many", [False, True], ids=["one generator", "one each"])
+def test_generators_decide_the_noise_instead_of_seed_and_ids(many):
+    pipeline = make_pipeline()
+
+    def images(seed=3, batch=4, **options):
+        one = torch.Generator().manual_seed(seed)
+        each = [torch.Generator().manual_seed(seed + k) for k in range(6)]
+        made = replace(pipeline, sampler=replace(pipeline.sampler, batch=batch))
+        return arrays(made(photos(6), generator=each if many else one, **options)).astype(int)
+
+    base = images()
+    assert np.array_equal(images(seed=3, ids=list("abcdef")), base)
+    assert np.abs(images(batch=6) - base).max() <= 1
+    assert not np.array_equal(images(seed=4), base)
+
+
+def test_batches_of_1_and_16_give_the_same_images():
+    pipeline = make_pipeline()
+    one, many = (
+        arrays(replace(pipeline, sampler=replace(pipeline.sampler, batch=n))(photos(5)))
+        for n in (1, 16)
+    )
+    assert np.abs(one.astype(int) - many).max() <= 1
+
+
+def test_a_callback_sees_and_replaces_the_latents_of_each_step():
+    pipeline, calls = make_pipeline(), []
+
+    def callback(pipe, step, timestep, kwargs):
+        calls.append((pipe is pipeline, step, float(timestep), kwargs["latents"].shape))
+        return {"latents": torch.zeros_like(kwargs["latents"])}
+
+    base = arrays(pipeline(photos(2), steps=3))
+    zero = arrays(pipeline(photos(2), steps=3, callback_on_step_end=callback))
+    assert [call[:2] for call in calls] == [(True, 0), (True, 1), (True, 2)]
+    assert all(shape[1:] == (3, 8, 8) for *_, shape in calls)
+    assert np.array_equal(zero[0], zero[1])
+    assert not np.array_equal(zero, base)
+    looks = arrays(pipeline(photos(2), steps=3, callback_on_step_end=lambda *_: {}))
+    assert np.array_equal(looks, base)
+
+
+def test_the_progress_bar_counts_steps_and_can_be_turned_off(capsys):
+    pipeline = make_pipeline()
+    pipeline(photos(5), steps=3)
+    assert f"{3 * 2}/{3 * 2}" in capsys.readouterr().err  # two batches of 4
+    pipeline(photos(1), steps=2, progress=lambda *_: None)
+    pipeline.set_progress_bar_config(disable=True)
+    pipeline(photos(1), steps=2)
+    assert not capsys.readouterr().err
+
+
+def test_it_is_a_pipeline_of_diffusers(tmp_path):
+    pipeline = without_encoders(make_pipeline())
+    assert isinstance(pipeline, DiffusionPipeline)
+    assert sorted(pipeline.components) == ["autoencoder", "scheduler", "unet"]
+    pipeline.save_pretrained(tmp_path / "p")
+    index = json.loads((tmp_path / "p" / "model_index.json").read_text())
+    assert index["_class_name"] == "TactilePipeline"
+    parts = {k: tuple(v) for k, v in index.items() if not k.startswith("_")}
+    assert parts == {
+        "unet": ("diffusers", "UNet2DConditionModel"),
+        "autoencoder": ("diffusers", "VQModel"),
+        "scheduler": ("diffusers", type(pipeline.scheduler).__name__),
+    }
+    for name, (_, kind) in parts.items():  # each loads with diffusers alone
+        getattr(diffusers, kind).from_pretrained(tmp_path / "p" / name)
+    assert TactilePipeline.from_pretrained(tmp_path / "p").digest == pipeline.digest
+    for options in ({"safe_serialization": False}, {"variant": "fp16"}):
+        with pytest.raises(PalpateError, match="must be saved as safetensors"):
+            pipeline.save_pretrained(tmp_path / "q", **options)
+
+
+@pytest.mark.parametrize("way", ["push_to_hub", "save_pretrained"])
+def test_pushed_to_the_hub_with_its_own_card_it_comes_back(tmp_path, monkeypatch, way):
+    pipeline, hub = without_encoders(make_pipeline()), tmp_path / "hub"
+    name = SimpleNamespace(repo_id="me/touch")
+
+    def upload(*, repo_id, folder_path, **_):
+        assert repo_id == "me/touch"
+        shutil.copytree(folder_path, hub)
+
+    blank = ModelCard("---\nlibrary_name: diffusers\n---\nblank")
+    monkeypatch.setattr(hub_utils, "create_repo", lambda *_, **__: name)
+    monkeypatch.setattr(hub_utils, "upload_folder", upload)
+    monkeypatch.setattr(hub_utils, "load_or_create_model_card", lambda *_, **__: blank)
+    if way == "push_to_hub":
+        pipeline.push_to_hub("me/touch")
+    else:
+        pipeline.save_pretrained(tmp_path / "p", push_to_hub=True, repo_id="me/touch")
+    card = (hub / "README.md").read_text()
+    assert "TactilePipeline.from_pretrained" in card
+    assert pipeline.digest in card
+    monkeypatch.setattr(huggingface_hub, "snapshot_download", lambda *_, **__: str(hub))
+    assert TactilePipeline.from_pretrained("me/touch", device="cpu").digest == pipeline.digest
+
+
+def test_another_scheduler_samples_and_belongs_to_the_settings(tmp_path):
+    pipeline = without_encoders(make_pipeline())
+    c, base = torch.randn(5, 6), pipeline.digest
+    first = pipeline.sample(c, list("abcde"), seed=0)
+    config = pipeline.scheduler.config
+    for kind in (diffusers.UniPCMultistepScheduler, diffusers.EulerAncestralDiscreteScheduler):
+        pipeline.scheduler = kind.from_config(config)
+        made = pipeline.sample(c, list("abcde"), seed=0)
+        assert not np.array_equal(made, first)
+        # Noise that the scheduler adds belongs to the sample, too.
+        alone = pipeline.sample(c[2:4], ["c", "d"], seed=0)
+        assert np.abs(alone.astype(int) - made[2:4]).max() <= 1
+        assert pipeline.other_scheduler["_class_name"] == kind.__name__
+        with pytest.raises(PalpateError, match="sampler's scheduler"):
+            pipeline.save(tmp_path / "p")
+    assert pipeline.digest == base
+    pipeline.sampler = replace(pipeline.sampler, steps=2)
+    assert pipeline.other_scheduler is None
+
+
+def test_the_unet_computes_in_another_type_and_is_saved_in_32_bits(tmp_path):
+    pipeline = without_encoders(make_pipeline())
+    c, exact = torch.randn(2, 6), pipeline.digest
+    base = pipeline.sample(c, ["a", "b"], seed=0).astype(int)
+    assert pipeline.to(torch.bfloat16) is pipeline
+    assert (pipeline.dtype, pipeline.device.type) == (torch.bfloat16, "cpu")
+    made = pipeline.sample(c, ["a", "b"], seed=0)
+    assert 0 < np.abs(made - base).mean() < 8
+    assert pipeline.digest != exact  # weights are rounded
+    pipeline.save(tmp_path / "p")
+    again = TactilePipeline.from_pretrained(tmp_path / "p")
+    assert (again.dtype, again.digest) == (torch.float32, pipeline.digest)
+    assert np.array_equal(again.to("cpu", torch.bfloat16).sample(c, ["a", "b"], seed=0), made)
+
+
+def test_a_changed_part_changes_the_digest():
+    pipeline, other = make_pipeline(), make_pipeline()
+    next(other.unet.parameters()).data.add_(1e-3)
+    before = pipeline.digest
+    pipeline.unet = other.unet
+    assert pipeline.denoiser.unet is other.unet
+    assert pipeline.digest == other.digest != before
+
+
+@pytest.mark.parametrize(
+    ("parts", "got"),
+    [
+        ({"stats": LatentStats((0.0,) * 4, (1.0,) * 4)}, r"\[3, 4\] channels"),
+        ({"size": 33}, "sides of 33"),
+        ({"autoencoder": BackgroundAutoencoder(4, 8, 16)}, r"must be one for .* 4 channels"),
+        ({"denoiser": make_pipeline(background=True).denoiser}, None),
+    ],
+)
+def test_parts_that_do_not_fit_are_rejected(parts, got):
+    if got is None:
+        assert replace(make_pipeline(), **parts).background
+        return
+    with pytest.raises(PalpateError, match=got):
+        replace(make_pipeline(), **parts)
+
+
+def test_unknown_weights_are_rejected(tmp_path):
+    without_encoders(make_pipeline()).save(tmp_path / "p")
+    file = next((tmp_path / "p" / "unet").glob("diffusion*.safetensors"))
+    save_file(load_file(file) | {"extra.weight": torch.zeros(1)}, file)
+    with pytest.raises(PalpateError, match=r"1 unknown weights, first extra\.weight"):
+        TactilePipeline.from_pretrained(tmp_path / "p")
+
+
+@pytest.mark.parametrize(
+    ("record", "lines"),
+    [
+        ({}, ["license: unknown"]),
+        ({"license": "mit", "ceiling": {"psnr": 21.5}}, ["license: mit", "| psnr |", "| 21.5 |"]),
+        (
+            {"split": "5" * 64, "manifest": "7" * 64, "train_samples": 12, "split_rule": {"by": 1}},
+            ["- split: `" + "5" * 64, "- manifest: `" + "7" * 64, '| {"by": 1} | 12 |'],
+        ),
+        (
+            {"data": [{"world": "w"}], "scores": [{"score": "TMMD", "value": 0.5}]},
+            ["| w |", "| TMMD | 0.5 |"],
+        ),
+    ],
+)
+def test_the_card_says_what_is_known(tmp_path, record, lines):
+    pipeline = replace(make_pipeline(), encoders=None, training=record)
+    pipeline.save(tmp_path / "p")
+    card = (tmp_path / "p" / "README.md").read_text()
+    for line in [*lines, f"- model: `{pipeline.digest}`", "- autoencoder: `"]:
+        assert line in card

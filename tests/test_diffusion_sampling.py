@@ -103,8 +103,8 @@ def test_noise_belongs_to_seed_and_id():
 def network() -> Denoiser:
     torch.manual_seed(0)
     options = UNetOptions(widths=(8, 16), attention=(False, True), layers=1, head_width=8, groups=4)
-    unet = build_unet(options, channels=3, size=8, width=12, background=False)
-    return Denoiser(unet, ConditionPolicy(width=12)).eval()
+    policy = ConditionPolicy(width=12)
+    return Denoiser(build_unet(options, policy, channels=3, size=8), policy).eval()
 
 
 def draw(model: Denoiser, conditions, ids, **changes) -> torch.Tensor:

@@ -97,7 +97,7 @@ def test_other_encoders_autoencoders_and_schedules_are_rejected(small_manifest, 
         )
 
     other = make_pipeline().autoencoder
-    other.vq.quantize.embedding.weight.data.add_(1)
+    other.net.quantize.embedding.weight.data.add_(1)
     for change, word in (
         ({"encoders": make_encoders(seed=4)}, "another vision encoder"),
         ({"autoencoder": other}, "another autoencoder"),

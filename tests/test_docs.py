@@ -50,6 +50,8 @@ def examples(tmp_path_factory):
             Image.fromarray(image.clip(0, 255).astype(np.uint8)).save(folder / name / f"{k}.png")
     photo = next((folder / "tag" / "dataset").glob("*/video_frame/*.jpg"))
     shutil.copy(photo, folder / "photo.jpg")
+    gel = sorted((folder / "tag" / "dataset").glob("*/gelsight_frame/*.jpg"))[0]  # not yet touched
+    Image.open(gel).save(folder / "no-contact.png")
     return folder
 
 

@@ -11,10 +11,8 @@ import pytest
 from PIL import Image
 
 from palpate.cli import main
-from palpate.core import rng_for
 from palpate.sim import MATERIALS, PRESETS, VERSION, plan_world
 from palpate.sim.felt import SCALES
-from palpate.sim.materials import draw_surface
 from palpate.sim.plan import written_frames
 
 TOP = Path(__file__).resolve().parents[1]
@@ -110,16 +108,10 @@ def test_the_table_of_materials_is_that_of_the_code():
     assert [(int(label), name) for label, name, _ in rows] == [
         (material.label, name) for name, material in MATERIALS.items()
     ]
-    words = set()
     for _, name, kinds in rows:
-        told = dict(re.findall(r"([^;(]+?) \(([^)]*)\)(?:; )?", kinds))
-        assert tuple(told) == MATERIALS[name].subtypes
-        for k in range(8):
-            surface = draw_surface(name, MATERIALS[name], 64, rng_for(0, "docs", name, k))
-            assert told[surface.subtype] == ", ".join(surface.words)
-        words |= {word for listed in told.values() for word in listed.split(", ")}
+        assert tuple(kinds.split(", ")) == MATERIALS[name].subtypes
     felt = {word for scale in SCALES.values() for level in scale.words for word in level}
-    assert f"a list of {len(felt)}, those of label captions from a list of {len(words)};" in PAGE
+    assert f"from a list of {len(felt)}," in PAGE
 
 
 def test_the_table_of_costs_has_the_frames_of_the_presets():

@@ -25,7 +25,8 @@ SIGNATURES = {
         "seed body key_variable again prices dry_run progress"
     ),
     "generate": (
-        "photos * model output split part seed guidance steps batch skip_bad device progress"
+        "photos * text weight gel model output split part seed noise guidance steps batch"
+        " best_of best_by skip_bad device progress"
     ),
     "load": "source * format images skip_bad progress **options",
     "probe": (
@@ -44,15 +45,19 @@ SIGNATURES = {
         "data split * preset clip output epochs targets weights partners held_out seed device"
         " compute progress"
     ),
+    "train_autoencoder": "data split * preset start output seed device compute progress",
     "train_generator": (
-        "data split clip * preset autoencoder output source background steps seed device compute"
-        " progress"
+        "data split clip * preset autoencoder unet output source background align align_weight"
+        " steps seed device compute progress"
     ),
     "validate": "source * format check progress **options",
     "Encoder.from_pretrained": "source * modality device",
     "Encoder.encode": "self inputs * batch progress",
     "TactilePipeline.from_pretrained": "source * device",
-    "TactilePipeline.__call__": "self photos * ids seed guidance steps background progress",
+    "TactilePipeline.__call__": (
+        "self photos * text weight ids seed guidance steps gel generator callback_on_step_end"
+        " progress"
+    ),
     "World.__init__": "self options * cache",
     "Manifest.load": "path root",
     "Split.from_ids": "* rule manifest **parts",

@@ -11,11 +11,12 @@ import torch
 from PIL import Image
 from transformers import Dinov2Config, Dinov2Model
 
-from palpate.core import PalpateError, Split, rng_for
+from palpate.core import PalpateError, Split, rng_for, seed_for
 from palpate.data.manifest import Manifest
 from palpate.diffusion.training import train_generator
 from palpate.encoders import contrastive
 from palpate.encoders.contrastive import (
+    TactileLoss,
     TactileModel,
     new_clip,
     train_clip,
@@ -32,8 +33,10 @@ from palpate.encoders.losses import (
     soft_targets,
     three_way,
 )
-from palpate.encoders.presets import preset
-from palpate.encoders.rows import augmented, draw, subsets_of
+from palpate.encoders.presets import Augment, preset
+from palpate.encoders.rows import Rows, augmented, draw, subsets_of
+from palpate.training.engine import Task, fit
+from palpate.training.options import Compute
 from palpate.training.steps import Step
 
 TINY = preset("tiny")
@@ -261,7 +264,21 @@ def test_photos_may_be_missing_partners_may_learn_and_videos_may_be_held_out(wor
     assert lines.count("held_out") == lines.count("probe") > 1
 
 
+def with_val(manifest, rows):
+    """Six videos of train, and so many samples of the others held out."""
+    split = by_video(manifest)
+    return Split.from_ids(train=split.ids("train"), val=split.ids("test")[:rows])
+
+
 def test_a_batch_of_one_and_one_sample_are_rejected(world, clip, tmp_path):
+    how = {"device": "cpu"}
+    with pytest.raises(PalpateError, match=r"held-out part must hold two samples.*Got one, v6/0"):
+        train_tactile(world, with_val(world, 1), clip, TINY, tmp_path, **how)
+    course = replace(TINY.tactile_course, evaluations=0)
+    encoders = train_tactile(
+        world, with_val(world, 1), clip, quick(tactile_course=course), tmp_path, **how
+    )
+    assert not any("held_out" in line for line in encoders.card["loss"])
     one = Split.from_ids(train=world.ids[:1])
     with pytest.raises(PalpateError, match="must hold two samples"):
         train_tactile(world, one, clip, TINY, tmp_path, device="cpu")
@@ -269,6 +286,23 @@ def test_a_batch_of_one_and_one_sample_are_rejected(world, clip, tmp_path):
         preset = quick(tactile_course=replace(TINY.tactile_course, batch=batch))
         with pytest.raises(PalpateError, match=must):
             train_tactile(world, by_video(world), clip, preset, tmp_path, device="cpu")
+
+
+def test_a_training_that_would_change_nothing_is_rejected(world, clip, tmp_path):
+    how = {"device": "cpu", "weights": (0, 1, 0)}
+    with pytest.raises(PalpateError, match="pair with the tactile encoder"):
+        train_tactile(world, by_video(world), clip, TINY, tmp_path, **how)
+    how["weights"] = (1, 1, 1)
+    for change in ({"keep": "best"}, {"patience": 1}):
+        preset = quick(tactile_course=replace(TINY.tactile_course, **change))
+        with pytest.raises(PalpateError, match=f"`{next(iter(change))}` needs a held-out part"):
+            train_tactile(world, by_video(world), clip, preset, tmp_path, **how)
+
+
+@pytest.mark.parametrize("change", [{"crop": 5}, {"crop": -1}, {"share": 2}, {"gain": -0.1}])
+def test_views_out_of_range(change):
+    with pytest.raises(PalpateError, match=f"`augment_{next(iter(change))}` must lie in"):
+        Augment(**change)
 
 
 @pytest.mark.parametrize("weights", [(1, 1), (0, 0, 0), (1, -1, 1), (math.nan,) * 3])
@@ -447,7 +481,7 @@ def test_mistakes_are_explained(world, clip, tmp_path):
 
     for options, message in (
         ({"split": Split.from_ids(test=world.ids)}, "train part"),
-        ({"split": Split.from_ids(train=["nobody"])}, r"1 that are not, first .nobody"),
+        ({"split": Split.from_ids(train=["nobody"])}, r"1 of 1 missing, first .nobody"),
         ({"rows": changed(tactile=None)}, r"tactile image.*v0/2"),
         ({"rows": changed(tactile="gone.png")}, "1 bad-image"),
         ({"device": "abacus"}, "`device` must be auto"),
@@ -499,7 +533,99 @@ def test_a_vision_encoder_without_text_is_a_partner(world, tmp_path, partners):
     train_encoder(world, by_video(world), output=tmp_path / "e", weights=(0, 0, 1), **options)
     encoders = EncoderSet.load(tmp_path / "e")
     assert encoders.modalities == ["vision", "tactile"]
-    with pytest.raises(PalpateError, match=r"`clip` must have vision and text\. Got no text"):
+    with pytest.raises(PalpateError, match=r"`clip` must have text and vision\. Got no text"):
         train_generator(world, by_video(world), encoders, preset="tiny", steps=1)
+    alone = train_generator(
+        world, by_video(world), encoders, preset="tiny", steps=1, source="vision"
+    )
+    assert alone.training["text_source"] is None
+    assert len(alone([str(p) for p in world.paths("vision")[:2]], gel=None).images) == 2
     vision, tactile = (embed(world, encoders, side).features for side in encoders.modalities)
     assert tactile.shape == vision.shape == (len(world), 32)
+
+
+def plain_loop(model, images, text, vision, words, preprocess, options):
+    """The training loop as it was before the engine, in float32 on one process.
+
+    Returns:
+        the loss of each step, and the averaged weights.
+    """
+    parameters = list(model.parameters())
+    average = [p.detach().clone() for p in parameters]
+    matrices, vectors = ([p for p in parameters if (p.ndim > 1) == wide] for wide in (True, False))
+    groups = [{"params": matrices, "weight_decay": options.weight_decay}]
+    groups += [{"params": vectors, "weight_decay": 0.0}]
+    optimizer, losses = torch.optim.AdamW(groups, lr=options.lr, betas=options.betas), []
+    for step in range(options.steps):
+        generator = torch.Generator().manual_seed(seed_for(options.seed, "step", step))
+        epoch, start = divmod(step * options.batch, len(images))
+        rows = rng_for(options.seed, "order", epoch).permutation(len(images))
+        rows = rows[start : start + options.batch]
+        n = len(rows)
+        zoom = 1 - 0.1 * torch.rand(n, generator=generator)
+        shift = (2 * torch.rand(n, 2, generator=generator) - 1) * (1 - zoom)[:, None]
+        for high, shape in ((4, (n,)), (2, (n, 2))):  # turns and flips, which are off
+            torch.randint(0, high, shape, generator=generator)
+        gain = torch.exp(0.1 * torch.randn(n, generator=generator))
+        offset = 0.05 * torch.randn(n, generator=generator)
+        window = torch.cat([torch.eye(2) * zoom[:, None, None], shift[:, :, None]], dim=2)
+        x = torch.from_numpy(images[rows]).permute(0, 3, 1, 2) / 255
+        grid = torch.nn.functional.affine_grid(window, list(x.shape), align_corners=False)
+        x = torch.nn.functional.grid_sample(x, grid, align_corners=False, padding_mode="reflection")
+        x = preprocess.normalize(x * gain.view(n, 1, 1, 1) + offset.view(n, 1, 1, 1))
+        z = model.tactile(pixel_values=x).image_embeds
+        z, t, v = z / z.norm(dim=1, keepdim=True), text[rows], vision[rows]
+        same = (words[rows][:, None] == words[rows][None, :]).float()
+        same = same / same.sum(dim=1, keepdim=True)
+        loss = 0.0
+        for a, b, target in ((z, t, same), (v, t, same), (z, v, torch.eye(n))):
+            logits = model.log_scale.exp() * a @ b.T
+            for each in (logits, logits.T):
+                loss = loss - (target * each.log_softmax(dim=1)).sum(dim=1).mean() / 6
+        optimizer.zero_grad()
+        loss.backward()
+        torch.nn.utils.clip_grad_norm_(parameters, options.clip_norm)
+        through = max(0, step - options.warmup) / (options.steps - options.warmup)
+        rate = options.lr * (1 + math.cos(math.pi * through)) / 2
+        for group in optimizer.param_groups:
+            group["lr"] = min(1, (step + 1) / options.warmup) * rate
+        optimizer.step()
+        decay = min(options.ema, (1 + step) / (10 + step))
+        with torch.no_grad():
+            average = [
+                decay * a + (1 - decay) * p for a, p in zip(average, parameters, strict=True)
+            ]
+        losses.append(float(loss.detach()))
+    return losses, average
+
+
+def test_losses_and_averaged_weights_are_those_of_the_loop_before_the_engine(world, clip, tmp_path):
+    """The batch divides the rows, so that none crosses the border of two epochs: those changed."""
+    train, course = world.part(by_video(world), "train"), replace(TINY.tactile_course, batch=6)
+    options = replace(course.options(len(train), seed=3, epochs=7), warmup=4, ema=0.9)
+    rows = Rows(train, clip, TINY.preprocess)
+    loss = TactileLoss(rows, clip, TINY.preprocess, "identical-text", (1, 1, 1))
+    task = Task("training", len(train), lambda step: rows.load(step, course.augment), loss)
+    engine, plain = (TactileModel(new_tactile(TINY.tactile_config(8), seed=3)) for _ in range(2))
+    log = fit(engine, task, options, tmp_path)
+    text = torch.from_numpy(embed(train, EncoderSet(clip), "text").features)
+    losses, average = plain_loop(
+        plain, rows.images, text, rows.vision, rows.texts, TINY.preprocess, options
+    )
+    assert [line["step"] for line in log] == [0, 10, 20]
+    for line in log:
+        assert line["loss"] == pytest.approx(losses[line["step"]], abs=1e-6)
+    assert losses[-1] < losses[0] - 0.1
+    for ours, theirs in zip(engine.parameters(), average, strict=True):
+        assert torch.allclose(ours, theirs, atol=1e-5)
+
+
+@pytest.mark.filterwarnings("error::FutureWarning")
+def test_gradient_checkpointing_changes_nothing_and_warns_of_nothing(world, clip, tmp_path):
+    digests = set()
+    for again in (False, True):
+        compute = Compute(gradient_checkpointing=again)
+        how = {"device": "cpu", "compute": compute}
+        encoders = train_tactile(world, by_video(world), clip, TINY, tmp_path / f"{again}", **how)
+        digests.add(encoders.digest("tactile"))
+    assert len(digests) == 1

@@ -19,7 +19,7 @@ from palpate.encoders import Encoder, EncoderSet, train_encoder
 from palpate.encoders.embed import embed
 from palpate.encoders.preprocess import prepared_images
 from palpate.encoders.presets import preset
-from palpate.encoders.tactile import load_tactile
+from palpate.encoders.tactile import _depth, load_tactile
 from test_evaluation_guard import by_video
 
 WIDTH, DEPTH, HEADS = 128, 2, 2
@@ -228,6 +228,20 @@ def test_a_missing_further_or_permuted_name_is_refused(tmp_path, kind):
             load_tactile(write(kind, tmp_path, state))
 
 
+def test_models_of_published_widths_have_all_their_blocks():
+    for width, depth in ((192, 12), (384, 12), (768, 12), (1024, 24)):
+        assert _depth(width, set(range(depth))) == depth
+        with pytest.raises(ValueError, match=f"{depth - 1} blocks of width {width}"):
+            _depth(width, set(range(depth - 1)))
+
+
+def test_sparsh_takes_two_frames(tmp_path):
+    good = sparsh()
+    state = good | {"patch_embed.proj.weight": good["patch_embed.proj.weight"][:, :3].clone()}
+    with pytest.raises(PalpateError, match="patches of 3 channels"):
+        load_tactile(write("sparsh", tmp_path, state))
+
+
 def test_the_names_of_sparshs_base_model():
     """dino_vitbase.safetensors has 174 tensors."""
     depth = 12
@@ -382,6 +396,8 @@ def test_an_encoder_trains_on_whole_turned_images_minus_their_background(tmp_pat
     tactile = Encoder(again, "tactile")
     assert tactile.saw(train).all()
     assert not tactile.saw(digits.part(split, "test")).any()
+    shifted = train.table.with_columns(pl.col("background").shift(1).fill_null(strategy="backward"))
+    assert tactile.saw(Manifest(shifted, train.root)).all()  # another background, the same image
     bare = Manifest(digits.table.with_columns(background=pl.lit(None, pl.String)), digits.root)
     with pytest.raises(PalpateError, match="subtracts the no-contact image"):
         train_encoder(bare, split, preset=kind, device="cpu")

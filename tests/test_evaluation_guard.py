@@ -104,14 +104,16 @@ def test_the_impact_of_a_leak_is_not_measured_by_an_encoder_that_saw_the_samples
     assert "24 of 48 that it was trained on" in sentence(note)
     assert sentence(note, COMMAND_LINE).endswith("E.g. --allow-seen")
     result = audit(small_manifest, **options, allow_seen=True)
-    assert {row.features for row in result.impact.rows} == {
-        f"{m} encoder, trained on some of these images" for m in ("vision", "tactile")
-    }
-    for text in (result.impact.headline, audit_text(result), str(result.to_json())):
+    rows = {(row.features, row.seen) for row in result.impact.rows}
+    assert rows == {("vision encoder", True), ("tactile encoder", True)}
+    page = tmp_path / "page.html"
+    result.to_html(page)
+    for text in (result.impact.headline, audit_text(result), page.read_text()):
         assert "trained on some of these images" in text
     assert "The tactile encoder was trained on 24 of the 48 images" in audit_text(result)
     result = audit(small_manifest, **options | {"encoder": "palpate/mini"})
-    assert {row.features for row in result.impact.rows} == {"vision encoder", "tactile encoder"}
+    rows = {(row.features, row.seen) for row in result.impact.rows}
+    assert rows == {("vision encoder", False), ("tactile encoder", False)}
 
 
 def test_a_declared_data_set_is_refused(encoders, small_manifest):
@@ -125,7 +127,8 @@ def test_a_declared_data_set_is_refused(encoders, small_manifest):
                 guard(public, "tactile", manifest)
         notes = guard(public, "tactile", manifest, allow_seen=True)
         codes = [n.code for n in notes]
-        assert codes == ["seen-dataset"] * refused + ["encoder-license"]
+        rest = ["encoder-license"] + ["pretraining-sets"] * (not refused)
+        assert codes == ["seen-dataset"] * refused + rest
 
 
 def test_an_encoder_of_another_split_is_doubted_only_where_its_images_are_unknown(

@@ -92,7 +92,7 @@ def test_a_page_shows_confusions_and_what_was_retrieved(manifest, split, encoder
     assert "Rows: the true class of test samples" in page
     assert page.count('<figure class="strip">') == len(results.strips) > 0
     assert "number v3#0" in page
-    assert page.count("data:image/png") > 10
+    assert page.count("data:image/") > 10
     assert "chance" in results.to_latex()
     results.save(tmp_path / "p.json")
     assert main(["report", str(tmp_path / "p.json"), "-o", str(tmp_path / "report.html")]) == 0

@@ -106,8 +106,6 @@ def typed_manifest(path: Path) -> None:
                 ("audit a.jpg a.jpg --table", "must be new"),
             )
         ),
-        ("s.png", "my notes", "world -o w --preset tiny --sheet s.png", "of the kind"),
-        ("w.json", "palpate", "world -o w --preset tiny --sheet w.json", "of the kind"),
     ],
 )
 def test_a_broken_input_is_one_line(name, content, command, words, tmp_path, monkeypatch, capsys):

@@ -51,7 +51,7 @@ CELLS = st.fixed_dictionaries(
 ROWS = st.lists(CELLS, min_size=1, max_size=14)
 
 
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=100)
 @given(FRAMES, FRAMES)
 def test_the_audit_equals_a_double_loop(train, test):
     result = audit(frames_of(train), frames_of(test))
@@ -77,7 +77,7 @@ def test_the_audit_equals_a_double_loop(train, test):
         assert abs(pair.test.frame - pair.train.frame) == pair.gap
 
 
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=100)
 @given(ROWS, ROWS, st.integers(0, 40))
 def test_the_signals_equal_double_loops(train_rows, test_rows, near):
     train, test = manifest(train_rows, "r"), manifest(test_rows, "t")
@@ -340,7 +340,7 @@ def test_the_group_is_the_first_that_both_parts_know():
 def test_the_worst_pairs_come_from_different_videos_first():
     test, train = manifest([{"video": v} for v in "aaab"], "t"), manifest([{"video": "c"}], "r")
     scores = np.array([0.9, 0.8, 1.0, 0.7], np.float32)
-    flags = signals.Flags("x", scores, np.ones(4, bool), np.zeros(4, np.int64))
+    flags = signals.Flags.of("x", scores, np.ones(4, bool), np.zeros(4, np.int64))
     none = Gaps(np.full(4, -1), np.full(4, -1))
     worst = flags.summary(train, test, none, 3).worst
     assert [p.test.id for p in worst] == ["t2", "t3", "t0"]

@@ -78,7 +78,7 @@ MATRICES = st.lists(
 TARGETS = st.sampled_from([(0.8, 0.2), (0.7, 0.3), (0.5, 0.5), (0.6, 0.2, 0.2), (1 / 3,) * 3])
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 @given(MATRICES, TARGETS, st.integers(0, 5))
 def test_the_optimum_is_that_of_brute_force_and_every_seed_reaches_it(rows, target, seed):
     rows = rows[:6] if len(target) == 3 else rows
@@ -121,7 +121,7 @@ def test_many_groups_are_assigned_by_parts_of_the_program(groups, worst):
     assert (drawn[0] != drawn[1]).any()
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=25)
 @given(
     st.lists(
         st.tuples(st.integers(0, 14), st.integers(0, 3), st.integers(1, 30)),

@@ -39,7 +39,7 @@ FUNCTIONS = {
     "kid": "generated, reference, **options",
     "mean_score": (
         "metric, values, *, ids=None, groups=None, bounds=(-inf, inf), higher_is_better=True, "
-        "level=0.95, notes=(), **fields"
+        "notes=(), **fields"
     ),
     "measure_contacts": CONTACT,
     "ms_ssim": f"{IMAGES}, **options",

@@ -111,9 +111,9 @@ def test_intervals_over_images_and_over_groups():
     values, score = ssim_per_image(a, b), ssim(a, b)
     reach = stats.t.ppf(0.975, 5) * values.std(ddof=1) / math.sqrt(6)
     assert score.interval == pytest.approx((values.mean() - reach, values.mean() + reach))
-    grouped = ssim(a, b, groups=["u", "v", "w"] * 2, level=0.9)
+    grouped = ssim(a, b, groups=["u", "v", "w"] * 2)
     means = np.array([values[k::3].mean() for k in range(3)])
-    reach = stats.t.ppf(0.95, 2) * means.std(ddof=1) / math.sqrt(3)
+    reach = stats.t.ppf(0.975, 2) * means.std(ddof=1) / math.sqrt(3)
     assert grouped.interval == pytest.approx((means.mean() - reach, means.mean() + reach))
     assert grouped.interval_method == "leave-one-group-out jackknife, t, 2 df"
     for score in (ssim(a, b, groups=["u"] * 6), ssim(a[:1], b[:1]), ssim(a, a)):
@@ -260,7 +260,6 @@ def with_pixel(value):
         (with_pixel(-0.5), B, {}, ["`generated`", "-0.5", "image 3"]),
         (A, B, {"groups": ["g"] * 5}, ["groups", "6", "5"]),
         (A, B, {"ids": ["g"] * 5}, ["ids", "6", "5"]),
-        (A, B, {"level": 95}, ["`level`", "95"]),
         (A / 127.5 - 1, B / 127.5 - 1, {}, ["[0, 1]", "image 0"]),
         (A > 0, B, {}, ["uint8", "bool"]),
         ([[1], [1, 2]], B, {}, ["`generated`", "array"]),
@@ -286,7 +285,7 @@ def test_images_smaller_than_the_window_are_rejected():
 @pytest.mark.parametrize(
     ("generated", "reference", "message"),
     [
-        (["a", "b"], list("abcdef"), "4 not generated: 'c', 'd', 'e' and 1 more"),
+        (["a", "b"], list("abcdefgh"), "6 not generated: 'c', 'd', .*, 'g' and 1 more"),
         (["a", "x", "b"], ["a", "b"], "1 without reference: 'x'"),
         (["a", "x"], ["a", "b"], "1 not generated: 'b'; 1 without reference: 'x'"),
         (["a", "a", "b"], ["a", "b"], "generated id must be unique. Got 1 repeated: 'a'"),

@@ -79,7 +79,7 @@ def layout(seed, n, units=5):
     block=st.sampled_from([1, 2, 3, 2048]),
     dtype=st.sampled_from([np.float32, np.float64]),
 )
-@settings(max_examples=120, deadline=None)
+@settings(max_examples=120)
 @pytest.mark.filterwarnings("ignore:.*bit for bit")
 def test_mmd_equals_the_double_loop(seed, m, n, d, sigma, estimator, duplicates, block, dtype):
     x, y = unit_rows(seed, m, d).astype(dtype), unit_rows(seed + 1, n, d).astype(dtype)
@@ -265,7 +265,7 @@ def spread_rows(seed, n, d, scale=0.4):
     estimator=st.sampled_from(["unbiased", "biased", "grouped"]),
     scale=st.sampled_from([0.05, 1.0, 5.0]),
 )
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @pytest.mark.filterwarnings("ignore:.*bit for bit")
 def test_moments_are_within_their_bound_of_the_loop(seed, m, n, d, sigma, estimator, scale):
     x, y = spread_rows(seed, m, d, scale), spread_rows(seed + 1, n, d, scale)
@@ -492,7 +492,6 @@ GROUPS = {"estimator": "grouped", "groups_x": ["a"] * 8, "groups_y": ["b"] * 8}
         (lambda: tmmd(X, Y, groups=["a"] * 3), ["`groups`", "8", "3"]),
         (lambda: tmmd(X, Y, labels="a"), ["`labels`", "8", "1"]),
         (lambda: tmmd(X, Y, seed=2**70), ["`seed`", "whole number", str(2**70)]),
-        (lambda: tmmd(X, Y, level=95), ["`level` must lie in (0, 1)", "95", "level=0.95"]),
         (lambda: i_tmmd(X, sigmaa=3), ["sigmaa", "spelling"]),
         (lambda: i_tmmd(X, permutations=1.5), ["`permutations`"]),
         (lambda: i_tmmd(X, halves="group"), ["`groups`", "halves='group'"]),

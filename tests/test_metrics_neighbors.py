@@ -40,7 +40,7 @@ def by_matrices(generated, real, k, unit_g=None, unit_r=None):
     )
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 @given(
     n=st.integers(8, 40),
     m=st.integers(8, 40),

@@ -188,7 +188,7 @@ def test_half_is_rounded_first_and_read_back_to_the_same_digest(tmp_path):
     stored = weights(tmp_path / "a")
     assert stored["quantize.embedding.weight"].dtype == torch.float16
     assert torch.equal(
-        stored["quantize.embedding.weight"].float(), model.vq.quantize.embedding.weight
+        stored["quantize.embedding.weight"].float(), model.net.quantize.embedding.weight
     )
     assert model.halve() == 0  # rounded once is rounded for good
 
@@ -216,6 +216,7 @@ def test_a_generator_that_refers_carries_no_copies_and_checks_what_it_finds(
     folder = shipped_folder("palpate/mini", "generator")
     assert sorted(p.name for p in folder.iterdir()) == [
         "README.md",
+        "model_index.json",
         "palpate.json",
         "scheduler",
         "unet",
@@ -331,7 +332,7 @@ def test_what_ships_is_small_enough_complete_and_16_bit():
     assert size(MINI / "encoders") + size(MINI / "autoencoder") < 12e6
     assert size(MINI / "generator") < 10e6
     files = [p for p in MINI.rglob("*") if p.is_file()]
-    assert {p.suffix for p in files} <= {".json", ".md", ".safetensors"}
+    assert {p.suffix for p in files} <= {".json", ".md", ".png", ".safetensors"}
     for place in ("encoders/clip", "encoders/tactile", "autoencoder", "generator/unet"):
         assert {v.dtype for v in weights(MINI / place).values() if v.is_floating_point()} == {
             torch.float16

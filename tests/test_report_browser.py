@@ -6,6 +6,8 @@ chromium, or ``$PALPATE_CHROMIUM``.
 
 import dataclasses
 import os
+import re
+import runpy
 from contextlib import contextmanager
 from itertools import pairwise
 from pathlib import Path
@@ -113,13 +115,17 @@ FOLDED = """[...document.querySelectorAll('details:not([open]) img')]
 FOCUS = (
     """[document.activeElement.tagName, document.activeElement.getAttribute('aria-label') ?? '']"""
 )
+EAGER = """Promise.all([...document.images].map(image => {
+    image.loading = 'eager';
+    return image.decode();
+}))"""
 UNFOLD = "document.querySelectorAll('details').forEach(d => { d.open = true })"
 
 
 @pytest.fixture(scope="module")
 def page_file(tmp_path_factory):
     folder = tmp_path_factory.mktemp("page")
-    return write_report(long_results(folder), folder / "page.html").page
+    return write_report(long_results(folder), folder / "page.html", max_bytes=10_000_000).page
 
 
 @pytest.fixture(scope="module")
@@ -164,9 +170,10 @@ def test_the_page_fits_and_decodes_every_image(chromium, page_file, width, schem
                 page.evaluate(UNFOLD)
             screenshot(page, f"page-{width}-{scheme}-{state}")
             assert not page.evaluate(OVERFLOW), state
+        page.evaluate(EAGER)
         ask = "[...document.images].map(i => [i.complete, i.naturalWidth, i.alt.length])"
         decoded = page.evaluate(ask)
-    assert len(decoded) == 48 * 3 + 1 + 8 * 4
+    assert len(decoded) == 48 * 3 + 2 + 8 * 4
     assert all(complete and natural > 0 and alt > 0 for complete, natural, alt in decoded)
 
 
@@ -208,18 +215,49 @@ def test_the_keyboard_reaches_the_sections_and_the_wide_tables(chromium, page_fi
             page.keyboard.press("Tab")
             reached.append(page.evaluate(FOCUS))
     tags = [tag for tag, _ in reached]
-    assert tags[:6] == ["A"] * 6
+    assert tags[:6] == [*["A"] * 5, "FIGURE"]
     assert "SUMMARY" in tags
-    assert any(tag == "DIV" and label.startswith("Table: Tactile") for tag, label in reached)
+    assert any(tag == "DIV" and label == "Table: the verdict" for tag, label in reached)
 
 
-def test_a_printed_page_opens_what_is_folded(chromium, page_file):
+def test_a_printed_page_is_what_is_open_with_its_images(chromium, page_file):
     with opened(chromium, page_file, 800) as page:
-        folded = page.evaluate(FOLDED)
         page.emulate_media(media="print")
-        style = "getComputedStyle(document.querySelector('details'), '::details-content')"
-        page.wait_for_function(f"{style}.contentVisibility === 'visible'")
-        printed = page.evaluate(FOLDED)
-    assert len(folded) == len(printed) > 10
-    assert not any(folded)
-    assert all(printed)
+        folded = page.evaluate(FOLDED)
+        assert len(folded) > 10
+        assert not any(folded)
+        pages = len(re.findall(rb"/Type\s*/Page\b", page.pdf()))
+        page.evaluate(UNFOLD)
+        assert len(re.findall(rb"/Type\s*/Page\b", page.pdf())) > pages
+
+
+def test_a_sample_enlarges_by_click_and_by_key_and_commands_are_copied(chromium, page_file):
+    with opened(chromium, page_file) as page:
+        large = "document.querySelector('dialog[open] img')?.clientWidth ?? 0"
+        page.click(".hero .row img >> nth=0")
+        assert page.evaluate(large) > 200
+        page.keyboard.press("Escape")
+        assert page.evaluate(large) == 0
+        page.focus("#gallery .row")
+        page.keyboard.press("Enter")
+        assert page.evaluate(large) > 200
+        page.keyboard.press("Escape")
+        page.click("#cite button")
+        page.wait_for_function("document.querySelector('#cite button').textContent === 'Copied'")
+        assert page.evaluate("getSelection().toString()").startswith(f"palpate audit {LONG}")
+
+
+def test_a_page_keeps_the_limits_of_its_benchmark(chromium, tmp_path):
+    """Height, bytes, first screen, phone and print, as ``benchmarks/page.py`` measures them."""
+    tool = runpy.run_path(str(Path(__file__).parents[1] / "benchmarks" / "page.py"))
+    results = full_results(tmp_path, 48, 64)
+    accuracy = score("material accuracy", "real", 0.6, details={"chance": 0.1})
+    results = dataclasses.replace(results, scores=[*results.scores, accuracy])
+    page, pictures = write_report(results, tmp_path / "page.html").page, tmp_path / "pictures"
+    pictures.mkdir()
+    facts = tool["measure"](chromium, page, (1280, 800), pictures)
+    assert tool["problems"](facts, (1280, 800)) == []
+    assert facts["print pages"] <= 8
+    assert {p.suffix for p in pictures.iterdir()} == {".png", ".pdf"}
+    over = facts | {"bytes": 2_000_000, "light 390": facts["light 390"] | {"sideways": True}}
+    assert len(tool["problems"](over, (1280, 500))) == 4

@@ -60,7 +60,7 @@ def test_image_paths_in_a_file_are_relative_to_it(tmp_path, monkeypatch):
     again = Results.load("moved/r.json")
     assert Path(again.gallery[0].generated) == Path("moved/generated0.png")
     again.to_html("page.html")
-    assert "data:image/png" in Path("page.html").read_text()
+    assert "data:image/webp" in Path("page.html").read_text()
 
 
 def test_showing_results_in_a_notebook_escapes_names():

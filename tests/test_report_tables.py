@@ -201,5 +201,5 @@ def test_settings_name_the_reference_of_each_subject():
     scores = [score(subject=s, reference="r" * 64) for s in "ab"]
     assert settings_of(Results("t", scores=scores, settings={"x": 1})) == {
         "x": 1,
-        "reference images": {"a, b": "r" * 64},
+        "reference images": {"a": "r" * 64, "b": "r" * 64},
     }

@@ -2,14 +2,13 @@
 them."""
 
 import dataclasses
-import json
 
 import numpy as np
 import pytest
 
 from palpate.core import PalpateError
 from palpate.sim import MATERIALS, PRESETS, Material, Surface, WorldOptions, write_world
-from palpate.sim.materials import added_materials, draw_surface
+from palpate.sim.materials import draw_surface
 
 TINY = dataclasses.replace(PRESETS["tiny"], size=16, tile=64)
 FLAT = np.zeros((64, 64))
@@ -18,7 +17,7 @@ FLAT = np.zeros((64, 64))
 def piece(**changes):
     def draw(tile, rng):
         height, albedo = np.zeros((tile.n, tile.n)), np.full((tile.n, tile.n, 3), 0.5)
-        content = {"height": height, "albedo": albedo, "subtype": "only", "words": ("odd", "new")}
+        content = {"height": height, "albedo": albedo, "subtype": "only"}
         return Surface(**{**content, **changes})
 
     return draw
@@ -30,21 +29,16 @@ def failing(tile, rng):
 
 def springy(tile, rng):
     albedo = np.full((tile.n, tile.n, 3), 0.5, np.float32)
-    return Surface(tile.noise(1.0, 8.0) * 0.1, albedo, "only", ("springy", "dry"))
+    return Surface(tile.noise(1.0, 8.0) * 0.1, albedo, "only")
 
 
 def add(monkeypatch, draw, label=20, name="Cork"):
-    monkeypatch.setitem(MATERIALS, name, Material(label, "cork", draw, ("only",)))
+    monkeypatch.setitem(MATERIALS, name, Material(label, draw, ("only",)))
 
 
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"words": ("odd",)}, "2 to 4 different words"),
-        ({"words": ("a", "b", "c", "d", "e")}, "2 to 4 different words"),
-        ({"words": ("odd", "odd")}, "2 to 4 different words"),
-        ({"words": ("odd", "two\nlines")}, "2 to 4 different words"),
-        ({"noun": "two\nlines"}, "noun of one line"),
         ({"height": [[0.0], [0.0, 1.0]]}, "draw a Surface without an error"),
         ({"height": FLAT[1:]}, "height and an albedo of shapes"),
         ({"height": FLAT * np.nan}, "finite numbers"),
@@ -57,20 +51,18 @@ def add(monkeypatch, draw, label=20, name="Cork"):
     ],
 )
 def test_what_a_material_draws_is_checked(changes, message):
-    material = Material(20, "cork", piece(**changes), ("only",))
+    material = Material(20, piece(**changes), ("only",))
     with pytest.raises(PalpateError, match=message) as error:
         draw_surface("Cork", material, 64, np.random.default_rng(0))
     assert "'Cork'" in error.value.must
 
 
 def test_lists_and_whole_numbers_are_converted():
-    changes = {"words": ["odd", "new"], "height": np.arange(64 * 64).reshape(64, 64) // 100}
-    draw = piece(**changes, albedo=np.full((64, 64, 3), 1.5), gloss=np.float32(0.5))
-    surface = draw_surface("Cork", Material(20, "cork", draw), 64, np.random.default_rng(0))
-    assert surface.words == ("odd", "new")
+    height = np.arange(64 * 64).reshape(64, 64) // 100
+    draw = piece(height=height, albedo=np.full((64, 64, 3), 1.5), gloss=np.float32(0.5))
+    surface = draw_surface("Cork", Material(20, draw), 64, np.random.default_rng(0))
     assert surface.height.dtype == surface.albedo.dtype == np.float32
     assert float(surface.albedo.max()) == 1.0
-    assert surface.noun == "cork"
 
 
 @pytest.mark.parametrize("workers", [1, pytest.param(2, marks=pytest.mark.slow)])
@@ -100,16 +92,8 @@ def test_names_and_labels_are_unique_and_safe(entry, message, monkeypatch):
     WorldOptions(materials=("Sand",))  # a world without it is not affected
 
 
-def test_a_custom_material_enters_lists_and_record(tmp_path, monkeypatch):
+def test_a_custom_material_enters_lists(tmp_path, monkeypatch):
     add(monkeypatch, springy)
     options = dataclasses.replace(TINY, materials=("Wood", "Cork"))
     write_world(tmp_path / "w", options)
     assert "Cork: 20" in (tmp_path / "w" / "category_reference.txt").read_text().splitlines()
-    record = json.loads((tmp_path / "w" / "world.json").read_text())
-    assert record["materials"] == added_materials(options.names)
-    assert list(record["materials"]) == ["Cork"]
-    add(monkeypatch, piece())  # an edited function: neither taken for finished nor continued
-    with pytest.raises(PalpateError, match="other options or materials"):
-        write_world(tmp_path / "w", options)
-    monkeypatch.setitem(MATERIALS, "Wood", dataclasses.replace(MATERIALS["Wood"], noun="timber"))
-    assert list(added_materials(("Wood", "Sand"))) == ["Wood"]

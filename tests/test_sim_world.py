@@ -203,12 +203,11 @@ def test_samples_rendered_alone_equal_written_files(options, tmp_path):
 
 
 def test_captions_and_objects_follow_the_object_in_contact():
-    options = dataclasses.replace(TINY, mixed=1.0, contacts_per_video=4, captions="label")
+    options = dataclasses.replace(TINY, mixed=1.0, contacts_per_video=4)
     for plan in plan_world(options):
         video, names = Video(options, plan), {ref.name for ref in plan.objects}
         assert 2 <= len(names) <= 3
-        surface = video.object_of(3).surface
-        assert sum(word in video.text(3).lower() for word in surface.words) >= 2
+        assert video.text(0) != video.text(3)
         assert contact_frames(options, 3)[0] < options.video_length
 
 

@@ -105,6 +105,27 @@ def test_a_killed_study_ends_as_one_that_was_not(data, tmp_path):
     assert [s["value"] for s in scores] == [s.value for s in whole]
 
 
+def test_a_field_of_a_preset_is_switched_off_or_refused(capsys, monkeypatch):
+    presets = []
+
+    def stop(*_, preset, **options):
+        presets.append(preset)
+        raise PalpateError("Nothing must be trained", "a test", "")
+
+    monkeypatch.setattr("palpate.encoders.contrastive.train_encoder", stop)
+    train = ["train", "encoder", "x", "-o", "none", "--preset", "tiny"]
+    assert main([*train, "--clip-norm", "none", "--lr", "0.5"]) == 2
+    course = presets[0].tactile_course
+    assert (course.clip_norm, course.lr, course.patience) == (None, 0.5, None)
+    for words, must in (
+        (("--clip", "palpate/mini", "--clip-lr", "1"), "--clip-lr is of the vision and text"),
+        (("--warmup", "1.5"), "--warmup must lie in [0, 1]"),
+        (("--augment-crop", "5"), "--augment-crop must lie in [0, 0.99]"),
+    ):
+        assert main([*train, *words]) == 2
+        assert must in capsys.readouterr().err
+
+
 def test_every_preset_of_train_encoder_is_taken():
     assert set(get_args(EncoderPresetName)) == set(PRESETS)
 
@@ -113,6 +134,10 @@ def test_a_study_needs_seeds_and_either_encoders_or_training(data, tmp_path, cap
     monkeypatch.chdir(tmp_path)
     with pytest.raises(PalpateError, match="`seeds` must hold at least one"):
         compare_splits(data, ["orig.json"], work="run", seeds=(0, 0))
+    monkeypatch.setenv("WORLD_SIZE", "2")
+    with pytest.raises(PalpateError, match="must run in one process"):
+        compare_splits(data, ["orig.json"], work="run")
+    monkeypatch.delenv("WORLD_SIZE")
     assert main(["probe", "tag", "--split", "orig.json"]) == 2
     assert "Either an encoder or training must be chosen" in capsys.readouterr().err
     assert main(["probe", *ARGS, "--encoder", "palpate/mini"]) == 2

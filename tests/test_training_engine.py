@@ -17,6 +17,7 @@ from palpate.core import PalpateError, quiet
 from palpate.training import engine
 from palpate.training.engine import Losses, Task
 from palpate.training.options import Compute, LoopOptions, RowOrder, learning_rate
+from palpate.training.processes import barrier, place, work_folder
 
 N = 23
 STEPS = 14
@@ -260,6 +261,53 @@ def test_a_loss_that_is_not_finite_names_its_rows_and_is_not_kept(tmp_path):
         assert all(torch.isfinite(value).all() for value in kept)
 
 
+def test_only_a_checkpoint_that_there_is_is_said_to_be_kept(tmp_path):
+    def message(compute, last):
+        with pytest.raises(PalpateError) as caught:
+            fit(Net(), overflowing({last}), N, options(), tmp_path, compute)
+        return str(caught.value)
+
+    assert message(NEVER, 3).endswith("or lower the learning rate.")
+    assert message(ALWAYS, 3).endswith("the last checkpoint is kept.")
+    assert message(NEVER, 5).endswith("the last checkpoint is kept.")  # of the run before
+
+
+def test_of_several_processes_each_names_the_bad_rows_of_the_whole_batch(
+    tmp_path, on_two_processes
+):
+    row = int(RowOrder(N, 4, 5)(4)[3])  # of the second process
+
+    def message():
+        broken = Net()
+        broken.data[row] = math.nan
+        with pytest.raises(PalpateError, match="must be finite") as caught:
+            fit(broken, loss, N, options(), tmp_path)
+        return [caught.value.got, caught.value.shared]
+
+    assert on_two_processes(message) == [[f"nan at step 4, with row {row}", True]] * 2
+
+
+def test_a_batch_that_processes_cannot_share_is_rejected(tmp_path, on_two_processes):
+    def message():
+        with pytest.raises(PalpateError, match="multiple of the 2 processes") as caught:
+            fit(Net(), loss, 7, options(batch=8), tmp_path)
+        return [caught.value.got, caught.value.shared]
+
+    assert on_two_processes(message) == [["7, all training samples", True]] * 2
+
+
+def test_processes_without_an_output_share_a_folder_until_all_are_done(on_two_processes):
+    def folder():
+        with work_folder(None) as work:
+            (work / f"{place()[0]}").touch()
+            barrier()
+            return [str(work), len(list(work.iterdir()))]
+
+    one, two = on_two_processes(folder)
+    assert one == two
+    assert one[1] == 2
+
+
 @pytest.mark.parametrize("clip", [None, 1.0])
 def test_finite_loss_with_infinite_gradient_is_reported(tmp_path, clip):
     def bad(module, batch):
@@ -292,6 +340,8 @@ def test_no_rows_no_parameters_bad_options(tmp_path):
         {"ema": 1.0},
         {"clip_norm": 0.0},
         {"warmup": -1},
+        {"keep": "best", "evaluations": 0},
+        {"patience": 1, "evaluations": 0},
     ):
         with pytest.raises(PalpateError, match=f"`{next(iter(change))}` must"):
             options(**change)
@@ -391,6 +441,44 @@ def test_held_out_loss_is_logged_and_its_best_weights_are_kept(tmp_path):
     assert len(steps) == count  # a run that has stopped stays so
 
 
+@pytest.mark.parametrize("rows", [1, 3, 9])
+def test_held_out_loss_is_that_of_all_rows_on_any_number_of_processes(
+    tmp_path, on_two_processes, rows
+):
+    def losses(folder="two"):
+        how, task = options(evaluations=3, lr=0.1), {"held_out": (rows, load)}
+        log = fit(Net(), loss, N, how, tmp_path / folder, **task)
+        return [line["held_out"] for line in log if "held_out" in line]
+
+    one, two = losses("one"), on_two_processes(losses)
+    assert two[0] == two[1] == pytest.approx(one, rel=1e-5)
+    assert len(one) == 3
+
+
+def test_held_out_batches_are_shuffled_rows_of_nearly_equal_number(tmp_path):
+    batches = []
+
+    def watched(step):
+        batches.append(step.rows.tolist())
+        return load(step)
+
+    fit(Net(), loss, N, options(evaluations=2), tmp_path, held_out=(11, watched))
+    assert [len(rows) for rows in batches] == [6, 5] * 2
+    assert batches[:2] == batches[2:]
+    assert sorted(batches[0] + batches[1]) == list(range(11)) != batches[0] + batches[1]
+
+
+def test_a_held_out_loss_that_is_not_finite_is_reported(tmp_path):
+    def breaks(module, batch):
+        return loss(module, batch)._replace(total=module.b.weight.sum() * math.nan)
+
+    def only_held_out(module, batch):
+        return (loss if module.training else breaks)(module, batch)
+
+    with pytest.raises(PalpateError, match="held-out loss of training must be finite"):
+        fit(Net(), only_held_out, N, options(), tmp_path, held_out=(9, load))
+
+
 def weights_of_a_plain_run(tmp_path):
     net = Net()
     fit(net, loss, N, options(evaluations=7), tmp_path / "plain")
@@ -424,6 +512,48 @@ def test_half_precision_learns(tmp_path, whole, precision, lines):
     log = fit(Net(), loss, N, options(), tmp_path, compute)
     for row, plain in list(zip(log, whole[1], strict=True))[:lines]:
         assert row["loss"] == pytest.approx(plain["loss"], rel=0.01)
+
+
+def overflowing(steps):
+    """The loss, with infinite gradients in these steps."""
+
+    def changed(module, batch):
+        losses = loss(module, batch)
+        harm = torch.sqrt(module.a.weight[0, 0] * 0) if int(batch["step"]) in steps else 0
+        return losses._replace(total=losses.total + harm)
+
+    return changed
+
+
+def test_a_skipped_step_of_16_bits_is_resumed_exactly(tmp_path):
+    compute = Compute(precision="fp16", checkpoint_minutes=0)
+    whole, again, bad = Net(), Net(), overflowing({2, 3})
+    fit(whole, bad, N, options(), tmp_path / "whole", compute)
+    stop = StopAt(6, None, "progress")
+    with pytest.raises(KeyboardInterrupt):
+        fit(Net(), bad, N, options(), tmp_path / "again", compute, progress=stop.progress)
+    fit(again, bad, N, options(), tmp_path / "again", compute)
+    assert same(weights(again), weights(whole))
+
+
+def test_gradients_of_16_bits_that_overflow_at_every_scale_are_reported(tmp_path):
+    how = options(steps=40)
+    with pytest.raises(PalpateError, match=r"gradient of training must be finite.*at step 1[5-8]"):
+        fit(Net(), overflowing(range(40)), N, how, tmp_path, Compute(precision="fp16"))
+
+
+@pytest.mark.parametrize("tf32", [True, False])
+def test_tf32_is_set_for_products_and_convolutions_and_restored(tmp_path, tf32):
+    backends, seen = (torch.backends.cuda.matmul, torch.backends.cudnn), []
+
+    def watched(module, batch):
+        seen.append([backend.allow_tf32 for backend in backends])
+        return loss(module, batch)
+
+    before = [backend.allow_tf32 for backend in backends]
+    fit(Net(), watched, N, options(steps=1), tmp_path, Compute(tf32=tf32))
+    assert seen == [[tf32, tf32]]
+    assert [backend.allow_tf32 for backend in backends] == before
 
 
 def a_sheet(module):
@@ -468,6 +598,36 @@ def test_tensorboard_has_the_log_and_the_samples(tmp_path):
     for line in log:
         for name in ("loss", "lr"):
             assert values[line["step"], name] == pytest.approx(line[name], rel=1e-6)
+
+
+WANDB = """
+import json
+class Run:
+    def __init__(self):
+        self.lines = []
+    def update(self, values, **_):
+        self.lines.append(values)
+    def log(self, values, step=None, **_):
+        self.lines.append([step, {k: v for k, v in values.items() if k != "samples"}])
+    def finish(self):
+        json.dump(self.lines, open("wandb.json", "w"))
+def init(project, **_):
+    global config
+    config = Run()
+    return config
+Image = list
+"""
+
+
+def test_wandb_has_the_settings_and_the_log(tmp_path, monkeypatch):
+    (tmp_path / "wandb.py").write_text(WANDB)
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.chdir(tmp_path)
+    log = fit(Net(), loss, N, options(), tmp_path / "run", Compute(trackers=("wandb",)))
+    settings, *lines = json.loads((tmp_path / "wandb.json").read_text())
+    assert (settings["lr"], settings["batch"]) == (options().lr, options().batch)
+    assert [step for step, _ in lines] == [line["step"] for line in log]
+    assert lines[-1][1]["loss"] == log[-1]["loss"]
 
 
 @pytest.mark.parametrize(

@@ -21,12 +21,15 @@ PYTHON = [sys.executable, "-m"]
 
 @pytest.fixture
 def place(small_manifest, tmp_path):
-    """A saved data set of six videos with a split by video; a data set as users have one."""
+    """A saved data set of six videos with a split by video, three samples of it held out; a data
+    set as users have one.
+    """
     videos = small_manifest.column("video")
     chosen = set(videos[:16] + videos[-16:])
-    parts = {"train": [], "test": []}
+    parts = {"train": [], "val": [], "test": []}
     for name, video in zip(small_manifest.ids, videos, strict=True):
-        parts["train" if video in chosen else "test"].append(name)
+        side = "val" if len(parts["val"]) < 3 else "test"
+        parts["train" if video in chosen else side].append(name)
     small_manifest.save(tmp_path / "tag" / "manifest.parquet")
     Split.from_ids(**parts, manifest=small_manifest.digest).save(tmp_path / "split.json")
     return tmp_path
@@ -61,8 +64,8 @@ def close(one, two):
 
 @pytest.mark.slow
 def test_two_processes_take_the_steps_of_one(place):
-    run(place, "encoder", "one", "--held-out", "0.5", "--evaluations", "2")
-    out = run(place, "encoder", "two", "--held-out", "0.5", "--evaluations", "2", processes=2)
+    run(place, "encoder", "one", "--evaluations", "2", "--keep", "best")
+    out = run(place, "encoder", "two", "--evaluations", "2", "--keep", "best", processes=2)
     assert "processes" in out
     assert out.count("Encoders two") == 1  # the first process alone prints
     assert EncoderSet.load(place / "two").card["processes"] == 2
@@ -140,3 +143,19 @@ def test_when_a_process_dies_the_others_end_without_a_traceback_and_the_run_can_
     run(place, "encoder", "out", *more)  # in one process, from the checkpoint of two
     run(place, "encoder", "whole", *more)
     close(logs(place / "whole"), logs(place / "out"))
+
+
+@pytest.mark.slow
+def test_what_all_processes_raise_is_printed_once(place):
+    def stderr(*more):
+        parts = command("encoder", "out", "--clip", "palpate/mini", *more, processes=2)
+        done = subprocess.run(
+            parts, cwd=place, env=ENV, capture_output=True, text=True, check=False
+        )
+        assert done.returncode != 0
+        return [line for line in done.stderr.splitlines() if line.startswith("palpate train")]
+
+    (line,) = stderr("--lr", "1e30")
+    assert "must be finite" in line
+    (line,) = stderr("--batch-size", "7")
+    assert "--batch-size must be a multiple of the 2 processes. Got 7. " in line

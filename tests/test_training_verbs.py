@@ -67,6 +67,18 @@ def test_encoders_and_a_generator_from_the_command_line(data, tmp_path, capsys, 
     assert "must be absent or an empty folder" in capsys.readouterr().err
 
 
+def test_a_loss_that_is_no_number_ends_a_generator_in_one_line(data, tmp_path, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    command = ["train", "generator", "tag", "--split", "split.json", "--preset", "tiny", "--quiet"]
+    options = ["--source", "resnet", "--condition-photo-size", "16", "--condition-photo-width", "4"]
+    harm = ["--lr", "1e30", "--warmup", "0", "--steps", "4"]
+    assert main([*command, *options, *harm, "-o", "model"]) == 2
+    (line,) = capsys.readouterr().err.strip().splitlines()
+    assert "of generator must be finite. Got nan at step" in line
+    assert "with v" in line  # names the samples
+    assert not (tmp_path / "model").exists()
+
+
 def test_an_interrupted_training_ends_as_an_uninterrupted_one(data, tmp_path):
     manifest, split = data
     common = {"preset": "tiny", "device": "cpu"}

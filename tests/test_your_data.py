@@ -178,14 +178,12 @@ def test_templates_that_lose_something_are_errors(tmp_path, templates, words):
     assert not (tmp_path / "m").exists()
 
 
-def test_images_of_no_template_and_replacements_without_a_match_are_reported(tmp_path):
+def test_images_of_no_template_are_reported(tmp_path):
     make_tree([str(tmp_path / f"own/{p}.png") for p in ("rgb/1", "tac/1", "other/5")])
     templates = {"vision": "rgb/{frame}.png", "tactile": "tac/{frame}.png"}
-    maps = {"columns": {"object": "replace(path, 'cup', 'mug')"}}
-    imported = import_dataset(tmp_path / "own", tmp_path / "m", **templates, **maps)
+    imported = import_dataset(tmp_path / "own", tmp_path / "m", **templates)
     kinds = {problem.kind: problem.text for problem in imported.suspicious}
-    assert kinds["unmatched"] == "images of no template: 1: other/5.png"
-    assert "1 of 1 rows" in kinds["no-match"]
+    assert kinds["unmatched"] == "images of no template: other/5.png"
 
 
 @pytest.mark.parametrize(
@@ -221,13 +219,9 @@ def test_images_of_no_template_and_replacements_without_a_match_are_reported(tmp
 )
 def test_templates_of_names(names, tactile):
     layout = detect_layout(sorted(set(files_of(names))), "own")
-    assert layout.certain
-    assert layout.templates["tactile"].startswith(tactile)
+    assert layout["tactile"].startswith(tactile)
     rows, problems = join(
-        assign(
-            sorted(set(files_of(names))),
-            {s: Template.parse(t) for s, t in layout.templates.items()},
-        )
+        assign(sorted(set(files_of(names))), {s: Template.parse(t) for s, t in layout.items()})
     )
     assert (len(rows) > 0, problems) == (True, [])
 
@@ -235,11 +229,11 @@ def test_templates_of_names(names, tactile):
 NAME = st.text("aB1_-. {}*ü", min_size=1, max_size=6).filter(lambda name: name.strip(". ") != "")
 
 
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=150)
 @given(st.lists(st.lists(NAME, min_size=1, max_size=3).map("/".join), min_size=1, unique=True))
 def test_a_template_that_is_found_matches_every_file(paths):
     files = [f"{path}.png" for path in paths]
-    for text in (template_of(files), *detect_layout(files, "own").templates.values()):
+    for text in (template_of(files), *detect_layout(files, "own").values()):
         Template.parse(text)
     template = Template.parse(template_of(files))
     assert [file for file in files if template.match(file) is None] == []
@@ -250,7 +244,7 @@ def test_a_hundred_thousand_names_are_understood_quickly():
         f"{o}/{c}/{s}/{f}.png"
         for o, c, s, f in product(range(50), range(10), ("rgb", "tac"), range(100))
     ]
-    assert detect_layout(files, "own").templates == {
+    assert detect_layout(files, "own") == {
         "vision": "{object}/{video}/rgb/{frame:d}.png",
         "tactile": "{object}/{video}/tac/{frame:d}.png",
     }

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from palpate.captions import caption
     from palpate.core import Score, Split
     from palpate.data import Manifest, load, validate
-    from palpate.diffusion import TactilePipeline, generate, train_generator
+    from palpate.diffusion import TactilePipeline, generate, train_autoencoder, train_generator
     from palpate.encoders import Encoder, train_encoder
     from palpate.evaluation import audit, probe, score
     from palpate.leakage import split
@@ -47,6 +47,7 @@ _MODULES = {
     "score": "evaluation",
     "split": "leakage",
     "train_encoder": "encoders",
+    "train_autoencoder": "diffusion",
     "train_generator": "diffusion",
     "validate": "data",
 }
@@ -65,6 +66,7 @@ __all__ = [
     "probe",
     "score",
     "split",
+    "train_autoencoder",
     "train_encoder",
     "train_generator",
     "validate",

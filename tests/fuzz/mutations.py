@@ -409,7 +409,7 @@ def change_arguments(rng: Rng, args: list[str], places: list[str], outputs: list
     kind = int(rng.integers(6))
     if kind < 3 or k == len(args):
         args += option(rng, verb, places)
-    elif args[k - 1] in ("-o", "--table", "--page", "--latex", "--sheet"):
+    elif args[k - 1] in ("-o", "--table", "--page", "--latex"):
         args[k] = pick(rng, outputs)
     elif kind == 3 and args[k - 1].removeprefix("--") not in WORK:
         args[k] = pick(rng, [*WORDS, *places])

@@ -8,6 +8,7 @@ import json
 import shutil
 from pathlib import Path
 from typing import Any
+from unittest.mock import patch
 
 import numpy as np
 import polars as pl
@@ -16,8 +17,10 @@ from safetensors.numpy import save_file
 import palpate
 from data_fixtures import write_video
 from format_trees import TREES, gel, photo, put, write_csv
+from palpate import preference
 from palpate.cli import main
 from palpate.data.manifest import Manifest
+from preference_crowd import Crowd
 
 MINI = Path(palpate.__file__).parent / "mini"
 #: Command -> how often it is drawn next to the others; those that load models are slow. ``demo``
@@ -81,7 +84,7 @@ COMMANDS: dict[str, int] = {
     "score --generated IN/manifest --reference IN/manifest --split IN/split/split.json "
     "--encoder IN/models/encoders --permutations 9": 1,
     "report IN/results/audit.json IN/results/scores.json -o OUT/page.html": 8,
-    "world -o OUT/w --preset tiny --size 16 --materials 2 --workers 1 --sheet OUT/s.png": 1,
+    "world -o OUT/w --preset tiny --size 16 --materials 2 --workers 1": 1,
     "world -o OUT/w --options IN/world/world.json --workers 1": 1,
     "probe IN/manifest --split IN/split/split.json --encoder IN/models/encoders -o OUT/s.json": 1,
     "generate IN/pairs/vision/rec0/0.jpg -o OUT/t.png --model IN/models/generator --steps 1": 1,
@@ -94,6 +97,9 @@ COMMANDS: dict[str, int] = {
     "caption IN/manifest --template {material} --per frame -o OUT/c": 2,
     "caption IN/manifest --server http://127.0.0.1:9/v1 --model x "
     "--per frame --dry-run -o OUT/c": 1,
+    "preference make --reference IN/manifest --generated IN/manifest IN/generated --names a b "
+    "--raters 1 --size 32 -o OUT/study": 3,
+    "preference score IN/study IN/study/votes --replicates 100 -o OUT/s.json --latex OUT/t.tex": 4,
     "demo --data IN/vectors --preset tiny -o OUT/d": 1,
     "completion bash": 1,
 }
@@ -183,6 +189,10 @@ def _results(folder: Path) -> None:
     call("generate", manifest, "-o", folder / "generated", "--steps", "1")
     scored = ("--generated", folder / "generated", "--reference", results)
     call("score", *scored, "--companions", "psnr", "-o", results / "scores.json")
+    with patch("secrets.token_hex", return_value=64 * "0"):
+        reference, methods = folder / "manifest", {"a": folder / "manifest", "b": results}
+        plan = preference.make(reference, methods, folder / "study", raters=2, size=32)
+    Crowd({"a": 1.0, "b": 0.0}).write(plan, folder / "study" / "votes")
     options = ("--preset", "tiny", "--size", "16", "--materials", "2", "--workers", "1")
     call("world", "-o", folder / "made", *options)
     (folder / "world").mkdir()

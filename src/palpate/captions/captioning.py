@@ -36,6 +36,7 @@ from palpate.core import (
     plain,
     problem_lines,
     quiet,
+    require,
     short,
     write_json,
 )
@@ -266,10 +267,9 @@ def _require_one(**sources: str | None) -> None:
 
 def _require_sound(limits: Mapping[str, float], prices: Sequence[float] | None, body: Any) -> None:
     for name, limit in limits.items():
-        if not 0 < limit < inf:
-            raise PalpateError("must be a positive number", str(limit), "", argument=name)
-    if not all(0 <= price < inf for price in prices or ()):
-        raise PalpateError("must be numbers from 0", str(prices), "", argument="prices")
+        require(0 < limit < inf, name, "must be a positive number", limit)
+    sound = all(0 <= price < inf for price in prices or ())
+    require(sound, "prices", "must be numbers from 0", prices)
     try:
         json.dumps(body, allow_nan=False, ensure_ascii=False).encode()
     except (TypeError, ValueError, RecursionError) as error:

@@ -24,7 +24,7 @@ from palpate.captions.reading import read_captions
 from palpate.captions.vocabulary import Vocabulary, visual_in, words_of
 from palpate.core import FeatureSet, Note, PalpateError, Progress, Score, Split, quiet, rng_for
 from palpate.data.manifest import Manifest
-from palpate.metrics.means import mean_over_groups
+from palpate.metrics.means import mean_of
 from palpate.metrics.probe import fit_probe
 from palpate.report.results import Results
 
@@ -160,7 +160,7 @@ def _shares(rows: _Rows, vocabulary: Vocabulary) -> list[Score]:
 def _share(name: str, words: Sequence[Sequence[str]], rows: _Rows) -> Score:
     """The share of captions with words of a kind, those words, and examples."""
     hits = np.array([bool(row) for row in words])
-    score = mean_over_groups(SHARE, hits, rows.groups, estimator="mean", subject=name)
+    score = mean_of(SHARE, hits, rows.groups, estimator="mean", subject=name).score
     counts = Counter(word for row in words for word in set(row))
     listed = dict(counts.most_common(SHOWN_WORDS))
     where = [k for k in np.flatnonzero(hits)[:EXAMPLES] if rows.texts[k]]
@@ -207,7 +207,7 @@ def _accuracies(
     settings = {"words": WORDS, "penalty": PENALTY, "folds": FOLDS}
     common: dict[str, Any] = {"estimator": "mean", "settings": settings, "seed": seed}
     metric = "material accuracy from the text"
-    scores = [mean_over_groups(metric, h, groups, subject=s, **common) for s, h in hits.items()]
+    scores = [mean_of(metric, h, groups, subject=s, **common).score for s, h in hits.items()]
     scores = [replace(score, higher_is_better=False) for score in scores]
     bare = scores[1].value or 0.0
     notes = [Note("captions-code", {"accuracy": bare})] if bare > CODE else []

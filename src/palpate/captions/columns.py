@@ -13,16 +13,10 @@ from palpate.data.manifest import SCHEMA, Manifest
 
 
 def template_texts(template: str, manifest: Manifest, units: Units, seed: int) -> list[str | None]:
-    """Fill a template for every unit, from its first sample.
+    """One text a unit, from its first sample; None where a column has no value.
 
-    Args:
-        template: text with columns in braces; ``""`` takes adjectives of the material.
-        manifest: the samples.
-        units: which samples share a caption.
-        seed: of the draw of adjectives.
-
-    Returns:
-        One text a unit; None where a column has no value.
+    The template is text with columns in braces; ``""`` takes adjectives of the material, drawn by
+    the seed.
 
     Raises:
         PalpateError: if the template names no column, or one without any value.

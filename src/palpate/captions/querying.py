@@ -173,15 +173,7 @@ def query_all(
 ) -> list[Problem]:
     """Send a request for every photo; replies go to the log as they arrive.
 
-    Args:
-        pending: the photos.
-        question: what is the same for all.
-        describer: the model.
-        log: where replies are kept.
-        threads: requests at once.
-        progress: progress callback.
-        answered: whether some photo has an answer already; then it is no matter of the server if
-            it takes none of these.
+    Where some photo is ``answered`` already, the server is not to blame if it takes none of these.
 
     Returns:
         The photos that cannot be read or that the server does not take.

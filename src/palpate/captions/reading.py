@@ -18,16 +18,9 @@ SCHEMA = {"id": pl.String(), "text": pl.String(), **LISTS}
 
 
 def read_captions(captions: Any, data: Any = None, **options: Any) -> tuple[Manifest, pl.DataFrame]:
-    """Read captions.
+    """The samples with their captions as texts, and the captions with the columns of ``SCHEMA``.
 
-    Args:
-        captions: folder of captions or a table with ``id`` and ``text``; without ``data`` also
-            anything that :func:`palpate.load` reads.
-        data: the samples.
-        options: options of a table without ``data``.
-
-    Returns:
-        The samples with their captions as texts, and the captions with the columns of ``SCHEMA``.
+    Arguments are those of :func:`palpate.captions.check_captions`.
 
     Raises:
         PalpateError: if there are none, or they are of other samples.

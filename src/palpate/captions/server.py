@@ -16,16 +16,18 @@ import os
 import re
 import threading
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from queue import SimpleQueue
 from typing import Any
 
 from palpate.captions.prompts import LONGEST, valid
 from palpate.captions.replies import RejectedError, Reply, Request
-from palpate.core import MissingExtraError, PalpateError
+from palpate.core import MissingExtraError, PalpateError, few
 
 #: Where the key is looked for unless another variable is named.
 KEY_VARIABLE = "PALPATE_CAPTION_KEY"
+#: How often a request is sent to a busy or failing server.
+TRIES = 6
 #: Longest pause before another try, in seconds.
 LONGEST_PAUSE = 60.0
 #: Longest wait that a server may request, in seconds.
@@ -45,7 +47,6 @@ class Server:
         key_variable: environment variable that holds the key; None looks into ``KEY_VARIABLE``.
         body: further fields of every request; null removes a default one.
         timeout: longest silence of the server, in seconds.
-        tries: how often a request is sent to a busy or failing server.
         pause: seconds before the second try; doubles with every further one.
         connections: requests at once.
 
@@ -64,7 +65,6 @@ class Server:
         key_variable: str | None = None,
         body: Mapping[str, Any] | None = None,
         timeout: float = 120.0,
-        tries: int = 6,
         pause: float = 1.0,
         connections: int = 8,
     ) -> None:
@@ -78,7 +78,7 @@ class Server:
         self.url = _checked_url(url)
         self._variable = key_variable or KEY_VARIABLE
         self._key = _key(self._variable, required=key_variable is not None)
-        self._tries, self._pause, self._body = tries, pause, dict(body or {})
+        self._pause, self._body = pause, dict(body or {})
         headers = {"Authorization": f"Bearer {self._key}"} if self._key else {}
         limits = httpx2.Limits(max_connections=1, keepalive_expiry=60)
         secure = httpx2.create_ssl_context()
@@ -148,7 +148,7 @@ class Server:
             PalpateError: if it does not answer any more, or takes no request.
         """
         failure, wait = self._gone("no request"), 0.0
-        for k in range(self._tries):
+        for k in range(TRIES):
             if wait and self._closed.wait(wait):
                 break
             wait = min(LONGEST_PAUSE, self._pause * 2**k)
@@ -206,7 +206,7 @@ class Server:
             return PalpateError(must, f"{self.url}: {got}", fix, argument="server")
         if status == 404:
             if (models := self._models()) and self.model not in models:
-                must, fix = f"must be a model of {self.url}", f"It has {_few(models)}"
+                must, fix = f"must be a model of {self.url}", f"It has {few(models)}"
                 return PalpateError(must, self.model, fix, argument="model")
             must, fix = "must be an OpenAI-compatible API", "Give its base: http://HOST:PORT/v1"
             return PalpateError(must, f"{self.url}: {got}", fix, argument="server")
@@ -240,7 +240,7 @@ class Server:
         if len(models) != 1:
             got = f"{len(models)} models" if models else "no list of models"
             unlisted = "Name it, or give the base of the API: http://HOST:PORT/v1"
-            fix = f"Choose one of {_few(models)}" if models else unlisted
+            fix = f"Choose one of {few(models)}" if models else unlisted
             raise PalpateError(f"must be named for {self.url}", got, fix, argument="model")
         return models[0]
 
@@ -349,7 +349,3 @@ def _text_of(content: Any) -> str:
     if isinstance(content, list):
         return "".join(str(part.get("text") or "") for part in content)
     return str(content or "")
-
-
-def _few(names: Sequence[str]) -> str:
-    return ", ".join(names[:8]) + " ..." * (len(names) > 8)

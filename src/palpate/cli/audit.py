@@ -105,9 +105,8 @@ def run(options: Options, terminal: Terminal) -> tuple[dict[str, Any], int]:
     _check(options)
     cache, temporary = options.cache, None
     written = options.outputs.output or options.outputs.page or options.outputs.table
-    if (
-        cache is None and written is not None and not is_stream(written)
-    ):  # an interrupted run resumes from it
+    if cache is None and written is not None and not is_stream(written):
+        # An interrupted run resumes from it.
         cache = temporary = written.absolute().parent / f".{written.name}.work"
     with terminal.progress() as progress:
         result = audit(
@@ -129,10 +128,8 @@ def run(options: Options, terminal: Terminal) -> tuple[dict[str, Any], int]:
     terminal.show(result)
     for command in result.commands:
         terminal.print_line(f"Next: {command}")
-    leaked, limit = (
-        max(a.leaked_fraction for a in (result, *result.others)),
-        options.outputs.fail_over,
-    )
+    leaked = max(a.leaked_fraction for a in (result, *result.others))
+    limit = options.outputs.fail_over
     failed = leaked > limit
     if failed and limit:
         terminal.print_line(f"FAIL: leaked fraction {leaked} is over {limit}")

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -10,7 +10,7 @@ import tyro
 
 from palpate.cli.importing import Maps, columns_of
 from palpate.cli.terminal import FAILED_CHECK, Common, OptionalOutPath, Terminal, guard_output
-from palpate.core import PalpateError
+from palpate.core import require
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -48,8 +48,7 @@ def run(options: Options, terminal: Terminal) -> tuple[dict[str, Any], int]:
     from palpate.captions.checking import FLAGGED, SHARE
 
     limit = options.fail_over
-    if limit is not None and not 0 <= limit <= 1:
-        raise PalpateError("must lie in [0, 1]", str(limit), "", argument="fail_over")
+    require(limit is None or 0 <= limit <= 1, "fail_over", "must lie in [0, 1]", limit)
     for path in filter(None, (options.output, options.page)):
         inputs = [p for p in (options.captions, options.data, options.split) if p is not None]
         guard_output(path, inputs, (b'"format": "palpate-', b"palpate"))
@@ -63,12 +62,7 @@ def run(options: Options, terminal: Terminal) -> tuple[dict[str, Any], int]:
             progress=progress,
             **extra,
         )
-    results = replace(results, commands=[terminal.command])
-    terminal.show(results)
-    if options.output:
-        results.save(options.output)
-    if options.page:
-        results.to_html(options.page)
+    shown = terminal.deliver(results, output=options.output, page=options.page)
     if options.mask:
         masked = mask_captions(options.captions, options.mask, data=options.data, **extra)
         terminal.print(str(masked))
@@ -76,4 +70,4 @@ def run(options: Options, terminal: Terminal) -> tuple[dict[str, Any], int]:
     failed = limit is not None and flagged > limit
     if failed:
         terminal.print_line(f"FAIL: share of flagged captions {round(flagged, 5)} is over {limit}")
-    return results.to_json() | {"failed": failed}, FAILED_CHECK if failed else 0
+    return shown | {"failed": failed}, FAILED_CHECK if failed else 0

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import importlib
+import io
 from dataclasses import dataclass, make_dataclass
 from functools import reduce
 from operator import or_
@@ -24,9 +26,6 @@ class Options(Common):
 
 def run(options: Options, terminal: Terminal) -> dict[str, Any]:
     """Print the script for all verbs."""
-    import contextlib
-    import io
-
     verbs: dict[str, Any] = {}
     groups: dict[str, dict[str, Any]] = {}
     for name, verb in VERBS.items():

@@ -28,7 +28,8 @@ class Options(Common):
     clip: str | None = None
     """Hub id or folder of a pretrained CLIP, instead of the small one that ships with palpate."""
     autoencoder: str | None = None
-    """Hub id or folder of a pretrained VQ model, instead of the small one that ships."""
+    """A pretrained autoencoder (see `palpate train generator`), instead of the small one that
+    ships."""
     from_scratch: Switch = False
     """Use nothing that ships: train the small models in the run, on another world and the train
     part."""

@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Any, Literal
 
-import tyro
-
-from palpate.cli.presets import EncoderPresetName, Machine, preset_flags, print_plan, with_flags
-from palpate.cli.terminal import Common, OutPath, Switch, Terminal, require_extra
+from palpate.cli.presets import EncoderPresetName, Training, preset_flags, print_plan, with_flags
+from palpate.cli.terminal import Switch, Terminal, require_extra
+from palpate.core import PalpateError
 from palpate.encoders.presets import PRESETS, EncoderPreset
 
 _FLAGS = ("tactile_course", ("name", "cost", "pretrained", "tactile_course.epochs", "targets"))
@@ -17,19 +15,12 @@ _Preset = preset_flags("Preset", EncoderPreset, *_FLAGS)
 
 
 @dataclass(frozen=True, kw_only=True)
-class Options(Common):
+class Options(Training):
     """Train the tactile encoder against frozen vision and text encoders (three-way InfoNCE)."""
 
-    data: Annotated[Path, tyro.conf.Positional]
-    """Manifest file, the folder of an import, or a data set."""
-    output: OutPath
-    """Folder for the encoders; must be new or empty."""
     clip: str | None = None
     """Hub id or folder of a pretrained CLIP, or palpate/mini. Default: the preset's, or a small one
     that is trained first on the same train part."""
-    split: Path | None = None
-    """Split file; only its train part is trained on. Default: the one that lies with the data, in
-    `splits/`."""
     preset: EncoderPresetName = "mini"
     """Size and course; `tvl-*` are TVL's and `paper` is the paper's, for GPUs."""
     epochs: float | None = None
@@ -45,12 +36,8 @@ class Options(Common):
     held_out: float = 0.0
     """Share of the train videos on which loss and probe are measured in training, where the split
     has no part val (which is taken otherwise)."""
-    seed: int = 0
-    """Of weights, order and augmentation."""
     dry_run: Switch = False
     """Print parameters, memory, operations and time, and stop."""
-    machine: Machine = field(default_factory=Machine)
-    """How to run it on the machine at hand."""
     fields: _Preset = field(default_factory=_Preset)  # pyright: ignore[reportInvalidTypeForm]
     """Fields of the preset; `--clip-...` are of the vision and text encoders trained first."""
 
@@ -61,6 +48,10 @@ def run(options: Options, terminal: Terminal) -> dict[str, Any]:
     from palpate.encoders.contrastive import plan_encoder, train_encoder
 
     preset = with_flags(PRESETS[options.preset], options.fields, *_FLAGS)
+    given = [k for k, v in vars(options.fields).items() if v is not None and k.startswith("clip_")]
+    if options.clip and (idle := sorted(set(given) - {"clip_norm"})):
+        must, fix = "is of the vision and text encoders that are trained first", "Leave one out"
+        raise PalpateError(must, f"--clip {options.clip} as well", fix, argument=idle[0])
     data, machine = (options.data, options.split), options.machine
     if options.dry_run:
         how: dict[str, Any] = {"held_out": options.held_out, "device": machine.device}

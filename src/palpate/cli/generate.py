@@ -1,4 +1,4 @@
-"""``palpate generate``: tactile images for photos."""
+"""``palpate generate``: tactile images for photos or a text."""
 
 from __future__ import annotations
 
@@ -13,12 +13,21 @@ from palpate.cli.terminal import Common, OutPath, Switch, Terminal, require_extr
 
 @dataclass(frozen=True, kw_only=True)
 class Options(Common):
-    """Make a tactile image for each photo or sample of a data set. Run again to continue."""
+    """Make a tactile image for each photo or sample of a data set, or for a text. Run again to
+    continue.
+    """
 
-    photos: Annotated[tuple[Path, ...], tyro.conf.Positional]
+    photos: Annotated[tuple[Path, ...], tyro.conf.Positional] = ()
     """Photos, a folder of them, or a manifest (its file or the folder of an import)."""
     output: OutPath
     """A .png for one photo; else a folder for images/ and index.json."""
+    text: str | None = None
+    """What is felt, e.g. "rough, porous stone"; alone, or next to photos for all of them."""
+    weight: float = 0.5
+    """With photos and a text: the share of the photo."""
+    gel: Path | None = None
+    """Picture of your gel without contact; the images are made on it (default: the background of
+    each sample, else the model's stock gel)."""
     model: str = "palpate/mini"
     """Folder of `palpate train generator`, hub id, or palpate/mini (a synthetic world alone)."""
     split: Path | None = None
@@ -33,8 +42,17 @@ class Options(Common):
     """Sampling steps (default: the model's)."""
     batch: int | None = None
     """Images at a time; the images do not depend on it."""
+    best_of: int = 1
+    """Make so many of each and keep the one whose tactile embedding is most similar to the photo or
+    text."""
+    best_by: str | None = None
+    """With --best-of: the encoders that choose (`palpate train encoder`); `palpate score` rejects
+    their tactile encoder for these images."""
     skip_bad: Switch = False
     """Skip unreadable photos and list them."""
+    dry_run: Switch = False
+    """Write nothing; print images, network evaluations, time and disk, from a batch that is sampled
+    with few steps."""
     device: str = "auto"
     """auto, cpu, cuda, mps."""
 
@@ -44,21 +62,21 @@ def run(options: Options, terminal: Terminal) -> dict[str, Any]:
     require_extra("palpate generate")
     from palpate.diffusion.generation import generate
 
+    arguments = dict(vars(options))
+    for name in ("as_json", "quiet", "photos", "dry_run"):
+        arguments.pop(name)
+    photos: Any = (options.photos[0] if len(options.photos) == 1 else options.photos) or None
+    if options.dry_run:
+        from palpate.diffusion.estimating import estimate
+
+        with terminal.progress() as progress:
+            needed = estimate(photos, progress=progress, **arguments)
+        terminal.print(str(needed))
+        return needed.to_json()
     with terminal.progress() as progress:
-        made = generate(
-            options.photos[0] if len(options.photos) == 1 else options.photos,
-            model=options.model,
-            output=options.output,
-            split=options.split,
-            part=options.part,
-            seed=options.seed,
-            guidance=options.guidance,
-            steps=options.steps,
-            batch=options.batch,
-            skip_bad=options.skip_bad,
-            device=options.device,
-            progress=progress,
-        )
+        made = generate(photos, progress=progress, **arguments)
+    for note in made.notes:
+        terminal.note(note)
     facts: dict[str, Any] = {
         "image" if made.folder is None else "folder": str(options.output),
         "images": len(made.ids),
@@ -70,4 +88,5 @@ def run(options: Options, terminal: Terminal) -> dict[str, Any]:
     }
     terminal.facts(f"Tactile images {options.output}", facts)
     terminal.skipped(made.skipped)
-    return facts | {"skipped": [asdict(p) for p in made.skipped]}
+    notes = [note.to_json() for note in made.notes]
+    return facts | {"skipped": [asdict(p) for p in made.skipped], "notes": notes}

@@ -88,18 +88,8 @@ class FormatOptions:
 
     labels: tuple[Path, ...] = ()
     """Frame lists (Touch and Go; default: label.txt, else train.txt and test.txt)."""
-    lists: Path | None = None
-    """Folder of lists to use instead of those of the data set (HCT, SSVTP)."""
-    contact: Switch = False
-    """Include frames that only contact.json names (HCT)."""
-    session_gap: float | None = None
-    """Trajectories that start within so many seconds share a session (HCT)."""
     swap: Literal["report", "fix"] | None = None
     """Report or fix trajectories whose vision and tactile folders are swapped (HCT)."""
-    scale: str | None = None
-    """Scale of the views, e.g. 40_30 (TaRF)."""
-    metadata: Path | None = None
-    """Table of objects and materials (ObjectFolder)."""
     part: Literal["real", "sim"] | None = None
     """Real or simulated recordings (YCB-Slide)."""
     prefix: str | None = None
@@ -114,8 +104,6 @@ class FormatOptions:
     """Keep at most this many evenly spaced frames of each contact (Touch and Go, your own
     videos).
     """
-    seed: int | None = None
-    """With `--max-per-contact`: 0 takes the middle of each stretch, others a random place."""
 
 
 @dataclass(frozen=True, kw_only=True)

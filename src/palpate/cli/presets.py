@@ -11,11 +11,12 @@ import re
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, make_dataclass
 from functools import cache
+from pathlib import Path
 from typing import Annotated, Any, Literal, get_args, get_type_hints
 
 import tyro
 
-from palpate.cli.terminal import Switch, Terminal
+from palpate.cli.terminal import Common, OutPath, Switch, Terminal
 from palpate.core import PalpateError
 from palpate.training.options import Compute, LoopOptions
 
@@ -35,17 +36,19 @@ class _Field:
 
 @cache
 def _fields(preset: type[Any], main: str, skip: tuple[str, ...]) -> tuple[_Field, ...]:
-    return tuple(f for f in _walk(preset, main, ()) if f.path not in skip)
+    outside = tuple(f"{path}." for path in skip)
+    return tuple(f for f in _walk(preset, main, ()) if not f"{f.path}.".startswith(outside))
 
 
 def _walk(record: type[Any], main: str, path: tuple[str, ...]) -> Iterator[_Field]:
     hints, texts = get_type_hints(record), attributes(record)
     for each in dataclasses.fields(record):
         kind = hints[each.name]
-        inner = next((t for t in (kind, *get_args(kind)) if dataclasses.is_dataclass(t)), None)
         where = (*path, each.name)
-        if isinstance(inner, type):
-            yield from _walk(inner, main, where)
+        inner = [t for t in (kind, *get_args(kind)) if dataclasses.is_dataclass(t)]
+        if inner:  # one record, or one of several
+            parts = [part for t in inner if isinstance(t, type) for part in _walk(t, main, where)]
+            yield from {part.flag: part for part in reversed(parts)}.values()
             continue
         parts = [p.removesuffix("_course") for p in where if p != main]
         flag = "_".join([*parts[:-1], WORDS.get(parts[-1], parts[-1])])
@@ -67,16 +70,19 @@ def attributes(record: type[Any]) -> Mapping[str, str]:
 def preset_flags(title: str, preset: type[Any], main: str, skip: tuple[str, ...]) -> Any:
     """A group of options, each None unless given: the fields of a preset class.
 
+    What may be None there is switched off by the word ``none``.
+
     Args:
         title: of the class.
         preset: the class.
         main: the field that holds the main training, whose options have no prefix.
-        skip: paths of fields that have an option of their own.
+        skip: paths of fields that have an option of their own, or of whole parts.
     """
     rows: list[tuple[str, Any, Any]] = []
     for each in _fields(preset, main, skip):
         about = tyro.conf.arg(help=each.help, help_behavior_hint="(default: the preset's)")
-        rows.append((each.flag, Annotated[each.kind | None, about], field(default=None)))
+        off = Literal["none"] if type(None) in get_args(each.kind) else None
+        rows.append((each.flag, Annotated[each.kind | off | None, about], field(default=None)))
     return make_dataclass(title, rows, frozen=True, kw_only=True)
 
 
@@ -91,10 +97,11 @@ def with_flags(preset: Any, given: Any, main: str, skip: tuple[str, ...]) -> Any
             *parts, name = each.path.split(".")
             records = [preset]
             for part in parts:
-                if (record := getattr(records[-1], part)) is None:
-                    must, got = "must belong to a part of the preset", f"a preset without {part}"
-                    raise PalpateError(must, got, "Leave it out", argument=each.flag)
-                records.append(record)
+                records.append(getattr(records[-1], part))
+            if not hasattr(records[-1], name):
+                must, got = "must belong to a part of the preset", f"a preset without {each.path}"
+                raise PalpateError(must, got, "Leave it out", argument=each.flag)
+            value = None if value == "none" and type(None) in get_args(each.kind) else value
             for record, inner in zip(reversed(records), [name, *reversed(parts)], strict=True):
                 value = dataclasses.replace(record, **{inner: value})
             preset = value
@@ -128,6 +135,23 @@ class Machine:
     def compute(self) -> Compute:
         """The settings as the rooms take them."""
         return Compute(**{k: v for k, v in vars(self).items() if k != "device"})
+
+
+@dataclass(frozen=True, kw_only=True)
+class Training(Common):
+    """What all trainings take."""
+
+    data: Annotated[Path, tyro.conf.Positional]
+    """Manifest file, the folder of an import, or a data set."""
+    output: OutPath
+    """Folder for what is trained; must be new or empty."""
+    split: Path | None = None
+    """Split file; only its train part is trained on. Default: the one that lies with the data, in
+    `splits/`."""
+    seed: int = 0
+    """Of everything random: weights, order, augmentation, noise."""
+    machine: Machine = field(default_factory=Machine)
+    """How to run it on the machine at hand."""
 
 
 def print_plan(terminal: Terminal, title: str, plan: dict[str, Any]) -> dict[str, Any]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import shutil
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -88,11 +88,14 @@ class Options(Common):
     """Split file: its test part is scored, its train part gives the floor of TMMD, a material probe
     and the controls."""
     allow_seen: Switch = False
-    """Score with an encoder that was trained on some of the real images; every score says so."""
+    """Score with an encoder that was trained on some of the real images, or chose generated ones
+    (--best-of); every score says so."""
     output: OptionalOutPath = None
     """Write scores, gallery and settings as JSON, for `palpate report`."""
     latex: Path | None = None
-    """Write the tables as LaTeX (booktabs; longtable for many differences)."""
+    """Write the tables as LaTeX (booktabs)."""
+    page: Path | None = None
+    """Write the same as one self-contained page (.html), with .json and .md next to it."""
     cache: Path | None = None
     """Folder for embeddings and decoded images. Default: one next to -o, for a run that is
     interrupted; removed at the end."""
@@ -122,19 +125,11 @@ def run(options: Options, terminal: Terminal) -> dict[str, Any]:
     }
     with terminal.progress() as progress:
         results = score(list(options.generated), options.reference, progress=progress, **arguments)
-    results = replace(results, commands=[terminal.command])
-    try:
-        terminal.show(results)  # before saving: a full disk loses nothing
-    finally:
-        if options.output:
-            results.save(options.output)
-        if options.latex:
-            from palpate.core import write_text
-
-            write_text(options.latex, results.to_latex())
+    files = {"output": options.output, "page": options.page, "latex": options.latex}
+    shown = terminal.deliver(results, **files)
     if cache is not None and options.cache is None:
         shutil.rmtree(cache, ignore_errors=True)
-    return results.to_json()
+    return shown
 
 
 def _check_outputs(options: Options) -> None:
@@ -144,6 +139,11 @@ def _check_outputs(options: Options) -> None:
     inputs = [path for path in read if path]
     if options.output:
         guard_output(options.output, inputs)
+    if options.page:
+        if options.page.suffix != ".html":
+            raise PalpateError("must end in .html", options.page.name, "", argument="page")
+        for suffix in (".html", ".json", ".md"):
+            guard_output(options.page.with_suffix(suffix), inputs, (b"palpate",))
     if options.latex:
         guard_output(options.latex, inputs, (b"% palpate",))
         if options.output and options.latex.resolve() == options.output.resolve():
@@ -155,7 +155,7 @@ def _check_outputs(options: Options) -> None:
 
 
 def _cache(options: Options) -> Path | None:
-    output = options.output or options.latex
+    output = options.output or options.page or options.latex
     images = options.reference.is_dir() or options.encoder
     if options.cache or output is None or is_stream(output) or not images:
         return options.cache

@@ -50,6 +50,7 @@ from palpate.core import (
     is_stream,
     problem_lines,
     quiet,
+    write_text,
 )
 from palpate.core.files import NO_ROOM
 
@@ -105,7 +106,8 @@ OPTION_NAMES: dict[tuple[str, str], str] = {
     ("generate", "photos"): "PATH",
 }
 
-#: Of several processes that torchrun started, the first one writes; errors are everyone's.
+#: Of several processes that torchrun started, the first one writes; errors are everyone's,
+#: but for those that all of them raise.
 FIRST = os.environ.get("RANK", "0") == "0"
 #: What would break a line of the terminal, or color it.
 _CONTROL = re.compile("[\x00-\x1f\x7f-\x9f\u2028\u2029]")
@@ -158,6 +160,27 @@ class Terminal:
 
         print_result(result, self.out)
 
+    def deliver(
+        self,
+        results: Results,
+        *,
+        output: Path | None = None,
+        page: Path | None = None,
+        latex: Path | None = None,
+    ) -> dict[str, Any]:
+        """Show results, write them where asked, and return them as JSON."""
+        results = dataclasses.replace(results, commands=[self.command])
+        try:
+            self.show(results)  # before saving: a full disk loses nothing
+        finally:
+            if output:
+                results.save(output)
+            if page:
+                results.to_html(page)
+            if latex:
+                write_text(latex, results.to_latex())
+        return results.to_json()
+
     def problems(self, title: str, problems: Sequence[Problem]) -> None:
         """List problems on standard error, below a title and their number."""
         if problems:
@@ -206,7 +229,9 @@ class Terminal:
 
 
 class _LogProgress:
-    """At most a line every ten seconds, and one at the end of what took long."""
+    """At most a line every ten seconds, one at the end of what took long, and one at the start of
+    what cannot be counted.
+    """
 
     def __init__(self, print_line: Callable[[str], None], every: float = 10.0) -> None:
         self.print_line, self.every = print_line, every
@@ -215,8 +240,10 @@ class _LogProgress:
 
     def __call__(self, what: str, done: int, total: int, remark: str = "") -> None:
         ended = bool(total) and done >= total and what in self.shown
-        if ended or time.monotonic() - self.last >= self.every:
-            self.print_line(f"  {what} {done}{f'/{total}' if total else ''} {remark}".rstrip())
+        begun = not total and what not in self.shown
+        if ended or begun or time.monotonic() - self.last >= self.every:
+            amount = f"{done}/{total}" if total else "..."
+            self.print_line(f"  {what} {amount} {remark}".rstrip())
             self.last = time.monotonic()
             self.shown = self.shown - {what} if ended else self.shown | {what}
 
@@ -479,6 +506,8 @@ def run_verb(name: str, args: Sequence[str]) -> int:
         return status
     except (PalpateError, OSError) as caught:
         error = caught if isinstance(caught, PalpateError) else _file_error(caught)
+        if error.shared and not FIRST:
+            return USER_ERROR
         _print_error(f"palpate {name}: {error_line(name, error)}")
         if isinstance(error, ProblemsError):
             list_problems(error.problems, _print_error)

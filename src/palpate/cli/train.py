@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Any, Literal
 
-import tyro
-
-from palpate.cli.presets import Machine, preset_flags, print_plan, with_flags
-from palpate.cli.terminal import Common, OutPath, Switch, Terminal, require_extra
+from palpate.cli.presets import Training, preset_flags, print_plan, with_flags
+from palpate.cli.terminal import Switch, Terminal, require_extra
+from palpate.diffusion.options import Sources
 from palpate.diffusion.presets import PRESETS, DiffusionPreset
 
 _SKIP = ("name", "loop.steps", "loop.seed", "condition.width", "condition.source")
@@ -18,37 +16,36 @@ _Preset = preset_flags("Preset", DiffusionPreset, *_FLAGS)
 
 
 @dataclass(frozen=True, kw_only=True)
-class Options(Common):
+class Options(Training):
     """Train a generator of tactile images: conditioned on text, later driven by photos."""
 
-    data: Annotated[Path, tyro.conf.Positional]
-    """Manifest file, the folder of an import, or a data set."""
-    clip: str
+    clip: str | None = None
     """Encoders that condition the generator: folder of `palpate train encoder` or of a CLIP, hub
-    id, or palpate/mini."""
-    output: OutPath
-    """Folder for the pipeline; must be new or empty."""
+    id, or palpate/mini. `--source resnet` needs none."""
     autoencoder: str | None = None
-    """Hub id or folder of a pretrained VQ model (diffusers VQModel), or palpate/mini. Default: a
-    small one, trained first on the train part."""
-    split: Path | None = None
-    """Split file; only its train part is trained on. Default: the one that lies with the data, in
-    `splits/`."""
-    preset: Literal["mini", "tiny", "paper"] = "mini"
-    """Geometry, schedule and length; `paper` is the paper's, for GPUs."""
-    source: Literal["text", "vision", "mixed"] | None = None
-    """What training conditions on; `vision` is the baseline without text (GVST). Default: the
-    preset's."""
+    """Pretrained autoencoder: folder or hub id of a diffusers VQModel or AutoencoderKL, a .ckpt of
+    latent diffusion (vq-f4, kl-f8), or palpate/mini. Default: a small one, trained first on the
+    train part."""
+    unet: str | None = None
+    """Trained U-Net of diffusers to go on from: folder or hub id of it or of its generator, whose
+    autoencoder is the default. Default: random weights; the preset `sd15` needs one."""
+    preset: Literal["mini", "tiny", "small", "paper", "sd15"] = "mini"
+    """Geometry, schedule and length: `small` for one small GPU, `paper` is the paper's, `sd15` goes
+    on from Stable Diffusion 1.5."""
+    source: Sources | None = None
+    """What training conditions on: `resnet` is GVST, the baseline without text and encoders;
+    `vision` is it with the encoder's photo. Default: the preset's."""
     background: Switch = False
     """The variant that also sees the no-contact image."""
+    align: str | None = None
+    """Encoder that the U-Net's middle block is pulled to (REPA): a folder of palpate or
+    transformers, a hub id, a public tactile encoder. It may not score this generator."""
+    align_weight: float = 0.5
+    """Of that term in the loss."""
     steps: int | None = None
     """Optimizer steps. Default: the preset's."""
-    seed: int = 0
-    """Of weights, order, noise and condition dropout."""
     dry_run: Switch = False
     """Print parameters, memory, operations and time, and stop."""
-    machine: Machine = field(default_factory=Machine)
-    """How to run it on the machine at hand."""
     fields: _Preset = field(default_factory=_Preset)  # pyright: ignore[reportInvalidTypeForm]
     """Fields of the preset; `--autoencoder-...` are of the autoencoder that is trained first."""
 
@@ -62,6 +59,7 @@ def run(options: Options, terminal: Terminal) -> dict[str, Any]:
     data, machine = (options.data, options.split), options.machine
     if options.dry_run:
         how: dict[str, Any] = {"background": options.background, "device": machine.device}
+        how |= {"unet": options.unet, "source": options.source}
         plan = plan_generator(*data, preset=preset, steps=options.steps, **how)
         return print_plan(terminal, f"Plan of {options.output}", plan)
     with terminal.progress() as progress:
@@ -70,9 +68,12 @@ def run(options: Options, terminal: Terminal) -> dict[str, Any]:
             options.clip,
             preset=preset,
             autoencoder=options.autoencoder,
+            unet=options.unet,
             output=options.output,
             source=options.source,
             background=options.background,
+            align=options.align,
+            align_weight=options.align_weight,
             steps=options.steps,
             seed=options.seed,
             device=machine.device,

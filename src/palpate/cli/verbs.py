@@ -65,6 +65,11 @@ VERBS: dict[str, Verb] = {
         "Train the tactile encoder against frozen vision and text encoders",
         "palpate train encoder tag/ --split noleak.json -o encoders/",
     ),
+    "train autoencoder": Verb(
+        "autoencoder",
+        "Train the autoencoder that a generator works in",
+        "palpate train autoencoder tag/ --split noleak.json -o autoencoder/",
+    ),
     "train generator": Verb(
         "train",
         "Train a generator of tactile images",
@@ -77,6 +82,21 @@ VERBS: dict[str, Verb] = {
         "score",
         "Score generated tactile images",
         "palpate score --generated generated/ --reference real/ --encoder palpate/mini",
+    ),
+    "preference make": Verb(
+        "preference_make",
+        "Plan a blinded study: whose images do people find closer to the real ones?",
+        "palpate preference make --reference real/ --generated ours/ gvst/ -o study/",
+    ),
+    "preference serve": Verb(
+        "preference_serve",
+        "Serve a study and keep its votes",
+        "palpate preference serve study/ --invite 10",
+    ),
+    "preference score": Verb(
+        "preference_score",
+        "Score the votes of a study",
+        "palpate preference score study/ votes/ -o people.json --latex people.tex",
     ),
     "probe": Verb(
         "probe",

@@ -9,7 +9,7 @@ from typing import Annotated, Any, Literal
 
 import tyro
 
-from palpate.cli.terminal import Common, OutPath, Terminal, guard_output
+from palpate.cli.terminal import Common, OutPath, Terminal
 from palpate.core import PalpateError
 from palpate.sim import (
     DEFAULT,
@@ -17,7 +17,6 @@ from palpate.sim import (
     SEEN_WARNING,
     WorldOptions,
     load_options,
-    render_sheet,
     seen_by_mini,
     write_world,
 )
@@ -41,7 +40,9 @@ def _group(name: str) -> Any:
         metavar = _METAVARS.get(kind) or "|".join(limits.get("choices", ("X",)))
         number = int if isinstance(limits["low"], int) else float
         of = Literal[limits["choices"]] if kind == "choice" else _TYPES.get(kind, number)
-        default = f"(default: the preset's; WorldOptions: {option.default})"
+        value = getattr(PRESETS[DEFAULT], option.name)
+        value = " ".join(map(str, value)) if isinstance(value, tuple) else value
+        default = f"(default: the preset's; {DEFAULT}: {value})"
         argument = tyro.conf.arg(help=text, metavar=metavar, help_behavior_hint=default)
         fields.append((option.name, Annotated[of | None, argument], field(default=None)))
     return make_dataclass(name.title(), fields, frozen=True, kw_only=True)
@@ -66,33 +67,26 @@ class Options(Common):
     """What to start from; small (the default) has 8,000 contact frames at 64 px, full 36,000 at
     128 px."""
     options: Path | None = None
-    """Start from the options of another world: its world.json."""
+    """Start from the options of another world (its file world.json) instead of a preset."""
     workers: int = 2
-    """Processes; the bytes do not depend on it."""
-    sheet: Path | None = None
-    """Also draw an overview image of all materials into this file."""
+    """Processes; the files do not depend on it."""
     world: _World = field(default_factory=_World)  # pyright: ignore[reportInvalidTypeForm]
-    """The world, and the lists that it comes with."""
+    """What is simulated, and the train and test lists."""
     amounts: _Amounts = field(default_factory=_Amounts)  # pyright: ignore[reportInvalidTypeForm]
-    """How much there is of what."""
+    """How many objects, videos, contacts and frames there are."""
     physics: _Physics = field(default_factory=_Physics)  # pyright: ignore[reportInvalidTypeForm]
-    """The objects, the gel and how it is pressed; lengths in mm."""
+    """The objects, the gel, and how it is pressed; lengths are in mm."""
     photos: _Photos = field(default_factory=_Photos)  # pyright: ignore[reportInvalidTypeForm]
-    """The camera, and everything in the photos that is irrelevant to contact."""
+    """The camera, and what in the photos has nothing to do with touch."""
 
 
 def run(options: Options, terminal: Terminal) -> dict[str, Any]:
     """Write the world and print what it holds."""
     world = world_options(options)
-    if options.sheet:
-        inputs = [options.options] if options.options else []
-        guard_output(options.sheet, inputs, (b"tEXtSoftware\0palpate",))
     if seen_by_mini(world):
         terminal.print_line(f"Seed {world.seed}: {SEEN_WARNING}")
     with terminal.progress() as progress:
         record = write_world(options.output, world, workers=options.workers, progress=progress)
-    if options.sheet:
-        render_sheet(world, options.sheet)
     facts = {"folder": str(record.folder), "digest": record.digest, **record.counts}
     facts |= {"seen_by_shipped_models": SEEN_WARNING} if seen_by_mini(world) else {}
     leak = {f"leak: {k}": v for k, v in record.leak.items()}
@@ -118,6 +112,4 @@ def world_options(options: Options) -> WorldOptions:
         given.setdefault("free_written", "all")
     if given.get("layout") == "hct":
         given.setdefault("look", "digit")
-    if "named" in given:
-        given.setdefault("captions", "label")
     return dataclasses.replace(base, **given)

@@ -18,9 +18,11 @@ from palpate.core.errors import (
     PalpateWarning,
     Problem,
     ProblemsError,
+    few,
     problem_lines,
     require,
     require_choice,
+    require_rows,
 )
 from palpate.core.features import FeatureSet
 from palpate.core.files import (
@@ -64,6 +66,7 @@ __all__ = [
     "digest_json",
     "digest_lines",
     "fact_lines",
+    "few",
     "inside",
     "is_stream",
     "locked",
@@ -78,6 +81,7 @@ __all__ = [
     "require_comparable",
     "require_new_folder",
     "require_regular",
+    "require_rows",
     "rng_for",
     "seed_for",
     "short",

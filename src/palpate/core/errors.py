@@ -14,6 +14,8 @@ from typing import Any
 
 from palpate.core.digest import plain
 
+#: Names that a list in a sentence has.
+FEW = 5
 #: Lines of a printed list of problems, and how many of one kind it lists one by one.
 SHOWN_PROBLEMS = 40
 FEW_PROBLEMS = 3
@@ -30,7 +32,12 @@ class PalpateError(Exception):
         argument: name of the Python argument that is at fault; the command line shows its option.
         example: arguments that would work (``{"train": 0.8}``); each front end writes them its way.
         choices: arguments of several calls that would work, for the user to choose from.
+
+    Attributes:
+        shared: whether all processes of a training raise it; the first one then prints it.
     """
+
+    shared = False
 
     def __init__(
         self,
@@ -77,6 +84,13 @@ class PalpateError(Exception):
         return {"error": type(self).__name__} | {name: getattr(self, name) for name in names}
 
 
+def few(names: Iterable[object]) -> str:
+    """Return ``"a, b, c, d, e and 3 more"``, or ``"none"``."""
+    words = [str(name) for name in names]
+    more = f" and {len(words) - FEW:,} more" if len(words) > FEW else ""
+    return ", ".join(words[:FEW]) + more if words else "none"
+
+
 def require_choice(argument: str, value: Any, choices: Iterable[str]) -> None:
     """Check that an argument is one of ``choices``.
 
@@ -89,9 +103,7 @@ def require_choice(argument: str, value: Any, choices: Iterable[str]) -> None:
         raise PalpateError(must, repr(value), "Choose one of these", argument=argument)
 
 
-def require(
-    holds: bool, argument: str, must: str, got: Any, example: Any = None, *, fix: str = ""
-) -> None:
+def require(holds: bool, argument: str, must: str, got: Any, example: Any = None) -> None:
     """Check an argument: ``require(0 < share < 1, "share", "must lie in (0, 1)", share, 0.5)``.
 
     Raises:
@@ -99,7 +111,20 @@ def require(
     """
     if not holds:
         shown = {} if example is None else {argument: example}
-        raise PalpateError(must, repr(got), fix, argument=argument, example=shown)
+        raise PalpateError(must, repr(got), "", argument=argument, example=shown)
+
+
+def require_rows(ids: Iterable[str], wanted: Sequence[str], must: str, fix: str) -> list[int]:
+    """Return the row of each wanted id.
+
+    Raises:
+        PalpateError: if one is missing.
+    """
+    row = {name: k for k, name in enumerate(ids)}
+    if missing := [i for i in wanted if i not in row]:
+        got = f"{len(missing)} of {len(wanted)} missing, first {missing[0]!r}"
+        raise PalpateError(must, got, fix)
+    return [row[i] for i in wanted]
 
 
 class PalpateWarning(UserWarning):

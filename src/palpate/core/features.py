@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from palpate.core.digest import to_numpy
-from palpate.core.errors import PalpateError
+from palpate.core.errors import PalpateError, require_rows
 from palpate.core.files import atomic_path
 
 #: Rows that are checked and hashed at a time: a memory-mapped array is never copied whole.
@@ -66,11 +66,8 @@ class FeatureSet:
         for name in ("labels", "groups"):
             column = getattr(self, name)
             if column is not None and len(column) != n:
-                must, fix = (
-                    f"must have one entry per row ({n})",
-                    "Pass them in the order of the ids",
-                )
-                raise PalpateError(must, f"{len(column)}", fix, argument=name)
+                must, got = f"must have one entry per row ({n})", f"{len(column)}"
+                raise PalpateError(must, got, "Pass them in the order of the ids", argument=name)
         finite = [np.isfinite(self.features[k : k + BLOCK]).all(axis=1) for k in range(0, n, BLOCK)]
         bad = np.flatnonzero(~np.concatenate(finite)) if finite else ()
         if len(bad):
@@ -101,12 +98,8 @@ class FeatureSet:
         Raises:
             PalpateError: if an id is missing.
         """
-        row = {name: k for k, name in enumerate(self.ids)}
-        if missing := [i for i in ids if i not in row]:
-            got = f"{len(missing)} without, first {missing[0]!r}"
-            fix = "Embed those samples as well"
-            raise PalpateError("Every requested id must have features", got, fix)
-        rows = [row[i] for i in ids]
+        must, fix = "Every requested id must have features", "Embed those samples as well"
+        rows = require_rows(self.ids, ids, must, fix)
         labels, groups = (
             None if column is None else [column[k] for k in rows]
             for column in (self.labels, self.groups)

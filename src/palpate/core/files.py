@@ -216,10 +216,8 @@ def reading_entry(path: Path, key: str) -> Generator[None]:
     try:
         yield
     except (ArithmeticError, AttributeError, LookupError, TypeError, ValueError) as error:
-        must, got = (
-            f"{key} in {path} must be as palpate writes it",
-            f"{type(error).__name__}: {error}",
-        )
+        must = f"{key} in {path} must be as palpate writes it"
+        got = f"{type(error).__name__}: {error}"
         raise PalpateError(must, got, "Copy the whole folder again") from None
 
 

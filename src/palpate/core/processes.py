@@ -20,14 +20,9 @@ from palpate.core.errors import PalpateError
 def worker_pool(
     workers: int, initializer: Callable[..., None] | None = None, arguments: tuple[Any, ...] = ()
 ) -> Generator[ProcessPoolExecutor]:
-    """A pool of worker processes with one thread each.
+    """A pool of worker processes of one thread, which call ``initializer(*arguments)`` first.
 
-    They are spawned: a fork of a process with threads can deadlock.
-
-    Args:
-        workers: how many.
-        initializer: called with ``arguments`` at the start of each.
-        arguments: must be picklable.
+    They are spawned: a fork of a process with threads can deadlock. So arguments are pickled.
 
     Raises:
         PalpateError: if a worker dies, mostly because the calling script has no ``__main__`` guard.

@@ -24,11 +24,9 @@ def quiet(what: str, done: int, total: int, remark: str = "") -> None:
     """Show nothing."""
 
 
-def track(
-    items: Sequence[T] | Iterable[T], what: str, progress: Progress, total: int | None = None
-) -> Iterator[T]:
+def track(items: Iterable[T], what: str, progress: Progress) -> Iterator[T]:
     """Yield ``items`` and report after each."""
-    count = total if total is not None else len(items) if isinstance(items, Sequence) else 0
+    count = len(items) if isinstance(items, Sequence) else 0
     progress(what, 0, count)
     for done, item in enumerate(items, 1):
         yield item

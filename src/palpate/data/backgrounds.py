@@ -27,7 +27,6 @@ from palpate.core import (
     PalpateError,
     Problem,
     Progress,
-    Split,
     fact_lines,
     locked,
     plain,
@@ -47,7 +46,7 @@ from palpate.data.contacts import (
 )
 from palpate.data.frames import FolderFrames
 from palpate.data.images import in_threads, read_image
-from palpate.data.imported import Imported, removing_on_error
+from palpate.data.imported import Imported, removing_on_error, splits_of
 from palpate.data.manifest import Manifest
 from palpate.data.reading import load
 
@@ -157,28 +156,23 @@ def propose_backgrounds(
     proposed = Manifest(table.with_columns(column), manifest.root, facts)
     kept, without = len(given) - given.count(None), chosen.count(None)
     with locked(path.parent), removing_on_error(path.parent) as created:
-        Imported(proposed, splits=_splits(source)).save(path.parent, created)
+        # Splits name samples, so those of an import hold for the new manifest, too.
+        splits = splits_of(Path(source)) if isinstance(source, (str, Path)) else {}
+        Imported(proposed, splits=splits).save(path.parent, created)
     reference = len(chosen) - kept - without - before
     return Backgrounds(proposed, path, kept, before, reference, without, methods, problems)
 
 
 @dataclass(frozen=True)
 class _Video:
-    """The frames of a video in order.
+    """The frames of a video in order."""
 
-    Attributes:
-        paths: (n,) of its readable frames.
-        thumbnails: (n, 48, 64, 3).
-        rows_of: (n,) rows of the table that show each frame; none for further images of the folder.
-        contact_of: (n,) the manifest's contact of each frame, if it is a sample.
-        numbers: (n,) frames, where they are known.
-    """
-
-    paths: list[Path]
-    thumbnails: Pixels
+    paths: list[Path]  # (n,) of its readable frames
+    thumbnails: Pixels  # (n, 48, 64, 3)
+    #: (n,) rows of the table that show each frame; none for further images of the folder.
     rows_of: list[list[int]]
-    contact_of: list[str | None]
-    numbers: list[int | None]
+    contact_of: list[str | None]  # (n,) the manifest's contact of each frame, if it is a sample
+    numbers: list[int | None]  # (n,) frames, where they are known
 
     @classmethod
     def read(
@@ -267,11 +261,7 @@ class _Video:
 
 
 def _references(how: How | Mapping[str, How], videos: Collection[str]) -> dict[str, How]:
-    """The reference of each video.
-
-    Raises:
-        PalpateError: on a video that is not there, or a word that is no reference.
-    """
+    """The reference of each video."""
     given: Mapping[str, How]
     given = how if isinstance(how, Mapping) else dict.fromkeys(videos, how)
     for name, value in given.items():
@@ -313,10 +303,3 @@ def _with_siblings(samples: dict[Path, list[dict[str, Any]]], root: Path) -> lis
     if any(k is None or not frames.has(k) or frames.path(k) != path for path, k in numbers):
         return list(samples)
     return [frames.path(k) for k in frames.numbers]
-
-
-def _splits(source: Any) -> dict[str, Split]:
-    """The splits of an import; they name samples, so they hold for the new manifest, too."""
-    folder = Path(source) / "splits" if isinstance(source, (str, Path)) else Path()
-    files = sorted(folder.glob("*.json")) if folder.name == "splits" else []
-    return {file.stem: Split.load(file) for file in files}

@@ -1,19 +1,20 @@
-"""Contacts in a tactile video: the untouched gel, how far each frame is from it, and the presses.
+"""Contacts in a tactile video: which frame shows the untouched gel, and when it is pressed.
 
-1. *Thumbnails* of 64 x 48, blurred by a Gaussian of one pixel, the mean of each channel removed:
-   brightness is no contact.
-2. *Reference*: the frame that most resembles frames at other times. The untouched gel comes back
-   between presses, while no two presses are the same; so a press at frame 0 does no harm. Of at
-   most 200 evenly spaced frames it is the one whose distance to its nearest neighbors, at least a
-   tenth of the video away, is least (the neighbor at 5 % of the frames counts). A gel that is
-   untouched for less than that, or pressed at rest for longer than it is free, must be declared.
-3. *Contact energy* of a frame: root mean square of its difference to the reference, in gray levels.
-4. *Contacts*: peaks of the energy (over a median of 5 frames) with a prominence of three tenths of
-   its 98 % quantile, at least 1 gray level and 4 times the change between frames of the quietest
-   quarter. A contact lasts while the energy is above half way between the trough on that side and
-   the peak, so a gel that relaxes slowly, or a soft press after a hard one, has a level of its own.
-5. *Background* of a contact: the last frame before it whose energy is within a tenth of the way
-   from the trough to the peak; the reference where there is none.
+1. Every frame becomes a *thumbnail* of 64 x 48, slightly blurred. The mean of each channel is
+   subtracted, so that a change of brightness is no contact.
+2. The *reference* is the frame of the untouched gel. The gel looks the same between presses, while
+   no two presses do: so it is the frame most similar to frames at other times (at least a tenth of
+   the video away; of at most 200 evenly spaced frames the one whose neighbor at the 5 % rank is
+   nearest). A gel that is untouched for less than 5 % of the video, or pressed at rest for longer
+   than it is free, must be given as an image.
+3. The *contact energy* of a frame is the root mean square difference to the reference, in gray
+   levels.
+4. A *contact* is a peak of the energy (median over 5 frames). It must rise by three tenths of the
+   98 % quantile, by 1 gray level, and by 4 times the change between frames of the quietest quarter.
+   It lasts while the energy is above the middle between the peak and the lowest point on that side,
+   so that a gel that recovers slowly does not join two presses.
+5. The *background* of a contact is the last frame before it that is nearly at rest (within a tenth
+   of the way up to the peak), or the reference if there is none.
 
 Measured on five real clips of Touch and Go (``benchmarks/contacts.py``).
 """
@@ -45,23 +46,13 @@ HALF, REST = 0.5, 0.1
 
 @dataclass(frozen=True)
 class Contacts:
-    """What :func:`find_contacts` found; frames are positions in the video.
+    """What :func:`find_contacts` found; frames are positions in the video."""
 
-    Attributes:
-        energy: (n,) contact energy, in gray levels.
-        reference: the frame that shows the untouched gel.
-        method: how it was chosen: ``declared`` or ``detected``.
-        runs: (first, last) frame of each contact, both included.
-        backgrounds: for each contact the frame that shows the gel before it.
-        height: how far a contact rises above the frames around it at least, in gray levels.
-    """
-
-    energy: Floats
-    reference: int
-    method: str
-    runs: list[tuple[int, int]]
-    backgrounds: list[int]
-    height: float
+    energy: Floats  # (n,) contact energy, in gray levels
+    reference: int  # the frame that shows the untouched gel
+    runs: list[tuple[int, int]]  # (first, last) frame of each contact, both included
+    backgrounds: list[int]  # for each contact the frame that shows the gel before it
+    height: float  # how far a contact rises above the frames around it at least, in gray levels
 
     def why_none(self) -> str:
         """Why there is no contact, in words."""
@@ -88,7 +79,6 @@ def find_contacts(
         gel: (48, 64, 3) the untouched gel, if there is an image of it; the reference is then the
             frame most like it.
     """
-    method = "detected" if reference is None and gel is None else "declared"
     if gel is not None:
         energy = contact_energy(thumbnails, gel)
         reference = int(energy.argmin())
@@ -99,7 +89,7 @@ def find_contacts(
     strong = PROMINENCE * float(np.quantile(smooth, 0.98))
     height = max(strong, LEAST, TIMES_NOISE * _noise(thumbnails))
     runs, backgrounds = _contacts(smooth, height, reference)
-    return Contacts(energy, reference, method, runs, backgrounds, height)
+    return Contacts(energy, reference, runs, backgrounds, height)
 
 
 def contact_energy(thumbnails: Pixels, reference: Pixels) -> Floats:
@@ -125,11 +115,8 @@ def find_reference(thumbnails: Pixels) -> int:
 def rest_before(energy: Floats, first: int, after: int, peak: float) -> int | None:
     """The last frame between ``after`` and ``first``, both excluded, that is at rest; or None.
 
-    Args:
-        energy: (n,) contact energy.
-        first: where the contact begins.
-        after: the last frame of the contact before it; -1 if there is none.
-        peak: energy of the contact.
+    ``energy`` is (n,); the contact begins at ``first`` and rises to ``peak``; ``after`` is the last
+    frame of the contact before it, -1 if there is none.
     """
     gap = energy[after + 1 : first]
     if not len(gap) or gap.min() > HALF * peak:

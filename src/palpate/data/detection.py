@@ -1,9 +1,8 @@
 """The templates of a folder, found from the names of its files.
 
 Names are cut into words, numbers and signs. A word such as ``photo`` or ``gelsight`` that occurs in
-some paths and not in others gives their side. Without such words, two names of one place (sibling
-folders, endings of names) under which the same paths recur are two sides, though nothing says
-which. What the paths of a side have in common is written out; what varies becomes a field:
+some paths and not in others gives their side. What the paths of a side have in common is written
+out; what varies becomes a field:
 
 - digits at the end of file names are the ``frame``;
 - a word before what varies names it (``press_3``: ``contact``), else its values do (``train``,
@@ -19,9 +18,9 @@ import posixpath
 import re
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 
 from palpate.data.captions import ADJECTIVES
+from palpate.data.manifest import DIGITS
 from palpate.data.rows import PART_NAMES
 from palpate.data.templates import Template
 
@@ -44,43 +43,24 @@ _MEANING = {
 }
 _MEANING_OF = {word: column for column, words in _MEANING.items() for word in words}
 _MATERIALS = {name.lower() for name in ADJECTIVES}
-#: The frames of a manifest have 64 bits, so a longer number is none.
-DIGITS = 18
 _TOKEN = re.compile(r"[A-Za-z]+|[0-9]+|[^A-Za-z0-9]")
 
 
-@dataclass(frozen=True)
-class Layout:
-    """What a folder seems to hold.
-
-    Attributes:
-        templates: column -> template, most likely first.
-        certain: whether names say what each side shows.
-    """
-
-    templates: dict[str, str]
-    certain: bool = True
-
-
-def detect_layout(files: Sequence[str], folder: str) -> Layout:
-    """The templates of the images below a folder.
+def detect_layout(files: Sequence[str], folder: str) -> dict[str, str]:
+    """Column -> template of the images below a folder; empty if no name says what they show.
 
     Args:
         files: paths below it, at least one.
         folder: its name, which may say what its only side shows.
     """
-    stems = {path: posixpath.splitext(path)[0] for path in files}
-    sides = _by_role(stems)
+    sides = _by_role({path: posixpath.splitext(path)[0] for path in files})
     if not sides and (roles := {_ROLE_OF[w] for w in _words(folder) if w in _ROLE_OF}):
         sides = {min(roles): list(files)} if len(roles) == 1 else {}
-    certain = bool(sides) and set(sides) != {"background"}
-    if not certain:
-        halves = _by_recurrence(stems) or ([], list(files))
-        sides = {side: half for side, half in zip(ROLES, halves, strict=False) if half}
+    if set(sides) <= {"background"}:
+        return {}
     several = any(map(_several, sides.values()))
-    order = [side for side in ROLES if side in sides]
-    templates = {side: template_of(sides[side], several) for side in order}
-    return Layout(_alike(templates, sides), certain)
+    templates = {side: template_of(sides[side], several) for side in ROLES if side in sides}
+    return _alike(templates, sides)
 
 
 def _alike(templates: dict[str, str], sides: Mapping[str, Sequence[str]]) -> dict[str, str]:
@@ -152,27 +132,6 @@ def _has_partner(stem: str, partners: set[object], places: set[object]) -> bool:
     return stem in partners or any(
         (k, *tokens[:k], "", *tokens[k + 1 :]) in partners for k in inside
     )
-
-
-def _by_recurrence(stems: dict[str, str]) -> tuple[list[str], list[str]] | None:
-    """Two groups with the same paths but for one folder, or for an ending of the names."""
-    parts = {path: tuple(stem.split("/")) for path, stem in stems.items()}
-    for depth in range(min(map(len, parts.values())) - 1):
-        values = sorted({names[depth] for names in parts.values()})
-        if len(values) == 2:
-            one, two = ([p for p, names in parts.items() if names[depth] == v] for v in values)
-            bare = [{parts[p][:depth] + parts[p][depth + 1 :] for p in side} for side in (one, two)]
-            if 2 * len(bare[0] & bare[1]) > len(bare[0] | bare[1]):
-                return one, two
-    known = set(stems.values())
-    longer = [
-        path
-        for path, stem in stems.items()
-        if (ending := re.search(r"[_\-. ]+[A-Za-z]+$", stem)) and stem[: ending.start()] in known
-    ]
-    if not longer or 3 * len(longer) < len(stems):
-        return None
-    return [path for path in stems if path not in set(longer)], longer
 
 
 def _several(files: Sequence[str]) -> bool:

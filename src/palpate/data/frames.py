@@ -19,18 +19,17 @@ from PIL import Image
 
 from palpate.core import PalpateError, atomic_path, inside, require_regular
 from palpate.data.contacts import SIZE, thumbnail
-from palpate.data.images import SUFFIXES, read_image
+from palpate.data.images import SUFFIXES, VIDEOS, read_image
+from palpate.data.manifest import DIGITS
 from palpate.data.stacks import SUFFIX, StackReader
 from palpate.data.video import VideoReader
 
 ImageFormat = Literal["jpg", "png"]
 IMAGE_FORMATS: tuple[str, ...] = ("jpg", "png")
+#: The typical frame of a recording is chosen from at most so many frames.
+MEDIAN_OF = 15
 #: Files that hold many frames.
-VIDEOS = (".mp4", ".mov", ".avi", ".mkv", ".m4v", ".webm")
 MOVING = (*VIDEOS, SUFFIX)
-#: Frames of a manifest have 64 bits; longer file names are no frame numbers.
-DIGITS = 18
-
 
 #: (n, 48, 64, 3) thumbnails and, of a video, (n,) seconds.
 Stream = tuple[NDArray[np.uint8], NDArray[np.float64] | None]
@@ -86,11 +85,7 @@ class FolderFrames:
         return ((k, np.asarray(read_image(self.path(k)))) for k in indices)
 
     def stream(self) -> Stream | None:
-        """Thumbnails of all frames; None if numbers are missing.
-
-        Raises:
-            PalpateError: if an image is unreadable.
-        """
+        """Thumbnails of all frames; None if numbers are missing."""
         if not self.numbers or self.numbers[-1] - self.numbers[0] >= len(self.numbers):
             return None
         small = (2 * SIZE[0], 2 * SIZE[1])
@@ -99,11 +94,7 @@ class FolderFrames:
 
 
 class VideoFrames:
-    """Frames of a video or stack, cached as images in ``cache``; as for folders, without links.
-
-    Raises:
-        PalpateError: if the video is cut short or unreadable.
-    """
+    """Frames of a video or stack, cached as images in ``cache``; as for folders, without links."""
 
     leaving: frozenset[int] = frozenset()
     duplicates: tuple[tuple[str, str], ...] = ()
@@ -126,20 +117,12 @@ class VideoFrames:
         return self.cache / f"{k:010d}.{self.suffix}"
 
     def read(self, indices: Iterable[int]) -> Iterator[tuple[int, NDArray[np.uint8]]]:
-        """Yield ``(k, (h, w, 3) image)``, decoding rising numbers in one pass.
-
-        Raises:
-            PalpateError: if the video breaks off.
-        """
+        """Yield ``(k, (h, w, 3) image)``, decoding rising numbers in one pass."""
         with reader_of(self.source) as reader:
             yield from reader.frames(indices)
 
     def stream(self) -> Stream:
-        """Thumbnails of all frames, and when each is presented, in seconds.
-
-        Raises:
-            PalpateError: if the video breaks off.
-        """
+        """Thumbnails of all frames, and when each is presented, in seconds."""
         with reader_of(self.source) as reader:
             return reader.thumbnails(SIZE), reader.seconds
 
@@ -163,11 +146,7 @@ Frames = FolderFrames | VideoFrames
 def streams_of(
     frames: Mapping[str, Frames],
 ) -> tuple[dict[str, NDArray[np.uint8]], dict[str, NDArray[np.float64]]]:
-    """Thumbnails of each modality without gaps, and the seconds of those that are videos.
-
-    Raises:
-        PalpateError: if one cannot be read to its end.
-    """
+    """Thumbnails of each modality without gaps, and the seconds of those that are videos."""
     streams = {modality: source.stream() for modality, source in frames.items()}
     there = {modality: stream for modality, stream in streams.items() if stream is not None}
     seconds = {modality: times for modality, (_, times) in there.items() if times is not None}
@@ -187,11 +166,7 @@ def save_frame(path: Path, image: NDArray[np.uint8], size: int | None) -> None:
 
 
 def nearest_to_median(images: Sequence[NDArray[np.uint8]], source: Path) -> int:
-    """Which of some frames (h, w, 3) has the least mean difference to their pixelwise median.
-
-    Raises:
-        PalpateError: if the frames of ``source`` differ in size.
-    """
+    """Which of some frames (h, w, 3) has the least mean difference to their pixelwise median."""
     if len({image.shape for image in images}) > 1:
         must = f"The frames in {source} must have one size"
         raise PalpateError(must, "several", "Extract them again from the video")

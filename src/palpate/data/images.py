@@ -41,6 +41,7 @@ from palpate.data.manifest import Manifest
 
 Check = Literal["decode", "header", "none"]
 SUFFIXES = (".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".webp")
+VIDEOS = (".mp4", ".mov", ".avi", ".mkv", ".m4v", ".webm")
 _CUT = (struct.error, zlib.error, Image.DecompressionBombError)
 #: What Pillow raises for files that are cut, empty, or no images.
 BROKEN = (OSError, SyntaxError, ValueError, EOFError, IndexError, TypeError, *_CUT)
@@ -97,19 +98,23 @@ def check_image(path: Path, how: Check = "decode") -> str | None:
     Args:
         path: the file.
         how: ``decode`` reads every byte (a JPEG at an eighth of its size, which detects truncation
-            as well), ``header`` reads the first bytes only, ``none`` checks that the file exists.
+            as well), ``header`` reads the first bytes only.
     """
     path = Path(path)
-    if how == "none":
-        return None if path.is_file() else "no such file"
     try:
-        with opened(path) as image:
-            if how == "decode":
-                image.draft("L", (max(1, image.width // 8), max(1, image.height // 8)))
-                image.load()
-            return None
+        form_of(path, how)
     except BROKEN as error:
         return _reason(path, error)
+    return None
+
+
+def form_of(source: Path | BinaryIO, how: Check) -> str:
+    """What Pillow calls the form of an image that is usable; raises one of ``BROKEN`` if not."""
+    with opened(source) as image:
+        if how == "decode":
+            image.draft("L", (max(1, image.width // 8), max(1, image.height // 8)))
+            image.load()
+        return str(image.format)
 
 
 def load_images(
@@ -121,14 +126,8 @@ def load_images(
 ) -> NDArray[np.uint8]:
     """Load images as one array; a path that occurs twice is decoded once.
 
-    Args:
-        paths: (n,) files.
-        size: side of the squares, in pixels.
-        progress: progress callback.
-        into: array to fill; default: a new one.
-
     Returns:
-        (n, size, size, 3), 0 to 255.
+        (n, size, size, 3), 0 to 255: ``into``, or a new array.
 
     Raises:
         ProblemsError: naming every unreadable file.
@@ -210,9 +209,6 @@ def image_stamp(manifest: Manifest, column: str) -> str:
     """Digest of the paths, file sizes and modification times of one image column.
 
     For keys of caches and checkpoints, which must not outlive the images they were made from.
-
-    Raises:
-        PalpateError: if a row has no such image.
     """
     paths = manifest.paths(column)
     stamps = {path: file_stamp(path) for path in dict.fromkeys(paths)}

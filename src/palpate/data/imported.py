@@ -167,28 +167,30 @@ def readable(facts: Facts) -> dict[str, Any]:
     return rows | {f"mean, std of {k}": f"{m}, {std}" for k, (m, std) in normalization.items()}
 
 
-def raise_if(problems: Sequence[Problem], skip_bad: bool) -> None:
-    """Raise all problems at once unless they are to be skipped.
+def splits_of(folder: Path) -> dict[str, Split]:
+    """The splits in the folder of an import, by name."""
+    return {path.stem: Split.load(path) for path in sorted(folder.glob("splits/*.json"))}
 
-    Raises:
-        ProblemsError: if there is a problem and not ``skip_bad``.
-    """
+
+def raise_if(problems: Sequence[Problem], skip_bad: bool) -> None:
+    """Raise all problems at once unless they are to be skipped."""
     if problems and not skip_bad:
         raise ProblemsError(problems, FIX, example={"skip_bad": True})
 
 
 def require_some(samples: int, source: object, skipped: Sequence[Problem]) -> None:
-    """Reject an import without samples.
-
-    Raises:
-        ProblemsError: with what was skipped, if that is why.
-        PalpateError: if nothing was skipped either.
-    """
+    """Reject an import without samples."""
     if samples == 0 and skipped:
         raise ProblemsError(skipped, "No sample is left without these: correct the data set")
     if samples == 0:
         must = f"{source} must hold at least one usable sample"
         raise PalpateError(must, "none", "Check the labels and the folder")
+
+
+def place_of(problem: Problem) -> tuple[str, int]:
+    """``file:line`` to sort problems by."""
+    name, _, line = problem.where.rpartition(":")
+    return (name, int(line)) if line.isdecimal() else (problem.where, 0)
 
 
 @contextmanager

@@ -13,8 +13,10 @@ from palpate.core import (
     Split,
     atomic_folder,
     digest_file,
+    few,
     locked,
     quiet,
+    require_choice,
     require_regular,
     write_text,
 )
@@ -34,8 +36,8 @@ from palpate.data.formats.videos import is_templated
 from palpate.data.images import Check
 from palpate.data.imported import Imported, Validation, removing_on_error, templates_of
 from palpate.data.listing import write_table
-from palpate.data.manifest import IMAGE_COLUMNS, SCHEMA, Manifest
-from palpate.data.texts import has_manifest, read_texts, reimported, with_texts
+from palpate.data.manifest import IMAGE_COLUMNS, SCHEMA, Manifest, is_manifest
+from palpate.data.texts import read_texts, reimported, with_texts
 
 #: All that an import writes.
 WRITTEN = {"manifest.parquet", "splits", "images"}
@@ -86,7 +88,7 @@ def import_dataset(
     common: dict[str, Any] = {"check": check, "progress": progress}
     texts = None if text is None else read_texts(Path(text))
     with locked(output), removing_on_error(output) as created:
-        if text is not None and format == "auto" and has_manifest(source):
+        if text is not None and format == "auto" and is_manifest(source):
             imported = reimported(source)
         else:
             into = Into(output, created, skip_bad)
@@ -131,7 +133,7 @@ def validate(
         must, fix = "must be a folder or a table on disk", "Write it, or see palpate.load"
         raise PalpateError(must, type(source).__name__, fix, argument="source")
     source, world = Path(source), world_facts(Path(source))
-    if format == "auto" and has_manifest(source) and not world:
+    if format == "auto" and is_manifest(source) and not world:
         name, (facts, scan) = "manifest", _of_import(source, options)
     else:
         name, form = recognized(source, format, options)
@@ -155,14 +157,10 @@ def _of_import(source: Path, options: Mapping[str, Any]) -> tuple[Facts, Scan]:
     given = {name: value for name, value in options.items() if value is not None} | {"root": None}
     if wrong := [name for name, value in given.items() if value is not None]:
         raise PalpateError("must be left out for a manifest", str(source), "", argument=wrong[0])
-    known: dict[str, Any] = {
-        k: manifest.facts[k] for k in ("license", "citation", "url") if k in manifest.facts
-    }
-    group = manifest.facts.get("group", "video")
-    name, count = manifest.facts.get("dataset", "an import"), f"{len(manifest)} in the manifest"
-    facts = Facts(
-        name=name, samples=count, group=f"the column {group}", group_column=group, **known
-    )
+    known: dict[str, Any] = {"name": manifest.facts.get("dataset", "an import")}
+    known |= {k: v for k, v in manifest.facts.items() if k in ("license", "citation", "url")}
+    group = f"the column {manifest.facts.get('group', 'video')}"
+    facts = Facts(samples=f"{len(manifest)} in the manifest", group=group, **known)
     rows = [
         (str(row["id"]), {c: cell for c, cell in row.items() if cell is not None})
         for row in manifest.table.iter_rows(named=True)
@@ -178,10 +176,6 @@ def write_lists(manifest: Manifest, split: Split, output: Path) -> list[Path]:
 
     Returns:
         The files written.
-
-    Raises:
-        PalpateError: if the split's ids are not in the manifest, or a sample lacks what the lists
-            need.
     """
     form = FORMATS.get(manifest.facts.get("format", ""))
     bare = "format" not in manifest.facts and not manifest.table["frame"].null_count()
@@ -210,14 +204,8 @@ def write_summed_lists(manifest: Manifest, split: Split, output: Path) -> list[s
 def recognized(
     source: Path, name: str = "auto", options: Mapping[str, Any] | None = None
 ) -> tuple[str, Format]:
-    """The named format, or the first that the source looks like; templates are of pairs or videos.
-
-    Raises:
-        PalpateError: if there is no source, no such format, or none that fits.
-    """
-    if name != "auto" and name not in FORMATS:
-        must = f"must be auto or one of {', '.join(FORMATS)}"
-        raise PalpateError(must, repr(name), "Choose one of these", argument="format")
+    """The named format, or the first that the source looks like; templates give pairs or videos."""
+    require_choice("format", name, ("auto", *FORMATS))
     require_regular(source)
     if not source.exists() and (name == "auto" or not FORMATS[name].remote):
         fix = "Check the path; a data set on the hub needs the format hf"
@@ -242,21 +230,15 @@ def scan_options(name: str, form: Format, options: dict[str, Any]) -> dict[str, 
     Raises:
         PalpateError: if an option does not belong to the format.
     """
-    names = inspect.signature(form.scan).parameters
-    return {key: value for key, value in _given(name, form, options).items() if key in names}
-
-
-def _given(name: str, form: Format, options: dict[str, Any]) -> dict[str, Any]:
-    """The options that were given, if all belong to the format; ``size`` may be without use."""
     given = {key: value for key, value in options.items() if value is not None}
-    if "size" not in form.options:
-        given.pop("size", None)
-    if unknown := sorted(set(given) - set(form.options)):
+    known = {*form.options, "size"}  # which may be without use
+    if unknown := sorted(set(given) - known):
         takes = ", ".join(k for k in form.options if k not in ("skip_bad", "check", "progress"))
         must, got = f"must be left out for the format {name}", repr(given[unknown[0]])
         fix = f"This format takes {takes or 'no options'}"
         raise PalpateError(must, got, fix, argument=unknown[0])
-    return given
+    names = inspect.signature(form.scan).parameters
+    return {key: value for key, value in given.items() if key in names}
 
 
 def _contents(source: Path) -> str:
@@ -264,5 +246,4 @@ def _contents(source: Path) -> str:
     if source.is_file():
         return f"the file {source.name}"
     names = sorted(p.name + "/" * p.is_dir() for p in source.iterdir())
-    more = " ..." if len(names) > 8 else ""
-    return f"a folder with {', '.join(names[:8])}{more}" if names else "an empty folder"
+    return f"a folder with {few(names)}" if names else "an empty folder"

@@ -14,12 +14,13 @@ from __future__ import annotations
 import csv
 import re
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import polars as pl
 
 from palpate.core import PalpateError, Problem, ProblemsError, write_text
+from palpate.data.imported import place_of
 from palpate.data.manifest import CLIMBS, SCHEMA, Manifest
 from palpate.data.tables import decoded, delimiter_of, lines_of
 
@@ -38,22 +39,16 @@ SPELLING = {"Ruber": "Rubber"}
 
 @dataclass(frozen=True)
 class FrameList:
-    """The rows of a list, or of several as one.
+    """The rows of a list, or of several as one."""
 
-    Attributes:
-        manifest: the usable rows in list order; image columns are null.
-        skipped: bad rows that were skipped.
-        inconclusive: number of rows with the label -1, skipped as well.
-        rows: the usable rows as a table ``source, line, id, video, frame, label, suffix``, in the
-            order of the manifest.
-        contact: table ``video, frame`` of every readable row, inconclusive ones included: all
-            frames in contact.
-    """
-
-    manifest: Manifest
-    skipped: list[Problem]
-    inconclusive: int
+    manifest: Manifest  # the usable rows in list order; image columns are null
+    skipped: list[Problem]  # bad rows that were skipped
+    inconclusive: int  # number of rows with the label -1, skipped as well
+    #: The usable rows as a table ``source, line, id, video, frame, label, suffix``, in the order of
+    #: the manifest.
     rows: pl.DataFrame
+    #: Table ``video, frame`` of every readable row, inconclusive ones included: all frames in
+    #: contact.
     contact: pl.DataFrame
 
 
@@ -69,15 +64,10 @@ def read_list(
         categories: label -> class name. Default: ``category_reference.txt`` next to the list if
             there is one, else a label stays as it is (``"3"``). With a table, a label that it lacks
             is a problem.
-
-    Raises:
-        PalpateError: if there is no such file.
-        ProblemsError: unless ``skip_bad``, with every bad line at once.
     """
-    table = Path(path).parent / "category_reference.txt"
-    if categories is None and table.is_file():
-        categories = read_categories(table)
-    return read_lists([path], root=table.parent, skip_bad=skip_bad, categories=categories)
+    root = Path(path).parent
+    categories = categories_in(root) if categories is None else categories
+    return read_lists([path], root=root, skip_bad=skip_bad, categories=categories)
 
 
 def read_lists(
@@ -89,22 +79,13 @@ def read_lists(
 ) -> FrameList:
     """Read several lists as one: frames in two of them are detected, contacts numbered together.
 
-    Args:
-        paths: the lists, in order.
-        root: root of the manifest.
-        skip_bad: as in :func:`read_list`.
-        categories: label -> class name, or None to keep the label as text.
-
-    Raises:
-        PalpateError: if a list is missing.
-        ProblemsError: unless ``skip_bad``.
+    Arguments as :func:`read_list`; labels without ``categories`` stay text.
     """
     problems: list[Problem] = []
     every = pl.concat([_parse(Path(path), problems) for path in paths])
     conclusive = every.filter(pl.col("label") != INCONCLUSIVE)
     rows = _without_duplicates(_with_known_labels(conclusive, categories, problems), problems)
-    order = {str(Path(path)): k for k, path in enumerate(paths)}
-    problems.sort(key=lambda p: _place(p, order))
+    problems.sort(key=place_of)
     if problems and not skip_bad:
         raise ProblemsError(problems, FIX, example={"skip_bad": True})
     names = contact_names(rows["video"], rows["frame"], rows["label"])
@@ -127,16 +108,10 @@ def contact_names(
     frames: Sequence[int] | pl.Series,
     labels: Sequence[object] | pl.Series | None,
 ) -> list[str]:
-    """The contact that each frame belongs to, in the order given.
+    """The contact ``video#0001`` that each frame belongs to, in the order given.
 
-    Args:
-        videos: (n,) names.
-        frames: (n,) integers, in any order.
-        labels: (n,) classes that a contact must not mix, or None.
-
-    Returns:
-        ``n`` names ``video#0001``; the numbers count the contacts of a video from 1 in the order of
-        frames.
+    The numbers count the contacts of a video from 1 in the order of frames. Frames are integers in
+    any order; ``labels`` are classes that a contact must not mix.
     """
     schema = {"video": pl.String, "frame": pl.Int64}
     table = pl.DataFrame({"video": videos, "frame": frames}, schema).with_row_index("row")
@@ -149,36 +124,12 @@ def contact_names(
     return named.sort("row")["contact"].to_list()
 
 
-def number_together(*manifests: Manifest) -> list[Manifest]:
-    """Number the contacts of several lists together, so that one name means one contact.
-
-    Manifests with a row that has no video or frame stay as they are.
-    """
-    if any(m.table["video"].null_count() or m.table["frame"].null_count() for m in manifests):
-        return list(manifests)
-    rows = pl.concat([m.table.select("video", "frame", "material") for m in manifests])
-    # A frame in two lists belongs to one contact.
-    distinct = rows.unique(["video", "frame"], maintain_order=True)
-    names = contact_names(distinct["video"], distinct["frame"], distinct["material"])
-    distinct = distinct.with_columns(contact=pl.Series(names, dtype=pl.String))
-    contacts = rows.join(distinct, on=["video", "frame"], how="left", maintain_order="left")
-    numbered: list[Manifest] = []
-    for m in manifests:
-        table = m.table.with_columns(contacts["contact"].head(len(m)))
-        contacts = contacts.slice(len(m))
-        numbered.append(replace(m, table=table))
-    return numbered
-
-
 def write_list(path: Path, rows: Iterable[tuple[str, int]]) -> None:
     """Write a frame list, atomically.
 
     Args:
         path: the file.
         rows: (sample id or path, label); an id without a suffix gets ``.jpg``.
-
-    Raises:
-        ProblemsError: if a row could not be read again.
     """
     lines: list[str] = []
     problems: list[Problem] = []
@@ -199,6 +150,12 @@ def write_table(path: Path, manifest: Manifest) -> Path:
     return path
 
 
+def categories_in(folder: Path) -> dict[int, str] | None:
+    """The classes of ``category_reference.txt``, if a folder has one."""
+    table = folder / "category_reference.txt"
+    return read_categories(table) if table.is_file() else None
+
+
 def read_categories(path: Path) -> dict[int, str]:
     """Read a table of classes: ``Name: id`` lines, or CSV of id and name in either order.
 
@@ -207,10 +164,6 @@ def read_categories(path: Path) -> dict[int, str]:
     Returns:
         id -> name, the inconclusive class (-1) included if it is listed; known misspellings are
         corrected.
-
-    Raises:
-        PalpateError: if the file is missing or names no class.
-        ProblemsError: on lines of another form and on ids that occur twice.
     """
     text = _text(path)
     names: dict[int, str] = {}
@@ -257,11 +210,7 @@ class FrameTable:
 
 
 def read_frame_table(path: Path) -> FrameTable:
-    """Read ``video/frame.jpg,words`` lines; the header ``frame,...`` is optional, so are quotes.
-
-    Raises:
-        PalpateError: if the file is missing.
-    """
+    """Read ``video/frame.jpg,words`` lines; the header ``frame,...`` is optional, so are quotes."""
     values: dict[tuple[str, int], str] = {}
     skipped: list[Problem] = []
     for number, line in enumerate(lines_of(_text(path)), 1):
@@ -368,9 +317,3 @@ def _without_duplicates(rows: pl.DataFrame, problems: list[Problem]) -> pl.DataF
             problems.append(Problem(places[k], kind, f"frame {frame} of {video!r} {text}"))
             drop.append(group["row"][k])
     return rows.filter(~pl.col("row").is_in(drop)).drop("row")
-
-
-def _place(problem: Problem, order: Mapping[str, int]) -> tuple[int, int]:
-    """Sort key: list, then line."""
-    name, _, line = problem.where.rpartition(":")
-    return (order[name], int(line)) if name in order else (order[problem.where], 0)

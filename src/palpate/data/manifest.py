@@ -28,7 +28,7 @@ from __future__ import annotations
 import io
 import os
 from collections.abc import Generator, Iterable, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, replace
 from functools import cache, cached_property
 from pathlib import Path
@@ -46,6 +46,7 @@ from palpate.core import (
     digest_lines,
     fact_lines,
     inside,
+    require_rows,
 )
 
 IMAGE_COLUMNS = ("vision", "tactile", "background")
@@ -61,6 +62,8 @@ FORMAT = "palpate-manifest/3"
 FORMAT_2 = "palpate-manifest/2"
 #: Prefix of the keys of facts in the metadata.
 FACT = "palpate.fact."
+#: Digits of a frame number, which has 64 bits; a longer one is none.
+DIGITS = 18
 #: Absolute paths, drive letters, and ``..`` as a component.
 CLIMBS = r"^[/\\]|^[A-Za-z]:[/\\]|(?:^|[/\\])\.\.(?:[/\\]|$)"
 
@@ -165,12 +168,8 @@ class Manifest:
         Raises:
             PalpateError: if an id is not in the manifest.
         """
-        row = {name: k for k, name in enumerate(self.ids)}
-        if missing := [i for i in ids if i not in row]:
-            must = "Every id of the split must be in the manifest"
-            got = f"{len(missing)} that are not, first {missing[0]!r}"
-            raise PalpateError(must, got, "Use the split made for this manifest")
-        return replace(self, table=self.table[[row[i] for i in ids]])
+        must, fix = "Every id of the split must be in the manifest", "Use the split made for it"
+        return replace(self, table=self.table[require_rows(self.ids, ids, must, fix)])
 
     def part(self, split: Split, *parts: str) -> Manifest:
         """The rows in the given parts of a split, in manifest order.
@@ -222,7 +221,7 @@ class Manifest:
         full = {n: os.path.realpath(self.path(row[n])) if row[n] else None for n in IMAGE_COLUMNS}
         return SampleRef(row["id"], row["video"], row["frame"], row["material"], **full)
 
-    def problems(self, *, files: bool = True) -> list[Problem]:
+    def problems(self) -> list[Problem]:
         """Everything wrong with the rows: bad ids, paths outside the root, missing files."""
         problems = [] if len(self) else [Problem("manifest", "empty", "there are no samples")]
         seen: dict[str, int] = {}
@@ -238,8 +237,7 @@ class Manifest:
             path = inside(self.root, value)
             if path is None:
                 return "outside-root", f"{value!r} leaves the root"
-            missing = files and not path.is_file()
-            return ("missing-file", f"no file {value!r}") if missing else None
+            return None if path.is_file() else ("missing-file", f"no file {value!r}")
 
         for name in IMAGE_COLUMNS:
             for line, value in enumerate(self.column(name), 1):
@@ -247,13 +245,13 @@ class Manifest:
                     problems.append(Problem(f"row {line}", *problem))
         return problems
 
-    def require_valid(self, *, files: bool = True) -> Manifest:
+    def require_valid(self) -> Manifest:
         """Return this manifest, if it has no problems.
 
         Raises:
             ProblemsError: with every problem at once.
         """
-        if problems := self.problems(files=files):
+        if problems := self.problems():
             raise ProblemsError(problems, "Correct the rows, or import again and skip the bad ones")
         return self
 
@@ -285,8 +283,8 @@ class Manifest:
         if not path.is_file():
             raise PalpateError("The manifest must exist", f"no file {path}", fix)
         try:
-            with open(path, "rb") as file, reading_parquet():
-                meta = pl.read_parquet_metadata(file)
+            meta = _metadata(path)
+            with reading_parquet():
                 table = pl.read_parquet(path, glob=False)  # a path may hold brackets
         except Exception as error:  # polars raises several kinds for a file that is not Parquet
             got = str(error).splitlines()[0]
@@ -325,6 +323,22 @@ def reading_parquet() -> Generator[None]:
         yield
     except pl.exceptions.PanicException as error:
         raise ValueError(str(error)) from None
+
+
+def is_manifest(path: Path) -> bool:
+    """Whether this is a manifest file or a folder that holds one."""
+    if path.is_dir():
+        return (path / "manifest.parquet").is_file()
+    if path.suffix.lower() != ".parquet" or not path.is_file():
+        return False
+    with suppress(Exception):  # polars raises several kinds for a file that is not Parquet
+        return _metadata(path).get("palpate.format", "").startswith("palpate-manifest/")
+    return False
+
+
+def _metadata(path: Path) -> dict[str, str]:
+    with open(path, "rb") as file, reading_parquet():
+        return pl.read_parquet_metadata(file)
 
 
 def write_parquet(

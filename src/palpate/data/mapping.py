@@ -22,17 +22,12 @@ FIX = "Use SQL functions on columns: substr, split_part, replace, regexp_replace
 
 @dataclass(frozen=True)
 class ColumnMaps:
-    """Manifest columns as expressions over the columns of a table.
+    """Manifest columns as expressions over the columns of a table."""
 
-    Attributes:
-        expressions: target -> expression, in an order in which each can be computed.
-        columns: columns of the table that they read.
-        texts: target -> the expression as it was written.
-    """
-
+    #: Target -> expression, in an order in which each can be computed.
     expressions: Mapping[str, pl.Expr]
-    columns: tuple[str, ...]
-    texts: Mapping[str, str]
+    columns: tuple[str, ...]  # columns of the table that they read
+    texts: Mapping[str, str]  # target -> the expression as it was written
 
     def source(self, target: str) -> str | None:
         """The column that a target is, if it is nothing but one."""
@@ -54,9 +49,6 @@ class ColumnMaps:
 
         Returns:
             Target -> (n,) texts: None where the expression is null, ``""`` where it is empty.
-
-        Raises:
-            PalpateError: if an expression cannot be computed.
         """
         computed: dict[str, list[str | None]] = {}
         for target, expression in self.expressions.items():

@@ -67,9 +67,6 @@ def read_names(path: Path, **options: Any) -> tuple[Manifest, list[Problem], Spl
     Returns:
         The samples, without images unless they are there; what is wrong with the list; and the
         split that it states. None if it is no such list.
-
-    Raises:
-        PalpateError: if an option does not fit the list.
     """
     if path.suffix.lower() not in TABLES or _is_interval(path):
         return _intervals(path) if _is_interval(path) else None
@@ -117,7 +114,7 @@ def name_together(
         for m in manifests
     ]
     if "HCT" in known:
-        sessions = hct.sessions_of({v for m in named for v in m.table["video"].drop_nulls()}, 60.0)
+        sessions = hct.sessions_of(v for m in named for v in m.table["video"].drop_nulls())
         session = pl.col("video").replace_strict(sessions, default=None, return_dtype=pl.String)
         named = [replace(m, table=m.table.with_columns(session=session)) for m in named]
     return named, "" if template else text

@@ -4,11 +4,9 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
-
-import polars as pl
 
 from palpate.core import PalpateError, Problem, Progress, quiet, require_choice, require_regular
 from palpate.data.formats import Format
@@ -17,7 +15,7 @@ from palpate.data.images import SUFFIXES
 from palpate.data.imported import raise_if, require_some
 from palpate.data.importing import recognized, scan_options
 from palpate.data.listing import LINE, read_list
-from palpate.data.manifest import IMAGE_COLUMNS, MODALITIES, SCHEMA, Manifest, reading_parquet
+from palpate.data.manifest import IMAGE_COLUMNS, MODALITIES, SCHEMA, Manifest, is_manifest
 from palpate.data.mapping import compile_maps
 from palpate.data.rows import manifest_rows, read_classes
 from palpate.data.tables import TABLES, Table, decoded, header_of, lines_of, open_table, table_of
@@ -55,9 +53,8 @@ def load(
         ProblemsError: with every bad row, unless ``skip_bad``.
     """
     imported = isinstance(source, str | Path) and is_manifest(Path(source))
-    if imported and (unknown := sorted(set(options) - {"root"})):
-        got = repr(options[unknown[0]])
-        raise PalpateError("must be left out for a manifest", got, "", argument=unknown[0])
+    if imported:
+        _require_left_out(options, {"root"}, "a manifest")
     options |= {"format": format, "skip_bad": skip_bad, "progress": progress}
     manifest, _ = read_samples(source, **options)
     without = not manifest.table["vision"].count() and not manifest.table["tactile"].count()
@@ -80,10 +77,6 @@ def read_samples(
 
     Returns:
         The samples, and what was skipped.
-
-    Raises:
-        PalpateError: if there is no such source, or it is nothing of these.
-        ProblemsError: with every bad row, unless ``skip_bad``.
     """
     options = {name: value for name, value in options.items() if value is not None}
     if isinstance(source, Manifest):
@@ -116,26 +109,8 @@ def read_samples(
     return _of_scan(scan, path, facts, skip_bad, progress)
 
 
-def is_manifest(path: Path) -> bool:
-    """Whether this is a manifest file or a folder that holds one."""
-    if path.is_dir():
-        return (path / "manifest.parquet").is_file()
-    if path.suffix.lower() != ".parquet" or not path.is_file():
-        return False
-    try:
-        with open(path, "rb") as file, reading_parquet():
-            metadata = pl.read_parquet_metadata(file)
-    except Exception:  # polars raises several kinds for a file that is not Parquet
-        return False
-    return metadata.get("palpate.format", "").startswith("palpate-manifest/")
-
-
 def is_image_files(source: Any) -> bool:
-    """Whether this is a list of image files.
-
-    Raises:
-        PalpateError: if only some of a list are.
-    """
+    """Whether this is a list of image files."""
     if not isinstance(source, list | tuple):
         return False
     images = [isinstance(p, str | Path) and Path(p).suffix.lower() in SUFFIXES for p in source]
@@ -151,6 +126,12 @@ def is_list(path: Path) -> bool:
         head = decoded(file.read(1 << 16))
     line = next((line.strip() for line in lines_of(head) if line.strip()), "")
     return re.match(LINE, line) is not None
+
+
+def _require_left_out(options: Mapping[str, Any], known: set[str], what: str) -> None:
+    """Raise for an option that a kind of source does not take."""
+    for name in sorted(set(options) - known):
+        raise PalpateError(f"must be left out for {what}", repr(options[name]), "", argument=name)
 
 
 def _scanned(form: Format, path: Path, options: dict[str, Any]) -> Scan:
@@ -169,9 +150,7 @@ def _of_images(
     files: Sequence[str | Path], skip_bad: bool, options: dict[str, Any]
 ) -> tuple[Manifest, list[Problem]]:
     """Samples of a list of image files: ids are paths, and declare nothing."""
-    if unknown := sorted(set(options) - {"side", "names"}):
-        must, got = "must be left out for a list of images", repr(options[unknown[0]])
-        raise PalpateError(must, got, "", argument=unknown[0])
+    _require_left_out(options, {"side", "names"}, "a list of images")
     paths = [Path(file).parent.resolve() / Path(file).name for file in files]
     root = Path(os.path.commonpath([path.parent for path in paths]))
     side, facts = options.get("side"), {"format": "files", "dataset": root.name}
@@ -187,9 +166,7 @@ def _of_table(
     table: Table, root: Path, skip_bad: bool, options: dict[str, Any]
 ) -> tuple[Manifest, list[Problem]]:
     """Samples of a data frame, or of a table without images."""
-    if unknown := sorted(set(options) - {"columns", "root", "classes"}):
-        must, got = "must be left out for a table", repr(options[unknown[0]])
-        raise PalpateError(must, got, "", argument=unknown[0])
+    _require_left_out(options, {"columns", "root", "classes"}, "a table")
     maps = compile_maps(options.get("columns", {}), table.names, [*SCHEMA, "split"])
     if not any(name in maps.expressions for name in NAMING):
         must = f"must have at least one of the columns {', '.join(NAMING)}"

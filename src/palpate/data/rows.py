@@ -84,12 +84,7 @@ def _make_integers(row: Row) -> Iterator[tuple[str, str]]:
 
 
 def read_classes(path: Path) -> dict[int, str]:
-    """Read a table of classes, as :func:`read_categories`.
-
-    Raises:
-        PalpateError: if the file is missing or names no class.
-        ProblemsError: with every line that is not a class.
-    """
+    """Read a table of classes, as :func:`read_categories`."""
     if not path.is_file():
         must, got = "must be a table of classes", f"no file {path}"
         raise PalpateError(must, got, "Check the path", argument="classes")

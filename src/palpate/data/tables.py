@@ -39,21 +39,13 @@ _Records = Callable[[Sequence[str]], Iterable[Record]]
 
 @dataclass
 class Table:
-    """A table whose columns are known and whose rows are read on request.
+    """A table whose columns are known and whose rows are read on request."""
 
-    Attributes:
-        name: the file, or how an in-memory table is called in messages.
-        names: its columns.
-        problems: what is wrong with its rows; complete after :meth:`read`.
-        records: from the requested columns to (line, cells).
-        lines: (rows,) line of each row that was read.
-    """
-
-    name: str
-    names: list[str]
-    problems: list[Problem]
-    records: _Records
-    lines: list[int] = field(default_factory=list)
+    name: str  # the file, or how an in-memory table is called in messages
+    names: list[str]  # its columns
+    problems: list[Problem]  # what is wrong with its rows; complete after :meth:`read`
+    records: _Records  # from the requested columns to (line, cells)
+    lines: list[int] = field(default_factory=list)  # (rows,) line of each row that was read
 
     def read(self, columns: Sequence[str]) -> pl.DataFrame:
         """Read the rows.
@@ -61,10 +53,6 @@ class Table:
         Returns:
             (rows) with the requested columns as texts, null where empty, and the column ``LINE``.
             Bad rows are skipped and join ``problems``.
-
-        Raises:
-            PalpateError: if a column occurs twice in the header, or does not hold texts and
-                numbers.
         """
         if double := [name for name in columns if self.names.count(name) > 1]:
             must = f"Columns of {self.name} must have different names"
@@ -166,6 +154,15 @@ def decoded(data: bytes) -> str:
 def lines_of(text: str) -> list[str]:
     """The lines of a text by any of the ends LF, CR LF and CR, and by no other sign."""
     return text.replace("\r\n", "\n").replace("\r", "\n").split("\n")
+
+
+def csv_text(header: Sequence[str], rows: Iterable[Sequence[object]]) -> str:
+    """CSV with a header and bare line feeds; None is an empty cell."""
+    text = io.StringIO(newline="")
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(header)
+    writer.writerows(rows)
+    return text.getvalue()
 
 
 def _unfit(cells: Sequence[Any], columns: Sequence[str]) -> tuple[str, str] | None:
@@ -286,10 +283,8 @@ def _of_frame(
         for column in columns:
             kind = schema[column]
             if kind.is_nested() or kind.base_type() in (pl.Binary, pl.Object):
-                must, got = (
-                    f"Columns of {name} must hold texts or numbers",
-                    f"{column} of type {kind}",
-                )
+                must = f"Columns of {name} must hold texts or numbers"
+                got = f"{column} of type {kind}"
                 fix = "For images inside the table use the format hf on its folder"
                 raise PalpateError(must, got, fix)
         yield from enumerate(read(columns).iter_rows(), 1)

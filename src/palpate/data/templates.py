@@ -23,15 +23,13 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from palpate.core import PalpateError, Problem
-from palpate.data.manifest import CLIMBS, IMAGE_COLUMNS
+from palpate.data.manifest import CLIMBS, DIGITS, IMAGE_COLUMNS
 
 _TOKEN = re.compile(
     r"(?<![^/])(?:\*\*|\{(?P<deep>\w+):\*\*\})(?P<end>/|$)"
     r"|\{(?P<field>\w+)(?::(?P<spec>[^{}]*))?\}|(?P<star>\*+)|(?P<literal>[^{}*]+)|(?P<wrong>.)"
 )
 FIX = "Write fields as {object}, {frame:d} or {video:**}, and * for what does not matter"
-#: The frames of a manifest have 64 bits, so a longer number is none.
-_DIGITS = "[0-9]{1,18}"
 #: Field -> value, in the order of the template.
 Fields = dict[str, str]
 #: (path below the root, fields) of the files that match, in the order of the walk.
@@ -40,21 +38,13 @@ Matches = Sequence[tuple[str, Fields]]
 
 @dataclass(frozen=True)
 class Template:
-    """A path with fields; see the module.
+    """A path with fields; see the module."""
 
-    Attributes:
-        text: as it was written.
-        fields: names in the order of the path.
-        digits: those that are numbers.
-        pattern: of a whole path below the root.
-        letters: how many characters stand for themselves.
-    """
-
-    text: str
-    fields: tuple[str, ...]
-    digits: frozenset[str]
-    pattern: re.Pattern[str]
-    letters: int
+    text: str  # as it was written
+    fields: tuple[str, ...]  # names in the order of the path
+    digits: frozenset[str]  # those that are numbers
+    pattern: re.Pattern[str]  # of a whole path below the root
+    letters: int  # how many characters stand for themselves
 
     @classmethod
     def parse(cls, text: str, argument: str | None = None) -> Template:
@@ -126,7 +116,7 @@ def _piece(token: re.Match[str], name: str | None, spec: str, *, loose: bool) ->
         return "[^/]*"
     group = f"(?P<{name}>" if name else "(?:"
     if spec == "d":
-        return f"{'(?<![0-9])' * loose}{group}{_DIGITS})(?![0-9])"
+        return f"{'(?<![0-9])' * loose}{group}[0-9]{{1,{DIGITS}}})(?![0-9])"
     if token["end"] is None:
         return f"{group}[^/]+)"
     return f"(?:{group}.+)/)?" if token["end"] else f"{group}.+)"
@@ -134,10 +124,6 @@ def _piece(token: re.Match[str], name: str | None, spec: str, *, loose: bool) ->
 
 def walk(root: Path, suffixes: tuple[str, ...] = ("",)) -> tuple[list[str], list[str]]:
     """All files below a folder, in the order of their names; hidden ones are skipped.
-
-    Args:
-        root: the folder.
-        suffixes: of the files, in lower case.
 
     Returns:
         Paths below the root, and links to folders outside it, which are not followed; other links
@@ -188,9 +174,6 @@ def join(
 
     Returns:
         Rows with all fields and the path of each column, and what has no partner or too many.
-
-    Raises:
-        PalpateError: if two sides of several files share no field.
     """
     (first, matches), *others = sides.items()
     rows = [fields | {first: path} for path, fields in matches]

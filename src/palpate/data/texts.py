@@ -12,9 +12,9 @@ from pathlib import Path
 
 import polars as pl
 
-from palpate.core import PalpateError, Problem, ProblemsError, Split, digest_lines, short
+from palpate.core import PalpateError, Problem, ProblemsError, digest_lines, short
 from palpate.data.images import file_digest
-from palpate.data.imported import Imported
+from palpate.data.imported import Imported, splits_of
 from palpate.data.manifest import Manifest, write_parquet
 from palpate.data.tables import open_table
 
@@ -27,18 +27,12 @@ WITNESSES = 64
 
 @dataclass(frozen=True)
 class Texts:
-    """Texts by sample id.
+    """Texts by sample id."""
 
-    Attributes:
-        of: id -> text, only where there is one.
-        ids: all ids of the table.
-        source: where they come from, with a digest: kept in manifests and in models.
-        images: :func:`image_digests` of the samples that they were made for.
-    """
-
-    of: dict[str, str]
-    ids: frozenset[str]
-    source: str
+    of: dict[str, str]  # id -> text, only where there is one
+    ids: frozenset[str]  # all ids of the table
+    source: str  # where they come from, with a digest: kept in manifests and in models
+    #: :func:`image_digests` of the samples that they were made for.
     images: Mapping[str, str] = field(default_factory=dict)
 
 
@@ -103,16 +97,11 @@ def read_texts(path: Path) -> Texts:
 
 
 def joined(manifest: Manifest, texts: Texts, where: Path, *, keep: bool = True) -> Manifest:
-    """The same samples with texts from a table.
-
-    Args:
-        manifest: the samples.
-        texts: by id.
-        where: the table, for the error.
-        keep: samples without a text there keep theirs.
+    """The same samples with texts by id; with ``keep`` samples without one keep theirs.
 
     Raises:
-        PalpateError: if the table has none of the samples, or was made for others of their names.
+        PalpateError: if the table ``where`` has none of the samples, or was made for others of
+            their names.
     """
     ids, must, fix = manifest.ids, "The texts must be of these samples", "Use those made for them"
     if texts.ids.isdisjoint(ids):
@@ -129,11 +118,7 @@ def joined(manifest: Manifest, texts: Texts, where: Path, *, keep: bool = True) 
 
 
 def with_texts(imported: Imported, texts: Texts, where: Path) -> Imported:
-    """An import with texts from a table; samples without one there keep theirs.
-
-    Raises:
-        PalpateError: as :func:`joined`.
-    """
+    """An import with texts from a table; samples without one there keep theirs."""
     manifest = joined(imported.manifest, texts, where)
     suspicious = list(imported.suspicious)
     if absent := [name for name in manifest.ids if name not in texts.of]:
@@ -146,13 +131,7 @@ def with_texts(imported: Imported, texts: Texts, where: Path) -> Imported:
     return replace(imported, manifest=manifest, splits=splits, suspicious=suspicious)
 
 
-def has_manifest(source: Path) -> bool:
-    """Whether a source is an import: a manifest, or the folder that holds one."""
-    return source.name == "manifest.parquet" or (source / "manifest.parquet").is_file()
-
-
 def reimported(source: Path) -> Imported:
     """An import that is there already, with its splits."""
     folder = source if source.is_dir() else source.parent
-    splits = {path.stem: Split.load(path) for path in sorted((folder / "splits").glob("*.json"))}
-    return Imported(Manifest.load(folder), splits=splits)
+    return Imported(Manifest.load(source), splits=splits_of(folder))

@@ -82,11 +82,7 @@ class VideoReader:
         return self._last[1]
 
     def frames(self, indices: Iterable[int]) -> Iterator[tuple[int, NDArray[np.uint8]]]:
-        """Yield ``(k, (h, w, 3) image)`` as given; rising numbers are decoded in one pass.
-
-        Raises:
-            PalpateError: as for a single frame.
-        """
+        """Yield ``(k, (h, w, 3) image)`` as given; rising numbers are decoded in one pass."""
         for k in indices:
             yield k, self[k]
 
@@ -96,11 +92,7 @@ class VideoReader:
         return np.asarray(self._pts) * float(self._stream.time_base or 1)
 
     def thumbnails(self, size: tuple[int, int]) -> NDArray[np.uint8]:
-        """All frames, reduced to (width, height) while they are decoded: (n, height, width, 3).
-
-        Raises:
-            PalpateError: if the video breaks off.
-        """
+        """All frames, reduced to (width, height) while they are decoded: (n, height, width, 3)."""
         from av.video.reformatter import Interpolation, VideoReformatter
 
         images = np.empty((len(self), size[1], size[0], 3), np.uint8)

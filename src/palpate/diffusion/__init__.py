@@ -11,15 +11,17 @@ from typing import TYPE_CHECKING
 from palpate._lazy import import_name
 
 if TYPE_CHECKING:
+    from palpate.diffusion.autoencoders import train_autoencoder
     from palpate.diffusion.generation import Generated, generate
     from palpate.diffusion.pipeline import TactilePipeline
     from palpate.diffusion.training import train_generator
 
-__all__ = ["Generated", "TactilePipeline", "generate", "train_generator"]
+__all__ = ["Generated", "TactilePipeline", "generate", "train_autoencoder", "train_generator"]
 _MODULES = {
     "Generated": "generation",
     "TactilePipeline": "pipeline",
     "generate": "generation",
+    "train_autoencoder": "autoencoders",
     "train_generator": "training",
 }
 

@@ -1,13 +1,20 @@
-"""The frozen VQ autoencoder: z = E(x), x_hat = D(z) (paper section 2).
+"""The frozen autoencoder: z = E(x), x_hat = D(z) (paper section 2).
 
-A diffusers ``VQModel`` in its own folder format, so that any VQModel (e.g. latent diffusion's
-``vq-f4``) loads as it is. *Encode* gives the latents before quantization, *decode* quantizes first:
-the semantics of latent diffusion's ``VQModelInterface``.
+:class:`Autoencoder` is one of two kinds of diffusers models, in their own folder format or from a
+file of latent diffusion (:mod:`palpate.diffusion.compvis`):
+
+- ``VQModel`` (e.g. ``vq-f4``): *encode* gives the latents before quantization, *decode* quantizes
+  first: the semantics of latent diffusion's ``VQModelInterface``. Its ``scaling_factor`` is not
+  used, as there.
+- ``AutoencoderKL`` (e.g. Stable Diffusion's ``kl-f8``): *encode* gives the mode of the posterior,
+  ``z = scaling_factor (mode - shift_factor)``, as Stable Diffusion's denoiser sees it; *decode*
+  inverts this.
+
+:class:`BackgroundAutoencoder` is ours: it is given the gel without contact, and codes the rest.
 
 A patch stem makes a small model fast: patches of ``patch`` x ``patch`` pixels become channels
 (pixel unshuffle) before the first convolution, so that the whole network runs at latent resolution.
-``patch`` is recorded in ``palpate.json`` next to the VQModel; a folder without that file has patch
-1.
+``patch`` is recorded in ``palpate.json`` next to the model; a folder without that file has patch 1.
 
 The denoiser sees latents normalized by the statistics of the training part:
 
@@ -18,83 +25,125 @@ from __future__ import annotations
 
 import logging
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any, Literal, cast
 
 import numpy as np
 import torch
+from diffusers.configuration_utils import ConfigMixin, register_to_config
+from diffusers.models.autoencoders.autoencoder_kl import AutoencoderKL
 from diffusers.models.autoencoders.vq_model import VQModel
+from diffusers.models.modeling_utils import ModelMixin
 from diffusers.utils import logging as diffusers_logging
 from numpy.typing import NDArray
 from torch import Tensor, nn
-from torch.nn.functional import pixel_shuffle, pixel_unshuffle
+from torch.nn.functional import pixel_shuffle, pixel_unshuffle, silu
 
-from palpate.core import PalpateError, digest_json, read_record, write_json
+from palpate.core import PalpateError, digest_file, digest_json, read_json, read_record, write_json
+from palpate.diffusion.compvis import read_compvis
 from palpate.encoders.models import (
     architecture,
     digest_tensors,
     find_single,
+    is_hub_id,
+    is_shipped,
     load_model,
     round_to_half,
     save_model,
+    stated,
 )
 from palpate.encoders.preprocess import to_unit
 from palpate.training.cards import write_model_cards
 
 FORMAT = "palpate-autoencoder/1"
-FIX = "Name a shipped model, a folder with config.json and plain weights, or a hub id within reach"
+FIX = (
+    "Name a shipped model, a .ckpt of latent diffusion, a folder with config.json and plain "
+    "weights, or a hub id within reach"
+)
+FILES = (".ckpt", ".safetensors")
+KINDS: dict[str, Any] = {"VQModel": VQModel, "AutoencoderKL": AutoencoderKL}
+#: Where the autoencoder lies in the folders of whole generators.
+WITHIN = ("vae", "vqvae", "autoencoder")
 
 # diffusers announces its fallbacks (no accelerate here) at each load.
 diffusers_logging.set_verbosity(logging.ERROR)
 
 
 class Autoencoder(nn.Module):
-    """A VQModel with an optional patch stem.
+    """A VQModel or AutoencoderKL with an optional patch stem.
 
     Attributes:
-        vq: the diffusers model.
+        net: the diffusers model.
         patch: side of the pixel patches that become channels (1: none).
         card: JSON facts about how it was trained and how well it reconstructs.
     """
 
-    def __init__(self, vq: VQModel, patch: int = 1, card: dict[str, Any] | None = None) -> None:
+    def __init__(
+        self, net: VQModel | AutoencoderKL, patch: int = 1, card: dict[str, Any] | None = None
+    ) -> None:
         super().__init__()
-        self.vq, self.patch, self.card = vq, patch, card or {}
-        channels = (vq.config["in_channels"], vq.config["out_channels"])
+        self.net, self.patch, self.card = net, patch, card or {}
+        channels = (net.config["in_channels"], net.config["out_channels"])
         if channels != (3 * patch**2, 3 * patch**2):
-            must = f"A VQModel with patch {patch} must have {3 * patch**2} channels in and out"
+            must = f"An autoencoder with patch {patch} must have {3 * patch**2} channels in and out"
             fix = "Set patch in palpate.json to the one it was trained with"
             raise PalpateError(must, f"{channels[0]} and {channels[1]}", fix)
 
     @property
     def factor(self) -> int:
         """Pixels of the image that a latent position covers, along one side."""
-        return self.patch * 2 ** (len(self.vq.config["block_out_channels"]) - 1)
+        return self.patch * 2 ** (len(self.net.config["block_out_channels"]) - 1)
 
     @property
     def channels(self) -> int:
         """Channels of the latents."""
-        return int(self.vq.config["vq_embed_dim"] or self.vq.config["latent_channels"])
+        config = self.net.config
+        return int(config.get("vq_embed_dim") or config["latent_channels"])
+
+    @property
+    def codebook(self) -> int | None:
+        """Entries of the codebook; None without one."""
+        size = self.net.config.get("num_vq_embeddings")
+        return None if size is None else int(size)
 
     @property
     def digest(self) -> str:
         """SHA-256 of patch, architecture and weights."""
-        weights = digest_tensors(self.vq.state_dict())
-        return digest_json([self.patch, architecture(self.vq.config), weights])
+        weights = digest_tensors(self.net.state_dict())
+        return digest_json([self.patch, architecture(self.net.config), weights])
 
     def latents(self, unit: Tensor) -> Tensor:
         """Encode images (n, 3, h, w) in [-1, 1] to unquantized latents (n, c, h / f, w / f)."""
-        patches = pixel_unshuffle(unit, self.patch)
-        return cast("Tensor", self.vq.encode(patches, return_dict=False)[0])
+        encoded: Any = self.net.encode(pixel_unshuffle(unit, self.patch), return_dict=False)[0]
+        if isinstance(self.net, VQModel):
+            return cast("Tensor", encoded)
+        scale, shift = self._scale
+        return scale * (encoded.mode() - shift)
 
     def image(self, latents: Tensor, *, quantize: bool = True) -> tuple[Tensor, Tensor]:
-        """Decode latents to images (n, 3, h, w) near [-1, 1]; return them and the codebook loss."""
-        decoded: Any = self.vq.decode(latents, force_not_quantize=not quantize, return_dict=False)
-        return pixel_shuffle(decoded[0], self.patch), decoded[1]
+        """Decode latents to images (n, 3, h, w) near [-1, 1]; return them and the codebook loss.
 
-    def codes(self, latents: Tensor) -> Tensor:
-        """Return the index of the nearest code at each position, int64 (n, h, w)."""
-        _, _, (_, _, index) = self.vq.quantize(latents)
+        Without a codebook the loss is 0 and ``quantize`` has no meaning.
+        """
+        decode: Any = self.net.decode
+        if isinstance(self.net, VQModel):
+            made, loss = decode(latents, force_not_quantize=not quantize, return_dict=False)
+        else:
+            scale, shift = self._scale
+            (made,), loss = decode(latents / scale + shift, return_dict=False), torch.zeros(())
+        return pixel_shuffle(made, self.patch), loss
+
+    @property
+    def _scale(self) -> tuple[float, float]:
+        """Factor and shift of the latents of a KL autoencoder."""
+        return self.net.config["scaling_factor"], self.net.config.get("shift_factor") or 0.0
+
+    def codes(self, latents: Tensor) -> Tensor | None:
+        """Return the index of the nearest code at each position, int64 (n, h, w), if any."""
+        if not isinstance(self.net, VQModel):
+            return None
+        _, _, (_, _, index) = self.net.quantize(latents)
         return index.reshape(latents.shape[0], *latents.shape[2:])
 
     @torch.no_grad()
@@ -120,7 +169,7 @@ class Autoencoder(nn.Module):
 
     @torch.no_grad()
     def decode(self, latents: Tensor, batch: int = 32) -> NDArray[np.uint8]:
-        """Latents (n, c, h, w), quantized first -> bytes (n, f h, f w, 3)."""
+        """Latents (n, c, h, w), quantized first if it has codes -> bytes (n, f h, f w, 3)."""
         device = next(self.parameters()).device
         height, width = (self.factor * side for side in latents.shape[2:])
         parts = [np.empty((0, height, width, 3), np.uint8)]
@@ -130,10 +179,10 @@ class Autoencoder(nn.Module):
 
     def halve(self) -> float:
         """Round all weights to 16 bits in place; see ``models.round_to_half``."""
-        return round_to_half({"vq": self.vq})
+        return round_to_half({"net": self.net})
 
     def save(self, folder: Path, *, half: bool = False) -> None:
-        """Write the VQModel, ``palpate.json`` and ``README.md``.
+        """Write the diffusers model, ``palpate.json`` and ``README.md``.
 
         Args:
             folder: is created.
@@ -144,39 +193,261 @@ class Autoencoder(nn.Module):
         """
         if half:
             self.halve()
-        save_model(self.vq, folder, half=half)
+        save_model(self.net, folder, half=half)
         about = {"format": FORMAT, "patch": self.patch, "digest": self.digest, "card": self.card}
         write_json(Path(folder) / "palpate.json", about)
         write_model_cards(Path(folder))
 
     @classmethod
     def load(cls, source: str | Path) -> Autoencoder:
-        """Load a shipped autoencoder (``palpate/mini``), a VQModel folder, or a hub id.
+        """Load a shipped autoencoder (``palpate/mini``), a folder, a hub id, or a file.
 
-        safetensors are preferred; an old ``.bin`` is read as weights only. Weights are float32 in
+        A folder (a hub id) is that of a VQModel or AutoencoderKL, or holds one as ``vae``,
+        ``vqvae`` or ``autoencoder``; safetensors are preferred, an old ``.bin`` is read as weights
+        only. For a file see :func:`~palpate.diffusion.compvis.read_compvis`. Weights are float32 in
         memory.
 
         Raises:
-            PalpateError: if there is no VQModel, it does not match its ``palpate.json``, or the hub
-                is out of reach.
+            PalpateError: if there is no such model, it does not match its ``palpate.json``, or the
+                hub is out of reach.
         """
-        name, folder = find_single(source, "autoencoder", "autoencoder", FIX)
-        must = f"The autoencoder {source} must be a diffusers VQModel"
-        options = {"low_cpu_mem_usage": False, "local_files_only": name == str(folder)}
-        vq = load_model(VQModel, name, must, FIX, **options)
+        if not is_shipped(source) and Path(source).is_file():
+            path = Path(source)
+            origin = {"file": path.name, "sha256": digest_file(path)}
+            return cls(read_compvis(path), card=_foreign(path.name, origin, "unknown")).eval()
+        if Path(source).suffix in FILES:  # `weights/vq-f4.ckpt` has the form of a hub id
+            raise PalpateError(f"The file {source} must exist", "no such file", "Check the path")
+        name, root = find_single(source, "autoencoder", "autoencoder", FIX, WITHIN)
+        places = ("", *WITHIN)
+        inside = next((p for p in places if (root / p / "config.json").is_file()), "")
+        folder = root / inside
+        config = folder / "config.json"
+        about = read_json(config, "configuration of a model") if config.is_file() else {}
+        kind = about.get("_class_name") if isinstance(about, dict) else None
+        must = f"The autoencoder {source} must be a diffusers {' or '.join(KINDS)}"
+        if kind not in KINDS:
+            raise PalpateError(must, f"{kind or 'no'} model in {config.name}", FIX)
+        options = {"low_cpu_mem_usage": False, "local_files_only": name == str(root)}
+        net = load_model(KINDS[kind], name, must, FIX, subfolder=inside or None, **options)
         note = folder / "palpate.json"
         if not note.is_file():
-            return cls(vq).eval()
+            called = str(source) if is_hub_id(source) else root.resolve().name
+            return cls(net, card=_foreign(called, called, stated(root)["license"])).eval()
         keys = ("patch", "digest", "card")
         about = read_record(note, "autoencoder card", form=FORMAT, keys=keys)
         if not isinstance(about["patch"], int) or about["patch"] < 1:
             must, fix = f"patch in {note} must be a whole number from 1", "Copy the folder again"
             raise PalpateError(must, repr(about["patch"]), fix)
-        model = cls(vq, about["patch"], about["card"]).eval()
+        model = cls(net, about["patch"], about["card"]).eval()
         if model.digest != about["digest"]:
             must, fix = f"The weights in {source} must match palpate.json", "Copy the folder again"
             raise PalpateError(must, "other weights", fix)
         return model
+
+
+def _foreign(name: str, source: Any, terms: str) -> dict[str, Any]:
+    """The card of an autoencoder that others trained."""
+    return {"title": f"Autoencoder {name}, trained by others", "license": terms, "source": source}
+
+
+#: Rows: luma, red - blue, green - magenta; orthonormal.
+OPPONENT = [[3**-0.5] * 3, [2**-0.5, 0.0, -(2**-0.5)], [6**-0.5, -2 * 6**-0.5, 6**-0.5]]
+
+
+class _Residual(nn.Module):
+    """x + conv(silu(conv(silu(x)))); the identity at first."""
+
+    def __init__(self, width: int) -> None:
+        super().__init__()
+        self.first = nn.Conv2d(width, width, 3, padding=1)
+        self.last = nn.Conv2d(width, width, 3, padding=1)
+        nn.init.zeros_(self.last.weight)
+        nn.init.zeros_(self.last.bias)  # pyright: ignore[reportArgumentType]
+
+    def forward(self, x: Tensor) -> Tensor:
+        """(n, width, h, w) -> (n, width, h, w)."""
+        return x + self.last(silu(self.first(silu(x))))
+
+
+class BackgroundAutoencoder(ModelMixin, ConfigMixin):
+    """Codes the difference between a tactile image x and its gel without contact, b.
+
+        z = E(x - b, b);   x_hat = b + D(z, b)
+
+    Markers, gel color and lighting are given to both networks, so the latent holds the contact
+    alone. In the paper, a variant whose *denoiser* is conditioned on the background scores worse
+    (w/ BG). Here the background is the reference that an image is coded against.
+
+    Colors are turned into luma and two opponents (an orthonormal basis): x - b is divided by its
+    spread over the training part, b is standardized over the gels. There is no codebook, no KL
+    term, no normalization layer and no attention; sides may be any multiple of 4.
+
+    Attributes:
+        factor: pixels of the image that a latent position covers, along one side.
+        card: JSON facts about how it was trained and how well it reconstructs.
+        spread: standard deviation of each color of x - b over the training part (3, 1, 1).
+        mean, std: of each color of b over the gels (3, 1, 1).
+    """
+
+    factor = 4
+    colors: Tensor
+    spread: Tensor
+    mean: Tensor
+    std: Tensor
+
+    @register_to_config
+    def __init__(self, channels: int = 8, narrow: int = 48, wide: int = 96) -> None:
+        super().__init__()
+        self.card: dict[str, Any] = {}
+        conv = partial(nn.Conv2d, kernel_size=3, padding=1)
+        self.encode_fine = nn.Sequential(
+            nn.PixelUnshuffle(2), conv(24, narrow), _Residual(narrow), nn.SiLU()
+        )
+        self.encode_coarse = nn.Sequential(
+            nn.Conv2d(narrow, wide, 4, 2, 1),
+            _Residual(wide),
+            _Residual(wide),
+            nn.SiLU(),
+            conv(wide, channels),
+        )
+        self.background_fine = nn.Sequential(
+            nn.PixelUnshuffle(2), conv(12, narrow), _Residual(narrow), nn.SiLU()
+        )
+        self.background_coarse = nn.Conv2d(narrow, wide, 4, 2, 1)
+        self.decode_in = conv(channels, wide)
+        self.decode_coarse = nn.Sequential(
+            *(_Residual(wide) for _ in range(3)),
+            nn.SiLU(),
+            conv(wide, 4 * narrow),
+            nn.PixelShuffle(2),
+        )
+        self.mix = nn.Conv2d(2 * narrow, narrow, 1)
+        self.decode_fine = nn.Sequential(
+            _Residual(narrow), _Residual(narrow), nn.SiLU(), conv(narrow, 12), nn.PixelShuffle(2)
+        )
+        self.register_buffer("colors", torch.tensor(OPPONENT))
+        for name, fill in (("spread", 16.0), ("mean", 0.0), ("std", 64.0)):
+            self.register_buffer(name, torch.full((3, 1, 1), fill))
+
+    @property
+    def channels(self) -> int:
+        """Channels of the latents."""
+        return int(self.config["channels"])
+
+    @property
+    def digest(self) -> str:
+        """SHA-256 of the weights."""
+        return digest_tensors(self.state_dict())
+
+    def inputs(self, images: Tensor, background: Tensor) -> tuple[Tensor, Tensor]:
+        """Gray levels (n, 3, h, w) -> scaled colors of x - b, and of b."""
+        residual = self._turned(images.float() - background) / self.spread
+        return residual, (self._turned(background.float()) - self.mean) / self.std
+
+    def latents(self, residual: Tensor, background: Tensor) -> Tensor:
+        """Scaled colors -> latents (n, c, h / 4, w / 4)."""
+        return self.encode_coarse(self.encode_fine(torch.cat([residual, background], 1)))
+
+    def residual(self, latents: Tensor, background: Tensor) -> Tensor:
+        """Latents and scaled colors of b -> scaled colors of x - b (n, 3, h, w)."""
+        fine = self.background_fine(background)
+        coarse = self.decode_coarse(self.decode_in(latents) + self.background_coarse(fine))
+        return self.decode_fine(self.mix(torch.cat([coarse, fine], 1)))
+
+    @torch.no_grad()
+    def encode(
+        self, images: NDArray[np.uint8], background: NDArray[np.uint8], batch: int = 32
+    ) -> Tensor:
+        """Encode bytes (n, h, w, 3) and their gels to float32 latents on the CPU."""
+        parts = [
+            torch.empty(0, self.channels, *(side // self.factor for side in images.shape[1:3]))
+        ]
+        for start in range(0, len(images), batch):
+            rows = slice(start, start + batch)
+            pairs = self.inputs(*(_gray(a[rows], self.device) for a in (images, background)))
+            parts.append(self.latents(*pairs).float().cpu())
+        return torch.cat(parts)
+
+    @torch.no_grad()
+    def decode(
+        self, latents: Tensor, background: NDArray[np.uint8], batch: int = 32
+    ) -> NDArray[np.uint8]:
+        """Latents (n, c, h, w) on gels (n, f h, f w, 3) -> bytes (n, f h, f w, 3)."""
+        parts = [np.empty((0, *background.shape[1:]), np.uint8)]
+        for start in range(0, len(latents), batch):
+            gray = _gray(background[start : start + batch], self.device)
+            made = self.residual(
+                latents[start : start + batch].to(gray), self.inputs(gray, gray)[1]
+            )
+            back = torch.einsum("ij,nihw->njhw", self.colors, made.float() * self.spread)
+            parts.append(to_bytes((gray + back) / 127.5 - 1))
+        return np.concatenate(parts)
+
+    @torch.no_grad()
+    def gel(self, background: NDArray[np.uint8]) -> Tensor:
+        """What a denoiser is shown of gels (n, h, w, 3): every pixel of a position as a channel.
+
+        Returns:
+            float32 (n, 48, h / 4, w / 4) on the CPU.
+        """
+        gray = _gray(background, self.device)
+        return pixel_unshuffle(self.inputs(gray, gray)[1], self.factor).cpu()
+
+    def halve(self) -> float:
+        """Round all weights to 16 bits in place; see ``models.round_to_half``."""
+        return round_to_half({"autoencoder": self})
+
+    def save(self, folder: Path, *, half: bool = False) -> None:
+        """Write the model in diffusers' format, ``palpate.json`` and ``README.md``."""
+        if half:
+            self.halve()
+        save_model(self, folder, half=half)
+        about = {"format": FORMAT, "digest": self.digest, "card": self.card}
+        write_json(Path(folder) / "palpate.json", about)
+        write_model_cards(Path(folder))
+
+    @torch.no_grad()
+    def measure(self, images: NDArray[np.uint8], background: NDArray[np.uint8]) -> None:
+        """Set the buffers from up to 1,000 training images, evenly spread."""
+        rows = np.linspace(0, len(images) - 1, min(len(images), 1000)).astype(int)
+        x, b = (self._turned(_gray(a[rows], self.device)) for a in (images, background))
+        self.mean.copy_(b.mean((0, 2, 3))[:, None, None])
+        self.spread.copy_((x - b).std((0, 2, 3)).clamp(min=1.0)[:, None, None])
+        self.std.copy_(b.std((0, 2, 3)).clamp(min=1.0)[:, None, None])
+
+    def _turned(self, gray: Tensor) -> Tensor:
+        return torch.einsum("ij,njhw->nihw", self.colors, gray)
+
+
+def _gray(images: NDArray[np.uint8], device: torch.device) -> Tensor:
+    return torch.from_numpy(np.array(images)).to(device).permute(0, 3, 1, 2).float()
+
+
+AnyAutoencoder = Autoencoder | BackgroundAutoencoder
+
+
+def load_autoencoder(source: str | Path) -> AnyAutoencoder:
+    """Load an autoencoder of any kind: a shipped name, a folder, a file or a hub id.
+
+    Raises:
+        PalpateError: if it is none, or does not match its ``palpate.json``.
+    """
+    if Path(source).is_file():
+        return Autoencoder.load(source)
+    name, folder = find_single(source, "autoencoder", "autoencoder", FIX)
+    config = folder / "config.json"
+    kind = read_json(config, "configuration").get("_class_name") if config.is_file() else None
+    if kind != BackgroundAutoencoder.__name__:
+        return Autoencoder.load(source)
+    must = f"The autoencoder {source} must be as palpate writes it"
+    options = {"low_cpu_mem_usage": False, "local_files_only": name == str(folder)}
+    model = load_model(BackgroundAutoencoder, name, must, FIX, strict=True, **options)
+    about = read_record(folder / "palpate.json", "autoencoder card", form=FORMAT, keys=("digest",))
+    if model.digest != about["digest"]:
+        must, fix = f"The weights in {source} must match palpate.json", "Copy the folder again"
+        raise PalpateError(must, "other weights", fix)
+    model.card = about.get("card", {})
+    return model
 
 
 @dataclass(frozen=True)

@@ -17,8 +17,10 @@ image: trained on crops alone, whole images come out too dark.
 
 from __future__ import annotations
 
+import copy
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
+from typing import cast
 
 import numpy as np
 import torch
@@ -28,7 +30,7 @@ from scipy.spatial import KDTree
 from torch import Tensor, nn
 
 from palpate.core import PalpateError, Progress, digest_json, quiet, rng_for
-from palpate.diffusion.autoencoder import Autoencoder, to_bytes
+from palpate.diffusion.autoencoder import Autoencoder, BackgroundAutoencoder, to_bytes
 from palpate.diffusion.options import AutoencoderOptions
 from palpate.encoders.encoder_set import seeded
 from palpate.encoders.preprocess import to_unit
@@ -65,6 +67,7 @@ def train_autoencoder(
     options: AutoencoderOptions,
     folder: Path,
     *,
+    start: Autoencoder | None = None,
     held_out: NDArray[np.uint8] | None = None,
     seed: int = 0,
     key: str = "",
@@ -78,6 +81,7 @@ def train_autoencoder(
         images: bytes (n, h, w, 3), an array or a memory map: the train part alone.
         options: see :class:`AutoencoderOptions`.
         folder: for checkpoints.
+        start: fine-tune a copy of this one, in its own shape: the last stage alone.
         held_out: bytes (m, h, w, 3) of other videos; the card then says how well they are
             reconstructed, and some are drawn with each checkpoint.
         seed: of weights, order, crops and noise.
@@ -95,8 +99,9 @@ def train_autoencoder(
         must, got = f"must be a multiple of {factor} that fits into the images", f"{side}"
         raise PalpateError(must, got, "Choose another", argument="crop")
     with seeded(seed, "autoencoder"):
-        model = build_autoencoder(options).to(device)
-    key = digest_json([key, asdict(options), seed])
+        model = copy.deepcopy(start) if start is not None else build_autoencoder(options)
+    model.requires_grad_(True).to(device)
+    key = digest_json([key, asdict(options), seed, *([] if start is None else [start.digest])])
     free = LoopOptions(options.steps_free, options.batch, options.lr, weight_decay=1e-4, seed=seed)
     last = replace(free, steps=options.steps_quantized, lr=options.lr / 2)
 
@@ -113,10 +118,12 @@ def train_autoencoder(
         task = Task(what, len(images), loss.load, loss, key, samples=draw)
         fit(model, task, course, folder / stage, compute=compute, progress=progress)
 
-    run("autoencoder", free, "free", quantize=False)
-    _set_codebook(model, images, options, seed)
+    if start is None:
+        run("autoencoder", free, "free", quantize=False)
+        _set_codebook(model, images, options, seed)
     run("codebook", last, "quantized", quantize=True)
     model.card = {"options": asdict(options), "seed": seed, "images": len(images), "key": key}
+    model.card |= {} if start is None else {"start": start.digest}
     if held_out is not None and len(held_out):
         model.card["held_out"] = asdict(measure_reconstruction(model, held_out))
     return model.eval().requires_grad_(False)
@@ -184,7 +191,8 @@ def _set_codebook(
     chosen = np.sort(rng.choice(len(images), size=min(len(images), count), replace=False))
     latents = model.encode(images[chosen]).permute(0, 2, 3, 1).reshape(-1, model.channels)
     centers = k_means(latents.double().numpy(), options.codes, rng)
-    model.vq.quantize.embedding.weight.data.copy_(torch.from_numpy(centers))
+    assert isinstance(model.net, VQModel)
+    model.net.quantize.embedding.weight.data.copy_(torch.from_numpy(centers))
 
 
 def k_means(
@@ -222,9 +230,9 @@ class Reconstruction:
     Attributes:
         n: images.
         psnr: mean over images of 10 log10(1 / MSE), values in [0, 1].
-        psnr_free: the same without quantization.
         ssim: mean structural similarity (Wang et al. 2004: Gaussian window of 11, sigma 1.5, range
             1).
+        psnr_free: ``psnr`` without quantization; this and the next three are None without codes.
         perplexity: exp of the entropy of the codes used; at most the number of codes.
         dead: codes never used on these images.
         codes: entries of the codebook.
@@ -232,35 +240,45 @@ class Reconstruction:
 
     n: int
     psnr: float
-    psnr_free: float
     ssim: float
-    perplexity: float
-    dead: int
-    codes: int
+    psnr_free: float | None = None
+    perplexity: float | None = None
+    dead: int | None = None
+    codes: int | None = None
 
 
 @torch.no_grad()
 def measure_reconstruction(
-    autoencoder: Autoencoder, images: NDArray[np.uint8], batch: int = 64
+    autoencoder: Autoencoder | BackgroundAutoencoder,
+    images: NDArray[np.uint8],
+    background: NDArray[np.uint8] | None = None,
+    batch: int = 64,
 ) -> Reconstruction:
-    """Score reconstructions of bytes (n, h, w, 3), a batch at a time."""
-    device = next(autoencoder.parameters()).device
-    codes = int(autoencoder.vq.config["num_vq_embeddings"])
-    counts = np.zeros(codes, dtype=np.int64)
+    """Score reconstructions of bytes (n, h, w, 3), a batch at a time.
+
+    ``background`` holds the gel of each image, for an autoencoder that is given them.
+    """
+    codes = autoencoder.codebook if isinstance(autoencoder, Autoencoder) else None
+    counts = np.zeros(codes or 0, dtype=np.int64)
     rows: list[NDArray[np.float64]] = []
     for start in range(0, len(images), batch):
-        pixels = np.asarray(images[start : start + batch])
-        z = autoencoder.latents(to_unit(pixels, device, signed=True))
+        part = slice(start, start + batch)
+        pixels = np.asarray(images[part])
+        gels = () if background is None else (background[part],)
+        z = autoencoder.encode(pixels, *gels, batch=batch)
         # Rounded to bytes first: what is scored is the image that a user gets.
-        made, free = (to_bytes(autoencoder.image(z, quantize=q)[0]) for q in (True, False))
-        scored = [
-            per_image("PSNR", made, pixels),
-            per_image("PSNR", free, pixels),
-            per_image("SSIM", made, pixels),
-        ]
+        made = autoencoder.decode(z, *gels, batch=batch)
+        scored = [per_image("PSNR", made, pixels), per_image("SSIM", made, pixels)]
+        if codes is not None and isinstance(autoencoder, Autoencoder):
+            z = z.to(next(autoencoder.parameters()).device)
+            free = to_bytes(autoencoder.image(z, quantize=False)[0])
+            scored.append(per_image("PSNR", free, pixels))
+            index = cast("Tensor", autoencoder.codes(z))
+            counts += np.bincount(index.flatten().cpu().numpy(), minlength=codes)
         rows.append(np.stack([score.values for score in scored]))
-        counts += np.bincount(autoencoder.codes(z).flatten().cpu().numpy(), minlength=codes)
+    psnr, ssim, *free = map(float, np.concatenate(rows, axis=1).mean(axis=1))
+    if codes is None:
+        return Reconstruction(len(images), psnr, ssim)
     share = counts[counts > 0] / counts.sum()
-    psnr, psnr_free, ssim = map(float, np.concatenate(rows, axis=1).mean(axis=1))
     perplexity, dead = float(np.exp(-(share * np.log(share)).sum())), int((counts == 0).sum())
-    return Reconstruction(len(images), psnr, psnr_free, ssim, perplexity, dead, codes)
+    return Reconstruction(len(images), psnr, ssim, free[0], perplexity, dead, codes)

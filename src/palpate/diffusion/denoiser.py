@@ -7,13 +7,19 @@ fit into the same slot (paper section 2; section 9, "token type"):
 
 with m_source = 0 (``gap="none"``, the paper's reading) or the mean of that modality on the train
 part (``"mean-shift"``, which closes the constant part of the gap between text and vision
-embeddings). The unconditional token of classifier-free guidance is all zeros, or learned. All of
-this is part of the checkpoint.
+embeddings). ``"memory"`` also keeps the training texts, and projects a photo that takes the place
+of a text on them. The unconditional token of classifier-free guidance is all zeros, or learned.
+All of this is part of the checkpoint.
+
+The words of a text and the patches of a photo may follow as tokens, through a trained matrix. The
+baseline GVST (``source="resnet"``) has no embedding: its tokens are the map that a residual
+network, part of the denoiser, makes of the photo.
 
 With ``UNetOptions.modulate`` the token is also added, through two layers, to the embedding of the
 time step, which shifts every residual block. That is not in the paper; a small network trains
 faster with it than with cross-attention to one token. The paper's variant with background ("w/ BG")
-concatenates the latent of the no-contact image to the noisy latent along channels.
+concatenates the latent of the no-contact image to the noisy latent along channels; behind an
+autoencoder that is given the gel anyway, its pixels.
 """
 
 from __future__ import annotations
@@ -23,21 +29,32 @@ from pathlib import Path
 from typing import Any, cast
 
 import torch
+from diffusers.models.autoencoders.vae import Encoder
 from diffusers.models.unets.unet_2d_condition import UNet2DConditionModel
 from safetensors.torch import load_file, save_file
 from torch import Tensor, nn
 
-from palpate.core import PalpateError, atomic_path
-from palpate.diffusion.options import SOURCES, ConditionPolicy, Source, UNetOptions
-from palpate.encoders.models import UNREADABLE, first_line, load_model, round_to_half, save_model
+from palpate.core import PalpateError, atomic_path, require, require_regular
+from palpate.diffusion.options import PHOTO_TOKENS, SOURCES, ConditionPolicy, Source, UNetOptions
+from palpate.encoders.models import (
+    UNREADABLE,
+    find_single,
+    first_line,
+    is_hub_id,
+    load_model,
+    round_to_half,
+    save_model,
+)
+
+FIX_UNET = "Pass a folder or hub id, e.g. of Stable Diffusion 1.5"
 
 
 def build_unet(
-    options: UNetOptions, *, channels: int, size: int, width: int, background: bool
+    options: UNetOptions, policy: ConditionPolicy, *, channels: int, size: int, background: int = 0
 ) -> UNet2DConditionModel:
-    """Build an untrained U-Net for latents (channels, size, size) and tokens of ``width``.
+    """Build an untrained U-Net for latents (channels, size, size) and the tokens of a policy.
 
-    With ``background`` it takes twice the channels: noisy latent, then background latent.
+    ``background`` channels of the no-contact image follow those of the noisy latent.
     """
     down = ["CrossAttnDownBlock2D" if a else "DownBlock2D" for a in options.attention]
     up = ["CrossAttnUpBlock2D" if a else "UpBlock2D" for a in reversed(options.attention)]
@@ -45,22 +62,134 @@ def build_unet(
     heads: Any = tuple(max(1, w // options.head_width) for w in options.widths)
     return UNet2DConditionModel(
         sample_size=size,
-        in_channels=channels * (2 if background else 1),
+        in_channels=channels + background,
         out_channels=channels,
         down_block_types=tuple(down),
         up_block_types=tuple(up),
         block_out_channels=options.widths,
         layers_per_block=options.layers,
-        cross_attention_dim=width,
+        cross_attention_dim=policy.width,
         norm_num_groups=options.groups,
         class_embed_type="projection" if options.modulate else None,
-        projection_class_embeddings_input_dim=width if options.modulate else None,
+        projection_class_embeddings_input_dim=(
+            max(1, slots_of(policy)) * policy.width if options.modulate else None
+        ),
         attention_head_dim=heads,
     )
 
 
+def slots_of(policy: ConditionPolicy) -> int:
+    """Embeddings that a sample is conditioned on at once: text and photo, one, or none."""
+    return {"both": 2, "resnet": 0}.get(policy.source, 1)
+
+
+def repeats_of(policy: ConditionPolicy) -> int:
+    """Copies of an embedding that go into the denoiser: k, or one that k are made of."""
+    return 1 if policy.learned else policy.tokens
+
+
+def inputs_of(policy: ConditionPolicy) -> tuple[str, ...]:
+    """What else tokens are made of: ``photos``, or ``words`` and ``patches``."""
+    if policy.source == "resnet":
+        return ("photos",)
+    counts = {"words": (policy.words, "text"), "patches": (policy.patches, "vision")}
+    known = {name: policy.source in ("mixed", "both", s) for name, (_, s) in counts.items()}
+    return tuple(name for name, (count, _) in counts.items() if count and known[name])
+
+
+def lengths_of(policy: ConditionPolicy) -> tuple[int, ...]:
+    """Tokens of each embedding, then of each input."""
+    tokens = {"photos": PHOTO_TOKENS, "words": policy.words, "patches": policy.patches}
+    each = tuple(tokens[name] for name in inputs_of(policy))
+    return (repeats_of(policy),) * slots_of(policy) + each
+
+
+def find_unet(source: str | Path) -> tuple[str, Path, str]:
+    """Return what ``from_pretrained`` takes, the folder of ``config.json``, and its subfolder.
+
+    Args:
+        source: a folder or hub id of a U-Net, or of a generator that has one as ``unet``.
+
+    Raises:
+        PalpateError: if there is none, or the hub is out of reach.
+    """
+    name, root = find_single(source, "generator", "U-Net", FIX_UNET, ("unet",))
+    inside = "" if (root / "config.json").is_file() else "unet"
+    if not (root / inside / "config.json").is_file():
+        raise PalpateError(f"{source} must hold a U-Net of diffusers", "no config.json", FIX_UNET)
+    return name, root / inside, inside
+
+
+def load_unet(
+    source: str | Path, policy: ConditionPolicy, *, channels: int, background: int = 0
+) -> UNet2DConditionModel:
+    """Load a trained U-Net to go on from; channels of the no-contact image begin with no effect.
+
+    Raises:
+        PalpateError: if it is none of diffusers, or made for other latents or tokens.
+    """
+    name, root, inside = find_unet(source)
+    must = f"{source} must hold a UNet2DConditionModel of diffusers"
+    options: dict[str, Any] = {
+        "subfolder": inside or None,
+        "local_files_only": not is_hub_id(source),
+    }
+    options |= {"low_cpu_mem_usage": False, "strict": True}
+    unet = load_model(UNet2DConditionModel, name, must, FIX_UNET, **options)
+    known, config = channels + background, unet.config
+    must = f"must have {config['out_channels']} latent channels, as the U-Net"
+    require(channels == config["out_channels"], "autoencoder", must, channels)
+    must = f"must give embeddings of width {config['cross_attention_dim']}, as the U-Net knows"
+    require(policy.width == config["cross_attention_dim"], "clip", must, policy.width)
+    plain = config["class_embed_type"] is None and config["in_channels"] == channels
+    require(plain, "unet", "must see latents and tokens alone", root.name)
+    if background:
+        first, wide = unet.conv_in, nn.Conv2d(known, unet.conv_in.out_channels, 3, padding=1)
+        nn.init.zeros_(wide.weight)
+        wide.weight.data[:, :channels], wide.bias = first.weight.data, first.bias
+        unet.conv_in = wide
+        unet.register_to_config(in_channels=known)
+    return unet.requires_grad_(True)
+
+
+class PhotoMap(nn.Module):
+    """Makes 8 x 8 tokens of a photo: the residual encoder of diffusers' autoencoders.
+
+    It has group normalization, by which the rows of a batch do not see each other.
+    """
+
+    def __init__(self, policy: ConditionPolicy) -> None:
+        super().__init__()
+        # Half the size by the stem, and again by each level but the last.
+        levels = (policy.photo_size // 8).bit_length() - 1
+        self.net = Encoder(
+            in_channels=12,
+            out_channels=policy.width,
+            down_block_types=("DownEncoderBlock2D",) * levels,
+            block_out_channels=tuple(policy.photo_width * min(8, 2**k) for k in range(levels)),
+            norm_num_groups=min(32, policy.photo_width // 4),
+            double_z=False,
+            mid_block_add_attention=False,
+        )
+        self.norm = nn.LayerNorm(policy.width, elementwise_affine=False)
+
+    def forward(self, photos: Tensor) -> Tensor:
+        """Bytes (n, size, size, 3) -> tokens (n, 64, d) with the entries of an embedding's."""
+        x = nn.functional.pixel_unshuffle(photos.permute(0, 3, 1, 2) / 127.5 - 1, 2)
+        return self.norm(self.net(x).flatten(2).transpose(1, 2))
+
+
+def _state_map(name: str, width: int, out: int) -> nn.Module:
+    """Map states to tokens; those of words begin as they are, as pretrained networks know them."""
+    linear = nn.Linear(width, out)
+    if width == out:
+        nn.init.eye_(linear.weight)
+        nn.init.zeros_(linear.bias)
+    return nn.Sequential(nn.LayerNorm(width) if name == "patches" else nn.Identity(), linear)
+
+
 class Denoiser(nn.Module):
-    """U-Net, condition policy, the modality means and the unconditional token.
+    """U-Net, condition policy, and what makes tokens of a sample's condition.
 
     Attributes:
         unet: the diffusers model.
@@ -69,17 +198,29 @@ class Denoiser(nn.Module):
     """
 
     means: Tensor
+    memory: Tensor
 
     def __init__(
         self,
         unet: UNet2DConditionModel,
         policy: ConditionPolicy,
         means: Mapping[Source, Tensor] | None = None,
+        memory: Tensor | None = None,
+        widths: Mapping[str, int] | None = None,
     ) -> None:
-        """Take, for ``gap="mean-shift"``, the training mean (d,) of each source as ``means``."""
+        """Take what the policy's ``gap`` needs.
+
+        Args:
+            unet: the network.
+            policy: how embeddings become tokens.
+            means: the training mean (d,) of each source.
+            memory: embeddings (m, d) of the training texts.
+            widths: of the states of words and patches; default: that of the embeddings.
+        """
         super().__init__()
         self.unet, self.policy = unet, policy
-        self.background = unet.config["in_channels"] == 2 * unet.config["out_channels"]
+        self.slots, self.repeats = slots_of(policy), repeats_of(policy)
+        self.background = unet.config["in_channels"] > unet.config["out_channels"]
         # A source without a mean is marked by NaN, and raises when it is used.
         fill = 0.0 if policy.gap == "none" else float("nan")
         known = means if means is not None and policy.gap != "none" else {}
@@ -87,6 +228,21 @@ class Denoiser(nn.Module):
         self.register_buffer("means", torch.stack(rows))
         learned = policy.null == "learned"
         self.null = nn.Parameter(0.02 * torch.randn(policy.width)) if learned else None
+        self.expand = (
+            nn.Linear(policy.width, policy.tokens * policy.width)
+            if policy.learned and slots_of(policy)
+            else None
+        )
+        self.guide: Any = None  # an alignment, in training alone
+        self.maps = nn.ModuleDict()
+        for name in inputs_of(policy):
+            width = (widths or {}).get(name, policy.width)
+            photos = name == "photos"
+            self.maps[name] = PhotoMap(policy) if photos else _state_map(name, width, policy.width)
+        if policy.gap == "memory":
+            kept = torch.zeros(1, policy.width)  # until load() fills it
+            kept = kept if memory is None else self._unit(memory, "text")
+            self.register_buffer("memory", kept)
 
     @property
     def channels(self) -> int:
@@ -98,12 +254,86 @@ class Denoiser(nn.Module):
         """Where the weights are."""
         return self.means.device
 
+    @property
+    def dtype(self) -> torch.dtype:
+        """The type that the U-Net computes in; tokens and latents are float32."""
+        return next(self.unet.parameters()).dtype
+
     def tokens(self, conditions: Tensor, source: Source) -> Tensor:
-        """Embeddings (n, d) of one source -> tokens (n, k, d).
+        """Embeddings (n, d) of one source -> tokens (n, k, d) of one slot.
 
         Raises:
             PalpateError: for another width, or a source whose training mean is unknown.
         """
+        unit = self._unit(conditions.to(self.device), source)
+        if source == "vision" and self.policy.gap == "memory" and self.slots == 1:
+            unit = self.project(unit)
+        return self._repeated(unit)
+
+    def condition(
+        self, photos: Tensor | None, texts: Tensor | None = None, weight: float = 0.5
+    ) -> Tensor:
+        """The tokens (n, slots k, d) of samples described by photos, by texts, or by both.
+
+        Args:
+            photos: embeddings (n, d), with tokens of their patches (n, 1 + p, d), of GVST tokens
+                (n, 64, d), or None.
+            texts: embeddings (n, d), with tokens of their words (n, 1 + w, d), or None; at least
+                one of the two.
+            weight: with both, the share of the photo where the two take one place.
+
+        Raises:
+            PalpateError: for another width, an unknown mean, or texts without a place.
+        """
+        if "photos" in self.maps:
+            return self._map(photos, texts)
+        photo, of_photo = self._split(photos, "vision")
+        text, of_text = self._split(texts, "text")
+        place = photo if self.slots == 1 else None  # of two slots the photo has its own
+        if photo is not None and self.policy.gap == "memory":
+            place = self.project(photo)
+        if text is not None:
+            mixed = text if place is None else weight * place + (1 - weight) * text
+            place = nn.functional.normalize(mixed, dim=1)
+        null = self.null_tokens(1)
+        slots = (place,) if self.slots == 1 else (place, photo)
+        n = len(next(e for e in (photo, text) if e is not None))
+        parts = [None if e is None else self._repeated(e) for e in slots]
+        parts += [{"words": of_text, "patches": of_photo}[name] for name in inputs_of(self.policy)]
+        lengths = zip(parts, lengths_of(self.policy), strict=True)
+        given = [null[:, :k].expand(n, -1, -1) if p is None else p for p, k in lengths]
+        return torch.cat(given, dim=1)
+
+    def _split(
+        self, conditions: Tensor | None, source: Source
+    ) -> tuple[Tensor | None, Tensor | None]:
+        """Unit embeddings (n, d), and the tokens behind them if there are any."""
+        if conditions is None:
+            return None, None
+        conditions = conditions.to(self.device)
+        if conditions.ndim == 2:
+            return self._unit(conditions, source), None
+        return self._unit(conditions[:, 0], source), conditions[:, 1:]
+
+    def _map(self, photos: Tensor | None, texts: Tensor | None) -> Tensor:
+        shape = (PHOTO_TOKENS, self.policy.width)
+        if texts is not None or photos is None:
+            must, fix = "must be left out for a generator that knows photos alone", "Pass a photo"
+            raise PalpateError(must, "a text", fix, argument="text")
+        if photos.shape[1:] != shape:
+            must, got = f"must be tokens of shape (n, {shape[0]}, {shape[1]})", f"{photos.shape}"
+            raise PalpateError(must, got, "Use the pipeline's embed", argument="conditions")
+        return photos.to(self.device)
+
+    def project(self, photos: Tensor) -> Tensor:
+        """Unit embeddings of photos (n, d) -> unit means of the training texts nearest to them."""
+        parts = [
+            torch.softmax(rows @ self.memory.T / self.policy.tau, dim=1) @ self.memory
+            for rows in photos.split(1024)
+        ]
+        return nn.functional.normalize(torch.cat(parts), dim=1)
+
+    def _unit(self, conditions: Tensor, source: Source) -> Tensor:
         width = self.policy.width
         if conditions.ndim != 2 or conditions.shape[1] != width:
             must, got = f"must be embeddings of shape (n, {width})", str(tuple(conditions.shape))
@@ -111,16 +341,18 @@ class Denoiser(nn.Module):
             raise PalpateError(must, got, fix, argument="conditions")
         mean = self.means[SOURCES.index(source)]
         if not torch.isfinite(mean).all():
-            must = f"gap='mean-shift' needs the training mean of {source} embeddings"
+            must = f"gap={self.policy.gap!r} needs the training mean of {source} embeddings"
             fix = f"Give training the {source} embeddings too"
             raise PalpateError(must, "a checkpoint without it", fix)
-        centered = conditions.to(self.device, torch.float32) - mean
-        token = nn.functional.normalize(centered, dim=1) * width**0.5
-        return token.unsqueeze(1).expand(-1, self.policy.tokens, -1)
+        return nn.functional.normalize(conditions.float() - mean.to(conditions.device), dim=1)
+
+    def _repeated(self, unit: Tensor) -> Tensor:
+        token = unit * self.policy.width**0.5
+        return token.unsqueeze(1).expand(-1, self.repeats, -1)
 
     def null_tokens(self, n: int) -> Tensor:
-        """The unconditional tokens (n, k, d)."""
-        shape = (n, self.policy.tokens, self.policy.width)
+        """The unconditional tokens (n, k, d): of all embeddings and inputs."""
+        shape = (n, sum(lengths_of(self.policy)), self.policy.width)
         return (
             torch.zeros(shape, device=self.device) if self.null is None else self.null.expand(shape)
         )
@@ -128,36 +360,48 @@ class Denoiser(nn.Module):
     def forward(
         self, x: Tensor, t: Tensor, tokens: Tensor, background: Tensor | None = None
     ) -> Tensor:
-        """The network's output (n, c, h, w): noise, or v where the schedule says so.
+        """The network's output (n, c, h, w): noise, v or velocity, as the schedule says.
 
         Args:
             x: noisy normalized latents (n, c, h, w).
-            t: steps, int64 (n,) in 0..T-1 (the paper's 1..T).
-            tokens: (n, k, d).
-            background: normalized latents of the no-contact images (n, c, h, w), for the variant w/
-                BG.
+            t: steps (n,) in 0..T-1 (the paper's 1..T).
+            tokens: (n, k, d), of all embeddings and inputs.
+            background: of the no-contact images (n, g, h, w), for the variant w/ BG.
         """
         x = x if background is None else torch.cat([x, background], dim=1)
-        first = tokens[:, 0] if self.unet.config["class_embed_type"] == "projection" else None
-        options: Any = {"encoder_hidden_states": tokens, "class_labels": first}
-        return cast("Tensor", self.unet(x, t, return_dict=False, **options)[0])
+        first = None
+        vectors, states = tokens.tensor_split([self.slots * self.repeats], dim=1)
+        if self.unet.config["class_embed_type"] == "projection":
+            first = vectors[:, :: self.repeats] if self.slots else states.mean(1, keepdim=True)
+            first = first.flatten(1)
+        if self.expand is not None:
+            vectors = self.expand(vectors).reshape(len(x), -1, self.policy.width)
+            tokens = torch.cat([vectors, states], dim=1)
+        kind = self.dtype
+        options: Any = {"encoder_hidden_states": tokens.to(kind)}
+        options["class_labels"] = None if first is None else first.to(kind)
+        return cast("Tensor", self.unet(x.to(kind), t, return_dict=False, **options)[0]).float()
 
     def halve(self) -> float:
-        """Round the U-Net's weights to 16 bits in place; see ``models.round_to_half``."""
+        """Round the U-Net's weights and the training texts to 16 bits in place."""
+        if self.policy.gap == "memory":
+            self.memory.copy_(self.memory.half())
         return round_to_half({"unet": self.unet})
 
     def save(self, folder: Path, *, half: bool = False) -> None:
-        """Write the U-Net and ``condition.safetensors`` (means, learned token).
+        """Write the U-Net and ``condition.safetensors`` (means, texts, learned parts).
 
-        With ``half``, :meth:`halve` first (this object too), and the U-Net's weights are 16-bit;
-        the few others stay float32.
+        With ``half``, :meth:`halve` first (this object too), and the U-Net's weights and the texts
+        are 16-bit; the few others stay float32.
         """
         if half:
             self.halve()
         save_model(self.unet, folder, half=half)
-        extra = {"means": self.means} | ({} if self.null is None else {"null": self.null.detach()})
+        extra = {k: v for k, v in self.state_dict().items() if not k.startswith("unet.")}
+        if half and "memory" in extra:
+            extra["memory"] = extra["memory"].half()
         with atomic_path(Path(folder) / "condition.safetensors") as part:
-            save_file({k: v.cpu().contiguous() for k, v in extra.items()}, part)
+            save_file({k: v.detach().cpu().contiguous() for k, v in extra.items()}, part)
 
     @classmethod
     def load(cls, folder: Path, policy: ConditionPolicy) -> Denoiser:
@@ -168,12 +412,19 @@ class Denoiser(nn.Module):
         """
         must, fix = f"The denoiser {folder} must be as palpate writes it", "Copy the folder again"
         options = {"low_cpu_mem_usage": False, "use_safetensors": True, "local_files_only": True}
-        model = cls(load_model(UNet2DConditionModel, str(folder), must, fix, **options), policy)
+        unet = load_model(UNet2DConditionModel, str(folder), must, fix, strict=True, **options)
+        require_regular(Path(folder) / "condition.safetensors")
         try:
             extra = load_file(Path(folder) / "condition.safetensors")
+            states = [name for name in inputs_of(policy) if name != "photos"]
+            widths = {name: extra[f"maps.{name}.1.weight"].shape[1] for name in states}
+            model = cls(unet, policy, widths=widths)
+            if "memory" in extra:
+                model.memory = extra.pop("memory").float()
+            wanted = {k for k in model.state_dict() if not k.startswith("unet.")} - {"memory"}
+            if wanted != set(extra):
+                raise KeyError(f"other entries than {', '.join(sorted(wanted))}")
             model.load_state_dict(extra, strict=False)
-            if missing := {"means", "null"} & set(model.state_dict()) - set(extra):
-                raise KeyError(f"no {', '.join(missing)}")
         except UNREADABLE as error:
             raise PalpateError(must, first_line(error), fix) from None
         return model.eval().requires_grad_(False)

@@ -15,19 +15,25 @@ the pipeline's digest, seed, sampler and image size; a folder made with others i
 from __future__ import annotations
 
 import hashlib
+import os
 import re
 import tempfile
-from collections.abc import Generator, Mapping, Sequence
+from collections import deque
+from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager, nullcontext
 from dataclasses import asdict, dataclass, field, replace
+from functools import lru_cache, partial
+from itertools import chain, islice
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, Any, TypeVar, cast
 
 import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, PngImagePlugin
 
 from palpate.core import (
+    Note,
     PalpateError,
     Problem,
     ProblemsError,
@@ -44,23 +50,31 @@ from palpate.core import (
     short,
     write_json,
 )
-from palpate.core.digest import canonical_json
+from palpate.core.digest import canonical_json, facts
 from palpate.core.records import from_plain
-from palpate.data.images import BROKEN, SUFFIXES, check_image, load_images, read_image, square
+from palpate.data.images import BROKEN, SUFFIXES, VIDEOS, check_image, read_image, square
 from palpate.encoders.models import FIX_MODEL, find_model
 
 if TYPE_CHECKING:  # torch takes seconds to import, and what is checked first needs none of it
     from torch import Tensor
 
     from palpate.data.manifest import Manifest
+    from palpate.diffusion.choosing import Chooser
     from palpate.diffusion.options import SamplerOptions
     from palpate.diffusion.pipeline import TactilePipeline
+    from palpate.encoders.encoder_set import EncoderSet
 
 FORMAT = "palpate-generated/1"
+T = TypeVar("T")
+R = TypeVar("R")
 Photos = str | Path | Sequence[str | Path] | Mapping[str, Path]
 FIX_PHOTOS = "Fix, remove or skip these photos"
 #: Photos that are decoded before the model is loaded, so that a broken one is reported at once.
 FEW = 64
+#: Threads that read photos while others are sampled.
+THREADS = max(2, min(16, os.cpu_count() or 1))
+#: Gels kept in memory.
+GELS = 64
 
 
 @dataclass(frozen=True)
@@ -74,6 +88,7 @@ class Generated:
         skipped: inputs that could not be used.
         made: how many images this call made (0 when loaded).
         notice: what everyone who looks at the images must know; often empty.
+        notes: what the caller must know: of the gel and the text that were given.
         memory: id -> image, where no output was given.
     """
 
@@ -83,6 +98,7 @@ class Generated:
     skipped: Sequence[Problem] = ()
     made: int = 0
     notice: str = ""
+    notes: Sequence[Note] = ()
     memory: Mapping[str, Image.Image] = field(default_factory=dict[str, Image.Image], repr=False)
 
     @property
@@ -139,24 +155,41 @@ class _Input:
     """One image to make."""
 
     id: str
-    vision: Path
+    vision: Path | None
     background: Path | None = None
 
     def digest(self) -> str:
         return digest_json([digest_file(p) if p else None for p in (self.vision, self.background)])
 
 
-def generate(  # noqa: PLR0913 - a public verb
-    photos: Manifest | Photos,
+@dataclass(frozen=True)
+class _Ready:
+    """An input whose files have been read: its pixels, and later its condition."""
+
+    item: _Input
+    stamp: str
+    photo: NDArray[np.uint8] | None
+    ground: NDArray[np.uint8] | None
+    condition: Tensor | None = None
+
+
+def generate(  # noqa: PLR0913 - a public verb, step by step
+    photos: Manifest | Photos | None = None,
     *,
+    text: str | None = None,
+    weight: float = 0.5,
+    gel: str | Path | None = None,
     model: TactilePipeline | str | Path = "palpate/mini",
     output: str | Path | None = None,
     split: Split | str | Path | None = None,
     part: str = "test",
     seed: int = 0,
+    noise: str | None = None,
     guidance: float | None = None,
     steps: int | None = None,
     batch: int | None = None,
+    best_of: int = 1,
+    best_by: EncoderSet | str | Path | None = None,
     skip_bad: bool = False,
     device: str = "auto",
     progress: Progress = quiet,
@@ -168,16 +201,25 @@ def generate(  # noqa: PLR0913 - a public verb
             (n, h, w, 3), a tensor (n, 3, h, w), or a manifest (or its file, folder or frame), whose
             columns ``vision`` and, for a pipeline w/ BG, ``background`` are used.
             The ids, which with ``seed`` decide the noise, are paths below a folder, file names, or
-            those of the manifest.
+            those of the manifest. A video gives an image a frame, all of one noise, and in a folder
+            as output also ``tactile.mp4``. None: one image of ``text`` alone, whose id is the text.
+        text: what is felt, e.g. ``"rough, porous stone"``; next to photos, for all of them.
+        weight: with photos and a text, the share of the photo where both take one place.
+        gel: an image of the gel without contact, on which the images are made; default: the
+            manifest's column ``background``, else the model's stock gel.
         model: a pipeline, a folder of ``palpate train generator``, a hub id, or the shipped
             ``palpate/mini``, which knows a synthetic world alone.
         output: a folder, or a ``.png`` for one photo; None keeps the images in memory.
         split: with a manifest: only one part of this split (or split file).
         part: which part.
         seed: of the noise of each sample.
+        noise: an id whose noise all images get: they then differ by their photos alone.
         guidance: scale of classifier-free guidance, 1 is none; default: the pipeline's.
         steps: of the solver; default: the pipeline's.
         batch: images at once, which they do not depend on; default: the pipeline's.
+        best_of: make so many of each, from different noise, and keep the one whose tactile
+            embedding is most similar to the condition.
+        best_by: the encoders that choose it; their tactile encoder must not score these images.
         skip_bad: list unreadable photos in the result instead of raising.
         device: ``auto``, ``cpu``, ``cuda`` or ``mps``.
         progress: called while the work goes on.
@@ -187,63 +229,259 @@ def generate(  # noqa: PLR0913 - a public verb
 
     Raises:
         PalpateError: on wrong arguments, or if the folder was made with other settings.
-        ProblemsError: naming every unreadable photo, before any image is made, unless ``skip_bad``.
+        ProblemsError: naming every unreadable photo, unless ``skip_bad``; of up to 32 photos before
+            any image is made.
     """
-    if _in_memory(photos):
+    _require_condition(photos, text, weight)
+    options: dict[str, Any] = {"text": text, "weight": weight, "gel": gel, "seed": seed}
+    options |= {"guidance": guidance, "steps": steps, "batch": batch}
+    options |= {"best_of": best_of, "best_by": best_by, "noise": noise, "progress": progress}
+    if photos is not None and in_memory(photos):
         with tempfile.TemporaryDirectory() as folder:
-            options: dict[str, Any] = {
-                "seed": seed,
-                "guidance": guidance,
-                "steps": steps,
-                "batch": batch,
-            }
-            options |= {"device": device, "progress": progress}
-            return generate(_as_files(photos, Path(folder)), model=model, output=output, **options)
-    manifest = _manifest(photos, split, part)
-    table = {} if manifest is not None else photo_ids(cast("Photos", photos))
-    paths = manifest.paths("vision") if manifest is not None else list(table.values())
+            options |= {"model": model, "device": device}
+            return generate(as_files(photos, Path(folder)), output=output, **options)
     output = None if output is None else Path(output)
-    single = _is_single(output, paths)
-    if not paths:
-        must, fix = "There must be at least one photo", "Check the folder, the split or the names"
-        raise PalpateError(must, "none", fix)
-    if not skip_bad and len(paths) <= FEW:
+    if (video := video_of(photos)) is not None:
+        model = loaded(model, _connected(device), progress)
+        return _of_video(video, output, model, **options)
+    options |= {"split": split, "part": part, "skip_bad": skip_bad, "device": device}
+    return prepare(photos, model=model, output=output, **options).make(progress)
+
+
+def prepare(  # noqa: PLR0913 - as the verb
+    photos: Manifest | Photos | None,
+    *,
+    text: str | None = None,
+    weight: float = 0.5,
+    gel: str | Path | None = None,
+    model: TactilePipeline | str | Path = "palpate/mini",
+    output: Path | None = None,
+    split: Split | str | Path | None = None,
+    part: str = "test",
+    seed: int = 0,
+    noise: str | None = None,
+    guidance: float | None = None,
+    steps: int | None = None,
+    batch: int | None = None,
+    best_of: int = 1,
+    best_by: EncoderSet | str | Path | None = None,
+    skip_bad: bool = False,
+    device: str = "auto",
+    progress: Progress = quiet,
+) -> Run:
+    """Check the arguments of :func:`generate`, for photos in files, and load what it needs."""
+    device = _connected(device)
+    manifest, table = _photos(photos, split, part)
+    paths = [*table.values()] if manifest is None else manifest.paths("vision")
+    single = _is_single(output, paths or [Path(str(text))])
+    if photos is not None and not skip_bad:
         _require_readable(paths)
+    if best_of < 1:
+        example = {"best_of": 4}
+        got = str(best_of)
+        raise PalpateError("must be at least 1", got, "", argument="best_of", example=example)
+    model = loaded(model, device, progress)
+    sampler = model.sampler_with(guidance=guidance, steps=steps, batch=batch)
+    if single:  # not among the copies that fill a batch: a fraction of the time
+        sampler = replace(sampler, batch=1)
+    words = None if text is None else model.embed_text(text)
+    chooser = None
+    if best_of > 1:
+        from palpate.diffusion.choosing import Chooser
+
+        chooser = Chooser.load(best_of, best_by, model)
+    settings = _settings(model, sampler, seed)
+    settings |= {"text": text, "weight": None if photos is None else weight} if text else {}
+    settings |= {} if noise is None else {"noise": noise}
+    settings |= {} if chooser is None else chooser.settings
+    target = _Target(output, single, settings, model.notice)
+    inputs = _inputs(model, manifest, table or {str(text): None}, gel)
+    how: dict[str, Any] = {"weight": weight, "seed": seed, "sampler": sampler}
+    notes = [*_text_notes(model, text), *_gel_notes(model, gel)]
+    return Run(model, inputs, target, words, chooser, noise, how, skip_bad, notes)
+
+
+def _text_notes(model: TactilePipeline, text: str | None) -> list[Note]:
+    if text is None or model.encoders is None:
+        return []
+    length, most = model.encoders.clip.length(text)
+    return [Note("text-cut", {"tokens": length, "most": most})] if length > most else []
+
+
+def _gel_notes(model: TactilePipeline, gel: str | Path | None) -> list[Note]:
+    if gel is None:
+        return []
+    from palpate.diffusion.gels import gel_notes
+
+    return gel_notes(Path(gel), model.size, model.gel)
+
+
+@dataclass(frozen=True)
+class Run:
+    """A call of :func:`generate` that has been checked.
+
+    Attributes:
+        model: the pipeline.
+        inputs: one an image.
+        target: where the images go.
+        words: embedding (1, d) of the text, or None.
+        chooser: of the best of several images, or None.
+        noise: the id whose noise all have, or None.
+        how: the other arguments of :meth:`TactilePipeline.sample`.
+        skip_bad: whether unreadable photos are skipped.
+        notes: what the caller must know.
+    """
+
+    model: TactilePipeline
+    inputs: Sequence[_Input]
+    target: _Target
+    words: Tensor | None
+    chooser: Chooser | None
+    noise: str | None
+    how: Mapping[str, Any]
+    skip_bad: bool
+    notes: Sequence[Note] = ()
+
+    @property
+    def sampler(self) -> SamplerOptions:
+        """How to sample."""
+        return self.how["sampler"]
+
+    def reader(self) -> _Reader:
+        """Reads the inputs of this process."""
+        rank, size = self.target.place
+        return _Reader(self.model, self.inputs[rank::size], self.target, skip_bad=self.skip_bad)
+
+    def make(self, progress: Progress) -> Generated:
+        """Make the images that are not there."""
+        target, reader = self.target, self.reader()
+        ready = iter(reader)
+        first = next(ready, None)  # few photos are all read before anything is written
+        bad = target.gathered(reader.bad)
+        self._require_none(bad)
+        made: dict[str, bool] = {}
+        with target.writing():
+            rows = self._sampled(ready if first is None else chain([first], ready))
+            for one in _ahead(lambda row: target.keep(*row), rows, self.sampler.batch, 1):
+                made[one.item.id] = True
+                done = len(made) + reader.found + len(reader.bad)
+                progress("generating", done, len(reader.inputs))
+            bad, made = target.gathered(bad | reader.bad), target.gathered(made)
+            self._require_none(bad)
+            ids = [i.id for i in self.inputs if i.id not in bad]
+            result = target.finish(ids, [*bad.values()], len(made))
+        return replace(result, notes=self.notes)
+
+    def _sampled(self, ready: Iterator[_Ready]) -> Generator[tuple[_Ready, NDArray[np.uint8]]]:
+        while chunk := [*islice(ready, self.sampler.batch)]:
+            yield from zip(chunk, self.sample(chunk, **self.how), strict=True)
+
+    def sample(self, chunk: Sequence[_Ready], **how: Any) -> NDArray[np.uint8]:
+        """The images (n, size, size, 3) of a batch."""
+        rows: list[Any] = [one.condition for one in chunk if one.condition is not None]
+        photos = None if not rows else cast("Tensor", rows[0].new_tensor(np.stack(rows)))
+        grounds = [one.ground for one in chunk if one.ground is not None]
+        names = [one.item.id if self.noise is None else self.noise for one in chunk]
+        sample = partial(
+            self.model.sample,
+            photos,
+            texts=self.words,
+            background=np.stack(grounds) if grounds else None,
+            **how,
+        )
+        if self.chooser is None:
+            return sample(names)
+        return self.chooser.best(sample, names, photos, self.words, how["weight"])
+
+    def _require_none(self, bad: Mapping[str, Problem]) -> None:
+        if bad and not self.skip_bad:
+            raise ProblemsError([*bad.values()], FIX_PHOTOS, example={"skip_bad": True})
+
+
+def _ahead(
+    function: Callable[[T], R], items: Iterable[T], depth: int, threads: int
+) -> Generator[R]:
+    """Yield ``function(item)`` in order, computed in threads up to ``depth`` items ahead."""
+    waiting: deque[Future[R]] = deque()
+    with ThreadPoolExecutor(threads) as pool:
+        try:
+            for item in items:
+                waiting.append(pool.submit(function, item))
+                if len(waiting) > depth:
+                    yield waiting.popleft().result()
+            while waiting:
+                yield waiting.popleft().result()
+        finally:
+            pool.shutdown(wait=True, cancel_futures=True)
+
+
+def _connected(device: str) -> str:
+    """Join the other processes of ``torchrun``, if any; the device of this one."""
+    if int(os.environ.get("WORLD_SIZE", "1")) == 1:
+        return device
+    from palpate.training.processes import connect
+
+    return connect(device)
+
+
+def loaded(model: TactilePipeline | str | Path, device: str, progress: Progress) -> TactilePipeline:
+    """The pipeline, loaded where it is a name or a folder."""
     if isinstance(model, str | Path):
         progress(f"loading {model}", 0, 0)
         model = find_model(model, "generator", "pipeline", FIX_MODEL)
     from palpate.diffusion.pipeline import TactilePipeline
 
-    if not isinstance(model, TactilePipeline):
-        model = TactilePipeline.from_pretrained(model, device=device)
-    sampler = model.sampler_with(guidance=guidance, steps=steps, batch=batch)
-    if single:  # not among the copies that fill a batch: a fraction of the time
-        sampler = replace(sampler, batch=1)
-    target = _Target(output, single, _settings(model, sampler, seed), model.notice)
-    inputs = _inputs(model, manifest, table)
-    stamps, bad = _stamps(inputs)
-    todo = [i for i in inputs if i.id in stamps and not target.has(i.id, stamps[i.id])]
-    conditions, broken = _embed(model, todo, progress)
-    bad |= broken
-    if bad and not skip_bad:
-        raise ProblemsError(list(bad.values()), FIX_PHOTOS, example={"skip_bad": True})
-    todo = [i for i in todo if i.id in conditions]
-    with target.writing():
-        for start in range(0, len(todo), sampler.batch):
-            chunk = todo[start : start + sampler.batch]
-            files = [i.background for i in chunk if i.background]
-            images = model.sample(
-                np.stack([conditions[i.id] for i in chunk]),
-                [i.id for i in chunk],
-                seed=seed,
-                sampler=sampler,
-                background=load_images(files, model.size) if files else None,
-            )
-            for item, image in zip(chunk, images, strict=True):
-                target.keep(item.id, image, stamps[item.id])
-            progress("generating", start + len(chunk), len(todo))
-        ids = [i.id for i in inputs if i.id not in bad]
-        return target.finish(ids, list(bad.values()), len(todo))
+    if isinstance(model, TactilePipeline):
+        return model
+    return TactilePipeline.from_pretrained(model, device=device)
+
+
+def video_of(photos: Any) -> Path | None:
+    """The file, if the photos are the frames of one video."""
+    one = [photos] if isinstance(photos, str | Path) else photos
+    if not isinstance(one, list | tuple) or len(one) != 1 or not isinstance(one[0], str | Path):
+        return None
+    return Path(one[0]) if Path(one[0]).suffix.lower() in VIDEOS else None
+
+
+def _require_condition(photos: object, text: str | None, weight: float) -> None:
+    if photos is None and text is None:
+        must, fix = "There must be at least one photo, or a text", "Pass one of them"
+        raise PalpateError(must, "none", fix)
+    if not 0 <= weight <= 1:
+        raise PalpateError("must lie in [0, 1]", f"{weight:g}", "1 is the photo", argument="weight")
+
+
+def _of_video(
+    video: Path, output: Path | None, model: TactilePipeline, **options: Any
+) -> Generated:
+    """An image a frame, all of one noise, so the touch stays where it is; and their video."""
+    from palpate.diffusion.video import save_frames, write_video
+
+    if options["best_of"] > 1:
+        must, got = "must be 1 for a video, whose frames share their noise", str(options["best_of"])
+        raise PalpateError(must, got, "Generate from its frames", argument="best_of")
+    with tempfile.TemporaryDirectory() as folder:
+        frames, rate = save_frames(video, Path(folder), model.vision_size, options["progress"])
+        options["noise"] = video.name
+        made = generate(frames, output=output, model=model, **options)
+    if made.folder is not None:
+        write_video(made.folder / "tactile.mp4", made.images, rate)
+    return made
+
+
+def _photos(
+    photos: Manifest | Photos | None, split: Split | str | Path | None, part: str
+) -> tuple[Manifest | None, dict[str, Path]]:
+    """The samples of a manifest, or the photos by id."""
+    if photos is None:
+        return None, {}
+    manifest = _manifest(photos, split, part)
+    table = {} if manifest is not None else photo_ids(cast("Photos", photos))
+    if not (manifest.ids if manifest is not None else table):
+        must, fix = "There must be at least one photo", "Check the folder, the split or the names"
+        raise PalpateError(must, "none", fix)
+    return manifest, table
 
 
 @dataclass(frozen=True)
@@ -269,12 +507,25 @@ class _Target:
         self.file = output if single else None
         self.folder = None if single else output
         self.memory: dict[str, Image.Image] = {}
+        self.place = (0, 1)
+        if int(os.environ.get("WORLD_SIZE", "1")) > 1:
+            from palpate.training.processes import place
+
+            self.place = place()
         self.index: dict[str, Any] = {}
         if self.folder is not None:
             index = _old_index(self.folder, settings, self.digest)
             head = {"format": FORMAT, "complete": False, "settings": settings}
             new = head | {"digest": self.digest, "images": {}, "skipped": []}
             self.index = (index or new) | {"notice": notice}
+
+    def at(self, folder: Path) -> _Target:
+        """The same images in another folder."""
+        return _Target(folder, False, self.settings, self.notice)
+
+    def written(self, sample_id: str) -> bool:
+        """Whether there is a file of an image, of whatever settings."""
+        return (path := self.path(sample_id)) is not None and path.exists()
 
     def path(self, sample_id: str) -> Path | None:
         """The file of an image; None in memory."""
@@ -293,28 +544,40 @@ class _Target:
 
     @contextmanager
     def writing(self) -> Generator[None]:
-        """Hold the folder, and mark it as unfinished."""
+        """Hold the folder, and mark it as unfinished; of several processes the first one."""
         self.index["complete"] = False
+        if self.place[0]:
+            yield
+            return
         with nullcontext() if self.folder is None else locked(self.folder):
             if self.folder is not None:
                 write_json(self.folder / "index.json", self.index)
             yield
 
-    def keep(self, sample_id: str, array: NDArray[np.uint8], stamp: str) -> None:
+    def gathered(self, found: dict[str, T]) -> dict[str, T]:
+        """What all processes found; each of them has come this far."""
+        if self.place[1] == 1:
+            return found
+        from palpate.training.processes import merged
+
+        return merged(found)
+
+    def keep(self, one: _Ready, array: NDArray[np.uint8]) -> _Ready:
         """Keep one image, as a PNG that says what it is."""
         image = Image.fromarray(array)
-        if (path := self.path(sample_id)) is None:
-            self.memory[sample_id] = image
-            return
+        if (path := self.path(one.item.id)) is None:
+            self.memory[one.item.id] = image
+            return one
         text = PngImagePlugin.PngInfo()
         made_with = canonical_json(self.settings)
-        values = {"id": sample_id, "settings": self.digest, "input": stamp}
+        values = {"id": one.item.id, "settings": self.digest, "input": one.stamp}
         values |= {"made-with": made_with, "notice": self.notice}
         for name, value in values.items():  # their order decides the bytes
             if value:
                 text.add_itxt(f"palpate.{name}", value)
         with atomic_path(path) as part:
             image.save(part, format="PNG", pnginfo=text)
+        return one
 
     def finish(self, ids: Sequence[str], skipped: Sequence[Problem], made: int) -> Generated:
         """Complete the index; all images of the target, earlier ones included."""
@@ -323,9 +586,10 @@ class _Target:
             files = self.index["images"] | {i: file_name(i) for i in ids}
             skips = [asdict(problem) for problem in skipped]
             self.index |= {"complete": True, "images": files, "skipped": skips}
-            write_json(self.folder / "index.json", self.index)
-        common = (self.settings, skipped, made, self.notice, self.memory)
-        return Generated(self.folder, files, *common)
+            if not self.place[0]:
+                write_json(self.folder / "index.json", self.index)
+        common = (self.settings, skipped, made, self.notice)
+        return Generated(self.folder, files, *common, memory=self.memory)
 
 
 def photo_ids(photos: Photos) -> dict[str, Path]:
@@ -361,13 +625,13 @@ def file_name(sample_id: str) -> str:
     return f"{plain or 'sample'}-{short(hashlib.sha256(sample_id.encode()).hexdigest())}.png"
 
 
-def _in_memory(photos: Any) -> bool:
+def in_memory(photos: Any) -> bool:
     """Return whether photos are images, arrays or tensors instead of files."""
     first = photos[0] if isinstance(photos, list | tuple) and photos else photos
     return isinstance(first, Image.Image | np.ndarray) or hasattr(first, "detach")
 
 
-def _as_files(photos: Any, folder: Path) -> dict[str, Path]:
+def as_files(photos: Any, folder: Path) -> dict[str, Path]:
     """Write images in memory to ``folder`` without loss; their ids are their numbers."""
     from palpate.encoders.encoder import list_images
 
@@ -425,37 +689,54 @@ def _is_single(output: Path | None, paths: Sequence[Path]) -> bool:
     return True
 
 
-def _require_readable(paths: Sequence[Path]) -> None:
+def _require_readable(paths: Sequence[Path], argument: str = "photos") -> None:
+    if len(paths) > FEW:
+        return
     reasons = ((path, check_image(path)) for path in paths)
     if bad := [Problem(str(path), "bad-image", reason) for path, reason in reasons if reason]:
         if len(paths) == 1:
             must, got = "must be an image that can be read", f"{paths[0]}: {bad[0].text}"
-            raise PalpateError(must, got, "Check the path", argument="photos")
+            raise PalpateError(must, got, "Check the path", argument=argument)
         raise ProblemsError(bad, FIX_PHOTOS, example={"skip_bad": True})
 
 
 def _settings(pipeline: TactilePipeline, sampler: SamplerOptions, seed: int) -> dict[str, Any]:
     """All that an image depends on next to its photo; the batch is no part of it."""
-    return {
+    other = {"scheduler": pipeline.other_scheduler, "dtype": str(pipeline.dtype)}
+    usual = {"scheduler": None, "dtype": "torch.float32"}
+    return {k: v for k, v in other.items() if v != usual[k]} | {
+        **({"guides": pipeline.guides} if pipeline.guides else {}),
         "pipeline": pipeline.digest,
         "split": pipeline.training.get("split"),
         "preset": pipeline.preset,
         "seed": seed,
         "size": pipeline.size,
-        "sampler": {k: v for k, v in asdict(sampler).items() if k != "batch"},
+        "sampler": {k: v for k, v in facts(sampler).items() if k != "batch"},
     }
 
 
 def _inputs(
-    pipeline: TactilePipeline, manifest: Manifest | None, photos: Mapping[str, Path]
+    pipeline: TactilePipeline,
+    manifest: Manifest | None,
+    photos: Mapping[str, Path | None],
+    given: str | Path | None,
 ) -> list[_Input]:
+    """One input per image; its gel where the pipeline uses one other than its stock gel."""
+    gel = None if given is None else Path(given)
+    if gel is not None and not pipeline.background:
+        must = "must be left out for a generator that codes the gel with the image"
+        raise PalpateError(must, str(gel), "Train one with the preset mini", argument="gel")
+    if gel is not None:
+        _require_readable([gel], "gel")
     if manifest is None:
-        if pipeline.background:
-            must, got = "A generator w/ BG needs a background image per sample", "photos alone"
-            raise PalpateError(must, got, "Use a manifest with backgrounds")
-        return [_Input(i, path) for i, path in photos.items()]
-    count = len(manifest)
-    grounds = manifest.paths("background") if pipeline.background else [None] * count
+        if pipeline.background and gel is None and pipeline.gel is None:
+            must, got = "must be given for a generator w/ BG", "photos alone"
+            raise PalpateError(must, got, "Or pass a manifest with backgrounds", argument="gel")
+        return [_Input(i, path, gel) for i, path in photos.items()]
+    grounds: Sequence[Path | None] = [gel] * len(manifest)
+    if pipeline.background and gel is None:
+        own = pipeline.gel is None or any(manifest.column("background"))
+        grounds = manifest.paths("background") if own else grounds
     rows = zip(manifest.ids, manifest.paths("vision"), grounds, strict=True)
     return [_Input(*row) for row in rows]
 
@@ -481,7 +762,8 @@ def _old_index(
     if (output / "index.json").is_file():
         index = _read_index(output)
         if settings is not None and index["digest"] != digest:
-            differ = [k for k, v in settings.items() if index["settings"].get(k) != v]
+            old = index["settings"]
+            differ = [k for k in {**settings, **old} if settings.get(k) != old.get(k)]
             must, got = "must hold images of the same settings", f"another {', '.join(differ)}"
             raise PalpateError(must, got, "Choose another folder", argument="output")
         return index
@@ -491,40 +773,69 @@ def _old_index(
     return None
 
 
-def _stamps(inputs: Sequence[_Input]) -> tuple[dict[str, str], dict[str, Problem]]:
-    """Return, by id, the digest of each input's files, or a problem if they cannot be opened."""
-    stamps: dict[str, str] = {}
-    bad: dict[str, Problem] = {}
-    for item in inputs:
+class _Reader:
+    """Reads inputs in threads, ahead of the sampling; yields those that are still to be made.
+
+    After an unreadable photo that may not be skipped it yields no more, and only looks for others.
+
+    Attributes:
+        bad: by id, what could not be read.
+        found: how many images are there already.
+    """
+
+    def __init__(
+        self,
+        pipeline: TactilePipeline,
+        inputs: Sequence[_Input],
+        target: _Target,
+        *,
+        skip_bad: bool,
+    ) -> None:
+        self.pipeline, self.inputs, self.target, self.skip_bad = pipeline, inputs, target, skip_bad
+        self.bad: dict[str, Problem] = {}
+        self.found = 0
+        self._gel = lru_cache(GELS)(self._square)  # many samples share one
+
+    def __iter__(self) -> Generator[_Ready]:
+        from palpate.diffusion.pipeline import EMBED
+
+        ready: list[_Ready] = []
+        for item, one in _ahead(self._read, self.inputs, EMBED, THREADS):
+            if isinstance(one, Problem):
+                self.bad[item.id] = one
+            elif one is None:
+                self.found += 1
+            else:
+                ready.append(one)
+            if self.bad and not self.skip_bad:
+                ready.clear()
+            elif len(ready) == EMBED:
+                yield from self._embedded(ready)
+                ready = []
+        yield from self._embedded(ready)
+
+    def _read(self, item: _Input) -> tuple[_Input, _Ready | Problem | None]:
+        file = item.vision
         try:
-            stamps[item.id] = item.digest()
+            stamp = item.digest()
+            if self.target.has(item.id, stamp):
+                return item, None
+            photo = None if file is None else self._square(file, self.pipeline.vision_size)
+            file = item.background
+            ground = None if file is None else self._gel(file, self.pipeline.size)
+            return item, _Ready(item, stamp, photo, ground)
+        except PalpateError as error:
+            return item, Problem(str(file), "bad-image", error.got)
         except OSError as error:
             reason = error.strerror or "cannot be opened"
-            bad[item.id] = Problem(str(error.filename or item.vision), "missing-file", reason)
-    return stamps, bad
+            return item, Problem(str(error.filename or item.vision), "missing-file", reason)
 
+    @staticmethod
+    def _square(file: Path, size: int) -> NDArray[np.uint8]:
+        return square(read_image(file), size)
 
-def _embed(
-    pipeline: TactilePipeline, inputs: Sequence[_Input], progress: Progress
-) -> tuple[dict[str, Tensor], dict[str, Problem]]:
-    """Return, by id, the vision embedding of each input, or a problem if it does not decode."""
-    from palpate.diffusion.pipeline import EMBED
-
-    embedded: dict[str, Tensor] = {}
-    bad: dict[str, Problem] = {}
-    for start in range(0, len(inputs), EMBED):
-        pixels: dict[str, NDArray[np.uint8]] = {}
-        for item in inputs[start : start + EMBED]:
-            file = item.vision
-            try:
-                photo = square(read_image(file), pipeline.vision_size)
-                if (file := item.background) is not None:
-                    read_image(file)
-                pixels[item.id] = photo
-            except PalpateError as error:
-                bad[item.id] = Problem(str(file), "bad-image", error.got)
-        if pixels:
-            rows = pipeline.embed(np.stack(list(pixels.values())))
-            embedded |= dict(zip(pixels, rows, strict=True))
-        progress("embedding photos", len(embedded) + len(bad), len(inputs))
-    return embedded, bad
+    def _embedded(self, ready: list[_Ready]) -> Generator[_Ready]:
+        photos = [one.photo for one in ready if one.photo is not None]
+        rows: Any = self.pipeline.embed(np.stack(photos)) if photos else [None] * len(ready)
+        for one, row in zip(ready, rows, strict=True):
+            yield replace(one, condition=row, photo=None)

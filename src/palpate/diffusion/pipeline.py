@@ -12,10 +12,12 @@ image depends on (seed, id) and not on what else is generated.
 
 ::
 
+    model_index.json  the parts and their classes, as diffusers writes them
     unet/          the denoiser, diffusers' format, and condition.safetensors (means, learned null)
-    autoencoder/   the VQModel, diffusers' format, and its palpate.json
+    autoencoder/   the autoencoder, diffusers' format, and its palpate.json
     encoders/      the vision (and text) encoder whose embeddings the denoiser knows
     scheduler/     scheduler_config.json, diffusers' format: for programs that read only the parts
+    gel.png        the stock gel without contact, of a generator that is given one
     palpate.json   preset, condition policy, schedule, sampler, latent statistics, record, digest
     README.md      the card for people
 
@@ -26,20 +28,30 @@ either case and checked on loading.
 
 from __future__ import annotations
 
+import copy
+import inspect
+import json
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, field, replace
-from functools import cached_property
+from contextlib import nullcontext
+from dataclasses import asdict, dataclass, field, fields, replace
+from functools import cached_property, partial
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 import torch
+from diffusers.pipelines.pipeline_utils import DiffusionPipeline
 from diffusers.schedulers.scheduling_ddim import DDIMScheduler
 from diffusers.schedulers.scheduling_dpmsolver_multistep import DPMSolverMultistepScheduler
+from diffusers.schedulers.scheduling_flow_match_euler_discrete import (
+    FlowMatchEulerDiscreteScheduler,
+)
+from diffusers.schedulers.scheduling_flow_match_heun_discrete import FlowMatchHeunDiscreteScheduler
+from diffusers.utils.outputs import BaseOutput
 from numpy.typing import NDArray
 from PIL import Image
-from torch import Tensor
+from torch import Tensor, nn
 
 from palpate import __version__
 from palpate.core import (
@@ -47,14 +59,22 @@ from palpate.core import (
     Progress,
     atomic_folder,
     digest_json,
-    quiet,
     read_record,
     rng_for,
     write_json,
 )
-from palpate.diffusion.autoencoder import Autoencoder, LatentStats
+from palpate.core.digest import facts
+from palpate.data.images import read_image, square
+from palpate.diffusion.autoencoder import (
+    AnyAutoencoder,
+    Autoencoder,
+    BackgroundAutoencoder,
+    LatentStats,
+    load_autoencoder,
+)
 from palpate.diffusion.denoiser import Denoiser
-from palpate.diffusion.options import ConditionPolicy, SamplerOptions, Schedule, Source
+from palpate.diffusion.options import ConditionPolicy, Method, SamplerOptions, Schedule
+from palpate.encoders.embed import embed_texts
 from palpate.encoders.encoder import list_images, squares
 from palpate.encoders.encoder_set import EncoderSet, load_clip
 from palpate.encoders.models import (
@@ -65,7 +85,7 @@ from palpate.encoders.models import (
     find_model,
     pick_device,
 )
-from palpate.encoders.preprocess import to_unit
+from palpate.encoders.preprocess import Preprocess, to_unit
 from palpate.training.cards import write_model_cards
 
 FORMAT = "palpate-pipeline/2"
@@ -81,10 +101,13 @@ SYNTHETIC = (
 EMBED = 32
 #: (z_t (n, c, h, w), t (n,), tokens (n, k, d), background or None) -> prediction (n, c, h, w).
 Predictor = Callable[[Tensor, Tensor, Tensor, Tensor | None], Tensor]
+#: (index of the step, t, latents after it) -> the latents to go on with.
+OnStep = Callable[[int, Tensor, Tensor], Tensor]
+MODULES = ("autoencoder", "scheduler", "unet")
 
 
-@dataclass(frozen=True)
-class TactileImages:
+@dataclass
+class TactileImages(BaseOutput):
     """What a pipeline returns.
 
     Attributes:
@@ -94,14 +117,17 @@ class TactileImages:
     images: list[Image.Image]
 
 
-@dataclass(frozen=True)
-class TactilePipeline:
-    """A generator of tactile images.
+@dataclass(eq=False, repr=False)
+class TactilePipeline(DiffusionPipeline):
+    """A generator of tactile images; a pipeline of diffusers.
 
     ::
 
         pipeline = TactilePipeline.from_pretrained("palpate/mini")
         image = pipeline("photo.jpg", seed=0).images[0]
+
+    ``unet`` and ``scheduler`` may be replaced as in any pipeline of diffusers; ``scheduler`` is by
+    default that of the sampler's method. ``dataclasses.replace`` makes a pipeline with other parts.
 
     Attributes:
         autoencoder, denoiser: frozen, on one device.
@@ -114,9 +140,10 @@ class TactilePipeline:
         preset: name of the preset.
         training: JSON record: digests of manifest, split and encoder, steps, seed, source of the
             conditions.
+        gel: a no-contact image (size, size, 3) of the training part, for photos without one.
     """
 
-    autoencoder: Autoencoder
+    autoencoder: AnyAutoencoder
     denoiser: Denoiser
     stats: LatentStats
     schedule: Schedule
@@ -125,80 +152,203 @@ class TactilePipeline:
     encoders: EncoderSet | None = None
     preset: str = ""
     training: Mapping[str, Any] = field(default_factory=dict)
+    gel: NDArray[np.uint8] | None = None
 
-    def __call__(
+    def __post_init__(self) -> None:
+        """Name the parts for diffusers.
+
+        Raises:
+            PalpateError: if the U-Net and the autoencoder do not fit.
+        """
+        code, unet = self.autoencoder, self.denoiser.unet.config
+        gel = 3 * code.factor**2 if isinstance(code, BackgroundAutoencoder) else code.channels
+        seen = unet["in_channels"] - unet["out_channels"]
+        latent = {self.denoiser.channels, len(self.stats.mean), len(self.stats.std)}
+        if latent != {code.channels} or seen not in (0, gel) or self.size % code.factor:
+            must = (
+                f"The denoiser must be one for the autoencoder: {code.channels} channels (and "
+                f"{gel} of the gel), sides that are multiples of {code.factor}"
+            )
+            got = f"{sorted(latent)} channels (and {seen}), sides of {self.size}"
+            raise PalpateError(must, got, "Use the autoencoder that it was trained on")
+        self.scheduler = build_scheduler(self.schedule, self.sampler.method)
+        parts = (code.net if isinstance(code, Autoencoder) else code, self.scheduler, self.unet)
+        self.register_to_config(**dict(zip(MODULES, map(_class_of, parts), strict=True)))
+
+    @classmethod
+    def _get_signature_keys(cls, obj: Any) -> tuple[list[str], list[str]]:
+        """The names of the parts that diffusers knows, and of the others."""
+        return [*MODULES], [f.name for f in fields(cls) if f.name not in MODULES]
+
+    @property
+    def unet(self) -> Any:
+        """The denoiser's network."""
+        return self.denoiser.unet
+
+    @unet.setter
+    def unet(self, unet: Any) -> None:
+        self.denoiser.unet = unet
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        """Set a part; the digest, and the scheduler of another sampler, follow."""
+        super().__setattr__(name, value)
+        self.__dict__.pop("digest", None)
+        if name in ("schedule", "sampler") and "scheduler" in self.__dict__:
+            self.scheduler = build_scheduler(self.schedule, self.sampler.method)
+
+    @property
+    def device(self) -> torch.device:
+        """Where the parts are."""
+        return self.denoiser.device
+
+    @property
+    def dtype(self) -> torch.dtype:
+        """The type that the U-Net computes in."""
+        return self.denoiser.dtype
+
+    def __call__(  # noqa: PLR0913 - one row per choice
         self,
-        photos: Any,
+        photos: Any = None,
         *,
+        text: str | None = None,
+        weight: float = 0.5,
         ids: Sequence[str] | None = None,
         seed: int = 0,
         guidance: float | None = None,
         steps: int | None = None,
-        background: Any = None,
-        progress: Progress = quiet,
+        gel: Any = None,
+        generator: torch.Generator | Sequence[torch.Generator] | None = None,
+        callback_on_step_end: Callable[[Any, int, Tensor, dict[str, Any]], Any] | None = None,
+        progress: Progress | None = None,
     ) -> TactileImages:
         """Tactile images for photos.
 
         Args:
             photos: a file or a folder of them, a PIL image, a list of files or PIL images, a uint8
-                array (n, h, w, 3), or a tensor (n, 3, h, w).
+                array (n, h, w, 3), or a tensor (n, 3, h, w); None: one image of the text alone.
+            text: what is felt; next to photos, for all of them.
+            weight: with both, the share of the photo where the two take one place.
             ids: one name per photo; with ``seed`` they decide the noise. Default: the file names,
                 and ``"0"``, ``"1"``, ... for images in memory.
             seed: of the noise.
             guidance: s; default: the sampler's.
             steps: of the solver; default: the sampler's.
-            background: no-contact images, one per photo, for a pipeline w/ BG.
-            progress: called with the number of images done.
+            gel: no-contact image of the gel, one for all or one per photo; default: the stock gel.
+            generator: of the starting noise instead of seed and ids; one for all, or one per image.
+            callback_on_step_end: called as ``(pipeline, step, timestep, {"latents": ...})`` after
+                each step of each batch; ``latents`` of the dictionary that it returns replace them.
+            progress: called with the number of images done, instead of the progress bar of
+                diffusers, which ``set_progress_bar_config(disable=True)`` turns off.
 
         Raises:
-            PalpateError: if a photo is unreadable, a background is missing, or settings do not fit.
+            PalpateError: if a photo is unreadable, a gel is missing, or settings do not fit.
         """
-        images = list_images(photos)
+        if photos is None and text is None:
+            must, fix = "There must be at least one photo, or a text", "Pass one of them"
+            raise PalpateError(must, "none", fix)
+        images = [] if photos is None else list_images(photos)
         if ids is None:
             ids = [i.name if isinstance(i, Path) else str(k) for k, i in enumerate(images)]
+            ids = ids if images else [str(text)]
+        if images and len(ids) != len(images):
+            raise _not_one_each(ids, len(images))
         sampler = self.sampler_with(guidance=guidance, steps=steps)
-        if len(images) == 1:  # not among the copies that fill a batch: a fraction of the time
+        if len(ids) == 1:  # not among the copies that fill a batch: a fraction of the time
             sampler = replace(sampler, batch=1)
-        ground = None if background is None else squares(list_images(background), self.size)
-        embedded = self.embed(squares(images, self.vision_size))
+        ground = None if gel is None else squares(list_images(gel), self.size)
+        if ground is not None and len(ground) == 1:
+            ground = np.broadcast_to(ground, (len(ids), *ground.shape[1:]))
+        embedded = self.embed(squares(images, self.vision_size)) if images else None
+        words = None if text is None else self.embed_text(text)
+        noise = None if generator is None else self._noise(generator, len(ids))
         made: list[Image.Image] = []
-        for start in range(0, len(ids), sampler.batch):
-            rows = slice(start, start + sampler.batch)
-            arrays = self.sample(
-                embedded[rows],
-                ids[rows],
-                seed=seed,
-                sampler=sampler,
-                background=None if ground is None else ground[rows],
-            )
-            made += map(Image.fromarray, arrays)
-            progress("generating", len(made), len(ids))
-        return TactileImages(made)
+        self.scheduler.set_timesteps(sampler.steps)
+        total = math.ceil(len(ids) / sampler.batch) * len(self.scheduler.timesteps)
+        bars: Any = self.progress_bar  # wrongly typed in diffusers
+        bar = nullcontext() if progress is not None else bars(total=total)
+        with bar:
+            for start in range(0, len(ids), sampler.batch):
+                rows = slice(start, start + sampler.batch)
+                arrays = self.sample(
+                    None if embedded is None else embedded[rows],
+                    ids[rows],
+                    texts=words,
+                    weight=weight,
+                    seed=seed,
+                    sampler=sampler,
+                    background=None if ground is None else ground[rows],
+                    noise=None if noise is None else noise[rows],
+                    on_step=partial(self._on_step, None if progress else bar, callback_on_step_end),
+                )
+                made += map(Image.fromarray, arrays)
+                if progress is not None:
+                    progress("generating", len(made), len(ids))
+        return TactileImages(images=made)
+
+    def _on_step(self, bar: Any, callback: Any, step: int, t: Tensor, latents: Tensor) -> Tensor:
+        if bar is not None:
+            bar.update()
+        given = callback(self, step, t, {"latents": latents}) if callback else None
+        return (given or {}).get("latents", latents)
+
+    def _noise(self, generator: torch.Generator | Sequence[torch.Generator], n: int) -> Tensor:
+        """The starting noise of n images, drawn on the generators' own device."""
+        generators = [generator] * n if isinstance(generator, torch.Generator) else list(generator)
+        if len(generators) != n:
+            fix = "Pass one generator, or one per image"
+            got = f"{len(generators)} for {n} images"
+            raise PalpateError("must be one per image", got, fix, argument="generator")
+        draws = [torch.randn(self._latent, generator=g, device=g.device) for g in generators]
+        return torch.stack([draw.cpu() for draw in draws])
+
+    @property
+    def _latent(self) -> tuple[int, int, int]:
+        side = self.size // self.autoencoder.factor
+        return self.denoiser.channels, side, side
 
     @cached_property
     def digest(self) -> str:
-        """SHA-256 of all that the images depend on, except seed, sampler and input."""
-        parts = [
+        """SHA-256 of all that the images depend on, except seed, sampler, type and input."""
+        weights = self.denoiser.state_dict()
+        parts: list[Any] = [
             FORMAT_1,
             asdict(self.stats),
-            asdict(self.schedule),
-            asdict(self.denoiser.policy),
+            facts(self.schedule),
+            facts(self.denoiser.policy),
             self.size,
             self.autoencoder.digest,
             architecture(self.denoiser.unet.config),
-            digest_tensors(self.denoiser.state_dict()),
+            digest_tensors(
+                # torch.compile puts a prefix before the names.
+                {k.replace("_orig_mod.", ""): v.float() for k, v in weights.items()}
+            ),
         ]
-        return digest_json([*parts, self.encoders.digest("vision") if self.encoders else None])
+        parts.append(self.encoders.digest("vision") if self.encoders else None)
+        if self.gel is not None:
+            parts.append(digest_tensors({"gel": torch.from_numpy(np.array(self.gel))}))
+        return digest_json(parts)
+
+    @property
+    def guides(self) -> list[str]:
+        """Digests of encoders that it was aligned with in training, which may not score it."""
+        records = (self.training, self.training.get("start_record") or {})
+        return [record["align"]["encoder"] for record in records if record.get("align")]
 
     @property
     def background(self) -> bool:
-        """Whether each image needs one of the sensor without contact."""
-        return self.denoiser.background
+        """Whether each image is made on one of the gel without contact."""
+        return self.denoiser.background or self.gel is not None
 
     @property
     def vision_size(self) -> int:
         """Side in pixels of the squares that photos are resized to."""
-        return self._encoders().preprocess("vision").resize
+        return self._preprocess.resize
+
+    @property
+    def _preprocess(self) -> Preprocess:
+        if "photos" not in self.denoiser.maps:
+            return self._encoders().preprocess("vision")
+        return Preprocess(self.denoiser.policy.photo_size, self.denoiser.policy.photo_size)
 
     def _encoders(self) -> EncoderSet:
         if self.encoders is None:
@@ -235,76 +385,151 @@ class TactilePipeline:
         return sampler
 
     def embed(self, photos: NDArray[np.uint8]) -> Tensor:
-        """Photos, bytes (n, h, w, 3), -> L2-normalized vision embeddings (n, d), on the CPU."""
+        """Photos, bytes (n, h, w, 3), -> what conditions on them, on the CPU.
+
+        L2-normalized vision embeddings (n, d), with tokens of their patches (n, 1 + p, d), or of
+        GVST tokens (n, 64, d).
+        """
+        batches = _batches(len(photos), EMBED)
+        parts = [self._embed(self._preprocess.fit(photos[rows]))[:n].cpu() for rows, n in batches]
+        return torch.cat(parts) if parts else self.denoiser.null_tokens(0)[:, 0]
+
+    @torch.no_grad()
+    def _embed(self, photos: NDArray[np.uint8]) -> Tensor:
+        maps, count = self.denoiser.maps, self.denoiser.policy.patches
+        if "photos" in maps:
+            return maps["photos"](torch.from_numpy(photos).to(self.device))
         encoders = self._encoders()
-        preprocess, parts = encoders.preprocess("vision"), [torch.empty(0, encoders.dim)]
-        with torch.no_grad():
-            for rows, count in _batches(len(photos), EMBED):
-                unit = to_unit(preprocess.fit(photos[rows]), encoders.device, signed=True)
-                pixels = preprocess(unit.add(1.0).div(2.0))
-                parts.append(encoders.encode("vision", pixels)[:count].cpu())
-        return torch.cat(parts)
+        unit = to_unit(photos, encoders.device, signed=True)
+        pixels = self._preprocess(unit.add(1.0).div(2.0))
+        embedding = encoders.encode("vision", pixels)
+        if "patches" not in maps:
+            return embedding
+        states = maps["patches"](encoders.states("vision", pixels, count))
+        return torch.cat([embedding[:, None], states], dim=1)
+
+    @torch.no_grad()
+    def embed_text(self, text: str) -> Tensor:
+        """One text -> its L2-normalized embedding (1, d), on the CPU.
+
+        With the tokens of its words, for a denoiser that knows them: (1, 1 + w, d).
+
+        Raises:
+            PalpateError: if the pipeline has no text encoder, or the text is empty.
+        """
+        if self.encoders is None or "text" not in self.encoders.modalities:
+            must, fix = "must be left out for a generator without text encoder", "Pass a photo"
+            raise PalpateError(must, repr(text), fix, argument="text")
+        if not text.strip():
+            fix = "Say what is felt, e.g. rough, porous"
+            raise PalpateError("must not be empty", repr(text), fix, argument="text")
+        embedding = torch.from_numpy(embed_texts([text], self.encoders))
+        if "words" not in self.denoiser.maps:
+            return embedding
+        states = self.encoders.states("text", [text], self.denoiser.policy.words)
+        words = self.denoiser.maps["words"](states.to(self.device)).cpu()
+        return torch.cat([embedding[:, None], words], dim=1)
 
     def sample(
         self,
-        conditions: Tensor | NDArray[Any],
+        conditions: Tensor | NDArray[Any] | None,
         ids: Sequence[str],
         *,
         seed: int,
-        source: Source = "vision",
+        texts: Tensor | NDArray[Any] | None = None,
+        weight: float = 0.5,
         sampler: SamplerOptions | None = None,
         background: NDArray[np.uint8] | None = None,
+        noise: Tensor | None = None,
+        on_step: OnStep | None = None,
     ) -> NDArray[np.uint8]:
-        """Tactile images (n, size, size, 3), uint8, from embeddings (n, d) of either source.
+        """Tactile images (n, size, size, 3), uint8, from embeddings (n, d) of photos or texts.
 
         Args:
-            conditions: one row per id.
+            conditions: embeddings of photos, one row per id, or None.
             ids: with ``seed`` they decide the noise.
             seed: of the noise.
-            source: of the embeddings.
+            texts: embeddings of texts, one row per id or one for all, or None.
+            weight: with both, the share of the photo where the two take one place.
             sampler: default: the pipeline's.
-            background: bytes (n, size, size, 3) of the sensor without contact, for a pipeline w/
-                BG.
+            background: bytes (n, size, size, 3) of the gel without contact; default: the stock gel,
+                which a pipeline w/ BG and a VQ autoencoder lacks.
+            noise: the starting noise (n, c, h, w) instead of that of seed and ids.
+            on_step: called after each step of each batch.
 
         Raises:
             PalpateError: if there is not one condition per id, or a background is missing or of
                 another size.
         """
-        if len(conditions) != len(ids):
-            got, fix = f"{len(ids)} ids, {len(conditions)} conditions", "Pass one row per id"
-            raise PalpateError("Every id needs one condition", got, fix)
+        photos, words = (
+            None if c is None else torch.as_tensor(np.asarray(c)) for c in (conditions, texts)
+        )
+        if words is not None and len(words) == 1:
+            words = words.expand(len(ids), *words.shape[1:])
+        if bad := [c for c in (photos, words) if c is not None and len(c) != len(ids)]:
+            raise _not_one_each(ids, len(bad[0]))
+        if background is None and self.gel is not None:
+            background = np.broadcast_to(self.gel, (len(ids), *self.gel.shape))
         if self.background != (background is not None):
-            must = "must be given for a generator w/ BG, and only for one"
+            must = "must be given for a generator that sees the gel, and only for one"
             raise PalpateError(
                 must, "none" if self.background else "one", "", argument="background"
             )
-        ground = None
-        if background is not None:
-            if background.shape[:3] != (len(ids), self.size, self.size):
-                must = f"must hold one image of {self.size} pixels square per photo"
-                raise PalpateError(must, str(background.shape), "", argument="background")
-            ground = self.stats.normalize(self.autoencoder.encode(background))
-        side = self.size // self.autoencoder.factor
+        if background is not None and background.shape[:3] != (len(ids), self.size, self.size):
+            must = f"must hold one image of {self.size} pixels square per photo"
+            raise PalpateError(must, str(background.shape), "", argument="background")
+        code, ground = self.autoencoder, None
+        if background is not None and self.denoiser.background:
+            if isinstance(code, BackgroundAutoencoder):
+                ground = code.gel(background)
+            else:
+                ground = self.stats.normalize(code.encode(background))
+        options = sampler or self.sampler_with()
         latents = sample(
             self.denoiser,
-            self.denoiser.tokens(torch.as_tensor(conditions), source),
+            self.denoiser.condition(photos, words, weight),
             self.denoiser.null_tokens(1),
             ids,
-            shape=(self.denoiser.channels, side, side),
+            shape=self._latent,
             schedule=self.schedule,
-            options=sampler or self.sampler_with(),
+            options=options,
             seed=seed,
             background=ground,
+            scheduler=self.scheduler if options.method == self.sampler.method else None,
+            noise=noise,
+            on_step=on_step,
         )
-        return self.autoencoder.decode(self.stats.restore(latents))
+        latents = self.stats.restore(latents)
+        if isinstance(code, BackgroundAutoencoder):
+            assert background is not None
+            return code.decode(latents, background)
+        return code.decode(latents)
 
-    def to(self, device: str | torch.device) -> TactilePipeline:
-        """Move all parts to a device, in place; return the pipeline."""
-        for part in (self.autoencoder, self.denoiser):
-            part.to(pick_device(device))
-        if self.encoders is not None:
-            self.encoders.to(device)
+    def to(  # pyright: ignore[reportIncompatibleMethodOverride] - its forms with one or two
+        self, device: str | torch.device | torch.dtype | None = None, dtype: Any = None
+    ) -> TactilePipeline:
+        """Move all parts to a device, and the U-Net to a type, in place; return the pipeline.
+
+        The encoders and the autoencoder stay float32.
+        """
+        if isinstance(device, torch.dtype):
+            device, dtype = None, device
+        if device is not None:
+            for part in (self.autoencoder, self.denoiser):
+                nn.Module.to(part, pick_device(device))
+            if self.encoders is not None:
+                self.encoders.to(device)
+        if dtype is not None:
+            nn.Module.to(self.unet, dtype)
+            self.__dict__.pop("digest", None)
         return self
+
+    @property
+    def other_scheduler(self) -> dict[str, Any] | None:
+        """Class and settings of the scheduler, if it is not the one of the sampler."""
+        own = build_scheduler(self.schedule, self.sampler.method)
+        shown = [json.loads(s.to_json_string()) for s in (own, self.scheduler)]
+        return None if shown[0] == shown[1] else shown[1]
 
     @property
     def notice(self) -> str:
@@ -327,23 +552,68 @@ class TactilePipeline:
                 referred to, not written.
 
         Raises:
-            PalpateError: if the folder is not empty, a weight is too large for 16 bits, or the
-                shared model differs.
+            PalpateError: if the folder is not empty, a weight is too large for 16 bits, the shared
+                model differs, or the scheduler is not the sampler's.
         """
+        if self.other_scheduler is not None:
+            must, fix = "A saved pipeline must have its sampler's scheduler", "Set sampler instead"
+            raise PalpateError(must, type(self.scheduler).__name__, fix)
+        if self.dtype != torch.float32:
+            whole = replace(self, denoiser=copy.deepcopy(self.denoiser))
+            whole.to(torch.float32).save(folder, half=half, shared=shared)
+            return
         if shared is not None and self._digests() != _digests(*_shared_parts(shared)):
             must = f"A pipeline that refers to {shared} must use its autoencoder and vision encoder"
             raise PalpateError(must, "others", "Leave out shared, or train on these")
         with atomic_folder(Path(folder)) as part:
             self.denoiser.save(part / "unet", half=half)
+            if self.gel is not None:
+                Image.fromarray(self.gel).save(part / "gel.png")
             if shared is None:
                 self.autoencoder.save(part / "autoencoder", half=half)
                 if self.encoders is not None:
                     self.encoders.save(part / "encoders", half=half)
             self.__dict__.pop("digest", None)  # of the weights before rounding
-            build_scheduler(self.schedule, self.sampler.method).save_pretrained(part / "scheduler")
+            self.scheduler.save_pretrained(part / "scheduler")
+            index = json.loads(self.to_json_string())
+            absent = {} if shared is None else {"autoencoder": [None, None]}
+            write_json(part / "model_index.json", index | absent)
             about = self.to_json() | ({} if shared is None else {"shared": shared})
             write_json(part / "palpate.json", about)
             write_model_cards(part)
+
+    def save_pretrained(  # pyright: ignore[reportIncompatibleMethodOverride]
+        self,
+        save_directory: str | Path,
+        safe_serialization: bool = True,
+        variant: str | None = None,
+        *,
+        push_to_hub: bool = False,
+        **hub: Any,
+    ) -> None:
+        """:meth:`save` under diffusers' name.
+
+        Args:
+            save_directory: must be new or empty.
+            safe_serialization: must be true: nothing is pickled.
+            variant: must be None.
+            push_to_hub: also upload it.
+            hub: ``repo_id`` (default: the name of the folder), and others of ``push_to_hub``.
+
+        Raises:
+            PalpateError: as :meth:`save`, or for another form of weights.
+        """
+        if not safe_serialization or variant is not None:
+            must = "Weights must be saved as safetensors and without a variant"
+            raise PalpateError(must, variant or "pickle", "For 16 bits use save(half=True)")
+        self.save(Path(save_directory))
+        if push_to_hub:
+            self.push_to_hub(hub.pop("repo_id", Path(save_directory).name), **hub)
+
+    def _upload_folder(self, working_dir: str | Path, *args: Any, **options: Any) -> Any:
+        """Upload palpate's cards: before this call diffusers replaces them by a blank one."""
+        write_model_cards(Path(working_dir))
+        return super()._upload_folder(working_dir, *args, **options)
 
     def _digests(self) -> tuple[str, str | None]:
         return _digests(self.autoencoder, self.encoders)
@@ -357,9 +627,9 @@ class TactilePipeline:
             "preset": self.preset,
             "size": self.size,
             "background": self.background,
-            "condition": asdict(self.denoiser.policy),
-            "schedule": asdict(self.schedule),
-            "sampler": asdict(self.sampler),
+            "condition": facts(self.denoiser.policy),
+            "schedule": facts(self.schedule),
+            "sampler": facts(self.sampler),
             "latents": asdict(self.stats) | {"factor": self.autoencoder.factor},
             "autoencoder": autoencoder,
             "encoders": vision,
@@ -368,7 +638,9 @@ class TactilePipeline:
         }
 
     @classmethod
-    def from_pretrained(cls, source: str | Path, *, device: str = "auto") -> TactilePipeline:
+    def from_pretrained(  # pyright: ignore[reportIncompatibleMethodOverride]
+        cls, source: str | Path, *, device: str = "auto"
+    ) -> TactilePipeline:
         """Read a saved pipeline and check its digest.
 
         Args:
@@ -391,9 +663,10 @@ class TactilePipeline:
                 fix = "Install the version that it names, or train again"
                 raise PalpateError(must, "those of another version of palpate", fix)
         else:
-            autoencoder = Autoencoder.load(folder / "autoencoder")
+            autoencoder = load_autoencoder(folder / "autoencoder")
             place = folder / ("encoders" if about["format"] == FORMAT else "towers")
             encoders = EncoderSet.load(place) if vision else None
+        gel = folder / "gel.png"
         try:
             latents = about["latents"]
             pipeline = cls(
@@ -406,6 +679,7 @@ class TactilePipeline:
                 encoders=encoders,
                 preset=str(about["preset"]),
                 training=dict(about["training"]),
+                gel=square(read_image(gel), int(about["size"])) if gel.is_file() else None,
             )
         except (KeyError, TypeError, ValueError) as error:
             must = f"The entries of {note} must be as palpate writes them"
@@ -416,22 +690,49 @@ class TactilePipeline:
         return pipeline.to(device)
 
 
-def _digests(autoencoder: Autoencoder, encoders: EncoderSet | None) -> tuple[str, str | None]:
+def _not_one_each(ids: Sequence[str], n: int) -> PalpateError:
+    got, fix = f"{len(ids)} ids, {n} conditions", "Pass one row per id"
+    return PalpateError("Every id needs one condition", got, fix)
+
+
+def _class_of(part: Any) -> tuple[str, str]:
+    """Library (of palpate: module) and class, as ``model_index.json`` names them."""
+    name = type(part).__module__
+    return name if name.startswith("palpate.") else name.split(".")[0], type(part).__name__
+
+
+def _digests(autoencoder: AnyAutoencoder, encoders: EncoderSet | None) -> tuple[str, str | None]:
     return autoencoder.digest, encoders.digest("vision") if encoders else None
 
 
-def _shared_parts(name: str) -> tuple[Autoencoder, EncoderSet]:
+def _shared_parts(name: str) -> tuple[AnyAutoencoder, EncoderSet]:
     """Load autoencoder and encoders of a shipped model; a folder would differ elsewhere."""
     if name not in SHIPPED:
         must, fix = f"must be one of {', '.join(SHIPPED)}", "Save the pipeline with its parts"
         raise PalpateError(must, repr(name), fix, argument="shared")
-    return Autoencoder.load(name), EncoderSet(load_clip(name))
+    return load_autoencoder(name), EncoderSet(load_clip(name))
 
 
-def build_scheduler(
-    schedule: Schedule, method: Literal["ddim", "dpm"]
-) -> DDIMScheduler | DPMSolverMultistepScheduler:
-    """The diffusers scheduler for a trained model; latents are not clipped."""
+def build_scheduler(schedule: Schedule, method: Method) -> Any:
+    """The diffusers scheduler for a trained model; latents are not clipped.
+
+    Raises:
+        PalpateError: if the method is not one for the schedule.
+    """
+    flow = schedule.prediction == "flow"
+    if method != "dpm" and flow != (method in ("euler", "heun")):
+        known = "dpm, euler or heun" if flow else "dpm or ddim"
+        must = f"must be {known} for a model that predicts {schedule.prediction}"
+        raise PalpateError(must, method, "Choose one of these", argument="method")
+    if flow:
+        steps: dict[str, Any] = {"num_train_timesteps": schedule.steps}
+        if method == "euler":
+            return FlowMatchEulerDiscreteScheduler(**steps)
+        if method == "heun":
+            return FlowMatchHeunDiscreteScheduler(**steps)
+        return DPMSolverMultistepScheduler(
+            use_flow_sigmas=True, prediction_type="flow_prediction", **steps
+        )
     common: dict[str, Any] = {
         "num_train_timesteps": schedule.steps,
         "beta_start": schedule.beta_start,
@@ -444,9 +745,8 @@ def build_scheduler(
     if method == "ddim":
         return DDIMScheduler(clip_sample=False, set_alpha_to_one=True, **common)
     # Steps uniform in log(a / (1 - a)). Uniform in t, 20 steps leave one wide gap before t = 0
-    # under this
-    # schedule, and Gaussian data of spread 0.4 (0.2) come out with 80 % (55 %) of it; now with 100
-    # % (99 %).
+    # under this schedule, and Gaussian data of spread 0.4 (0.2) come out with 80 % (55 %) of it;
+    # now with 100 % (99 %).
     common |= {"algorithm_type": "dpmsolver++", "solver_order": 2, "use_lu_lambdas": True}
     return DPMSolverMultistepScheduler(**common)
 
@@ -457,8 +757,13 @@ def starting_noise(ids: Sequence[str], shape: tuple[int, int, int], seed: int) -
     return torch.from_numpy(np.stack(draws))
 
 
+def _generator(seed: int, sample_id: str) -> torch.Generator:
+    """The noise that a scheduler adds while it samples."""
+    return torch.Generator().manual_seed(int(rng_for(seed, "steps", sample_id).integers(2**62)))
+
+
 @torch.no_grad()
-def sample(
+def sample(  # noqa: PLR0913 - one row per part
     predict: Predictor,
     tokens: Tensor,
     null: Tensor,
@@ -469,6 +774,9 @@ def sample(
     options: SamplerOptions,
     seed: int,
     background: Tensor | None = None,
+    scheduler: Any = None,
+    noise: Tensor | None = None,
+    on_step: OnStep | None = None,
 ) -> Tensor:
     """Normalized latents (n, c, h, w) of ``ids``, on the CPU.
 
@@ -482,20 +790,30 @@ def sample(
         options: see :class:`SamplerOptions`.
         seed: of the starting noise.
         background: normalized background latents (n, c, h, w), or None.
+        scheduler: diffusers' scheduler; default: that of the method.
+        noise: starting noise (n, c, h, w); default: that of seed and ids.
+        on_step: called after each step of each batch.
     """
     parts = [torch.empty(0, *shape)]
+    scheduler = scheduler or build_scheduler(schedule, options.method)
+    scales = hasattr(scheduler, "scale_model_input")  # not those of flows
+    draws = "generator" in inspect.signature(scheduler.step).parameters
     for rows, count in _batches(len(ids), options.batch):
-        z = starting_noise([ids[k] for k in rows], shape, seed).to(tokens.device)
+        names = [ids[k] for k in rows]
+        z = starting_noise(names, shape, seed) if noise is None else noise[rows]
+        more = {"generator": [_generator(seed, i) for i in names]} if draws else {}
         ground = None if background is None else background[rows].to(tokens.device)
         given = tokens[rows]
-        scheduler = build_scheduler(schedule, options.method)
-        scheduler.set_timesteps(options.steps, device=z.device)
-        z = z * scheduler.init_noise_sigma
-        for t in scheduler.timesteps:
+        scheduler.set_timesteps(options.steps, device=tokens.device)
+        z = z.to(tokens.device) * getattr(scheduler, "init_noise_sigma", 1.0)
+        for k, t in enumerate(scheduler.timesteps):
             times, empty = t.expand(len(z)), null.expand(given.shape)
-            prediction = guided(predict, z, times, given, empty, ground, options)
-            step: Any = scheduler.step(prediction, t, z, return_dict=False)  # pyright: ignore[reportArgumentType]
-            z = step[0]
+            inside = options.low < float(t) / schedule.steps <= options.high
+            here = options if inside else replace(options, guidance=1.0)
+            scaled = scheduler.scale_model_input(z, t) if scales else z
+            prediction = guided(predict, scaled, times, given, empty, ground, here)
+            z = scheduler.step(prediction, t, z, return_dict=False, **more)[0]
+            z = z if on_step is None else on_step(k, t, z)
         parts.append(z[:count].cpu())
     return torch.cat(parts)
 

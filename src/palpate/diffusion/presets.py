@@ -1,23 +1,42 @@
 """Presets: complete configurations of autoencoder, denoiser, training and sampling.
 
+For tests, for two CPU cores, and the paper's:
+
 ==============  ====================  ============================  ================================
 setting         ``tiny``              ``mini``                      ``paper``
 ==============  ====================  ============================  ================================
 for             tests, seconds        two CPU cores, minutes        GPUs; paper sections 2 and 9
-image, latents  32 px, 3 x 8 x 8      64 px, 4 x 16 x 16            256 px, 3 x 64 x 64
-autoencoder     patch 4, width 16     patch 2, 32-64, 8,192 codes   latent diffusion ``vq-f4``
+image, latents  32 px, 3 x 8 x 8      64 px, 8 x 16 x 16            256 px, 3 x 64 x 64
+autoencoder     patch 4, width 16     given the gel, 48-96          latent diffusion ``vq-f4``
 latent scale    std                   std                           one (recorded, not applied)
 U-Net           16-32                 64-96, modulated, 2.6 M       192 x (1, 2, 3, 5), 406.3 M
-schedule        T = 1000, beta linear in its square root, 0.0015 -> 0.0195, in all three
-prediction      eps                   v                             eps (Eq. 1)
-condition       one token, dropout 0.1, null zeros, in all three
-source          text                  text or photo, half each      text
-gap, noise      none, 0               mean-shift, 0.3               none, 0
+schedule        beta, T = 1000        flow, time mean .5            beta, T = 1000
+prediction      eps                   velocity                      eps (Eq. 1)
+condition       one token             text and photo, a token each  one token
+source          text                  both                          text
+gap, noise      none, 0               memory, 0.3                   none, 0
 optimizer       AdamW 1e-3, EMA 0.99  AdamW 1e-3, cosine, EMA 0.99  AdamW 6.4e-5, EMA 0.9999
-length          20 steps of 8         800 steps of 8                30 epochs of batch 32
-sampler         DPM-Solver++ 4        DPM-Solver++ 8                DDIM 200, eta 0
-guidance        2                     4                             7.5
+length          20 steps of 8         400 steps of 16               30 epochs of batch 32
+sampler         DPM-Solver++ 4        DPM-Solver++ 10               DDIM 200, eta 0
+guidance        2                     2.5                           7.5
 ==============  ====================  ============================  ================================
+
+beta: linear in its square root, 0.0015 -> 0.0195. Dropout 0.1 and null zeros in all presets.
+
+Two more for one GPU, which are given and have not been trained to their end:
+
+==============  ==============================  ====================================
+setting         ``small``, a small GPU          ``sd15``, Stable Diffusion 1.5 goes on
+==============  ==============================  ====================================
+image, latents  128 px, 8 x 32 x 32             256 px, 4 x 32 x 32
+autoencoder     given the gel, 64-128           its ``kl-f8``, whose scale is applied
+U-Net           128-256-384, modulated, 64 M    its own, 860 M, from ``unet``
+prediction      velocity, time mean .5          eps, beta 0.00085 -> 0.012
+condition       as ``mini``                     text: embedding and its 77 words
+optimizer       AdamW 3e-4, cosine, EMA 0.9995  AdamW 1e-5, EMA 0.9999
+length          30,000 steps of 64              10,000 steps of 32
+sampler         DPM-Solver++ 20, guidance 2.5   DPM-Solver++ 25, guidance 7.5
+==============  ==============================  ====================================
 
 ``mini`` is the geometry of the models that ship (docs/concepts/mini.md, with their scores and with
 what did not work): what is trained with it can go on from them. ``source="text"`` is the paper's
@@ -26,12 +45,14 @@ training.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field, replace
 from typing import Literal
 
 from palpate.core import require, require_choice
 from palpate.diffusion.options import (
     AutoencoderOptions,
+    BackgroundOptions,
     ConditionPolicy,
     SamplerOptions,
     Schedule,
@@ -48,9 +69,11 @@ class DiffusionPreset:
         name: recorded in the pipeline.
         size: side of the tactile images in pixels.
         autoencoder: how to train one, or None if a trained one is given (``paper``: a ``vq-f4``
-            folder).
+            folder; ``sd15``: that of the U-Net).
         latent_scale: see :class:`~palpate.diffusion.autoencoder.LatentStats`.
-        unet, schedule, sampler: see there.
+        unet: geometry of an untrained one; the folder or hub id of a trained one to go on from; or
+            None if one is given (``sd15``).
+        schedule, sampler: see there.
         condition: the policy; its width is replaced by that of the encoders at hand.
         loop: training; ``steps`` is ignored if ``epochs`` is given.
         epochs: passes over the training part, or None.
@@ -58,9 +81,9 @@ class DiffusionPreset:
 
     name: str
     size: int
-    autoencoder: AutoencoderOptions | None
+    autoencoder: AutoencoderOptions | BackgroundOptions | None
     latent_scale: Literal["std", "one"]
-    unet: UNetOptions
+    unet: UNetOptions | str | None
     condition: ConditionPolicy
     loop: LoopOptions
     epochs: int | None = None
@@ -68,9 +91,17 @@ class DiffusionPreset:
     sampler: SamplerOptions = field(default_factory=SamplerOptions)
 
     def __post_init__(self) -> None:
-        """Raise ``PalpateError`` if the dropout is no probability below 1."""
-        dropout = self.condition.dropout
+        """Raise ``PalpateError`` for settings out of range, or a min-SNR weight of a flow."""
+        dropout, size = self.condition.dropout, self.condition.photo_size
         require(0 <= dropout < 1, "dropout", "must lie in [0, 1)", dropout, 0.1)
+        whole = size >= 16 and size & (size - 1) == 0
+        require(whole, "photo_size", "must be a power of 2 from 16 on", size, 64)
+        patches, width = self.condition.patches, self.condition.photo_width
+        square = math.isqrt(patches) ** 2 == patches
+        require(square, "patches", "must be a square number", patches, 64)
+        require(width % 4 == 0 < width, "photo_width", "must be a multiple of 4", width, 32)
+        snr = None if self.schedule.prediction != "flow" else self.schedule.min_snr
+        require(snr is None, "min_snr", "must be left out for flow matching", snr)
 
     def loop_for(self, n: int, *, seed: int | None = None) -> LoopOptions:
         """The loop for ``n`` training samples: epochs become steps."""
@@ -107,20 +138,16 @@ TINY = DiffusionPreset(
 MINI = DiffusionPreset(
     name="mini",
     size=64,
-    # f4 as in latent diffusion: pixel pairs become channels, then one halving. Plain 4 px patches
-    # lose texture.
-    autoencoder=AutoencoderOptions(
-        patch=2, widths=(32, 64), channels=4, codes=8192, steps_free=2000, steps_quantized=300
-    ),
+    autoencoder=BackgroundOptions(),
     latent_scale="std",
     unet=UNetOptions(
         widths=(64, 96), attention=(False, True), layers=1, head_width=32, groups=16, modulate=True
     ),
     # Gap and noise go beyond the paper: the text-image gap is wide in small encoders.
-    condition=ConditionPolicy(width=128, gap="mean-shift", noise=0.3, source="mixed"),
-    loop=LoopOptions(steps=800, batch=8, lr=1e-3, warmup=50, ema=0.99),
-    schedule=Schedule(prediction="v_prediction"),
-    sampler=SamplerOptions("dpm", steps=8, guidance=4.0),
+    condition=ConditionPolicy(width=128, gap="memory", noise=0.3, source="both"),
+    loop=LoopOptions(steps=400, batch=16, lr=1e-3, warmup=50, ema=0.99),
+    schedule=Schedule(prediction="flow"),
+    sampler=SamplerOptions("dpm", steps=10, guidance=2.5),
 )
 
 #: The paper's model as far as it is known; reference/paper.md section 9 gives the reason for each
@@ -137,7 +164,7 @@ PAPER = DiffusionPreset(
         head_width=32,
         groups=32,
     ),
-    condition=ConditionPolicy(width=768),
+    condition=ConditionPolicy(width=768, photo_size=256, photo_width=64),
     loop=LoopOptions(
         steps=0,
         batch=32,
@@ -152,7 +179,41 @@ PAPER = DiffusionPreset(
     sampler=SamplerOptions("ddim", steps=200, guidance=7.5),
 )
 
-PRESETS = {preset.name: preset for preset in (TINY, MINI, PAPER)}
+SMALL = DiffusionPreset(
+    name="small",
+    size=128,
+    autoencoder=BackgroundOptions(narrow=64, wide=128, steps=10_000, crop=64),
+    latent_scale="std",
+    unet=UNetOptions(
+        widths=(128, 256, 384),
+        attention=(False, True, True),
+        layers=2,
+        head_width=64,
+        groups=32,
+        modulate=True,
+    ),
+    condition=replace(MINI.condition, photo_size=128, photo_width=64),
+    loop=LoopOptions(steps=30_000, batch=64, lr=3e-4, warmup=500, ema=0.9995),
+    schedule=Schedule(prediction="flow"),
+    sampler=SamplerOptions("dpm", steps=20, guidance=2.5),
+)
+
+#: Text keeps the tokens that the U-Net knows; a photo enters as its embedding, so a text has one.
+SD15 = DiffusionPreset(
+    name="sd15",
+    size=256,
+    autoencoder=None,
+    latent_scale="one",
+    unet=None,
+    condition=ConditionPolicy(width=768, words=77, photo_size=256, photo_width=64),
+    loop=LoopOptions(
+        steps=10_000, batch=32, lr=1e-5, warmup=500, decay="constant", weight_decay=0.01, ema=0.9999
+    ),
+    schedule=Schedule(beta_start=0.00085, beta_end=0.012),
+    sampler=SamplerOptions("dpm", steps=25, guidance=7.5),
+)
+
+PRESETS = {preset.name: preset for preset in (TINY, MINI, SMALL, PAPER, SD15)}
 
 
 def preset_named(name: str) -> DiffusionPreset:

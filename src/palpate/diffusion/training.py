@@ -1,4 +1,5 @@
-"""Training a generator (paper section 2): encode once, then train the denoiser on Eq. 1,
+"""Training a generator (paper section 2): encode once, then train the denoiser, in the paper on
+Eq. 1,
 
     L(theta) = E_{z, c, eps, t} || eps - eps_theta(z^t, t, c) ||^2,   t uniform on 1..T,
     z^t = sqrt(a_t) z + sqrt(1 - a_t) eps.
@@ -8,7 +9,8 @@ and photos through the frozen encoders once, into caches; the training loop read
 condition c is dropped with probability p, which trains the unconditional model that guidance needs
 (Ho & Salimans 2022).
 
-Options beyond the paper: v-prediction (Salimans & Ho 2022), whose target is ``sqrt(a) eps - sqrt(1
+Options beyond the paper: flow matching (Lipman et al. 2023) with logit-normal time, whose target is
+``eps - z``; v-prediction (Salimans & Ho 2022), whose target is ``sqrt(a) eps - sqrt(1
 - a) z``, and the min-SNR weight (Hang et al. 2023): ``min(snr, g) / snr`` for eps and ``min(snr, g)
 / (snr + 1)`` for v.
 """
@@ -17,11 +19,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, cast
+from typing import Any, cast
 
 import numpy as np
 import torch
+from diffusers.models.unets.unet_2d_condition import UNet2DConditionModel
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
@@ -30,26 +34,52 @@ from palpate.core import (
     PalpateError,
     Progress,
     Split,
-    atomic_path,
     digest_json,
     digest_lines,
     quiet,
     read_json,
-    write_json,
+    short,
 )
+from palpate.core.digest import facts
 from palpate.data.images import cached_images, image_stamp
 from palpate.data.manifest import Manifest
 from palpate.data.reading import load
-from palpate.diffusion.autoencoder import Autoencoder, LatentStats
-from palpate.diffusion.autoencoder_training import SHOWN, sheet, train_autoencoder
-from palpate.diffusion.denoiser import Denoiser, build_unet
-from palpate.diffusion.options import SOURCES, ConditionPolicy, Schedule, Source, UNetOptions
+from palpate.diffusion.alignment import Alignment, Guide
+from palpate.diffusion.autoencoder import (
+    AnyAutoencoder,
+    BackgroundAutoencoder,
+    LatentStats,
+    load_autoencoder,
+)
+from palpate.diffusion.autoencoder_training import SHOWN, sheet
+from palpate.diffusion.autoencoders import autoencoder_of, gels_of, has_gels
+from palpate.diffusion.denoiser import (
+    Denoiser,
+    build_unet,
+    find_unet,
+    inputs_of,
+    lengths_of,
+    load_unet,
+    repeats_of,
+    slots_of,
+)
+from palpate.diffusion.encoding import encode_latents, encode_states
+from palpate.diffusion.options import (
+    SOURCES,
+    AutoencoderOptions,
+    BackgroundOptions,
+    ConditionPolicy,
+    Schedule,
+    Source,
+    Sources,
+    UNetOptions,
+)
 from palpate.diffusion.pipeline import TactilePipeline
 from palpate.diffusion.presets import DiffusionPreset, preset_named
 from palpate.encoders.contrastive import load_split, train_part
 from palpate.encoders.embed import embed, texts_of
-from palpate.encoders.encoder_set import EncoderSet, load_clip, seeded
-from palpate.encoders.models import digest_tensors, pick_device
+from palpate.encoders.encoder_set import EncoderSet, Modality, load_clip, seeded
+from palpate.encoders.models import digest_tensors, is_hub_id, pick_device, stated
 from palpate.encoders.rows import evenly
 from palpate.training.engine import Batch, Losses, Task, fit
 from palpate.training.estimate import estimate
@@ -57,11 +87,9 @@ from palpate.training.options import Compute, LoopOptions
 from palpate.training.processes import connect, first_alone, keep_logs, place, work_folder
 from palpate.training.steps import Step
 
-if TYPE_CHECKING:
-    from diffusers.models.unets.unet_2d_condition import UNet2DConditionModel
-
-CACHE_FORMAT = "palpate-latents/1"
-Sources = Literal["text", "vision", "mixed"]
+#: Which encoder's states an input is.
+STATES: Mapping[str, Modality] = {"words": "text", "patches": "vision"}
+Backgrounds = Callable[[NDArray[np.int64]], Tensor]
 
 
 @dataclass(frozen=True)
@@ -69,25 +97,39 @@ class Encoded:
     """A part of the data as the denoiser's training reads it.
 
     Attributes:
-        conditions: embeddings (n, d) by source.
-        latents, background: (n, c, h, w), not normalized, in memory or mapped.
+        conditions: embeddings (n, d) by source; by name states of words and patches (n, k, w), and
+            photos (n, s, s, 3) of GVST.
+        latents: (n, c, h, w), not normalized, in memory or mapped.
+        gels: the no-contact images (n, s, s, 3), where they are needed.
+        background_latents: of an autoencoder that codes the gel with the image.
     """
 
-    conditions: Mapping[Source, NDArray[Any]]
+    conditions: Mapping[str, NDArray[Any]]
     latents: NDArray[np.float32]
-    background: NDArray[np.float32] | None = None
+    gels: NDArray[np.uint8] | None = None
+    background_latents: NDArray[np.float32] | None = None
+
+    def backgrounds(self, autoencoder: AnyAutoencoder, stats: LatentStats) -> Backgrounds:
+        """What the denoiser of the variant w/ BG sees."""
+        gels, codes = self.gels, self.background_latents
+        if isinstance(autoencoder, BackgroundAutoencoder):
+            return lambda rows: autoencoder.gel(cast("Any", gels)[rows])
+        return lambda rows: stats.normalize(_take(cast("Any", codes), rows))
 
 
 def train_generator(  # noqa: PLR0913 - a public verb
     data: Manifest | str | Path,
     split: Split | str | Path | None,
-    clip: EncoderSet | str | Path,
+    clip: EncoderSet | str | Path | None = None,
     *,
     preset: str | DiffusionPreset = "mini",
-    autoencoder: Autoencoder | str | Path | None = None,
+    autoencoder: AnyAutoencoder | str | Path | None = None,
+    unet: str | Path | None = None,
     output: Path | str | None = None,
     source: Sources | None = None,
     background: bool = False,
+    align: EncoderSet | str | Path | None = None,
+    align_weight: float = 0.5,
     steps: int | None = None,
     seed: int = 0,
     device: str = "auto",
@@ -101,14 +143,21 @@ def train_generator(  # noqa: PLR0913 - a public verb
         split: a split or its file; its digest goes into the pipeline. None: the one that lies with
             the data.
         clip: vision and text encoders that condition the generator: a set of encoders, its folder,
-            the folder or hub id of a CLIP, or ``palpate/mini``.
-        preset: geometry, schedule and length: ``mini``, ``tiny`` or ``paper``, or a preset.
-        autoencoder: a VQ model, its folder or hub id, or ``palpate/mini``. Default: a small one,
-            trained first on the train part; the preset ``paper`` needs one.
+            the folder or hub id of a CLIP, or ``palpate/mini``; ``source="resnet"`` needs none.
+        preset: geometry, schedule and length, or its name (:data:`palpate.diffusion.PRESETS`).
+        autoencoder: any :class:`~palpate.diffusion.autoencoder.Autoencoder` or what its ``load``
+            takes: folder, hub id, ``.ckpt`` or ``palpate/mini``. Default: a small one, trained
+            first on the train part, or that of ``unet``; the preset ``paper`` needs one.
+        unet: go on from this one of diffusers instead of random weights: a folder or hub id of it
+            or of its generator; the preset ``sd15`` needs one.
         output: folder for the pipeline, new or empty; None keeps it in memory.
-        source: what training conditions on; default: the preset's. ``vision`` is the baseline
-            without text (GVST).
+        source: what training conditions on; default: the preset's. ``resnet`` is GVST, the baseline
+            without text; ``vision`` has the preset's encoder in its place.
         background: the variant w/ BG, which also sees the no-contact image.
+        align: pull the features of the U-Net's middle block to what this encoder makes of the
+            tactile images (REPA); its tactile encoder, or else its vision encoder. Scores by the
+            same encoder are rejected: use another one.
+        align_weight: of that term in the loss.
         steps: optimizer steps; default: the preset's.
         seed: of weights, order, noise and condition dropout.
         device: ``auto``, ``cpu``, ``cuda`` or ``mps``.
@@ -122,41 +171,38 @@ def train_generator(  # noqa: PLR0913 - a public verb
     if steps is not None and steps < 1:
         fix = "Leave it out for the preset's length"
         raise PalpateError("must be at least 1", str(steps), fix, argument="steps")
-    chosen = preset if isinstance(preset, DiffusionPreset) else preset_named(preset)
+    chosen = _chosen(preset, unet)
     if autoencoder is None and chosen.autoencoder is None:
-        must, fix = f"must be given for the preset {chosen.name}", "Pass a hub id or a folder"
-        raise PalpateError(must, "none", fix, argument="autoencoder")
+        if not isinstance(chosen.unet, str):
+            raise _not_given("autoencoder", chosen)
+        autoencoder = chosen.unet
     device = connect(device)
     manifest, split = load(data), load_split(data, split)
-    encoders = clip if isinstance(clip, EncoderSet) else EncoderSet(load_clip(clip))
-    if missing := [source for source in SOURCES if source not in encoders.modalities]:
-        must, got = "must have vision and text", f"no {' and no '.join(missing)}"
+    encoders = EncoderSet(load_clip(clip)) if isinstance(clip, str | Path) else clip
+    needed = _modalities(_policy(chosen, encoders, source))
+    known = [] if encoders is None else encoders.modalities
+    if missing := [modality for modality in needed if modality not in known]:
+        must, got = f"must have {' and '.join(needed)}", f"no {' and no '.join(missing)}"
         raise PalpateError(must, got, "Pass a CLIP", argument="clip")
     output = None if output is None else Path(output)
     with work_folder(output) as work:
         cache = work / "cache"
         if autoencoder is None:
-            train, others = train_part(manifest, split), manifest.part(split, "val", "test")
-            with first_alone():
-                images, held_out = (
-                    cached_images(p, "tactile", chosen.size, cache, progress) if len(p) else None
-                    for p in (train, others)
-                )
-            assert images is not None
             assert chosen.autoencoder is not None
-            autoencoder = train_autoencoder(
-                images,
+            autoencoder = autoencoder_of(
+                manifest,
+                split,
                 chosen.autoencoder,
+                chosen.size,
                 work / "autoencoder",
-                held_out=held_out,
+                cache=cache,
                 seed=seed,
-                key=image_stamp(train, "tactile"),
-                device=pick_device(device),
+                device=device,
                 compute=compute,
                 progress=progress,
             )
-        elif not isinstance(autoencoder, Autoencoder):
-            autoencoder = Autoencoder.load(autoencoder)
+        elif not isinstance(autoencoder, AnyAutoencoder):
+            autoencoder = load_autoencoder(autoencoder)
         pipeline = train_pipeline(
             manifest,
             split,
@@ -168,6 +214,7 @@ def train_generator(  # noqa: PLR0913 - a public verb
             steps=steps,
             source=source,
             background=background,
+            align=None if align is None else Alignment.of(align, align_weight, device),
             cache=cache,
             device=device,
             compute=compute,
@@ -179,39 +226,66 @@ def train_generator(  # noqa: PLR0913 - a public verb
     return pipeline
 
 
+def _chosen(preset: str | DiffusionPreset, unet: str | Path | None) -> DiffusionPreset:
+    """The preset, with a trained U-Net where one is given."""
+    chosen = preset if isinstance(preset, DiffusionPreset) else preset_named(preset)
+    chosen = chosen if unet is None else replace(chosen, unet=str(unet))
+    if chosen.unet is None:
+        raise _not_given("unet", chosen)
+    if isinstance(chosen.unet, str):
+        find_unet(chosen.unet)
+    return chosen
+
+
+def _not_given(argument: str, preset: DiffusionPreset) -> PalpateError:
+    must, fix = f"must be given for the preset {preset.name}", "Pass a folder, a hub id or a file"
+    return PalpateError(must, "none", fix, argument=argument)
+
+
 def plan_generator(
     data: Manifest | str | Path,
     split: Split | str | Path | None = None,
     *,
     preset: str | DiffusionPreset = "mini",
+    unet: str | Path | None = None,
+    source: Sources | None = None,
     steps: int | None = None,
     background: bool = False,
     device: str = "auto",
 ) -> dict[str, Any]:
     """What training the denoiser would take; only the manifest is read.
 
-    Latents are taken as those of the preset's autoencoder, or of an f4 of three channels.
+    Latents are taken as those of the preset's autoencoder, or of an f4 of three channels; with a
+    trained U-Net of an f8 of four.
 
     Returns:
         see :func:`palpate.training.estimate.estimate`.
     """
-    chosen = preset if isinstance(preset, DiffusionPreset) else preset_named(preset)
+    chosen = _chosen(preset, unet)
     train = train_part(load(data), load_split(data, split))
     loop = chosen.loop_for(len(train))
     loop = loop if steps is None else replace(loop, steps=steps)
-    vq, width = chosen.autoencoder, chosen.condition.width
-    factor = vq.patch * 2 ** (len(vq.widths) - 1) if vq else 4
-    channels, side = vq.channels if vq else 3, chosen.size // factor
+    options, policy = chosen.autoencoder, _policy(chosen, None, source)
+    vq = options if isinstance(options, AutoencoderOptions) else None
+    trained = isinstance(chosen.unet, str)
+    factor = vq.patch * 2 ** (len(vq.widths) - 1) if vq else 8 if trained else 4
+    channels = options.channels if options else 4 if trained else 3
+    side = chosen.size // factor
+    wide = 0 if not background else 48 if isinstance(options, BackgroundOptions) else channels
 
     def build() -> nn.Module:
-        shape: dict[str, Any] = {"channels": channels, "size": side, "width": width}
-        return build_unet(chosen.unet, **shape, background=background)
+        if isinstance(chosen.unet, UNetOptions):
+            return build_unet(chosen.unet, policy, channels=channels, size=side, background=wide)
+        file = find_unet(str(chosen.unet))[1] / "config.json"
+        config = read_json(file, "configuration") | {"in_channels": channels + wide}
+        return cast("nn.Module", UNet2DConditionModel.from_config(config))
 
     def forward(model: nn.Module, rows: int, where: torch.device) -> Tensor:
-        denoiser = Denoiser(cast("UNet2DConditionModel", model), chosen.condition).to(where)
-        z = torch.zeros(rows, channels * (2 if background else 1), side, side, device=where)
-        tokens = torch.zeros(rows, chosen.condition.tokens, width, device=where)
-        return denoiser(z, torch.zeros(rows, dtype=torch.long, device=where), tokens)
+        denoiser = Denoiser(cast("UNet2DConditionModel", model), policy).to(where)
+        z = torch.zeros(rows, channels + wide, side, side, device=where)
+        return denoiser(
+            z, torch.zeros(rows, dtype=torch.long, device=where), denoiser.null_tokens(rows)
+        )
 
     plan = estimate(build, forward, loop, len(train), pick_device(device))
     return plan | {"learning_rate_if_the_batch_is_each_of_two_gpus": 2 * loop.lr}
@@ -220,8 +294,8 @@ def plan_generator(
 def train_pipeline(  # noqa: PLR0913, PLR0917 - one row per choice of the training
     manifest: Manifest,
     split: Split,
-    encoders: EncoderSet,
-    autoencoder: Autoencoder,
+    encoders: EncoderSet | None,
+    autoencoder: AnyAutoencoder,
     preset: DiffusionPreset,
     folder: Path,
     *,
@@ -229,6 +303,7 @@ def train_pipeline(  # noqa: PLR0913, PLR0917 - one row per choice of the traini
     steps: int | None = None,
     source: Sources | None = None,
     background: bool = False,
+    align: Alignment | None = None,
     start: TactilePipeline | None = None,
     cache: Path | None = None,
     device: str = "auto",
@@ -241,7 +316,7 @@ def train_pipeline(  # noqa: PLR0913, PLR0917 - one row per choice of the traini
         manifest: samples with tactile image and photo, and a text or a material.
         split: its digest goes into the pipeline.
         encoders: their text embeddings condition the training, their vision embeddings the
-            sampling.
+            sampling; None for ``source="resnet"``.
         autoencoder: frozen.
         preset: geometry, schedule, length, sampler.
         folder: for checkpoints and latents; nothing in it belongs to the pipeline.
@@ -249,6 +324,7 @@ def train_pipeline(  # noqa: PLR0913, PLR0917 - one row per choice of the traini
         steps: default: the preset's length.
         source: default: the preset's.
         background: the variant w/ BG.
+        align: of the U-Net's middle block with an encoder.
         start: go on from this pipeline's denoiser instead of random weights. It must use the same
             autoencoder, vision encoder and schedule, gives its latent statistics, and its record
             goes into the new one, so that the data it was trained on stays declared.
@@ -262,61 +338,88 @@ def train_pipeline(  # noqa: PLR0913, PLR0917 - one row per choice of the traini
             not fit.
     """
     train = train_part(manifest, split)
+    if preset.size % autoencoder.factor:
+        must = f"must reduce images of {preset.size} pixels, the preset's, by a divisor of it"
+        fix = "Choose another, or another size"
+        raise PalpateError(must, str(autoencoder.factor), fix, argument="autoencoder")
     if start is not None:
         _require_same(start, encoders, autoencoder, preset)
     where = pick_device(connect(device))
-    encoders.to(where)
-    autoencoder.to(where)
-    texts, text_source = texts_of(train)
-    columns = ("tactile", "background") if background else ("tactile",)
+    policy = _policy(preset, encoders, source)
+    encoders = encoders.to(where) if encoders is not None and policy.sources else None
+    nn.Module.to(autoencoder, where)
+    modalities = _modalities(policy)
+    texts, text_source = texts_of(train) if "text" in modalities else ([], None)
+    given_gel = isinstance(autoencoder, BackgroundAutoencoder)
+    gels = background or (given_gel and has_gels(train))
+    columns = ("vision", "tactile", *(("background",) if gels else ()))
 
-    def encoded(part: Manifest, name: str) -> Encoded:
-        def latents(column: str) -> NDArray[np.float32]:
-            images = cached_images(part, column, preset.size, cache, progress)
-            key = digest_json([part.digest, image_stamp(part, column), preset.size])
-            work = folder / f"latents-{name}{column}"
-            return encode_latents(autoencoder, images, part.ids, work, key=key, progress=progress)
-
-        conditions: dict[Source, NDArray[Any]] = {
-            s: embed(part, encoders, s, cache=cache, progress=progress).features for s in SOURCES
-        }
-        return Encoded(conditions, *map(latents, columns))
-
+    code = partial(
+        _encoded,
+        encoders=encoders,
+        autoencoder=autoencoder,
+        policy=policy,
+        align=align,
+        columns=columns[1:],
+        size=preset.size,
+        folder=folder,
+        cache=cache,
+        progress=progress,
+    )
     with first_alone():
-        rows, held = encoded(train, ""), manifest.part(split, "val")
-        others = encoded(held, "val-") if len(held) else None
-        shown = _shown(manifest, split, columns, preset.size, encoders)
-    key = [digest_lines(texts), *(image_stamp(train, c) for c in ("vision", *columns))]
-    key += [train.digest, held.digest if len(held) else "", autoencoder.digest]
-    key += [encoders.digest(source) for source in SOURCES]
+        rows, held = code(train), manifest.part(split, "val")
+        others = code(held, like=rows.gels) if len(held) else None
+        shown = _shown(manifest, split, preset.size)
+    key = [digest_lines(texts), *(image_stamp(train, c) for c in columns)]
+    key += [
+        *(train.digest, held.digest if len(held) else "", autoencoder.digest),
+        *(encoders.digest(modality) for modality in modalities if encoders is not None),
+        *([digest_json(align.about)] if align else []),
+    ]
     stats = LatentStats.of(rows.latents, preset.latent_scale) if start is None else start.stats
-    policy = preset.condition_for(encoders.dim)
-    policy = policy if source is None else replace(policy, source=source)
     loop = preset.loop_for(len(train), seed=seed)
     loop = loop if steps is None else replace(loop, steps=steps)
+
+    def backgrounds(encoded: Encoded) -> Backgrounds | None:
+        return encoded.backgrounds(autoencoder, stats) if background else None
 
     def samples(module: nn.Module) -> NDArray[np.uint8]:
         assert isinstance(module, Denoiser)
         assert shown is not None
-        parts = (autoencoder, module, stats, preset.schedule, preset.sampler, preset.size)
-        ids, conditions, photos, tactile, *gel = shown
-        made = TactilePipeline(*parts).sample(
-            conditions, ids, seed=seed, background=gel[0] if gel else None
-        )
+        part, photos, tactile = shown
+        gels = None if rows.gels is None else gels_of(part, preset.size, like=rows.gels)
+        drawn = pipeline(module)
+        made = drawn.sample(drawn.embed(photos), part.ids, seed=seed, background=gels)
         return sheet(photos, tactile, made)
+
+    def pipeline(denoiser: Denoiser, record: dict[str, Any] | None = None) -> TactilePipeline:
+        return TactilePipeline(
+            autoencoder,
+            denoiser,
+            stats,
+            preset.schedule,
+            preset.sampler,
+            preset.size,
+            # The tactile encoder scores, it does not generate.
+            None if encoders is None else EncoderSet(encoders.clip),
+            preset.name,
+            record or {},
+            rows.gels[0] if given_gel and rows.gels is not None else None,
+        )
 
     denoiser = train_denoiser(
         rows.latents,
         rows.conditions,
         stats=stats,
-        unet=preset.unet,
+        unet=cast("UNetOptions | str", preset.unet),
         policy=policy,
         schedule=preset.schedule,
         loop=loop,
         folder=folder / "denoiser",
-        background=rows.background,
-        held_out=others,
+        background=backgrounds(rows),
+        held_out=(others.conditions, others.latents, backgrounds(others)) if others else None,
         start=start.denoiser if start else None,
+        align_weight=align.weight if align else 0.0,
         key=digest_json(key),
         names=train.ids,
         samples=samples if shown else None,
@@ -331,61 +434,134 @@ def train_pipeline(  # noqa: PLR0913, PLR0917 - one row per choice of the traini
         "train_samples": len(train),
         "text_source": text_source,
         "autoencoder": autoencoder.digest,
-        "vision": encoders.digest("vision"),
-        "text": encoders.digest("text"),
+        "ceiling": autoencoder.card.get("held_out"),
+        **_digests(encoders),
         "source": policy.source,
         "background": background,
+        "align": align.about if align else None,
+        "gel": ("manifest" if gels else "median") if given_gel else None,
         "loop": asdict(loop),
-        "unet": asdict(preset.unet),
+        "unet": _geometry(preset.unet),
         "seed": seed,
         "processes": place()[1],
         "palpate": __version__,
-        "parameters": sum(p.numel() for p in denoiser.unet.parameters()),
+        "parameters": sum(p.numel() for p in denoiser.parameters()),
         "synthetic": bool(manifest.synthetic),
         "materials": sorted({str(m) for m in train.column("material") if m}),
         "start": start.digest if start else None,
         "start_record": dict(start.training) if start else None,
     }
-    return TactilePipeline(
-        autoencoder,
-        denoiser,
-        stats,
-        preset.schedule,
-        preset.sampler,
-        preset.size,
-        EncoderSet(encoders.clip),  # the tactile encoder scores, it does not generate
-        preset.name,
-        record,
-    )
+    return pipeline(denoiser, record)
+
+
+def _geometry(unet: UNetOptions | str | None) -> dict[str, Any]:
+    """The geometry of a U-Net, or whose it was."""
+    if isinstance(unet, UNetOptions):
+        return asdict(unet)
+    _, root, inside = find_unet(str(unet))
+    root = root.parent if inside else root
+    name = str(unet) if is_hub_id(str(unet)) else root.resolve().name
+    return {"source": name, "license": stated(root)["license"]}
+
+
+def _digests(encoders: EncoderSet | None) -> dict[str, str | None]:
+    known = [] if encoders is None else encoders.modalities
+    return {s: encoders.digest(s) if encoders and s in known else None for s in ("vision", "text")}
+
+
+def _policy(
+    preset: DiffusionPreset, encoders: EncoderSet | None, source: Sources | None
+) -> ConditionPolicy:
+    """The preset's policy with another source; photos alone need no memory of texts."""
+    width = preset.condition.width if encoders is None else encoders.dim
+    policy = preset.condition_for(width)
+    chosen, gap = source or policy.source, policy.gap
+    if chosen == "vision" != policy.source and gap == "memory":
+        gap = "mean-shift"
+    return replace(policy, source=chosen, gap="none" if chosen == "resnet" else gap)
+
+
+def _modalities(policy: ConditionPolicy) -> tuple[Source, ...]:
+    """The encoders that training needs: vision for the samples that it draws, at least."""
+    if not policy.sources:
+        return ()
+    return SOURCES if "text" in policy.sources or policy.gap == "memory" else ("vision",)
+
+
+def _encoded(  # noqa: PLR0913 - one row per part
+    part: Manifest,
+    *,
+    encoders: EncoderSet | None,
+    autoencoder: AnyAutoencoder,
+    policy: ConditionPolicy,
+    align: Alignment | None,
+    columns: Sequence[str],
+    size: int,
+    folder: Path,
+    cache: Path | None,
+    like: NDArray[np.uint8] | None = None,
+    progress: Progress = quiet,
+) -> Encoded:
+    """Encode a part, or find it in the cache."""
+    given = isinstance(autoencoder, BackgroundAutoencoder)
+    gels = None
+    if given:
+        gels = gels_of(part, size, cache, progress, like)
+    elif "background" in columns:
+        gels = cached_images(part, "background", size, cache, progress)
+    images = cached_images(part, "tactile", size, cache, progress)
+    key = digest_json([part.digest, *(image_stamp(part, c) for c in columns), size])
+    place = (cache or folder) / f"latents-{short(digest_json([key, autoencoder.digest]))}"
+    code = partial(encode_latents, autoencoder, ids=part.ids, key=key, progress=progress)
+    conditions: dict[str, NDArray[Any]] = {}
+    if encoders is not None:
+        for s in _modalities(policy):
+            conditions[s] = embed(part, encoders, s, cache=cache, progress=progress).features
+        for name in inputs_of(policy):
+            conditions[name] = encode_states(
+                part,
+                encoders,
+                STATES[name],
+                getattr(policy, name),
+                folder=cache or folder,
+                progress=progress,
+            )
+    if "photos" in inputs_of(policy):
+        conditions["photos"] = cached_images(part, "vision", policy.photo_size, cache, progress)
+    if align is not None:
+        conditions["guide"] = align.states(part, cache or folder, progress)
+    latents = code(images, gels if given else None, folder=place)
+    if gels is None or given:
+        return Encoded(conditions, latents, gels)
+    return Encoded(conditions, latents, gels, code(gels, None, folder=place / "background"))
 
 
 def _shown(
-    manifest: Manifest, split: Split, columns: Sequence[str], size: int, encoders: EncoderSet
-) -> tuple[Any, ...] | None:
-    """Some samples outside of train: ids, vision embeddings, photos and images of ``columns``."""
-    columns = ("vision", *columns)
+    manifest: Manifest, split: Split, size: int
+) -> tuple[Manifest, NDArray[np.uint8], NDArray[np.uint8]] | None:
+    """Some samples outside of train, their photos and tactile images."""
     held = manifest.part(split, "val")
     held = held if len(held) else manifest.part(split, "test")
-    cells = zip(held.ids, *(held.column(c) for c in columns), strict=True)
+    cells = zip(held.ids, held.column("vision"), held.column("tactile"), strict=True)
     whole = [name for name, *images in cells if all(images)]
     if not whole:
         return None
     some = held.take([whole[k] for k in evenly(len(whole), SHOWN)])
-    return (
-        some.ids,
-        embed(some, encoders, "vision").features,
-        *(cached_images(some, column, size) for column in columns),
-    )
+    photos, tactile = (cached_images(some, column, size) for column in ("vision", "tactile"))
+    return some, photos, tactile
 
 
 def _require_same(
-    start: TactilePipeline, encoders: EncoderSet, autoencoder: Autoencoder, preset: DiffusionPreset
+    start: TactilePipeline,
+    encoders: EncoderSet | None,
+    autoencoder: AnyAutoencoder,
+    preset: DiffusionPreset,
 ) -> None:
     """A denoiser goes on only in the space that it knows."""
     vision = start.encoders.digest("vision") if start.encoders else None
     pairs = {
         "autoencoder": (start.autoencoder.digest, autoencoder.digest),
-        "vision encoder": (vision, encoders.digest("vision")),
+        "vision encoder": (vision, _digests(encoders)["vision"]),
         "schedule": (start.schedule, preset.schedule),
     }
     if different := [name for name, (a, b) in pairs.items() if a != b]:
@@ -393,61 +569,20 @@ def _require_same(
         raise PalpateError(must, got, "Leave it out", argument="start")
 
 
-def encode_latents(
-    autoencoder: Autoencoder,
-    images: NDArray[np.uint8],
-    ids: Sequence[str],
-    folder: Path,
-    *,
-    key: str = "",
-    batch: int = 32,
-    progress: Progress = quiet,
-) -> NDArray[np.float32]:
-    """Latents of all images, before quantization, as a read-only memory map; encoded once.
-
-    Args:
-        autoencoder: frozen; its digest is part of the cache's key.
-        images: (n, h, w, 3) bytes, in the order of ``ids``; an array or a memory map.
-        ids: sample ids.
-        folder: holds ``latents.npy`` and ``latents.json``, the ids in order and a key.
-        key: digest of what the images are (manifest, column, size).
-        batch: images at once.
-        progress: called after each batch.
-
-    Returns:
-        float32 (n, c, h / f, w / f).
-    """
-    data, note = folder / "latents.npy", folder / "latents.json"
-    key = digest_json([key, autoencoder.digest])
-    about = {"format": CACHE_FORMAT, "key": key, "ids": list(ids)}
-    if not (data.is_file() and note.is_file() and read_json(note, "latent cache") == about):
-        note.unlink(missing_ok=True)
-        height, width = (side // autoencoder.factor for side in images.shape[1:3])
-        shape = (len(ids), autoencoder.channels, height, width)
-        with atomic_path(data) as part:
-            store = np.lib.format.open_memmap(part, mode="w+", dtype=np.float32, shape=shape)
-            for start in range(0, len(ids), batch):
-                rows = slice(start, min(start + batch, len(ids)))
-                store[rows] = autoencoder.encode(images[rows], batch).numpy()
-                progress("encoding tactile images", rows.stop, len(ids))
-            store.flush()
-        write_json(note, about)
-    return np.load(data, mmap_mode="r", allow_pickle=False)
-
-
 def train_denoiser(  # noqa: PLR0913 - one row per part of the model
     latents: Tensor | NDArray[Any],
-    conditions: Mapping[Source, Tensor | NDArray[Any]],
+    conditions: Mapping[str, Tensor | NDArray[Any]],
     *,
     stats: LatentStats,
-    unet: UNetOptions,
+    unet: UNetOptions | str,
     policy: ConditionPolicy,
     schedule: Schedule,
     loop: LoopOptions,
     folder: Path,
-    background: Tensor | NDArray[Any] | None = None,
-    held_out: Encoded | None = None,
+    background: Backgrounds | None = None,
+    held_out: tuple[Mapping[str, Any], Any, Backgrounds | None] | None = None,
     start: Denoiser | None = None,
+    align_weight: float = 0.5,
     key: str = "",
     names: Sequence[str] | None = None,
     samples: Callable[[nn.Module], NDArray[np.uint8]] | None = None,
@@ -460,17 +595,19 @@ def train_denoiser(  # noqa: PLR0913 - one row per part of the model
     Args:
         latents: (n, c, h, w) of the autoencoder, not normalized; a memory map will do.
         conditions: embeddings (n, d) by source; ``policy.sources`` are needed, others only give
-            their mean.
+            their mean. By name ``inputs_of(policy)``, arrays or memory maps; as ``guide`` states
+            (n, k, w) of an encoder that the middle block is aligned with.
         stats: normalize the latents of tactile and background images.
-        unet: geometry of the network.
+        unet: geometry of the network, or a trained one, see :func:`load_unet`.
         policy: how embeddings become tokens, and which train.
         schedule: the forward process and the target.
         loop: length, rate, averaging; its seed also seeds the weights.
         folder: for checkpoints and the log.
-        background: latents (n, c, h, w) of the no-contact images, for the variant w/ BG.
-        held_out: rows whose loss is measured in training.
+        background: rows -> (n, g, h, w), see :meth:`Encoded.backgrounds`, for the variant w/ BG.
+        held_out: conditions, latents and background of rows whose loss is measured in training.
         start: go on from these weights instead of random ones, in the same geometry. The modality
             means are those of ``conditions`` all the same.
+        align_weight: of the alignment in the loss.
         key: digest of latents, conditions and background, which are not read for it.
         names: of the rows, for errors.
         samples: see :class:`~palpate.training.engine.Task`.
@@ -485,116 +622,179 @@ def train_denoiser(  # noqa: PLR0913 - one row per part of the model
         PalpateError: if a source is missing, or ``start`` has another geometry.
     """
     tables: dict[Source, Tensor] = {
-        s: torch.as_tensor(np.asarray(t), dtype=torch.float32) for s, t in conditions.items()
+        s: torch.as_tensor(np.asarray(conditions[s]), dtype=torch.float32)
+        for s in SOURCES
+        if s in conditions
     }
-    if missing := [s for s in policy.sources if s not in tables]:
-        must, fix = f"source={policy.source!r} needs embeddings of {', '.join(policy.sources)}", ""
+    needed = (*policy.sources, *inputs_of(policy))
+    if missing := [name for name in needed if name not in conditions]:
+        must, fix = f"source={policy.source!r} needs conditions of {', '.join(needed)}", ""
         raise PalpateError(must, f"none of {missing[0]}", fix)
     channels, size = latents.shape[1], latents.shape[2]
     means: dict[Source, Tensor] = {
         s: tables[s].double().mean(0).float() for s in SOURCES if s in tables
     }
     with seeded(loop.seed, "denoiser"):
-        shape: dict[str, Any] = {"channels": channels, "size": size, "width": policy.width}
-        net = build_unet(unet, **shape, background=background is not None)
-        model = Denoiser(net, policy, means).to(device)
+        wide = 0 if background is None else background(np.arange(1)).shape[1]
+        how: dict[str, Any] = {"channels": channels, "background": wide}
+        net = (
+            load_unet(unet, policy, **how)
+            if isinstance(unet, str)
+            else build_unet(unet, policy, size=size, **how)
+        )
+        texts = tables["text"].unique(dim=0) if policy.gap == "memory" else None
+        widths = {name: conditions[name].shape[2] for name in inputs_of(policy)}
+        model = Denoiser(net, policy, means, texts, widths)
+        inputs = [*inputs_of(policy), *(["guide"] if "guide" in conditions else [])]
+        if "guide" in conditions:
+            model.guide = Guide(net, conditions["guide"].shape[2])
+        model.to(device)
     if start is not None:
         _copy_weights(start, model)
     with torch.no_grad():
 
-        def loss_of(conditions: Mapping[Source, Tensor], *tables: Any) -> DiffusionLoss:
+        def loss_of(
+            conditions: Mapping[str, Any], latents: Any, background: Backgrounds | None
+        ) -> DiffusionLoss:
             tokens: dict[Source, Tensor] = {
-                s: model.tokens(conditions[s], s).to("cpu") for s in policy.sources
+                s: model.tokens(torch.as_tensor(conditions[s]), s).to("cpu") for s in policy.sources
             }
-            how: dict[str, Any] = {"stats": stats, "schedule": schedule, "policy": policy}
-            return DiffusionLoss(tables[0], tokens, tables[1], **how)
+            return DiffusionLoss(
+                latents,
+                tokens,
+                background,
+                stats=stats,
+                schedule=schedule,
+                policy=policy,
+                inputs={name: conditions[name] for name in inputs},
+                align_weight=align_weight,
+            )
 
-        loss, others = loss_of(tables, latents, background), None
+        loss, others = loss_of({**conditions, **tables}, latents, background), None
         if held_out is not None:
-            texts: dict[Source, Tensor] = {
-                s: torch.as_tensor(held_out.conditions[s]) for s in policy.sources
-            }
-            held = loss_of(texts, held_out.latents, held_out.background)
-            others = (len(held_out.latents), held.load)
-    facts = [asdict(settings) for settings in (stats, unet, policy, schedule)]
+            others = (len(held_out[1]), loss_of(*held_out).load)
+    records = (stats, unet, policy, schedule)
+    settings = [facts(r) for r in records if not isinstance(r, str)]
     begin = [] if start is None else [digest_tensors(start.unet.state_dict())]
-    key = digest_json([key, background is not None, *facts, *begin])
+    begin += [digest_tensors(net.state_dict())] if isinstance(unet, str) else []
+    key = digest_json([key, background is not None, *settings, *begin])
     task = Task("generator", len(latents), loss.load, loss, key, names, others, None, samples)
     fit(model, task, loop, folder, compute=compute, progress=progress)
+    if model.guide is not None:
+        model.guide.hook.remove()
+        model.guide = None
     return model.eval().requires_grad_(False)
 
 
 def _copy_weights(source: Denoiser, target: Denoiser) -> None:
-    """Copy the U-Net, and the unconditional token if both have learned one."""
-    shapes = [{k: v.shape for k, v in d.unet.state_dict().items()} for d in (source, target)]
+    """Copy the U-Net, and what else both have learned."""
+    weights, own = (dict(d.named_parameters()) for d in (source, target))
+    shared = [k for k in weights | own if k.startswith("unet.") or (k in weights and k in own)]
+    shapes = [[d[k].shape if k in d else None for k in shared] for d in (weights, own)]
     if shapes[0] != shapes[1]:
         must, got = "must have the geometry of the preset", "another geometry"
         raise PalpateError(must, got, "Leave it out", argument="start")
-    target.unet.load_state_dict(source.unet.state_dict())
-    if source.null is not None and target.null is not None:
-        target.null.data.copy_(source.null.data)
+    for name in shared:
+        own[name].data.copy_(weights[name].data)
 
 
 class DiffusionLoss:
-    """Eq. 1 for one batch; all draws are those of the step."""
+    """Eq. 1, or that of flow matching, for one batch; all draws are those of the step."""
 
     def __init__(
         self,
         latents: Tensor | NDArray[Any],
         tokens: Mapping[Source, Tensor],
-        background: Tensor | NDArray[Any] | None,
+        background: Backgrounds | None,
         *,
         stats: LatentStats,
         schedule: Schedule,
         policy: ConditionPolicy,
+        inputs: Mapping[str, Any] | None = None,
+        align_weight: float = 0.5,
     ) -> None:
-        """Take latents and backgrounds (n, c, h, w), not normalized, and tokens (n, k, d)."""
+        """Take latents (n, c, h, w), not normalized, tokens (n, k, d) by source, and inputs."""
         self.latents, self.tokens, self.background = latents, dict(tokens), background
         self.stats, self.schedule, self.policy = stats, schedule, policy
+        self.inputs, self.align_weight = dict(inputs or {}), align_weight
+        self.lengths = torch.tensor(lengths_of(policy))
         self.alphas = schedule.alphas()
 
     def load(self, step: Step) -> Batch:
-        """Noisy latents, their targets, tokens and which of these are dropped."""
+        """Noisy latents, their targets, tokens, and which of these are dropped."""
         z = self.stats.normalize(_take(self.latents, step.rows))
-        t = step.randint(self.schedule.steps)
+        if self.schedule.prediction == "flow":
+            time = torch.sigmoid(self.schedule.time_mean + step.randn())
+            keep, spread, t = 1 - time, time, self.schedule.steps * time
+        else:
+            t = step.randint(self.schedule.steps)
+            a = self.alphas[t].float()
+            keep, spread = a.sqrt(), (1 - a).sqrt()
+        keep, spread = keep.reshape(-1, 1, 1, 1), spread.reshape(-1, 1, 1, 1)
         noise = step.randn(*z.shape[1:])
-        tokens = self._tokens(step)
-        dropped = step.rand() < self.policy.dropout
-        a = self.alphas[t].float().reshape(-1, 1, 1, 1)
-        epsilon = self.schedule.prediction == "epsilon"
+        target = {"epsilon": noise, "v_prediction": keep * noise - spread * z, "flow": noise - z}[
+            self.schedule.prediction
+        ]
+        tokens, by_photo = self._tokens(step)
+        dropped = self._dropped(step, by_photo)
         batch = {
-            "noisy": a.sqrt() * z + (1 - a).sqrt() * noise,
-            "target": noise if epsilon else a.sqrt() * noise - (1 - a).sqrt() * z,
+            "noisy": keep * z + spread * noise,
+            "target": target,
             "t": t,
             "weight": self.weight(t),
-            "tokens": tokens,
-            "dropped": dropped.reshape(-1, 1, 1),
+            **({} if tokens is None else {"tokens": tokens}),
+            **{name: _take(table, step.rows) for name, table in self.inputs.items()},
+            "dropped": dropped.repeat_interleave(self.lengths, dim=1),
         }
         if self.background is not None:
-            batch["background"] = self.stats.normalize(_take(self.background, step.rows))
+            batch["background"] = self.background(step.rows)
         return batch
 
     def __call__(self, module: nn.Module, batch: Batch) -> Losses:
         """Return the weighted error of a batch, and the unweighted to log."""
         assert isinstance(module, Denoiser)
         null = module.null_tokens(len(batch["t"]))
-        tokens = torch.where(batch["dropped"], null, batch["tokens"])
+        parts = [batch["tokens"]] if "tokens" in batch else []
+        parts += [make(batch[name].float()) for name, make in module.maps.items()]
+        tokens = torch.where(batch["dropped"], null, torch.cat(parts, dim=1))
         prediction = module(batch["noisy"], batch["t"], tokens, batch.get("background"))
         error = (prediction.float() - batch["target"]).square().mean((1, 2, 3))
-        mse = error.detach().mean()
-        return Losses((batch["weight"] * error).mean(), {"mse": mse}, error.detach())
+        total, logs = (batch["weight"] * error).mean(), {"mse": error.detach().mean()}
+        if module.guide is not None:
+            distance = module.guide(batch["guide"].float()).mean()
+            total, logs = total + self.align_weight * distance, logs | {"align": distance.detach()}
+        return Losses(total, logs, error.detach())
 
-    def _tokens(self, step: Step) -> Tensor:
-        parts = [self.tokens[s][step.rows] for s in self.policy.sources]
-        tokens = parts[0]
-        if len(parts) == 2:
-            tokens = torch.where(step.rand(1, 1) < 0.5, parts[0], parts[1])
+    def _tokens(self, step: Step) -> tuple[Tensor | None, Tensor | None]:
+        """Tokens of the embeddings, and of ``mixed`` which rows (n, 1, 1) are of the photo."""
+        parts, by_photo = [self.tokens[s][step.rows] for s in self.policy.sources], None
+        if not parts:
+            return None, None
+        tokens = torch.cat(parts, dim=1) if slots_of(self.policy) == 2 else parts[0]
+        if self.policy.source == "mixed":
+            by_photo = step.rand(1, 1) < self.policy.photo_share
+            tokens = torch.where(by_photo, parts[1], parts[0])
         if self.policy.noise:
-            # One draw per sample: the k tokens stay copies of each other.
-            noise = step.randn(1, self.policy.width)
+            # One draw per embedding: the k tokens stay copies of each other.
+            noise = step.randn(slots_of(self.policy), self.policy.width)
+            noise = noise.repeat_interleave(repeats_of(self.policy), dim=1)
             tokens = nn.functional.normalize(tokens + self.policy.noise * noise, dim=2)
             tokens = tokens * self.policy.width**0.5
-        return tokens
+        return tokens, by_photo
+
+    def _dropped(self, step: Step, by_photo: Tensor | None) -> Tensor:
+        """Which embeddings and inputs (n, parts, 1) are dropped; states also with theirs."""
+        draws = step.rand(len(self.lengths), 1)
+        dropped = draws < self.policy.dropout
+        for k, name in enumerate(
+            inputs_of(self.policy) if slots_of(self.policy) else (), slots_of(self.policy)
+        ):
+            text = name == "words"
+            theirs = dropped[:, 0 if text else slots_of(self.policy) - 1]
+            if by_photo is not None:
+                theirs = theirs | (by_photo[:, 0] == text)
+            dropped[:, k] = theirs | (draws[:, k] < self.policy.drop_states)
+        return dropped
 
     def weight(self, t: Tensor) -> Tensor:
         """The min-SNR weight of each step."""

@@ -52,7 +52,7 @@ from palpate.encoders.losses import (
     three_way,
 )
 from palpate.encoders.models import move, pick_device
-from palpate.encoders.preprocess import CLIP_MEAN, CLIP_STD, digest_images, union
+from palpate.encoders.preprocess import CLIP_MEAN, CLIP_STD, digest_images, prepared_images, union
 from palpate.encoders.presets import EncoderPreset, Targets, preset
 from palpate.encoders.rows import Rows, augmented, draw, numbers, unit
 from palpate.encoders.tokenizer import train_tokenizer
@@ -66,6 +66,7 @@ from palpate.training.processes import (
     gather_rows,
     keep_logs,
     place,
+    shared,
     work_folder,
 )
 from palpate.training.steps import Step
@@ -238,14 +239,15 @@ class TactileLoss:
         images = augmented(unit(batch["images"]), batch)
         tactile = in_chunks(partial(self.encode, module), images, self.chunk)
         text, vision = batch.get("text"), batch.get("vision")
+        whole = partial(gather_rows, batch=len(batch["texts"]))
         if module.partners is not None and clip.tokenizer is not None:
-            text = gather_rows(_encode_phrases(clip, self.rows.phrases, batch["phrase"]))
+            text = whole(_encode_phrases(clip, self.rows.phrases, batch["phrase"]))
         if "photos" in batch:
             photos = clip.preprocess(unit(batch["photos"]))
-            vision = gather_rows(in_chunks(clip.encode_vision, photos, self.chunk))
+            vision = whole(in_chunks(clip.encode_vision, photos, self.chunk))
         labels = Labels(batch["texts"], batch["contacts"], batch.get("seen"))
         how: dict[str, Any] = {"targets": self.targets, "weights": self.weights}
-        total, logs = three_way(gather_rows(tactile), text, vision, scale, labels, **how)
+        total, logs = three_way(whole(tactile), text, vision, scale, labels, **how)
         return Losses(total, {**logs, "scale": scale.detach()}, tactile.sum(dim=1))
 
     def probe(self, others: Rows, module: nn.Module) -> dict[str, float]:
@@ -324,7 +326,8 @@ def train_tactile(  # noqa: PLR0913 - one row per choice of the training
     tactile, preprocess = _first_weights(preset, clip.dim, rows.images, seed, start)
     course, mode = preset.tactile_course, targets or preset.targets
     options = course.options(len(train), seed, epochs)
-    _require_pairs(rows, options, weights)
+    _require_pairs(rows, options, weights, trainable=trainable)
+    _require_held_out(held, options)
     facts = _facts(preset, train, split, (rows.captions, rows.text_source), options) | {
         "targets": mode,
         "weights": list(weights),
@@ -356,13 +359,19 @@ def train_tactile(  # noqa: PLR0913 - one row per choice of the training
     card["start_card"] = start.card if start else None
     card["synthetic"] = train.synthetic if not start or start.card.get("synthetic") else False
     card["seen_in_part"] = start is not None and start.seen is None
-    seen = union(digest_images(rows.images), start.seen if start else None)
+    images = rows.images
+    if preset.subtract:  # another background makes no new image
+        plain = replace(preset.preprocess, subtract=())
+        images = prepared_images(train, "tactile", plain, cache, progress)
+    seen = union(digest_images(images), start.seen if start else None)
     if trainable and rows.photos is not None and clip.seen is not None:
         clip.seen = union(digest_images(rows.photos), clip.seen)
     return EncoderSet(clip, model.tactile.eval().requires_grad_(False), preprocess, card, seen)
 
 
-def _require_pairs(rows: Rows, options: LoopOptions, weights: Sequence[float]) -> None:
+def _require_pairs(
+    rows: Rows, options: LoopOptions, weights: Sequence[float], *, trainable: bool
+) -> None:
     """Check that there are samples to compare with each other.
 
     Raises:
@@ -370,15 +379,31 @@ def _require_pairs(rows: Rows, options: LoopOptions, weights: Sequence[float]) -
     """
     if len(rows.manifest) == 1:
         must = "The train part must hold two samples: the loss compares them with each other"
-        raise PalpateError(
-            must, f"one, {rows.manifest.ids[0]}", "Make another split: palpate split"
+        got, fix = f"one, {rows.manifest.ids[0]}", "Make another split: palpate split"
+        raise shared(PalpateError(must, got, fix))
+    if not (weights[0] or weights[2] or trainable):
+        must = "must keep a pair with the tactile encoder, which trains alone"
+        raise shared(
+            PalpateError(must, f"{tuple(weights)}", "Or train the partners", argument="weights")
         )
     if not (weights[0] or weights[1]) and int((rows.photo >= 0).sum()) < 2:
         must = "must leave a pair of which there are two samples"
-        raise PalpateError(must, f"{tuple(weights)}", "Photos are missing", argument="weights")
+        raise shared(
+            PalpateError(must, f"{tuple(weights)}", "Photos are missing", argument="weights")
+        )
     if options.batch == 1:
         must, fix = "must be at least 2: the loss compares rows", "Pass a larger one"
-        raise PalpateError(must, "1", fix, argument="batch")
+        raise shared(PalpateError(must, "1", fix, argument="batch"))
+
+
+def _require_held_out(held: Manifest | None, options: LoopOptions) -> None:
+    if held is None and (options.keep == "best" or options.patience):
+        name = "keep" if options.keep == "best" else "patience"
+        must = "needs a held-out part: a part val of the split, or a share of the train videos"
+        raise shared(PalpateError(must, "none", "Pass held_out", argument=name))
+    if held is not None and len(held) == 1 and options.evaluations:
+        must = "The held-out part must hold two samples: the loss compares them with each other"
+        raise shared(PalpateError(must, f"one, {held.ids[0]}", "Make another split: palpate split"))
 
 
 def _parts(

@@ -35,7 +35,7 @@ from palpate.encoders.encoder_set import MODALITIES, EncoderSet, Modality
 from palpate.encoders.preprocess import Frames, load_frames, to_unit
 
 
-def texts_of(manifest: Manifest, *, seed: int = 0) -> tuple[list[str], str]:
+def texts_of(manifest: Manifest) -> tuple[list[str], str]:
     """One text per sample: the manifest's, else a caption of its material, object, video or id.
 
     Returns:
@@ -48,7 +48,7 @@ def texts_of(manifest: Manifest, *, seed: int = 0) -> tuple[list[str], str]:
     for row in manifest.table.select("text", *NAMED).iter_rows(named=True):
         column = next(name for name in ("text", *NAMED) if row[name] or name == "id")
         text = str(row[column])
-        texts.append(text if column == "text" else caption(text, str(row["id"]), seed))
+        texts.append(text if column == "text" else caption(text, str(row["id"])))
         made = "caption" if column == "material" else f"caption of the {column}"
         sources.add(default if column == "text" else made)
     return texts, " and ".join(sorted(sources, key=lambda s: (s != default, s)))
@@ -119,15 +119,9 @@ def embed_images(
     batch: int = 128,
     progress: Progress = quiet,
 ) -> NDArray[np.float32]:
-    """Embeddings of images in memory or in a mapped file.
+    """Embeddings of images (n, h, w, 3), 0 to 255, in memory or in a mapped file.
 
-    Args:
-        images: (n, h, w, 3), 0 to 255; other sizes than the encoder's are cut and resized as files
-            are.
-        encoders: see :class:`EncoderSet`.
-        modality: ``tactile`` or ``vision``.
-        batch: images at a time.
-        progress: called with the number of images done.
+    Other sizes than the encoder's are cut and resized as files are.
 
     Returns:
         (n, dim) float32, L2-normalized.

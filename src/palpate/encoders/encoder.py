@@ -92,11 +92,6 @@ class Encoder:
     ) -> NDArray[np.bool_]:
         """Whether the encoder was trained on images, by their decoded pixels, whatever their names.
 
-        Args:
-            inputs: images as for :meth:`encode`.
-            batch: images in memory at a time.
-            progress: called with the number of images done.
-
         Returns:
             (n,) booleans; all false where the encoder's images are not known (public ones).
         """
@@ -133,10 +128,7 @@ class Encoder:
 
 
 def list_images(inputs: Any) -> list[Path | Image.Image]:
-    """Images in any form as a list of files and PIL images.
-
-    Args:
-        inputs: see :meth:`Encoder.encode`.
+    """Images in any form that :meth:`Encoder.encode` takes, as a list of files and PIL images.
 
     Raises:
         PalpateError: for arrays of another type or shape, a missing path, or other objects.

@@ -23,6 +23,7 @@ weights.
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Generator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
@@ -36,7 +37,7 @@ from PIL import Image
 from safetensors import SafetensorError
 from safetensors.numpy import load_file, save_file
 from torch import Tensor, nn
-from torch.nn.functional import normalize
+from torch.nn.functional import adaptive_avg_pool2d, normalize
 from transformers import (
     AutoModel,
     AutoTokenizer,
@@ -52,6 +53,8 @@ from palpate.core import (
     digest_json,
     quiet,
     read_record,
+    require,
+    require_regular,
     seed_for,
     write_json,
 )
@@ -160,6 +163,12 @@ class ClipEncoders:
         encoded = self.tokenizer(list(texts), return_tensors="pt", **options)
         return {k: encoded[k].to(self.model.device) for k in names}
 
+    def length(self, text: str) -> tuple[int, int]:
+        """Tokens of a text, marks of its ends included, and the most that the encoder takes."""
+        most = int(_config(self.model).text_config.max_position_embeddings)
+        with silent():  # the tokenizer warns of long texts, in its own words
+            return len(self.tokenizer(text)["input_ids"]), most
+
     def encode_text(self, texts: Sequence[str]) -> Tensor:
         """Texts to (n, dim), L2-normalized; differentiable."""
         tokens: dict[str, Any] = {**self.tokens(texts)}
@@ -173,6 +182,22 @@ class ClipEncoders:
         inputs = _patches(pixels, self.model) if self.family == "siglip2" else {}
         inputs = {"pixel_values": pixels, **inputs}
         return normalize(_projected(self.model.get_image_features(**inputs)), dim=-1)
+
+    def states(self, modality: str, batch: Tensor | Sequence[str], count: int) -> Tensor:
+        """States of the last layer, before the projection; see :meth:`EncoderSet.states`."""
+        if modality == "vision":
+            model: Any = getattr(self.model, "vision_model", self.model)
+            pixels = torch.as_tensor(batch)
+            inputs = _patches(pixels, self.model) if self.family == "siglip2" else {}
+            return patch_states(model(**{"pixel_values": pixels, **inputs}), pixels, model, count)
+        config: Any = _config(self.model).text_config
+        context = int(config.max_position_embeddings)
+        require(count <= context, "words", f"must be at most {context}, the encoder's", count)
+        texts = [str(text).lower() if self.family != "clip" else str(text) for text in batch]
+        fill: dict[str, Any] = {"padding": "max_length", "truncation": True, "max_length": count}
+        ids = self.tokenizer(texts, return_tensors="pt", **fill)["input_ids"]
+        # Without a mask, as the generators that were trained on these states saw them.
+        return self.model.text_model(input_ids=ids.to(self.model.device)).last_hidden_state
 
     def digest(self, modality: str) -> str:
         """SHA-256 of the vision or the text encoder."""
@@ -365,6 +390,28 @@ class EncoderSet:
             return tactile.encode(pixels, names)
         return encode_tactile(tactile, pixels)
 
+    def states(self, modality: str, batch: Tensor | Sequence[str], count: int) -> Tensor:
+        """States of an encoder's last layer, which share no space: (n, count, width).
+
+        Args:
+            modality: ``text``, ``vision`` or ``tactile``.
+            batch: texts, of which the first ``count`` words are taken with their padding, or
+                preprocessed pixels (n, 3, size, size), whose patches are averaged to a square.
+            count: of images a square number.
+
+        Raises:
+            PalpateError: if the text encoder reads fewer words, or the encoder has no patches.
+        """
+        if modality != "tactile":
+            return self._clip(modality).states(modality, batch, count)
+        tactile: Any = self._tactile(modality)[0]
+        if isinstance(tactile, TactileModule):
+            must, fix = "must be a transformer of palpate or transformers", "Choose another"
+            raise PalpateError(must, f"{tactile.format.name}", fix, argument="encoder")
+        pixels = torch.as_tensor(batch)
+        model = tactile.vision_model
+        return patch_states(model(pixel_values=pixels), pixels, model, count)
+
     def digest(self, modality: str) -> str:
         """SHA-256 of one encoder: weights, architecture, preprocessing."""
         if modality in ("vision", "text"):
@@ -400,7 +447,7 @@ class EncoderSet:
         known = self.seen_by(modality)
         if known is None:
             return np.zeros(len(images), bool)
-        preprocess = self.preprocess(modality)
+        preprocess = replace(self.preprocess(modality), subtract=())
         files: Sequence[Frame] = (
             preprocess.frames(images, modality).files
             if isinstance(images, Manifest)
@@ -584,6 +631,7 @@ def load_seen(folder: Path, count: int | None) -> Digests | None:
     """
     if count is None:
         return None
+    require_regular(folder / SEEN)
     must = f"{folder / SEEN} must hold the digests of the {count:,} images of the training"
     try:
         seen = load_file(folder / SEEN)["digests"]
@@ -638,6 +686,13 @@ def _patches(pixels: Tensor, model: Any) -> dict[str, Tensor]:
     shapes = torch.full((n, 2), side, device=pixels.device)
     mask = torch.ones(rows.shape[:2], dtype=torch.int32, device=pixels.device)
     return {"pixel_values": rows, "pixel_attention_mask": mask, "spatial_shapes": shapes}
+
+
+def patch_states(output: Any, pixels: Tensor, model: Any, count: int) -> Tensor:
+    """States (n, count, width) of a transformer's patches, averaged; of others' (CLS) none."""
+    grid = pixels.shape[2] // int(model.config.patch_size)
+    states = output.last_hidden_state[:, -(grid**2) :].transpose(1, 2).unflatten(2, (grid, grid))
+    return adaptive_avg_pool2d(states, math.isqrt(count)).flatten(2).transpose(1, 2)
 
 
 def _projected(output: Any) -> Tensor:

@@ -33,7 +33,7 @@ from zipfile import is_zipfile
 
 from safetensors import SafetensorError
 
-from palpate.core import PalpateError
+from palpate.core import PalpateError, require_regular
 from palpate.core.digest import canonical_json
 
 if TYPE_CHECKING:  # names are checked before torch is imported, which takes seconds
@@ -66,8 +66,10 @@ UNREADABLE = (
     pickle.UnpicklingError,
 )
 #: What palpate's saved folders hold, and the small files of a single model.
-PATTERNS = ("*.json", "*.txt", "*.md", "*.safetensors")
+PATTERNS = ("*.json", "*.txt", "*.md", "*.safetensors", "gel.png")
 SMALL_FILES = ("README.md", "config.json", "palpate.json", "preprocessor_config.json")
+#: What was got instead of weights, and the fix.
+POINTER = ("a pointer of Git LFS without the weights", "Fetch them: git lfs pull")
 #: Settings of a transformers or diffusers model that decide what it computes; others name files or
 #: versions.
 ARCHITECTURE = """
@@ -79,8 +81,8 @@ ARCHITECTURE = """
     down_block_types downsample_padding flip_sin_to_cos freq_shift in_channels latent_channels
     layers_per_block lookup_from_codebook mid_block_add_attention mid_block_scale_factor
     mid_block_type norm_eps norm_num_groups norm_type num_vq_embeddings only_cross_attention
-    out_channels resnet_time_scale_shift scaling_factor time_embedding_type timestep_post_act
-    transformer_layers_per_block up_block_types use_linear_projection vq_embed_dim
+    out_channels resnet_time_scale_shift scaling_factor shift_factor time_embedding_type
+    timestep_post_act transformer_layers_per_block up_block_types use_linear_projection vq_embed_dim
 """.split()  # noqa: SIM905 - readable as a list of words
 
 
@@ -197,10 +199,16 @@ def find_encoder(source: str | Path) -> tuple[Path, str | None]:
     return path, sensor.lower() or None
 
 
-def find_single(source: str | Path, part: Part, what: str, fix: str) -> tuple[str, Path]:
-    """Return what ``from_pretrained`` takes, and the local folder of the small files."""
+def find_single(
+    source: str | Path, part: Part, what: str, fix: str, within: Sequence[str] = ()
+) -> tuple[str, Path]:
+    """Return what ``from_pretrained`` takes, and the local folder of the small files.
+
+    Those of the subfolders ``within`` are fetched from the hub as well.
+    """
     if is_hub_id(source):  # small files first: a hub out of reach is queried once, not many times
-        return str(source), _fetch(str(source), SMALL_FILES, what, fix)
+        files = (*SMALL_FILES, *(f"{folder}/*.json" for folder in within))
+        return str(source), _fetch(str(source), files, what, fix)
     folder = find_model(source, part, what, fix)
     return str(folder), folder
 
@@ -249,11 +257,17 @@ def read_weights(path: Path, fix: str) -> dict[str, Tensor]:
     import torch
     from safetensors.torch import load_file
 
+    require_regular(path)
     must = f"{path} must hold weights and nothing else"
+    if is_pointer(path):
+        raise PalpateError(must, *POINTER)
+    # TVL keeps its options so; latent diffusion names the class of a callback, which stays unused.
+    callback = "pytorch_lightning.callbacks.model_checkpoint.ModelCheckpoint"
+    safe: list[Any] = [argparse.Namespace, (argparse.Namespace, callback)]
     try:
         if path.suffix == ".safetensors":
             return load_file(path)
-        with torch.serialization.safe_globals([argparse.Namespace]):  # TVL keeps its options so
+        with torch.serialization.safe_globals(safe):
             content = torch.load(path, map_location="cpu", weights_only=True, mmap=is_zipfile(path))
     except (*UNREADABLE, EOFError) as error:
         raise PalpateError(must, first_line(error)[:160], fix) from None
@@ -264,21 +278,35 @@ def read_weights(path: Path, fix: str) -> dict[str, Tensor]:
     return {str(name): value for name, value in content.items() if hasattr(value, "shape")}
 
 
-def load_model(kind: Any, name: str, must: str, fix: str, **options: Any) -> Any:
+def is_pointer(path: Path) -> bool:
+    """Whether a file is the pointer of Git LFS to one that was not fetched."""
+    if not path.is_file():
+        return False
+    with path.open("rb") as file:
+        return file.read(64).startswith(b"version https://git-lfs")
+
+
+def load_model(
+    kind: Any, name: str, must: str, fix: str, *, strict: bool = False, **options: Any
+) -> Any:
     """``kind.from_pretrained(name)`` in float32, for evaluation, without gradients.
 
     Raises:
         PalpateError: ``must``, if files are absent, unreadable, or lack weights, which transformers
-            would draw at random.
+            would draw at random; with ``strict`` also for weights that the model has not.
     """
     try:
         with silent():
             model, report = kind.from_pretrained(name, output_loading_info=True, **options)
     except Exception as error:  # the libraries raise many kinds
+        if any(map(is_pointer, Path(name, options.get("subfolder") or "").glob("*"))):
+            raise PalpateError(must, *POINTER) from None
         raise PalpateError(must, first_line(error), fix) from None
     if missing := sorted(report["missing_keys"]):
         got = f"{len(missing)} weights are missing, first {missing[0]}"
         raise PalpateError(must, got, fix)
+    if strict and (extra := sorted(report["unexpected_keys"])):
+        raise PalpateError(must, f"{len(extra)} unknown weights, first {extra[0]}", fix)
     return model.float().eval().requires_grad_(False)
 
 
@@ -374,10 +402,8 @@ def pick_device(device: str | torch.device) -> torch.device:
     try:
         torch.empty(0, device=device)
     except (RuntimeError, AssertionError, NotImplementedError) as error:
-        must, fix = (
-            "must be auto, cpu, or a device of this machine",
-            "Choose auto, cpu, cuda or mps",
-        )
+        must = "must be auto, cpu, or a device of this machine"
+        fix = "Choose auto, cpu, cuda or mps"
         got = f"{str(device)!r}: {first_line(error)}"
         raise PalpateError(must, got, fix, argument="device") from None
     return torch.device(device)

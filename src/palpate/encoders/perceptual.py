@@ -27,7 +27,7 @@ from torch.nn.functional import adaptive_avg_pool2d, max_pool2d, relu
 
 from palpate.core import PalpateError, Progress, quiet
 from palpate.encoders.embed import exact
-from palpate.encoders.models import digest_modules, pick_device, read_weights
+from palpate.encoders.models import digest_modules, read_weights
 from palpate.metrics.images import image_pairs
 
 #: Below this the last stage has no pixel left that saw the whole image.
@@ -99,13 +99,12 @@ class Lpips(nn.Module):
         return total
 
 
-def load_lpips(backbone: Path, heads: Path, *, device: str = "cpu") -> Lpips:
+def load_lpips(backbone: Path, heads: Path) -> Lpips:
     """The LPIPS network from its two files; ``.safetensors`` of the same names are read as well.
 
     Args:
         backbone: state of torchvision's AlexNet; its classifier is not used.
         heads: state of the linear layers of LPIPS v0.1 for AlexNet.
-        device: see :func:`palpate.encoders.models.pick_device`.
 
     Raises:
         PalpateError: if a file is missing, holds more than weights, or other weights; both files
@@ -126,7 +125,7 @@ def load_lpips(backbone: Path, heads: Path, *, device: str = "cpu") -> Lpips:
         )
     network.eval().requires_grad_(False)
     network.digest = digest_modules({"lpips": network}, {"version": "0.1", "net": "alex"})
-    return network.to(pick_device(device))
+    return network
 
 
 def lpips_per_image(
@@ -160,10 +159,8 @@ def lpips_per_image(
     generated, reference = image_pairs(generated, reference)
     shape = generated.shape
     if min(shape[1:3]) < SMALLEST:
-        must, got = (
-            f"must be at least {SMALLEST} x {SMALLEST} for LPIPS",
-            f"{shape[1]} x {shape[2]}",
-        )
+        must = f"must be at least {SMALLEST} x {SMALLEST} for LPIPS"
+        got = f"{shape[1]} x {shape[2]}"
         raise PalpateError(must, got, "Score larger images", argument="generated")
     if mask is not None and (mask.shape != shape[:3] or mask.dtype != bool):
         must, got = f"must be boolean of shape {shape[:3]}", f"{mask.dtype} of shape {mask.shape}"

@@ -218,12 +218,7 @@ class Preprocess:
         return np.stack(fitted) if fitted else images.reshape(0, *self.shape)
 
     def frames(self, manifest: Manifest, column: str, *, still: bool = False) -> Frames:
-        """The files that samples are prepared from.
-
-        Args:
-            manifest: the samples; an earlier frame is looked for among them.
-            column: of the images.
-            still: take no earlier frames.
+        """The files that samples are prepared from; ``still`` takes no earlier frames.
 
         Raises:
             PalpateError: if a sample lacks its image, or the no-contact image of its sensor.
@@ -293,13 +288,6 @@ def prepared_images(
     progress: Progress = quiet,
 ) -> NDArray[np.uint8]:
     """The prepared images of a manifest; with a cache they are made once and mapped afterwards.
-
-    Args:
-        manifest: the samples.
-        column: of the images.
-        preprocess: how they are prepared.
-        cache: folder for a file of the array; None keeps it in memory.
-        progress: called with the number of images done.
 
     Returns:
         (n, height, width, channels), 0 to 255, in row order.

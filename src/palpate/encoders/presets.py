@@ -54,10 +54,29 @@ class Augment:
     hue: float = 0.0
     share: float = 1.0
 
+    def __post_init__(self) -> None:
+        for name, top in {
+            "crop": 0.99,
+            "gain": 10,
+            "offset": 1,
+            "saturation": 1,
+            "hue": 1,
+            "share": 1,
+        }.items():
+            if not 0 <= getattr(self, name) <= top:
+                must, got = f"must lie in [0, {top}]", str(getattr(self, name))
+                raise PalpateError(must, got, "Choose another value", argument=f"augment_{name}")
+
 
 @dataclass(frozen=True)
 class Size:
-    """A transformer; its feed-forward layer is four times as wide."""
+    """A transformer; its feed-forward layer is four times as wide.
+
+    Attributes:
+        width: of a token, a multiple of the heads.
+        layers: blocks of attention and feed-forward layer.
+        heads: of attention.
+    """
 
     width: int
     layers: int
@@ -72,7 +91,13 @@ class Size:
 
 @dataclass(frozen=True)
 class Course:
-    """A training course; ``warmup`` is a share of all steps, others as in :class:`LoopOptions`."""
+    """A training course.
+
+    Attributes:
+        epochs: passes over the train part.
+        warmup: share of the steps in which the learning rate rises.
+        augment: see :class:`Augment`.
+    """
 
     epochs: float
     batch: int
@@ -85,6 +110,11 @@ class Course:
     evaluations: int = 10
     patience: int | None = None
     keep: str = "last"
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.warmup <= 1:
+            must, got = "must lie in [0, 1], as a share of the steps", str(self.warmup)
+            raise PalpateError(must, got, "Choose another value", argument="warmup")
 
     def options(self, n: int, seed: int, epochs: float | None = None) -> LoopOptions:
         """Return the options for ``n`` rows; no batch is larger than the set."""

@@ -40,14 +40,16 @@ from palpate.encoders.models import Origin, first_line, read_weights
 from palpate.encoders.preprocess import Preprocess
 
 State = Mapping[str, Tensor]
-NC = "CC-BY-NC-4.0"
+NON_COMMERCIAL = "CC-BY-NON_COMMERCIAL-4.0"
 IMAGENET = ((0.485, 0.456, 0.406), (0.229, 0.224, 0.225))
 SPARSH = "the .safetensors file of facebook/sparsh-{mae,dino,dinov2,ijepa}-{small,base}"
 KNOWN = f"{SPARSH}, tvl_enc_vit{{t,s,b}}.pth of TVL, or checkpoint.pth of AnyTouch 1"
 #: Words in the names of sensors, in the order in which they are looked for -> AnyTouch's number.
-SENSORS = {"digit": 1, "gelslim": 2, "mini": 3, "duragel": 4, "gelsight": 0}
+SENSOR_NUMBERS = {"digit": 1, "gelslim": 2, "mini": 3, "duragel": 4, "gelsight": 0}
+#: Width of a published model -> its number of blocks: a file that lost its last ones looks whole.
+DEPTHS = {192: 12, 384: 12, 768: 12, 1024: 24}
 #: Width of a head of every vision transformer here; a narrower model has one head.
-HEAD = 64
+HEAD_WIDTH = 64
 
 
 @dataclass(frozen=True)
@@ -56,12 +58,12 @@ class Format(Origin):
 
     Attributes:
         prefix: of the names of its weights; others are not read. '' reads all.
-        mark: a name after the prefix by which it is recognized.
+        signature: a name after the prefix by which it is recognized.
         build: makes the module for given weights.
     """
 
     prefix: str
-    mark: str
+    signature: str
     build: Callable[[State], TactileModule]
 
 
@@ -71,19 +73,19 @@ class TactileModule(nn.Module):
     Attributes:
         dim: width of the features.
         preprocess: for its images.
-        sensors: whether it needs the sensors' numbers.
+        needs_sensors: whether it needs the sensors' numbers.
         format: whose it is.
     """
 
     dim: int
     preprocess: Preprocess
-    sensors = False
+    needs_sensors = False
     format: Format
 
     def encode(self, pixels: Tensor, sensors: Sequence[str] | None = None) -> Tensor:
         """Prepared pixels (n, channels, h, w), and names of sensors, to (n, dim), L2-normalized."""
         names = [""] * len(pixels) if sensors is None else list(sensors)
-        numbers = sensor_numbers(names, pixels.device) if self.sensors else None
+        numbers = sensor_numbers(names, pixels.device) if self.needs_sensors else None
         return normalize(self(pixels, numbers), dim=-1)
 
 
@@ -93,7 +95,7 @@ class Attention(nn.Module):
     def __init__(self, width: int) -> None:
         super().__init__()
         self.qkv, self.proj = nn.Linear(width, 3 * width), nn.Linear(width, width)
-        self.heads = max(1, width // HEAD)
+        self.heads = max(1, width // HEAD_WIDTH)
 
     def forward(self, x: Tensor) -> Tensor:
         """(n, tokens, width) to the same."""
@@ -113,7 +115,7 @@ class Mlp(nn.Module):
         return self.fc2(gelu(self.fc1(x)))
 
 
-class Scale(nn.Module):
+class LayerScale(nn.Module):
     """A learned factor per channel."""
 
     def __init__(self, width: int) -> None:
@@ -132,7 +134,7 @@ class Block(nn.Module):
         super().__init__()
         self.norm1, self.norm2 = (nn.LayerNorm(width, eps=1e-6) for _ in range(2))
         self.attn, self.mlp = Attention(width), Mlp(width, hidden)
-        self.ls1, self.ls2 = (Scale(width) if scaled else nn.Identity() for _ in range(2))
+        self.ls1, self.ls2 = (LayerScale(width) if scaled else nn.Identity() for _ in range(2))
 
     def forward(self, x: Tensor) -> Tensor:
         """(n, tokens, width) to the same."""
@@ -140,7 +142,7 @@ class Block(nn.Module):
         return x + self.ls2(self.mlp(self.norm2(x)))
 
 
-class Patches(nn.Module):
+class PatchEmbedding(nn.Module):
     """The image's patches as tokens."""
 
     def __init__(self, weight: Tensor) -> None:
@@ -153,7 +155,7 @@ class Patches(nn.Module):
         return self.proj(x)
 
 
-class Waves(nn.Module):
+class SinusoidalPositions(nn.Module):
     """Sparsh's positions: sines and cosines of row and column."""
 
     def __init__(self, bands: Tensor) -> None:
@@ -170,8 +172,20 @@ class Waves(nn.Module):
 
 def _blocks(state: State, *, scaled: bool) -> nn.ModuleList:
     hidden, width = state["blocks.0.mlp.fc1.weight"].shape
-    depth = len({name.split(".")[1] for name in state if name.startswith("blocks.")})
+    names = [name for name in state if name.startswith("blocks.")]
+    depth = _depth(width, {int(name.split(".")[1]) for name in names})
     return nn.ModuleList(Block(width, hidden, scaled=scaled) for _ in range(depth))
+
+
+def _depth(width: int, numbers: set[int]) -> int:
+    """The number of blocks.
+
+    Raises:
+        ValueError: if it is not that of the published model of this width.
+    """
+    if len(numbers) != (depth := DEPTHS.get(width, len(numbers))):
+        raise ValueError(f"{len(numbers)} blocks of width {width}, not {depth}")
+    return depth
 
 
 class Sparsh(TactileModule):
@@ -192,11 +206,11 @@ class Sparsh(TactileModule):
     def __init__(self, state: State) -> None:
         super().__init__()
         weight = state["patch_embed.proj.weight"]
+        if weight.shape[1] != 6:
+            raise ValueError(f"patches of {weight.shape[1]} channels, not 6: two frames")
         self.dim = weight.shape[0]
-        self.patch_embed, self.pos_embed = (
-            Patches(weight),
-            Waves(state["pos_embed.frequency_bands"]),
-        )
+        self.patch_embed = PatchEmbedding(weight)
+        self.pos_embed = SinusoidalPositions(state["pos_embed.frequency_bands"])
         if "register_tokens" in state:  # all but MAE
             self.register_tokens = nn.Parameter(torch.empty_like(state["register_tokens"]))
         self.blocks, self.norm = _blocks(state, scaled=True), nn.LayerNorm(self.dim, eps=1e-6)
@@ -232,7 +246,7 @@ class Tvl(TactileModule):
         width, self.dim = weight.shape[0], state["head.weight"].shape[0]
         size = round((state["pos_embed"].shape[1] - 1) ** 0.5) * weight.shape[3]
         self.preprocess = replace(self.preprocess, size=size, resize=size)
-        self.patch_embed = Patches(weight)
+        self.patch_embed = PatchEmbedding(weight)
         self.cls_token = nn.Parameter(torch.empty(1, 1, width))
         self.pos_embed = nn.Parameter(torch.empty_like(state["pos_embed"]))
         self.blocks, self.fc_norm = _blocks(state, scaled=False), nn.LayerNorm(width, eps=1e-6)
@@ -251,21 +265,21 @@ class AnyTouch(TactileModule):
     """AnyTouch 1: a CLIP vision encoder with tokens of the sensor."""
 
     preprocess = Preprocess(224, 224, *IMAGENET, fitting="squash", resample=2)
-    sensors = True
+    needs_sensors = True
 
     def __init__(self, state: State) -> None:
         super().__init__()
         weight = state["touch_model.embeddings.patch_embedding.weight"]
         width, _, patch, _ = weight.shape
-        numbers = re.findall(r"encoder\.layers\.(\d+)\.", " ".join(state))
+        layers = re.findall(r"encoder\.layers\.(\d+)\.", " ".join(state))
         tokens = len(state["touch_model.embeddings.position_embedding.weight"])
         size = round((tokens - 1) ** 0.5) * patch
         self.preprocess = replace(self.preprocess, size=size, resize=size)
         config = CLIPVisionConfig(
             hidden_size=width,
             intermediate_size=len(state["touch_model.encoder.layers.0.mlp.fc1.weight"]),
-            num_hidden_layers=len(set(numbers)),
-            num_attention_heads=max(1, width // HEAD),
+            num_hidden_layers=_depth(width, set(map(int, layers))),
+            num_attention_heads=max(1, width // HEAD_WIDTH),
             image_size=size,
             patch_size=patch,
             hidden_act="gelu",
@@ -296,10 +310,12 @@ FORMATS = (
         "touch_model.embeddings.class_embedding",
         AnyTouch,
     ),
-    Format("TVL", NC, ("HCT", "SSVTP"), "tactile_encoder.", "patch_embed.proj.weight", Tvl),
+    Format(
+        "TVL", NON_COMMERCIAL, ("HCT", "SSVTP"), "tactile_encoder.", "patch_embed.proj.weight", Tvl
+    ),
     Format(
         "Sparsh",
-        NC,
+        NON_COMMERCIAL,
         ("YCB-Slide", "Touch-Slide", "Touch and Go", "ObjectFolder"),
         "",
         "pos_embed.frequency_bands",
@@ -307,7 +323,7 @@ FORMATS = (
     ),
 )
 #: Parts of AnyTouch 1 under its prefix that pretrain the encoder and are no part of it.
-DECODERS = re.compile(r"(?!touch_model\.|sensor_token$|touch_projection\.)")
+PRETRAINING_PARTS = re.compile(r"(?!touch_model\.|sensor_token$|touch_projection\.)")
 
 
 def load_tactile(path: Path) -> TactileModule:
@@ -321,14 +337,14 @@ def load_tactile(path: Path) -> TactileModule:
             lack a name, have one more, or another shape.
     """
     state = read_weights(path, f"Pass {KNOWN}")
-    form = next((f for f in FORMATS if f.prefix + f.mark in state), None)
+    form = next((f for f in FORMATS if f.prefix + f.signature in state), None)
     if form is None:
         must = f"{path} must be a tactile encoder that is recognized by the names of its weights"
         got = f"{len(state)} weights, first {', '.join(list(state)[:3]) or 'none'}"
         raise PalpateError(must, got, f"Pass {KNOWN}")
     state = {k.removeprefix(form.prefix): v for k, v in state.items() if k.startswith(form.prefix)}
     if form.name == "AnyTouch 1":
-        state = {k: v for k, v in state.items() if not DECODERS.match(k)}
+        state = {k: v for k, v in state.items() if not PRETRAINING_PARTS.match(k)}
     must = f"{path} must hold the weights of {form.name}"
     try:
         module = form.build(state)
@@ -357,9 +373,11 @@ def sensor_numbers(names: list[str], device: torch.device) -> Tensor:
     Raises:
         PalpateError: for a name without one.
     """
-    numbers = {n: next((v for word, v in SENSORS.items() if word in n), None) for n in set(names)}
+    numbers = {
+        n: next((v for word, v in SENSOR_NUMBERS.items() if word in n), None) for n in set(names)
+    }
     if unknown := sorted(n for n, number in numbers.items() if number is None):
-        must = f"AnyTouch must be given sensors whose names have one of {', '.join(SENSORS)}"
+        must = f"AnyTouch must be given sensors whose names have one of {', '.join(SENSOR_NUMBERS)}"
         got = f"{unknown[0]!r} for {names.count(unknown[0])} of {len(names)} images"
         fix = "Fill the manifest's column sensor, or name one for all: checkpoint.pth#digit"
         raise PalpateError(must, got, fix)

@@ -24,7 +24,7 @@ from tokenizers import (
 )
 from transformers import PreTrainedTokenizerFast
 
-from palpate.core import PalpateError
+from palpate.core import PalpateError, require
 
 PAD, START, UNKNOWN, END = SPECIAL = ("<pad>", "<|startoftext|>", "<unk>", "<|endoftext|>")
 
@@ -49,9 +49,8 @@ def train_tokenizer(
         raise PalpateError("A tokenizer needs at least one text", "none", fix)
     alphabet = pre_tokenizers.ByteLevel.alphabet()
     smallest = len(alphabet) + len(SPECIAL)
-    if vocabulary < smallest:
-        must = f"must hold the bytes and special tokens, {smallest}"
-        raise PalpateError(must, f"{vocabulary}", "Choose e.g. 1024", argument="vocabulary")
+    must = f"must hold the bytes and special tokens, {smallest}"
+    require(vocabulary >= smallest, "vocabulary", must, vocabulary, 1024)
     tokenizer: Any = Tokenizer(models.BPE())
     tokenizer.normalizer = normalizers.Sequence([normalizers.NFC(), normalizers.Lowercase()])
     tokenizer.pre_tokenizer = pre_tokenizers.ByteLevel(add_prefix_space=True)

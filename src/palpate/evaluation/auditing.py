@@ -69,6 +69,7 @@ def audit(
 
         features: Any = "pixels"
         notes: list[Note] = []
+        seen: list[str] = []
         if encoder is not None:  # every sample is in the test part of some leak-free split
             judged = samples.take([i for part in ("train", "test") for i in split.ids(part)])
             there = [m for m in MODALITIES if judged.table[m].null_count() < len(judged)]
@@ -77,11 +78,11 @@ def audit(
             features = {}
             for m in known:
                 notes += (new := guard(encoders(), m, judged, **how))
-                seen = any(note.code in ("seen-images", "seen-dataset") for note in new)
-                # In its name, so that headline, table and plot are marked, too.
-                mark = ", trained on some of these images" if seen else ""
-                features[f"{m} encoder{mark}"] = embed(samples, m)
+                if any(note.code in ("seen-images", "seen-dataset") for note in new):
+                    seen.append(f"{m} encoder")
+                features[f"{m} encoder"] = embed(samples, m)
         how = {"features": features, "name": name, "cache": folder, "progress": progress}
+        how["seen"] = seen
         result = measure_impact(samples, split, group=group, **how)
         return replace(result, notes=[*notes, *result.notes])
 

@@ -59,7 +59,7 @@ class Weights:
 
     inception: Path | str | None = None
     clip: Path | str | None = None
-    lpips: tuple[Path, Path] | None = None
+    lpips: tuple[str | Path, str | Path] | None = None
 
     def for_features(self, name: str) -> tuple[Literal["inception", "clip"], Path | str | None]:
         """The standard encoder of a companion on features, and its weights."""
@@ -160,12 +160,8 @@ def choose(
 ) -> Chosen:
     """Sort the requested companions by what they need; None means all whose inputs are there.
 
-    Args:
-        requested: names, or None; an empty list is none.
-        weights: of standard encoders.
-        images: whether there are images (else embeddings).
-        encoder: whether there are features of an encoder.
-        background: whether the reference has backgrounds.
+    ``images``, ``encoder`` and ``background`` say whether there are images (else embeddings),
+    features of an encoder, and backgrounds of the reference.
 
     Raises:
         PalpateError: for an unknown name, or a companion whose inputs are not there.
@@ -215,14 +211,9 @@ def _lacking(name: str, weights: Weights, *, images: bool) -> PalpateError:
 def score_features(
     names: Sequence[str], features: Features, default: bool, progress: Progress
 ) -> Outcome:
-    """Compute companions on given features.
+    """Compute companions, among :data:`FEATURES`, on given features.
 
-    Args:
-        names: among :data:`FEATURES`.
-        features: of generators, controls and reference.
-        default: whether nobody requested them: one that raises, or forms too many pairs, becomes a
-            note.
-        progress: called with what is done.
+    By ``default`` nobody requested them: one that raises, or forms too many pairs, becomes a note.
     """
     outcome = Outcome()
     for name in (n for n in FEATURES if n in names):
@@ -358,14 +349,9 @@ def _lpips(pairs: Pairs) -> Outcome:
     from palpate.encoders.perceptual import load_lpips, lpips_per_image
 
     assert pairs.weights.lpips is not None  # `choose` requires it
-    network, real = load_lpips(*pairs.weights.lpips), pairs.reference
+    network, real = load_lpips(*map(Path, pairs.weights.lpips)), pairs.reference
     settings = {"network": "alex", "version": "0.1", "size": [int(v) for v in real.shape[1:3]]}
-    more: dict[str, Any] = {
-        **pairs.common,
-        "level": 0.95,
-        "higher_is_better": False,
-        "encoder": network.digest,
-    }
+    more: dict[str, Any] = {**pairs.common, "higher_is_better": False, "encoder": network.digest}
 
     def outcome_of(metric: str, values: Mapping[str, Any], **extra: Any) -> Outcome:
         scores = {

@@ -9,8 +9,8 @@ file              content
 ``.safetensors``  tensor ``features`` (n, d) of F64, F32, F16 or BF16; optionally, in the metadata,
                   ``ids``, ``labels`` and ``groups`` as JSON lists, ``encoder`` as text;
                   memory-mapped
-``.parquet``      columns ``id``, ``features`` (a list per row) or ``f0`` .. ``f<d-1>``; optionally
-                  ``material`` or ``label``, ``video`` or ``group``; ``encoder`` in the metadata
+``.parquet``      columns ``id`` and ``features`` (a list per row); optionally ``material`` or
+                  ``label``, ``video`` or ``group``; ``encoder`` in the metadata
 ================  ================================================================================
 """
 
@@ -200,9 +200,13 @@ def embeddings_of_table(table: pl.DataFrame, source: str, encoder: str | None = 
     Raises:
         PalpateError: if a column is missing, or a row has no features or features of another width.
     """
-    if "id" not in table.columns:
-        got = f"columns {', '.join(table.columns[:8])}"
-        raise PalpateError(f"{source} must have a column id", got, "Add it: ids pair the samples")
+    for name, fix in (
+        ("id", "Add it: ids pair the samples"),
+        ("features", "A list of floats a row"),
+    ):
+        if name not in table.columns:
+            got = f"columns {', '.join(table.columns[:8])}"
+            raise PalpateError(f"{source} must have a column {name}", got, fix)
     labels, groups = (
         text_column(table, name, source) if (name := first_of(table.columns, names)) else None
         for names in (LABELS, GROUPS)
@@ -212,17 +216,9 @@ def embeddings_of_table(table: pl.DataFrame, source: str, encoder: str | None = 
 
 
 def _table_features(table: pl.DataFrame, source: str) -> NDArray[Any]:
-    """The column ``features`` as (n, d), or f0, f1, ... side by side."""
+    """The column ``features`` as (n, d)."""
     import polars as pl
 
-    if "features" not in table.columns:
-        names = [f"f{k}" for k in range(len(table.columns))]
-        names = names[: next(k for k, name in enumerate([*names, ""]) if name not in table.columns)]
-        if not names or any(n[:1] == "f" and n[1:].isdigit() for n in {*table.columns} - {*names}):
-            got = f"columns {', '.join(table.columns[:8])}"
-            must = f"{source} must have a column features, or f0, f1, ... without a gap"
-            raise PalpateError(must, got, "Rename the columns")
-        table = table.with_columns(pl.concat_list(names).alias("features"))
     column = table["features"]
     if not isinstance(column.dtype, pl.List | pl.Array):
         must = f"The column features in {source} must be lists of floats"

@@ -5,6 +5,11 @@ leak-free one the classifier must know the material. The difference, in points o
 leaking is worth. Two classifiers measure it: 1-NN (remembers everything) and a linear probe
 (remembers little), on raw pixels or on any embeddings.
 
+1-NN: a test row x gets the label of the train row z with the smallest ||x - z||^2. Equal images are
+common (an untouched gel, a frame stored twice), so where several train rows are equally near, the
+hit is the share of them with the right label: what a random choice among them would score on
+average. Equally near means within the rounding of float32, ``TIE (||x||^2 + max ||z||^2)``.
+
 What is held equal: the samples (train and test of the given split, of materials that can be
 compared), the shares, the number of train samples (larger train parts are thinned evenly), the
 features and their reduction (fitted to each train part alone), the classifiers, and how the probe's
@@ -26,7 +31,7 @@ number would vary with other test videos, not with other train videos.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -35,17 +40,17 @@ import numpy as np
 import polars as pl
 from numpy.typing import NDArray
 
-from palpate.core import FeatureSet, Note, PalpateError, Progress, Split, quiet, require
+from palpate.core import FeatureSet, Note, PalpateError, Progress, Split, quiet, require, rng_for
 from palpate.data.manifest import Manifest
 from palpate.evaluation.impact_features import (
+    SIZE,
     Rows,
     Source,
-    array_sources,
     fit_reduction,
+    given_sources,
     pixel_sources,
 )
-from palpate.evaluation.impact_scores import Codes, code, nearest_hits, thin
-from palpate.leakage.groups import GROUPS, choose_group, nested_groups
+from palpate.leakage.groups import GROUPS, nested_groups
 from palpate.leakage.splitting import split as leak_free_split
 from palpate.metrics.means import Mean, mean_of, spread_of
 from palpate.metrics.probe import fit_probe
@@ -56,7 +61,12 @@ PROBE_ROWS = 10_000
 #: Columns kept by the PCA; features of no more columns are not reduced.
 COMPONENTS = 128
 CLASSIFIERS = ("1-NN", "linear probe")
-Features = Literal["pixels"] | Mapping[str, FeatureSet | NDArray[Any]]
+#: Entries of a block of distances (float32: 64 MB), of some test rows by all train rows.
+CELLS = 1 << 24
+#: Rounding of a float32 distance, relative to the squared lengths.
+TIE = 2e-6
+
+Codes = NDArray[np.int64]
 
 
 @dataclass(frozen=True)
@@ -73,7 +83,7 @@ class _Design:
     """What is compared.
 
     Attributes:
-        ids, rows: the samples, and their rows in the manifest.
+        ids: the samples.
         at: their rows in the features.
         material, group: codes into ``materials`` and ``groups``, one per sample.
         splits: the given split, then the leak-free ones.
@@ -82,7 +92,6 @@ class _Design:
     """
 
     ids: list[str]
-    rows: Rows
     at: Rows
     material: Codes
     group: Codes
@@ -98,11 +107,11 @@ def impact(
     split: Split,
     *,
     group: str = "video",
-    features: Features = "pixels",
+    features: Literal["pixels"] | Mapping[str, FeatureSet] = "pixels",
     seeds: Sequence[int] = (0, 1, 2),
-    size: int = 32,
     name: str = "",
     cache: Path | None = None,
+    seen: Collection[str] = (),
     progress: Progress = quiet,
 ) -> Impact:
     """Measure what a split's leak is worth in material accuracy (see the head of this file).
@@ -110,16 +119,15 @@ def impact(
     Args:
         manifest: the samples, with materials.
         split: the split in question; its train and test parts are compared.
-        group: column that the leak-free splits keep whole and that intervals are made over;
-            ``auto`` takes what the data set has. If a coarser one is known, there are rows of it,
-            too.
+        group: column that the leak-free splits keep whole and that intervals are made over. If a
+            coarser one is known, there are rows of it, too.
         features: ``pixels`` (tactile, tactile minus background, vision: those that the manifest
-            has), or name -> features, as a :class:`FeatureSet` or an (n, d) array in the order of
-            ``manifest.ids``.
+            has), or name -> features of the samples.
         seeds: one leak-free split each; the clean accuracy is that of their test samples together.
-        size: side of the pixels.
         name: of the split, for the headline; default: its rule's name.
         cache: folder for decoded pixels; None keeps nothing.
+        seen: features of encoders that were trained on some of the samples; row and headline say
+            so.
         progress: called with what is done.
 
     Returns:
@@ -129,26 +137,23 @@ def impact(
 
     Raises:
         PalpateError: without two materials that can be compared, with nulls in the group column, or
-            on features that are missing, of another length, or not finite.
+            on features that are missing.
         ProblemsError: naming every missing or unreadable image.
     """
-    known = not isinstance(features, str) or features == "pixels"
-    require(known, "features", "must be 'pixels' or a mapping", features)
-    once = 0 < len(seeds) == len(set(seeds))
-    require(once, "seeds", "must hold at least one seed, each once", list(seeds), (0, 1, 2))
+    require(len(features) > 0, "features", "must hold features to classify by", features)
     design = _design(manifest, split, group, seeds)
     coarser, more = _coarser(manifest, split, design, seeds)
     notes = [*design.notes, *more]
     if isinstance(features, str):
         samples = manifest.take(design.ids)
-        sources, more = pixel_sources(samples, size=size, cache=cache, progress=progress)
+        sources, more = pixel_sources(samples, cache=cache, progress=progress)
         notes += more
     else:
-        sources = array_sources(features, manifest, design.ids, design.rows)
-    rows, facts = _measure(design, sources, progress)
+        sources = given_sources(features, design.ids)
+    rows, facts = _measure(design, sources, seen, progress)
     settings = {
         **design.settings,
-        "size": size if isinstance(features, str) else None,
+        "size": SIZE if isinstance(features, str) else None,
         "components": COMPONENTS,
         "features": facts,
         "interval": "leave-one-group-out jackknife over test groups, paired, t, 95 %",
@@ -157,7 +162,7 @@ def impact(
         rows[0], name or str(split.rule.get("name") or "the given split"), settings
     )
     if coarser is not None:
-        further, facts = _measure(coarser, sources, progress)
+        further, facts = _measure(coarser, sources, seen, progress)
         column, rows = coarser.settings["group"], rows + further
         settings[f"by {column}"] = coarser.settings | {"features": facts}
         headline += f" Of new {column}s (splits by {column}): {100 * further[0].clean:.1f} %."
@@ -166,7 +171,7 @@ def impact(
 
 
 def _measure(
-    design: _Design, sources: Sequence[Source], progress: Progress
+    design: _Design, sources: Sequence[Source], seen: Collection[str], progress: Progress
 ) -> tuple[list[ImpactRow], dict[str, Any]]:
     """Rows for each kind of features and classifier, and facts on the features."""
     rows: list[ImpactRow] = []
@@ -191,7 +196,8 @@ def _measure(
             **{c: [round(float(m.score), 5) for m in means[c]] for c in CLASSIFIERS},
         }
         chance = 1 / len(design.materials)
-        rows += [_row(source.name, c, means[c], chance, column) for c in CLASSIFIERS]
+        of_source = [_row(source.name, c, means[c], chance, column) for c in CLASSIFIERS]
+        rows += [replace(row, seen=source.name in seen) for row in of_source]
     progress(f"classifying materials by {column}", total, total)
     return rows, facts
 
@@ -234,24 +240,23 @@ def _design(manifest: Manifest, split: Split, group: str, seeds: Sequence[int]) 
         must, fix = "The impact of a leak needs materials", "Fill the manifest's column material"
         raise PalpateError(must, "none in train and test", fix)
     pool = manifest.take([ids[k] for k in rows])
-    column, reason = choose_group(pool) if group == "auto" else (group, None)
-    notes = [reason] if reason else []
+    notes: list[Note] = []
     if len(rows) < len(inside):
         notes.append(Note("no-material", {"count": len(inside) - len(rows)}))
     if "val" in split.parts.values():
         notes.append(Note("val-excluded"))
-    owners = _owners(pool, column)
+    owners = _owners(pool, group)
     videos = pool.table["video"].drop_nulls().n_unique()
-    if column == "contact" and videos not in (0, pool.table["contact"].n_unique()):
+    if group == "contact" and videos not in (0, pool.table["contact"].n_unique()):
         notes.append(Note("shared-videos"))
     here, given = [labels[k] for k in rows], [str(part_of[k]) for k in rows]
-    excluded = _incomparable(here, owners, [given], column)
+    excluded = _incomparable(here, owners, [given], group)
     rows, here, owners, given = _without(excluded, here, rows, here, owners, given)
     share = given.count("train") / len(given)
     kept = manifest.take([ids[k] for k in rows])
-    plans = [leak_free_split(kept, train=share, by=column, seed=s) for s in seeds]
+    plans = [leak_free_split(kept, train=share, by=group, seed=s) for s in seeds]
     parts = [given, *([p.parts[i] for i in kept.ids] for p in plans)]
-    late = _incomparable(here, owners, parts, column)
+    late = _incomparable(here, owners, parts, group)
     rows, here, owners, *parts = _without(late, here, rows, here, owners, *parts)
     excluded |= late
     digests = [split.digest, *(p.digest for p in plans)]
@@ -263,7 +268,7 @@ def _design(manifest: Manifest, split: Split, group: str, seeds: Sequence[int]) 
     groups, owner = code(owners)
     settings = {
         "given_split": split.digest,
-        "group": column,
+        "group": group,
         "seeds": list(seeds),
         "train_share": round(share, 5),
         "materials": materials,
@@ -272,15 +277,13 @@ def _design(manifest: Manifest, split: Split, group: str, seeds: Sequence[int]) 
     }
     settings["deviation"] = [round(p.rule["deviation"], 5) for p in plans]
     notes += _qualifications(settings, excluded, len(plans) - len(set(digests[1:])))
-    ids, places = [ids[k] for k in rows], (np.array(rows), np.arange(len(rows)))
-    return _Design(ids, *places, material, owner, materials, groups, splits, notes, settings)
+    ids, at = [ids[k] for k in rows], np.arange(len(rows))
+    return _Design(ids, at, material, owner, materials, groups, splits, notes, settings)
 
 
 def _owners(pool: Manifest, column: str) -> list[str]:
     """The group of each sample."""
-    if column not in GROUPS:
-        must, example = f"must be auto or one of {', '.join(GROUPS)}", {"group": "video"}
-        raise PalpateError(must, repr(column), "", argument="group", example=example)
+    require(column in GROUPS, "group", f"must be one of {', '.join(GROUPS)}", column, "video")
     if nulls := pool.table[column].null_count():
         must = f"Every sample that is compared needs a {column}"
         fix, example = "Fill the column, or choose another group", {"group": "contact"}
@@ -409,11 +412,73 @@ def _headline(row: ImpactRow, name: str, settings: Mapping[str, Any]) -> str:
         low, high = row.cost_interval
         interval = f" [{100 * low:.1f}, {100 * high:.1f}]"
         doubt = ", which may be nothing" if low <= 0 <= high else ""
+    features = f"{row.features}, trained on some of these images" if row.seen else row.features
     start = (
-        f"{row.classifier} on {row.features}: {100 * row.given:.1f} % under {name}, "
+        f"{row.classifier} on {features}: {100 * row.given:.1f} % under {name}, "
         f"{100 * row.clean:.1f} % under {clean} by {group} (chance {100 * row.chance:.1f} %)"
     )
     points = f"{100 * row.cost:.1f} points{interval}"
     if not settings["shared_groups"]:
         return f"{start}: {name} shares no {group}, and the difference is {points}."
     return f"{start}: leaking is worth {points}{doubt}."
+
+
+def nearest_hits(
+    queries: NDArray[np.float32], base: NDArray[np.float32], query_class: Codes, base_class: Codes
+) -> NDArray[np.float64]:
+    """Probability (m,) that 1-NN gets each query right, ties being broken at random.
+
+    Queries (m, d) and base (n, d) have class numbers from 0.
+    """
+    classes = int(max(query_class.max(), base_class.max())) + 1
+    one_hot = np.zeros((len(base), classes), np.float32)
+    one_hot[np.arange(len(base)), base_class] = 1
+    length = np.einsum("ij,ij->i", base, base)
+    out = np.empty(len(queries))
+    step = max(1, CELLS // len(base))
+    for start in range(0, len(queries), step):
+        x = queries[start : start + step]
+        distance = x @ base.T
+        distance *= -2
+        distance += length
+        rounding = TIE * (np.einsum("ij,ij->i", x, x) + length.max())
+        tied = distance <= (distance.min(axis=1) + rounding)[:, None]
+        # Sums of at most 2^24 ones are exact in float32.
+        votes = tied.astype(np.float32) @ one_hot
+        right = votes[np.arange(len(x)), query_class[start : start + step]]
+        out[start : start + step] = right / votes.sum(axis=1)
+    return out
+
+
+def thin(rows: Codes, groups: Codes, classes: Codes, count: int, seed: int) -> Codes:
+    """Choose rows evenly: every class keeps its share (at least one row), and so every group.
+
+    Each class gets ``count * n_c / n`` rows, rounded so that the sum is ``count``; within a class
+    the rows, sorted by group and at random within it, are taken at equal steps from a random start,
+    so a group keeps its share to within one row. Groups and classes are numbers, one a row, and
+    ``count`` is at least that of classes. The rows come in a random order.
+    """
+    rng = rng_for(seed, "impact thin", count)
+    order = rng.permutation(len(rows))
+    if len(rows) <= count:
+        return rows[order]
+    sizes = np.bincount(classes)
+    exact = count * sizes / len(rows)
+    quota = np.where(sizes > 0, np.maximum(np.floor(exact), 1), 0).astype(np.int64)
+    while (off := count - int(quota.sum())) != 0:
+        room = (quota < sizes) if off > 0 else (quota > 1)
+        gap = np.where(room, (exact - quota) * np.sign(off), -np.inf)
+        quota[int(gap.argmax())] += np.sign(off)
+    chosen: list[Codes] = []
+    for c in np.flatnonzero(quota):
+        of_class = order[classes[order] == c]
+        line = of_class[np.argsort(groups[of_class], kind="stable")]
+        at = (np.arange(quota[c]) + rng.random()) * len(line) / quota[c]
+        chosen.append(line[at.astype(np.int64)])
+    return rows[rng.permutation(np.concatenate(chosen))]
+
+
+def code(names: Sequence[str]) -> tuple[list[str], Codes]:
+    """The distinct names, sorted, and the number of each."""
+    values, codes = np.unique(np.asarray(list(names), dtype=str), return_inverse=True)
+    return [str(v) for v in values], codes.astype(np.int64)

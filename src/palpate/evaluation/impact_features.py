@@ -1,6 +1,6 @@
 """Features that the impact of a leak is measured on, and their reduction by a PCA of train.
 
-Pixels: the center square as ``size x size`` RGB, row by row. Given features are used as they are if
+Pixels: the center square as 32 x 32 RGB, row by row. Given features are used as they are if
 their rows have length 1 (Euclidean order is then the order by cosine); otherwise their columns are
 standardized by the train part.
 
@@ -21,10 +21,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from palpate.core import FeatureSet, Note, PalpateError, Progress, quiet, require, rng_for
+from palpate.core import FeatureSet, Note, PalpateError, Progress, quiet, rng_for
 from palpate.data.images import cached_images
 from palpate.data.manifest import Manifest
 
+#: Side of the squares of pixels.
+SIZE = 32
 #: Train rows that the PCA is fitted to; more change 128 components by less than the choice of the
 #: split.
 FIT_ROWS = 10_000
@@ -74,21 +76,14 @@ class Reduction:
 
 
 def pixel_sources(
-    manifest: Manifest, *, size: int = 32, cache: Path | None = None, progress: Progress = quiet
+    manifest: Manifest, *, cache: Path | None = None, progress: Progress = quiet
 ) -> tuple[list[Source], list[Note]]:
     """The kinds of pixels that a manifest has, and a note for each that it lacks.
-
-    Args:
-        manifest: the samples, in the order of the rows.
-        size: side of the squares in pixels.
-        cache: folder for decoded images.
-        progress: called with how many files are decoded.
 
     Raises:
         PalpateError: if there are neither vision nor tactile images, or only some samples have one.
         ProblemsError: naming every missing or unreadable file.
     """
-    require(size >= 4, "size", "must be at least 4", size, 32)
     nulls = {
         name: manifest.table[name].null_count() for name in ("tactile", "vision", "background")
     }
@@ -100,10 +95,10 @@ def pixel_sources(
     sources: list[Source] = []
     notes = [Note("no-images", {"column": n}) for n in ("tactile", "vision") if n not in present]
     for name in present:
-        images = cached_images(manifest, name, size, cache, progress)
+        images = cached_images(manifest, name, SIZE, cache, progress)
         sources.append(_pixels(f"{name} pixels", images))
         if name == "tactile" and not nulls["background"]:
-            background = cached_images(manifest, "background", size, cache, progress)
+            background = cached_images(manifest, "background", SIZE, cache, progress)
             sources.append(_pixels("tactile minus background", images, background))
     if "tactile" in present and nulls["background"]:
         counts = {"count": nulls["background"], "n": len(manifest)}
@@ -111,49 +106,19 @@ def pixel_sources(
     return sources, notes
 
 
-def array_sources(
-    features: Mapping[str, FeatureSet | NDArray[Any]],
-    manifest: Manifest,
-    ids: Sequence[str],
-    rows: Rows,
-) -> list[Source]:
-    """Given features: of samples by id, or (n, d) in the order of the manifest.
-
-    Args:
-        features: name -> features of at least the samples used.
-        manifest: all samples.
-        ids: the samples used; they become rows 0, 1, ... of the sources.
-        rows: their numbers in the manifest.
+def given_sources(features: Mapping[str, FeatureSet], ids: Sequence[str]) -> list[Source]:
+    """The features of the samples ``ids``, by name.
 
     Raises:
-        PalpateError: for no features, another number of rows, missing ids, or values that are not
-            finite.
+        PalpateError: if some have none.
     """
-    if not features:
-        fix = "Pass 'pixels', or name -> array"
-        raise PalpateError("must hold features to classify by", "none", fix, argument="features")
-    return [_given(name, value, len(manifest), rows, ids) for name, value in features.items()]
+    return [_given(name, known.take(ids)) for name, known in features.items()]
 
 
-def _given(
-    name: str, value: FeatureSet | NDArray[Any], total: int, rows: Rows, ids: Sequence[str]
-) -> Source:
-    encoder = None
-    if isinstance(value, FeatureSet):
-        x, encoder = value.take(ids).features, value.encoder
-    else:
-        x = np.asarray(value)
-        if x.ndim != 2 or len(x) != total:
-            must = f"The features {name!r} must have shape ({total}, d), one row per sample"
-            fix = "Pass them in the order of manifest.ids, or as a FeatureSet with ids"
-            raise PalpateError(must, f"shape {x.shape}", fix)
-        x = x[rows]
-    if x.dtype.kind not in "fiub" or not x.shape[1]:
-        must = f"The features {name!r} must be numbers in at least one column"
-        raise PalpateError(must, f"{x.dtype}, shape {x.shape}", "Pass floats")
-    x = FeatureSet(ids, x.astype(np.float32, copy=False)).features  # raises on NaN and infinity
+def _given(name: str, known: FeatureSet) -> Source:
+    x = known.features.astype(np.float32, copy=False)
     unit = bool((np.abs(np.linalg.norm(x, axis=1) - 1) < UNIT).all())
-    return Source(name, x.shape[1], lambda at: x[at], not unit, encoder or _digest(x))
+    return Source(name, x.shape[1], lambda at: x[at], not unit, known.encoder or _digest(x))
 
 
 def _pixels(name: str, images: NDArray[np.uint8], *less: NDArray[np.uint8]) -> Source:
@@ -178,14 +143,9 @@ def _digest(*arrays: NDArray[Any]) -> str:
 
 
 def fit_reduction(source: Source, train: Rows, components: int, seed: int) -> Reduction:
-    """The PCA at the head of this file.
+    """The PCA at the head of this file, of the rows ``train``, whose order says nothing.
 
-    Args:
-        source: the features.
-        train: rows of the train part, in an order that does not follow the content.
-        components: columns to keep; features of no more columns are only centered (and
-            standardized).
-        seed: of the start.
+    Features of no more columns than ``components`` are only centered (and standardized).
     """
     used = train if len(train) <= FIT_ROWS else train[np.arange(FIT_ROWS) * len(train) // FIT_ROWS]
     x = source.read(used)

@@ -36,6 +36,7 @@ from palpate.core import (
     quiet,
     read_json,
     require_regular,
+    require_rows,
     short,
 )
 from palpate.core.digest import to_numpy
@@ -129,12 +130,8 @@ class Samples:
         Raises:
             PalpateError: if an id is missing.
         """
-        row = {name: k for k, name in enumerate(self.ids)}
-        if missing := [i for i in ids if i not in row]:
-            must = f"{self.source} must have every id of the split's test part"
-            got = f"{len(missing)} of {len(ids)} missing, first {missing[0]!r}"
-            raise PalpateError(must, got, "Use the split that was made for it")
-        at = [row[i] for i in ids]
+        must = f"{self.source} must have every id of the split's test part"
+        at = require_rows(self.ids, ids, must, "Use the split that was made for it")
         groups = picked(self.groups, at)
         return replace(
             self,
@@ -237,12 +234,7 @@ def _image_size(path: Path) -> tuple[int, int]:
 
 
 def read(source: Source, name: str, group: str = "video") -> Samples:
-    """Read one source; see the head of this module.
-
-    Args:
-        source: what holds the samples.
-        name: what errors call a source that is no path.
-        group: manifest column of the groups.
+    """Read one source, which errors call ``name`` if it is no path; see the head of this module.
 
     Raises:
         PalpateError: if it is nothing that can be scored, or empty.
@@ -272,14 +264,14 @@ def _read_path(path: Path, group: str) -> Samples:
     if not path.exists():
         raise PalpateError("What is scored must exist", f"nothing at {path}", f"Pass {KINDS}")
     require_regular(path)
-    if path.is_file() and not _is_manifest(path):
+    from palpate.data.manifest import Manifest, is_manifest
+
+    if path.is_file() and not is_manifest(path):
         if path.suffix.lower() not in SUFFIXES:
             fix = "Pass one of these; pickles are never loaded"
             raise PalpateError(f"{path} must be {KINDS}", path.suffix or "no suffix", fix)
         return _of_embeddings(read_embeddings(path), str(path), path)
     require_utf8("Paths of images", os.path.realpath(path))
-    from palpate.data.manifest import Manifest
-
     if path.is_file() or (path / "manifest.parquet").is_file():
         manifest = Manifest.load(path)
         kinds = ("empty", "null-id", "duplicate-id")
@@ -297,13 +289,6 @@ def _read_path(path: Path, group: str) -> Samples:
         samples = _of_manifest(Manifest.from_rows(rows, path), str(path), group)
         return replace(samples, generator=folder.settings)
     return _of_manifest(Manifest.from_rows(_folder_rows(path), path), str(path), group)
-
-
-def _is_manifest(path: Path) -> bool:
-    try:
-        return path.suffix.lower() == ".parquet" and "palpate.format" in read_parquet(path)[0]
-    except Exception:  # not a Parquet file; the reader of embeddings reports it
-        return False
 
 
 def require_utf8(what: str, text: str) -> None:
@@ -458,7 +443,7 @@ def read_inputs(
     """
     auto = str(split.rule.get("group", "video")) if split else "video"
     column = auto if group == "auto" else group
-    sources = _named(generated, names, reserved)
+    sources = named_sources(generated, names, reserved)
     real = read(reference, REFERENCE, column)
     made = {name: read(source, name, column) for name, source in sources.items()}
     _require_one_kind([real, *made.values()])
@@ -467,10 +452,12 @@ def read_inputs(
             must, got = "must go with images", "embeddings"
             raise PalpateError(must, got, "Drop it", argument="background")
         real = replace(real, background=read([background], "background"))
-    known = _keywords(labels, groups, column, exact=group != "auto")
+    known = keywords_of(labels, groups, column, exact=group != "auto")
     given = {i for keyword in known for i in keyword.values}
-    real = _complete(real, known)
-    made = {name: _complete(_with_ids(s, [*real.ids, *given]), known) for name, s in made.items()}
+    real = complete(real, known)
+    made = {
+        name: complete(with_known_ids(s, [*real.ids, *given]), known) for name, s in made.items()
+    }
     if known and not any(given & {*samples.ids} for samples in (real, *made.values())):
         raise PalpateError(f"{known[0].source} must hold ids of the samples", "other ids", "")
     if real.numbered:  # row k of a generator is not row k of the reference
@@ -490,7 +477,7 @@ def read_inputs(
     return Inputs(made, real, train, _common_group([real, *made.values()], group) or column, notes)
 
 
-def _named(
+def named_sources(
     generated: Source, names: Sequence[str] | None, reserved: Sequence[str]
 ) -> dict[str, Source]:
     """Name -> source of every generator; names must differ, and must not be those of a control."""
@@ -566,7 +553,7 @@ class _Keyword:
     source: str
 
 
-def _keywords(labels: Source, groups: Source, group: str, *, exact: bool) -> list[_Keyword]:
+def keywords_of(labels: Source, groups: Source, group: str, *, exact: bool) -> list[_Keyword]:
     """The columns of the keywords ``labels`` (which may hold groups as well) and ``groups``."""
     group_names = (group,) if exact else (group, *GROUPS)
     wanted = {"labels": LABELS} | ({} if groups is not None else {"groups": group_names})
@@ -612,7 +599,7 @@ def _table(source: Source, column: str, argument: str) -> tuple[pl.DataFrame, st
     return pl.DataFrame({"id": list(values), column: list(values.values())}), f"`{argument}`"
 
 
-def _with_ids(samples: Samples, known: Sequence[str]) -> Samples:
+def with_known_ids(samples: Samples, known: Sequence[str]) -> Samples:
     """Images whose ids are known ids but for the suffix take the known ids."""
     if samples.manifest is None:
         return samples
@@ -626,7 +613,7 @@ def _with_ids(samples: Samples, known: Sequence[str]) -> Samples:
     return replace(samples, ids=ids, manifest=replace(samples.manifest, table=table))
 
 
-def _complete(samples: Samples, keywords: Sequence[_Keyword]) -> Samples:
+def complete(samples: Samples, keywords: Sequence[_Keyword]) -> Samples:
     """Samples with labels and groups of the keywords; those without any id in a keyword stay."""
     for keyword in keywords:
         values, where = keyword.values, keyword.source
@@ -720,14 +707,16 @@ def load_encoders(encoder: Any, progress: Progress) -> Any:
     """An ``EncoderSet``, loaded where it is a name or a folder."""
     if encoder is None or not isinstance(encoder, str | Path):
         return encoder
-    progress(f"loading {encoder}", 0, 1)
+    progress(f"loading {encoder}", 0, 0)
     from palpate.encoders.models import find_encoder, parts_of
 
     for part in parts_of(encoder):
         find_encoder(part)  # a wrong name answers at once; torch takes seconds to import
     from palpate.encoders.encoder_set import EncoderSet
 
-    return EncoderSet.load(encoder, device="auto")
+    encoders = EncoderSet.load(encoder, device="auto")
+    progress(f"loading {encoder}", 1, 1)
+    return encoders
 
 
 def guard(
@@ -762,32 +751,28 @@ def guard(
     from PIL import Image
 
     judged: Any = [*map(Image.fromarray, images)] if isinstance(images, np.ndarray) else images
-    dataset = str(getattr(images, "facts", {}).get("dataset") or "")
-    notes: list[Note] = []
-    origin = encoders.origin(modality)
-    seen = encoders.saw(modality, judged, progress=progress)
-    trained_on = origin.trained_on if origin else ()
-    declared = [name for name in trained_on if name.lower() in dataset.lower()]
+    origin, seen = encoders.origin(modality), encoders.saw(modality, judged, progress=progress)
+    dataset = str(getattr(images, "facts", {}).get("dataset") or "").lower()
+    declared = [name for name in (origin.trained_on if origin else ()) if name.lower() in dataset]
+    notes, got = list[Note](), ""
     if seen.any():
-        params = {"modality": modality, "seen": int(seen.sum()), "n": len(seen)}
-        notes.append(Note("seen-images", params))
+        params: dict[str, Any] = {"modality": modality, "seen": int(seen.sum()), "n": len(seen)}
+        notes = [Note("seen-images", params)]
+        got = f"{params['seen']:,} of {len(seen):,} that it was trained on"
     elif declared:
-        notes.append(
-            Note("seen-dataset", {"modality": modality, "dataset": " and ".join(declared)})
-        )
+        params = {"modality": modality, "dataset": " and ".join(declared)}
+        notes = [Note("seen-dataset", params)]
+        got = f"images of {params['dataset']}, with which its authors trained it"
     if notes and not allow_seen:
-        got = f"{int(seen.sum()):,} of {len(seen):,} that it was trained on"
-        if not seen.any():
-            got = f"images of {' and '.join(declared)}, with which its authors trained it"
-        raise PalpateError(
-            f"The {modality} encoder must judge images that it has not seen",
-            got,
-            "Judge other images or use another encoder, or allow it: every score then says so",
-            example={"allow_seen": True},
-        )
+        must = f"The {modality} encoder must judge images that it has not seen"
+        fix = "Judge other images or use another encoder, or allow it: every score then says so"
+        raise PalpateError(must, got, fix, example={"allow_seen": True})
     if origin:
         params = {"modality": modality, "name": origin.name, "license": origin.license}
         notes.append(Note("encoder-license", params))
+        if origin.trained_on and not declared and not getattr(images, "synthetic", False):
+            params = {"modality": modality, "sets": ", ".join(origin.trained_on)}
+            notes.append(Note("pretraining-sets", params))
     if modality != "tactile":
         return notes
     card, simulated = encoders.card, getattr(images, "synthetic", None)
@@ -797,4 +782,42 @@ def guard(
     if split is not None and unknown and card.get("split") != split.digest:
         known = card.get("split") is not None
         notes.append(Note("encoder-of-other-split" if known else "encoder-without-split"))
+    return notes
+
+
+def guard_choice(
+    digest: str, generators: Mapping[str, Samples], *, allow_seen: bool = False
+) -> dict[str, list[Note]]:
+    """Raise if an encoder judges images that it chose, or whose generator was aligned with it.
+
+    Args:
+        digest: of the tactile encoder.
+        generators: what it judges, by name.
+        allow_seen: note it instead.
+
+    Returns:
+        By name, what readers must know of such images, and of all that were chosen.
+
+    Raises:
+        PalpateError: if the encoder chose some of the images, or guided their generator's training.
+    """
+    notes: dict[str, list[Note]] = {name: [] for name in generators}
+    for name, samples in generators.items():
+        settings = samples.generator or {}
+        if digest in settings.get("guides", ()):
+            if not allow_seen:
+                must = "The tactile encoder must judge images of generators not aligned with it"
+                got = f"{name!r}, whose training followed this encoder"
+                fix = "Score with another encoder, or allow it: every score then says so"
+                raise PalpateError(must, got, fix, example={"allow_seen": True})
+            notes[name].append(Note("aligned"))
+        if not settings.get("chosen_by"):
+            continue
+        same = settings["chosen_by"] == digest
+        if same and not allow_seen:
+            must = "The tactile encoder must judge images that it has not chosen"
+            got = f"{name!r}, the best of {settings.get('best_of')} by this encoder"
+            fix = "Score with another encoder, or allow it: every score then says so"
+            raise PalpateError(must, got, fix, example={"allow_seen": True})
+        notes[name].append(Note("chosen", {"n": settings.get("best_of"), "same": same}))
     return notes

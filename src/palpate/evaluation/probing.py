@@ -325,12 +325,7 @@ def results_of(
 ) -> Results:
     """Scores of all subjects, of several trainings their mean, with paired differences.
 
-    Args:
-        title: of the page.
-        runs: subject -> what each of its trainings (one a seed) scores.
-        plan: what was measured.
-        manifest: the samples.
-        splits: by name.
+    ``runs`` has for each subject what each of its trainings (one a seed) scores.
     """
     scores: list[Score] = []
     single = all(len(of) == 1 for of in runs.values())
@@ -383,20 +378,16 @@ def _drop(difference: Score) -> str:
 
 
 def named(value: Any, argument: str) -> dict[str, Any]:
-    """One or several, by name; those of a list are named by the shortest distinct end of a path."""
+    """One or several, by name; a list by its files' names, by whole paths where those are equal."""
     if isinstance(value, Mapping):
         named = {str(name): each for name, each in value.items()}
     elif isinstance(value, list | tuple):
-        names = [
-            Path(v).stem if isinstance(v, str | Path) else f"{argument} {k + 1}"
+        paths = [
+            str(v) if isinstance(v, str | Path) else f"{argument} {k + 1}"
             for k, v in enumerate(value)
         ]
-        if len(set(names)) < len(names):
-            names = [
-                str(v) if isinstance(v, str | Path) else name
-                for v, name in zip(value, names, strict=True)
-            ]
-        named = dict(zip(names, value, strict=True))
+        stems = [Path(path).stem for path in paths]
+        named = dict(zip(stems if len({*stems}) == len(stems) else paths, value, strict=True))
     else:
         named = {argument: value}
     if not named or len(named) < (len(value) if isinstance(value, list | tuple) else 1):

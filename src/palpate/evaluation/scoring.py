@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import sys
 import tempfile
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from functools import partial
@@ -21,7 +21,17 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 
 from palpate import __version__
-from palpate.core import FeatureSet, Note, PalpateError, Progress, Score, Split, quiet, rng_for
+from palpate.core import (
+    FeatureSet,
+    Note,
+    PalpateError,
+    Progress,
+    Score,
+    Split,
+    quiet,
+    require_choice,
+    rng_for,
+)
 from palpate.evaluation.companions import (
     MANY,
     Chosen,
@@ -48,18 +58,11 @@ from palpate.evaluation.inputs import (
     Source,
     from_reference,
     guard,
+    guard_choice,
     load_encoders,
     read_inputs,
 )
-from palpate.metrics import (
-    PRESETS,
-    Comparison,
-    compare,
-    compare_tmmd,
-    distance,
-    require_same_ids,
-    tmmd,
-)
+from palpate.metrics import PRESETS, compare, compare_tmmd, distance, require_same_ids, tmmd
 from palpate.metrics.kernels import MOMENT_BYTES
 from palpate.metrics.mmd import BLOCKS_OF_MANY, sample_units
 from palpate.report.results import GalleryItem, Results
@@ -122,11 +125,7 @@ def score_family(
 ) -> Outcome:
     """TMMD, I-, CI- and D-TMMD of every set by preset and bandwidth, with paired differences.
 
-    Args:
-        features: of generators, controls and reference.
-        family: presets, bandwidths, options.
-        train: further real features, whose TMMD to the reference is the floor of TMMD.
-        progress: called with how many columns are done.
+    The TMMD of ``train``, further real features, to the reference is the floor of TMMD.
     """
     sets = {**features.generators, **features.controls}
     grouped = [s.groups is not None for s in (features.reference, *sets.values())]
@@ -152,30 +151,15 @@ def score_family(
                 result = compare(some, features.reference, floor=floor, **options)
             else:
                 result = compare_tmmd(some, features.reference, **options)
-            more = result.excess or Comparison([], [])
             scores = [replace(s, floor=least) if s.metric == "TMMD" else s for s in result.scores]
-            both = (
-                (outcome.scores, scores, more.scores),
-                (outcome.differences, result.differences, more.differences),
-            )
-            for results, of_family, excess in both:
-                results += [family.named(s, sigma) for s in _interleaved(of_family, excess)]
-            outcome.notes += [
-                Note("below-floor", {"metric": s.metric, "subject": s.subject})
-                for s in (family.named(s, sigma) for s in more.scores)
-                if s.floor and s.interval and s.interval[1] < s.floor
-            ]
+            outcome.differences += [family.named(s, sigma) for s in result.differences]
+            for s in scores:
+                outcome.scores.append(named := family.named(s, sigma))
+                if s.metric.endswith(" E") and s.floor and s.interval and s.interval[1] < s.floor:
+                    params = {"metric": named.metric, "subject": s.subject}
+                    outcome.notes.append(Note("below-floor", params))
         progress("TMMD family", done + 1, len(columns))
     return outcome
-
-
-def _interleaved(scores: Sequence[Score], excess: Sequence[Score]) -> Iterator[Score]:
-    """Every score followed by its excess E."""
-    excess_of = {(e.metric.replace(" E", "", 1), e.subject): e for e in excess}
-    for s in scores:
-        yield s
-        if (s.metric, s.subject) in excess_of:
-            yield excess_of[s.metric, s.subject]
 
 
 def score_streamed(
@@ -308,7 +292,8 @@ def score(  # noqa: PLR0913
         lpips: the two files of LPIPS: AlexNet's weights and the heads.
         permutations: relabelings of the permutation test of TMMD; 0 for none.
         seed: of random halves, permutations and the choice of control images.
-        allow_seen: score with an encoder that was trained on some of the reference's images; every
+        allow_seen: score with an encoder that was trained on some of the reference's images, or
+            that chose generated ones (``best_of``) or guided their generator (``align``); every
             score says so.
         cache: folder for embeddings and decoded images, which an interrupted run finds again.
         progress: called with what is done.
@@ -331,7 +316,7 @@ def score(  # noqa: PLR0913
     labels, clusters = _clusters(labels)
     requested: Any = [companions] if isinstance(companions, str) else companions
     family = Family(
-        presets=_names(presets, PRESETS, "presets") or (),
+        presets=_presets(presets),
         sigmas=_sigmas(sigma),
         estimator=estimator,
         options={"backend": backend, "permutations": permutations, "normalize": normalize},
@@ -348,7 +333,7 @@ def score(  # noqa: PLR0913
         split=split,
         reserved=(REFERENCE,) if split is None else (REFERENCE, BACKGROUND, SAME_MATERIAL, REAL),
     )
-    weights: dict[str, Any] = {"inception": inception, "clip": clip, "lpips": lpips}
+    weights = Weights(inception=inception, clip=clip, lpips=lpips)
     images = inputs.reference.features is None
     if images:
         if encoder is None and not requested:
@@ -356,58 +341,47 @@ def score(  # noqa: PLR0913
             example = {"encoder": "palpate/mini"}
             got, must = "none", "must be given for images"
             raise PalpateError(must, got, fix, argument="encoder", example=example)
-    elif used := [n for n, v in {"encoder": encoder, "cache": cache, **weights}.items() if v]:
+    elif used := [n for n, v in {"encoder": encoder, "cache": cache, **vars(weights)}.items() if v]:
         raise PalpateError("must go with images", "embeddings", "Drop it", argument=used[0])
     streamed = any(s.streamed for s in (inputs.reference, *inputs.generators.values()))
-    chosen, pairs = _companions(inputs, requested, Weights(**weights), encoder, streamed=streamed)
+    chosen, pairs = _companions(inputs, requested, weights, encoder, streamed=streamed)
     encoders = load_encoders(encoder, progress) if images else None
     of_encoder: list[Note] = []
     if encoders is not None:
         judged: Any = inputs.reference.manifest or inputs.reference.images
         how: dict[str, Any] = {"split": split, "allow_seen": allow_seen, "progress": progress}
         of_encoder = guard(encoders, "tactile", judged, **how)
+    digest = encoders.digest("tactile") if encoders is not None else ""
+    choices = guard_choice(digest, inputs.generators, allow_seen=allow_seen)
     if streamed:
         outcome = score_streamed(inputs, family, requested, progress)
     else:
         with tempfile.TemporaryDirectory() if cache is None else nullcontext(cache) as folder:
-            run = _Run(
-                inputs,
-                family,
-                encoders,
-                Weights(**weights),
-                Path(folder),
-                cache is not None,
-                progress,
-            )
+            run = _Run(inputs, family, encoders, weights, Path(folder), cache is not None, progress)
             run, of = run.clustered(clusters) if clusters else (run, "")
             outcome = run.score(chosen, pairs=pairs, controls=controls)
             outcome = _with_clusters(outcome, clusters, of) if clusters else outcome
-    digest = encoders.digest("tactile") if encoders is not None else ""
-    outcome.scores = with_warnings(outcome.scores, inputs, split, digest, of_encoder)
+    outcome.scores = with_warnings(
+        outcome.scores, inputs, split, digest, of_encoder, choices=choices
+    )
     settings = _settings(inputs, family, outcome, encoders)
     if split is not None:
         settings["split rule"] = dict(split.rule)
-    if encoders is not None:
-        settings["encoder"] = str(encoder)
+    settings |= {"encoder": str(encoder)} if encoders is not None else {}
     return Results(
         title=f"Scores of {', '.join(inputs.generators)}",
-        scores=[*outcome.scores, *map(_with_verdict, outcome.differences)],
+        scores=[*outcome.scores, *outcome.differences],
         gallery=_gallery(inputs, seed),
         settings=settings,
         notes=[*outcome.notes, *_copies(outcome)],
     )
 
 
-def _names(
-    names: str | Sequence[str] | None, known: Collection[str], argument: str
-) -> tuple[str, ...] | None:
-    """One name or several, without repeats; None stays None."""
-    if names is None:
-        return None
-    unique = tuple(dict.fromkeys([names] if isinstance(names, str) else names))
-    if unknown := [name for name in unique if name not in known]:
-        must = f"must be of {', '.join(known)}"
-        raise PalpateError(must, repr(unknown[0]), "Choose of these", argument=argument)
+def _presets(presets: str | Sequence[str] | None) -> tuple[str, ...]:
+    """One or several, without repeats; none for the default."""
+    unique = tuple(dict.fromkeys([presets] if isinstance(presets, str) else presets or ()))
+    for name in unique:
+        require_choice("presets", name, PRESETS)
     return unique
 
 
@@ -419,8 +393,7 @@ def _sigmas(sigma: float | str | Sequence[float | str] | None) -> tuple[float | 
         word = isinstance(value, str)  # the square of a number must be finite
         if not (value in ("median", "multi") if word else 1e-100 < value < 1e100):
             must = "must be numbers from 1e-100 to 1e100, 'median' or 'multi'"
-            example = {"sigma": 10}
-            raise PalpateError(must, repr(value), "", argument="sigma", example=example)
+            raise PalpateError(must, repr(value), "", argument="sigma", example={"sigma": 10})
     return tuple(dict.fromkeys(values))
 
 
@@ -716,16 +689,6 @@ def _settings(inputs: Inputs, family: Family, outcome: Outcome, encoders: Any) -
     return settings
 
 
-def _with_verdict(difference: Score) -> Score:
-    """A difference with a note on which generator is ahead, and how sure that is."""
-    d = difference.details
-    if d.get("p_better") is None or d.get("better") is None:
-        return difference
-    ahead = d["p_better"] if d["better"] == d["a"] else 1 - d["p_better"]
-    params = {"better": d["better"], "confidence": ahead, "p_adjusted": d.get("p_adjusted")}
-    return replace(difference, notes=[Note("ahead", params), *difference.notes])
-
-
 def _copies(outcome: Outcome) -> list[Note]:
     copies: dict[str, Note] = {}
     for s in outcome.scores:
@@ -757,8 +720,12 @@ def with_warnings(
     split: Split | None,
     digest: str,
     of_encoder: Sequence[Note],
+    *,
+    choices: Mapping[str, Sequence[Note]],
 ) -> list[Score]:
-    """The scores with notes on the encoder, and on generators that may have seen test samples."""
+    """The scores with notes on the encoder, on generators that may have seen test samples, and on
+    chosen images.
+    """
     of_generator = {
         name: [Note("generator-of-other-split")]
         for name, s in inputs.generators.items()
@@ -773,6 +740,7 @@ def with_warnings(
                 *s.notes,
                 *(of_encoder if s.encoder == digest else []),
                 *of_generator.get(s.subject, []),
+                *choices.get(s.subject, []),
             ],
         )
         for s in scores

@@ -11,7 +11,7 @@ that no metadata reveals.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -20,7 +20,7 @@ import numpy as np
 import polars as pl
 from numpy.typing import NDArray
 
-from palpate.core import Note, PalpateError, Progress, Split, quiet, require, require_choice
+from palpate.core import Note, PalpateError, Progress, Split, few, quiet, require, require_choice
 from palpate.data.manifest import MODALITIES, Manifest
 from palpate.leakage.content import shows_nothing
 from palpate.leakage.groups import GROUPS, shared_groups
@@ -161,10 +161,7 @@ def audit(  # noqa: PLR0913
     )
     _check(options)
     if impact is not None and test is not None:
-        must, fix = (
-            "needs all samples and a split",
-            "Import the data set, and audit it with a split",
-        )
+        must, fix = "needs all samples and a split", "Import them, and audit them with a split"
         raise PalpateError(must, "train and test apart", fix, argument="impact")
     sources = [x for x in (train_or_data, test, pretrain) if x is not None]
     read = read_all(sources, skip_bad, progress, root, reading)
@@ -214,23 +211,15 @@ def _check(options: _Options) -> None:
 
 
 def _stated(splits: Mapping[str, Split]) -> Split:
-    """The split that a source states.
-
-    Raises:
-        PalpateError: unless there is one.
-    """
+    """The split that a source states."""
     if len(splits) != 1:
         raise PalpateError(
             "An audit takes train and test samples, or samples with a split",
-            f"neither test samples nor a split; the source states {len(splits)}{_few(splits)}",
+            f"neither test samples nor a split; the source states {few(sorted(splits))}",
             "Pass test samples, or a split",
             example={"split": "split.json"},
         )
     return next(iter(splits.values()))
-
-
-def _few(names: Collection[str]) -> str:
-    return f" ({', '.join(sorted(names))})" if names else ""
 
 
 def _name(source: Any, default: str) -> str:
@@ -274,16 +263,11 @@ def _with_images(train: Manifest, test: Manifest) -> bool:
 
 
 def _group(train: Manifest, test: Manifest, options: _Options) -> str:
-    """The group to audit by.
-
-    Raises:
-        PalpateError: on an empty part, or a group that a part does not know at all.
-    """
+    """The group to audit by."""
     for part, samples in (("train", train), ("test", test)):
         if not len(samples):
-            raise PalpateError(
-                f"The {part} part must hold samples", "none", "Check the split or list file"
-            )
+            must, got = f"The {part} part must hold samples", "none"
+            raise PalpateError(must, got, "Check the split or list file")
     group = known_group(train, test) if options.by == "auto" else options.by
     listed = all("path" in part.table.columns for part in (train, test))
     images = options.images and _with_images(train, test)
@@ -336,7 +320,7 @@ def _compare(
         groups_test=len(groups[1]),
         groups_shared=len(in_both),
         test_samples_in_shared_groups=in_shared,
-        leaked_fraction=0.0,
+        leaked_fraction=0.0,  # the class computes it from the signals
         identical_samples=int(flags[0].flag.sum()),
         gap_min=int(timed.min()) if timed.size else None,
         gap_median=_plain(float(np.median(timed))) if timed.size else None,
@@ -369,16 +353,7 @@ def _reason(
     *,
     named: bool,
 ) -> str:
-    """Why a leak might not show; '' where it would.
-
-    Args:
-        train: samples.
-        test: the samples in question.
-        group: of the audit.
-        flags: all signals.
-        options: of the audit.
-        named: whether equal names say something.
-    """
+    """Why a leak might not show; '' where it would. ``named``: equal names say something."""
     near = [f for f in flags if f.kind.startswith("near-duplicate")]
     if near and options.encoder is None:
         column = near[-1].kind.split()[-1]  # tactile images decide where there are any

@@ -41,11 +41,7 @@ def shows_nothing(
 ) -> bool:
     """Whether the images of a column differ by light, drift and noise alone.
 
-    Args:
-        parts: the samples; backgrounds are used if all have one.
-        column: ``vision`` or ``tactile``.
-        threads: that decode.
-        progress: callback.
+    Backgrounds are used if all samples have one.
 
     Returns:
         False if there are fewer than ``FEWEST`` images that are readable and of 48 pixels or more.

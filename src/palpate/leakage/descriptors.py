@@ -73,14 +73,10 @@ class Index(Protocol):
 
 
 class Descriptors:
-    """Ways in which a pool of images is compared, by row.
+    """Ways in which a pool of images is compared, by row."""
 
-    Attributes:
-        shares: of the rate of false positives, for each question.
-        ways: the question that each answers, and what makes an index of train images.
-    """
-
-    shares: Sequence[float]
+    shares: Sequence[float]  # of the rate of false positives, for each question
+    #: The question that each answers, and what makes an index of train images.
     ways: Sequence[tuple[int, Callable[[Ints], Index]]]
 
 
@@ -173,12 +169,10 @@ class Whitened(Descriptors):
         gray: bool,
         fit: Ints,
     ) -> None:
-        self._pixels, self._images, self._backgrounds, self._gray = (
-            pixels,
-            images,
-            backgrounds,
-            gray,
-        )
+        self._pixels = pixels
+        self._images = images
+        self._backgrounds = backgrounds
+        self._gray = gray
         fit = fit[np.linspace(0, len(fit) - 1, min(len(fit), FITTED)).astype(np.int64)]
         # Over backgrounds the light no longer shows which edit was made: edits are not tried.
         shapes = GEOMETRIES if backgrounds is None else GEOMETRIES[:1]
@@ -440,10 +434,8 @@ def _best(near: Ints, values: Floats, count: int) -> tuple[Ints, Floats]:
     """The best of some candidates."""
     values = np.where(near >= 0, values, -np.inf)
     order = np.argsort(-values, axis=1, kind="stable")[:, :count]
-    near, values = (
-        np.take_along_axis(near, order, axis=1),
-        np.take_along_axis(values, order, axis=1),
-    )
+    near = np.take_along_axis(near, order, axis=1)
+    values = np.take_along_axis(values, order, axis=1)
     return near, np.where(near >= 0, values, np.nan)
 
 

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
-from palpate.core import Note, PalpateError
+from palpate.core import Note, PalpateError, require
 from palpate.data.manifest import MODALITIES, Manifest
 
 #: Columns that a split can keep whole, and by which a split can be audited.
@@ -32,9 +32,6 @@ def choose_group(manifest: Manifest, parts: int = 2) -> tuple[str, Note | None]:
 
     Returns:
         The column, and a note that says why, unless it is simply the coarsest.
-
-    Raises:
-        PalpateError: if neither videos nor contacts nor objects are known.
     """
     named = manifest.facts.get("group")
     chain = list(dict.fromkeys([*_known(manifest, [str(named)]), *nested_groups(manifest)]))
@@ -115,21 +112,10 @@ def components(
 
     Returns:
         n names, in row order; ``sample:<id>`` for samples without any value.
-
-    Raises:
-        PalpateError: on an unknown column, on nulls unless ``single``, and on links of another
-            length.
     """
     table, n = manifest.table, len(manifest)
     for column in by:
-        if column not in GROUPS:
-            raise PalpateError(
-                f"must be among {', '.join(GROUPS)}",
-                repr(column),
-                "Choose one or several of these",
-                argument="by",
-                example={"by": "video"},
-            )
+        require(column in GROUPS, "by", f"must be among {', '.join(GROUPS)}", column, "video")
         empty = table[column].null_count()
         if empty and (nulls == "raise" or empty == n):
             raise PalpateError(
@@ -143,12 +129,9 @@ def components(
     for link in links:
         label = np.asarray(link)
         if label.shape != (n,) or label.dtype.kind not in "iu":
-            raise PalpateError(
-                f"must be {n} integers, one a sample",
-                f"{label.dtype} of shape {label.shape}",
-                "Compute the labels on this manifest",
-                argument="near",
-            )
+            must = f"must be {n} integers, one a sample"
+            got = f"{label.dtype} of shape {label.shape}"
+            raise PalpateError(must, got, "Compute the labels on this manifest", argument="near")
         labels.append(label.astype(np.int64))
     return _names(manifest, by, _joined(labels, n))
 

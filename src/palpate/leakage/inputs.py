@@ -16,10 +16,11 @@ import polars as pl
 
 from palpate.core import Note, PalpateError, Problem, ProblemsError, Progress, Split, quiet
 from palpate.data.formats import FORMATS
-from palpate.data.listing import number_together, read_categories, read_lists
-from palpate.data.manifest import MODALITIES, SCHEMA, Manifest
+from palpate.data.imported import splits_of
+from palpate.data.listing import categories_in, contact_names, read_lists
+from palpate.data.manifest import MODALITIES, SCHEMA, Manifest, is_manifest
 from palpate.data.naming import name_together, read_names
-from palpate.data.reading import is_image_files, is_list, is_manifest, read_samples
+from palpate.data.reading import is_image_files, is_list, read_samples
 
 #: A manifest, a path, several frame lists that are joined, or a polars or pandas frame.
 Data = Any
@@ -30,6 +31,7 @@ SHOWN = 40
 Identity = Literal["auto", "names", "images"]
 #: Columns of names; those of several samples, which are renamed where they mean nothing.
 NAMES = ("id", "video", "contact", "object", "session")
+PLACE = ["video", "frame"]
 #: Formats of tables in which somebody names things.
 DECLARING = (None, "pairs", "intervals", "hf")
 
@@ -50,18 +52,7 @@ def read(
     root: str | Path | None = None,
     reading: Mapping[str, Any] | None = None,
 ) -> Source:
-    """Read samples.
-
-    Args:
-        data: what names them.
-        skip_bad: skip bad rows, and note them.
-        progress: callback.
-        root: where the paths of tables start.
-        reading: further options of sources, as of :func:`palpate.load`.
-
-    Raises:
-        ProblemsError: with every bad row, unless ``skip_bad``.
-    """
+    """Read samples; ``root`` and ``reading`` as in :func:`palpate.leakage.audit`."""
     options = {name: value for name, value in (reading or {}).items() if value}
     root = options.pop("root", root)
     several = data if isinstance(data, list | tuple) and not is_image_files(data) else ()
@@ -86,13 +77,12 @@ def read(
     manifest, skipped = read_samples(
         source, skip_bad=skip_bad, root=root, progress=progress, **options
     )
-    stated = sorted(path.glob("splits/*.json")) if path is not None and path.is_dir() else []
     notes = _notes(skipped)
     if "side_assumed" in manifest.facts:
         notes.append(Note("photos-assumed", {"name": manifest.facts.get("dataset", "")}))
     if lost := manifest.facts.get("images_not_below"):
         notes.append(Note("images-not-found", {"root": lost}))
-    return Source(manifest, {p.stem: Split.load(p) for p in stated}, notes)
+    return Source(manifest, splits_of(path) if path is not None else {}, notes)
 
 
 def _notes(skipped: Sequence[Problem]) -> list[Note]:
@@ -140,14 +130,26 @@ def read_all(
 
 
 def number_contacts(manifests: list[Manifest]) -> list[Manifest]:
-    """Number the contacts of bare frame lists over all of them."""
+    """Number the contacts of bare frame lists together, so that one name means one contact."""
     bare = [
         k
         for k, m in enumerate(manifests)
         if set(m.facts) == {"source"} and "path" not in m.table.columns
     ]
-    numbered = iter(number_together(*(manifests[k] for k in bare)) if len(bare) > 1 else ())
-    return [next(numbered, m) if k in bare else m for k, m in enumerate(manifests)]
+    if len(bare) < 2 or any(manifests[k].table[c].has_nulls() for k in bare for c in PLACE):
+        return manifests
+    rows = pl.concat([manifests[k].table.select(*PLACE, "material") for k in bare])
+    # A frame in two lists belongs to one contact.
+    distinct = rows.unique(PLACE, maintain_order=True)
+    names = contact_names(*(distinct[name] for name in (*PLACE, "material")))
+    distinct = distinct.with_columns(contact=pl.Series(names, dtype=pl.String))
+    contacts = rows.join(distinct, on=PLACE, how="left", maintain_order="left")
+    numbered = list(manifests)
+    for k in bare:
+        m = manifests[k]
+        numbered[k] = replace(m, table=m.table.with_columns(contacts["contact"].head(len(m))))
+        contacts = contacts.slice(len(m))
+    return numbered
 
 
 def shared_names(train: Manifest, test: Manifest, identity: Identity) -> tuple[str, ...]:
@@ -213,19 +215,12 @@ def _join(
     """Several lists as one manifest."""
     for path in paths:
         if not path.is_file() or is_manifest(path):
-            raise PalpateError(
-                "Several paths must all be lists",
-                f"{path}, which is none" if path.exists() else f"no file {path}",
-                "Name one manifest, or lists alone",
-            )
+            must = "Several paths must all be lists"
+            got = f"{path}, which is none" if path.exists() else f"no file {path}"
+            raise PalpateError(must, got, "Name one manifest, or lists alone")
     if not all(map(is_list, paths)):
         parts = read_all(paths, skip_bad, quiet, root, reading)
         return Manifest.join(*(part.manifest for part in parts)), []
-    table = paths[0].parent / "category_reference.txt"
-    joined = read_lists(
-        paths,
-        root=paths[0].parent,
-        skip_bad=skip_bad,
-        categories=read_categories(table) if table.is_file() else None,
-    )
+    root = paths[0].parent
+    joined = read_lists(paths, root=root, skip_bad=skip_bad, categories=categories_in(root))
     return joined.manifest, joined.skipped

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from palpate.core import Progress, quiet, rng_for
-from palpate.leakage.descriptors import Descriptors, Whitened
+from palpate.leakage.descriptors import Descriptors, Embeddings, Whitened
 from palpate.leakage.neighbors import Apart, Floats, Ints
 from palpate.leakage.pool import Pool
 
@@ -21,42 +21,30 @@ NULL_IMAGES = 2000
 
 @dataclass(frozen=True)
 class View:
-    """One way to compare images.
+    """One way to compare images."""
 
-    Attributes:
-        descriptors: of all images.
-        known: (items,) those that can be compared so.
-        queries: (items,) those whose matches are of interest.
-        shares: of the rate of false positives of these, for each question.
-    """
-
-    descriptors: Descriptors
-    known: NDArray[np.bool_]
-    queries: NDArray[np.bool_]
-    shares: Sequence[float]
+    descriptors: Descriptors  # of all images
+    known: NDArray[np.bool_]  # (items,) those that can be compared so
+    queries: NDArray[np.bool_]  # (items,) those whose matches are of interest
+    shares: Sequence[float]  # of the rate of false positives of these, for each question
 
 
 @dataclass(frozen=True)
 class Unrelated:
-    """Train images, and which others are known to be unrelated to each.
+    """Train images, and which others are known to be unrelated to each."""
 
-    Attributes:
-        rows: (k,) rows of the base.
-        apart: of these against the base.
-        groups: (k,) videos, or pieces of the recording order.
-        source: ``videos`` or ``order``.
-    """
-
-    rows: Ints
-    apart: Apart
-    groups: Ints
-    source: str
+    rows: Ints  # (k,) rows of the base
+    apart: Apart  # of these against the base
+    groups: Ints  # (k,) videos, or pieces of the recording order
+    source: str  # ``videos`` or ``order``
 
 
 def image_views(images: Pool, base: Ints, queries: Ints) -> list[View]:
     """Log thumbnails without and with backgrounds, in color; in gray for gray queries, and for all
-    where train has gray images among others.
+    where train has gray images among others. Embeddings are compared as they are.
     """
+    if images.vectors is not None:
+        return [View(Embeddings(images.vectors), ~images.blank, ~images.blank, Embeddings.shares)]
     both = np.concatenate([base, queries])
     gray = images.colorless()
     kinds = [(bool(gray[base].any()) and not gray[both].all(), ~images.blank)]

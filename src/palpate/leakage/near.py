@@ -34,7 +34,6 @@ from palpate.core import Note, PalpateError, Progress, quiet
 from palpate.data.manifest import Manifest
 from palpate.leakage import calibration
 from palpate.leakage.calibration import Tail
-from palpate.leakage.descriptors import Embeddings
 from palpate.leakage.matching import (
     Unrelated,
     View,
@@ -56,6 +55,8 @@ LINKED = 0.75
 TIGHT = 0.97
 #: Videos from which a rate is more than a guess.
 VIDEOS = 80
+#: Rate of false positives by default, and of what a split keeps together.
+RATE = 0.001
 #: Cosine of equal images.
 SAME = 0.9995
 
@@ -65,7 +66,7 @@ def near_duplicates(
     test: Manifest,
     modality: str,
     *,
-    false_positives: float = 0.001,
+    false_positives: float = RATE,
     features: tuple[object, object] | None = None,
     cache: Path | None = None,
     threads: int | None = None,
@@ -78,8 +79,7 @@ def near_duplicates(
         test: the samples in question.
         modality: ``vision`` or ``tactile``.
         false_positives: share of unrelated samples that may be flagged, in (0, 0.1].
-        features: embeddings of train and test, (n_train, d) and (n_test, d), to compare instead of
-            the images.
+        features: embeddings (n_train, d) and (n_test, d) to compare instead of the images.
         cache: folder for thumbnails, so that a rerun is quick; None keeps nothing.
         threads: that decode.
         progress: callback.
@@ -98,36 +98,22 @@ def near_duplicates(
 
 
 def near_groups(
-    manifest: Manifest,
-    modality: str,
-    *,
-    false_positives: float = 0.001,
-    cache: Path | None = None,
-    threads: int | None = None,
-    progress: Progress = quiet,
+    manifest: Manifest, modality: str, *, cache: Path | None = None, progress: Progress = quiet
 ) -> Ints:
     """Clusters of near-duplicates, to be kept whole by a split.
 
     Two images are linked if one is near the other by the rules of :func:`near_duplicates`, and from
     a cosine of 0.75 in any case: other videos may hold copies here, which raise the threshold. A
-    cluster is a connected component. Clusters chain: the first and
-    the last frame of a long slide may share nothing, so a cluster may be as large as a recording.
-    That is what a split needs, but a cluster is no list of duplicates.
-
-    Args:
-        manifest: (n) samples.
-        modality: as in :func:`near_duplicates`.
-        false_positives: as in :func:`near_duplicates`.
-        cache: folder for thumbnails, or None.
-        threads: that decode.
-        progress: callback.
+    cluster is a connected component. Clusters chain: the first and the last frame of a long slide
+    may share nothing, so a cluster may be as large as a recording. That is what a split needs, but
+    a cluster is no list of duplicates.
 
     Returns:
         (n,) the number of each sample's cluster; -1 for samples that are near no other image, that
         show nothing, or that cannot be read.
     """
     none = Manifest(manifest.table.clear(), manifest.root)
-    images = pool(manifest, none, modality, cache=cache, threads=threads, progress=progress)
+    images = pool(manifest, none, modality, cache=cache, progress=progress)
     base = _shown(images, slice(None))
     views = image_views(images, base, base) if len(base) else []
     null = _null(images, base, views)
@@ -137,7 +123,7 @@ def near_groups(
         nulls = [row for values, _ in answers(view, base, tasks, progress) for row in values]
         fitted = calibration.tails(nulls, null.groups, view.shares) if null is not None else []
         for question, first, second, cosine in links(view, base, LINKS, progress):
-            limits = [t.similarity(t.surprise_at(false_positives)) for t in fitted[question:][:1]]
+            limits = [t.similarity(t.surprise_at(RATE)) for t in fitted[question:][:1]]
             limit = min([*limits, LINKED])
             i.append(first[cosine >= limit])
             j.append(second[cosine >= limit])
@@ -146,25 +132,16 @@ def near_groups(
 
 @dataclass(frozen=True)
 class Matches:
-    """The answer for the images of test.
+    """The answer for the images of test."""
 
-    Attributes:
-        score: (n,) NaN where there is nothing to compare with.
-        place: (n,) the best match in the base, -1 for none.
-        threshold: score from which images are flagged.
-        tails: of the null, one for each question; none without a null.
-        unrelated: (k,) scores of the null.
-        measured: share of the null that is over a threshold from its other half.
-        note: where the threshold is from.
-    """
-
-    score: Floats
-    place: Ints
-    threshold: float
-    note: Note
-    tails: Sequence[Tail] = ()
+    score: Floats  # (n,) NaN where there is nothing to compare with
+    place: Ints  # (n,) the best match in the base, -1 for none
+    threshold: float  # score from which images are flagged
+    note: Note  # where the threshold is from
+    tails: Sequence[Tail] = ()  # of the null, one for each question; none without a null
+    #: (k,) scores of the null.
     unrelated: Floats = field(default_factory=lambda: np.zeros(0, np.float32))
-    measured: float | None = None
+    measured: float | None = None  # share of the null that is over a threshold from its other half
 
 
 def _match(images: Pool, base: Ints, queries: Ints, rate: float, progress: Progress) -> Matches:
@@ -173,7 +150,7 @@ def _match(images: Pool, base: Ints, queries: Ints, rate: float, progress: Progr
         note = Note("cannot-tell-untouched", {"part": "train" if len(queries) else "test"})
         nothing = np.full(len(queries), np.nan, np.float32), np.full(len(queries), -1, np.int64)
         return Matches(*nothing, 1.0, note)
-    views = _views(images, base, queries)
+    views = image_views(images, base, queries)
     null = _null(images, base, views)
     matches: list[tuple[Floats, Ints]] = []
     nulls: list[Floats] = []
@@ -230,10 +207,8 @@ def _flags(
         nearest[known] = first[base[matches.place[at[known]]]]
     thumbs, rows = np.unique(images.images[base], return_index=True)
     same = known & np.isin(images.images[item], thumbs)
-    score[same], nearest[same] = (
-        1.0,
-        first[base[rows[np.searchsorted(thumbs, images.images[item[same]])]]],
-    )
+    score[same] = 1.0
+    nearest[same] = first[base[rows[np.searchsorted(thumbs, images.images[item[same]])]]]
     flag = same | (np.nan_to_num(score) >= matches.threshold)
     checked = int(np.isfinite(score).sum())
     verdict = _verdict(matches, images.unit[cut:], score, flag, same, rate=rate)
@@ -241,7 +216,7 @@ def _flags(
     cause = np.where(flag, "content", "").astype("<U15")
     cause[(item >= 0) & images.blank[item]] = "nothing touched"
     edges, unrelated_scores, histogram = calibration.histograms(matches.unrelated, score)
-    return Flags(
+    return Flags.of(
         f"near-duplicate {modality}",
         score,
         flag,
@@ -299,12 +274,6 @@ def _first(item: Ints, count: int) -> Ints:
     return first
 
 
-def _views(images: Pool, base: Ints, queries: Ints) -> list[View]:
-    if images.vectors is None:
-        return image_views(images, base, queries)
-    return [View(Embeddings(images.vectors), ~images.blank, ~images.blank, Embeddings.shares)]
-
-
 def _null(images: Pool, base: Ints, views: list[View]) -> Unrelated | None:
     """What is known to be unrelated among train images."""
     first = _first(images.item, len(images.images))[base]
@@ -323,16 +292,13 @@ def _embedded(features: tuple[object, object], train: Manifest, test: Manifest) 
         or shapes[0][1:] != shapes[1][1:]
         or (len(parts[0]), len(parts[1])) != counts
     ):
-        raise PalpateError(
-            f"The embeddings must be (n, d): {counts[0]} of train, {counts[1]} of test",
-            " and ".join(map(str, shapes)),
-            "Embed the same samples",
-        )
+        must = f"The embeddings must be (n, d): {counts[0]} of train, {counts[1]} of test"
+        got = " and ".join(map(str, shapes))
+        raise PalpateError(must, got, "Embed the same samples")
     vectors = np.concatenate(parts)
     if not np.isfinite(vectors).all():
-        raise PalpateError(
-            "The embeddings must be finite", "a number that is not", "Embed the images again"
-        )
+        must, got = "The embeddings must be finite", "a number that is not"
+        raise PalpateError(must, got, "Embed the images again")
     rows = np.arange(len(vectors))
     return Pool(
         item=rows,

@@ -20,17 +20,11 @@ MOST = 100
 
 @dataclass(frozen=True)
 class Apart:
-    """Which rows of the base are no neighbors of a query, as they may be related to it.
+    """Which rows of the base are no neighbors of a query, as they may be related to it."""
 
-    Attributes:
-        queries: (q,) a number of each query.
-        base: (m,) a number of each base row.
-        window: None excludes equal numbers; else numbers, all different, that are at most so far
-            apart.
-    """
-
-    queries: Ints
-    base: Ints
+    queries: Ints  # (q,) a number of each query
+    base: Ints  # (m,) a number of each base row
+    #: None excludes equal numbers; else numbers, all different, that are at most so far apart.
     window: int | None = None
 
     def related(self, rows: Any, base: Any) -> NDArray[np.bool_]:
@@ -39,16 +33,10 @@ class Apart:
 
 
 def nearest(queries: Floats, base: Floats, k: int = 1, *, apart: Apart | None = None) -> Ints:
-    """The k nearest base rows of each query, by Euclidean distance.
-
-    Args:
-        queries: (n, d).
-        base: (m, d).
-        k: how many, at least 1.
-        apart: which base rows are no neighbors.
+    """The k nearest base rows of each query, by Euclidean distance; ``apart`` excludes some.
 
     Returns:
-        (n, k) rows of the base, nearest first; -1 where there is none.
+        (n, k) rows of the base (m, d) for queries (n, d), nearest first; -1 where there is none.
     """
     if apart is None:
         return _search(queries, base, k)[0]

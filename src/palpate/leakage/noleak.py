@@ -18,7 +18,7 @@ from collections.abc import Mapping, Sequence
 from importlib import resources
 from typing import Any
 
-from palpate.core import Note, PalpateError, Split, digest_json
+from palpate.core import Note, PalpateError, Split, digest_json, require
 from palpate.data.manifest import Manifest
 
 FORMAT = "palpate-noleak/1"
@@ -43,44 +43,25 @@ def load_record() -> dict[str, Any]:
 
 
 def verify_record(record: Mapping[str, Any]) -> None:
-    """Check a record's checksum and every split's digest.
-
-    Raises:
-        PalpateError: if one does not match.
-    """
+    """Check a record's checksum and every split's digest."""
     body = {k: v for k, v in record.items() if k != "sha256"}
     entries = [entry for by_seed in record["splits"].values() for entry in by_seed.values()]
     if digest_json(body) != record.get("sha256") or any(
         Split.from_ids(**entry["videos"]).digest != entry["digest"] for entry in entries
     ):
-        raise PalpateError(
-            "A NoLeak record must match its checksum",
-            "a record that was changed",
-            "Install palpate again",
-        )
+        must, got = "A NoLeak record must match its checksum", "a record that was changed"
+        raise PalpateError(must, got, "Install palpate again")
 
 
 def record_split(record: Mapping[str, Any], train: float, val: float, seed: int) -> Split:
-    """A split of the record, over videos.
-
-    Raises:
-        PalpateError: if the record has no such shares or seed.
-    """
+    """A split of the record, over videos."""
     ratio = next((name for name, shares in RATIOS.items() if shares == (train, val)), None)
     if ratio is None:
         shares = ", ".join(f"train {t} and val {v}" for t, v in RATIOS.values())
-        raise PalpateError(
-            f"The record's shares are {shares}",
-            f"train {train} and val {val}",
-            "Choose one of these, or make a split by your groups",
-        )
-    if str(seed) not in record["splits"][ratio]:
-        raise PalpateError(
-            f"must be one of {', '.join(map(str, SEEDS))}, the record's seeds",
-            str(seed),
-            "Choose one of these, or make a split by your groups",
-            argument="seed",
-        )
+        must, got = f"The record's shares are {shares}", f"train {train} and val {val}"
+        raise PalpateError(must, got, "Choose one of these, or make a split by your groups")
+    must = f"must be one of {', '.join(map(str, SEEDS))}, the record's seeds"
+    require(str(seed) in record["splits"][ratio], "seed", must, seed)
     entry = record["splits"][ratio][str(seed)]
     shares = {"train": train, "val": val, "test": round(1 - train - val, 12)}
     rule = {
@@ -98,11 +79,7 @@ def record_split(record: Mapping[str, Any], train: float, val: float, seed: int)
 def published(
     manifest: Manifest | None, train: float, val: float, seed: int, notes: Sequence[Note] = ()
 ) -> Split:
-    """TaG-NoLeak on the user's samples of Touch and Go; without samples, over its videos.
-
-    Raises:
-        PalpateError: if a sample has no video, or one that the record does not know.
-    """
+    """TaG-NoLeak on the user's samples of Touch and Go; without samples, over its videos."""
     videos = record_split(load_record(), train, val, seed)
     if manifest is None:
         return videos
@@ -122,22 +99,13 @@ def published(
 
 
 def require_hct(manifest: Manifest) -> str:
-    """The gap that joined the sessions of HCT.
-
-    Raises:
-        PalpateError: if a sample has no session, or sessions were joined by another gap.
-    """
+    """The gap that joined the sessions of HCT."""
     gap = manifest.facts.get("session_gap", SESSION_GAP)
     if gap != SESSION_GAP:
-        raise PalpateError(
-            f"HCT-NoLeak joins folders that start within {SESSION_GAP}",
-            f"sessions joined within {gap}",
-            "Import HCT with the default gap",
-        )
+        must = f"HCT-NoLeak joins folders that start within {SESSION_GAP}"
+        got = f"sessions joined within {gap}"
+        raise PalpateError(must, got, "Import HCT with the default gap")
     if empty := manifest.table["session"].null_count():
-        raise PalpateError(
-            "HCT-NoLeak needs the session of every sample",
-            f"{empty} without",
-            "Import the tree with: palpate import --format hct",
-        )
+        must, got = "HCT-NoLeak needs the session of every sample", f"{empty} without"
+        raise PalpateError(must, got, "Import the tree with: palpate import --format hct")
     return gap

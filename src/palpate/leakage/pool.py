@@ -35,26 +35,17 @@ BLOCK = 1024
 
 @dataclass
 class Pool:
-    """Distinct images of train and test together.
+    """Distinct images of train and test together."""
 
-    Attributes:
-        item: (n,) for each sample, train first, the number of its image; -1 if it cannot be read.
-        unit: (n,) codes of what names related images, -1 where unknown.
-        pixels: (u, 32, 32, 3) thumbnails of images and backgrounds.
-        images, backgrounds: (items,) rows in ``pixels``; -1 without a background.
-        blank: (items,) whether an image shows nothing.
-        notes: what a reader must know.
-        vectors: (items, d) embeddings in place of thumbnails.
-    """
-
+    #: (n,) for each sample, train first, the number of its image; -1 if it cannot be read.
     item: Ints
-    unit: Ints
-    pixels: NDArray[np.uint8]
-    images: Ints
+    unit: Ints  # (n,) codes of what names related images, -1 where unknown
+    pixels: NDArray[np.uint8]  # (u, 32, 32, 3) thumbnails of images and backgrounds
+    images: Ints  # (items,) rows in ``pixels``; -1 without a background
     backgrounds: Ints
-    blank: NDArray[np.bool_]
-    notes: list[Note] = field(default_factory=list)
-    vectors: Floats | None = None
+    blank: NDArray[np.bool_]  # (items,) whether an image shows nothing
+    notes: list[Note] = field(default_factory=list)  # what a reader must know
+    vectors: Floats | None = None  # (items, d) embeddings in place of thumbnails
 
     def colorless(self) -> NDArray[np.bool_]:
         """(items,) whether an image has no color."""
@@ -75,16 +66,7 @@ def pool(
     threads: int | None = None,
     progress: Progress = quiet,
 ) -> Pool:
-    """Decode one modality of two manifests.
-
-    Args:
-        train: the samples to compare with.
-        test: the samples in question.
-        modality: ``vision`` or ``tactile``.
-        cache: folder for thumbnails, or None.
-        threads: that decode; None takes one a core.
-        progress: called with the number of files done.
-    """
+    """Decode one modality, ``vision`` or ``tactile``, of two manifests."""
     parts = (train, test)
     paths = _paths(parts, modality)
     behind = _paths(parts, "background") if modality == "tactile" else [None] * len(paths)
@@ -97,7 +79,8 @@ def pool(
     item = np.full(len(paths), -1, np.int64)
     readable = row >= 0
     key = np.stack([row, recorded], axis=1)[readable]
-    different, item[readable] = _distinct(key)
+    different, place = np.unique(key, axis=0, return_inverse=True)
+    item[readable] = place.ravel()
     images, backgrounds = different[:, 0], different[:, 1]
     result = Pool(
         item, unit, thumbs.pixels, images, backgrounds, np.zeros(len(images), bool), notes
@@ -140,12 +123,6 @@ def codes(parts: Sequence[Manifest], column: str) -> Ints:
     """One column of several manifests as numbers; -1 where null."""
     values = pl.concat([m.table[column] for m in parts])
     return values.rank("dense").cast(pl.Int64).fill_null(0).to_numpy() - 1
-
-
-def _distinct(key: Ints) -> tuple[Ints, Ints]:
-    """Different rows, and the place of each row among them."""
-    different, place = np.unique(key, axis=0, return_inverse=True)
-    return different, place.ravel()
 
 
 def _with_medians(

@@ -90,17 +90,11 @@ class Problem:
 
 @dataclass(frozen=True)
 class Optimum:
-    """The smallest largest deviation.
+    """The smallest largest deviation."""
 
-    Attributes:
-        assignment: (G,) part of each group.
-        deviation: its largest deviation, recounted from whole samples.
-        bound: no assignment that lacks as few materials has a smaller one.
-    """
-
-    assignment: Ints
-    deviation: float
-    bound: float
+    assignment: Ints  # (G,) part of each group
+    deviation: float  # its largest deviation, recounted from whole samples
+    bound: float  # no assignment that lacks as few materials has a smaller one
 
 
 def optimize(problem: Problem) -> Optimum:
@@ -209,14 +203,10 @@ class _Program:
         gap: float = 0.0,
         seed: int = 0,
     ) -> tuple[Ints | None, float]:
-        """Minimize.
+        """Minimize the objective, with the excess in a range.
 
-        Args:
-            objective: weights of all variables.
-            excess: range of the excess.
-            nodes: of branch and bound, times groups x parts.
-            gap: relative gap at which to stop.
-            seed: of the groups that are assigned anew where the whole program is not solved.
+        ``nodes`` of branch and bound are divided by groups x parts; ``gap`` is the relative one at
+        which to stop; the seed draws groups to assign anew where the whole program is not solved.
 
         Returns:
             The part of each group, None if no assignment came within the limits, and a lower bound.

@@ -16,17 +16,17 @@ The signals of the images' content, whose thresholds are calibrated, are in ``ne
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Collection, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import polars as pl
 from numpy.typing import NDArray
 
 from palpate.core import Note, Progress, quiet
-from palpate.data.images import in_threads
+from palpate.data.images import file_digest, file_stamp, in_threads
 from palpate.data.manifest import MODALITIES, Manifest
 from palpate.report.results import CAUSES, LeakPair, Signal
 
@@ -37,15 +37,10 @@ HARMLESS_PAIRS = 3
 
 @dataclass(frozen=True)
 class Gaps:
-    """The nearest train frame of the same video.
+    """The nearest train frame of the same video."""
 
-    Attributes:
-        row: (n,) its row in train; -1 where there is none.
-        frames: (n,) its distance; -1 where there is none.
-    """
-
-    row: Ints
-    frames: Ints
+    row: Ints  # (n,) its row in train; -1 where there is none
+    frames: Ints  # (n,) its distance; -1 where there is none
 
 
 def nearest_in_video(train: pl.DataFrame, test: pl.DataFrame) -> Gaps:
@@ -93,39 +88,30 @@ def in_time(table: pl.DataFrame) -> pl.DataFrame:
     )
 
 
-@dataclass(frozen=True)
-class Flags:
-    """One signal over all test samples, in their order.
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Flags(Signal):
+    """A signal with what it says of every test sample, in their order."""
 
-    Attributes:
-        kind: the signal's name, as in :class:`palpate.report.results.Signal`.
-        score: (n,) in [0, 1]; NaN where the sample could not be checked.
-        flag: (n,) whether it leaks by this signal.
-        nearest: (n,) row of the train sample that it leaks from, or is most similar to; -1 for
-            none.
-        threshold: score from which a sample is flagged.
-        counts: whether flagged samples count as leaking.
-        false_positives, edges, unrelated, matches: see :class:`palpate.report.results.Signal`.
-        cause: (n,) one of ``CAUSES``, or '' below the threshold; None for exact signals.
-        notes: what a reader must know.
-        verdict, expected, measured: see :class:`palpate.report.results.Signal`.
-    """
-
-    kind: str
-    score: NDArray[np.float32]
-    flag: NDArray[np.bool_]
+    score: NDArray[np.float32]  # (n,) in [0, 1]; NaN where the sample could not be checked
+    flag: NDArray[np.bool_]  # (n,) whether it leaks by this signal
+    #: (n,) row of the train sample that it leaks from, or is most similar to; -1 for none.
     nearest: Ints
-    threshold: float = 1.0
-    counts: bool = True
-    false_positives: float | None = None
-    edges: Sequence[float] = ()
-    unrelated: Sequence[int] = ()
-    matches: Sequence[int] = ()
+    #: (n,) one of ``CAUSES``, or '' below the threshold; None for exact signals.
     cause: NDArray[np.str_] | None = None
-    notes: Sequence[Note] = ()
-    verdict: str = ""
-    expected: float | None = None
-    measured: float | None = None
+
+    @classmethod
+    def of(
+        cls,
+        kind: str,
+        score: NDArray[np.float32],
+        flag: NDArray[np.bool_],
+        nearest: Ints,
+        threshold: float = 1.0,
+        **facts: Any,
+    ) -> Flags:
+        """Flags and how many they are; ``facts`` are further fields."""
+        counts = int(np.isfinite(score).sum()), int(flag.sum())
+        return cls(kind, *counts, threshold, score=score, flag=flag, nearest=nearest, **facts)
 
     def columns(self, ids: NDArray[np.object_]) -> dict[str, pl.Series]:
         """Score, flag, nearest train id and, where known, the cause, as table columns."""
@@ -142,27 +128,13 @@ class Flags:
         return columns
 
     def summary(self, train: Manifest, test: Manifest, gaps: Gaps, worst: int) -> Signal:
-        """The signal as a result."""
-        causes: dict[str, int] = {}
+        """The signal as a result, with its strongest pairs."""
+        facts: dict[str, Any] = {f.name: getattr(self, f.name) for f in fields(Signal)}
         if self.cause is not None:
-            causes = {name: n for name in CAUSES if (n := int((self.cause == name).sum()))}
-        return Signal(
-            kind=self.kind,
-            checked=int(np.isfinite(self.score).sum()),
-            flagged=int(self.flag.sum()),
-            threshold=self.threshold,
-            false_positives=self.false_positives,
-            edges=list(self.edges),
-            unrelated=list(self.unrelated),
-            matches=list(self.matches),
-            causes=causes,
-            worst=self._worst(train, test, gaps, worst),
-            notes=list(self.notes),
-            counts=self.counts,
-            verdict=self.verdict,
-            expected=self.expected,
-            measured=self.measured,
-        )
+            counts = {name: int((self.cause == name).sum()) for name in CAUSES}
+            facts["causes"] = {name: count for name, count in counts.items() if count}
+        facts["worst"] = self._worst(train, test, gaps, worst)
+        return Signal(**facts)
 
     def _worst(self, train: Manifest, test: Manifest, gaps: Gaps, worst: int) -> list[LeakPair]:
         """The strongest pairs, one a video first; then a few of each cause that is no leak."""
@@ -191,19 +163,15 @@ def identical_samples(
 ) -> Flags:
     """Test samples whose id, or whose video and frame, are in train.
 
-    Args:
-        train: samples.
-        test: the samples in question.
-        gaps: the nearest train frames.
-        named: columns in which equal names mean the same thing; without ``id`` and ``video``
-            nothing can be checked.
+    ``named`` are the columns in which equal names mean the same thing; without ``id`` and ``video``
+    nothing can be checked.
     """
     place = {name: k for k, name in enumerate(train.ids)} if "id" in named else {}
     same = np.array([place.get(name, -1) for name in test.ids], np.int64)
     nearest = np.where(same >= 0, same, np.where(gaps.frames == 0, gaps.row, -1))
     flag = nearest >= 0
     score = np.where(bool({"id", "video"} & {*named}), flag, np.nan).astype(np.float32)
-    return Flags("identical sample", score, flag, nearest)
+    return Flags.of("identical sample", score, flag, nearest)
 
 
 def shared_group(train: Manifest, test: Manifest, column: str, *, counts: bool) -> Flags | None:
@@ -224,7 +192,7 @@ def shared_group(train: Manifest, test: Manifest, column: str, *, counts: bool) 
     if not counts and shared.any():
         notes.append(Note("signal-not-counted", {"group": column}))
     none = np.full(len(b), -1, np.int64)
-    return Flags(f"shared {column}", score, shared, none, counts=counts, notes=notes)
+    return Flags.of(f"shared {column}", score, shared, none, counts=counts, notes=notes)
 
 
 def time_gap(gaps: Gaps, near: int) -> Flags | None:
@@ -238,7 +206,7 @@ def time_gap(gaps: Gaps, near: int) -> Flags | None:
     if not known.any():
         return None
     score = np.where(known, np.exp2(-gaps.frames / max(near, 1)), 0.0).astype(np.float32)
-    return Flags(
+    return Flags.of(
         "time gap",
         score,
         known & (gaps.frames <= near),
@@ -255,12 +223,12 @@ def identical_bytes(train: Manifest, test: Manifest, progress: Progress = quiet)
     files the first row counts.
     """
     base, queries = _files(train), _files(test)
-    sizes = {path: _size(path) for _, path in (*base, *queries)}
+    sizes = {path: file_stamp(path)[0] for _, path in (*base, *queries)}
     if not base or not any(sizes[path] > 0 for _, path in queries):
         return None
     common = {sizes[p] for _, p in base} & {sizes[p] for _, p in queries} - {-1, 0}
     candidates = sorted(path for path, size in sizes.items() if size in common)
-    digests = dict(in_threads(_digest, candidates, "comparing files", progress))
+    digests = dict(in_threads(file_digest, candidates, "comparing files", progress))
     first: dict[str, int] = {}
     for row, path in sorted(base):
         if digest := digests.get(path):
@@ -275,7 +243,7 @@ def identical_bytes(train: Manifest, test: Manifest, progress: Progress = quiet)
     score = np.where(checked, flag, np.nan).astype(np.float32)
     empty = sum(size == 0 for size in sizes.values())
     notes = [Note("empty-files", {"count": empty})] if empty else []
-    return Flags("identical bytes", score, flag, nearest, notes=notes)
+    return Flags.of("identical bytes", score, flag, nearest, notes=notes)
 
 
 def signal_table(
@@ -317,20 +285,3 @@ def _files(manifest: Manifest) -> list[tuple[int, Path]]:
         for row, name in enumerate(manifest.column(column))
         if name is not None
     ]
-
-
-def _size(path: Path) -> int:
-    """Size in bytes, -1 if there is no such file."""
-    try:
-        return path.stat().st_size
-    except OSError:
-        return -1
-
-
-def _digest(path: Path) -> str | None:
-    """BLAKE2b of a file's bytes; None if it cannot be read."""
-    try:
-        with path.open("rb") as file:
-            return hashlib.file_digest(file, "blake2b").hexdigest()
-    except OSError:
-        return None

@@ -148,12 +148,9 @@ def _check(
     train: float, val: float, folds: int | None, tolerance: float, noleak: str | None
 ) -> None:
     if folds is None and not (0 < train < 1 and 0 <= val < 1 and 1 - train - val > 1e-9):
-        raise PalpateError(
-            "The shares of train and val must be positive and leave room for test",
-            f"train {train}, val {val}",
-            "Choose smaller shares",
-            example={"train": 0.8, "val": 0.1},
-        )
+        must = "The shares of train and val must be positive and leave room for test"
+        got = f"train {train}, val {val}"
+        raise PalpateError(must, got, "Choose smaller shares", example={"train": 0.8, "val": 0.1})
     least = 2 + (val > 0)
     require(0 <= tolerance < 1, "tolerance", "must lie in [0, 1)", tolerance, 0.01)
     require(folds is None or folds >= least, "folds", f"must be at least {least}", folds, 5)
@@ -198,21 +195,13 @@ def _columns(
 def _problem(
     manifest: Manifest, groups: Sequence[str], columns: Sequence[str], target: Sequence[float]
 ) -> tuple[list[str], list[str], Problem]:
-    """The names of groups and of materials, and the samples by both with the wanted shares.
-
-    Raises:
-        PalpateError: if there are fewer groups than parts, or the largest group leaves the other
-            parts less than ``LEAST_FILL`` of what they want.
-    """
+    """The names of groups and of materials, and the samples by both with the wanted shares."""
     kind = " and ".join(columns) or LINKED
     names = sorted(set(groups))
     if len(names) < len(target):
-        raise PalpateError(
-            f"A split into {len(target)} parts needs at least as many groups",
-            f"{len(names)} {kind} group(s)",
-            "Choose a finer group",
-            example={"by": "contact"},
-        )
+        must = f"A split into {len(target)} parts needs at least as many groups"
+        got = f"{len(names)} {kind} group(s)"
+        raise PalpateError(must, got, "Choose a finer group", example={"by": "contact"})
     materials: list[str] = sorted(manifest.table["material"].drop_nulls().unique())
     row, column = ({name: k for k, name in enumerate(x)} for x in (names, materials))
     counts = np.zeros((len(names), len(materials) + 1), np.int64)
@@ -286,11 +275,5 @@ def _notes(manifest: Manifest, facts: dict[str, Any]) -> list[Note]:
 
 def _fold_parts(folds: int, val: bool) -> list[list[str]]:
     """For each split the part of each fold."""
-    rows: list[list[str]] = []
-    for fold in range(folds):
-        parts = ["train"] * folds
-        if val:
-            parts[(fold + 1) % folds] = "val"
-        parts[fold] = "test"
-        rows.append(parts)
-    return rows
+    others = ["val" if val else "train", *["train"] * (folds - 2)]
+    return [np.roll(["test", *others], fold).tolist() for fold in range(folds)]

@@ -40,17 +40,12 @@ Decoded = tuple[NDArray[np.uint8], dict[int, str]]
 
 @dataclass(frozen=True)
 class Thumbnails:
-    """Different images, decoded.
+    """Different images, decoded."""
 
-    Attributes:
-        row: (n,) the thumbnail of each path; -1 without a path or where it cannot be read.
-        pixels: (u, 32, 32, 3) 0 to 255, all different.
-        unreadable: path -> reason.
-    """
-
+    #: (n,) the thumbnail of each path; -1 without a path or where it cannot be read.
     row: NDArray[np.int64]
-    pixels: NDArray[np.uint8]
-    unreadable: dict[str, str]
+    pixels: NDArray[np.uint8]  # (u, 32, 32, 3) 0 to 255, all different
+    unreadable: dict[str, str]  # path -> reason
 
 
 def thumbnail(path: Path) -> NDArray[np.uint8] | str:

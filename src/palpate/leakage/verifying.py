@@ -175,11 +175,9 @@ def _deviation(
     manifest: Manifest, split: Split, groups: Sequence[str], parts: pl.Series, linked: bool
 ) -> Check:
     """The largest deviation of a share, counted again, against what the rule states."""
-    name, stated, shares = (
-        "the rule's largest deviation",
-        float(split.rule["deviation"]),
-        split.rule.get("shares", {}),
-    )
+    name = "the rule's largest deviation"
+    stated = float(split.rule["deviation"])
+    shares = split.rule.get("shares", {})
     if bool(split.rule.get("near")) != linked:
         return Check(name, True, f"stated {stated:.5f}; cannot be counted without the same groups")
     table = pl.DataFrame({"material": manifest.table["material"], "group": groups, "part": parts})

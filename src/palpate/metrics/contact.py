@@ -13,8 +13,7 @@ and compared where the real image shows contact, so that the no-contact image ea
   the real clips of Touch and Go they hold three quarters of the squared d), so they are skipped.
 * *Residual*: ``sum (d' - d)^2 / sum (d'^2 + d^2)`` over the mask, d' generated. 0: identical; 1:
   the no-contact image, and on average any contact unrelated to the real one; 2: its negative. The
-  sum below is over both, because sum d^2 alone would reward the no-contact image
-  (``details["per_real_energy"]``).
+  sum below is over both, because sum d^2 alone would reward the no-contact image.
 * *SSIM*: the SSIM map of d' and d, with a window at every pixel, averaged over mask and channels.
   Its data range is 0.25, a few deviations of a contact: with 2, the range of d, C2 exceeds the
   contact's variance and the no-contact image scores above a real image of the same material.
@@ -22,7 +21,7 @@ and compared where the real image shows contact, so that the no-contact image ea
   the mask.
 * *PSNR*: -10 log10 of the mean squared d' - d over the mask, data range 1. A squared error prefers
   the no-contact image to a wrong contact: compare with ``details["empty"]``, its score.
-* *IoU*: of the generated mask and the real one. ``details["everywhere"]``: a contact everywhere.
+* *IoU*: of the generated mask and the real one. A contact everywhere has ``details["area"]``.
 
 For a network that compares images, such as LPIPS, :func:`contact_images` gives the differences as
 images, neutral gray outside the mask.
@@ -111,7 +110,7 @@ def _for_all(background: Any, images: Any) -> Any:
 def mask_of(image: Array, background: Array) -> tuple[Mask, Mask]:
     """Contact mask (h, w) of one image, and the pixels on or next to a marker."""
     side = min(image.shape[:2])
-    near = _markers(image) | _markers(background)
+    near = marker_mask(image) | marker_mask(background)
     if side >= 48:  # a smaller image has markers of a pixel, and hardly two of gel between them
         near = _dilated(near, side // 96)
     sigma = side / 48
@@ -141,7 +140,8 @@ def _dilated(mask: Mask, pixels: int) -> Mask:
     return np.asarray(ndimage.binary_dilation(mask, iterations=max(1, pixels)), bool)
 
 
-def _markers(image: Array) -> Mask:
+def marker_mask(image: Array) -> Mask:
+    """The pixels (h, w) of an image (h, w, c) in [0, 1] that are a marker."""
     gray = image @ LUMA if image.shape[2] == 3 else image[..., 0]
     # a median over a sixth of the side changes slowly, and costs the fourth power of the side
     step = max(1, min(gray.shape) // 64)
@@ -203,14 +203,12 @@ class Contacts:
     Attributes:
         values: metric -> (n,), those of :data:`METRICS`; a PSNR is infinite where identical.
         empty: metric -> (n,) score of the no-contact image.
-        per_real_energy: (n,) squared error over the energy of the real contact; 1 for no contact.
         area: (n,) share of the pixels in the real mask, 0 where it is empty.
         settings: of the comparison.
     """
 
     values: dict[str, Array]
     empty: dict[str, Array]
-    per_real_energy: Array
     area: Array
     settings: dict[str, Any]
 
@@ -220,12 +218,7 @@ class Contacts:
         names = checked_names("ids", ids, n) or [str(i) for i in range(n)]
         count, first = int(none.sum()), [names[i] for i in np.flatnonzero(none)[:10]]
         notes = [Note("no-contact", {"count": count, "n": n})] if count else []
-        area, energy = (_mean(v[~none]) for v in (self.area, self.per_real_energy))
-        common = {"no_contact": {"count": count, "ids": first}, "area": area}
-        more = {
-            "contact residual": {"per_real_energy": energy},
-            "contact IoU": {"everywhere": area},
-        }
+        common = {"no_contact": {"count": count, "ids": first}, "area": _mean(self.area[~none])}
         scales = {"contact MS-SSIM": {"scales": fitting_scales(self.settings["size"])}}
         return [
             mean_score(
@@ -236,7 +229,7 @@ class Contacts:
                 higher_is_better=up,
                 settings=self.settings | settings | scales.get(metric, {}),
                 notes=notes,
-                details={"empty": _mean(self.empty[metric]), **more.get(metric, {}), **common},
+                details={"empty": _mean(self.empty[metric]), **common},
                 **fields,
             )
             for metric, (bounds, up, settings) in METRICS.items()
@@ -248,7 +241,7 @@ def measure_contacts(generated: Any, reference: Any, background: Any) -> Contact
     x, y, gel = _checked(generated, reference, background)
     n = len(y)
     values, empty = ({name: np.full(n, np.nan) for name in METRICS} for _ in range(2))
-    energy, area = np.full(n, np.nan), np.zeros(n)
+    area = np.zeros(n)
     for i, made, real, kept, mask in _in_contact(x, y, gel):
         made_mask = mask_of(as_unit(x[i]), as_unit(gel[i]))[0]
         row = {"contact IoU": (mask & made_mask).sum() / (mask | made_mask).sum()}
@@ -256,9 +249,9 @@ def measure_contacts(generated: Any, reference: Any, background: Any) -> Contact
         nothing = {"contact IoU": 0.0} | _compare(np.zeros_like(real), real, kept)
         for metric in METRICS:
             values[metric][i], empty[metric][i] = row[metric], nothing[metric]
-        energy[i], area[i] = row["per_real_energy"], mask.mean()
+        area[i] = mask.mean()
     size = {"size": list(y.shape[1:3]), "background": background_digest(background)}
-    return Contacts(values, empty, energy, area, SETTINGS | size)
+    return Contacts(values, empty, area, SETTINGS | size)
 
 
 class ContactImages(NamedTuple):
@@ -319,7 +312,6 @@ def _compare(x: Array, y: Array, kept: Mask) -> dict[str, float]:
         "contact SSIM": float(local_maps(x, y, "mirror", SSIM_RANGE)[0][kept].mean()),
         "contact PSNR": float(level),
         "contact MS-SSIM": multiscale_similarity(x, y, scales, kept, SSIM_RANGE),
-        "per_real_energy": error / energy if energy else np.nan,
     }
 
 

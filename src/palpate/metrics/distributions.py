@@ -53,7 +53,6 @@ from palpate.core import FeatureSet, Note, PalpateError, Progress, Score, quiet,
 from palpate.metrics.inputs import (
     Array,
     Index,
-    checked_level,
     checked_names,
     checked_pair,
     checked_whole,
@@ -61,11 +60,11 @@ from palpate.metrics.inputs import (
     feature_set,
     require_one_encoder,
 )
-from palpate.metrics.intervals import Scored, jackknife_errors, spread_of_values, t_interval
+from palpate.metrics.intervals import Scored, Spread, jackknife_errors, spread_of_values
 from palpate.metrics.paired import Comparison, difference, holm, same_samples
 
-#: Mean (d,) and factor (r, d) of a covariance F' F.
-Gaussian = tuple[Array, Array]
+#: A set as a normal distribution: mean (d,), and factor F (r, d) of its covariance F' F.
+Normal = tuple[Array, Array]
 #: The most blocks that the jackknife of FID leaves out.
 BLOCKS = 20
 #: Rows turned to float64 at a time.
@@ -101,9 +100,9 @@ def fid(
         reference_groups: m groups of ``reference``.
         encoder: digest of the encoder of both.
         **options: ``interval=False`` computes none, which costs about twenty times the distance;
-            ``normalize=True`` divides every row by its norm first; ``subject``, ``split`` and
-            ``level`` are kept in the score; ``seed`` draws more than 20 groups, or rows where there
-            are none, into 20 blocks of about equal size, which are then left out.
+            ``normalize=True`` divides every row by its norm first; ``subject`` and ``split``
+            are kept in the score; ``seed`` draws more than 20 groups, or rows where there are none,
+            into 20 blocks of about equal size, which are then left out.
 
     Returns:
         Value and interval; ``details["mean_term"]``: the part |mu1 - mu2|^2.
@@ -113,8 +112,9 @@ def fid(
             encoders of different digests.
     """
     x = feature_set(generated, ids=ids, groups=groups, encoder=encoder)
-    columns: dict[str, Any] = {"ids": reference_ids, "groups": reference_groups}
-    y = feature_set(reference, argument="reference", encoder=encoder, **columns)
+    y = feature_set(
+        reference, argument="reference", ids=reference_ids, groups=reference_groups, encoder=encoder
+    )
     return _fid(x, y, **options).score
 
 
@@ -151,32 +151,28 @@ def _fid(
     normalize: bool = False,
     seed: int = 0,
     split: str | None = None,
-    level: float = 0.95,
 ) -> Scored:
     """FID, and its value without each block."""
     checked_whole(0, seed=seed)
-    checked_level(level)
-    require_one_encoder(generated, reference, "reference")
+    require_one_encoder(generated, reference, "Generated and reference")
     sets, names = (generated.features, reference.features), ("generated", "reference")
     x, y = checked_pair(*sets, normalize=normalize, least=2, names=names)
     center = (x.mean(axis=0, dtype=np.float64) + y.mean(axis=0, dtype=np.float64)) / 2
-    a, b = _gaussian(x, center), _gaussian(y, center)
+    a, b = _normal(x, center), _normal(y, center)
     value, delta = _distance(a, b), a[0] - b[0]
     details: dict[str, Any] = {"mean_term": float(delta @ delta)}
     limits, method, replicates, units = None, "", np.zeros(0), []
     if interval:
-        parts = _draw_parts(generated, reference, seed)
-        if min(len(v) - np.bincount(p).max() for v, p in ((x, parts.x), (y, parts.y))) > 1:
-            units = list(parts.names)
-            without = (
-                _without_each(v, p, len(units), center) for v, p in ((x, parts.x), (y, parts.y))
-            )
+        blocks = _draw_blocks(generated, reference, seed)
+        sets = ((x, blocks.x), (y, blocks.y))
+        if min(len(v) - np.bincount(at).max() for v, at in sets) > 1:
+            units = list(blocks.names)
+            without = (_without_each(v, at, len(units), center) for v, at in sets)
             replicates = np.array([_distance(*pair) for pair in zip(*without, strict=True)])
         error = float(jackknife_errors(replicates[:, None])[0])
-        if error > 0:  # false for NaN as well
-            low, high = t_interval(value, error, len(units) - 1, level)
-            limits, method = (max(0.0, low), high), parts.method
-        details |= {"units": parts.units, "unit": parts.unit, "left_out": parts.left_out}
+        limits = Spread(value, error, len(units) - 1, "").interval(0.0)
+        method = blocks.method if limits else ""
+        details |= blocks.details
     n, d = min(len(x), len(y)), x.shape[1]
     copies = copies_across(x, y)
     notes = [Note("copied-rows", {"count": copies, "n": len(x)})] if copies else []
@@ -187,7 +183,6 @@ def _fid(
         subject,
         value,
         limits,
-        level=level,
         interval_method=method,
         estimator="plug-in",
         n=len(x),
@@ -203,7 +198,7 @@ def _fid(
     return Scored(score, replicates, units)
 
 
-def _gaussian(x: Array, center: Array) -> Gaussian:
+def _normal(x: Array, center: Array) -> Normal:
     """Mean about the center, and factor, of the rows of (n, d) features."""
     if len(x) > x.shape[1]:
         return _of_sums(len(x), _sums(x, center))
@@ -222,17 +217,17 @@ def _sums(x: Array, center: Array) -> Array:
     return total
 
 
-def _of_sums(n: int, sums: Array) -> Gaussian:
+def _of_sums(n: int, sums: Array) -> Normal:
     mean = sums[0] / n
     return mean, _factor((sums[1:] - n * np.outer(mean, mean)) / (n - 1))
 
 
-def _without_each(x: Array, block: Index, count: int, center: Array) -> Iterator[Gaussian]:
-    """The Gaussian without each block of rows."""
+def _without_each(x: Array, block: Index, count: int, center: Array) -> Iterator[Normal]:
+    """The normal distribution without each block of rows."""
     whole, sizes = None, np.bincount(block, minlength=count)
     for b in range(count):
         if (n := len(x) - int(sizes[b])) <= x.shape[1]:
-            yield _gaussian(x[block != b], center)
+            yield _normal(x[block != b], center)
             continue
         whole = _sums(x, center) if whole is None else whole
         yield _of_sums(n, whole - _sums(x[block == b], center))
@@ -248,7 +243,7 @@ def _factor(cov: Array) -> Array:
         return (vectors[:, keep] * np.sqrt(values[keep])).T
 
 
-def _distance(a: Gaussian, b: Gaussian) -> float:
+def _distance(a: Normal, b: Normal) -> float:
     delta, (f, g) = a[0] - b[0], (a[1], b[1])
     cross = f @ g.T
     if len(f) == len(g) == f.shape[1]:  # faster; squares lose no digits that matter at full rank
@@ -262,56 +257,42 @@ def _distance(a: Gaussian, b: Gaussian) -> float:
     return max(float(delta @ delta + traces - 2 * np.sum(roots)), 0.0)
 
 
-class _Parts(NamedTuple):
-    """Rows of both sets in blocks of whole units.
-
-    Attributes:
-        x, y: the block of every row, (n,) and (m,).
-        names: of the blocks; a block that is one group has its name.
-        unit: ``"group"`` or ``"row"``.
-        units: how many of them there are.
-        left_out: what is left out at a time: a ``"group"``, or a ``"block"`` of groups or rows.
-        method: of the interval.
-    """
+class _Blocks(NamedTuple):
+    """What the jackknife leaves out: the block of every row of both sets, by number."""
 
     x: Index
     y: Index
     names: Sequence[str]
-    unit: str
-    units: int
-    left_out: str
+    details: dict[str, Any]
     method: str
 
 
-def _draw_parts(generated: FeatureSet, reference: FeatureSet, seed: int) -> _Parts:
+def _draw_blocks(generated: FeatureSet, reference: FeatureSet, seed: int) -> _Blocks:
     """Groups, or rows where a set has no groups, in at most :data:`BLOCKS` blocks."""
     n, m = len(generated.ids), len(reference.ids)
     rng = rng_for(seed, "fid blocks")
     groups = [checked_names("groups", s.groups, len(s.ids)) for s in (generated, reference)]
-    jackknife = "leave-one-{}-out jackknife{}, t, {} df".format
     if groups[0] is None or groups[1] is None:
-        count = min(BLOCKS, n, m)
-        method = jackknife(
-            "block", f", {count} random blocks of rows, taken as independent", count - 1
-        )
-        drawn = rng.permutation(n) % count, rng.permutation(m) % count
-        return _Parts(*drawn, [f"block {b}" for b in range(count)], "row", n + m, "block", method)
-    found, unit = np.unique(groups[0] + groups[1], return_inverse=True)
-    names, units = [str(name) for name in found], len(found)
-    if units <= BLOCKS:
-        method = jackknife("group", "", units - 1)
-        return _Parts(unit[:n], unit[n:], names, "group", units, "group", method)
-    # the largest group first into the block that has least, ties at random: nearly equal sizes
-    sizes = [np.bincount(u, minlength=units) / len(u) for u in (unit[:n], unit[n:])]
-    size = sizes[0] + sizes[1]
-    order, load, block = rng.permutation(units), np.zeros(BLOCKS), np.zeros(units, np.intp)
-    for u in order[np.argsort(-size[order], kind="stable")]:
-        block[u] = int(load.argmin())
-        load[block[u]] += size[u]
-    drawn = block[unit[:n]], block[unit[n:]]
-    what = f", {BLOCKS} random blocks of whole groups ({units} groups)"
-    names = [f"block {b}" for b in range(BLOCKS)]
-    return _Parts(*drawn, names, "group", units, "block", jackknife("block", what, BLOCKS - 1))
+        count, units, unit = min(BLOCKS, n, m), n + m, "row"
+        x, y = rng.permutation(n) % count, rng.permutation(m) % count
+        what = "rows, taken as independent"
+    else:
+        names, of_row = np.unique(groups[0] + groups[1], return_inverse=True)
+        x, y, units, unit = of_row[:n], of_row[n:], len(names), "group"
+        if units <= BLOCKS:
+            details = {"units": units, "unit": unit, "left_out": "group"}
+            method = f"leave-one-group-out jackknife, t, {units - 1} df"
+            return _Blocks(x, y, names.tolist(), details, method)
+        # the largest group first into the block that has least, ties at random: nearly equal sizes
+        size = np.bincount(x, minlength=units) / n + np.bincount(y, minlength=units) / m
+        order, load, block = rng.permutation(units), np.zeros(BLOCKS), np.zeros(units, np.intp)
+        for u in order[np.argsort(-size[order], kind="stable")]:
+            block[u] = int(load.argmin())
+            load[block[u]] += size[u]
+        x, y, count, what = block[x], block[y], BLOCKS, f"whole groups ({units} groups)"
+    details = {"units": units, "unit": unit, "left_out": "block"}
+    method = f"leave-one-block-out jackknife, {count} random blocks of {what}, t, {count - 1} df"
+    return _Blocks(x, y, [f"block {b}" for b in range(count)], details, method)
 
 
 def prdc(
@@ -339,8 +320,8 @@ def prdc(
         encoder: digest of the encoder of both.
         **options: ``grouped``: look for neighbors in other groups only (see the top of this file),
             default where both sets have groups, False gives the values of the package ``prdc``;
-            ``normalize=True`` divides every row by its norm first; ``subject``, ``split`` and
-            ``level`` are kept in the scores; ``progress`` is called with the rows done.
+            ``normalize=True`` divides every row by its norm first; ``subject`` and ``split``
+            are kept in the scores; ``progress`` is called with the rows done.
 
     Returns:
         Four scores. Intervals are of the mean over rows (see :func:`prdc_rows`), robust to whole
@@ -351,8 +332,9 @@ def prdc(
             digests, or (grouped) a group outside which there are fewer than k rows.
     """
     x = feature_set(generated, ids=ids, groups=groups, encoder=encoder)
-    columns: dict[str, Any] = {"ids": reference_ids, "groups": reference_groups}
-    y = feature_set(reference, argument="reference", encoder=encoder, **columns)
+    y = feature_set(
+        reference, argument="reference", ids=reference_ids, groups=reference_groups, encoder=encoder
+    )
     return prdc_rows(x, y, k, **options)[0]
 
 
@@ -365,7 +347,6 @@ def prdc_rows(
     normalize: bool = False,
     subject: str = "generated",
     split: str | None = None,
-    level: float = 0.95,
     progress: Progress = quiet,
 ) -> tuple[list[Score], dict[str, Array]]:
     """As :func:`prdc`, with the rows that each score is the mean of.
@@ -373,8 +354,7 @@ def prdc_rows(
     (n,) over generated rows for Precision and Density, (m,) over real ones for Recall and Coverage.
     """
     checked_whole(1, k=k)
-    checked_level(level)
-    require_one_encoder(generated, reference, "reference")
+    require_one_encoder(generated, reference, "Generated and reference")
     sets, names = (generated.features, reference.features), ("generated", "reference")
     x, y = checked_pair(*sets, normalize=normalize, least=k + 1, names=names)
     groups = [checked_names("groups", s.groups, len(s.ids)) for s in (generated, reference)]
@@ -396,7 +376,7 @@ def prdc_rows(
     for metric, values in rows.items():
         over_real, balls = metric in ("Recall", "Coverage"), int(metric != "Recall")
         spread = spread_of_values(values, groups[over_real])
-        interval = spread.interval(0.0, np.inf if metric == "Density" else 1.0, level)
+        interval = spread.interval(0.0, np.inf if metric == "Density" else 1.0)
         empty, of = int((radii[balls] == 0).sum()), ("generated", "real")[balls]
         details = {"radius_generated": median[0], "radius_real": median[1], "empty_balls": empty}
         notes = [
@@ -410,8 +390,7 @@ def prdc_rows(
                 subject,
                 float(values.mean()),
                 interval,
-                level,
-                spread.method if interval else "",
+                interval_method=spread.method if interval else "",
                 estimator="per-row mean",
                 n=len(x),
                 m=len(y),

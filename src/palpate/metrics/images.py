@@ -27,11 +27,10 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from palpate import __version__
-from palpate.core import Note, PalpateError, Score
-from palpate.metrics.inputs import as_array, checked_level, checked_names, to_host
-from palpate.metrics.intervals import spread_of_values
+from palpate.core import Note, PalpateError, Score, few
+from palpate.metrics.inputs import Array, as_array, checked_names, to_host
+from palpate.metrics.intervals import LEVEL, spread_of_values
 
-Array = NDArray[np.float64]
 Border = Literal["valid", "mirror"]
 
 WINDOW, SIGMA, K1, K2 = 11, 1.5, 0.01, 0.03
@@ -49,14 +48,12 @@ class ScoreOptions(TypedDict, total=False):
         groups: n groups (videos); the interval is then robust to whole groups deviating together.
         subject: what is scored, default ``"generated"``.
         split: digest of the split, kept in the score.
-        level: coverage of the interval, default 0.95.
     """
 
     ids: Sequence[str] | None
     groups: Sequence[str] | None
     subject: str
     split: str | None
-    level: float
 
 
 def ssim(generated: Any, reference: Any, **options: Unpack[ScoreOptions]) -> Score:
@@ -153,7 +150,6 @@ def mean_score(
     groups: Sequence[str] | None = None,
     bounds: tuple[float, float] = (-np.inf, np.inf),
     higher_is_better: bool = True,
-    level: float = 0.95,
     notes: Sequence[Note] = (),
     **fields: Any,
 ) -> Score:
@@ -167,18 +163,16 @@ def mean_score(
         groups: n groups.
         bounds: of the metric; a t interval may leave them.
         higher_is_better: its direction.
-        level: coverage of the interval.
         notes: further notes.
         **fields: further fields of the score; ``details`` are merged with those made here.
     """
-    checked_level(level)
     n, finite = len(values), np.isfinite(values)
     names = checked_names("ids", ids, n) or [str(k) for k in range(n)]
     groups = checked_names("groups", groups, n)
     kept, identical = values[finite], int(np.isinf(values).sum())
     kept_groups = None if groups is None else list(np.array(groups)[finite])
     spread = spread_of_values(kept, kept_groups)
-    interval = spread.interval(*bounds, level)
+    interval = spread.interval(*bounds)
     badness = np.where(finite, -values if higher_is_better else values, -np.inf)
     worst = [i for i in np.argsort(-badness, kind="stable")[:5] if finite[i]]
     details = {
@@ -195,7 +189,7 @@ def mean_score(
         metric,
         value=float(kept.mean()) if len(kept) else None,
         interval=interval,
-        level=level,
+        level=LEVEL,
         interval_method=spread.method if interval else "",
         estimator="per-image mean",
         n=n,
@@ -223,19 +217,17 @@ def require_same_ids(generated_ids: Sequence[str], reference_ids: Sequence[str])
     generated, reference = ([str(v) for v in ids] for ids in (generated_ids, reference_ids))
     for name, ids in (("generated", generated), ("reference", reference)):
         if repeated := [i for i, count in Counter(ids).items() if count > 1]:
-            got = f"{len(repeated)} repeated: {_first(repeated)}"
+            got = f"{len(repeated)} repeated: {few(map(repr, repeated))}"
             raise PalpateError(f"Every {name} id must be unique", got, "Keep one image an id")
     missing, surplus = set(reference) - set(generated), set(generated) - set(reference)
     if missing or surplus or not reference:
         lists = (("not generated", missing), ("without reference", surplus))
-        got = "; ".join(f"{len(ids)} {what}: {_first(sorted(ids))}" for what, ids in lists if ids)
+        got = "; ".join(
+            f"{len(ids)} {what}: {few(map(repr, sorted(ids)))}" for what, ids in lists if ids
+        )
         fix = "Score the same samples in both: take() the common ids if that is what you mean"
         must = "Generated and reference ids must be the same set"
         raise PalpateError(must, got or "none", fix)
-
-
-def _first(ids: Sequence[str]) -> str:
-    return ", ".join(map(repr, ids[:3])) + f" and {len(ids) - 3} more" * (len(ids) > 3)
 
 
 def image_pairs(
@@ -365,8 +357,6 @@ def scale_weights(scales: int) -> Array:
 def require_side(size: Sequence[int], what: str) -> None:
     """Reject images (height, width) that are smaller than a window."""
     if min(size) < WINDOW:
-        must, got = (
-            f"Images must be at least {WINDOW} x {WINDOW} for {what}",
-            f"{size[0]} x {size[1]}",
-        )
+        must = f"Images must be at least {WINDOW} x {WINDOW} for {what}"
+        got = f"{size[0]} x {size[1]}"
         raise PalpateError(must, got, "Score larger images")

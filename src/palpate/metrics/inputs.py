@@ -25,7 +25,7 @@ import numpy as np
 from array_api_compat import array_namespace, device
 from numpy.typing import NDArray
 
-from palpate.core import FeatureSet, PalpateError, PalpateWarning
+from palpate.core import FeatureSet, PalpateError, PalpateWarning, require
 from palpate.core.features import is_missing
 
 Array = NDArray[np.float64]
@@ -154,9 +154,8 @@ def checked_features(name: str, x: Any, *, normalize: Normalize = "check", least
         PalpateError: on integers, a wrong shape, too few rows, NaN or infinity, zero or
             un-normalized rows (their numbers are given).
     """
-    if normalize not in (True, False, "check"):
-        must = 'must be "check", True or False'
-        raise PalpateError(must, repr(normalize), "Choose one of these", argument="normalize")
+    known = normalize in (True, False, "check")
+    require(known, "normalize", 'must be "check", True or False', normalize)
     x = as_array(name, x)
     kind = str(x.dtype).rsplit(".", maxsplit=1)[-1]
     if not kind.startswith(("float", "bfloat", "longdouble", ">f", "<f")):
@@ -205,7 +204,8 @@ def checked_pair(
     if x.ndim == y.ndim == 2 and x.shape[1] != y.shape[1]:
         got, fix = f"{x.shape[1]} and {y.shape[1]}", "Embed both with the same encoder"
         raise PalpateError(f"{both} must have the same width", got, fix)
-    homes = [_home(v) for v in (x, y)]
+    library = lambda v: f"{type(v).__module__.split('.')[0]} {getattr(v, 'device', '')}"
+    homes = [library(v) if is_foreign(v) else "numpy" for v in (x, y)]
     if homes[0] != homes[1]:
         must = f"{both} must be arrays of one library on one device"
         raise PalpateError(must, " and ".join(homes), "Move one of them")
@@ -215,13 +215,6 @@ def checked_pair(
         dtype = np.result_type(a.dtype, b.dtype)
         return a.astype(dtype, copy=False), b.astype(dtype, copy=False)
     return (like(a, b), b) if "64" in str(b.dtype) else (a, like(b, a))
-
-
-def _home(x: Any) -> str:
-    """Library and device of an array."""
-    if not is_foreign(x):
-        return "numpy"
-    return f"{type(x).__module__.split('.')[0]} {getattr(x, 'device', '')}"
 
 
 def _at_least_float32(x: Any) -> Any:
@@ -298,12 +291,6 @@ def checked_names(name: str, values: Any, n: int) -> list[str] | None:
     return [str(v) for v in items]
 
 
-def checked_level(level: Any) -> None:
-    """Reject a coverage that is not inside (0, 1)."""
-    if not isinstance(level, int | float | np.number) or not 0 < level < 1:
-        raise invalid("level", "must lie in (0, 1)", repr(level), "Choose a coverage", level=0.95)
-
-
 def checked_whole(least: int, **values: Any) -> None:
     """Reject parameters that are not whole numbers of at least ``least``."""
     for name, value in values.items():
@@ -322,14 +309,14 @@ def checked_number(*, positive: bool = False, **values: Any) -> None:
             raise invalid(name, must, repr(value), "Drop it for the default")
 
 
-def require_one_encoder(a: FeatureSet, b: FeatureSet, what: str) -> None:
-    """Reject features of different encoders.
+def require_one_encoder(a: FeatureSet, b: FeatureSet, both: str) -> None:
+    """Reject features of different encoders; ``both`` names them, as "Train and test".
 
     Raises:
         PalpateError: with both digests.
     """
     if a.encoder is not None and b.encoder is not None and a.encoder != b.encoder:
-        must = f"Generated and {what} features must come from one encoder"
+        must = f"{both} features must come from one encoder"
         got = f"digests {a.encoder[:12]} and {b.encoder[:12]}"
         raise PalpateError(must, got, "Embed both with the same encoder")
 

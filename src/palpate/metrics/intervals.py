@@ -82,7 +82,8 @@ class PairSums:
         bound: what the remainders of ``rows`` and ``same`` by moments cannot exceed; None if exact.
         squares: (P,) sum of squared weights of the samples of an item.
         weighings: the same sums with weights on the samples; see :meth:`weighed`.
-        even: one of these, after :meth:`merge`: where units weigh the same.
+        even: the one of ``weighings``, chosen by :meth:`merge`, in which every unit weighs the
+            same, whatever its number of samples.
     """
 
     n: Array
@@ -213,15 +214,17 @@ def one_hot(to: Index, segments: int) -> Array:
     return (to[:, None] == np.arange(segments)).astype(np.float64)
 
 
+def mean_of_pairs(sums: Array, pairs: Array) -> Array:
+    """``sums / pairs``; NaN where there are no pairs, of which rounding may have left a sum."""
+    none = np.full(np.broadcast_shapes(sums.shape, pairs.shape), np.nan)
+    return np.divide(sums, pairs, out=none, where=pairs > 0)
+
+
 Interval = tuple[float, float]
+#: Coverage of every interval.
+LEVEL = 0.95
 #: Relabelings that are computed together.
 BATCH = 256
-
-
-def t_interval(value: float, error: float, df: float, level: float) -> Interval:
-    """``value +- t * error`` with ``df`` degrees of freedom."""
-    reach = float(special.stdtrit(df, 0.5 + level / 2)) * error
-    return value - reach, value + reach
 
 
 def jackknife_errors(replicates: Array) -> Array:
@@ -247,14 +250,12 @@ class Spread:
         """Whether there is an error: no change without any group is no evidence of certainty."""
         return bool(1e-12 < self.error < np.inf)  # not for NaN
 
-    def interval(
-        self, low: float = -np.inf, high: float = np.inf, level: float = 0.95
-    ) -> Interval | None:
-        """The t interval within [low, high], or None."""
+    def interval(self, low: float = -np.inf, high: float = np.inf) -> Interval | None:
+        """The 95 % t interval within [low, high], or None."""
         if not self.known:
             return None
-        a, b = t_interval(self.value, self.error, self.df, level)
-        return max(a, low), min(b, high)
+        reach = float(special.stdtrit(self.df, 0.5 + LEVEL / 2)) * self.error
+        return max(self.value - reach, low), min(self.value + reach, high)
 
     def shares(self) -> tuple[float, float]:
         """The shares of its t distribution below and above 0; halves where there is no error."""
@@ -302,12 +303,11 @@ class Estimate:
     units: Index = field(repr=False)
     of_classes: bool = False
 
-    def interval(self, k: int, level: float) -> Interval | None:
+    def interval(self, k: int) -> Interval | None:
         """Interval of value k, or None where it has none."""
-        value, error = float(self.values[k]), float(self.errors[k])
-        if not (np.isfinite(value) and np.isfinite(error) and error > 0):
-            return None  # no variation between units is no evidence of certainty
-        return t_interval(value, error, self.df, level)
+        value = float(self.values[k])
+        spread = Spread(value, float(self.errors[k]), self.df, self.method)
+        return spread.interval() if np.isfinite(value) else None
 
 
 def estimate(sums: PairSums, statistic: Callable[[Totals], Array], unit: str) -> Estimate:
@@ -392,14 +392,7 @@ class Permuted:
 def permutation_test(
     sums: PairSums, estimator: str, scale: float, *, count: int = 999, seed: int = 0
 ) -> Permuted | None:
-    """Exchange units between segments 0 and 1.
-
-    Args:
-        sums: two segments, with ``block``.
-        estimator: ``"unbiased"``, ``"biased"`` or ``"grouped"``.
-        scale: factor on the values.
-        count: random relabelings.
-        seed: of the relabelings.
+    """Exchange units between segments 0 and 1, in ``count`` random relabelings.
 
     Returns:
         The test, or None without sums of items with items, or where there is nothing to exchange.
@@ -461,8 +454,7 @@ def _studentized(second: Array, sums: PairSums, unit: Any, estimator: str) -> tu
             total = (right + same_row).sum(axis=1)
             lost = (right + left + same_row - a * (b @ inner.T)) @ of_unit
             means.append(np.column_stack([total, total[:, None] - lost]))
-        with np.errstate(divide="ignore", invalid="ignore"):
-            mean = means[0] / means[1]
+        mean = mean_of_pairs(*means)
         value += weight * mean[:, 0]
         without += weight * mean[:, 1:]
     drift = without - without.mean(axis=1, keepdims=True)

@@ -196,10 +196,8 @@ def gaussian(sigma: Sigma, x: Any, groups: Sequence[str] | Index | None = None) 
     return Gaussian(tuple(f * middle for f in factors), f"gaussian, {sigma}")
 
 
-def median_distance(
-    x: Any, groups: Sequence[str] | Index | None = None, rows: int = MEDIAN_ROWS
-) -> float:
-    """The median Euclidean distance between rows of different groups, over ``rows`` random rows.
+def median_distance(x: Any, groups: Sequence[str] | Index | None = None) -> float:
+    """The median Euclidean distance between rows of different groups, over some random rows.
 
     Where all rows are of one group, all pairs count.
 
@@ -207,7 +205,7 @@ def median_distance(
         PalpateError: with fewer than two rows, or where the median is 0.
     """
     n = len(x)
-    at = np.sort(rng_for(0, "median distance").permutation(n)[:rows])
+    at = np.sort(rng_for(0, "median distance").permutation(n)[:MEDIAN_ROWS])
     some = host(rows_at(x, at))
     release(x)
     squares = (some**2).sum(axis=1)
@@ -438,15 +436,10 @@ def _indicators(cell: Index, z: Any) -> tuple[Index, Any]:
 
 
 def centered_squares(x: Any, rows: Index, kernel: Kernel) -> tuple[float, float, float]:
-    """Sum of squares over i != j, trace and squared diagonal of the doubly centered kernel.
+    """Sum of squares over i != j, trace and squared diagonal of the doubly centered kernel of rows.
 
     With the diagonal 0, ``Kc_ij = k_ij - r_i - r_j + r`` with r the row means, ``Kc_ii = r -
     2 r_i``. Of more than :data:`SPREAD_ROWS` rows it is estimated from so many random ones.
-
-    Args:
-        x: (N, d) features.
-        rows: (n,) of which.
-        kernel: the kernel.
     """
     n = len(rows)
     if n < 2:

@@ -22,9 +22,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from palpate.core import Score
+from palpate.metrics.inputs import Array
 from palpate.metrics.intervals import Spread, jackknife_errors
 
-Array = NDArray[np.float64]
 #: (..., K) means -> (...) their statistic.
 Statistic = Callable[[Array], Array]
 
@@ -64,14 +64,9 @@ def mean_of(
     weights: Array | None = None,
     **fields: Any,
 ) -> Mean:
-    """Weighted mean of values in [0, 1] as a score with a leave-one-group-out interval.
+    """Mean of values (n,) in [0, 1], weighted (n,) or not, as a score with an interval over groups.
 
-    Args:
-        metric: its name.
-        values: (n,) one a sample.
-        groups: n group names.
-        weights: (n,); None weights all samples the same.
-        **fields: further fields of the score.
+    ``fields`` are further fields of the score.
     """
     values = np.asarray(values, dtype=np.float64)
     weights = np.ones(len(values)) if weights is None else weights
@@ -83,13 +78,6 @@ def mean_of(
     interval = spread.interval(0.0, 1.0)
     method = spread.method if interval else ""
     return replace(mean, score=replace(score, interval=interval, interval_method=method))
-
-
-def mean_over_groups(
-    metric: str, values: NDArray[Any], groups: Sequence[str], **fields: Any
-) -> Score:
-    """The score of :func:`mean_of`."""
-    return mean_of(metric, values, groups, **fields).score
 
 
 def over_seeds(runs: Sequence[Mean]) -> Score:
@@ -111,12 +99,7 @@ def over_seeds(runs: Sequence[Mean]) -> Score:
 def spread_of(
     terms: Sequence[Sequence[Mean]], statistic: Statistic = lambda m: m[..., 0]
 ) -> Spread:
-    """A statistic of K means, each over S trainings, with its error over groups and seeds.
-
-    Args:
-        terms: K terms of S means each.
-        statistic: of an array (..., K).
-    """
+    """A statistic (..., K) of K means over S trainings, with its error by groups and seeds."""
     names = np.unique(np.concatenate([run.groups for runs in terms for run in runs]))
     by_seed = np.array([[run.score.value for run in runs] for runs in terms]).T  # (S, K)
     without = np.array([[run.without(names) for run in runs] for runs in terms])  # (K, S, G)

@@ -61,7 +61,6 @@ from palpate.metrics.inputs import (
     Array,
     Index,
     Normalize,
-    checked_level,
     checked_names,
     checked_number,
     checked_pair,
@@ -69,7 +68,7 @@ from palpate.metrics.inputs import (
     copies_across,
     invalid,
 )
-from palpate.metrics.intervals import PairSums, Totals
+from palpate.metrics.intervals import PairSums, Totals, mean_of_pairs
 from palpate.metrics.kernels import (
     BACKENDS,
     TOLERANCE,
@@ -104,15 +103,13 @@ def mmd_matrix(t: Totals, estimator: str, scale: float) -> Array:
     The diagonal has no meaning. A constant in k cancels, as XX + YY - 2 XY weighs it 1 + 1 - 2.
     """
     inner, cross = _means(t, estimator)
-    with np.errstate(invalid="ignore"):
-        return scale * (inner[:, None] + inner[None, :] - 2 * cross)  # Eq. 2
+    return scale * (inner[:, None] + inner[None, :] - 2 * cross)  # Eq. 2
 
 
 def mmd_bound(remainder: Totals, estimator: str, scale: float) -> Array:
     """What :func:`mmd_matrix` may be off by, where sums may be off by ``remainder``."""
     inner, cross = _means(remainder, estimator)
-    with np.errstate(invalid="ignore"):
-        return scale * (inner[:, None] + inner[None, :] + 2 * cross)
+    return scale * (inner[:, None] + inner[None, :] + 2 * cross)
 
 
 def _means(t: Totals, estimator: str) -> tuple[Array, Array]:
@@ -125,8 +122,7 @@ def _means(t: Totals, estimator: str) -> tuple[Array, Array]:
         inner_pairs = t.n * (t.n - 1)
     if estimator == "biased":
         inner_sums = inner_sums + t.diagonal
-    with np.errstate(divide="ignore", invalid="ignore"):
-        return inner_sums / inner_pairs, sums / pairs
+    return mean_of_pairs(inner_sums, inner_pairs), mean_of_pairs(sums, pairs)
 
 
 def largest_bound(sums: PairSums, estimator: str, scale: float) -> float:
@@ -286,7 +282,6 @@ class Options:
             norm, False takes them as they are.
         backend: ``"auto"``, ``"blocked"`` or ``"moments"`` (:mod:`palpate.metrics.kernels`).
         permutations: relabelings of the permutation test of TMMD; 0 for none.
-        level: coverage of intervals.
         seed: of random halves.
         subject: what is scored.
         split: digest of the split, kept with the score.
@@ -303,7 +298,6 @@ class Options:
     normalize: Normalize = "check"
     backend: Backend = "auto"
     permutations: int = 999
-    level: float = 0.95
     seed: int = 0
     subject: str = "generated"
     split: str | None = None
@@ -339,7 +333,6 @@ def plan_for(options: Mapping[str, Any], *, grouped: bool) -> Options:
         require_choice(name, getattr(plan, name), choices)
     checked_number(positive=True, scale=plan.scale)
     checked_whole(0, permutations=plan.permutations, seed=plan.seed)
-    checked_level(plan.level)
     checked_kernel(plan.kernel)
     for name, value in (("estimator", "grouped"), ("halves", "group")):
         if not grouped and getattr(plan, name) == value:
@@ -394,10 +387,6 @@ def design_of(t: Totals, plan: Options) -> Array:
 
     ``dist^2 = first * E + second * (mean diagonal k - b)``: first ``sum s_g(s_g-1) / (m(m-1))``, or
     with m^2 below for the biased form; second 0, or n / m^2 for the biased form.
-
-    Args:
-        t: 2K segments.
-        plan: the estimator.
     """
     t = whole_sets(t)
     inner, m, biased = np.diagonal(t.pairs) - t.n, t.n / 2, plan.estimator == "biased"
@@ -482,8 +471,8 @@ def dispersion_of(t: Totals, plan: Options) -> Array:
 
     ``(1/m + 1/m') * scale * (mean diagonal k - mean off-diagonal k)``.
     """
+    spread = t.diagonal / t.n - mean_of_pairs(np.diagonal(t.sums), t.n * (t.n - 1))
     with np.errstate(divide="ignore", invalid="ignore"):
-        spread = t.diagonal / t.n - np.diagonal(t.sums) / (t.n * (t.n - 1))
         return (1 / halves_of(t.n)).sum(axis=1) * plan.scale * spread
 
 

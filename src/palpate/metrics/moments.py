@@ -37,6 +37,8 @@ CHUNK = 2048
 WIDE = 256 << 20
 #: Largest ``rho`` that the bound is formed for (exp(30) is 1e13), and the value for no bound.
 WIDEST, NO_BOUND = 30.0, 1e30
+#: About so many rows give the center, in runs of so many.
+CENTER_ROWS, RUN = 4096, 64
 #: Sums over samples; ``rho`` is a maximum.
 ADDITIVE = ("n", "zeroth", "first", "second", "fourth", "diagonal")
 
@@ -142,15 +144,15 @@ def remainder_factor(rho: float) -> float:
     return float(np.exp(rho) * special.gammainc(3, rho) / rho**2)
 
 
-def center_of(parts: Iterable[Any], rows: int = 4096, run: int = 64) -> Array:
-    """The mean of about ``rows`` rows in short runs spread evenly over the arrays.
+def center_of(parts: Iterable[Any]) -> Array:
+    """The mean of some rows, in short runs spread evenly over the arrays.
 
     Any fixed center is right; one in the middle gives the smallest remainder. Runs, since an array
     on disk is read by pages.
     """
     parts = [p for p in parts if len(p)]
-    step, picked = max(run, run * (sum(len(p) for p in parts) // rows)), []
+    step, picked = max(RUN, RUN * (sum(len(p) for p in parts) // CENTER_ROWS)), []
     for part in parts:
-        picked += [host(part[k : k + run]) for k in range(0, len(part), step)]
+        picked += [host(part[k : k + RUN]) for k in range(0, len(part), step)]
         release(part)
     return np.concatenate(picked).mean(axis=0)

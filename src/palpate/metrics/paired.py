@@ -22,7 +22,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from itertools import combinations
+from itertools import accumulate, combinations
 from typing import Any
 
 import numpy as np
@@ -50,19 +50,19 @@ class Comparison:
         scores: the metrics of each generator, in the order given; ``subject`` is its name.
         differences: one score a metric and pair, ``value`` = a - b; ``details`` as in
             :func:`difference`, and ``p_adjusted``.
-        excess: of :func:`compare`: the same of E, the between-group excess of I- and CI-TMMD
-            (``"I-TMMD E"``, ``"CI-TMMD E"``).
     """
 
     scores: list[Score]
     differences: list[Score]
-    excess: Comparison | None = None
 
 
 def compare(
     generators: Mapping[str, Any], reference: Any, *, floor: Any = None, **options: Any
 ) -> Comparison:
     """TMMD, I-, CI- and D-TMMD of several generators on the same samples, with paired differences.
+
+    I- and CI-TMMD of halves of whole groups are followed by their between-group excess E, as a
+    metric of its own (``"I-TMMD E"``, ``"CI-TMMD E"``).
 
     Args:
         generators: name -> features of its samples; all with the same ids (any order), labels and
@@ -85,9 +85,12 @@ def compare(
         real = floors_of(feature_set(floor, argument="floor"), reference, first, options)
         floors = [None, *real]
         scores = {n: [s[0], *map(with_floor, s[1:], real)] for n, s in scores.items()}
-    excess = {name: [excess_of(s) for s in four[1:3]] for name, four in scores.items()}
-    of_floors = [None if s is None else excess_of(s) for s in floors[1:3]]
-    return replace(_compared(scores, floors), excess=_compared(excess, of_floors))
+    return _compared({n: _with_excess(s) for n, s in scores.items()}, _with_excess(floors))
+
+
+def _with_excess(four: Sequence[Scored | None]) -> list[Scored | None]:
+    """TMMD, I- and CI-TMMD, each followed by its E, and D-TMMD."""
+    return [x for s in four for x in (s, s and excess_of(s))]
 
 
 def _compared(
@@ -142,7 +145,7 @@ def _ordered(first: FeatureSet, first_name: str, other: FeatureSet, name: str) -
         got = f"{len(a - b)} missing and {len(b - a)} surplus ids{named}"
         fix = "Generate for the same manifest and split"
         raise PalpateError(f"{both} must have the same samples, each once", got, fix)
-    require_one_encoder(first, other, repr(name))
+    require_one_encoder(first, other, both)
     other = other if list(other.ids) == list(first.ids) else other.take(list(first.ids))
     for column in ("labels", "groups"):
         values = [getattr(s, column) for s in (first, other)]
@@ -175,12 +178,12 @@ def difference(a: Scored, b: Scored, floor: Scored | None = None) -> Score:
     x, y = a.score, b.score
     if x.value is None or y.value is None:
         return _as_difference(x, y, None, {}, note=Note("undefined", {"reason": "score"}))
-    value, level, df = x.value - y.value, x.level, len(a.units) - 1
+    value, df = x.value - y.value, len(a.units) - 1
     if not a.units or list(a.units) != list(b.units):
         reason = "different-units" if a.units else "no-units"
         return _as_difference(x, y, value, {}, note=Note("no-interval", {"reason": reason}))
     spread = _spread(value, a.replicates - b.replicates, df)
-    interval = spread.interval(level=level)
+    interval = spread.interval()
     note = Note("no-interval", {"reason": "no-change"}) if interval is None else None
     unit = x.details.get("left_out", x.details["unit"])
     method = f"paired leave-one-{unit}-out jackknife, t, {df} df" if interval else ""
@@ -193,7 +196,7 @@ def difference(a: Scored, b: Scored, floor: Scored | None = None) -> Score:
         gap = abs(x.value - center) - abs(y.value - center)
         moved = np.abs(a.replicates - real) - np.abs(b.replicates - real)
         of_gap = _spread(gap, moved, df)
-        gap_interval = of_gap.interval(level=level)
+        gap_interval = of_gap.interval()
         details = {"gap": gap, "gap_interval": gap_interval, "p_difference": p}
         details |= _verdict(x, y, of_gap, gap_interval)
     return _as_difference(x, y, value, details, note=note, interval=interval, method=method)
@@ -300,7 +303,7 @@ def _difference_of_means(a: Sequence[Mean], b: Sequence[Mean]) -> Score:
     if min(run.score.value or 0 for run in a) > 0:
         with np.errstate(divide="ignore", invalid="ignore"):  # a mean may be 0 without one group
             relative = spread_of([a, b], lambda m: 1 - m[..., 1] / m[..., 0])
-        bounds = relative.interval(high=1.0, level=x.level)
+        bounds = relative.interval(high=1.0)
         more = {"relative": relative.value, "relative_interval": bounds}
     return _by_spread(x, y, spread, (-1.0, 1.0), reason="no-change", **more)
 
@@ -309,7 +312,7 @@ def _by_spread(
     x: Score, y: Score, spread: Spread, bounds: Interval, *, reason: str, **more: Any
 ) -> Score:
     """The difference with the interval of a spread; ``reason`` where there is none."""
-    interval = spread.interval(*bounds, x.level)
+    interval = spread.interval(*bounds)
     return _as_difference(
         x,
         y,
@@ -326,11 +329,8 @@ def mean_differences(
 ) -> list[Score]:
     """Paired differences of a metric that is a mean over images; notes are of the difference alone.
 
-    Args:
-        scores: of the generators, of one metric.
-        values: (n,) of each generator, image by image in one order; pairs of which one is not
-            finite are skipped.
-        groups: n groups, or None.
+    ``values`` (n,) of each generator go image by image in one order; pairs of which one is not
+    finite are skipped.
 
     Raises:
         PalpateError: if the scores are of different settings.
@@ -351,12 +351,10 @@ def _mean_difference(x: Score, y: Score, delta: Array, groups: Sequence[str] | N
 
 def holm(differences: Sequence[Score]) -> list[Score]:
     """The differences of one metric with ``p_adjusted``, by Holm's step-down method."""
-    known = [k for k, d in enumerate(differences) if d.details["p_value"] is not None]
-    known.sort(key=lambda k: differences[k].details["p_value"])
-    adjusted, last = dict[int, float](), 0.0
-    for rank, k in enumerate(known):
-        last = max(last, min(1.0, (len(known) - rank) * differences[k].details["p_value"]))
-        adjusted[k] = last
+    p = {k: d.details["p_value"] for k, d in enumerate(differences)}
+    known = sorted((k for k in p if p[k] is not None), key=lambda k: p[k])
+    each = [min(1.0, (len(known) - rank) * p[k]) for rank, k in enumerate(known)]
+    adjusted = dict(zip(known, accumulate(each, max), strict=True))
     return [
         replace(d, details={**d.details, "p_adjusted": adjusted.get(k)})
         for k, d in enumerate(differences)

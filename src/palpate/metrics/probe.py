@@ -23,12 +23,14 @@ from scipy.optimize import minimize
 from scipy.special import log_softmax
 
 from palpate.core import FeatureSet, PalpateError, Score, rng_for
+from palpate.metrics.inputs import Array, require_one_encoder
 from palpate.metrics.means import Mean, mean_of
 from palpate.metrics.retrieval import TIE, blocks, unit_rows
 
-Array = NDArray[np.float64]
 #: Penalties that cross-validation chooses from.
 GRID = (1e-4, 1e-3, 1e-2, 1e-1)
+#: Folds of the cross-validation.
+FOLDS = 3
 #: Temperature of the votes of k-NN.
 VOTE = 0.07
 
@@ -50,16 +52,13 @@ class Probe:
         return [self.classes[k] for k in logits.argmax(axis=1)]
 
 
-def fit_probe(
-    train: FeatureSet, *, l2: float | None = None, folds: int = 3, seed: int = 0
-) -> Probe:
+def fit_probe(train: FeatureSet, *, l2: float | None = None, seed: int = 0) -> Probe:
     """Fit a linear probe to labeled features.
 
     Args:
         train: features with labels; rows without a label are skipped.
         l2: the penalty; None chooses among 1e-4 to 1e-1 by cross-validation over groups.
-        folds: of the cross-validation.
-        seed: of the folds.
+        seed: of the folds of the cross-validation.
 
     Raises:
         PalpateError: without labels, or with fewer than two classes.
@@ -73,7 +72,7 @@ def fit_probe(
     mean, sd = x.mean(axis=0), np.maximum(x.std(axis=0), 1e-8)
     z = (x - mean) / sd
     if l2 is None:
-        l2 = _choose_penalty(z, y, _folds(groups, folds, seed))
+        l2 = _choose_penalty(z, y, _folds(groups, seed))
     weight, bias = _logistic(z, y, len(classes), l2)
     return Probe(tuple(classes), mean, sd, weight, bias, l2)
 
@@ -106,7 +105,7 @@ def material_accuracy(
     Raises:
         PalpateError: without labels in both sets, or on features of two encoders.
     """
-    _require_one_encoder(train, test)
+    require_one_encoder(train, test, "Train and test")
     probe = probe or fit_probe(train, l2=l2, seed=seed)
     return _linear(probe, train, test, "material", seed=seed, subject=subject, split=split)[0].score
 
@@ -137,7 +136,7 @@ def class_accuracies(
     Raises:
         PalpateError: as :func:`material_accuracy`.
     """
-    _require_one_encoder(train, test)
+    require_one_encoder(train, test, "Train and test")
     probe = fit_probe(train, seed=seed)
     means = _linear(probe, train, test, label, seed=seed, **fields)
     x, labels, _ = _labeled(train, "train")
@@ -156,12 +155,7 @@ def neighbor_hits(
 ) -> Array:
     """(m,) probability that weighted k-NN names each test row correctly, votes being tied or not.
 
-    Args:
-        train: (n, d).
-        train_labels: n classes.
-        test: (m, d).
-        test_labels: m classes; one that train lacks is never named.
-        neighbors: k; at most n count.
+    Of ``neighbors`` at most n count. A class that train lacks is never named.
     """
     names, code = np.unique(np.array(train_labels), return_inverse=True)
     one_hot = np.eye(len(names), dtype=np.float32)[code]
@@ -243,12 +237,6 @@ def _accuracies(
     ]
 
 
-def _require_one_encoder(train: FeatureSet, test: FeatureSet) -> None:
-    if train.encoder != test.encoder:
-        must = "Train and test features must come from one encoder"
-        raise PalpateError(must, f"{train.encoder} and {test.encoder}", "Embed them again")
-
-
 def _labeled(features: FeatureSet, part: str) -> tuple[Array, list[str], list[str]]:
     """Rows with a label: features as float64, labels, groups (the id where there is none)."""
     labels = features.labels or []
@@ -281,11 +269,11 @@ def _logistic(x: Array, y: NDArray[np.intp], classes: int, l2: float) -> tuple[A
     return w[:d], w[d]
 
 
-def _folds(groups: Sequence[str], folds: int, seed: int) -> NDArray[np.intp] | None:
+def _folds(groups: Sequence[str], seed: int) -> NDArray[np.intp] | None:
     """The fold of every row (n,), by whole groups; None with too few groups."""
     names, group = np.unique(np.array(groups, dtype=str), return_inverse=True)
     order = rng_for(seed, "probe folds").permutation(len(names))
-    return np.argsort(order)[group] % folds if len(names) >= 2 * folds else None
+    return np.argsort(order)[group] % FOLDS if len(names) >= 2 * FOLDS else None
 
 
 def _choose_penalty(x: Array, y: NDArray[np.intp], fold: NDArray[np.intp] | None) -> float:

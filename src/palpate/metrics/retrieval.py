@@ -4,8 +4,9 @@ Row i of a belongs to row i of b. Ties count as a random order would, in expecta
 never look like hits. Strictly, only the key of the same sample is right; with texts, keys whose
 text has a cosine above a threshold to the query's are right as well (TVL), and the first counts.
 
-No matrix of all pairs is held: rows are taken a block at a time, and one product gives both
-directions, since the strict rank of a key's query needs only counts over the column.
+No matrix of all pairs is held, but for a bit each where texts are compared: rows are taken a block
+at a time. The best right key of each query is found first; then one product gives both
+directions, since a rank needs only counts over a row or a column.
 
 With a above the best right key, t tied with it (itself included) and w of these wrong,
 ``P(top k) = 1 - C(w, s) / C(t, s)`` with ``s = min(max(k - a, 0), t)`` places that the ties share,
@@ -27,6 +28,7 @@ from numpy.typing import NDArray
 from scipy.special import gammaln
 
 from palpate.core import FeatureSet, PalpateError, Score, rng_for
+from palpate.metrics.inputs import rows_text
 from palpate.metrics.means import Array, Mean, mean_of
 
 #: Cosines that differ by less are ties: products of equal vectors differ in the last bits.
@@ -94,7 +96,6 @@ def retrieval(  # noqa: PLR0913 - one argument a choice
     names: tuple[str, str] = ("a", "b"),
     top: Sequence[int] = (1, 5, 10),
     pool: int | None = None,
-    repeats: int | None = None,
     texts: NDArray[Any] | None = None,
     threshold: float = 0.999,
     seed: int = 0,
@@ -110,8 +111,7 @@ def retrieval(  # noqa: PLR0913 - one argument a choice
         names: of both, e.g. ``("tactile", "text")``.
         top: the values of k; those over the pool's size are skipped.
         pool: rank among so many samples drawn at random instead of among all; chance is then
-            k / pool whatever n.
-        repeats: pools to average over; default: at most 20, and fewer the larger they are.
+            k / pool whatever n. The mean is over up to 20 pools, fewer the larger they are.
         texts: (n, d) embeddings of the samples' texts: keys count as right as well if their text
             has a cosine above ``threshold`` to the query's. None counts the sample's own key only.
         threshold: see ``texts``; 0.999 takes equal texts.
@@ -125,16 +125,17 @@ def retrieval(  # noqa: PLR0913 - one argument a choice
         chance level, and the mean number of right keys.
 
     Raises:
-        PalpateError: if ids differ, the pool is larger than the set, or n < 2.
+        PalpateError: if ids differ, the pool is larger than the set, n < 2, or on texts that are
+            not finite.
     """
     n = len(a.ids)
     _check(a, b, pool)
     draws = [np.arange(n)]
     if pool is not None and pool < n:
-        repeats = repeats or int(np.clip(POOLED // pool**2, 1, 20))
-        draws = [rng_for(seed, "pool", r).choice(n, pool, replace=False) for r in range(repeats)]
+        count = int(np.clip(POOLED // pool**2, 1, 20))
+        draws = [rng_for(seed, "pool", r).choice(n, pool, replace=False) for r in range(count)]
     size, left, right = len(draws[0]), unit_rows(a.features), unit_rows(b.features)
-    words = None if texts is None else unit_rows(texts)
+    words = None if texts is None else unit_rows(texts, "The embeddings of texts")
     some = [slice(None)] if size == n else draws  # without a copy
     by_draw = [
         both_ranks(left[rows], right[rows], None if words is None else words[rows], threshold)
@@ -168,25 +169,66 @@ def both_ranks(
     """Ranks of b's rows for a's rows as queries, and the other way round.
 
     Args:
-        a: (n, d) rows of length 1.
+        a: (n, d) rows of :func:`unit_rows`.
         b: the same.
         texts: (n, e), see :func:`retrieval`.
         threshold: see :func:`retrieval`.
     """
-    if texts is None:
-        return _own_ranks(a, b)
-    return _similar_ranks(a, b, *_distinct(texts), threshold)
+    n = len(a)
+    similar = None if texts is None else _similar(texts, threshold)
+    best = np.full((2, n), -np.inf, np.float32)
+    for rows in blocks(n, n):
+        right = _right_keys(rows, n, similar)
+        if np.count_nonzero(right) < n // 4:  # products of few pairs, instead of all
+            i, j = np.divmod(np.flatnonzero(right), n)
+            columns, place = np.unique(j, return_inverse=True)
+            values = (a[rows] @ b[columns].T)[i, place]
+            np.maximum.at(best[0], i + rows.start, values)
+            np.maximum.at(best[1], j, values)
+        else:
+            cosines = np.where(right, a[rows] @ b.T, np.float32(-np.inf))
+            best[0, rows] = cosines.max(axis=1)
+            np.maximum(best[1], cosines.max(axis=0), out=best[1])
+    # Products of other shapes add in another order: a quarter of the worst error of such a sum.
+    tie = np.float32(max(TIE, a.shape[1] * 2**-26))
+    high, low = best + tie, best - tie
+    above, upper, ties = (np.zeros((2, n)) for _ in range(3))  # directions, queries
+    total = np.zeros(n)  # right keys of each query, the same in both directions
+    for rows in blocks(n, n):
+        cosines = a[rows] @ b.T
+        right = _right_keys(rows, n, similar)
+        total[rows] = _by_row(right)
+        _count(cosines, rows, high, above)
+        _count(cosines, rows, low, upper)
+        np.copyto(cosines, -np.inf, where=~right)
+        _count(cosines, rows, low, ties)
+    forth, back = (
+        Ranks(above[k], upper[k] - above[k], upper[k] - above[k] - ties[k], total, n)
+        for k in (0, 1)
+    )
+    return forth, back
 
 
-def unit_rows(x: NDArray[Any]) -> Floats:
-    """Rows of length 1 in float32; a row of zeros stays."""
+def unit_rows(x: NDArray[Any], name: str = "The features") -> Floats:
+    """Rows of length 1 in float32; a row of zeros stays.
+
+    Raises:
+        PalpateError: on NaN or infinity in ``name``, which no rank could place.
+    """
     x = np.asarray(x, dtype=np.float32)
-    return x / np.maximum(np.linalg.norm(x, axis=1, keepdims=True), 1e-12)
+    length = np.linalg.norm(x, axis=1, keepdims=True)
+    if (bad := ~np.isfinite(length[:, 0])).any():
+        got, fix = f"NaN or infinity in {rows_text(bad)}", "Check what those rows were made from"
+        raise PalpateError(f"{name} must be finite", got, fix)
+    return x / np.maximum(length, 1e-12)
 
 
 def blocks(rows: int, columns: int) -> Generator[slice]:
-    """Slices of rows, of at most ``CELLS`` cells and 255 rows each: counts fit into a byte."""
-    step = min(255, max(1, CELLS // columns))
+    """Slices of rows, of about ``CELLS`` cells and below 256 rows each: counts fit into a byte.
+
+    Each starts at a multiple of 8, for bits in bytes.
+    """
+    step = 8 * int(np.clip(CELLS // columns // 8, 1, 31))
     for start in range(0, rows, step):
         yield slice(start, min(start + step, rows))
 
@@ -201,45 +243,39 @@ def _distinct(texts: Floats) -> tuple[Floats, NDArray[np.intp]]:
     return texts[np.unique(code, return_index=True)[1]], code
 
 
-def _own_ranks(a: Floats, b: Floats) -> tuple[Ranks, Ranks]:
-    n = len(a)
-    pair = np.einsum("ij,ij->i", a, b)
-    high, low = pair + np.float32(TIE), pair - np.float32(TIE)
-    counts = np.zeros((2, 2, n))  # direction, (above, not below)
-    for rows in blocks(n, n):
-        similar = a[rows] @ b.T
-        for k, bound in enumerate((high, low)):
-            counts[0, k, rows] = _by_row(similar > bound[rows, None])
-            # Bytes are added without a wider copy.
-            counts[1, k] += (similar > bound).view(np.uint8).sum(axis=0, dtype=np.uint8)
-    weights = np.ones(n)
-    forth, back = (Ranks(c[0], c[1] - c[0], c[1] - c[0] - 1, weights, n) for c in counts)
-    return forth, back
+def _similar(texts: Floats, threshold: float) -> tuple[NDArray[np.uint8], NDArray[np.intp]]:
+    """Which distinct texts are similar, (m, m) as bits, and (n,) which of them each row has."""
+    texts, code = _distinct(texts)
+    m = len(texts)
+    bits = np.zeros((m, -(-m // 8)), np.uint8)
+    for rows in blocks(m, m):  # the upper triangle, and its mirror
+        similar = texts[rows] @ texts[rows.start :].T > threshold
+        bits[rows, rows.start // 8 :] |= np.packbits(similar, axis=1)
+        columns = slice(rows.start // 8, -(-rows.stop // 8))
+        bits[rows.start :, columns] |= np.packbits(np.ascontiguousarray(similar.T), axis=1)
+    return bits, code
 
 
-def _similar_ranks(
-    a: Floats, b: Floats, texts: Floats, code: NDArray[np.intp], threshold: float
-) -> tuple[Ranks, Ranks]:
-    n = len(a)
-    counts = np.zeros((2, 3, n))  # direction, (above, ties, wrong)
-    right = np.zeros(n)
-    for rows in blocks(n, n):
-        good = texts[code[rows]] @ texts.T > threshold
-        good = good if len(texts) == n else good[:, code]
-        good[np.arange(len(good)), np.arange(rows.start, rows.stop)] = True
-        right[rows] = _by_row(good)
-        cells = np.flatnonzero(good)
-        row = cells // n
-        starts = np.searchsorted(row, np.arange(len(good)))
-        for (above, ties, wrong), x, y in ((counts[0], a, b), (counts[1], b, a)):
-            similar = x[rows] @ y.T
-            values = similar.reshape(-1)[cells]
-            best = np.maximum.reduceat(values, starts)
-            above[rows] = _by_row(similar > (best + TIE)[:, None])
-            ties[rows] = _by_row(similar > (best - TIE)[:, None]) - above[rows]
-            wrong[rows] = ties[rows] - np.bincount(row, values > best[row] - TIE)
-    forth, back = (Ranks(c[0], c[1], c[2], right, n) for c in counts)
-    return forth, back
+def _right_keys(
+    rows: slice, n: int, similar: tuple[NDArray[np.uint8], NDArray[np.intp]] | None
+) -> NDArray[np.bool_]:
+    """Which keys are right for the queries among the rows, (rows, n)."""
+    own = np.arange(rows.start, rows.stop)
+    if similar is None:
+        right = np.zeros((len(own), n), bool)
+    else:
+        bits, code = similar
+        right = np.unpackbits(bits[code[rows]], axis=1, count=len(bits)).view(bool)
+        right = right if len(bits) == n else right[:, code]
+    right[own - rows.start, own] = True
+    return right
+
+
+def _count(cosines: Floats, rows: slice, bounds: Floats, counts: Array) -> None:
+    """Add the cosines above the bounds of their rows, and of their columns, to (2, n) counts."""
+    counts[0, rows] = _by_row(cosines > bounds[0, rows, None])
+    # Bytes are added without a wider copy.
+    counts[1] += (cosines > bounds[1]).view(np.uint8).sum(axis=0, dtype=np.uint8)
 
 
 def _by_row(mask: NDArray[np.bool_]) -> Array:

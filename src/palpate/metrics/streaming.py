@@ -141,9 +141,6 @@ class StreamingMetric:
 
     name: ClassVar[str]
     function: ClassVar[Any]  # (generated, real, options) -> Scored
-    higher_is_better: ClassVar[bool | None] = None
-    is_differentiable: ClassVar[bool] = False
-    full_state_update: ClassVar[bool] = False
     needs_real: ClassVar[bool] = False
 
     def __init__(
@@ -248,7 +245,7 @@ class StreamingMetric:
 class TMMD(StreamingMetric):
     """TMMD (paper, Eq. 2), the streaming form of :func:`palpate.metrics.tmmd`."""
 
-    name, higher_is_better, needs_real = "TMMD", False, True
+    name, needs_real = "TMMD", True
     function = staticmethod(tmmd_scored)
 
 

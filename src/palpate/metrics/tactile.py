@@ -264,23 +264,12 @@ def scored(  # noqa: PLR0913
     notes: Sequence[Note] = (),
     **fields: Any,
 ) -> Scored:
-    """A score with everything that the plan and the set fix.
+    """A score with everything that the plan and the set fix; ``fields`` are further ones.
 
-    NaN becomes None, and an undefined value loses its interval and has a note ``undefined``.
-
-    Args:
-        metric: its name.
-        table: for kernel, back end, units.
-        generated: for sizes and digests.
-        plan: options; those named in ``settings`` are recorded with the score.
-        settings: options that bear on this metric.
-        estimate: its first value is the score's; None for an undefined result.
-        design: as :class:`Scored`.
-        bound: the value is within this of the exact one, rounding aside.
-        limit: the largest bound that leaves a value; default: as much as a distance can be.
-        details: of the score.
-        notes: of the score.
-        **fields: further fields of the score.
+    NaN becomes None, and an undefined value loses its interval and has a note ``undefined``; so
+    does one whose ``bound`` (it is within this of the exact value, rounding aside) exceeds
+    ``limit``, by default as much as a distance can be. ``settings`` names the options that bear on
+    the metric, and are recorded.
     """
     value = plain(estimate.values[0]) if estimate else None
     notes = list(notes)
@@ -288,7 +277,7 @@ def scored(  # noqa: PLR0913
         value, notes = None, [UNBOUNDED]
     elif value is not None and bound > TOLERANCE * (plan.scale / 1000 if limit is None else 1):
         notes.insert(0, Note("within-bound", {"bound": float(bound)}))
-    interval = estimate.interval(0, plan.level) if estimate and value is not None else None
+    interval = estimate.interval(0) if estimate and value is not None else None
     if value is None:
         fields["null"] = None
         details |= {name: None for name in ("p_value", "z") if name in details}
@@ -303,8 +292,7 @@ def scored(  # noqa: PLR0913
         plan.subject,
         value,
         interval,
-        plan.level,
-        estimate.method if estimate and interval else "",
+        interval_method=estimate.method if estimate and interval else "",
         bandwidth=table.kernel.bandwidth,
         scale=plan.scale,
         n=len(generated.ids),
@@ -421,16 +409,16 @@ def tmmd(
         >>> tmmd(x, y, normalize=True).n
         50
     """
-    columns: dict[str, Any] = {"ids": ids, "labels": labels, "groups": groups, "encoder": encoder}
-    x = feature_set(generated, **columns)
-    columns = {"ids": reference_ids, "groups": reference_groups, "encoder": encoder}
-    y = feature_set(reference, argument="reference", **columns)
+    x = feature_set(generated, ids=ids, labels=labels, groups=groups, encoder=encoder)
+    y = feature_set(
+        reference, argument="reference", ids=reference_ids, groups=reference_groups, encoder=encoder
+    )
     return tmmd_scored(x, y, options).score
 
 
 def tmmd_scored(generated: FeatureSet, reference: FeatureSet, options: Mapping[str, Any]) -> Scored:
     """TMMD with its leave-one-unit-out values."""
-    require_one_encoder(generated, reference, "reference")
+    require_one_encoder(generated, reference, "Generated and reference")
     grouped = generated.groups is not None and reference.groups is not None
     plan = plan_for(options, grouped=grouped or bool(shared_ids(generated, reference)))
     table = build_table(generated, reference, plan, grouped=grouped)
@@ -509,8 +497,8 @@ def i_tmmd(
     Raises:
         PalpateError: on features that are rejected, or ``halves="group"`` without groups.
     """
-    columns: dict[str, Any] = {"ids": ids, "labels": labels, "groups": groups, "encoder": encoder}
-    return reference_free(i_tmmd_of, feature_set(generated, **columns), None, options).score
+    x = feature_set(generated, ids=ids, labels=labels, groups=groups, encoder=encoder)
+    return reference_free(i_tmmd_of, x, None, options).score
 
 
 def ci_tmmd(
@@ -531,8 +519,8 @@ def ci_tmmd(
         Value, interval (over groups; over classes where a class has only two groups), ``null``;
         ``details``: ``E``, ``per_class``, ``excluded``.
     """
-    columns: dict[str, Any] = {"ids": ids, "labels": labels, "groups": groups, "encoder": encoder}
-    return reference_free(ci_tmmd_of, feature_set(generated, **columns), None, options).score
+    x = feature_set(generated, ids=ids, labels=labels, groups=groups, encoder=encoder)
+    return reference_free(ci_tmmd_of, x, None, options).score
 
 
 def d_tmmd(
@@ -558,8 +546,8 @@ def d_tmmd(
         where ``inter`` is not two standard errors above 0), ``unstable`` (classes whose denominator
         is not two standard errors above 0), ``excluded``.
     """
-    columns: dict[str, Any] = {"ids": ids, "labels": labels, "groups": groups, "encoder": encoder}
-    return reference_free(d_tmmd_of, feature_set(generated, **columns), None, options).score
+    x = feature_set(generated, ids=ids, labels=labels, groups=groups, encoder=encoder)
+    return reference_free(d_tmmd_of, x, None, options).score
 
 
 def reference_free(
@@ -647,7 +635,7 @@ def _mean_of_halves(
     if table.grouped:
         # dist^2 of halves of whole groups is E times a number of the design.
         positive = (design[0] > 0).all()
-        details["E"], details["E_interval"] = est.values[1], est.interval(1, plan.level)
+        details["E"], details["E_interval"] = est.values[1], est.interval(1)
         if sums.bound is None:
             details["E_bound"] = 0.0
         elif positive:
@@ -779,11 +767,11 @@ def d_tmmd_of(table: Table, generated: FeatureSet, plan: Options) -> Scored:
     details |= {
         "matrix": matrix,
         "variants": {f"{d}/{a}": d_ratio(matrix, d, a) for d in DENOMINATORS for a in AGGREGATES},
-        "ratio_of_means": {"value": est.values[2], "interval": est.interval(2, plan.level)},
+        "ratio_of_means": {"value": est.values[2], "interval": est.interval(2)},
         "unstable": unstable,
-        "inter": {"value": est.values[3], "interval": est.interval(3, plan.level)},
+        "inter": {"value": est.values[3], "interval": est.interval(3)},
         "E_ratio": est.values[1] if use_excess else None,
-        "E_ratio_interval": est.interval(1, plan.level) if use_excess else None,
+        "E_ratio_interval": est.interval(1) if use_excess else None,
         "units": len(sums.units),
     }
     bound, notes = _d_bound(sums, matrix, plan), list[Note]()
@@ -863,7 +851,7 @@ def four_of(
     generated: FeatureSet, reference: FeatureSet, options: Mapping[str, Any]
 ) -> list[Scored]:
     """The four metrics as :class:`Scored`, in the order of the paper."""
-    require_one_encoder(generated, reference, "reference")
+    require_one_encoder(generated, reference, "Generated and reference")
     both = generated.groups is not None and reference.groups is not None
     paired = not both and bool(shared_ids(generated, reference))
     plan, metrics = plan_for(options, grouped=both or paired), (i_tmmd_of, ci_tmmd_of, d_tmmd_of)
@@ -882,7 +870,7 @@ def floors_of(
     Raises:
         PalpateError: if one of the two has groups and the other none, or encoders differ.
     """
-    require_one_encoder(like, floor, "floor")
+    require_one_encoder(like, floor, "Generated and floor")
     _require_same_groups(like, floor)
     return _from_one_table((i_tmmd_of, ci_tmmd_of, d_tmmd_of), floor, options, reference)
 

@@ -7,7 +7,6 @@ from typing import NamedTuple
 
 from palpate.report.notes import count, number, plural, score_text
 from palpate.report.results import Audit, ImpactRow, LeakPair
-from palpate.report.sentences import HARMLESS
 
 
 class PairList(NamedTuple):
@@ -49,7 +48,7 @@ def pair_facts(pair: LeakPair, kind: str) -> list[str]:
         facts = ["another video" if len(videos) == 2 and None not in videos else "gap unknown"]
     facts += [f"score {score_text(pair.score)}"] if pair.score is not None else []
     facts += [kind] if kind else []
-    facts += [f"{pair.cause}{': no leak' if pair.cause in HARMLESS else ''}"] if pair.cause else []
+    facts += [f"{pair.cause}{': no leak' if pair.cause != 'content' else ''}"] if pair.cause else []
     return facts
 
 
@@ -84,8 +83,9 @@ def matrix_rows(audit: Audit) -> list[GroupRow]:
 
 
 def impact_head(row: ImpactRow) -> list[str]:
-    """Return the features, the classifier, and by what the leak-free splits were made."""
-    return [row.features, row.classifier, *([f"by {row.group}"] if row.group else [])]
+    """Return the classifier, by what the leak-free splits were made, and a doubt."""
+    by = [f"by {row.group}"] if row.group else []
+    return [row.classifier, *by, *(["trained on some of these images"] if row.seen else [])]
 
 
 def impact_cells(row: ImpactRow) -> dict[str, tuple[float, tuple[float, float] | None, str, str]]:

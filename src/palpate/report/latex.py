@@ -12,14 +12,13 @@ import unicodedata
 from collections.abc import Callable, Iterable, Sequence
 
 from palpate.core import short
-from palpate.report.notes import confidence, sentence
+from palpate.report.notes import sentence
 from palpate.report.results import Results
 from palpate.report.tables import BASELINES, BEST, Cell, Column, Table, score_tables
+from palpate.report.terminal import NAMES, difference_rows
 
 #: First line of the file: how the command recognizes its own file.
 MARK = "% palpate: tables of scores"
-#: From so many differences on, a table may break over pages.
-LONG = 40
 ARROWS = {"↑": r"$\uparrow$", "↓": r"$\downarrow$", "→": r"$\rightarrow$"}
 _SPECIAL = {
     "\\": r"\textbackslash{}",
@@ -39,7 +38,7 @@ _SPECIAL = {
     "`": r"\`{}",
     "σ": r"$\sigma$",
     "×": r"$\times$",
-    "→": r"$\rightarrow$",
+    **ARROWS,
     "−": "$-$",
     "–": "--",
     "\u00a0": "~",
@@ -69,10 +68,8 @@ def latex_tables(results: Results) -> str:
         caption += [f"Command: {results.commands[0]}"] if results.commands else []
         lines += _scores(table, caption) if table.columns else []
         lines += _differences(table, caption) if table.differences else []
-    long = any(line.startswith(r"\begin{longtable}") for line in lines)
-    needs = "{booktabs,longtable}" if long else "{booktabs}"
     commands = (re.sub(r"[\x00-\x1f\x7f\u2028\u2029]", " ", c) for c in results.commands)
-    head = [MARK, *(f"% {c}" for c in commands), rf"% Needs \usepackage{needs}."]
+    head = [MARK, *(f"% {c}" for c in commands), r"% Needs \usepackage{booktabs}."]
     return "\n".join([*head, "", *lines]).rstrip() + "\n"
 
 
@@ -101,59 +98,30 @@ def _scores(table: Table, caption: Sequence[str]) -> list[str]:
     rows += [r"\midrule", *last] if last else []
     if table.differences:
         caption = [*caption, f"Bold: {BEST}"]
-    return [
-        r"\begin{table}",
-        r"\centering",
-        _caption(caption),
-        rf"\begin{{tabular}}{{l{'r' * len(table.columns)}}}",
-        r"\toprule",
-        *rows,
-        r"\bottomrule",
-        r"\end{tabular}",
-        *_below(table, (cell for column in table.columns for cell in column.cells)),
-        r"\end{table}",
-        "",
-    ]
+    below = _below(table, (cell for column in table.columns for cell in column.cells))
+    return _float(caption, "l" + "r" * len(table.columns), rows, below)
 
 
 def _differences(table: Table, caption: Sequence[str]) -> list[str]:
-    heads = ["metric", "$a$", "$b$", "$a - b$", "interval", "$a$ better", "Holm $p$"]
-    rows = [
-        _row(
-            [
-                f"{escape(d.metric)} {ARROWS[d.arrow]}",
-                escape(d.a),
-                escape(d.b),
-                f"${d.cell.score.value:z.{d.digits}f}$",
-                _pair(d.cell.score.interval, d.digits) or "--",
-                ("--" if d.confidence is None else escape(confidence(d.confidence)))
-                + _marks(d.cell),
-                f"${_p(d.p).lstrip('= ')}$" if d.p is not None else "--",
-            ]
-        )
-        for d in table.differences
-    ]
-    caption = _caption([f"Paired differences: {caption[0]}", *caption[1:]])
-    head = [r"\toprule", _row(heads), r"\midrule"]
-    below = _below(table, (d.cell for d in table.differences))
-    if len(rows) < LONG:
-        tabular = [r"\begin{tabular}{lllrrrr}", *head, *rows, r"\bottomrule", r"\end{tabular}"]
-        float_ = [r"\begin{table}", r"\centering", caption, *tabular, *below]
-        return [*float_, r"\end{table}", ""]
-    return [
-        r"\begin{longtable}{lllrrrr}",
-        rf"{caption} \\",
-        *head,
-        r"\endfirsthead",
-        *head,
-        r"\endhead",
-        r"\bottomrule",
-        r"\endfoot",
-        *rows,
-        r"\end{longtable}",
-        *below,
-        "",
-    ]
+    rows = difference_rows(table)
+    names = [name for name in rows[0] if name != "notes" and any(row[name] for row in rows)]
+    lines = [_row(["$a - b$" if name == "a - b" else escape(name) for name in names]), r"\midrule"]
+    for row, d in zip(rows, table.differences, strict=True):
+        cells = [escape(row[n]) if n in NAMES or "%" in row[n] else _math(row[n]) for n in names]
+        lines.append(_row([*cells[:-1], cells[-1] + _marks(d.cell)]))
+    columns = "".join("l" if name in NAMES else "r" for name in names)
+    cells = (d.cell for d in table.differences)
+    caption = [f"Paired differences: {caption[0]}", *caption[1:]]
+    return _float(caption, columns, lines, _below(table, cells))
+
+
+def _float(
+    caption: Sequence[str], columns: str, rows: Sequence[str], below: Sequence[str]
+) -> list[str]:
+    sentences = ". ".join(escape(s).rstrip(".") for s in caption)
+    head = [r"\begin{table}", r"\centering", rf"\caption{{{sentences}.}}"]
+    head += [rf"\begin{{tabular}}{{{columns}}}", r"\toprule"]
+    return [*head, *rows, r"\bottomrule", r"\end{tabular}", *below, r"\end{table}", ""]
 
 
 def _facts(table: Table) -> list[str]:
@@ -167,10 +135,6 @@ def _facts(table: Table) -> list[str]:
 def _short(text: str) -> str:
     """Cut a digest to its short name."""
     return short(text) if re.fullmatch(r"[0-9a-f]{32,128}", text) else text
-
-
-def _caption(sentences: Sequence[str]) -> str:
-    return rf"\caption{{{'. '.join(escape(s).rstrip('.') for s in sentences)}.}}"
 
 
 def _below(table: Table, cells: Iterable[Cell]) -> list[str]:
@@ -220,6 +184,10 @@ def _pair(pair: tuple[float, float] | None, digits: int) -> str:
 
 def _p(p: float) -> str:
     return "< 0.001" if p < 0.001 else f"= {p:.3g}"
+
+
+def _math(text: str) -> str:
+    return f"${text}$" if text else "--"
 
 
 def _marks(cell: Cell) -> str:

@@ -10,7 +10,7 @@ import json
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
-from palpate.report.notes import HINTS, HOW_TO_READ, sentence
+from palpate.report.notes import HOW_TO_READ, sentence
 from palpate.report.results import Results
 from palpate.report.sentences import purpose, summary_lines
 from palpate.report.tables import BEST, Table, score_tables, settings_of, table_facts
@@ -31,17 +31,13 @@ def render_markdown(results: Results) -> str:
         lines += ["## Read this first", "", *_items(map(sentence, results.notes))]
     tables = [line for table in score_tables(results.scores) for line in _scores(table)]
     sections = {
-        "scores": ("Scores", [HOW_TO_READ, "", *tables] if tables else []),
-        "audits": (
-            "Leakage audit",
-            [line for a in results.audits for line in _fenced(audit_text(a))],
-        ),
-        "settings": ("Settings and digests", _tree(settings_of(results))),
-        "commands": ("Commands", _fenced("\n".join(results.commands), "sh")),
+        "Scores": [HOW_TO_READ, "", *tables] if tables else [],
+        "Leakage audit": [line for a in results.audits for line in _fenced(audit_text(a))],
+        "Settings and digests": _tree(settings_of(results)),
+        "Commands": _fenced("\n".join(results.commands), "sh"),
     }
-    for name, (title, body) in sections.items():
-        hint, command = HINTS[name]
-        lines += [f"## {title}", "", *(body or [f"{hint} See {code(command)}."]), ""]
+    for title, body in sections.items():
+        lines += [f"## {title}", "", *body, ""] if body else []
     return "\n".join(lines).rstrip() + "\n"
 
 

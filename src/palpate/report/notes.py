@@ -14,16 +14,8 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from palpate.core import Note, SampleRef
+from palpate.core import Note, SampleRef, few
 
-#: What to run to fill an empty section of a page.
-HINTS = {
-    "gallery": ("No generated tactile image is in these results.", "palpate generate --help"),
-    "scores": ("Nothing was scored in these results.", "palpate score --help"),
-    "audits": ("No split was audited in these results.", "palpate audit --help"),
-    "commands": ("No command was recorded with these results.", "palpate --help"),
-    "settings": ("No settings were recorded with these results.", "palpate --help"),
-}
 #: What every reader of scores needs to know.
 HOW_TO_READ = (
     "Arrows give the better direction: for TMMD, FID, KID, CMMD and LPIPS lower is better; for "
@@ -34,8 +26,6 @@ HOW_TO_READ = (
     "The null band is where a meaningless difference would fall: a score inside it says nothing, "
     "and two scores whose intervals overlap widely are not distinguished."
 )
-#: Names in a sentence; the others are counted.
-NAMES = 5
 
 
 def count(value: int | None) -> str:
@@ -84,12 +74,6 @@ def score_text(value: float) -> str:
 def plural(n: int, singular: str, many: str | None = None) -> str:
     """Return ``"1 video"``, ``"1,234 videos"``; ``many`` where the plural is irregular."""
     return f"{n:,} {singular if n == 1 else many or singular + 's'}"
-
-
-def few(names: Sequence[str]) -> str:
-    """Return ``"a, b, c, d, e and 3 more"``."""
-    more = len(names) - NAMES
-    return ", ".join(names[:NAMES]) + (f" and {more} more" if more > 0 else "")
 
 
 def where(sample: SampleRef) -> str:
@@ -236,13 +220,8 @@ METRICS: dict[str, Sentence] = {
 }
 
 
-def _few(names: Sequence[Any]) -> str:
-    """The first names in brackets, if there are any."""
-    return f" ({'; '.join(map(str, names))})" if names else ""
-
-
 def _rows_skipped(params: Mapping[str, Any], _: Style) -> str:
-    return f"{params['count']} bad rows were skipped{_few(params['problems'][:3])}"
+    return f"{params['count']} bad rows were skipped ({few(params['problems'])})"
 
 
 def _blank_images(params: Mapping[str, Any], _: Style) -> str:
@@ -342,7 +321,7 @@ def _listed(template: str) -> Sentence:
 
 LEAKAGE: dict[str, Sentence] = {
     "backgrounds-unreadable": lambda p, _: (
-        f"{p['count']} background images cannot be read{_few(p['files'])}; their tactile images "
+        f"{p['count']} background images cannot be read ({few(p['files'])}); their tactile images "
         "were compared as they are"
     ),
     "blank-images": _blank_images,
@@ -371,7 +350,7 @@ LEAKAGE: dict[str, Sentence] = {
     "images-of-one-part": "Only one part has {modality} images: they were not compared",
     "images-unreadable": lambda p, _: (
         f"{p['count']} {p['modality']} images cannot be read and were not "
-        f"compared{_few(p['files'])}"
+        f"compared ({few(p['files'])})"
     ),
     "impact-not-by": "What known {group}s are worth could not be measured: {reason}",
     "impact-of-nothing": (
@@ -434,13 +413,6 @@ def confidence(share: float) -> str:
     return "> 99.9 %" if share > 0.999 else "< 0.1 %" if share < 0.001 else f"{100 * share:.1f} %"
 
 
-def _ahead(params: Mapping[str, Any], _: Style) -> str:
-    p = params["p_adjusted"]
-    holm = "" if p is None else ", Holm p < 1e-15" if p < 1e-15 else f", Holm p = {p:.2g}"
-    share = confidence(params["confidence"])
-    return f"{params['better']} is better with {share} confidence{holm}"
-
-
 def _materials_excluded(params: Mapping[str, Any], _: Style) -> str:
     materials = "; ".join(f"{m} ({why})" for m, why in sorted(params["materials"].items()))
     return f"Excluded ({len(params['materials'])} of {params['total']} materials): {materials}"
@@ -496,7 +468,6 @@ EVALUATION: dict[str, Sentence] = {
         "The validation part of the given split is excluded; the leak-free splits are made of its "
         "train and test samples"
     ),
-    "ahead": _ahead,
     "below-floor": (
         "{metric}, {subject}: below the floor of real images, so these vary less than real "
         "ones do; that is not better"
@@ -523,6 +494,31 @@ EVALUATION: dict[str, Sentence] = {
         "The {modality} encoder was trained on {dataset}: it may have seen the images that it "
         "judges here"
     ),
+    "pretraining-sets": (
+        "The {modality} encoder was trained on {sets}, without a list of the images: if these are "
+        "of one of them, it may have seen them"
+    ),
+    "aligned": lambda *_: (
+        "The generator was trained to agree with the encoder that scores it: the score flatters it"
+    ),
+    "chosen": lambda p, _: (
+        f"Each of these images is the best of {p['n']} by a tactile encoder"
+        + (", the same that scores them: the score is of its own choice" if p["same"] else "")
+    ),
+    "text-cut": (
+        "The text has {tokens} tokens, of which its encoder reads {most}: the words at its end "
+        "have no effect"
+    ),
+    "gel-contact": (
+        "{gel} looks like a contact, or like no image of a gel: a smooth fit leaves {left:.1f} "
+        "gray levels of its colors, and under 4 of a gel that nothing touches. The images are made "
+        "on it all the same"
+    ),
+    "gel-sensor": (
+        "{gel} is lit from other sides than the gels that the generator knows: a sensor of another "
+        "kind, on which its contacts are implausible"
+    ),
+    "gel-small": "{gel} is {side} px wide and was enlarged to {size}",
     "encoder-license": lambda p, _: (
         f"The {p['modality']} encoder is {p['name']}, whose license is "
         + ("not stated: see its page" if p["license"] == "unknown" else p["license"])
@@ -563,7 +559,6 @@ EVALUATION: dict[str, Sentence] = {
         "them with {arg:sigma=multi}"
     ),
     "widened": "The features in {source}: {type} was widened to float32; its rounding stays",
-    "within-bound": "Within {bound:.2g} of the exact value, as the bandwidth is narrow for moments",
 }
 
 
@@ -654,7 +649,101 @@ OTHER: dict[str, Sentence] = {
         "audits say of leaks does not apply to them"
     ),
 }
-SENTENCES: dict[str, Sentence] = METRICS | LEAKAGE | EVALUATION | CAPTIONS | OTHER
+#: Rule of a study -> what an excluded rater did.
+RULES = {
+    "catches": "answered {value} of the catch trials right, less than {limit}",
+    "finished": "answered {value} of the trials, less than {limit}",
+    "side": "chose one side in more than {limit} of the votes for a side",
+}
+
+
+def _rater_excluded(p: Mapping[str, Any], _: Style) -> str:
+    value, limit = percent(p["value"] or 0.0), percent(p["limit"])
+    what = RULES[p["rule"]].format(value=value, limit=limit)
+    return f"Rater {p['rater']} is excluded by the rule {p['rule']}, fixed before the votes: {what}"
+
+
+def _human_agreement(p: Mapping[str, Any], _: Style) -> str:
+    def known(name: str, write: Callable[[float], str]) -> str:
+        return "not known" if p[name] is None else write(p[name])
+
+    together = (
+        f"Raters agree in {known('agree', percent)} of their common trials (Cohen's kappa "
+        f"{known('kappa', number)}, Krippendorff's alpha {known('alpha', number)})"
+    )
+    parts = [
+        together
+        if p["agree"] is not None
+        else "No two raters answered the same trial: whether raters agree is not known",
+        *[f"with themselves in {percent(p['self'])} of {plural(p['repeats'], 'repeat')}"]
+        * bool(p["repeats"]),
+    ]
+    if p["left"] is not None:
+        parts.append(
+            f"{percent(p['left'])} of {p['sides']:,} votes for a side are for the left "
+            f"(p = {number(p['p_left'])})"
+        )
+    return "; ".join(parts)
+
+
+PREFERENCE: dict[str, Sentence] = {
+    "rater-excluded": _rater_excluded,
+    "human-agreement": _human_agreement,
+    "these-raters": lambda p, _: (
+        f"For {'these' if p['count'] > 1 else 'this'} {plural(p['count'], 'rater')} only: "
+        "intervals resample items, and say nothing about other people. Read as intervals of people "
+        "at large, those of 40 items and two raters cover 73 % instead of 95 % in simulated "
+        "studies; invite five raters or more, better ten"
+    ),
+    "votes-agree": lambda p, _: (
+        "The votes do not vary: no resampled interval. The bound is of Clopper and Pearson, with "
+        f"{plural(p['items'], 'item')} as the sample"
+    ),
+    "one-item": "One item is no sample: no interval",
+    "strength-of-prior": (
+        "All votes between some methods agree: how far apart their strengths are is the prior's, "
+        "N(0, 3^2) in logits, not the votes'"
+    ),
+    "materials-unshown": (
+        "{count} of {of} materials were answers but not shown: their accuracy is not known; more "
+        "items show them"
+    ),
+    "few-raters": (
+        "{count} raters are few to say how much people differ; invite five or more, better ten"
+    ),
+    "votes-twice": lambda p, _: f"{plural(p['count'], 'vote')} given twice count once",
+    "votes-differ": lambda p, _: (
+        f"{plural(p['count'], 'trial')} answered twice by one rater with different answers: the "
+        "later one counts. Did two people use one code?"
+    ),
+    "votes-late": lambda p, _: (
+        f"{plural(p['count'], 'vote')} after the end of the study are skipped"
+    ),
+    "clock-backwards": lambda p, _: (
+        f"The clock of {plural(p['count'], 'rater')} ran backwards between two votes; how long a "
+        "vote took comes from another clock"
+    ),
+    "items-left-out": lambda p, _: (
+        f"{p['name']}: {plural(p['missing'], 'item')} of the reference without an image, and "
+        f"{plural(p['unknown'], 'image')} without an item, are left out"
+    ),
+    "videos-unknown": "No video is known: every image counts as one of its own",
+    "materials-unknown": "No material is known: items are a random sample",
+    "one-video-classes": lambda p, _: (
+        f"Of {few(p['materials'])} there is one video, and so one item at most"
+    ),
+    "one-video-materials": lambda p, _: (
+        f"{few(p['materials'])} cannot be sorted: the examples would show the only video"
+    ),
+    "sampled-items": (
+        "{n} items are a sample of {candidates:,} images of {videos:,} videos, at most one a video"
+    ),
+    "fewer-items": (
+        "{n} items instead of {wanted}: there are {candidates:,} images of {videos:,} videos, and "
+        "a video gives one"
+    ),
+}
+SENTENCES: dict[str, Sentence] = METRICS | LEAKAGE | EVALUATION | CAPTIONS | PREFERENCE | OTHER
 
 
 def sentence(note: Note, style: Style = PYTHON) -> str:

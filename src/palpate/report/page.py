@@ -1,18 +1,21 @@
-"""The page: results -> one HTML file that needs no network, no script and no other file.
+"""The page: results -> one HTML file that needs no network and no other file.
 
-Jinja2 with escaping draws ``templates/page.html.j2``; the style sheet is inlined; a
-Content-Security-Policy in the page forbids every request. Images are ``data:`` URIs that fit what
-the text leaves of ``max_bytes``.
+Jinja2 with escaping draws ``templates/page.html.j2``; style sheet and script (copy buttons, larger
+images) are inlined; a Content-Security-Policy in the page forbids every request and every other
+script. Images are ``data:`` URIs that fit what the text leaves of ``max_bytes``.
 """
 
 from __future__ import annotations
 
+import base64
+import datetime
+import hashlib
 import re
 from collections import defaultdict
 from collections.abc import Hashable, Mapping, Sequence
 from functools import cache
 from importlib import resources
-from itertools import zip_longest
+from itertools import compress, zip_longest
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -21,29 +24,35 @@ from markupsafe import Markup, escape
 
 from palpate import __version__
 from palpate.core import PalpateError, Progress, SampleRef, plain, quiet, write_json, write_text
-from palpate.report import audits, plots, sentences
-from palpate.report.notes import (
-    HINTS,
-    HOW_TO_READ,
-    confidence,
-    count,
-    number,
-    percent,
-    plural,
-    sentence,
-    where,
-)
+from palpate.report import audits, first_screen, plots, sentences
+from palpate.report.notes import confidence, count, number, percent, plural, sentence, where
 from palpate.report.results import GalleryItem, LeakPair, Results, Strip
 from palpate.report.tables import heat_tables, score_tables, settings_of, table_facts
 from palpate.report.thumbnails import Album, Wanted, fit
 
+#: Samples of the first screen; their images take at most a third of the bytes.
+HERO_ROWS = 3
 #: Gallery rows and pairs of one list that show at once, and that the page holds at all.
-OPEN_ROWS, MAX_ROWS = 40, 160
+OPEN_ROWS, MAX_ROWS = 8, 160
 OPEN_PAIRS, MAX_PAIRS = 6, 24
 #: A list in the settings is cut here; the JSON keeps it whole.
 LONG_LIST = 24
 _DIGEST = re.compile(r"(?:sha256:)?[0-9a-f]{32,128}")
-_NUMBER = re.compile(r"(?<![\w.,])[−-]?\d[\d,]*(?:\.\d+)?(?:\s?%)?(?!\w|-[A-Za-z])")
+#: What to cite: palpate, and the paper whose splits, metrics and generator it implements.
+CITATIONS = (
+    """@software{palpate,
+  title   = {palpate: tactile images from photos, splits that do not leak, scores with intervals},
+  author  = {{The palpate developers}},
+  version = {VERSION}
+}""".replace("VERSION", __version__),
+    """@inproceedings{gungor2025towards,
+  title     = {Towards Generalization of Tactile Image Generation:
+               Reference-Free Evaluation in a Leakage-Free Setting},
+  author    = {Gungor, C. and Eppinger, D. and Kovashka, A.},
+  booktitle = {Proceedings of the IEEE/CVF International Conference on Computer Vision (ICCV)},
+  year      = {2025}
+}""",
+)
 
 
 class ReportFiles(NamedTuple):
@@ -59,7 +68,7 @@ def write_report(
     page: Path,
     *,
     base: Path | None = None,
-    max_bytes: int = 10_000_000,
+    max_bytes: int = 1_500_000,
     progress: Progress = quiet,
 ) -> ReportFiles:
     """Write ``page`` (HTML) and, next to it, the same results as ``.json`` and ``.md``.
@@ -101,60 +110,75 @@ def render_page(
     names: Sequence[str] = (),
     progress: Progress = quiet,
 ) -> str:
-    """Return the whole page as HTML.
-
-    Args:
-        results: what to draw.
-        base: folder that relative image paths start from.
-        max_bytes: the page's largest size in UTF-8.
-        names: names of the files written next to the page, for the footer.
-        progress: called while images are made.
+    """Return the whole page as HTML of at most ``max_bytes``; ``names`` are files for the footer.
 
     Raises:
         PalpateError: if scores of different settings would share a column, or the text alone is
             larger than ``max_bytes``.
     """
     rows, essential = image_rows(results)
-    hidden = ("matrix", "labels", "classes")
+    tables = score_tables(results.scores)
+    columns = first_screen.telling_columns(tables)
+    cards = first_screen.cards(results, columns)
+    samples = _gallery_images(results.gallery)
+    hero_rows: dict[Hashable, list[Wanted]] = {
+        id(item): images for item, images in samples[:HERO_ROWS]
+    }
+    script = _template("page.js")
+    date = datetime.datetime.now(datetime.UTC).date().isoformat()
     fixed = {
         "results": results,
-        "purpose": sentences.purpose(results),
-        "facts": list(results.facts) or sentences.summary_lines(results),
-        "tables": score_tables(results.scores),
+        "about": first_screen.about(results, date, __version__),
+        "purpose": _lede(results),
+        "facts": list(results.facts) or ([] if cards else sentences.summary_lines(results)),
+        "cards": cards,
+        "row_labels": [wanted.label for wanted in samples[0][1]] if samples else [],
+        "tables": tables,
+        "columns": columns,
+        "verdict": first_screen.verdict(columns),
+        "folded": len(tables) > 1,
+        "reading": first_screen.annotated(tables),
         "heats": heat_tables(results.scores),
-        "details": [
-            (s, plain({k: v for k, v in s.details.items() if k not in hidden}))
-            for s in results.scores
-        ],
         "settings": settings_of(results),
+        "citations": CITATIONS,
         "style": Markup(_template("style.css")),
+        "script": Markup(script),
+        "script_hash": _hash(script),
         "names": names,
         "version": __version__,
     }
 
-    def draw(album: Album) -> str:
-        notes = [*map(sentence, results.notes), *_album_notes(album, len(rows))]
-        page = environment().get_template("page.html.j2")
-        return page.render(
-            **fixed,
-            notes=notes,
-            images=album.rows,
-            gallery=_gallery(results, album),
-            strips=[
-                (strip, album.rows[id(strip)])
-                for strip in results.strips
-                if id(strip) in album.rows
-            ],
+    def draw(first: Album, album: Album) -> str:
+        hero, gallery = (
+            [(item, a.rows[id(item)]) for item, _ in samples if id(item) in a.rows]
+            for a in (first, album)
+        )
+        everything = Album({**first.rows, **album.rows}, album.side)
+        notes = [sentence(note) for note in results.notes]
+        notes += _album_notes(everything, len(hero_rows) + len(rows))
+        return (
+            environment()
+            .get_template("page.html.j2")
+            .render(
+                **fixed,
+                notes=notes,
+                hero=hero,
+                images=album.rows,
+                gallery=(gallery[:OPEN_ROWS], gallery[OPEN_ROWS:]),
+                shown=len(hero) + len(gallery),
+                strips=[(s, album.rows[id(s)]) for s in results.strips if id(s) in album.rows],
+            )
         )
 
-    bare = len(draw(Album({}, 0)).encode())
+    bare = len(draw(Album({}, 0), Album({}, 0)).encode())
     if bare > max_bytes:
         must = f"must hold at least the text of the page ({bare:,} bytes)"
         fix = f"Allow {2 * bare:,}"
         raise PalpateError(must, f"{max_bytes:,}", fix, argument="max_bytes")
-    budget = max_bytes - bare
+    first = fit(hero_rows, base, (max_bytes - bare) // 3, HERO_ROWS)
+    budget = max_bytes - len(draw(first, Album({}, 0)).encode())
     while True:
-        html = draw(fit(rows, base, budget, essential, progress))
+        html = draw(first, fit(rows, base, budget, essential, progress))
         if (excess := len(html.encode()) - max_bytes) <= 0:
             return html
         budget -= excess + 1_000
@@ -178,10 +202,10 @@ def image_rows(results: Results) -> tuple[dict[Hashable, list[Wanted]], int]:
         for a, k, members, head in lists:
             if rank < len(members):
                 target[a, k, rank] = _pair_images(members[rank], head)
-    gallery = [(id(i), _gallery_images(i)) for i in in_turns(results.gallery)[:MAX_ROWS]]
+    gallery = [(id(i), w) for i, w in _gallery_images(results.gallery)[HERO_ROWS:MAX_ROWS]]
     strips = [(id(strip), _strip_images(strip)) for strip in results.strips]
-    first = [*pairs.items(), *gallery[:OPEN_ROWS], *strips]
-    return dict([*first, *folded_pairs.items(), *gallery[OPEN_ROWS:]]), len(first)
+    first = [*gallery[:OPEN_ROWS], *pairs.items(), *strips]
+    return dict([*first, *gallery[OPEN_ROWS:], *folded_pairs.items()]), len(first)
 
 
 def _pair_images(pair: LeakPair, head: str) -> list[Wanted]:
@@ -201,17 +225,25 @@ def _pair_images(pair: LeakPair, head: str) -> list[Wanted]:
     ]
 
 
-def _gallery_images(item: GalleryItem) -> list[Wanted]:
-    sample = item.sample
-    name = f"{sample.material or 'sample'}, {where(sample)}"
-    images = [
-        Wanted(sample.vision, f"Photo: {name}", "Photo"),
-        Wanted(sample.tactile, f"Real tactile image: {name}", "Real"),
-        Wanted(item.generated, f"Generated tactile image: {name}", "Generated"),
-    ]
-    if item.background is not None:
-        images.append(Wanted(item.background, f"Sensor without contact: {name}", "No contact"))
-    return images
+def _gallery_images(gallery: Sequence[GalleryItem]) -> list[tuple[GalleryItem, list[Wanted]]]:
+    """Every sample with its images, materials in turn; a column that no sample has is skipped.
+
+    Where a background is known, the contacts follow: without the background, amplified.
+    """
+    rows: list[tuple[GalleryItem, list[Wanted]]] = []
+    for item in in_turns(gallery):
+        sample, background = item.sample, item.background or item.sample.background
+        name = f"{sample.material or 'sample'}, {where(sample)}"
+        tactile = (("Real", sample.tactile), ("Generated", item.generated))
+        images = [Wanted(sample.vision, f"Photo: {name}", "Photo")]
+        images += [Wanted(p, f"{kind} tactile image: {name}", kind) for kind, p in tactile]
+        images += [
+            Wanted(p and background and p, f"{kind} contact: {name}", f"{kind} contact", background)
+            for kind, p in tactile
+        ]
+        rows.append((item, images))
+    known = [any(images[k].path for _, images in rows) for k in range(5)] if rows else []
+    return [(item, list(compress(images, known))) for item, images in rows]
 
 
 def _strip_images(strip: Strip) -> list[Wanted]:
@@ -244,16 +276,12 @@ def in_turns(items: Sequence[GalleryItem]) -> list[GalleryItem]:
     return [item for turn in zip_longest(*queues.values()) for item in turn if item is not None]
 
 
-def _gallery(results: Results, album: Album) -> list[dict[str, list[Any]]]:
-    """The gallery rows that fit, by material, as (item, images): those open, and those folded."""
-    shown = [item for item in in_turns(results.gallery) if id(item) in album.rows]
-    groups: list[dict[str, list[Any]]] = []
-    for items in (shown[:OPEN_ROWS], shown[OPEN_ROWS:]):
-        by_material: defaultdict[str, list[Any]] = defaultdict(list)
-        for item in items:
-            by_material[material_of(item.sample)].append((item, album.rows[id(item)]))
-        groups.append(dict(sorted(by_material.items(), key=lambda pair: pair[0].casefold())))
-    return groups
+def _lede(results: Results) -> str:
+    """What the page shows; of audits alone, the question that the split asks."""
+    lines = (
+        [] if results.scores or results.gallery else map(sentences.question_line, results.audits)
+    )
+    return next(filter(None, lines), "") or sentences.purpose(results)
 
 
 def _album_notes(album: Album, wanted: int) -> list[str]:
@@ -276,6 +304,11 @@ def _template(name: str) -> str:
     return (resources.files("palpate.report") / "templates" / name).read_text(encoding="utf-8")
 
 
+def _hash(script: str) -> str:
+    """What a Content-Security-Policy names an inline script by."""
+    return f"sha256-{base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()}"
+
+
 @cache
 def environment() -> Environment:
     """Return Jinja2 with escaping on and unknown names as errors."""
@@ -288,21 +321,20 @@ def environment() -> Environment:
         auto_reload=False,
     )
     functions: dict[str, Any] = {
-        "hints": HINTS,
-        "how_to_read": HOW_TO_READ,
         "open_pairs": OPEN_PAIRS,
         "table_facts": table_facts,
         "long_list": LONG_LIST,
+        "READING": first_screen.READING,
         "like_rows": _like_rows,
     }
-    for module in (audits, plots, sentences):
+    for module in (audits, first_screen, plots, sentences):
         functions |= {k: v for k, v in vars(module).items() if callable(v)}
     env.globals.update(functions)
     words: dict[str, Any] = {"count": count, "number": number}
     words |= {"percent": percent, "plural": plural}
     env.filters.update(words)
     env.filters.update(
-        emphasize=_emphasize,
+        label=lambda key: str(key).replace("_", " "),
         leaf=_leaf,
         plain=plain,
         unbroken=_unbroken,
@@ -317,17 +349,8 @@ def _unbroken(line: str) -> str:
     return re.sub(r"(?<=\d) %", "\u00a0%", line)
 
 
-def _emphasize(line: str) -> Markup:
-    """Return the line, escaped, with its first number marked."""
-    line = _unbroken(line)
-    match = _NUMBER.search(line)
-    if match is None:
-        return escape(line)
-    return Markup("{}<b>{}</b>{}").format(line[: match.start()], match.group(), line[match.end() :])
-
-
 def _leaf(value: Any) -> Markup:
-    """Return a setting's value; the first twelve digits of a digest (its short name) stand out."""
+    """Return a setting's value; of a digest the first twelve digits, its short name."""
     if value is None:
         return Markup('<span class="none">none</span>')
     if isinstance(value, bool):
@@ -336,8 +359,7 @@ def _leaf(value: Any) -> Markup:
         return escape(f"{value:g}" if isinstance(value, float) else f"{value}")
     words = str(value)
     if _DIGEST.fullmatch(words):
-        cut = words.find(":") + 13
-        return Markup('<code class="digest"><b>{}</b>{}</code>').format(words[:cut], words[cut:])
+        return Markup("<code>{}</code>").format(words[: words.find(":") + 13])
     is_path = "/" in words or "\\" in words
     return Markup("<code>{}</code>").format(words) if is_path else escape(words)
 

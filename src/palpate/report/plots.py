@@ -33,11 +33,12 @@ class Axis:
     high: float
     ticks: Sequence[float]
     digits: int
+    width: float = WIDTH
 
     def x(self, value: float) -> float:
         """Return pixels from the left edge; values outside are put on the edge."""
         share = (value - self.low) / (self.high - self.low)
-        return round(PAD + min(1.0, max(0.0, share)) * (WIDTH - 2 * PAD), 2)
+        return round(PAD + min(1.0, max(0.0, share)) * (self.width - 2 * PAD), 2)
 
 
 def nice_step(span: float, parts: int) -> float:
@@ -104,7 +105,7 @@ def bar(
     if axis is None:
         return Markup("")
     mid = HEIGHT / 2
-    parts = [f'<line class="rail" x1="{PAD}" x2="{WIDTH - PAD}" y1="{mid}" y2="{mid}"/>']
+    parts = [f'<line class="rail" x1="{PAD}" x2="{axis.width - PAD}" y1="{mid}" y2="{mid}"/>']
     if null:
         a, b = sorted(map(axis.x, null))
         parts.append(
@@ -119,21 +120,28 @@ def bar(
         parts.append(f'<path class="interval" d="M{a} {mid}H{b}M{a} {mid - 4}v8M{b} {mid - 4}v8"/>')
     if value is not None:
         parts.append(f'<circle class="value" cx="{axis.x(value)}" cy="{mid}" r="4"/>')
-    return _svg("bar", WIDTH, HEIGHT, parts)
+    return _svg("bar", axis.width, HEIGHT, parts)
+
+
+def share_bar(share: float) -> Markup:
+    """Draw a share in [0, 1] as a bar as wide as its place; a leak of any size can be seen."""
+    rail = '<rect class="rest" width="100%" height="10" rx="2"/>'
+    leak = f'<rect class="leaked" width="{max(100 * share, 0.8):.3f}%" height="10" rx="2"/>'
+    return _svg("share", "100%", 10, [rail, leak] if share > 0 else [rail])
 
 
 def axis_row(axis: Axis | None) -> Markup:
     """Draw the labeled axis below a column of bars."""
     if axis is None:
         return Markup("")
-    parts = [f'<line class="rail" x1="{PAD}" x2="{WIDTH - PAD}" y1="1" y2="1"/>']
+    parts = [f'<line class="rail" x1="{PAD}" x2="{axis.width - PAD}" y1="1" y2="1"/>']
     for tick in axis.ticks:
         x, text = axis.x(tick), number(tick, axis.digits)
         half = 3.6 * len(text)  # of the label at 12 px
-        label = min(max(x, half), WIDTH - half)
+        label = min(max(x, half), axis.width - half)
         parts.append(f'<line class="tick" x1="{x}" x2="{x}" y1="1" y2="5"/>')
         parts.append(f'<text x="{label:.2f}" y="17" text-anchor="middle">{text}</text>')
-    return _svg("bar axis", WIDTH, 20, parts)
+    return _svg("bar axis", axis.width, 20, parts)
 
 
 def _svg(

@@ -130,6 +130,7 @@ class ImpactRow:
             fewer than two.
         chance: 1 / materials.
         group: the column that the leak-free splits keep whole; '' in files of earlier versions.
+        seen: whether the encoder of the features was trained on some of the samples.
     """
 
     features: str
@@ -142,6 +143,7 @@ class ImpactRow:
     cost_interval: tuple[float, float] | None
     chance: float
     group: str = ""
+    seen: bool = False
 
 
 @dataclass(frozen=True)

@@ -44,8 +44,6 @@ KINDS: tuple[tuple[str, str, str], ...] = (
         "have a near-duplicate tactile image in {data}",
     ),
 )
-#: Causes of similar images that are no leak.
-HARMLESS = {"nothing touched": "they show no contact, and were not compared"}
 
 
 def data_of(audit: Audit) -> str:
@@ -82,15 +80,6 @@ def cause_texts(signal: Signal) -> list[str]:
     ]
 
 
-def cause_notes(signal: Signal) -> list[str]:
-    """Return a sentence for each cause that is no leak."""
-    return [
-        f"{plural(signal.causes[cause], 'test sample')} ({cause}): {why}."
-        for cause, why in HARMLESS.items()
-        if signal.causes.get(cause)
-    ]
-
-
 def signal_notes(audit: Audit) -> list[tuple[str, Note]]:
     """Return the notes of signals, each once, with the kinds that have it."""
     kinds: dict[str, list[str]] = {}
@@ -113,24 +102,6 @@ def chance_text(signal: Signal) -> str:
         known = signal.measured is not None
         facts.append(rates + (f", measured {percent(signal.measured or 0.0)}" if known else ""))
     return words + (f" ({'; '.join(facts)})" if facts else "")
-
-
-def threshold_line(signal: Signal) -> str:
-    """Return how the threshold was set, and how many samples are at or above it."""
-    if signal.verdict == CANNOT_TELL:
-        return "Which similarity is chance is not known: the most similar pairs are listed."
-    line = f"The threshold is a score of {score_text(signal.threshold)}"
-    share = percent(signal.fraction)
-    verb = "is" if signal.flagged == 1 else "are"
-    samples = plural(signal.checked, "test sample")
-    line += f". {count(signal.flagged)} of {samples} ({share}) {verb} at or above it"
-    if signal.expected is None or signal.false_positives is None:
-        return f"{line}."
-    line += f", where chance explains {number(signal.expected)} ({percent(signal.false_positives)}"
-    if signal.measured is not None:
-        line += f"; measured on train images of other videos {percent(signal.measured)}"
-    verdicts = {"leaks": "more than chance explains", "none": "no more than chance explains"}
-    return f"{line}): {verdicts[signal.verdict]}." if signal.verdict else f"{line})."
 
 
 #: Why it is not known whether a split leaks.
@@ -210,16 +181,11 @@ def audit_line(audit: Audit) -> str:
 def purpose(results: Results) -> str:
     """Return one sentence that says what the page is."""
     parts: list[str] = []
-    if any(family_of(score.metric).title == "Captions" for score in results.scores):
+    families = {family_of(score.metric).title for score in results.scores}
+    probed = families and not results.gallery and families <= {"Recognition", "Retrieval"}
+    if "Captions" in families:
         parts.append("what captions give away about their labels, and whether they can be used")
-    elif results.strips or (
-        results.scores
-        and not results.gallery
-        and all(
-            family_of(score.metric).title in ("Recognition", "Retrieval")
-            for score in results.scores
-        )
-    ):
+    elif results.strips or probed:
         parts.append(
             "what an encoder's embeddings know of a sample: its class, its text, its image"
         )

@@ -35,6 +35,17 @@ class Family:
 #: The first family whose parts match takes a metric.
 FAMILIES = (
     Family(
+        "People",
+        "Which images do people find closer to the real ones, ties as half a vote, and which "
+        "materials do they recognize?",
+        ("human ",),
+    ),
+    Family(
+        "Agreement of metrics with people",
+        "Kendall's tau-b: 1 orders images or methods as people do, 0 has nothing to do with it.",
+        ("tau with people",),
+    ),
+    Family(
         "Tactile features",
         "Are generated and real images similar to a tactile encoder? I-, CI- and D-TMMD need no "
         "reference images.",
@@ -242,7 +253,7 @@ def family_of(metric: str) -> Family:
 
 def notes_of(score: Score) -> list[Note]:
     """Return what a reader must know of a score: its notes, and what follows from its fields."""
-    notes = [note for note in score.notes if note.code != "ahead"]  # the table has columns for it
+    notes = [note for note in score.notes if note.code != "ahead"]  # of earlier versions
     if excluded := score.details.get("excluded"):
         notes.append(Note("excluded-classes", {"excluded": excluded}))
     if score.higher_is_better is None and score.details.get("gap") is not None:
@@ -458,18 +469,13 @@ def _made(column: Sequence[Score]) -> list[tuple[str, str]]:
 
 def settings_of(results: Results) -> dict[str, Any]:
     """Return the settings of results, with the digest of each subject's reference images."""
-    references: dict[str, list[str]] = {}
+    references: dict[str, dict[str, None]] = {}
     for score in results.scores:
         if score.reference and not score.metric.endswith(DIFFERENCE):
-            known = references.setdefault(score.subject, [])
-            known += [] if score.reference in known else [score.reference]
-    subjects: dict[str, list[str]] = {}
-    for subject, digests in references.items():
-        subjects.setdefault(", ".join(digests), []).append(subject)
+            references.setdefault(score.subject, {})[score.reference] = None
     settings: dict[str, Any] = plain(results.settings)
-    if subjects:
-        by_subject = {", ".join(names): digests for digests, names in subjects.items()}
-        settings["reference images"] = by_subject
+    if references:
+        settings["reference images"] = {name: ", ".join(d) for name, d in references.items()}
     return settings
 
 

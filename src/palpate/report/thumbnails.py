@@ -1,8 +1,9 @@
 """Thumbnails as ``data:`` URIs that fit a budget of bytes.
 
-Images of at most 96 pixels stay lossless PNG (the page magnifies them without smoothing), larger
-ones become JPEG. Where the whole does not fit, first the images shrink, then the last rows are
-skipped. An image that is missing or broken keeps its place and its name.
+Images of at most 96 pixels stay without loss (WebP; the page magnifies them without smoothing),
+larger ones become JPEG. Where the whole does not fit, first the small ones become JPEG, then all
+shrink, then the last rows are skipped. An image that is missing or broken keeps its place and its
+name.
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ from PIL import Image, ImageFilter, ImageOps
 from palpate.core import Progress, quiet, track
 
 TINY = 96
-#: (longest side in pixels, JPEG quality), best first.
+#: (longest side in pixels, quality), best first.
 SIZES = ((256, 88), (192, 86), (160, 84), (128, 82), (96, 78), (64, 72), (48, 64), (32, 60))
 #: Below this side, rows that are folded anyway are skipped before images shrink further.
 KEEP_ALL = 128
@@ -125,11 +126,11 @@ def thumbnail(
         if less is not None:
             image = amplified(image, base / less if less else None)
         data = io.BytesIO()
-        if kind := "png" if tiny and side >= KEEP_ALL else "":
-            image.save(data, kind, optimize=True)
-        else:
-            kind = "jpeg"
-            image.save(data, kind, quality=quality, subsampling=0 if quality >= 86 else 2)
+        exact = tiny and side == SIZES[0][0] and less is None
+        kind = "webp" if exact else "jpeg"
+        image.save(
+            data, kind, lossless=exact, quality=quality, subsampling=0 if quality >= 86 else 2
+        )
     except FileNotFoundError:
         return Thumbnail(problem="file missing")
     except Exception:  # a damaged file makes PIL raise almost anything

@@ -11,7 +11,6 @@ from palpate.sim.materials import MATERIALS, Material, Surface
 from palpate.sim.options import VERSION, WorldOptions, load_options
 from palpate.sim.plan import VideoPlan, plan_world
 from palpate.sim.presets import DEFAULT, MINI_SEEDS, PRESETS, SEEN_WARNING, seen_by_mini
-from palpate.sim.sheet import render_sheet
 from palpate.sim.tile import Tile
 from palpate.sim.video import Video
 from palpate.sim.world import World
@@ -34,7 +33,6 @@ __all__ = [
     "WorldRecord",
     "load_options",
     "plan_world",
-    "render_sheet",
     "seen_by_mini",
     "write_world",
 ]

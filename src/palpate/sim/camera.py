@@ -73,10 +73,8 @@ def make_camera(options: WorldOptions, video: int) -> Camera:
         (near + far) / 2.0 + draw(-0.5, 0.5) * (far - near) * min(1.0, 0.4 + 0.6 * scale)
     )
     hand, hand_from = happens(options.hand), draw(0.0, circle)
-    shadow, shadow_at = (
-        happens(options.shadow),
-        (draw(0.0, math.pi), draw(-0.6, 0.6), draw(0.35, 0.75)),
-    )
+    shadow = happens(options.shadow)
+    shadow_at = (draw(0.0, math.pi), draw(-0.6, 0.6), draw(0.35, 0.75))
     edge, edge_at = happens(options.edge), (draw(0.0, circle), draw(0.25, 0.75))
     bare = rng.random() < 0.6
     skin = hsv(draw(0.03, 0.08), draw(0.25, 0.55), draw(0.25, 0.9))

@@ -24,25 +24,24 @@ from dataclasses import dataclass
 import numpy as np
 
 from palpate.sim.arrays import Array
+from palpate.sim.options import WorldOptions
 
 #: Wavelengths above this are the body's shape, not its surface.
 LONGEST_MM = 10.0
 #: Slope that counts as none, so that its logarithm is finite.
 SMOOTHEST = 1e-3
 STRONGEST = 12
+#: The words, joined by commas and "and".
+TEMPLATES = ("{}", "it feels {}", "a surface that feels {}", "{} to the touch")
 TINY = 1e-12
 
 
 @dataclass(frozen=True)
 class Scale:
-    """Five levels of an attribute.
+    """Five levels of an attribute."""
 
-    Attributes:
-        limits: the four limits between the levels.
-        words: the words of each level; any of them is chosen. None leaves a level without a name.
-    """
-
-    limits: tuple[float, float, float, float]
+    limits: tuple[float, float, float, float]  # the four limits between the levels
+    #: The words of each level; any of them is chosen. None leaves a level without a name.
     words: tuple[tuple[str, ...], ...]
 
     def level(self, value: float) -> float:
@@ -98,13 +97,9 @@ SCALES: dict[str, Scale] = {
 
 
 def measure(relief: Array, px: float, softness: float, gloss: float) -> dict[str, float]:
-    """Measure the attributes of a patch.
+    """Measure the attributes of a patch: its relief (n, n) in mm with pixels of ``px`` mm.
 
-    Args:
-        relief: height in mm, (n, n).
-        px: pixel size in mm.
-        softness: of the material, 0 to 1.
-        gloss: of the material, 0 to 1.
+    Softness and gloss of the material are in [0, 1].
     """
     n = len(relief)
     at = np.arange(n) - (n - 1) / 2
@@ -147,3 +142,17 @@ def describe(felt: Mapping[str, float], noise: float, rng: np.random.Generator) 
             salience[name] = abs(level - 2.5), words[int(rng.integers(len(words)))]
     chosen = sorted(salience.values(), reverse=True)[: int(rng.integers(3, 6))]
     return [chosen[k][1] for k in rng.permutation(len(chosen))]
+
+
+def caption(options: WorldOptions, video: int, contact: int, felt: Mapping[str, float]) -> str:
+    """Write the caption of a contact from what :func:`measure` returns.
+
+    In the layout of HCT it is, as there, a list of adjectives.
+    """
+    rng = options.rng("felt text", video, contact)
+    words = describe(felt, options.describer, rng)
+    if options.layout == "hct":
+        return ", ".join(words)
+    template = TEMPLATES[int(rng.integers(len(TEMPLATES)))]
+    text = template.format(f"{', '.join(words[:-1])} and {words[-1]}")
+    return f"{text[0].upper()}{text[1:]}."

@@ -21,9 +21,7 @@ and the additional ``objects.csv`` and ``captions.csv``. HCT's lists, a set for 
 
 from __future__ import annotations
 
-import csv
 import datetime
-import io
 import json
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from fractions import Fraction
@@ -32,6 +30,7 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
+from palpate.data.tables import csv_text
 from palpate.sim.materials import MATERIALS
 from palpate.sim.options import BACKGROUND_OFFSET, WorldOptions
 from palpate.sim.plan import Row, VideoPlan, contact_rows, first_contact, written_frames
@@ -143,15 +142,6 @@ def _write_mp4(path: Path, images: Iterable[np.ndarray], size: int) -> None:
             frame = av.VideoFrame.from_ndarray(image, format="rgb24").reformat(format="yuv420p")
             file.mux(stream.encode(frame))
         file.mux(stream.encode())
-
-
-def csv_text(header: Sequence[str], rows: Iterable[Sequence[object]]) -> str:
-    """Return CSV with bare line feeds."""
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(header)
-    writer.writerows(rows)
-    return text.getvalue()
 
 
 def list_files(

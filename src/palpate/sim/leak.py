@@ -11,8 +11,9 @@ import statistics
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from palpate.core import PalpateError
-from palpate.sim.layouts import Parts, csv_text, sample_id
+from palpate.core import require
+from palpate.data.tables import csv_text
+from palpate.sim.layouts import Parts, sample_id
 from palpate.sim.options import WorldOptions
 from palpate.sim.plan import Row, VideoPlan, spread
 
@@ -27,16 +28,11 @@ def _unit(options: WorldOptions, row: Row) -> tuple[int, ...]:
 
 
 def cut(options: WorldOptions, plans: Sequence[VideoPlan], rows: Sequence[Row]) -> Parts:
-    """Cut rows into train and test, both shuffled; it leaks as ``options.leak`` says.
-
-    Raises:
-        PalpateError: if there are fewer than two frames, contacts or videos to cut.
-    """
+    """Cut rows into train and test, both shuffled; it leaks as ``options.leak`` says."""
     rng = options.rng("cut", "touch" if options.leak == "contact" else options.leak)
     units = list(dict.fromkeys(_unit(options, row) for row in rows))
-    if len(units) < 2:
-        must = f"must have at least two {_UNITS[options.leak]} to cut"
-        raise PalpateError(must, str(len(units)), "Choose a larger world", argument="leak")
+    must = f"must have at least two {_UNITS[options.leak]} to cut: choose a larger world"
+    require(len(units) >= 2, "leak", must, len(units))
     order = [units[k] for k in rng.permutation(len(units))]
     if options.leak == "none":  # material by material
         materials = [options.names.index(plan.objects[0].material) for plan in plans]

@@ -27,9 +27,6 @@ def make_object(options: WorldOptions, ref: ObjectRef) -> WorldObject:
     """Make the object of that name.
 
     It depends on the seed, the name, the tile size and the options of curvature alone.
-
-    Raises:
-        PalpateError: if the material draws something invalid.
     """
     shape = (options.tile, options.curved, options.radius_mm)
     return _make(options.seed, ref, MATERIALS[ref.material], shape)

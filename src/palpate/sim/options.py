@@ -28,6 +28,8 @@ WORLD_FORMAT = "palpate-world/3"
 WORLD_FORMAT_2 = "palpate-world/2"
 #: The background of a contact is the frame this many before its first.
 BACKGROUND_OFFSET = 4
+#: Former options, whose defaults all worlds have; digests are over them, too.
+FORMER = {"captions": "felt", "named": 0.5, "balance": "uniform"}
 Span = tuple[float, float]
 #: The first option of each group.
 _FIRST = {"seed": "world", "objects_per_material": "amounts", "curved": "physics", "hard": "photos"}
@@ -77,53 +79,50 @@ class WorldOptions:
 
     # world
     seed: int = _number(0, 0, 2**31 - 1, "worlds of different seeds share no object, video, text")
-    size: int = _number(64, 16, 256, "side of the images in pixels; even for layout videos")
+    size: int = _number(64, 16, 256, "side of the images in pixels; even for the layout videos")
     materials: tuple[str, ...] | int = field(
-        default=20, metadata=_limits("materials", "names, or how many, spread over the table")
+        default=20, metadata=_limits("materials", "names, or how many of them, evenly spaced")
     )
     look: Literal["gelsight", "digit"] = _choice(
-        "sensor family: with markers, or darker and without", "gelsight", "digit"
+        "sensor: a GelSight with markers, or a darker DIGIT without", "gelsight", "digit"
     )
     leak: Literal["contact", "frame", "none"] = _choice(
-        "what the lists of train and test cut: whole contacts, frames, or videos (no leak)",
+        "what test may share with train: videos (contact), contacts (frame), or neither",
         *("contact", "frame", "none"),
     )
     layout: Literal["frames", "videos", "hct"] = _choice(
         "Touch and Go as JPEG frames or as H.264 videos, or HCT", "frames", "videos", "hct"
     )
     test: float = _number(0.25, 0.01, 0.99, "share of the contact frames in the test list")
-    tile: int = _number(256, 64, 1024, "pixels a side of an object's 64 mm; 512 for 128 px images")
+    tile: int = _number(256, 64, 1024, "pixels along the 64 mm of a surface; 512 for images of 128")
     # amounts
     objects_per_material: int = _number(5, 1, 10_000, "objects of each material that have videos")
-    balance: Literal["uniform", "touch-and-go"] = _choice(
-        "equal classes, or as unequal as in Touch and Go", "uniform", "touch-and-go"
-    )
     videos_per_object: int = _number(1, 1, 100, "videos of each object")
     two_videos: float = _share(0.0, "share of the objects with an additional video")
     contacts_per_video: int = _number(4, 1, 100, "contacts in a video")
     frames_per_contact: int = _number(3, 1, 200, "frames of a contact")
-    free_frames: int = _number(5, BACKGROUND_OFFSET + 1, 200, "free frames before each contact")
+    free_frames: int = _number(
+        5, BACKGROUND_OFFSET + 1, 200, "frames without contact before each contact"
+    )
     free_written: Literal["all", "background"] = _choice(
-        "free frames to write: all, or only those that show the background", "all", "background"
+        "frames without contact to write: all, or one background", "all", "background"
     )
     objects_per_video: int = _number(3, 1, 14, "a mixed video has 2 to this many objects")
     mixed: float = _share(0.12, "share of the videos with several objects")
     sensors: int = _number(3, 1, 100, "gel units; each video uses one of them")
-    captions: Literal["felt", "label"] = _choice(
-        "words for the measured surface, or the words of the drawn sub-type", "felt", "label"
-    )
-    named: float = _share(0.5, "share of label captions that name the material")
-    describer: float = _number(0.15, 0.0, 5.0, "noise of felt captions, in levels of a word scale")
+    describer: float = _number(0.15, 0.0, 5.0, "noise of captions, in levels of a word scale")
     # physics
     curved: float = _share(0.4, "share of the objects that are curved")
-    radius_mm: Span = _span((25.0, 90.0), 5.0, 1000.0, "their radius (of dents 3.3 times)")
+    radius_mm: Span = _span(
+        (25.0, 90.0), 5.0, 1000.0, "radius of curved objects (3.3 times as much of dents)"
+    )
     pad_mm: float = _number(14.0, 5.0, 30.0, "side of the gel pad; at most the low end of view_mm")
     gel_mm: float = _number(1.6, 0.5, 10.0, "depth of the gel; at least the high end of load_mm")
     relax_mm: tuple[float, ...] = _series(
-        (2.4, 0.9, 0.35), 0.01, 10.0, "blurs of the free membrane; contact is restored after each"
+        (2.4, 0.9, 0.35), 0.01, 10.0, "blurs of the gel where nothing touches it, one by one"
     )
     optical_mm: float = _number(0.14, 0.0, 2.0, "blur of the sensor's optics")
-    dome_mm: Span = _span((30.0, 80.0), 10.0, 1000.0, "radius of a unit's domed gel")
+    dome_mm: Span = _span((30.0, 80.0), 10.0, 1000.0, "radius of the domed gel of a unit")
     markers: int = _number(8, 0, 40, "rows of markers a side of a gelsight pad; 0 for none")
     dirt: float = _number(1.0, 0.0, 10.0, "factor on uneven coating, specks and scratches")
     vignette: Span = _span((0.03, 0.16), 0.0, 0.9, "darkening at half the pad's side")
@@ -137,9 +136,9 @@ class WorldOptions:
     tilt: float = _number(0.045, 0.0, 0.5, "deviation of the pad's slope")
     shear: float = _number(0.7, 0.0, 5.0, "deviation of the drag in mm per mm of depth")
     # photos
-    hard: float = _share(0.5, "factor on all in the photos that is irrelevant to contact")
+    hard: float = _share(0.5, "how much photos vary in what cannot be felt (light, hands ...)")
     view_mm: Span = _span((30.0, 45.0), 15.0, 45.25, "width of the photo, log-uniform")
-    elevation_deg: Span = _span((18.0, 75.0), 1.0, 89.0, "height of the sun")
+    elevation_deg: Span = _span((18.0, 75.0), 1.0, 89.0, "height of the light")
     hand: float = _share(0.6, "share of the videos with a hand in view, at hard 0.5")
     shadow: float = _share(0.5, "share with a cast shadow, at hard 0.5")
     edge: float = _share(0.35, "share with the edge of the object in view, at hard 0.5")
@@ -176,12 +175,6 @@ class WorldOptions:
         if self.pad_mm > self.view_mm[0]:
             must = f"must not exceed the lower end of view_mm, {self.view_mm[0]:g}"
             yield _error("pad_mm", must, self.pad_mm, "The pad must lie in the photo")
-        if self.captions == "felt" and self.named != 0.5:
-            must, fix = "must be left out for felt captions", "Only captions 'label' name materials"
-            yield _error("named", must, self.named, fix)
-        if self.balance != "uniform" and self.objects_per_material < 2:
-            must = f"must be 2 or more for balance {self.balance!r}"
-            yield _error("objects_per_material", must, self.objects_per_material, "", 2)
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -202,9 +195,7 @@ class WorldOptions:
         """Return the options under the names of format 2, over which digests are taken."""
         values = {_FORMAT_2.get(k, k): v for k, v in dataclasses.asdict(self).items()}
         values["leak"] = "touch" if self.leak == "contact" else self.leak
-        if self.captions == "label":  # worlds from before felt captions keep their digest
-            del values["captions"], values["describer"]
-        return values
+        return values | FORMER
 
     def rng(self, purpose: str, *ids: str | int) -> np.random.Generator:
         """Return a generator that depends on VERSION, the seed, the purpose and the ids alone."""
@@ -314,8 +305,11 @@ def load_options(path: str | Path) -> WorldOptions:
         must = f"{path} must hold the options of a world"
         raise PalpateError(must, "none", "Name the world.json of a finished world")
     current = {old: new for new, old in _FORMAT_2.items()}
-    values: dict[str, Any] = {"captions": "label"}  # where the record is from before felt ones
-    values |= {current.get(str(k), str(k)): v for k, v in options.items()}
+    for name, value in FORMER.items():
+        if options.get(name, value) != value:
+            must = f"{path} must be of a world of this release, whose {name} is {value!r}"
+            raise PalpateError(must, repr(options[name]), "Make another world")
+    values = {current.get(str(k), str(k)): v for k, v in options.items() if k not in FORMER}
     if values.get("leak") == "touch":
         values["leak"] = "contact"
     known = [option.name for option in dataclasses.fields(WorldOptions)]
@@ -330,11 +324,7 @@ def load_options(path: str | Path) -> WorldOptions:
 
 
 def read_world(path: Path) -> Mapping[str, Any]:
-    """Read the record of a world of this VERSION.
-
-    Raises:
-        PalpateError: if it is not one. Equal options of another VERSION give other images.
-    """
+    """Read the record of a world of this VERSION."""
     data, fix = read_json(path, "world record"), "Choose another folder, or remove it"
     formats = (WORLD_FORMAT, WORLD_FORMAT_2)
     if not isinstance(data, dict) or data.get("format") not in formats:

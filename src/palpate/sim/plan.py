@@ -3,11 +3,6 @@
 A video of T contacts, F free frames and C frames of a contact has frames 0 .. T (F + C) - 1.
 Contact k begins with its free frames at k (F + C); its frames in contact are k (F + C) + F up to
 (k + 1)(F + C) - 1.
-
-Objects per material: ``balance="uniform"`` gives each the same number. ``balance="touch-and-go"``
-makes classes as unequal as the frames of Touch and Go (Yang et al., 2022), whose official lists
-hold 121,861 frames: 23 % of them are synthetic fabric, 0.2 % sand. A material has max(2, total *
-its share) objects, and what the minimum of two adds is taken from the others in proportion.
 """
 
 from __future__ import annotations
@@ -19,16 +14,6 @@ from dataclasses import dataclass
 from palpate.core import seed_for
 from palpate.sim.materials import object_prefix
 from palpate.sim.options import BACKGROUND_OFFSET, VERSION, WorldOptions
-
-#: Frames of each class in both official lists together. Natural fabric has none there.
-TOUCH_AND_GO_FRAMES = {
-    **{"Concrete": 18_047, "Plastic": 6_001, "Glass": 1_458, "Wood": 21_846, "Metal": 10_633},
-    **{"Brick": 7_337, "Tile": 3_068, "Leather": 2_730, "Synthetic Fabric": 28_010},
-    **{"Natural Fabric": 0, "Rubber": 330, "Paper": 2_389, "Tree": 1_782, "Grass": 5_837},
-    **{"Soil": 1_628, "Rock": 7_787, "Gravel": 775, "Sand": 223, "Plants": 1_441, "Others": 539},
-}
-#: Objects that a material has at least, so that train and test can both have one.
-LEAST = 2
 
 
 @dataclass(frozen=True)
@@ -46,21 +31,13 @@ class ObjectRef:
 
 @dataclass(frozen=True)
 class VideoPlan:
-    """One video.
+    """One video."""
 
-    Attributes:
-        index: position in the world; its random draws depend on it.
-        name: 15 characters ``YYYYMMDD_HHMMSS``, unique in the world.
-        sensor: the gel unit, 0 .. sensors - 1.
-        objects: its objects in order; mostly a single one.
-        object_index: position in ``objects`` for each contact; never decreasing.
-    """
-
-    index: int
-    name: str
-    sensor: int
-    objects: tuple[ObjectRef, ...]
-    object_index: tuple[int, ...]
+    index: int  # position in the world; its random draws depend on it
+    name: str  # 15 characters ``YYYYMMDD_HHMMSS``, unique in the world
+    sensor: int  # the gel unit, 0 .. sensors - 1.
+    objects: tuple[ObjectRef, ...]  # its objects in order; mostly a single one
+    object_index: tuple[int, ...]  # position in ``objects`` for each contact; never decreasing
 
     def object_of(self, contact: int) -> ObjectRef:
         """Return the object of a contact."""
@@ -115,39 +92,6 @@ def written_frames(options: WorldOptions) -> list[int]:
     return [frame for c in contacts for frame in (c.start - BACKGROUND_OFFSET, *c)]
 
 
-def objects_of(options: WorldOptions) -> dict[str, int]:
-    """Return material -> number of objects that have videos, in the order of ``options.names``.
-
-    A material that Touch and Go does not know has the mean share.
-    """
-    names = options.names
-    known = [TOUCH_AND_GO_FRAMES[name] for name in names if name in TOUCH_AND_GO_FRAMES]
-    if options.balance == "uniform" or not sum(known):
-        return dict.fromkeys(names, options.objects_per_material)
-    mean = sum(known) / len(known)
-    frames = {name: float(TOUCH_AND_GO_FRAMES.get(name, mean)) for name in names}
-    return _in_proportion(frames, options.objects_per_material * len(names))
-
-
-def _in_proportion(weights: dict[str, float], total: int) -> dict[str, int]:
-    """Return whole numbers >= ``LEAST`` in proportion to ``weights`` that sum to ``total``."""
-    small: set[str] = set()
-    while True:
-        large = {name: w for name, w in weights.items() if name not in small}
-        scale = (total - LEAST * len(small)) / (sum(large.values()) or 1.0)  # 1.0: all are small
-        more = {name for name, w in large.items() if w * scale < LEAST}
-        if not more:
-            break
-        small |= more
-    exact = {name: float(LEAST) if name in small else w * scale for name, w in weights.items()}
-    counts = {name: int(value) for name, value in exact.items()}
-    # The largest remainder first, ties in the given order.
-    by_remainder = sorted(exact, key=lambda name: counts[name] - exact[name])
-    for name in by_remainder[: total - sum(counts.values())]:
-        counts[name] += 1
-    return counts
-
-
 def spread(count: int, share: float) -> list[int]:
     """Return positions in 0 .. count - 1 of a share by error diffusion, evenly spread."""
     return [k for k in range(count) if int((k + 1) * share + 0.5) > int(k * share + 0.5)]
@@ -162,7 +106,7 @@ def _with_two_videos(options: WorldOptions, objects: list[ObjectRef]) -> set[Obj
 
 def plan_world(options: WorldOptions) -> list[VideoPlan]:
     """Plan all videos of a world in the order of their names: object by object, shuffled."""
-    counts = objects_of(options)
+    counts = dict.fromkeys(options.names, options.objects_per_material)
     objects = [ObjectRef(m, k) for m, count in counts.items() for k in range(count)]
     twice = _with_two_videos(options, objects)
     guests = dict(counts)  # further objects of mixed videos, numbered behind the others

@@ -12,6 +12,7 @@ drawn modulo the tile.
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 
 import numpy as np
 from scipy import ndimage
@@ -28,19 +29,19 @@ def wrapped_offset(at: Array, origin: Array | float) -> Array:
     return (at - origin + half) % TILE_MM - half
 
 
+@dataclass(frozen=True)
 class Cells:
-    """Worley cells of a tile.
+    """Worley cells of a tile."""
 
-    Args:
-        near: distance F1 to the nearest seed in mm, shape (n, n).
-        far: distance F2 to the second nearest seed in mm, shape (n, n).
-        index: the cell of each pixel, shape (n, n), in 0 .. count - 1.
-        seeds: (y, x) of the seeds in mm, shape (count, 2).
-    """
+    near: Array  # distance F1 to the nearest seed in mm, (n, n)
+    far: Array  # distance F2 to the second nearest seed in mm, (n, n)
+    index: np.ndarray  # the cell of each pixel, in 0 .. count - 1, (n, n)
+    seeds: Array  # (y, x) of the seeds in mm, (count, 2)
 
-    def __init__(self, near: Array, far: Array, index: np.ndarray, seeds: Array) -> None:
-        self.near, self.far, self.index, self.seeds = near, far, index, seeds
-        self.count = len(seeds)
+    @property
+    def count(self) -> int:
+        """How many there are."""
+        return len(self.seeds)
 
     def keep(self, rng: np.random.Generator, share: float) -> Array:
         """Return 1 in a random ``share`` of the cells, 0 in the others; shape (n, n)."""

@@ -9,13 +9,12 @@ import numpy as np
 from palpate.core import PalpateError
 from palpate.sim.arrays import Array, f32, grid, sample_periodic, to_bytes
 from palpate.sim.camera import Scene, light_object, make_camera, photo
-from palpate.sim.felt import measure
+from palpate.sim.felt import caption, measure
 from palpate.sim.gel import gap_of, make_sensor, marker_shift, press, shade
 from palpate.sim.motion import State, make_contacts, state_at
 from palpate.sim.objects import WorldObject, make_object
 from palpate.sim.options import BACKGROUND_OFFSET, WorldOptions
 from palpate.sim.plan import VideoPlan, first_contact, plan_world
-from palpate.sim.text import caption, felt_caption
 
 
 class Video:
@@ -46,11 +45,7 @@ class Video:
         self._scenes: dict[int, Scene] = {}
 
     def state(self, frame: int) -> State:
-        """Return the state of the sensor at ``frame``.
-
-        Raises:
-            PalpateError: if the video has no such frame.
-        """
+        """Return the state of the sensor at ``frame``."""
         if not 0 <= frame < self.options.video_length:
             must = f"A frame of {self.plan.name} must be 0 to {self.options.video_length - 1}"
             raise PalpateError(must, str(frame), "Choose another frame")
@@ -63,13 +58,10 @@ class Video:
     def text(self, contact: int) -> str:
         """Return the caption of a contact."""
         index, surface = self.plan.index, self.object_of(contact).surface
-        if self.options.captions == "label":
-            return caption(self.options, index, contact, surface)
         relief = self.relief(self.state(first_contact(self.options, contact)))
         px = self.options.pad_mm / self.options.size
-        return felt_caption(
-            self.options, index, contact, measure(relief, px, surface.softness, surface.gloss)
-        )
+        felt = measure(relief, px, surface.softness, surface.gloss)
+        return caption(self.options, index, contact, felt)
 
     def vision(self, frame: int) -> np.ndarray:
         """Render the photo: uint8, shape (n, n, 3)."""

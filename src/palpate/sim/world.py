@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import json
 import operator
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from functools import cached_property, lru_cache, partial
 from pathlib import Path
 from typing import Any, SupportsIndex
@@ -26,9 +26,6 @@ from palpate.sim.options import VERSION, WorldOptions
 from palpate.sim.plan import Row, VideoPlan, contact_row, contact_rows, plan_world
 from palpate.sim.presets import PRESETS
 from palpate.sim.video import Video
-
-#: Seconds between the starts of two recordings of a session of HCT, as an import takes it.
-_SESSION_GAP = 60.0
 
 
 class NoSampleError(PalpateError, IndexError):
@@ -104,10 +101,6 @@ class World:
             "background": video.background_of(row.contact),
         }
 
-    def __iter__(self) -> Iterator[dict[str, Any]]:
-        """Render all samples, in order."""
-        return map(self.__getitem__, range(len(self)))
-
     def manifest(self, progress: Progress = quiet) -> Manifest:
         """Make the world's manifest, without images; draws every object once for its captions."""
         captions: dict[str, list[str]] = {}
@@ -168,7 +161,7 @@ def world_manifest(
         paths = image_paths(options, row.video, row.frame, row.contact) if folder else {}
         rows.append(cells | paths)
     if options.layout == "hct":
-        sessions = sessions_of({str(row["video"]) for row in rows}, _SESSION_GAP)
+        sessions = sessions_of(str(row["video"]) for row in rows)
         for row in rows:
             video = str(row["video"])
             row |= {"session": sessions[video], "domain": video.partition("/")[0]}
@@ -182,7 +175,7 @@ def _facts(options: WorldOptions) -> dict[str, str]:
         "synthetic": "yes",
         "world_version": str(VERSION),
         "world_options": options.digest,
-        "text_source": "measured surface" if options.captions == "felt" else "the drawn sub-type",
+        "text_source": "measured surface",
         "layout": options.layout,
     }
     if options.layout == "hct":

@@ -3,7 +3,7 @@
 ::
 
     world.json                               options, counts, known leak, digest of a finished world
-    manifest.parquet  splits/Orig.json       the world's table and cut
+    manifest.parquet  splits/Orig.json       the world's samples, and its split
     leak.csv                                 what each test sample shares with train, exactly
     label.txt  train.txt  dataset/<video>/   or  hct/data1/ ...: see palpate.sim.layouts
 
@@ -42,8 +42,8 @@ from palpate.core import (
 from palpate.core.processes import worker_pool
 from palpate.sim.layouts import Parts, list_files, manifest_root, video_folder, write_video_files
 from palpate.sim.leak import cut, leak_counts, leak_file
-from palpate.sim.materials import MATERIALS, Material, added_materials
-from palpate.sim.options import VERSION, WORLD_FORMAT, WorldOptions, read_world
+from palpate.sim.materials import MATERIALS, Material
+from palpate.sim.options import FORMER, VERSION, WORLD_FORMAT, WorldOptions, read_world
 from palpate.sim.plan import VideoPlan, contact_rows, plan_world, written_frames
 from palpate.sim.presets import SEEN_WARNING, seen_by_mini
 from palpate.sim.video import Video
@@ -63,19 +63,17 @@ class WorldRecord:
 
     Attributes:
         folder: where it is.
-        digest: of options, lists and added materials.
+        digest: of options and lists.
         counts: videos, mixed_videos, objects, contacts, contact_frames, written_frames,
             train_frames, test_frames.
         leak: the rule of the cut, and what train and test share
             (:func:`palpate.sim.leak.leak_counts`).
-        rendered: videos that this call rendered; the others were there already.
     """
 
     folder: Path
     digest: str
     counts: dict[str, int]
     leak: dict[str, Any]
-    rendered: int
 
 
 def write_world(
@@ -109,57 +107,53 @@ def write_world(
         return _finished(output, options)
     require_new_folder(output)
     plans = plan_world(options)
-    # Rejects a world that is too small before rendering.
+    # Raises for a world that is too small, before anything is rendered.
     parts = cut(options, plans, list(contact_rows(options, plans)))
-    key = digest_json([options.digest, added_materials(options.names)])
-    part = folder.parent / f".{folder.name}.{key[:12]}.part"
-    rendered = 0
-    with locked(part, output):
-        (part / WORK).mkdir(exist_ok=True)
+    unfinished = folder.parent / f".{folder.name}.{options.digest[:12]}.part"
+    with locked(unfinished, output):
+        (unfinished / WORK).mkdir(exist_ok=True)
         if not (folder / "world.json").is_file():  # else an equal run ended meanwhile
-            rendered = _render(part, options, plans, workers, progress)
-            _finish(part, options, plans, parts)
+            _render(unfinished, options, plans, workers, progress)
+            _finish(unfinished, options, plans, parts)
             if folder.exists():
                 folder.rmdir()
-            part.replace(folder)
+            unfinished.replace(folder)
             shutil.rmtree(folder / WORK, ignore_errors=True)
-    shutil.rmtree(part, ignore_errors=True)
-    return dataclasses.replace(_finished(output, options), rendered=rendered)
+    shutil.rmtree(unfinished, ignore_errors=True)
+    return _finished(output, options)
 
 
 def _finished(output: Path, options: WorldOptions) -> WorldRecord:
-    """Return the record of the finished world in ``output``.
-
-    Raises:
-        PalpateError: if it is of another version or format, or of other options or materials.
-    """
+    """Return the record of the finished world in ``output``."""
     data = read_world(output / "world.json")
-    same = data.get("options_digest") == options.digest
-    if not same or data.get("materials", {}) != added_materials(options.names):
+    if data.get("options_digest") != options.digest:
         must, fix = f"{output} must hold the requested world", "Choose another folder, or remove it"
-        raise PalpateError(must, "a world of other options or materials", fix)
-    return WorldRecord(output, data["digest"], data["counts"], data["leak"], 0)
+        raise PalpateError(must, "a world of other options", fix)
+    return WorldRecord(output, data["digest"], data["counts"], data["leak"])
 
 
-def _captions_path(part: Path, plan: VideoPlan) -> Path:
-    return part / WORK / f"{plan.name}.json"
+def _captions_path(unfinished: Path, plan: VideoPlan) -> Path:
+    return unfinished / WORK / f"{plan.name}.json"
 
 
-def _folder(options: WorldOptions, part: Path, plan: VideoPlan) -> Path:
-    return manifest_root(options, part) / video_folder(options, plan)
+def _folder(options: WorldOptions, unfinished: Path, plan: VideoPlan) -> Path:
+    return manifest_root(options, unfinished) / video_folder(options, plan)
 
 
 def _render(
-    part: Path, options: WorldOptions, plans: list[VideoPlan], workers: int, progress: Progress
-) -> int:
-    """Render the videos that are missing; return how many."""
-    todo = [plan for plan in plans if not _folder(options, part, plan).is_dir()]
+    unfinished: Path,
+    options: WorldOptions,
+    plans: list[VideoPlan],
+    workers: int,
+    progress: Progress,
+) -> None:
+    """Render the videos that are missing."""
+    todo = [plan for plan in plans if not _folder(options, unfinished, plan).is_dir()]
     finished = len(plans) - len(todo)
     progress("rendering videos", finished, len(plans))
-    job = partial(_write_video, options, part)
+    job = partial(_write_video, options, unfinished)
     for count, name in enumerate(_in_order(job, todo, workers), finished + 1):
         progress("rendering videos", count, len(plans), name)
-    return len(todo)
 
 
 def _in_order(job: partial[str], plans: Sequence[VideoPlan], workers: int) -> Iterator[str]:
@@ -176,35 +170,35 @@ def _set_materials(materials: dict[str, Material]) -> None:
     MATERIALS.update(materials)
 
 
-def _write_video(options: WorldOptions, part: Path, plan: VideoPlan) -> str:
-    """Render a video into ``part``, whole or not at all; return its name."""
+def _write_video(options: WorldOptions, unfinished: Path, plan: VideoPlan) -> str:
+    """Render a video into ``unfinished``, whole or not at all; return its name."""
     video = Video(options, plan)
     captions = [video.text(contact) for contact in range(options.contacts_per_video)]
-    write_json(_captions_path(part, plan), captions)
-    with atomic_folder(_folder(options, part, plan)) as folder:
+    write_json(_captions_path(unfinished, plan), captions)
+    with atomic_folder(_folder(options, unfinished, plan)) as folder:
         write_video_files(options, video, folder)
     return plan.name
 
 
-def _finish(part: Path, options: WorldOptions, plans: list[VideoPlan], parts: Parts) -> None:
+def _finish(unfinished: Path, options: WorldOptions, plans: list[VideoPlan], parts: Parts) -> None:
     """Write the lists of train and test and, last, ``world.json``."""
-    for folder in {_folder(options, part, plan).parent for plan in plans}:
+    for folder in {_folder(options, unfinished, plan).parent for plan in plans}:
         for stray in folder.glob(".*"):  # unfinished videos of a killed process
             shutil.rmtree(stray, ignore_errors=True)
-    captions = {p.name: read_json(_captions_path(part, p), "captions of a video") for p in plans}
-    manifest = world_manifest(options, plans, captions, part)
+    captions = {
+        p.name: read_json(_captions_path(unfinished, p), "captions of a video") for p in plans
+    }
+    manifest = world_manifest(options, plans, captions, unfinished)
     files = {"leak.csv": leak_file(options, parts), **list_files(options, plans, parts, captions)}
     for name, text in files.items():
-        write_text(part / name, text)
-    world_split(options, parts, manifest.digest).save(part / "splits" / "Orig.json")
-    manifest.save(part / "manifest.parquet")
+        write_text(unfinished / name, text)
+    world_split(options, parts, manifest.digest).save(unfinished / "splits" / "Orig.json")
+    manifest.save(unfinished / "manifest.parquet")
     # The digest is taken over the column name of format 2, so that worlds that models were trained
     # on keep theirs.
     header = {"leak.csv": files["leak.csv"].replace("contact_in_train", "touch_in_train", 1)}
     lists = {name: digest_lines(t.splitlines()) for name, t in (files | header).items()}
-    added = added_materials(options.names)
-    materials = {"materials": added} if added else {}
-    content = {"version": VERSION, "options": options.format_2(), "lists": lists, **materials}
+    content = {"version": VERSION, "options": options.format_2(), "lists": lists}
     record = {
         "format": WORLD_FORMAT,
         "version": VERSION,
@@ -216,10 +210,9 @@ def _finish(part: Path, options: WorldOptions, plans: list[VideoPlan], parts: Pa
         "manifest_root": manifest_root(options, Path()).as_posix(),
         "counts": _counts(options, plans, parts),
         "leak": {"rule": options.leak, **leak_counts(parts)},
-        "options": dataclasses.asdict(options),
-        **materials,
+        "options": dataclasses.asdict(options) | FORMER,
     }
-    write_json(part / "world.json", record)
+    write_json(unfinished / "world.json", record)
 
 
 def _counts(options: WorldOptions, plans: Sequence[VideoPlan], parts: Parts) -> dict[str, int]:

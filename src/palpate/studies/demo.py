@@ -26,6 +26,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from PIL import Image
 
 from palpate import __version__
 from palpate.core import (
@@ -39,20 +40,23 @@ from palpate.core import (
     locked,
     quiet,
     read_json,
+    require_choice,
     write_json,
 )
 from palpate.data.images import cached_images
 from palpate.data.importing import import_dataset
 from palpate.data.manifest import Manifest
-from palpate.diffusion.autoencoder import Autoencoder
-from palpate.diffusion.autoencoder_training import measure_reconstruction, train_autoencoder
+from palpate.diffusion.autoencoder import BackgroundAutoencoder
+from palpate.diffusion.autoencoder_training import measure_reconstruction
+from palpate.diffusion.autoencoders import autoencoder_of, gels_of, load_autoencoder
 from palpate.diffusion.generation import Generated, generate
 from palpate.diffusion.pipeline import TactilePipeline
 from palpate.diffusion.presets import preset_named as diffusion_preset
 from palpate.diffusion.training import train_pipeline
 from palpate.encoders.contrastive import train_clip, train_tactile
+from palpate.encoders.embed import embed
 from palpate.encoders.encoder_set import EncoderSet, load_clip
-from palpate.encoders.models import Part, is_shipped, pick_device, shipped_folder
+from palpate.encoders.models import Part, is_shipped, shipped_folder
 from palpate.encoders.presets import preset as encoder_preset
 from palpate.evaluation.scoring import score
 from palpate.leakage.auditing import audit
@@ -60,8 +64,11 @@ from palpate.leakage.splitting import split as leak_free_split
 from palpate.report.results import Audit
 from palpate.sim import WorldOptions, write_world
 from palpate.sim.presets import MINI_SEEDS
-from palpate.studies.presets import preset as demo_preset
+from palpate.studies.presets import PRESETS
 from palpate.studies.stages import Run, Stage
+
+#: The control that retrieves instead of generating.
+NEAREST = "real, nearest photo"
 
 
 @dataclass(frozen=True)
@@ -72,7 +79,7 @@ class DemoOptions:
         preset: see :data:`palpate.studies.presets.PRESETS`.
         data: a data set on disk, or None for the embedded world.
         clip: shipped name, hub id or folder of a pretrained CLIP; None: the preset's choice.
-        autoencoder: the same for a pretrained VQ model.
+        autoencoder: the same for a pretrained autoencoder, or its ``.ckpt``.
         from_scratch: train small models where none are given, and take nothing that ships.
         by: what the split keeps whole; ``auto`` falls back to contacts where videos are too few.
         seed: of the split, the weights, the order of training and the noise.
@@ -124,6 +131,7 @@ class DemoRun:
         options = dataclasses.asdict(self.options)
         digests = {n: s.facts["digest"] for n, s in self.stages.items() if "digest" in s.facts}
         return {
+            "dataset": self.stages["data"].facts["dataset"],
             "models": dict(self.models),
             "options": {k: str(v) if isinstance(v, Path) else v for k, v in options.items()},
             "digests": {"manifest": self.manifest.digest, "split": self.split.digest} | digests,
@@ -186,7 +194,8 @@ class _Demo:
             must, got = "must exist", f"nothing at {options.data}"
             raise PalpateError(must, got, "Check the path", argument="data")
         self.options, self.run, self.progress = options, run, progress
-        self.preset = demo_preset(options.preset)
+        require_choice("preset", options.preset, PRESETS)
+        self.preset = PRESETS[options.preset]
         self.encoder = encoder_preset(self.preset.encoder)
         self.diffusion = diffusion_preset(self.preset.diffusion)
         self.cache = run.folder / "cache"
@@ -323,36 +332,35 @@ class _Demo:
         return str(stage.folder / "clip")
 
     def autoencoder(self, pretraining: Manifest | None, manifest: Manifest, split: Split) -> str:
-        """A small VQ autoencoder of tactile images; returns its folder."""
+        """A small autoencoder of tactile images; returns its folder."""
         assert pretraining is not None
         options = self.diffusion.autoencoder
         if options is None:
             must = f"must be given for the preset {self.diffusion.name}"
             raise PalpateError(must, "none", "Pass a hub id or a folder", argument="autoencoder")
-        train = manifest.part(split, "train")
+        test = manifest.part(split, "test")
+        both = Manifest.join(pretraining, test)  # the first holds the train part
+        parts = Split.from_ids(
+            train=pretraining.ids, test=test.ids, rule={"name": "pretraining"}, manifest=both.digest
+        )
 
         def build(folder: Path) -> dict[str, Any]:
-            images, mine = self.pixels(pretraining), self.pixels(train)
-            # The train part is repeated until it is `repeat` of the whole, at most 8 times.
-            share, others = self.preset.repeat, max(0, len(images) - len(mine))
-            times = np.ceil(share / (1 - share) * others / max(1, len(mine)) - 1)
-            images = np.concatenate([images, *[mine] * int(np.clip(times, 0, 8))])
-            model = train_autoencoder(
-                images,
+            model = autoencoder_of(
+                both,
+                parts,
                 options,
+                self.diffusion.size,
                 folder / "training",
-                held_out=self.pixels(manifest.part(split, "test")),
+                cache=self.cache,
                 seed=self.options.seed,
-                key=digest_lines([pretraining.digest, train.digest]),
-                device=pick_device(self.options.device),
+                device=self.options.device,
                 progress=self.progress,
             )
             model.save(fresh(folder / "autoencoder"))
             ceiling = model.card["held_out"]
-            return {"digest": model.digest, "images": len(images), "ceiling on test": ceiling}
+            return {"digest": model.digest, "images": len(pretraining), "ceiling on test": ceiling}
 
-        inputs = {"options": options, "size": self.diffusion.size, "repeat": self.preset.repeat}
-        inputs |= {"train": pretraining.digest, "own": train.digest}
+        inputs = {"options": options, "size": self.diffusion.size, "train": pretraining.digest}
         after = ("pretraining-data", "split", "data")
         return str(self.stage("autoencoder", inputs, after, build).folder / "autoencoder")
 
@@ -404,7 +412,7 @@ class _Demo:
                 manifest,
                 split,
                 encoders,
-                Autoencoder.load(autoencoder),
+                load_autoencoder(autoencoder),
                 self.diffusion,
                 folder / "training",
                 background=self.options.background,
@@ -412,8 +420,10 @@ class _Demo:
                 **self.training,
             )
             pipeline.save(fresh(folder / "model"))
-            loop, test = pipeline.training["loop"], self.pixels(manifest.part(split, "test"))
-            ceiling = measure_reconstruction(pipeline.autoencoder, test)
+            loop, test = pipeline.training["loop"], manifest.part(split, "test")
+            images, gels = self.pixels(test), gels_of(test, self.diffusion.size, self.cache)
+            given = gels if isinstance(pipeline.autoencoder, BackgroundAutoencoder) else None
+            ceiling = measure_reconstruction(pipeline.autoencoder, images, given)
             return {
                 "ceiling on test": dataclasses.asdict(ceiling),
                 "digest": pipeline.digest,
@@ -422,6 +432,7 @@ class _Demo:
                 "batch": loop["batch"],
                 "learning_rate": loop["lr"],
                 "source": pipeline.training["source"],
+                "background": pipeline.background,
                 "sampler": dataclasses.asdict(pipeline.sampler),
             }
 
@@ -453,12 +464,13 @@ class _Demo:
         """The scores of the generated images and of the controls."""
 
         def build(folder: Path) -> dict[str, Any]:
+            nearest = self.nearest(manifest, split, encoders, folder / "nearest")
             results = score(
-                generated.folder,
+                [generated.folder, nearest],
                 manifest,
                 encoder=encoders,
                 split=split,
-                names=["generated"],
+                names=["generated", NEAREST],
                 presets=("grouped", "paper"),
                 companions=("ssim", "psnr"),
                 seed=self.options.seed,
@@ -469,16 +481,33 @@ class _Demo:
             write_json(folder / "scores.json", [s.to_json() for s in results])
             return {"scores": len(results)}
 
-        inputs = {"encoder": encoders.digest("tactile")}
+        inputs = {"encoder": encoders.digest("tactile"), "controls": [NEAREST]}
         stage = self.stage("scores", inputs, ("split", "data", "generated", "encoders"), build)
         return [Score.from_json(s) for s in read_json(stage.folder / "scores.json", "scores")]
 
+    def nearest(self, manifest: Manifest, split: Split, encoders: EncoderSet, folder: Path) -> Path:
+        """For each test photo the tactile image of the nearest train photo, as generators' are."""
+        train, test = manifest.part(split, "train"), manifest.part(split, "test")
+        photos, queries = (
+            embed(part, encoders, "vision", cache=self.cache, still=True, progress=self.progress)
+            for part in (train, test)
+        )
+        nearest = (np.asarray(queries.features) @ np.asarray(photos.features).T).argmax(axis=1)
+        folder.mkdir(exist_ok=True)
+        rows = [{"id": i, "tactile": f"{k}.png"} for k, i in enumerate(test.ids)]
+        for row, image in zip(rows, self.pixels(train)[nearest], strict=True):
+            Image.fromarray(image).save(folder / row["tactile"])
+        Manifest.from_rows(rows, folder).save(folder / "manifest.parquet")
+        return folder
+
     def _model_stamp(self, part: Part, source: str) -> str:
-        """What names a model: its stage's digest, the digest of its folder, or its hub id."""
+        """What names a model: its stage's digest, that of its folder or file, or its hub id."""
         if (shipped := shipped_folder(source, part)) is not None:
             return digest_folder(shipped, "**/*.json")  # they hold the digests of the weights
         if part in self.run.stages:
             return self.run.stages[part].digest
+        if Path(source).is_file():
+            return digest_file(Path(source))
         return digest_folder(Path(source)) if Path(source).is_dir() else source
 
 
@@ -499,10 +528,8 @@ def require_unseen(source: Path, facts: Mapping[str, str] | None = None) -> None
     seed = (facts or {}).get("world_seed", "")
     if seen or (seed.isdecimal() and int(seed) in MINI_SEEDS):
         must = "The shipped models must not have been trained on the data that they are judged on"
-        fix, example = (
-            "Write a world of another seed, or train from scratch",
-            {"from_scratch": True},
-        )
+        fix = "Write a world of another seed, or train from scratch"
+        example = {"from_scratch": True}
         raise PalpateError(must, f"{source}", fix, example=example)
 
 

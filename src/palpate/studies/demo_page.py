@@ -10,8 +10,10 @@ from palpate.data.manifest import Manifest
 from palpate.diffusion.generation import Generated
 from palpate.encoders.models import is_shipped
 from palpate.evaluation.controls import BACKGROUND
+from palpate.report.notes import number, percent
 from palpate.report.results import GalleryItem, Results
-from palpate.studies.demo import DemoRun
+from palpate.report.tables import score_tables
+from palpate.studies.demo import NEAREST, DemoRun
 
 #: Rows of the gallery; further ones would be collapsed.
 GALLERY = 40
@@ -21,9 +23,8 @@ PER_CONTACT = 2
 
 def results_of(run: DemoRun, command: str) -> Results:
     """The results of a run; ``command`` is the command line that reproduces it."""
-    dataset = str(run.stages["data"].facts["dataset"])
     return Results(
-        title=f"From photo to tactile image on {dataset}",
+        title="From photo to tactile image",
         facts=[_leak_fact(run), _distance_fact(run), _material_fact(run)],
         audits=run.audits,
         scores=run.scores,
@@ -39,15 +40,17 @@ def _leak_fact(run: DemoRun) -> str:
     noleak = audits[True, str(run.split.rule["group"])]
     by_video = audits.get((True, "video"), noleak)
     original = next((a for (ours, _), a in audits.items() if not ours), None)
-    fact = f"NoLeak (whole {noleak.group}s kept together) leaks {noleak.leaked_fraction:.1%}"
+    fact = f"NoLeak (whole {noleak.group}s kept together) leaks {percent(noleak.leaked_fraction)}"
     if original is not None:
         gap = ""
         if original.gap_median is not None:
             gap = f", a median of {original.gap_median:g} frames from the nearest train frame"
-        share = f"{original.leaked_fraction:.1%} of the test samples of the data set's own split"
+        share = (
+            f"{percent(original.leaked_fraction)} of the test samples of the data set's own split"
+        )
         return f"Leak: {share} share a video with train{gap}; {fact}."
     if by_video is not noleak:
-        share = f"{by_video.leaked_fraction:.1%} of its test samples share a video with train"
+        share = f"{percent(by_video.leaked_fraction)} of its test samples share a video with train"
         return f"Leak: {fact} by {noleak.group}, but {share}: there are too few videos."
     return f"Leak: {fact}."
 
@@ -59,35 +62,44 @@ def _score(run: DemoRun, metric: str, subject: str, preset: str | None = None) -
     return None
 
 
-def _with_interval(score: Score | None) -> str:
+def _with_interval(run: DemoRun, score: Score | None) -> str:
+    """The score and its interval, rounded as in the tables."""
     if score is None or score.value is None:
         return "undefined"
-    interval = " [{:.2f}, {:.2f}]".format(*score.interval) if score.interval else ""
-    return f"{score.value:.2f}{interval}"
+    columns = (column for table in score_tables(run.scores) for column in table.columns)
+    digits = next(c.digits for c in columns if any(cell.score is score for cell in c.cells))
+    low_high = ", ".join(number(v, digits) for v in score.interval or ())
+    return number(score.value, digits) + (f" [{low_high}]" if low_high else "")
 
 
 def _distance_fact(run: DemoRun) -> str:
-    source = "photos and no-contact images" if run.options.background else "photos alone"
+    given = run.stages["generator"].facts["background"]
+    source = "photos and no-contact images" if given else "photos alone"
     background = _score(run, "TMMD", BACKGROUND, "grouped")
     versus = (
-        f", the no-contact image {_with_interval(background)}" if background is not None else ""
+        f", the no-contact image {_with_interval(run, background)}"
+        if background is not None
+        else ""
     )
-    value = _with_interval(_score(run, "TMMD", "generated", "grouped"))
+    value = _with_interval(run, _score(run, "TMMD", "generated", "grouped"))
     start = f"Distance: {len(run.generated.ids)} tactile images generated from {source}"
     return f"{start} have TMMD (grouped) {value} to the real ones{versus} (lower is better)."
 
 
 def _material_fact(run: DemoRun) -> str:
-    generated, real, background = (
-        _score(run, "material accuracy", name) for name in ("generated", "real", BACKGROUND)
+    generated, real, nearest, background = (
+        _score(run, "material accuracy", name)
+        for name in ("generated", "real", NEAREST, BACKGROUND)
     )
     if generated is None or real is None:
         materials = run.manifest.table["material"].drop_nulls().n_unique()
         return f"Material: {materials} materials, too few for a probe."
-    more = f", of the no-contact image {background:.1%}" if background is not None else ""
-    more += f"; chance is {generated.details['chance']:.1%}"
+    more = f", {percent(float(nearest))} of those of the nearest photo" if nearest else ""
+    more += f", {percent(float(background))} of the no-contact image" if background else ""
+    more += f"; chance is {percent(generated.details['chance'])}"
     start = "Material: a probe fitted to real train images is right on"
-    shares = f"{real:.1%} of the real test images and {generated:.1%} of the generated ones"
+    shares = f"{percent(float(real))} of the real test images"
+    shares += f", {percent(float(generated))} of the generated ones"
     return f"{start} {shares}{more}."
 
 

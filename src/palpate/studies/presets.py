@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
-from palpate.core import require_choice
 from palpate.sim import PRESETS as WORLDS
 from palpate.sim import WorldOptions
 
@@ -23,8 +22,6 @@ class DemoPreset:
             and the tactile encoder that training goes on from; None: all are trained in the run.
         start: whether the generator goes on from that of ``models`` instead of from random weights.
         train: share of the train part.
-        repeat: the train part's tactile images are repeated until they are this share of the
-            autoencoder's training set.
         tactile_epochs: passes of the tactile encoder over the pretraining samples, then over the
             train part (the first are left out where it goes on from a ready one).
         cost: measured on two CPU cores.
@@ -38,7 +35,6 @@ class DemoPreset:
     models: str | None = None
     start: bool = False
     train: float = 0.75
-    repeat: float = 1 / 3
     tactile_epochs: tuple[float, float] = (5, 6)
     cost: str = ""
 
@@ -84,13 +80,3 @@ PRESETS = {
         ),
     )
 }
-
-
-def preset(name: str) -> DemoPreset:
-    """A preset by name.
-
-    Raises:
-        PalpateError: if there is none of that name.
-    """
-    require_choice("preset", name, PRESETS)
-    return PRESETS[name]

@@ -7,12 +7,13 @@ was, within a training as well.
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from palpate.core import Progress, Split, locked, quiet, require
+from palpate.core import PalpateError, Progress, Split, locked, quiet, require
 from palpate.data.reading import load
 from palpate.encoders import EncoderSet, train_encoder
 from palpate.encoders.encoder_set import load_clip
@@ -60,6 +61,9 @@ def compare_splits(  # noqa: PLR0913 - those of training
     Raises:
         PalpateError: without seeds, or as training and probing do.
     """
+    if (processes := os.environ.get("WORLD_SIZE", "1")) != "1":
+        fix = "Run it once without torchrun; palpate train encoder takes several"
+        raise PalpateError("A study of splits must run in one process", processes, fix)
     once = 0 < len(seeds) == len(set(seeds))
     require(once, "seeds", "must hold at least one seed, each once", list(seeds), (0, 1, 2))
     manifest, folder = load(data), Path(work)

@@ -5,9 +5,11 @@ The ``card`` in that JSON may have these keys, each with its own place on the pa
 ===========  ==================================================================================
 ``title``    one line
 ``summary``  what it is, what it was trained on, what it must not be used for; Markdown
-``license``  the hub's identifier; ``apache-2.0`` by default
+``license``  the hub's identifier; by default ``unknown`` for a pipeline, else ``apache-2.0``
 ``tags``     in addition to those of the format
-``data``     rows (list of objects): world, seeds, version, digest, frames ...
+``data``     rows (list of objects): world, seeds, version, digest, frames ...; of a pipeline
+             without: its manifest, split and training samples
+``ceiling``  of a pipeline: scores (an object) of what survives the autoencoder
 ``recipe``   the command that makes it again
 ``scores``   rows (list of objects): score, value, interval, chance, on, n ...
 ``limits``   sentences
@@ -25,7 +27,7 @@ from typing import Any, NamedTuple
 
 from palpate.core import PalpateError, read_json, write_text
 
-PLACED = ("title", "summary", "license", "tags", "data", "recipe", "scores", "limits")
+PLACED = ("title", "summary", "license", "tags", "data", "ceiling", "recipe", "scores", "limits")
 #: Longer entries of the record (loss curves, nested cards) are cut on the page.
 MAX_CHARACTERS = 240
 
@@ -58,9 +60,9 @@ _FORMATS = {
         "Autoencoder of tactile images",
         "diffusers",
         "image-to-image",
-        ("vq-gan", "autoencoder"),
-        "from palpate.diffusion.autoencoder import Autoencoder\n\n"
-        'autoencoder = Autoencoder.load("{name}")',
+        ("autoencoder",),
+        "from palpate.diffusion.autoencoder import load_autoencoder\n\n"
+        'autoencoder = load_autoencoder("{name}")',
     ),
     "palpate-pipeline/2": _Format(
         "From a photo to a tactile image",
@@ -93,21 +95,26 @@ def model_card(about: Mapping[str, Any]) -> str:
             repr(about.get("format")),
             "Pass the JSON of palpate.json",
         )
-    card = _card(about)
+    card, pipeline = _card(about), "training" in about
     head = ModelCardData(
-        license=card.get("license", "apache-2.0"),
+        license=card.get("license", "unknown" if pipeline else "apache-2.0"),
         library_name=form.library,
         pipeline_tag=form.task,
         tags=[*dict.fromkeys(("palpate", "tactile", *form.tags, *card.get("tags", ())))],
     )
     name = card.get("name") or about.get("name") or "FOLDER"
     digests = about.get("digests") or ({"model": about["digest"]} if about.get("digest") else {})
+    if pipeline:
+        parts = {"autoencoder": about.get("autoencoder"), "vision encoder": about.get("encoders")}
+        parts |= {k: card.get(k) for k in ("manifest", "split")}
+        digests = digests | {k: v for k, v in parts.items() if v}
     record = {
         k: _cut(v) for k, v in card.items() if k not in PLACED and v not in (None, {}, [], "")
     }
     sections = {
         "Scores": _table(card.get("scores")),
-        "Data": _table(card.get("data")),
+        "Ceiling: what survives the autoencoder": _table(card.get("ceiling")),
+        "Data": _table(card.get("data") or _trained_on(card)),
         "Limits": "\n".join(f"- {text}" for text in card.get("limits", ())),
         "Made by": _code("sh", str(card.get("recipe", ""))),
         "Digests": "\n".join(f"- {part}: `{digest}`" for part, digest in digests.items()),
@@ -164,6 +171,13 @@ def _contents(folder: Path, models: Mapping[Path, Mapping[str, Any]]) -> str:
 
 def _card(about: Mapping[str, Any]) -> Mapping[str, Any]:
     return about.get("card", about.get("training")) or {}
+
+
+def _trained_on(card: Mapping[str, Any]) -> dict[str, Any]:
+    """The data of a pipeline that palpate trained, as one row."""
+    names = {"split_rule": "split", "train_samples": "training samples", "materials": "materials"}
+    row = {shown: card[name] for name, shown in names.items() if card.get(name)}
+    return {k: json.dumps(v) if isinstance(v, Mapping) else v for k, v in row.items()}
 
 
 def _code(language: str, text: str) -> str:

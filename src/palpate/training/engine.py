@@ -29,9 +29,9 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import load_file, save_file
 from torch import Tensor, nn
 
-from palpate.core import PalpateError, Progress, atomic_path, digest_json, quiet
+from palpate.core import PalpateError, Progress, atomic_path, digest_json, quiet, rng_for
 from palpate.training.options import Compute, LoopOptions, RowOrder, Tracker, learning_rate
-from palpate.training.processes import average, barrier, place
+from palpate.training.processes import average, barrier, merged, place, shared
 from palpate.training.steps import Step
 
 Batch = dict[str, Tensor]
@@ -39,7 +39,7 @@ Batch = dict[str, Tensor]
 Load = Callable[[Step], Batch]
 CHECKPOINT, BEST, LOG = "checkpoint.safetensors", "best.safetensors", "log.jsonl"
 SAMPLES = "samples"
-MOMENTS = ("exp_avg", "exp_avg_sq")  # of AdamW
+MOMENTS = ("step", "exp_avg", "exp_avg_sq")  # of AdamW, which counts the steps it did not skip
 DTYPES = {"bf16": torch.bfloat16, "fp16": torch.float16}
 EVERY = 10  # steps between two lines of the log
 
@@ -143,6 +143,7 @@ class _Run:
     Attributes:
         step: whole steps done.
         busy: an update has begun and is not finished.
+        resumed: it goes on from a checkpoint.
     """
 
     def __init__(
@@ -172,14 +173,14 @@ class _Run:
         averaged = self.parameters if options.ema is not None else {}
         self.average = {name: p.detach().clone() for name, p in averaged.items()}
         shapes = {name: list(p.shape) for name, p in self.parameters.items()}
-        self.key = digest_json([task.key, task.n, shapes, options.facts])
+        self.key = digest_json(["palpate-checkpoint/2", task.key, task.n, shapes, options.facts])
         self.order = RowOrder(task.n, batch, options.seed)
         self.loss = torch.compile(task.loss) if compute.compile else task.loss
         if compute.gradient_checkpointing:
             _checkpoint_blocks(module)
         if compute.channels_last:
             module.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
-        self.step, self.busy = 0, False
+        self.step, self.busy, self.resumed = 0, False, False
         self.log: list[dict[str, float]] = []
         self.reader, self.writer = ThreadPoolExecutor(1), ThreadPoolExecutor(1)
         self.written: Future[None] | None = None
@@ -274,29 +275,35 @@ class _Run:
         A checkpoint would keep the harm, so none is written before this.
         """
         last: dict[str, float] = {}
+        # In 16 bits, gradients overflow now and then: that step is skipped, the scale lowered.
+        skipped = self.scaler.is_enabled() and self.scaler.get_scale() >= 1
         for step, names, values, norm, rows in self.unchecked:
             last = dict(zip(("loss", *names), values.tolist(), strict=True))
             if not math.isfinite(last["loss"]):
                 raise self.not_finite("loss", last["loss"], step, rows)
-            # In 16 bits, gradients overflow now and then: that step is skipped, the scale lowered.
-            if not (self.scaler.is_enabled() or math.isfinite(float(norm))):
+            if not (skipped or math.isfinite(float(norm))):
                 raise self.not_finite("gradient", float(norm), step, rows)
         self.unchecked.clear()
         return last
 
     def not_finite(self, name: str, value: float, step: int, rows: Tensor | None) -> PalpateError:
-        """Name the rows of this process's batch that make it so, or all of them."""
+        """Name the rows of the global batch that make it so, or all of them."""
         self.busy = True  # the weights may be harmed: nothing of them is kept
-        mine = Step(step, self.order(step), self.options.seed, self.part).rows
-        bad = mine if rows is None else mine[~torch.isfinite(rows.flatten()).cpu().numpy()]
-        bad = bad if len(bad) else mine
+        batch = Step(step, self.order(step), self.options.seed, self.part)
+        finite = np.full(len(batch.rows), True)
+        if rows is not None:
+            finite = torch.isfinite(rows.flatten()).cpu().numpy()
+        parts = merged({str(self.part[0]): batch.rows[~finite]})
+        bad = np.concatenate([parts[str(rank)] for rank in range(self.part[1])])
+        bad = bad if len(bad) else batch.all_rows
         names = self.task.names
         listed = [str(names[r]) if names is not None else f"row {r}" for r in bad[:5]]
         more = f" and {len(bad) - 5} more" if len(bad) > 5 else ""
         must = f"The {name} of {self.task.what} must be finite"
         got = f"{value} at step {step}, with {', '.join(listed)}{more}"
-        fix = "Look at these samples, or lower the learning rate; the last checkpoint is kept"
-        return PalpateError(must, got, fix)
+        kept = "; the last checkpoint is kept" if self.resumed or self.written else ""
+        fix = f"Look at these samples, or lower the learning rate{kept}"
+        return shared(PalpateError(must, got, fix))
 
     # --- the held-out part ---------------------------------------------------------------------
 
@@ -314,6 +321,11 @@ class _Run:
         with self.evaluating():
             if self.task.held_out is not None:
                 values["held_out"] = self.held_out_loss(*self.task.held_out)
+                if not math.isfinite(values["held_out"]):
+                    must = f"The held-out loss of {self.task.what} must be finite"
+                    got = f"{values['held_out']} after step {step - 1}"
+                    self.busy = True
+                    raise shared(PalpateError(must, got, "Lower the learning rate"))
             if self.task.probe is not None:
                 values |= self.task.probe(self.module)
             if "held_out" in values and values["held_out"] < self.best[0] and not self.part[0]:
@@ -321,16 +333,21 @@ class _Run:
         self.write_log({"step": step - 1} | values)
 
     def held_out_loss(self, n: int, load: Load) -> float:
-        """The mean loss over the whole batches of the held-out rows, with the same draws always."""
-        size = min(self.order.batch, n // self.part[1] * self.part[1])
-        totals: list[Tensor] = []
-        for k in range(n // size if size else 0):
-            rows = np.arange(k * size, (k + 1) * size)
-            losses = self.forward(load(Step(k, rows, self.options.seed + 1, self.part)))
-            totals.append(losses.total.detach().float())
-        mean = torch.stack(totals).mean() if totals else torch.tensor(math.nan)
-        average([mean])
-        return float(mean)
+        """The mean loss over all held-out rows, with the same batches and draws always.
+
+        The rows are shuffled, as in training, and cut into batches of nearly equal size, none
+        smaller than a training batch if there are as many rows. The processes share the batches,
+        each of which one process sees as a whole.
+        """
+        rows = rng_for(self.options.seed, "held-out").permutation(n)
+        batches = np.array_split(rows, max(1, n // self.order.batch))
+        rank, size = self.part
+        sums = torch.zeros(2, device=self.device)  # of the losses of the rows, and of the rows
+        for k in range(rank, len(batches), size):
+            losses = self.forward(load(Step(k, batches[k], self.options.seed + 1)))
+            sums += len(batches[k]) * torch.stack([losses.total.float(), sums.new_ones(())])
+        average([sums])
+        return float(sums[0] / sums[1])
 
     @property
     def best(self) -> tuple[float, int]:
@@ -393,6 +410,9 @@ class _Run:
         with atomic_path(self.folder / LOG) as part:
             part.write_text("".join(json.dumps(line) + "\n" for line in self.log), "utf-8")
         self.trackers = [_tracker(each, self.folder) for each in self.compute.trackers]
+        for tracker in self.trackers:
+            if tracker.name == "wandb":  # TensorBoard's takes numbers and words alone
+                tracker.store_init_configuration(dict(self.options.facts))
 
     def write_log(self, line: dict[str, float]) -> None:
         """Add a line to the log, its file and the trackers."""
@@ -459,15 +479,14 @@ class _Run:
         self.module.load_state_dict(model)
         for name, value in self.average.items():
             value.copy_(tensors[f"ema.{name}"])
-        self.step, self.log = int(meta["step"]), json.loads(meta["log"])
+        self.step, self.log, self.resumed = int(meta["step"]), json.loads(meta["log"]), True
         if "scaler" in meta and self.scaler.is_enabled():
             self.scaler.load_state_dict(json.loads(meta["scaler"]))
-        count = torch.tensor(float(self.step))
+        counter = self.device if self.device.type == "cuda" else "cpu"
         for name, p in self.parameters.items():
             if f"{MOMENTS[0]}.{name}" in tensors:
-                moments = {m: tensors[f"{m}.{name}"].to(p.device) for m in MOMENTS}
-                where = p.device if self.device.type == "cuda" else "cpu"
-                self.optimizer.state[p] = {"step": count.to(where, copy=True), **moments}
+                state = {m: tensors[f"{m}.{name}"].to(p.device) for m in MOMENTS}
+                self.optimizer.state[p] = state | {"step": state["step"].to(counter)}
 
 
 class _Values(NamedTuple):
@@ -487,9 +506,10 @@ def _require(task: Task, options: LoopOptions, processes: int) -> int:
         raise PalpateError(f"{task.what} needs at least one sample", "none", fix)
     batch = min(options.batch, task.n)
     if batch % processes:
-        must, got = f"must be a multiple of the {processes} processes", f"{batch}"
+        must = f"must be a multiple of the {processes} processes"
+        got = f"{batch}" + (", all training samples" if batch == task.n else "")
         fix = "Choose another, or another number of processes"
-        raise PalpateError(must, got, fix, argument="batch")
+        raise shared(PalpateError(must, got, fix, argument="batch"))
     return batch
 
 
@@ -514,8 +534,10 @@ def _save(tensors: dict[str, Tensor], path: Path, metadata: dict[str, str] | Non
 
 def _tracker(name: Tracker, folder: Path) -> Any:
     """A started tracker of accelerate; TensorBoard's files lie in ``tensorboard`` in the folder."""
+    from accelerate import PartialState
     from accelerate.tracking import TensorBoardTracker, WandBTracker
 
+    PartialState()  # which their logging needs, also in one process
     try:
         board = name == "tensorboard"
         tracker = TensorBoardTracker(name, folder) if board else WandBTracker("palpate")
@@ -528,8 +550,9 @@ def _tracker(name: Tracker, folder: Path) -> Any:
 
 def _checkpoint_blocks(module: nn.Module) -> None:
     """Switch on gradient checkpointing in the models of transformers and diffusers inside."""
+    calls = ("activation_checkpointing_enable", "gradient_checkpointing_enable")  # 5.23, before
     for part in module.modules():
-        for name in ("gradient_checkpointing_enable", "enable_gradient_checkpointing"):
+        for name in (*calls, "enable_gradient_checkpointing"):
             if hasattr(part, name):
                 getattr(part, name)()
                 break
@@ -537,10 +560,13 @@ def _checkpoint_blocks(module: nn.Module) -> None:
 
 @contextmanager
 def _numerics(compute: Compute) -> Generator[None]:
-    """TF32 inside, where requested; the setting is restored."""
-    before = torch.backends.cuda.matmul.allow_tf32
-    torch.backends.cuda.matmul.allow_tf32 = compute.tf32
+    """TF32 inside, of products and convolutions, where requested; the settings are restored."""
+    backends: Any = torch.backends.cuda.matmul, torch.backends.cudnn
+    before = [backend.allow_tf32 for backend in backends]
+    for backend in backends:
+        backend.allow_tf32 = compute.tf32
     try:
         yield
     finally:
-        torch.backends.cuda.matmul.allow_tf32 = before
+        for backend, setting in zip(backends, before, strict=True):
+            backend.allow_tf32 = setting

@@ -67,8 +67,14 @@ class LoopOptions:
             "ema": (self.ema is None or 0 <= self.ema < 1, "must lie in [0, 1) or be None"),
             "betas": (all(0 <= b < 1 for b in self.betas), "must lie in [0, 1)"),
             "evaluations": (self.evaluations >= 0, "must be at least 0"),
-            "patience": (self.patience is None or self.patience >= 1, "must be at least 1"),
-            "keep": (self.keep in ("last", "best"), "must be last or best"),
+            "patience": (
+                self.patience is None or (self.patience >= 1 and self.evaluations > 0),
+                "must be at least 1, with evaluations",
+            ),
+            "keep": (
+                self.keep == "last" or (self.keep == "best" and self.evaluations > 0),
+                "must be last or, with evaluations, best",
+            ),
         }
         for name, (holds, must) in valid.items():
             if not holds:

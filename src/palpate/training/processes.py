@@ -15,15 +15,22 @@ from collections.abc import Generator, Sequence
 from contextlib import contextmanager
 from datetime import timedelta
 from pathlib import Path
+from typing import Any, TypeVar
 
 import torch
-from torch import Tensor
+from torch import (
+    Tensor,
+    _utils,  # those of DistributedDataParallel
+)
 from torch import distributed as dist
 
 from palpate.core import PalpateError, locked, require_new_folder
 
+T = TypeVar("T")
 #: How long a process waits for another: the first one may decode a whole data set meanwhile.
 PATIENCE = timedelta(hours=12)
+#: Bytes that are averaged at once: a message has its cost, however short it is.
+BUCKET = 1 << 25
 
 
 def connect(device: str = "auto") -> str:
@@ -83,23 +90,45 @@ def average(tensors: Sequence[Tensor]) -> None:
     """
     if (size := place()[1]) == 1:
         return
+    for some in _utils._take_tensors(tensors, BUCKET):  # pyright: ignore
+        flat = _utils._flatten_dense_tensors(some)  # pyright: ignore
+        try:
+            dist.all_reduce(flat)
+        except RuntimeError as error:
+            raise _ended(error) from None
+        means = _utils._unflatten_dense_tensors(flat / size, some)  # pyright: ignore
+        torch._foreach_copy_(some, means)  # pyright: ignore
+
+
+def merged(table: dict[str, T]) -> dict[str, T]:
+    """The entries of the tables of all processes; all of them have been here when it returns."""
+    if place()[1] == 1:
+        return table
+    tables: list[Any] = [None] * place()[1]
     try:
-        for work in [dist.all_reduce(t, async_op=True) for t in tensors]:
-            work.wait()  # type: ignore[union-attr]
+        dist.all_gather_object(tables, table)
     except RuntimeError as error:
         raise _ended(error) from None
-    torch._foreach_div_(list(tensors), size)  # pyright: ignore
+    return {key: value for each in tables for key, value in each.items()}
 
 
-def gather_rows(rows: Tensor) -> Tensor:
+def shared(error: PalpateError) -> PalpateError:
+    """The same error, which all processes raise: the first one alone prints it."""
+    error.shared = True
+    return error
+
+
+def gather_rows(rows: Tensor, batch: int | None = None) -> Tensor:
     """The rows of all processes, (processes * n, ...), differentiable.
+
+    Rows that are the whole ``batch`` already, as in an evaluation, are returned as they are.
 
     Every process computes the same loss over all rows, and :func:`average` divides the gradients by
     the number of processes. So the rows of this process get their gradient times that number; the
     others are constants here and get theirs in their own process.
     """
     rank, size = place()
-    if size == 1:
+    if size == 1 or len(rows) == batch:
         return rows
     parts = [torch.empty_like(rows, requires_grad=False) for _ in range(size)]
     try:
@@ -127,7 +156,7 @@ def work_folder(output: Path | None) -> Generator[Path]:
 
     ``.<name>.work`` next to the output, which the same call finds again after a stop and which is
     removed on success; a temporary folder where there is no output. Of several processes the first
-    holds it.
+    holds it, and all are given the same.
 
     Raises:
         PalpateError: if the output exists already or is written by another run, before any work is
@@ -136,7 +165,8 @@ def work_folder(output: Path | None) -> Generator[Path]:
     rank = place()[0]
     if output is None:
         with tempfile.TemporaryDirectory(prefix="palpate-") as name:
-            yield Path(name)
+            yield Path(merged({str(rank): name})["0"])
+            barrier()  # the first one is removed when nobody needs it
         return
     require_new_folder(output)
     work = output.absolute().parent / f".{output.name}.work"

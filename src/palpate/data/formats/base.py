@@ -17,11 +17,10 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-from palpate.core import Problem, Progress, Split, inside, quiet, read_json
+from palpate.core import Problem, Progress, Split, few, inside, quiet, read_json
 from palpate.data.images import Check, check_image, in_threads
-from palpate.data.imported import Imported, raise_if, require_some
+from palpate.data.imported import Imported, place_of, raise_if, require_some
 from palpate.data.manifest import IMAGE_COLUMNS, Manifest
-from palpate.data.recordings import place_of
 
 #: Manifest column -> cell; ``split`` may hold the part of the data set's own split.
 Cells = dict[str, Any]
@@ -29,35 +28,25 @@ Cells = dict[str, Any]
 Row = tuple[str, Cells]
 #: Kinds of problems of files that are not there; every other kind means that a file or row is bad.
 MISSING = ("missing-", "unpaired")
-#: How many names a summary shows.
-FEW = 3
 MeanStd = tuple[tuple[float, float, float], tuple[float, float, float]]
 
 
 @dataclass(frozen=True, kw_only=True)
 class Facts:
-    """What is known of a data set, from its publication and its public files.
+    """What is known of a data set, from its publication and its public files."""
 
-    Attributes:
-        name: as its authors write it.
-        citation, license, url: of the data; ``"unknown"`` where none is stated.
-        sensor: tactile sensor.
-        image_size: (width, height) of the tactile images as released, in pixels, or None.
-        samples: how many there are, in words and with the source.
-        group: what a split must keep whole, in words.
-        group_column: the manifest column of that group; the default of audits and splits.
-        normalization: crop that it is valid for -> (mean, std) of RGB in [0, 1].
-    """
-
-    name: str
-    citation: str = "unknown"
+    name: str  # as its authors write it
+    citation: str = "unknown"  # of the data; ``"unknown"`` where none is stated
     license: str = "unknown"
     url: str = "unknown"
-    sensor: str = "unknown"
+    sensor: str = "unknown"  # tactile sensor
+    #: (width, height) of the tactile images as released, in pixels, or None.
     image_size: tuple[int, int] | None = None
-    samples: str
-    group: str
+    samples: str  # how many there are, in words and with the source
+    group: str  # what a split must keep whole, in words
+    #: The manifest column of that group; the default of audits and splits.
     group_column: str = "video"
+    #: Crop that it is valid for -> (mean, std) of RGB in [0, 1].
     normalization: Mapping[str, MeanStd] = field(default_factory=dict)
 
     def of_manifest(self) -> dict[str, str]:
@@ -98,30 +87,21 @@ def world_facts(folder: Path) -> dict[str, str]:
 
 @dataclass
 class Scan:
-    """What a source holds.
+    """What a source holds."""
 
-    Attributes:
-        base: folder that the rows' paths are relative to.
-        facts: further facts for the manifest (``layout``, ``text_source`` ...).
-        rows: the readable rows.
-        problems: everything that makes a row or file unusable.
-        suspicious: usable, but a person should look (swapped folders, unexpected counts ...).
-        splits: the data set's own splits, by name.
-        split_name, split_rule: of the split in the rows' cells ``split``, if they have any.
-        inconclusive: rows skipped because their label marks the material as unclear.
-        more: columns beyond those of every manifest.
-    """
-
-    base: Path
+    base: Path  # folder that the rows' paths are relative to
+    #: Further facts for the manifest (``layout``, ``text_source`` ...).
     facts: dict[str, str] = field(default_factory=dict)
-    rows: list[Row] = field(default_factory=list)
+    rows: list[Row] = field(default_factory=list)  # the readable rows
+    #: Everything that makes a row or file unusable.
     problems: list[Problem] = field(default_factory=list)
+    #: Usable, but a person should look (swapped folders, unexpected counts ...).
     suspicious: list[Problem] = field(default_factory=list)
-    splits: dict[str, Split] = field(default_factory=dict)
-    split_name: str = ""
+    splits: dict[str, Split] = field(default_factory=dict)  # the data set's own splits, by name
+    split_name: str = ""  # of the split in the rows' cells ``split``, if they have any
     split_rule: dict[str, Any] = field(default_factory=dict)
-    inconclusive: int = 0
-    more: tuple[str, ...] = ()
+    inconclusive: int = 0  # rows skipped because their label marks the material as unclear
+    more: tuple[str, ...] = ()  # columns beyond those of every manifest
 
     def problem(self, where: object, kind: str, text: str) -> None:
         """Report something that makes a row or file unusable."""
@@ -130,7 +110,7 @@ class Scan:
     def suspect(
         self, where: object, kind: str, text: str, names: Iterable[object] | None = None
     ) -> None:
-        """Report something to look at; with ``names`` only if there are any, with their number."""
+        """Report something to look at; with ``names`` only if there are any."""
         names = None if names is None else list(names)
         if names is None or names:
             text = text if names is None else f"{text}: {few(names)}"
@@ -139,48 +119,29 @@ class Scan:
 
 @dataclass(frozen=True)
 class Into:
-    """Where an import writes images that are no files yet.
+    """Where an import writes images that are no files yet."""
 
-    Attributes:
-        out: its folder.
-        created: every new file is added here.
-        skip_bad: skip bad rows instead of raising before images are written.
-    """
-
-    out: Path
-    created: list[Path]
-    skip_bad: bool
-
-
-def few(names: Iterable[object]) -> str:
-    """How many there are, and the first of them: ``"12: a, b, c ..."``, or ``"none"``."""
-    names = [str(name) for name in names]
-    more = " ..." if len(names) > FEW else ""
-    return f"{len(names)}: {', '.join(names[:FEW])}{more}" if names else "none"
+    out: Path  # its folder
+    created: list[Path]  # every new file is added here
+    skip_bad: bool  # skip bad rows instead of raising before images are written
 
 
 @dataclass(frozen=True)
 class Format:
-    """One data-set format.
+    """One data-set format."""
 
-    Attributes:
-        facts: about the data set; for formats of anyone's data, about the format.
-        detect: whether a source looks like it; must be quick and must not raise.
-        looks_for: what ``detect`` expects, for the error message.
-        scan: ``scan(source, *, progress, ...) -> Scan``; further keywords are the format's options.
-            A format that writes images has ``into: Into | None``, None where nothing is written,
-            and ``check``.
-        write_lists: ``write_lists(manifest, split, folder) -> files``: a split in the data set's
-            own form, if it has one.
-        remote: the source may be a name instead of a path on disk.
-    """
-
-    facts: Facts
+    facts: Facts  # about the data set; for formats of anyone's data, about the format
+    #: Whether a source looks like it; must be quick and must not raise.
     detect: Callable[[Path], bool]
-    looks_for: str
+    looks_for: str  # what ``detect`` expects, for the error message
+    #: ``scan(source, *, progress, ...) -> Scan``; further keywords are the format's options. A
+    #: format that writes images has ``into: Into | None``, None where nothing is written, and
+    #: ``check``.
     scan: Callable[..., Scan]
+    #: ``write_lists(manifest, split, folder) -> files``: a split in the data set's own form, if it
+    #: has one.
     write_lists: Callable[[Manifest, Split, Path], list[Path]] | None = None
-    remote: bool = False
+    remote: bool = False  # the source may be a name instead of a path on disk
 
     @property
     def options(self) -> list[str]:

@@ -15,17 +15,18 @@
 The source may be ``hct/``, one ``dataN/``, or the folder that holds ``hct/``. The paths of a list
 are relative to its ``dataN/``, or start at ``dataN/`` or ``hct/``.
 
-- **Samples** are the rows of the lists. Frames that only ``contact.json`` names are counted, and
-  are samples without words and part with ``contact``. Frames of ``not_contact.json`` are none.
-- **video** is the whole folder name, ``data2/4-1702596295.70``: the number before the dash is used
-  again and again. **frame** is the integer before the dash of the file. **contact** is a run of
-  consecutive frames in contact. **session** joins folders of one ``dataN`` of which each starts at
-  most ``session_gap`` seconds after the one before, since neighbors may hold the same object.
-  Captions are no object labels: frames of one folder are worded differently.
-- **background**: the list's image if it is there, else ``digit_background.png``, else of up to 15
-  frames of the trajectory in ``not_contact.json`` the one nearest to their median, else null.
-- **Swapped folders**: some trajectories have ``vision/`` and ``tactile/`` exchanged. Where the two
-  differ in size and vision has the sensor's, they are.
+- **Samples** are the rows of the lists. Frames that are in ``contact.json`` alone are none, but a
+  contact goes on through them.
+- **video** is a trajectory folder with its rig, ``data2/4-1702596295.70`` (numbers before the dash
+  repeat). **frame** is the number at the start of the file name. **contact** is a run of
+  consecutive frames in contact. **session** joins folders of one rig that were started at most a
+  minute after each other: they may show the same object. No column ``object`` is made of captions,
+  since frames of one folder are worded differently.
+- **background** is the first of these that exists: the image that the list names,
+  ``digit_background.png``, the most typical of up to 15 frames of the trajectory in
+  ``not_contact.json``.
+- **Swapped folders**: in some trajectories ``vision/`` holds the tactile images and ``tactile/``
+  the photos. They are recognized by their size, which is that of the sensor in ``vision/`` alone.
 - Photos of ``data3`` show the touched spot lower: TVL crops them 200 pixels further down.
 """
 
@@ -35,22 +36,20 @@ import re
 from collections import Counter, defaultdict
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
 from functools import cache
 from pathlib import Path, PurePosixPath
 from typing import Literal
 
 import numpy as np
 
-from palpate.core import PalpateError, Progress, Split, inside, quiet
+from palpate.core import PalpateError, Progress, Split, inside, quiet, require_choice
 from palpate.data.formats import tvl
 from palpate.data.formats.base import WORLD, Cells, Facts, Format, Row, Scan, world_facts
 from palpate.data.formats.layout import read_json_file, report_missing_folders, subfolders
-from palpate.data.frames import nearest_to_median
+from palpate.data.frames import MEDIAN_OF, nearest_to_median
 from palpate.data.images import BROKEN, check_image, in_threads, opened, read_image
 from palpate.data.listing import contact_names
 from palpate.data.manifest import CLIMBS, Manifest
-from palpate.data.recordings import MEDIAN_OF
 
 FACTS = Facts(
     name="HCT (Touch-Vision-Language)",
@@ -72,24 +71,9 @@ TRAJECTORY = re.compile(r"\d+-(\d+(?:\.\d+)?)")
 RIG = re.compile(r"data\d+")
 #: The stem of a frame's file: number and latency.
 FRAME = re.compile(r"(\d{1,18})(?:-.*)?")
+#: Seconds between the starts of two folders of one session.
+SESSION_GAP = 60.0
 Swap = Literal["report", "fix"]
-
-
-@dataclass
-class Lists:
-    """The lists of a tree; frames are rows with the paths and words as listed.
-
-    Attributes:
-        samples: the frames that are samples, by video (in order of time) and number.
-        contact: (video, number) of every frame known to be in contact.
-        untouched: video -> its frames in ``not_contact.json``.
-        files: the lists read.
-    """
-
-    samples: list[Row]
-    contact: set[tuple[str, int]]
-    untouched: dict[str, list[Cells]]
-    files: list[str]
 
 
 def detect(source: Path) -> bool:
@@ -107,72 +91,48 @@ def find(source: Path) -> tuple[Path, list[str]]:
     return (source.parent, [source.name]) if _is_rig(source) else (source, [])
 
 
-def scan(
-    source: Path,
-    *,
-    lists: Path | None = None,
-    contact: bool = False,
-    session_gap: float = 60.0,
-    swap: Swap = "report",
-    progress: Progress = quiet,
-) -> Scan:
+def scan(source: Path, *, swap: Swap = "report", progress: Progress = quiet) -> Scan:
     """Read the lists and look at the trajectories.
 
-    Args:
-        source: ``hct/``, one ``dataN/``, or the folder that holds ``hct/``.
-        lists: folder with lists to use instead of the data set's own (``lists/data1/train.csv``).
-        contact: include frames that only ``contact.json`` names.
-        session_gap: seconds between the starts of folders of one session.
+    Options:
         swap: trajectories whose vision and tactile folders are swapped are reported, or ``fix``
             also swaps their paths back.
-        progress: called with the number of trajectories looked at.
-
-    Raises:
-        PalpateError: if there are no trajectories, or an option has a wrong value.
     """
-    if swap not in ("report", "fix"):
-        raise PalpateError("must be report or fix", repr(swap), "", argument="swap")
-    if session_gap < 0:
-        got = f"{session_gap}"
-        raise PalpateError("must be 0 seconds or more", got, "", argument="session_gap")
+    require_choice("swap", swap, ("report", "fix"))
     root, rigs = find(Path(source))
     if not rigs:
         must = f"{source} must be HCT: {LOOKS_FOR}"
         raise PalpateError(must, "none of these", f"Unpack it from {tvl.URL}")
     result = Scan(root, {"layout": f"hct: {', '.join(rigs)}"} | world_facts(root))
-    listed = _read_lists(result, rigs, lists, contact)
-    keys = sorted(listed.contact)
+    files, in_contact, untouched = _read_lists(result, rigs)
+    keys = sorted(in_contact)
     names = contact_names([video for video, _ in keys], [k for _, k in keys], None)
     contacts = dict(zip(keys, names, strict=True))
-    sessions = sessions_of({row["video"] for _, row in listed.samples}, session_gap)
-    result.rows = listed.samples
+    sessions = sessions_of(row["video"] for _, row in result.rows)
     report_missing_folders(result)
     fixed = _swap(result, swap, progress)
-    _choose_backgrounds(result, listed.untouched, fixed)
+    _choose_backgrounds(result, untouched, fixed)
     sensor = WORLD.sensor if "synthetic" in result.facts else FACTS.sensor
     for _, row in result.rows:
         row |= {"contact": contacts[_key(row)], "session": sessions[row["video"]], "sensor": sensor}
-    result.split_name = "Orig" if lists is None else "Lists"
-    method = "official" if lists is None else "lists"
-    result.split_rule = {"method": method, "files": listed.files}
+    result.split_name, result.split_rule = "Orig", {"method": "official", "files": files}
     worded = sorted({f"{row['split']}.csv" for _, row in result.rows if row["text"]})
     result.facts["text_source"] = f"captions of {', '.join(worded)}" if worded else "none"
-    result.facts["session_gap"] = f"{session_gap:g} s"
     if root == Path(source) / "hct" and (root.parent / "ssvtp").is_dir():
         text = "ssvtp/ is next to hct/ and was not read: import it as the format ssvtp"
         result.suspect(source, "other-half", text)
     return result
 
 
-def sessions_of(videos: Iterable[str], gap: float) -> dict[str, str]:
+def sessions_of(videos: Iterable[str]) -> dict[str, str]:
     """Video -> session, named by its first video; a name without a time is its own session."""
     sessions: dict[str, str] = {}
     last: dict[str, tuple[float, str]] = {}
-    for video in sorted(videos, key=_in_time):
+    for video in sorted(set(videos), key=_in_time):
         rig, start, _ = _in_time(video)
         if start >= 0:
             before, session = last.get(rig, (float("-inf"), ""))
-            sessions[video] = session if start - before <= gap else video
+            sessions[video] = session if start - before <= SESSION_GAP else video
             last[rig] = (start, sessions[video])
         else:
             sessions[video] = video
@@ -222,38 +182,39 @@ def _key(row: Cells) -> tuple[str, int]:
     return row["video"], row["frame"]
 
 
-def _read_lists(result: Scan, rigs: Sequence[str], lists: Path | None, contact: bool) -> Lists:
-    """The samples of all lists, and what the two JSON files add."""
-    samples, unlisted, untouched = list[Row](), list[Row](), list[Row]()
+def _read_lists(
+    result: Scan, rigs: Sequence[str]
+) -> tuple[list[str], set[tuple[str, int]], dict[str, list[Cells]]]:
+    """Add the rows of all lists, by video (in order of time) and number.
+
+    Returns:
+        The lists read; (video, number) of every frame known to be in contact; video -> its frames
+        in ``not_contact.json``.
+    """
+    samples, touched, untouched = list[Row](), list[Row](), list[Row]()
     files: list[str] = []
     for rig in rigs:
-        for part, path in tvl.part_lists((lists or result.base) / rig).items():
+        for part, path in tvl.part_lists(result.base / rig).items():
             files.append(f"{rig}/{path.name}")
             samples += _frames(result, tvl.read_list(result, path), rig, part)
         untouched += _frames(result, _json_rows(result, rig, "not_contact"), rig, None)
-        unlisted += _frames(result, _json_rows(result, rig, "contact"), rig, None)
-    if lists is not None and not samples:
-        must = "must hold lists such as data1/train.csv"
-        raise PalpateError(must, str(lists), "", argument="lists")
+        touched += _frames(result, _json_rows(result, rig, "contact"), rig, None)
     known, resting = ({_key(row) for _, row in rows} for rows in (samples, untouched))
-    in_contact = known | ({_key(row) for _, row in unlisted} - resting)
-    unlisted = [(where, row) for where, row in unlisted if _key(row) not in known]
-    both = [where for where, row in [*samples, *unlisted] if _key(row) in resting]
+    both = [where for where, row in [*samples, *touched] if _key(row) in resting]
     text = "not_contact.json calls them untouched; samples only where a list has them"
     tvl.suspect_rows(result, both, "contact-and-not", text)
-    unlisted = [(where, row) for where, row in unlisted if _key(row) not in resting]
-    if contact:
-        samples += unlisted
-    else:
-        text = "in contact.json but in no list, so no samples; the option contact includes them"
-        tvl.suspect_rows(result, [where for where, _ in unlisted], "unlisted-contact", text)
+    unlisted = [where for where, row in touched if _key(row) not in known | resting]
+    text = "in contact.json but in no list, so no samples"
+    tvl.suspect_rows(result, unlisted, "unlisted-contact", text)
     partner = lambda row: f"{row['video']}/tactile/{PurePosixPath(row['vision']).name}"
     odd = [where for where, row in samples if row["tactile"] != partner(row)]
     text = "photo and tactile image differ in trajectory or file name"
     tvl.suspect_rows(result, odd, "unequal-names", text)
     result.facts["not_contact"] = f"{len(resting)} frames, no samples"
     samples.sort(key=lambda sample: (_in_time(sample[1]["video"]), sample[1]["frame"]))
-    return Lists(samples, in_contact, _by_video(untouched), files)
+    result.rows = samples
+    in_contact = known | ({_key(row) for _, row in touched} - resting)
+    return files, in_contact, _by_video(untouched)
 
 
 def _by_video(rows: Iterable[Row]) -> dict[str, list[Cells]]:

@@ -33,7 +33,7 @@ from PIL import Image
 from palpate.core import PalpateError, Progress, atomic_path, inside, quiet
 from palpate.data.formats.base import Cells, Facts, Format, Into, Scan
 from palpate.data.formats.huggingface_source import ROW, Source, first_line, open_source
-from palpate.data.images import BROKEN, Check, opened
+from palpate.data.images import BROKEN, Check, form_of
 from palpate.data.manifest import CLIMBS, IMAGE_COLUMNS, SCHEMA
 from palpate.data.mapping import ColumnMaps, compile_maps, text_of
 from palpate.data.rows import PART_NAMES, manifest_rows, odd_groups, read_classes
@@ -76,19 +76,11 @@ def scan(
 ) -> Scan:
     """Read a data set; without ``into`` nothing is written, and rows carry no paths of images.
 
-    Args:
-        source: folder, or name on the hub.
+    Options:
         columns: manifest column -> map expression over the data set's columns.
         classes: table of classes, for labels that are bare numbers.
         config: which configuration of the data set.
         revision: of a hub data set: branch, tag or commit.
-        check: how images are checked.
-        into: images go to its ``images``, which becomes the manifest's root.
-        progress: called with the number of rows read.
-
-    Raises:
-        PalpateError: if the source cannot be opened or lacks a needed column.
-        MissingExtraError: if ``datasets`` is not installed.
     """
     opened = open_source(source, config, revision)
     folder, created = (into.out / "images", into.created) if into else (None, list[Path]())
@@ -147,12 +139,7 @@ class _Store:
 def _checked(data: bytes, how: Check) -> tuple[str, str | None]:
     """(format of an image, why it is unusable or None)."""
     try:
-        with opened(io.BytesIO(data)) as image:
-            kind = str(image.format)
-            if how == "decode":
-                image.draft("L", (max(1, image.width // 8), max(1, image.height // 8)))
-                image.load()
-            return kind, None
+        return form_of(io.BytesIO(data), how), None
     except Image.UnidentifiedImageError:
         return "", "not an image" if data else "an empty file (0 bytes)"
     except BROKEN as error:

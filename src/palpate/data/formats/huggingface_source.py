@@ -23,37 +23,20 @@ ROW = "palpate_row"
 
 @dataclass(frozen=True)
 class Source:
-    """An opened data set.
+    """An opened data set."""
 
-    Attributes:
-        name: folder or hub name.
-        splits: name -> data set, whose images come as bytes.
-        images: columns of images.
-        labels: columns of class labels -> the names of their classes.
-        names: all columns.
-        description: of an export of palpate, or empty.
-        facts: for the manifest.
-        folder: where paths of images may point to, or None.
-    """
-
-    name: str
-    splits: Mapping[str, Any]
-    images: Sequence[str]
-    labels: Mapping[str, Sequence[str]]
-    names: Sequence[str]
-    description: Mapping[str, Any]
-    facts: Mapping[str, str]
-    folder: Path | None
+    name: str  # folder or hub name
+    splits: Mapping[str, Any]  # name -> data set, whose images come as bytes
+    images: Sequence[str]  # columns of images
+    labels: Mapping[str, Sequence[str]]  # columns of class labels -> the names of their classes
+    names: Sequence[str]  # all columns
+    description: Mapping[str, Any]  # of an export of palpate, or empty
+    facts: Mapping[str, str]  # for the manifest
+    folder: Path | None  # where paths of images may point to, or None
 
 
 def open_source(source: Path, config: str | None = None, revision: str | None = None) -> Source:
-    """Open a folder or a hub name.
-
-    Raises:
-        PalpateError: if there is none, it is of a kind that is not opened, or the hub cannot be
-            reached.
-        MissingExtraError: if ``datasets`` is not installed.
-    """
+    """Open a folder or a hub name."""
     try:
         import datasets
     except ImportError:

@@ -21,27 +21,18 @@ skipped: which is true is unknown.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
-import polars as pl
-
-from palpate.core import PalpateError, Problem, Progress, Split, quiet, write_text
+from palpate.core import PalpateError, Problem, Progress, quiet, require
 from palpate.data.formats.base import Facts, Format, Into, Scan
-from palpate.data.formats.touch_and_go import (
-    add_frames,
-    require_frame_options,
-    require_videos,
-    usable,
-)
+from palpate.data.formats.recordings import Recordings, Row
+from palpate.data.formats.touch_and_go import require_videos
 from palpate.data.frames import FolderFrames, ImageFormat
 from palpate.data.images import Check
 from palpate.data.listing import FrameTable
-from palpate.data.manifest import Manifest
 from palpate.data.mapping import compile_maps
-from palpate.data.recordings import Recordings, Row
 from palpate.data.rows import manifest_rows, odd_groups, read_classes
 from palpate.data.tables import header_of, open_table
 
@@ -78,13 +69,6 @@ class Interval:
     inconclusive: bool
 
 
-class _Whole(Recordings):
-    """Recordings whose frames are checked by interval, not one by one."""
-
-    def _has(self, row: Row) -> bool:
-        return True
-
-
 def detect(source: Path) -> bool:
     """Whether this is a table with video, start and end and without images, or bare lines."""
     header = [name.lower() for name in header_of(source)] if source.is_file() else []
@@ -110,8 +94,7 @@ def scan(  # noqa: PLR0913 (a public verb)
 ) -> Scan:
     """Read a list and its recordings; without ``into`` nothing is written.
 
-    Args:
-        source: the list.
+    Options:
         root: folder of the recordings (default: that of the list).
         columns: ``video``, ``start``, ``end``, ``material`` ... -> map expression.
         classes: table of classes, whose numbers are the labels.
@@ -120,62 +103,31 @@ def scan(  # noqa: PLR0913 (a public verb)
         sensor: the tactile sensor.
         image_format: of the extracted frames.
         size: their shorter side is reduced to so many pixels.
-        check: how extracted images are checked; ``decode`` also decodes the used frames of videos.
-        into: where frames of raw videos go, to ``images/<video>/{vision,tactile}/``; after an
-            interruption the same call continues.
-        progress: progress callback.
-
-    Raises:
-        PalpateError: if the list or the recordings are missing, a column is lacking, or an option
-            is out of range.
-        ProblemsError: with ``into``, before frames are written, unless bad rows are skipped.
     """
-    source, base = Path(source), _root(source, root)
-    require_frame_options(image_format, size)
-    out, created = (into.out, into.created) if into else (base, list[Path]())
-    work = _Whole(base, out, require_videos(base), {}, image_format, size, created)
-    listed = _read(work, source, columns, classes, half_open)
-    rows, contacts = _prepared(work, listed, every, check, progress)
-    words = _words(rows, contacts)
+    require(every >= 1, "every", "must be at least 1", every)
+    source, base = Path(source), Path(source).parent if root is None else Path(root)
+    if not base.is_dir():
+        must = "must be the folder of the recordings"
+        raise PalpateError(must, f"no folder {base}", "Check the path", argument="root")
+    result = Scan(base, {"dataset": source.stem})
+    work = Recordings(result, into, require_videos(base), {}, image_format, size)
+    listed = _read(result, source, columns, classes, half_open)
+    result.inconclusive = sum(i.inconclusive for i in listed)
+    contacts = _contacts(work, listed, progress)
+    rows = [row for name in contacts for row in _frames(work, name, contacts[name], every)]
+    starts, videos = {c: i.first for c, i in contacts.items()}, {i.video for i in contacts.values()}
+    rows = work.usable(rows, starts, videos, check=check, progress=progress)
+    words: dict[str, FrameTable] = {name: FrameTable({}, []) for name in WORDS}
+    for row in rows:
+        for name, word in contacts[row.contact].words.items():
+            words[name].values[row.video, row.frame] = word
     column = f"column {(columns or {}).get('text', 'text')}"
-    facts = {"dataset": source.stem, "text_source": column if words["text"].values else "none"}
-    result = Scan(base, facts, inconclusive=sum(i.inconclusive for i in listed))
-    more: dict[str, Any] = {"sensor": sensor, "words": words}
-    add_frames(result, work, rows, check=check, into=into, progress=progress, **more)
+    result.facts["text_source"] = column if words["text"].values else "none"
+    work.add(rows, check=check, progress=progress, sensor=sensor, words=words)
     return result
 
 
-def write_lists(manifest: Manifest, split: Split, folder: Path) -> list[Path]:
-    """Write ``<part>.csv`` with ``video,start,end,label,object,text``.
-
-    A line is a run of consecutive frames of one contact, both ends included; the lines hold exactly
-    the samples of the part.
-
-    Raises:
-        PalpateError: if a sample has no video or frame.
-    """
-    files: list[Path] = []
-    for part in split.counts():
-        table = manifest.part(split, part).table.sort("video", "frame")
-        if len(bad := table.filter(pl.any_horizontal(pl.col("video", "frame").is_null()))["id"]):
-            must = "An interval list needs the video and frame of every sample"
-            raise PalpateError(must, f"none for {bad[0]!r}", "Write the split file alone")
-        words = ["contact", "material", "object", "text"]
-        breaks = (pl.col("frame").diff() != 1).fill_null(True)
-        run = breaks | pl.struct("video", *words).rle_id().diff().fill_null(1).cast(pl.Boolean)
-        runs = table.group_by(run.cum_sum().alias("run"), maintain_order=True).agg(
-            pl.first("video"),
-            pl.first("frame").alias("start"),
-            pl.last("frame").alias("end"),
-            pl.first("material").alias("label"),
-            pl.first("object", "text"),
-        )
-        files.append(Path(folder) / f"{part}.csv")
-        write_text(files[-1], runs.drop("run").write_csv())
-    return files
-
-
-FORMAT = Format(FACTS, detect, LOOKS_FOR, scan, write_lists)
+FORMAT = Format(FACTS, detect, LOOKS_FOR, scan)
 
 
 def _is_bare(header: list[str]) -> bool:
@@ -184,25 +136,8 @@ def _is_bare(header: list[str]) -> bool:
     return len(header) in (3, 4) and header[0] != "" and numbers
 
 
-def _root(source: Path, root: Path | None) -> Path:
-    base = Path(source).parent if root is None else Path(root)
-    if not base.is_dir():
-        must = "must be the folder of the recordings"
-        raise PalpateError(must, f"no folder {base}", "Check the path", argument="root")
-    return base
-
-
-def _words(rows: Sequence[Row], contacts: Mapping[str, Interval]) -> dict[str, FrameTable]:
-    """Manifest column -> its words by frame."""
-    tables: dict[str, FrameTable] = {name: FrameTable({}, []) for name in WORDS}
-    for row in rows:
-        for name, word in contacts[row.contact].words.items():
-            tables[name].values[row.video, row.frame] = word
-    return tables
-
-
 def _read(
-    work: Recordings,
+    result: Scan,
     path: Path,
     columns: Mapping[str, str] | None,
     classes: Path | None,
@@ -223,9 +158,9 @@ def _read(
         must, example = f"{path} must have the columns {', '.join(NEEDED)}", {absent[0]: "COLUMN"}
         raise PalpateError(must, got, "Map your columns", example={"columns": example})
     cells = compiled.apply(table.read(compiled.columns))
-    work.problems += table.problems
+    result.problems += table.problems
     # Without classes, as an inconclusive contact (-1) is contact all the same.
-    rows, _ = manifest_rows(cells, len(table.lines), table.where, None, work.problems)
+    rows, _ = manifest_rows(cells, len(table.lines), table.where, None, result.problems)
     labels = None if classes is None else read_classes(Path(classes))
     intervals: list[Interval] = []
     for k, row in rows:
@@ -233,9 +168,9 @@ def _read(
         if isinstance(interval, Interval):
             intervals.append(interval)
         else:
-            work.problems.append(Problem(table.where(k), *interval))
+            result.problem(table.where(k), *interval)
     groups = [(i.where, {"video": i.video, **i.words}) for i in intervals]
-    work.suspicious += [p for p in odd_groups(path, groups) if p.kind == "word-for-null"]
+    result.suspicious += [p for p in odd_groups(path, groups) if p.kind == "word-for-null"]
     return intervals
 
 
@@ -261,12 +196,8 @@ def _interval(
     return Interval(where, str(video), start, last, words, label == "-1")
 
 
-def _prepared(
-    work: Recordings, listed: list[Interval], every: int, check: Check, progress: Progress
-) -> tuple[list[Row], dict[str, Interval]]:
-    """Everything up to extraction: the rows, and the contacts by name."""
-    if every < 1:
-        raise PalpateError("must be at least 1", str(every), "", argument="every")
+def _contacts(work: Recordings, listed: list[Interval], progress: Progress) -> dict[str, Interval]:
+    """The usable contacts by name; opens their recordings."""
     rows = [Row(i.where, i.video, i.video, i.first, i.where, "") for i in listed]
     opened = {row.where for row in work.open(rows, progress)}
     listed = [i for i in listed if i.where in opened and _within(work, i)]
@@ -276,14 +207,11 @@ def _prepared(
     work.in_contact = in_contact
     contacts: dict[str, Interval] = {}
     count: Counter[str] = Counter()
-    for i in _apart(listed, work.problems):
+    for i in _apart(listed, work.scan.problems):
         if not i.inconclusive:
             count[i.video] += 1
             contacts[f"{i.video}#{count[i.video]:04d}"] = i
-    rows = [row for name in contacts for row in _frames(work, name, contacts[name], every)]
-    starts = {name: i.first for name, i in contacts.items()}
-    rows = usable(work, rows, starts, set(count), check=check, progress=progress)
-    return rows, contacts
+    return contacts
 
 
 def _within(work: Recordings, interval: Interval) -> bool:
@@ -292,7 +220,7 @@ def _within(work: Recordings, interval: Interval) -> bool:
     if interval.last >= length:
         text = f"the contact reaches frame {interval.last} of {interval.video!r}: both modalities "
         text += f"have {length} frames, counted from 0"
-        work.problems.append(Problem(interval.where, "beyond-end", text))
+        work.scan.problem(interval.where, "beyond-end", text)
     return interval.last < length
 
 
@@ -332,7 +260,7 @@ def _frames(work: Recordings, contact: str, interval: Interval, every: int) -> l
             text += f"of them {lacking[0]}, in {source.source}"
             text += ": a link that leaves it" * leaves
             kind = "outside-root" if leaves else "missing-file"
-            work.problems.append(Problem(where, kind, text))
+            work.scan.problem(where, kind, text)
             missing.update(lacking)
     frames = (k for k in numbers if k not in missing)
     return [Row(where, f"{video}/{k:010d}", video, k, contact, "") for k in frames]

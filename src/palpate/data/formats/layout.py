@@ -17,13 +17,11 @@ from functools import cache
 from pathlib import Path, PurePosixPath
 from typing import Any, Generic, TypeGuard, TypeVar
 
-from palpate.core import PARTS, PalpateError, Split, inside, write_json
-from palpate.data.formats.base import Facts, Row, Scan, few
+from palpate.core import PARTS, PalpateError, Split, few, inside, write_json
+from palpate.data.formats.base import Facts, Row, Scan
 from palpate.data.images import SUFFIXES
-from palpate.data.manifest import CLIMBS, Manifest
+from palpate.data.manifest import CLIMBS, DIGITS, Manifest
 
-#: The frames of a manifest have 64 bits, so a longer number is none.
-DIGITS = 18
 NUMBER = r"([0-9]+)"
 K = TypeVar("K", int, str)
 #: (folder, name or number): what a JSON list calls a sample.
@@ -32,14 +30,10 @@ Key = tuple[str, int] | tuple[str, str]
 
 @dataclass(frozen=True)
 class Images(Generic[K]):
-    """The images of one folder.
+    """The images of one folder."""
 
-    Attributes:
-        place: the folder, relative to the root.
-        files: key (frame number or stem) -> file name, in order.
-    """
-
-    place: str
+    place: str  # the folder, relative to the root
+    #: Key (frame number or stem) -> file name, in order.
     files: dict[K, str] = field(default_factory=dict)
 
     def path(self, key: K) -> str:

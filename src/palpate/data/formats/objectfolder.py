@@ -50,14 +50,14 @@ def detect(source: Path) -> bool:
     return any((source / name / "tactile_data").is_dir() for name in _numbers(source))
 
 
-def scan(source: Path, *, metadata: Path | None = None, progress: Progress = quiet) -> Scan:
-    """List the images of all trials; ``metadata`` is a table of materials elsewhere."""
+def scan(source: Path, *, progress: Progress = quiet) -> Scan:
+    """List the images of all trials."""
     root = require_folder(source, FACTS.name)
     require_layout(root, LOOKS_FOR, FACTS, complete=detect(root))
     facts = {"background": "first image of the trial (inferred), which is no sample"}
     facts |= {"layout": "raw trials", "text_source": "none", "vision": "none in this layout"}
     result = Scan(root, facts)
-    materials = _materials(result, metadata)
+    materials = _materials(result)
     objects = _numbers(root)
     for done, name in enumerate(objects):
         progress("reading objects", done, len(objects))
@@ -113,14 +113,11 @@ def _object(result: Scan, name: str, material: str | None) -> None:
     result.suspect(place, "no-background", "trials of one image, which is a sample", single)
 
 
-def _materials(result: Scan, given: Path | None) -> dict[int, str]:
+def _materials(result: Scan) -> dict[int, str]:
     """Object -> material from the table; empty without one."""
-    path = result.base / METADATA if given is None else Path(given)
+    path = result.base / METADATA
     if not path.is_file():
-        if given is None:
-            return {}
-        got, fix = f"no file {path}", f"Fetch {METADATA} from github.com/alanzjl/t3"
-        raise PalpateError("must be a table of materials", got, fix, argument="metadata")
+        return {}
     table = open_table(path)
     if not {"Index", "Material"} <= set(table.names):
         must = f"{path} must have the columns Index, Name, Material"

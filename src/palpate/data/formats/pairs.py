@@ -31,20 +31,22 @@ from typing import Literal
 
 import polars as pl
 
-from palpate.core import PalpateError, Progress, quiet
+from palpate.core import PalpateError, Progress, few, quiet
 from palpate.data.detection import ROLES, detect_layout, template_of
-from palpate.data.formats.base import Cells, Facts, Format, Scan, few
+from palpate.data.formats.base import Cells, Facts, Format, Scan
 from palpate.data.formats.layout import require_folder
 from palpate.data.frames import VIDEOS
 from palpate.data.images import SUFFIXES
 from palpate.data.manifest import SCHEMA
-from palpate.data.mapping import ColumnMaps, compile_maps
+from palpate.data.mapping import compile_maps
 from palpate.data.rows import manifest_rows, odd_groups, read_classes
 from palpate.data.tables import TABLES, header_of, open_table
 from palpate.data.templates import FIX, Fields, Matches, Template, assign, join, walk
 
 Side = Literal["vision", "tactile"]
 SIDES = ("vision", "tactile")
+#: Columns of files; the first one that is there decides the order of rows.
+ORDER = ("tactile", "vision", "background")
 #: What may be mapped.
 TARGETS = (*SCHEMA, "split")
 LOOKS_FOR = (
@@ -84,8 +86,7 @@ def scan(
 ) -> Scan:
     """Read the rows of a table, or the images of a folder.
 
-    Args:
-        source: a table or a folder.
+    Options:
         vision: template of the photos of a folder; without any template the names are searched.
         tactile: template of its tactile images.
         background: template of its tactile images without contact.
@@ -96,12 +97,6 @@ def scan(
         classes: table of classes, whose numbers are in the column of the material; rows of -1 are
             skipped as inconclusive.
         side: what the images of a folder show, if all show one thing.
-        progress: called before and after reading.
-
-    Raises:
-        PalpateError: if the source is missing or of another form, lacks a needed column, a template
-            or an expression cannot be read, or the names do not say which images are which.
-        ProblemsError: on bad lines in the table of classes.
     """
     source = Path(source)
     maps = dict(columns or {})
@@ -114,9 +109,9 @@ def scan(
     if wrong := [name for name, value in foreign.items() if value is not None]:
         must = f"must come with a {'folder' if is_table else 'table'}"
         raise PalpateError(must, str(source), "Leave it out", argument=wrong[0])
-    progress("reading rows", 0, 1)
     base = source.parent if is_table else source
     result = Scan(base if root is None else Path(root))
+    progress("reading rows", 0, 1)
     if is_table:
         result.facts["layout"] = f"table {source.suffix.lower()[1:] or 'csv'}"
         _read_table(result, source, maps, names, labels)
@@ -158,10 +153,8 @@ def _read_table(
         got = f"no tactile among {columns}, and no vision" if columns else "an empty file"
         must = f"{path} must have the columns vision and tactile, or one of them"
         raise PalpateError(must, got, "Map your columns to them", example=MAP)
-    frame = table.read(compiled.columns)
-    cells = compiled.apply(frame)
+    cells = compiled.apply(table.read(compiled.columns))
     result.problems += table.problems
-    _report_unchanged(result, compiled, frame, cells)
     sides = [side for side in sides if any(cells[side])] or sides  # a column may be empty
     rows, result.inconclusive = manifest_rows(
         cells, len(table.lines), table.where, classes, result.problems
@@ -186,49 +179,79 @@ def _read_folder(
     classes: Mapping[int, str] | None,
 ) -> None:
     """Add the images of a folder, by its templates; map expressions go first."""
-    files, outside = walk(result.base, (*SUFFIXES, *VIDEOS))
+    files = walked(result, (*SUFFIXES, *VIDEOS))
     videos = [path for path in files if path.lower().endswith(VIDEOS)]
     text = "videos, which are read with a template of their own"
     result.suspect(result.base, "unmatched", text, videos)
     files = [path for path in files if path.lower().endswith(SUFFIXES)]
-    for place in outside:
-        text = "a link to a folder outside the root, which is not followed"
-        result.suspect(place, "outside-root", text)
-    texts = given or templates_of(files, result.base, side)
-    templates = {side: Template.parse(text, side) for side, text in texts.items()}
+    templates = parsed(given or templates_of(files, result.base, side))
     matches = {s: _distinct(result, found) for s, found in assign(files, templates).items()}
     for side_, template in templates.items():
         if not matches[side_]:
             got = f"{template.text}, which matches none of {few(files)}"
             raise PalpateError("must match images", got, FIX, argument=side_)
-    order = [column for column in ("tactile", "vision", "background") if column in templates]
-    rows, problems = join({column: matches[column] for column in order})
-    result.problems += problems
-    result.facts |= {f"template_{column}": template.text for column, template in templates.items()}
-    used = {path for found in matches.values() for path, _ in found}
-    result.suspect(
-        result.base, "unmatched", "images of no template", (f for f in files if f not in used)
-    )
+    rows, fields = joined(result, files, templates, matches, "images")
+    first = next(iter(templates))
     if "background" in templates:
-        without = [row[order[0]] for row in rows if "background" not in row]
+        without = [row[first] for row in rows if "background" not in row]
         result.suspect(result.base, "no-background", "images without a background", without)
-    fields = tuple(dict.fromkeys(name for t in templates.values() for name in t.fields))
-    _add_ids(rows, fields)
+    ids = ["/".join(row[name] for name in fields if name in row) for row in rows]
+    if fields and "id" not in fields and len(set(ids)) == len(ids):  # else they are the paths
+        rows = [row | {"id": i} for row, i in zip(rows, ids, strict=True)]
     name_apart(rows, fields)
-    places = [row[order[0]] for row in rows]
-    names = dict.fromkeys((*fields, *order, "id"))
+    places = [row[first] for row in rows]
+    names = dict.fromkeys((*fields, *templates, "id"))
     table = pl.DataFrame(
         {"path": places} | {name: [row.get(name) for row in rows] for name in names},
         schema=dict.fromkeys(("path", *names), pl.String),
     )
-    result.more = tuple(name for name in fields if name not in TARGETS)
     compiled = compile_maps(maps, table.columns, (*TARGETS, *result.more))
     cells = compiled.apply(table)
-    _report_unchanged(result, compiled, table, cells)
     numbered, result.inconclusive = manifest_rows(
         cells, len(places), places.__getitem__, classes, result.problems
     )
     result.rows += [(places[k], row) for k, row in numbered]
+
+
+def walked(result: Scan, suffixes: tuple[str, ...]) -> list[str]:
+    """The files of these suffixes below the root.
+
+    Links that leave it and names that are not UTF-8, which no table can hold, are reported.
+    """
+    files, outside = walk(result.base, suffixes)
+    for name in (odd := [f for f in files if any("\ud800" <= c <= "\udfff" for c in f)]):
+        result.problem(ascii(name), "bad-encoding", "the name of the file is not UTF-8")
+    files = [name for name in files if name not in odd]
+    text = "links to folders outside the root, which are not followed"
+    result.suspect(result.base, "outside-root", text, outside)
+    return files
+
+
+def parsed(texts: Mapping[str, str]) -> dict[str, Template]:
+    """Templates by column, in the order in which their files give rows."""
+    return {column: Template.parse(texts[column], column) for column in ORDER if column in texts}
+
+
+def joined(
+    result: Scan,
+    files: Sequence[str],
+    templates: Mapping[str, Template],
+    matches: Mapping[str, Matches],
+    what: str,
+) -> tuple[list[Fields], tuple[str, ...]]:
+    """Rows of the files of all templates, and their fields; what is odd is reported.
+
+    ``files`` should all be of a template; ``what`` they are is for messages.
+    """
+    rows, problems = join({column: matches[column] for column in templates})
+    result.problems += problems
+    used = {path for found in matches.values() for path, _ in found}
+    unmatched = [path for path in files if path not in used]
+    result.suspect(result.base, "unmatched", f"{what} of no template", unmatched)
+    result.facts |= {f"template_{column}": template.text for column, template in templates.items()}
+    fields = tuple(dict.fromkeys(name for t in templates.values() for name in t.fields))
+    result.more = tuple(name for name in fields if name not in TARGETS)
+    return rows, fields
 
 
 def templates_of(
@@ -238,34 +261,24 @@ def templates_of(
     what: str = "images",
     renamed: Callable[[Mapping[str, str]], dict[str, str]] = dict,
 ) -> dict[str, str]:
-    """The templates that the names of files suggest.
+    """The templates that the names of files below a folder suggest; ``side`` if all show one thing.
 
-    Args:
-        files: paths below the folder.
-        folder: their folder.
-        side: what they show, if all show one thing.
-        what: what the files are.
-        renamed: changes the names of fields.
-
-    Raises:
-        PalpateError: with commands to choose from, if they do not say what the images show.
+    ``what`` the files are is for errors; ``renamed`` changes the names of fields.
     """
     if not files:
         raise PalpateError(f"{folder} must hold {what}", "none", "Check the path")
     if side is not None:
         return renamed({side: template_of(files)})
-    layout = detect_layout(files, folder.resolve().name)
-    if layout.certain and _fit(files, layout.templates):
-        return renamed(layout.templates)
-    every = template_of(files)
-    choices = [{"tactile": every}, {"vision": every}]
-    got = f"{few(files)}, without a word like {ROLES['vision'][0]} or {ROLES['tactile'][0]}"
-    if len(layout.templates) > 1:
-        first, second = list(layout.templates.values())[:2]
-        choices = [{"vision": first, "tactile": second}, {"vision": second, "tactile": first}]
-        choices = [layout.templates, {"tactile": second}] if layout.certain else choices
-        choices.append({"vision": first} if layout.certain else {"tactile": every})
-        got = f"{few(files)}, of which few share their names" if layout.certain else got
+    templates = detect_layout(files, folder.resolve().name)
+    if templates and _fit(files, templates):
+        return renamed(templates)
+    if templates:
+        choices = [templates, *({side: text} for side, text in templates.items())]
+        got = f"{few(files)}, of which few share their names"
+    else:
+        every = template_of(files)
+        choices = [{"tactile": every}, {"vision": every}]
+        got = f"{few(files)}, without a word like {ROLES['vision'][0]} or {ROLES['tactile'][0]}"
     must = f"The names of the {what} in {folder} must say what they show"
     raise PalpateError(must, got, "Choose one of these", choices=[*map(renamed, choices)])
 
@@ -301,28 +314,3 @@ def name_apart(rows: Sequence[Cells], fields: Sequence[str]) -> None:
             names, count = ([*names, name], several) if several > count else (names, count)
         for row in named:
             row[column] = "/".join([*(row[name] for name in names if name in row), row[column]])
-
-
-def _add_ids(rows: Sequence[Cells], fields: Sequence[str]) -> None:
-    """Make ids of the fields, if they are different for all rows; else they are the paths."""
-    ids = ["/".join(row[name] for name in fields if name in row) for row in rows]
-    if fields and "id" not in fields and len(set(ids)) == len(ids):
-        for row, i in zip(rows, ids, strict=True):
-            row["id"] = i
-
-
-def _report_unchanged(
-    result: Scan, maps: ColumnMaps, table: pl.DataFrame, cells: Mapping[str, Sequence[str | None]]
-) -> None:
-    """Report replacements that left cells as they were."""
-    known = {**table.to_dict(as_series=False), **cells}
-    for target, expression in maps.expressions.items():
-        roots = expression.meta.root_names() if "replace(" in maps.texts[target] else []
-        columns = zip(*(known[name] for name in roots), strict=True)
-        rows = enumerate(zip(cells[target], columns, strict=True)) if roots else ()
-        same = [k for k, (value, others) in rows if value is not None and value in others]
-        if same:
-            text = (
-                f"{target} is as before in {len(same)} of {len(table)} rows, since nothing matched"
-            )
-            result.suspect(f"{target}={maps.texts[target]}", "no-match", text)

@@ -13,9 +13,8 @@
                                               takes for equal
 
 The source may be ``ssvtp/`` or a folder that holds it. Tactile image and text are found by the id
-of the photo, since the lists lack the column ``tactile`` or misname files in places; a listed path
-that disagrees is reported. Without lists every photo with its tactile image is a sample, and there
-is no part.
+of the photo, since the lists lack the column ``tactile`` or misname files in places. Without lists
+every photo with its tactile image is a sample, and there is no part.
 
 There is no recording, no object and no time in this set: ``video`` and ``frame`` are null, and only
 near-duplicates say which samples belong together. The caption is the first line of the text file,
@@ -25,7 +24,6 @@ else the list's.
 from __future__ import annotations
 
 import re
-from collections import defaultdict
 from pathlib import Path, PurePosixPath
 
 from palpate.core import PalpateError, Progress, Split, quiet
@@ -65,31 +63,19 @@ def find(source: Path) -> Path | None:
     return None
 
 
-def scan(source: Path, *, lists: Path | None = None, progress: Progress = quiet) -> Scan:
-    """Read the lists, or the folders where there are none, and find the files of each sample.
-
-    Args:
-        source: ``ssvtp/`` or the folder that holds it.
-        lists: folder with lists to use instead of the data set's own.
-        progress: called with the number of lists read.
-
-    Raises:
-        PalpateError: if the two image folders are not there, or ``lists`` holds none.
-    """
+def scan(source: Path, *, progress: Progress = quiet) -> Scan:
+    """Read the lists, or the folders where there are none, and find the files of each sample."""
     root = find(Path(source))
     if root is None:
         must = f"{source} must be SSVTP: {LOOKS_FOR}"
         raise PalpateError(must, "none of these", f"Unpack it from {tvl.URL}")
-    paths = tvl.part_lists(root if lists is None else Path(lists))
-    if lists is not None and not paths:
-        raise PalpateError("must hold train.csv or test.csv", str(lists), "", argument="lists")
+    paths = tvl.part_lists(root)
     result = Scan(root, {"layout": "ssvtp"})
     vision, tactile = (_images(result, side) for side in ("rgb", "tac"))
     captions: dict[str, str | None] = {}
     if paths:
-        result.split_name = "Orig" if lists is None else "Lists"
-        method = "official" if lists is None else "lists"
-        result.split_rule = {"method": method, "files": [p.name for p in paths.values()]}
+        files = [path.name for path in paths.values()]
+        result.split_name, result.split_rule = "Orig", {"method": "official", "files": files}
         for done, (part, path) in enumerate(paths.items()):
             progress("reading lists", done, len(paths))
             _read_list(result, path, part, (vision, tactile), captions)
@@ -139,7 +125,6 @@ def _read_list(
 ) -> None:
     """Add the rows of one list; ``captions`` gets the caption of each listed id."""
     vision, tactile = sides
-    misnamed: list[str] = []
     for where, cells in tvl.read_list(result, path, COLUMNS):
         listed = {name: cells.get(name) for name in ("url", "tactile")}
         name = PurePosixPath(listed["url"] or "").name
@@ -157,19 +142,14 @@ def _read_list(
                 "vision": f"images_rgb/{vision.files.get(key, f'image_{key}_rgb.jpg')}",
                 "tactile": f"images_tac/{tactile.files.get(key, f'image_{key}_tac.jpg')}",
             }
-            both = zip(listed.values(), paths.values(), strict=True)
-            if any(c and PurePosixPath(c).stem != PurePosixPath(p).stem for c, p in both):
-                misnamed.append(where)
             captions.setdefault(key, tvl.clean_caption(cells.get("caption")))
             result.rows.append((where, {"id": f"ssvtp/{key}", **paths, "split": part}))
-    text = "the files have other names than the id of the photo gives"
-    tvl.suspect_rows(result, misnamed, "misnamed-path", text)
 
 
 def _add_words(result: Scan, captions: dict[str, str | None]) -> None:
     """Add the text of each row, from its text file or else from its list."""
     sources: set[str] = set()
-    places: defaultdict[str, list[str]] = defaultdict(list)
+    without: list[str] = []
     for where, row in result.rows:
         key = row["id"].removeprefix("ssvtp/")
         caption = captions.get(key)
@@ -178,14 +158,10 @@ def _add_words(result: Scan, captions: dict[str, str | None]) -> None:
         if text or caption:
             sources.add("text/labels_<id>.txt" if text else "column caption")
         else:
-            places["no-text"].append(where)
-        if text and caption and text != caption:
-            places["two-captions"].append(where)
+            without.append(where)
     result.facts["text_source"] = ", ".join(sorted(sources)) or "none"
-    text = "the text file has other words than the list, and is taken"
-    tvl.suspect_rows(result, places["two-captions"], "two-captions", text)
     text = "neither a text file nor a caption in the list"
-    tvl.suspect_rows(result, places["no-text"], "no-text", text)
+    tvl.suspect_rows(result, without, "no-text", text)
 
 
 def _first_line(path: Path) -> str | None:

@@ -11,9 +11,8 @@ DIGIT touches located in 13 scanned scenes::
       split_interval.json                   {"train|val|test": [["<scene>_40_30", "<idx>"], ..]};
                                             not in the public code
 
-A scene is one recording, and the group: with 13 of them, leave scenes out. The views of the scale
-of the touch are read unless ``scale`` names another. An index is a frame number, so ``7`` and
-``0007`` are the same.
+A scene is one recording, and the group: with 13 of them, leave scenes out. Of several scales the
+views of that of the touch are read. An index is a frame number, so ``7`` and ``0007`` are the same.
 """
 
 from __future__ import annotations
@@ -68,17 +67,8 @@ def detect(source: Path) -> bool:
     return all(_scenes(source / side) for side in ("vision", "touch"))
 
 
-def scan(source: Path, *, scale: str | None = None, progress: Progress = quiet) -> Scan:
-    """Pair every tactile image with the view of its number.
-
-    Args:
-        source: the folder with ``vision/`` and ``touch/``.
-        scale: of the views, ``"80_60"``; default: that of the touch, else the only one there is.
-        progress: called with the number of scenes read.
-
-    Raises:
-        PalpateError: if a folder is missing, or the scale of the views is ambiguous or absent.
-    """
+def scan(source: Path, *, progress: Progress = quiet) -> Scan:
+    """Pair every tactile image with the view of its number."""
     root = require_folder(source, FACTS.name)
     tactile, vision = _scenes(root / "touch"), _scenes(root / "vision")
     require_layout(root, LOOKS_FOR, FACTS, complete=tactile and vision)
@@ -87,9 +77,13 @@ def scan(source: Path, *, scale: str | None = None, progress: Progress = quiet) 
     used: set[str] = set()
     for done, scene in enumerate(sorted({*tactile, *vision}, key=natural)):
         progress("reading scenes", done, len(tactile))
-        view = _view_scale(scene, vision.get(scene, []), scale)
-        used |= {view} if scene in tactile and scene in vision else set()
-        _scene(result, scene, view, ids)
+        scales = vision.get(scene, [])
+        scale = scales[0] if len(scales) == 1 else TACTILE_SCALE
+        if scales and scale not in scales:
+            must, got = f"The views of {scene!r} must have the scale {scale}", ", ".join(scales)
+            raise PalpateError(must, got, "Keep one scale, or fetch that one")
+        used |= {scale} if scene in tactile and scales else set()
+        _scene(result, scene, scale, ids)
     names = [name for side in ("touch", "vision") for name in subfolders(root / side)]
     odd = [name for name in names if not re.fullmatch(SCALED, name)]
     result.suspect(root, "unknown-folder", "skipped, as not named <scene>_<scale>", odd)
@@ -118,18 +112,6 @@ def _scenes(side: Path) -> dict[str, list[str]]:
         if match := re.fullmatch(SCALED, name):
             scenes.setdefault(match[1], []).append(match[2])
     return scenes
-
-
-def _view_scale(scene: str, scales: list[str], requested: str | None) -> str:
-    """Which scale of a scene's views is read."""
-    scale = requested or (scales[0] if len(scales) == 1 else TACTILE_SCALE)
-    if scales and scale not in scales:
-        got = f"{scale!r}; the views of {scene!r} have {', '.join(scales)}"
-        example = {"scale": scales[0]}
-        raise PalpateError(
-            "must be a scale of all views", got, "", argument="scale", example=example
-        )
-    return scale
 
 
 def _scene(result: Scan, scene: str, view_scale: str, ids: dict[tuple[str, int], str]) -> None:

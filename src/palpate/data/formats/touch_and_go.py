@@ -20,29 +20,25 @@ else null.
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
-from palpate.core import PalpateError, Problem, Progress, Split, quiet, require_choice, write_text
-from palpate.data.formats.base import WORLD, Cells, Facts, Format, Into, Scan, world_facts
+from palpate.core import PalpateError, Progress, Split, quiet, write_text
+from palpate.data.formats.base import WORLD, Facts, Format, Into, Scan, world_facts
 from palpate.data.formats.layout import require_folder, subfolders
-from palpate.data.frames import IMAGE_FORMATS, ImageFormat
+from palpate.data.formats.recordings import Recordings, VideoFiles, first_frames, rows_of, thin
+from palpate.data.frames import ImageFormat
 from palpate.data.images import Check
-from palpate.data.imported import raise_if, require_some
 from palpate.data.listing import (
     INCONCLUSIVE,
     FrameList,
     FrameTable,
-    read_categories,
+    categories_in,
     read_frame_table,
     read_lists,
     write_list,
 )
 from palpate.data.manifest import Manifest
-from palpate.data.recordings import Recordings, VideoFiles, first_frames, rows_of, thin
-from palpate.data.recordings import Row as FrameRow
 
 FACTS = Facts(
     name="Touch and Go",
@@ -89,7 +85,7 @@ def find_videos(root: Path) -> dict[str, VideoFiles]:
                 folder, file = (root / place / name / part for part in (frames, video))
                 paths[modality] = folder if folder.is_dir() else file if file.is_file() else None
             if any(paths.values()):
-                videos.setdefault(name, VideoFiles(name, **paths))
+                videos.setdefault(name, paths)
     return videos
 
 
@@ -100,7 +96,6 @@ def scan(
     image_format: ImageFormat = "jpg",
     size: int | None = None,
     max_per_contact: int | None = None,
-    seed: int = 0,
     check: Check = "decode",
     into: Into | None = None,
     progress: Progress = quiet,
@@ -111,44 +106,26 @@ def scan(
     import would, those of raw videos too; rows carry paths of extracted frames only if ``check`` is
     ``none``.
 
-    Args:
-        root: the data set.
+    Options:
         labels: frame lists; default ``label.txt``, else ``train.txt`` and ``test.txt``.
         image_format: of the cached frames.
         size: shorter side of the cached frames in pixels, if they are larger; None keeps them.
         max_per_contact: import that many evenly spaced frames of a contact.
-        seed: with ``max_per_contact``: 0 takes the middle of each of the equal stretches, any other
-            a random place in them.
-        check: how extracted images are checked.
-        into: where frames of raw videos go, to ``images/<video>/{vision,tactile}/``. After an
-            interruption the same call continues.
-        progress: progress callback.
-
-    Raises:
-        PalpateError: if the root, the list or the recordings are missing, or ``into`` holds frames
-            of other settings.
-        ProblemsError: with ``into``, before frames are written, unless bad rows are skipped.
     """
     root = require_folder(root, FACTS.name)
-    require_frame_options(image_format, size)
-    if max_per_contact is not None and max_per_contact < 1:
-        got = str(max_per_contact)
-        raise PalpateError("must be at least 1", got, "", argument="max_per_contact")
-    videos, lists = require_videos(root), _read_lists(root, labels)
-    out, created = (into.out, into.created) if into else (root, list[Path]())
-    work = Recordings(root, out, videos, lists.in_contact, image_format, size, created)
-    work.problems += lists.problems
-    work.suspicious += lists.unused
-    every = rows_of(lists.listed)
-    rows = work.open(thin(every, max_per_contact, seed) if into else every, progress)
-    listed = set(lists.listed.contact["video"])
-    rows = usable(work, rows, first_frames(every), listed, check=check, progress=progress)
-    result = Scan(root, lists.facts, inconclusive=lists.listed.inconclusive)
-    more: dict[str, Any] = {"sensor": lists.sensor, "words": lists.words}
-    add_frames(result, work, rows, check=check, into=into, progress=progress, **more)
-    if lists.official is not None:
+    result, videos = Scan(root, world_facts(root)), require_videos(root)
+    sensor = WORLD.sensor if "synthetic" in result.facts else FACTS.sensor
+    listed, official, words, in_contact = _read_lists(result, labels)
+    work = Recordings(result, into, videos, in_contact, image_format, size)
+    every = rows_of(listed)
+    rows = work.open(thin(every, max_per_contact) if into else every, progress)
+    rows = [row for row in rows if work.has(row)]
+    names, starts = set(listed.contact["video"]), first_frames(every)
+    rows = work.usable(rows, starts, names, check=check, progress=progress)
+    work.add(rows, check=check, progress=progress, sensor=sensor, words=words)
+    if official is not None:
         part_of = {name: part for part, name in OFFICIAL.items()}
-        cells = lists.official.rows.select("video", "frame", "source").iter_rows()
+        cells = official.rows.select("video", "frame", "source").iter_rows()
         parts = {(video, frame): part_of[Path(source).name] for video, frame, source in cells}
         for _, row in result.rows:
             row["split"] = parts.get((row["video"], row["frame"]))
@@ -164,9 +141,6 @@ def write_lists(manifest: Manifest, split: Split, folder: Path) -> list[Path]:
     than the published one writes, else the published ones. A material that is none of them keeps
     its number if it is one (bare lists without a category table), else it gets the next one, and
     ``category_reference.txt`` says which.
-
-    Raises:
-        PalpateError: if a sample has no video or frame.
     """
     classes: dict[str, str] = json.loads(manifest.facts.get("classes", "{}"))
     ids: dict[str | None, int] = {name: int(k) for k, name in (classes or CATEGORIES).items()}
@@ -197,15 +171,8 @@ def write_lists(manifest: Manifest, split: Split, folder: Path) -> list[Path]:
 FORMAT = Format(FACTS, detect, LOOKS_FOR, scan, write_lists)
 
 
-# --- Steps that interval lists share
-
-
 def require_videos(root: Path) -> dict[str, VideoFiles]:
-    """The recordings.
-
-    Raises:
-        PalpateError: if there is none.
-    """
+    """The recordings."""
     videos = find_videos(root)
     if not videos:
         must = f"{root} must hold recordings: folders with video.mp4 and gelsight.mp4, or "
@@ -215,124 +182,16 @@ def require_videos(root: Path) -> dict[str, VideoFiles]:
     return videos
 
 
-def require_frame_options(image_format: str, size: int | None) -> None:
-    """Check the options of extracted frames.
+def _read_lists(
+    result: Scan, labels: Sequence[Path] | Path | None
+) -> tuple[FrameList, FrameList | None, dict[str, FrameTable | None], dict[str, set[int]]]:
+    """Read the lists given, else ``label.txt``, else the official two, and what is next to them.
 
-    Raises:
-        PalpateError: if one is out of range.
+    Returns:
+        The samples; the official lists joined, if both are there; manifest column -> its words by
+        frame; recording -> the frames that any list calls a contact.
     """
-    if size is not None and size < 1:
-        raise PalpateError("must be at least 1 pixel", str(size), "", argument="size")
-    require_choice("image_format", image_format, IMAGE_FORMATS)
-
-
-def extracted(
-    work: Recordings, rows: list[FrameRow], source: Path, *, skip_bad: bool, progress: Progress
-) -> list[FrameRow]:
-    """The rows whose frames are there after extracting those of raw videos.
-
-    Raises:
-        ProblemsError: if something is bad and not ``skip_bad``, or no row is left.
-    """
-    raise_if(work.problems, skip_bad)
-    require_some(len(rows), source, work.problems)
-    rows = work.extract(rows, progress)
-    raise_if(work.problems, skip_bad)
-    require_some(len(rows), source, work.problems)
-    return rows
-
-
-def usable(
-    work: Recordings,
-    rows: list[FrameRow],
-    starts: Mapping[str, int],
-    listed: set[str],
-    *,
-    check: Check,
-    progress: Progress,
-) -> list[FrameRow]:
-    """The rows whose images are whole, with a background chosen for each contact.
-
-    Args:
-        work: takes what is wrong.
-        rows: of opened recordings.
-        starts: contact -> its first frame.
-        listed: the recordings in use; others are reported.
-        check: how images are checked.
-        progress: progress callback.
-    """
-    work.choose_backgrounds(rows, starts)
-    rows = work.check(rows, check, progress)
-    for video in sorted(set(work.videos) - listed):
-        text = f"no usable contact of the recording {video!r} is listed"
-        work.suspicious.append(Problem(str(work.root), "unlisted-video", text))
-    with_background = {*work.background_frames, *work.typical_of}
-    for contact in sorted({row.contact for row in rows} - with_background):
-        text = "no frame of its recording shows the untouched gel"
-        work.suspicious.append(Problem(contact, "no-background", text))
-    return rows
-
-
-def add_frames(
-    result: Scan,
-    work: Recordings,
-    rows: list[FrameRow],
-    *,
-    check: Check,
-    into: Into | None,
-    progress: Progress,
-    sensor: str | None = None,
-    words: Mapping[str, FrameTable | None] | None = None,
-) -> None:
-    """Add usable rows to a scan, after extracting their frames, or only decoding them.
-
-    Without ``into`` they have paths only if they are still to be checked and are files.
-    """
-    hidden: Cells = {}
-    if into is not None:
-        rows = extracted(work, rows, result.base, skip_bad=into.skip_bad, progress=progress)
-        result.facts |= work.facts(rows)
-        result.base = work.base(rows)
-    else:
-        rows = work.decode(rows, progress, videos=check == "decode")
-        if check == "decode":
-            work.check_streams(progress)
-        hidden = {} if check == "none" else dict.fromkeys((*MODALITIES, "background"))
-    cells = work.cells(rows, result.base.resolve(), sensor, words)
-    result.rows = [(row.where, cell | hidden) for row, cell in zip(rows, cells, strict=True)]
-    result.problems, result.suspicious = work.problems, work.suspicious
-
-
-# --- Lists
-
-
-@dataclass(frozen=True)
-class _Lists:
-    """What the lists at the root hold.
-
-    Attributes:
-        listed: the samples.
-        official: the official lists, joined, if both are there.
-        words: manifest column -> its words by frame.
-        in_contact: recording -> the frames that any list calls a contact.
-        facts: for the manifest.
-        sensor: the tactile sensor.
-        problems: all bad lines, each once.
-        unused: tables with words of frames that no list has.
-    """
-
-    listed: FrameList
-    official: FrameList | None
-    words: Mapping[str, FrameTable | None]
-    in_contact: Mapping[str, set[int]]
-    facts: dict[str, str]
-    sensor: str
-    problems: list[Problem]
-    unused: list[Problem]
-
-
-def _read_lists(root: Path, labels: Sequence[Path] | Path | None) -> _Lists:
-    """Read the lists given, else ``label.txt``, else the official two, and what is next to them."""
+    root = result.base
     every, official_paths = root / "label.txt", [root / name for name in OFFICIAL.values()]
     if labels is not None:
         paths = [Path(labels)] if isinstance(labels, (str, Path)) else [Path(p) for p in labels]
@@ -341,40 +200,29 @@ def _read_lists(root: Path, labels: Sequence[Path] | Path | None) -> _Lists:
     if not paths:
         must = f"{root} must hold label.txt, or train.txt and test.txt"
         raise PalpateError(must, "none of them", "Put a list there", example={"labels": "list.txt"})
-    table = root / "category_reference.txt"
-    categories = read_categories(table) if table.is_file() else CATEGORIES
-    categories = {k: name for k, name in categories.items() if k >= 0}
-    listed = read_lists(paths, root=root, skip_bad=True, categories=categories)
+    categories = {k: name for k, name in (categories_in(root) or CATEGORIES).items() if k >= 0}
+    read = lambda paths, **more: read_lists(paths, root=root, skip_bad=True, **more)
+    listed = read(paths, categories=categories)
     official: FrameList | None = listed
     if paths != official_paths:
-        both = all(path.is_file() for path in official_paths)
-        official = read_lists(official_paths, root=root, skip_bad=True) if both else None
-    contacts = [listed, *([official] if official else [])]
-    if every.is_file() and every not in paths:
-        contacts.append(read_lists([every], root=root, skip_bad=True))
+        official = read(official_paths) if all(path.is_file() for path in official_paths) else None
+    more = [read([every])] if every.is_file() and every not in paths else []
     in_contact: dict[str, set[int]] = {}
-    for frames in contacts:
+    for frames in (listed, *([official] if official else []), *more):
         for (video,), group in frames.contact.group_by("video"):
             in_contact.setdefault(str(video), set()).update(group["frame"].to_list())
     places = {"text": root / "captions.csv", "object": root / "objects.csv"}
     words = {c: read_frame_table(path) if path.is_file() else None for c, path in places.items()}
-    facts = {**FACTS.of_manifest(), **world_facts(root), "format": "touch-and-go"}
-    facts["text_source"] = "captions.csv" if words["text"] else "none"
-    if categories != CATEGORIES:
-        facts["classes"] = json.dumps({str(k): name for k, name in categories.items()})
-    sensor = WORLD.sensor if "synthetic" in facts else FACTS.sensor
     tables = [listed, *words.values(), official if official is not listed else None]
-    problems = [problem for table in tables if table for problem in table.skipped]
-    unused: list[Problem] = []
+    result.problems = [problem for table in tables if table for problem in table.skipped]
     for column, table in words.items():
-        strays = (
-            [key for key in table.values if key[1] not in in_contact.get(key[0], ())]
-            if table
-            else []
-        )
-        if strays:
-            text = (
-                f"{len(strays)} lines are of no listed frame, first {'{}/{}'.format(*strays[0])!r}"
-            )
-            unused.append(Problem(str(places[column]), "no-sample", text))
-    return _Lists(listed, official, words, in_contact, facts, sensor, problems, unused)
+        keys = table.values if table else ()
+        if strays := [(v, k) for v, k in keys if k not in in_contact.get(v, ())]:
+            first = "/".join(map(str, strays[0]))
+            text = f"{len(strays)} lines are of no listed frame, first {first!r}"
+            result.suspect(places[column], "no-sample", text)
+    result.inconclusive = listed.inconclusive
+    result.facts |= {"text_source": "captions.csv" if words["text"] else "none"}
+    if categories != CATEGORIES:
+        result.facts["classes"] = json.dumps({str(k): name for k, name in categories.items()})
+    return listed, official, words, in_contact

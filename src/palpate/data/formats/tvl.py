@@ -1,23 +1,19 @@
 """What the two halves of Touch-Vision-Language (TVL), HCT and SSVTP, share: lists and captions.
 
-**Lists** are ``train.csv`` and ``test.csv`` (``val.csv`` too, as palpate writes one). A first row
-without the name of an image is a header; without a header, columns go by position.
+**Lists** are ``train.csv`` and ``test.csv`` (and ``val.csv``, as palpate writes it), with a header.
 
 **Captions** are adjectives between commas; they are trimmed, in lower case, without full stops.
 """
 
 from __future__ import annotations
 
-import csv
-import io
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 from palpate.core import PARTS, write_text
 from palpate.data.formats.base import Row, Scan
 from palpate.data.formats.layout import count_rows
-from palpate.data.images import SUFFIXES
-from palpate.data.tables import header_of, open_table
+from palpate.data.tables import csv_text, header_of, open_table
 
 CITATION = (
     "L. Fu, G. Datta, H. Huang, W. C.-H. Panitch, J. Drake, J. Ortiz, M. Mukadam, M. Lambeta, "
@@ -51,30 +47,24 @@ def read_list(scan: Scan, path: Path, columns: Sequence[str] = COLUMNS) -> list[
     Returns:
         (``file:line``, cells by the names in ``columns``); empty cells are None.
     """
-    first = [name.lower() for name in header_of(path)]
-    if not first:
+    names = [name.lower() for name in header_of(path)]
+    if not names:
         scan.problem(path, "empty-list", "the list has no lines")
         return []
-    bare = any(map(is_image, first))
-    names = [*columns, *[""] * len(first)][: len(first)] if bare else first
     if "url" not in names and names[0] == "":  # saved with the photo as index
         names[0] = "url"
     if "url" not in names:
-        scan.problem(path, "missing-column", f"no column url among {', '.join(first)}")
+        scan.problem(path, "missing-column", f"no column url among {', '.join(names)}")
         return []
     table = open_table(path, names)
     rows = table.read([name for name in columns if name in names]).rows(named=True)
     scan.problems += table.problems
-    return [(table.where(k), row) for k, row in enumerate(rows) if k or bare]
+    return [(table.where(k), row) for k, row in enumerate(rows) if k]  # the first is the header
 
 
 def write_list(path: Path, columns: Sequence[str], rows: Iterable[Sequence[str | None]]) -> Path:
     """Write one list with a header, atomically; None becomes an empty cell."""
-    text = io.StringIO(newline="")
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(columns)
-    writer.writerows(rows)
-    write_text(path, text.getvalue())
+    write_text(path, csv_text(columns, rows))
     return path
 
 
@@ -82,11 +72,6 @@ def clean_caption(text: str | None) -> str | None:
     """Adjectives between commas: trimmed, lower case, no full stops, none empty; None if none."""
     words = (" ".join(word.split()) for word in (text or "").replace(".", "").lower().split(","))
     return ", ".join(word for word in words if word) or None
-
-
-def is_image(cell: str) -> bool:
-    """Whether a cell is the name of an image."""
-    return cell.lower().endswith(SUFFIXES)
 
 
 def suspect_rows(scan: Scan, places: Sequence[str], kind: str, text: str) -> None:

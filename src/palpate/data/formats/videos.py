@@ -29,22 +29,28 @@ from itertools import islice
 from pathlib import Path
 from typing import Any
 
-from palpate.core import PalpateError, Problem, ProblemsError, Progress, quiet
+from palpate.core import PalpateError, ProblemsError, Progress, few, quiet, require
 from palpate.data.contacts import Contacts, find_contacts, thumbnail
 from palpate.data.formats import touch_and_go
-from palpate.data.formats.base import Cells, Facts, Format, Into, Scan, few
+from palpate.data.formats.base import Cells, Facts, Format, Into, Scan
 from palpate.data.formats.layout import require_folder
-from palpate.data.formats.pairs import Side, name_apart, templates_of
-from palpate.data.formats.touch_and_go import extracted, require_frame_options
+from palpate.data.formats.pairs import (
+    ORDER,
+    SIDES,
+    Side,
+    joined,
+    name_apart,
+    parsed,
+    templates_of,
+    walked,
+)
+from palpate.data.formats.recordings import Recordings, Row, thin
 from palpate.data.frames import MOVING, ImageFormat, streams_of
 from palpate.data.images import SUFFIXES, Check, in_threads, read_image
-from palpate.data.manifest import SCHEMA
-from palpate.data.recordings import Recordings, Row, VideoFiles, thin
 from palpate.data.rows import PART_NAMES
 from palpate.data.streams import Finding, findings
-from palpate.data.templates import FIX, Fields, Template, assign, join, walk
+from palpate.data.templates import FIX, Fields, Template, assign, walk
 
-ORDER = ("tactile", "vision", "background")
 FACTS = Facts(
     name="your own videos", samples="the frames in contact, or every n-th", group="the column video"
 )
@@ -93,7 +99,6 @@ def scan(  # noqa: PLR0913 (a public verb)
     side: Side | None = None,
     every: int | None = None,
     max_per_contact: int | None = None,
-    seed: int = 0,
     sensor: str | None = None,
     image_format: ImageFormat = "jpg",
     size: int | None = None,
@@ -103,8 +108,7 @@ def scan(  # noqa: PLR0913 (a public verb)
 ) -> Scan:
     """Read a folder of videos; without ``into`` nothing is written.
 
-    Args:
-        source: the folder.
+    Options:
         vision: template of the videos (or photos) of the scene; without any template the names are
             searched.
         tactile: template of the tactile videos.
@@ -112,36 +116,23 @@ def scan(  # noqa: PLR0913 (a public verb)
         side: what the videos show, if all show one thing.
         every: take every n-th frame of whole videos, in contact or not.
         max_per_contact: keep that many evenly spaced frames of a contact.
-        seed: with ``max_per_contact``: 0 takes the middle of each stretch, others a random place.
         sensor: the tactile sensor.
         image_format: of the extracted frames.
         size: their shorter side is reduced to so many pixels.
-        check: without ``into``: ``decode`` decodes all; otherwise no contacts are found, and all
-            frames are listed.
-        into: where frames go, to ``images/<video>/{vision,tactile}/``; after an interruption the
-            same call continues.
-        progress: progress callback.
-
-    Raises:
-        PalpateError: if the source is no folder, a template cannot be read or matches nothing, or
-            an option is out of range.
-        ProblemsError: with ``into``, before frames are written, unless bad videos are skipped.
     """
-    require_frame_options(image_format, size)
     given = {"vision": vision, "tactile": tactile, "background": background}
     videos, result = _videos(require_folder(source, FACTS.name), given, side)
     decoded = check == "decode" or into is not None
     _require_amounts(videos, every if decoded else 1, max_per_contact)
-    out, created = (into.out, into.created) if into else (result.base, list[Path]())
-    work = _opened(result, videos, out, progress, image_format, size, created)
+    work = _opened(result, into, videos, progress, image_format, size)
     contacts = _contacts(work, videos, progress) if decoded else {}
     rows = _rows(work, videos, contacts, every if decoded else 1)
-    rows = rows if max_per_contact is None else thin(rows, max_per_contact, seed)
+    rows = thin(rows, max_per_contact)
     hidden: Cells = dict.fromkeys(ORDER)
     if into is not None:
-        _require_contact(work, rows)
-        rows = extracted(work, rows, result.base, skip_bad=into.skip_bad, progress=progress)
-        _copy_images(work, rows, videos)
+        _require_contact(result, rows)
+        rows = work.extract(rows, progress)
+        _copy_images(result.base, into, rows, videos)
         result.base, hidden = work.out, {}
         result.facts["frames"] = "in contact" if every is None else f"every {every} of whole videos"
     for row, cell in zip(rows, _cells(work, rows, videos, sensor), strict=True):
@@ -161,12 +152,9 @@ def _videos(
     """The recordings by name, and a scan without rows that holds what was wrong or odd."""
     result = Scan(root, {"layout": "videos", "dataset": root.resolve().stem, "text_source": "none"})
     texts = {column: text for column, text in given.items() if text is not None}
-    moving, outside = walk(root, MOVING)
-    texts = texts or templates_of(moving, root, side, "videos", _naming_videos)
-    files = walk(root, (*MOVING, *SUFFIXES))[0]
-    templates = {
-        column: Template.parse(texts[column], column) for column in ORDER if column in texts
-    }
+    files = walked(result, (*MOVING, *SUFFIXES))
+    moving = [path for path in files if path.lower().endswith(MOVING)]
+    templates = parsed(texts or templates_of(moving, root, side, "videos", _naming_videos))
     matches = assign(files, templates)
     for column, template in templates.items():
         kinds = {path.lower().endswith(MOVING) for path, _ in matches[column]}
@@ -179,14 +167,7 @@ def _videos(
         if "frame" in template.fields:
             got, fix = f"{template.text} with the field frame", "Name it video"
             raise PalpateError("must say which video, not frame", got, fix, argument=column)
-    rows, result.problems = join(matches)
-    used = {path for found in matches.values() for path, _ in found}
-    result.suspect(root, "unmatched", "videos of no template", (f for f in moving if f not in used))
-    text = "links to folders outside the root, which are not followed"
-    result.suspect(root, "outside-root", text, outside)
-    result.facts |= {f"template_{column}": template.text for column, template in templates.items()}
-    fields = tuple(dict.fromkeys(name for t in templates.values() for name in t.fields))
-    result.more = tuple(name for name in fields if name not in (*SCHEMA, "split"))
+    rows, fields = joined(result, moving, templates, matches, "videos")
     name_apart(rows, fields)
     return _named(rows, fields, result), result
 
@@ -225,9 +206,7 @@ def _named(rows: list[Fields], fields: tuple[str, ...], result: Scan) -> dict[st
 def _require_amounts(
     videos: Mapping[str, _Video], every: int | None, max_per_contact: int | None
 ) -> None:
-    for name, value in (("every", every), ("max_per_contact", max_per_contact)):
-        if value is not None and value < 1:
-            raise PalpateError("must be at least 1", str(value), "", argument=name)
+    require(every is None or every >= 1, "every", "must be at least 1", every)
     if every is not None and max_per_contact is not None:
         must, got = "must come without every", str(max_per_contact)
         raise PalpateError(must, got, "Choose one", argument="max_per_contact")
@@ -237,22 +216,17 @@ def _require_amounts(
 
 
 def _opened(
-    result: Scan, videos: Mapping[str, _Video], out: Path, progress: Progress, *settings: Any
+    result: Scan, into: Into | None, videos: Mapping[str, _Video], progress: Progress, *frames: Any
 ) -> Recordings:
     """The recordings with their files open."""
     files = {
-        name: VideoFiles(name, **{c: _path(result, video.moving.get(c)) for c in ORDER[:2]})
-        for name, video in videos.items()
+        name: {c: result.base / v.moving[c] if c in v.moving else None for c in SIDES}
+        for name, v in videos.items()
     }
-    sides = tuple(c for c in ("vision", "tactile") if any(c in v.moving for v in videos.values()))
-    work = Recordings(result.base, out, files, {}, *settings, modalities=sides)
-    work.problems, work.suspicious = result.problems, result.suspicious
+    sides = tuple(c for c in SIDES if any(c in v.moving for v in videos.values()))
+    work = Recordings(result, into, files, {}, *frames, modalities=sides)
     work.open([Row(v.where, name, name, 0, name, "") for name, v in videos.items()], progress)
     return work
-
-
-def _path(result: Scan, path: str | None) -> Path | None:
-    return None if path is None else result.base / path
 
 
 def _contacts(
@@ -263,7 +237,7 @@ def _contacts(
     def find(video: str) -> tuple[Contacts | None, list[Finding]] | str:
         try:
             declared = videos[video].still.get("background")
-            gel = None if declared is None else thumbnail(read_image(work.root / declared))
+            gel = None if declared is None else thumbnail(read_image(work.scan.base / declared))
             images, seconds = streams_of(work.frames[video])
         except PalpateError as error:
             return error.got
@@ -273,19 +247,20 @@ def _contacts(
     contacts: dict[str, Contacts | None] = {}
     for video, outcome in in_threads(find, sorted(work.frames), "finding contacts", progress):
         if isinstance(outcome, str):
-            work.problems.append(Problem(video, "bad-video", outcome))
+            work.scan.problem(video, "bad-video", outcome)
             continue
-        contacts[video] = outcome[0]
-        work.suspicious += [Problem(video, *problem) for problem in outcome[1]]
+        contacts[video], problems = outcome
+        for problem in problems:
+            work.scan.suspect(video, *problem)
         if outcome[0] is not None and not outcome[0].runs:
-            work.suspicious.append(Problem(video, "no-contact", outcome[0].why_none()))
+            work.scan.suspect(video, "no-contact", outcome[0].why_none())
     return contacts
 
 
-def _require_contact(work: Recordings, rows: list[Row]) -> None:
+def _require_contact(result: Scan, rows: list[Row]) -> None:
     """Raise if no video has a contact, and nothing else is wrong."""
-    none = [problem for problem in work.suspicious if problem.kind == "no-contact"]
-    if none and not rows and not work.problems:
+    none = [problem for problem in result.suspicious if problem.kind == "no-contact"]
+    if none and not rows and not result.problems:
         fix = "Give an image of the untouched gel, or take frames in contact or not"
         raise ProblemsError(none, fix, example={"every": 10})
 
@@ -321,15 +296,15 @@ def _rows(
     return rows
 
 
-def _copy_images(work: Recordings, rows: list[Row], videos: Mapping[str, _Video]) -> None:
-    """Copy the images that serve whole videos below ``out``, so that one root holds all."""
+def _copy_images(root: Path, into: Into, rows: list[Row], videos: Mapping[str, _Video]) -> None:
+    """Copy the images that serve whole videos next to the frames, so that one root holds all."""
     for name in dict.fromkeys(row.video for row in rows):
         for column, path in videos[name].still.items():
-            target = work.out / _place(name, column, path)
+            target = into.out / _place(name, column, path)
             if not target.is_file():
                 target.parent.mkdir(parents=True, exist_ok=True)
-                work.created.append(target)
-                shutil.copyfile(work.root / path, target)
+                into.created.append(target)
+                shutil.copyfile(root / path, target)
 
 
 def _place(video: str, column: str, path: str) -> str:

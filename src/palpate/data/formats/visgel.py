@@ -36,8 +36,8 @@ from pathlib import Path
 
 import numpy as np
 
-from palpate.core import PalpateError, Progress, Split, inside, quiet
-from palpate.data.formats.base import Cells, Facts, Format, Row, Scan, few
+from palpate.core import PalpateError, Progress, Split, few, inside, quiet
+from palpate.data.formats.base import Cells, Facts, Format, Row, Scan
 from palpate.data.formats.layout import (
     Images,
     natural,
@@ -97,15 +97,10 @@ def scan(
 ) -> Scan:
     """Read the lists, or find the recordings where there are none.
 
-    Args:
-        source: the folder with ``data_lst/``, or one with recordings.
+    Options:
         root: where the paths of the lists start; default: the source.
         prefix: start of the listed paths to remove, where they were written for another disk.
         min_contact: skip frames of this contact or less; T3 takes 18. Reads every frame.
-        progress: called with the number of recordings or lists read.
-
-    Raises:
-        PalpateError: if the source is no folder, or has neither lists nor recordings.
     """
     source = require_folder(source, FACTS.name)
     lists = _lists(source)

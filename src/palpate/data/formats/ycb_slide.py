@@ -26,7 +26,7 @@ import re
 from pathlib import Path
 from typing import Literal
 
-from palpate.core import PalpateError, Progress, quiet
+from palpate.core import Progress, quiet, require
 from palpate.data.formats.base import Facts, Format, Scan
 from palpate.data.formats.layout import (
     Images,
@@ -72,8 +72,7 @@ def detect(source: Path) -> bool:
 def scan(source: Path, *, part: Part | None = None, progress: Progress = quiet) -> Scan:
     """List the frames of ``part`` (default: ``real`` if it is there), with those of the webcam."""
     root = require_folder(source, FACTS.name)
-    if part is not None and part not in LAYOUT:
-        raise PalpateError("must be real or sim", repr(part), "", argument="part")
+    require(part is None or part in LAYOUT, "part", "must be real or sim", part)
     part = part or ("real" if _logs(root / "real", "real") else "sim")
     logs = _logs(root / part, part)
     require_layout(root, LOOKS_FOR, FACTS, complete=logs)

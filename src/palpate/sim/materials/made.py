@@ -13,17 +13,10 @@ from palpate.sim.arrays import Array, blend, f32, hsv, smoothstep, tint, turned
 from palpate.sim.materials.surface import Surface, flip, pick, plain, rising
 from palpate.sim.tile import TILE_MM, Tile, wrapped_offset
 
-_PLASTIC = {
-    "smooth": ("smooth", "even", "hard"),
-    "textured": ("finely textured", "even", "hard"),
-    "ribbed": ("ribbed", "smooth", "hard"),
-    "dotted": ("dotted", "smooth", "hard"),
-}
-
 
 def plastic(tile: Tile, rng: np.random.Generator) -> Surface:
     """Draw smooth, finely textured, ribbed, or dotted plastic."""
-    kind, draw = pick(rng, *_PLASTIC), rng.uniform
+    kind, draw = pick(rng, "smooth", "textured", "ribbed", "dotted"), rng.uniform
     color = hsv(rng.random(), draw(0.0, 0.9), draw(0.25, 0.95))
     angle = draw(0.0, math.pi)
     height = tile.noise(4.0, 40.0, 3.0) * 0.03
@@ -37,7 +30,7 @@ def plastic(tile: Tile, rng: np.random.Generator) -> Surface:
         height = height + smoothstep(np.cos(u) + np.cos(v), 0.6, 1.2) * draw(0.15, 0.35)
     height = height + tile.noise(0.3, 3.0, 1.0) * 0.002
     albedo = tint(plain(tile, color), 1.0 + 0.02 * tile.noise(1.0, 30.0))
-    return Surface(height, albedo, kind, _PLASTIC[kind], gloss=draw(0.35, 0.8), softness=0.05)
+    return Surface(height, albedo, kind, gloss=draw(0.35, 0.8), softness=0.05)
 
 
 def glass(tile: Tile, rng: np.random.Generator) -> Surface:
@@ -45,13 +38,11 @@ def glass(tile: Tile, rng: np.random.Generator) -> Surface:
     kind, draw = pick(rng, "clear", "clear", "clear", "frosted", "fluted"), rng.uniform
     color = hsv(draw(0.3, 0.62), draw(0.03, 0.25), draw(0.35, 0.8))
     height = tile.noise(8.0, 60.0, 3.0) * 0.01
-    words = ("perfectly smooth", "slick", "hard")
     if kind == "frosted":
         height = height + tile.noise(0.35, 1.6, 0.8) * draw(0.012, 0.03)
-        words = ("frosted", "faintly rough", "hard")
     elif kind == "fluted":
         flutes = np.cos(tile.wave(draw(4.0, 9.0), draw(0.0, math.pi)))
-        height, words = height + flutes * draw(0.1, 0.25), ("fluted", "slick", "hard")
+        height = height + flutes * draw(0.1, 0.25)
     albedo = tint(color, 0.75 + 0.16 * tile.noise(18.0, 64.0, 3.0))
     for _ in range(int(rng.integers(1, 4))):
         angle = draw(0.0, math.pi)
@@ -61,7 +52,7 @@ def glass(tile: Tile, rng: np.random.Generator) -> Surface:
         window = smoothstep(reach, 1.08, 0.95) * draw(0.25, 0.7)
         albedo = blend(albedo, f32([0.93, 0.96, 1.0]), window)
     dust = f32(tile.noise(0.2, 0.8, 0.0) > 3.0)
-    return Surface(height, blend(albedo, f32([0.9, 0.9, 0.9]), dust), kind, words, gloss=1.0)
+    return Surface(height, blend(albedo, f32([0.9, 0.9, 0.9]), dust), kind, gloss=1.0)
 
 
 def _tread(tile: Tile, rng: np.random.Generator) -> Array:
@@ -74,18 +65,10 @@ def _tread(tile: Tile, rng: np.random.Generator) -> Array:
     return smoothstep(np.minimum(first, second), 1.0, 0.6)
 
 
-_METAL = {
-    "brushed": ("brushed", "fine-lined", "cold", "hard"),
-    "tread plate": ("studded", "diamond-plated", "cold", "hard"),
-    "perforated": ("perforated", "smooth", "cold", "hard"),
-    "rusted": ("flaking", "uneven", "cold", "hard"),
-    "scratched": ("scratched", "smooth", "cold", "hard"),
-}
-
-
 def metal(tile: Tile, rng: np.random.Generator) -> Surface:
     """Draw brushed metal, tread plate, perforated, rusted, or scratched metal."""
-    kind, draw = pick(rng, *_METAL), rng.uniform
+    kind = pick(rng, "brushed", "tread plate", "perforated", "rusted", "scratched")
+    draw = rng.uniform
     value = draw(0.45, 0.85)
     color = f32([value, value * draw(0.93, 1.0), value * draw(0.85, 1.05)])
     if flip(rng, 0.25):
@@ -110,7 +93,7 @@ def metal(tile: Tile, rng: np.random.Generator) -> Surface:
         scratch = tile.strokes(30, 25.0, 0.6, angle=angle, spread=0.8, height=0.09, bend=0.1)
         height, albedo = height - scratch, tint(albedo, 1.0 - 2.5 * scratch)
     gloss = draw(0.5, 0.95) * (0.4 if kind == "rusted" else 1.0)
-    return Surface(height, albedo, kind, _METAL[kind], gloss=gloss)
+    return Surface(height, albedo, kind, gloss=gloss)
 
 
 def rubber(tile: Tile, rng: np.random.Generator) -> Surface:
@@ -120,7 +103,6 @@ def rubber(tile: Tile, rng: np.random.Generator) -> Surface:
     color = hsv(rng.random(), pick(rng, 0.0, 0.1, 0.6), value)
     angle = pick(rng, 0.0, math.pi / 4.0, math.pi / 3.0)
     u, v = tile.waves(draw(4.0, 9.0), angle)
-    first = "zigzag-grooved" if kind == "treaded" else kind
     if kind == "studded":
         height = smoothstep(np.cos(u) + np.cos(v), 0.1, 0.7) * 0.5
     elif kind == "treaded":
@@ -131,8 +113,8 @@ def rubber(tile: Tile, rng: np.random.Generator) -> Surface:
     else:
         height = tile.grains(draw(1.5, 3.0))[0] * 0.2
     height = height + tile.noise(0.3, 2.0, 1.0) * 0.008
-    albedo, words = tint(color, 0.75 + 0.25 * rising(height)), (first, "grippy", "elastic")
-    return Surface(height, albedo, kind, words, gloss=draw(0.05, 0.25), softness=0.45)
+    albedo = tint(color, 0.75 + 0.25 * rising(height))
+    return Surface(height, albedo, kind, gloss=draw(0.05, 0.25), softness=0.45)
 
 
 def paper(tile: Tile, rng: np.random.Generator) -> Surface:
@@ -141,34 +123,24 @@ def paper(tile: Tile, rng: np.random.Generator) -> Surface:
     color = hsv(draw(0.08, 0.15), draw(0.0, 0.15), draw(0.8, 0.97))
     fibre = tile.noise(0.25, 2.0, 0.9)
     height = fibre * 0.010 + tile.noise(8.0, 50.0, 3.0) * 0.06
-    words = ("thin", "flat", "dry")
     if kind == "corrugated":
         color = hsv(0.09, draw(0.3, 0.5), draw(0.5, 0.75))
         flutes = np.cos(tile.wave(draw(5.0, 8.0), pick(rng, 0.0, math.pi / 2.0)))
-        height, words = height + flutes * draw(0.10, 0.20), ("corrugated", "dry", "firm")
+        height = height + flutes * draw(0.10, 0.20)
     elif kind == "crumpled":
         cells = tile.cells(draw(9.0, 16.0))
         height = height + (cells.far - cells.near) * 0.16 + tile.ridged(3.0, 24.0, 2.6) * 0.07
-        words = ("crumpled", "creased", "thin")
     albedo = tint(color, 1.0 + 0.03 * fibre)
     if flip(rng, 0.5):
         line = smoothstep(np.sin(tile.wave(draw(3.0, 6.0), math.pi / 2.0)), 0.2, 0.4)
         print_ = line * (tile.noise(0.6, 3.0, 0.5, 3.0) > 0) * 0.85
         albedo = blend(albedo, f32([0.1, 0.1, 0.15]), print_)
-    return Surface(height, albedo, kind, words, gloss=0.05, softness=0.3)
-
-
-_OTHER = {
-    "sponge": (("porous", "spongy", "unusual"), "a sponge"),
-    "carpet": (("tufted", "springy", "unusual"), "carpet"),
-    "stud mat": (("studded", "regular", "unusual"), "a mat"),
-    "rope": (("corded", "twisted", "unusual"), "a rope"),
-}
+    return Surface(height, albedo, kind, gloss=0.05, softness=0.3)
 
 
 def other(tile: Tile, rng: np.random.Generator) -> Surface:
     """Draw what fits no other class: sponge, carpet, studded mat, rope."""
-    kind, draw = pick(rng, *_OTHER), rng.uniform
+    kind, draw = pick(rng, "sponge", "carpet", "stud mat", "rope"), rng.uniform
     color = hsv(rng.random(), draw(0.1, 0.9), draw(0.3, 0.95))
     if kind == "sponge":
         cells = tile.cells(draw(1.5, 3.5))
@@ -182,5 +154,5 @@ def other(tile: Tile, rng: np.random.Generator) -> Surface:
         strand = np.abs(np.sin(tile.wave(draw(10.0, 16.0), angle)))
         height = strand * 0.8 + 0.25 * np.sin(tile.wave(draw(2.0, 3.0), angle + 0.9))
     albedo = tint(color, 0.55 + 0.45 * rising(height))
-    height, (words, noun) = height + tile.noise(0.5, 4.0) * 0.02, _OTHER[kind]
-    return Surface(height, albedo, kind, words, draw(0.05, 0.4), 0.4, noun)
+    height = height + tile.noise(0.5, 4.0) * 0.02
+    return Surface(height, albedo, kind, gloss=draw(0.05, 0.4), softness=0.4)

@@ -21,18 +21,15 @@ def concrete(tile: Tile, rng: np.random.Generator) -> Surface:
         stones, cells = tile.grains(draw(2.2, 4.5), 0.4, draw(0.4, 0.8))
         height = height * 0.6 + stones * draw(0.25, 0.5)
         factor = 1.0 + cells.each(rng, 0.0, 0.12) * (stones > 0.2)
-        words = ("pebbly", "coarse", "hard")
     elif kind == "cast":
         cells = tile.cells(draw(3.0, 6.0))
         hole = smoothstep(cells.near, draw(0.4, 0.9), 0.1) * cells.keep(rng, 0.5)
         height, factor = height * 0.8 - hole * 0.5, 1.0 - 0.35 * hole
-        words = ("pitted", "gritty", "hard")
     else:
         lines = tile.noise(0.5, 3.5, 1.2, 14.0, draw(0.0, math.pi))
         height, factor = height * 0.5 + lines * draw(0.1, 0.2), 1.0 + 0.05 * lines
-        words = ("scored", "rough", "hard")
     albedo = tint(base, factor * (1.0 + 0.07 * tile.noise(0.3, 20.0, 1.6)))
-    return Surface(height, albedo, kind, words, gloss=0.03)
+    return Surface(height, albedo, kind, gloss=0.03)
 
 
 def brick(tile: Tile, rng: np.random.Generator) -> Surface:
@@ -43,29 +40,21 @@ def brick(tile: Tile, rng: np.random.Generator) -> Surface:
     grit = tile.noise(0.3, 4.0, 1.3)
     pits = smoothstep(tile.noise(0.5, 2.0, 0.8), 1.2, 2.0)
     relief = grit * draw(0.05, 0.12) - pits * 0.3
-    solid, words = tile.zeros() + 1.0, ("gritty", "grainy", "hard")
+    solid = tile.zeros() + 1.0
     if kind == "laid":
         course, length = TILE_MM / 4.0, TILE_MM / 2.0
         y = tile.y % course
         x = (tile.x + np.floor(tile.y / course) % 2.0 * (length / 2.0)) % length
         edge = np.minimum(np.minimum(y, course - y), np.minimum(x, length - x))
         solid = smoothstep(edge + tile.noise(2.0, 10.0) * 0.2, 0.9, 2.4)
-        words = ("jointed", "gritty", "hard")
     elif kind == "wire-cut":
         cuts = tile.noise(0.5, 5.0, 1.0, 20.0, pick(rng, 0.0, math.pi / 2.0))
-        relief, words = relief + cuts * draw(0.08, 0.16), ("scraped", "gritty", "hard")
+        relief = relief + cuts * draw(0.08, 0.16)
     height = solid * (draw(0.8, 1.6) + relief)
     height = height + (1.0 - solid) * tile.noise(0.3, 1.5, 0.8) * 0.12
     tone = (1.0 + 0.16 * tile.noise(1.0, 20.0)) * (1.0 + 0.10 * grit) * (1.0 - 0.25 * pits)
     joint = tint(mortar, 1.0 + 0.06 * tile.noise(0.3, 2.0))
-    return Surface(height, blend(joint, tint(clay, tone), solid), kind, words, gloss=0.02)
-
-
-_TILE = {
-    "glazed": ("slick", "smooth", "grid-lined"),
-    "textured": ("grippy", "nubbly", "grid-lined"),
-    "mosaic": ("slick", "smooth", "densely jointed"),
-}
+    return Surface(height, blend(joint, tint(clay, tone), solid), kind, gloss=0.02)
 
 
 def ceramic_tile(tile: Tile, rng: np.random.Generator) -> Surface:
@@ -85,7 +74,7 @@ def ceramic_tile(tile: Tile, rng: np.random.Generator) -> Surface:
     grout = f32([0.6, 0.59, 0.57]) * draw(0.5, 1.3)
     gloss = draw(0.1, 0.3) if kind == "textured" else draw(0.4, 0.9)
     albedo = blend(grout, tint(color, shade + marble), body)
-    return Surface(height, albedo, kind, _TILE[kind], gloss=gloss)
+    return Surface(height, albedo, kind, gloss=gloss)
 
 
 def rock(tile: Tile, rng: np.random.Generator) -> Surface:
@@ -95,18 +84,17 @@ def rock(tile: Tile, rng: np.random.Generator) -> Surface:
     angle = draw(0.0, math.pi)
     if kind == "craggy":
         form = tile.ridged(0.8, 25.0, 2.2)
-        height, words = form * 0.45, ("craggy", "sharp-edged", "hard")
+        height = form * 0.45
     elif kind == "layered":
         form = tile.noise(0.7, 25.0, 2.4, 7.0, angle)
         height = np.round(form * 3.0 + 0.3 * tile.noise(0.5, 3.0)) * 0.15 + form * 0.1
-        words = ("layered", "stepped", "hard")
     else:
         form = tile.noise(1.0, 25.0, 2.6)
-        height, words = form * 0.55, ("weathered", "uneven", "hard")
+        height = form * 0.55
     grit = tile.noise(0.3, 1.5, 0.6)
     specks = smoothstep(tile.noise(0.4, 1.6, 0.3), 1.0, 1.6) * (-0.5 if flip(rng, 0.5) else 0.5)
     albedo = tint(color, (1.0 + 0.16 * form + 0.08 * grit) * (1.0 + specks))
-    return Surface(height + grit * draw(0.02, 0.08), albedo, kind, words, gloss=0.04)
+    return Surface(height + grit * draw(0.02, 0.08), albedo, kind, gloss=0.04)
 
 
 def gravel(tile: Tile, rng: np.random.Generator) -> Surface:
@@ -121,9 +109,8 @@ def gravel(tile: Tile, rng: np.random.Generator) -> Surface:
         height = height + tile.ridged(0.8, 8.0, 1.8) * 0.12
     else:
         height = height + tile.noise(0.4, 3.0, 1.2) * 0.04
-    words = ("pebbly", "angular" if kind == "crushed" else "lumpy", "hard")
     tone = (1.0 + 0.1 * tile.noise(0.3, 3.0)) * smoothstep(stones, -0.05, 0.5)
-    return Surface(height, tint(colors[cells.index], tone), kind, words, gloss=0.05, softness=0.1)
+    return Surface(height, tint(colors[cells.index], tone), kind, gloss=0.05, softness=0.1)
 
 
 def sand(tile: Tile, rng: np.random.Generator) -> Surface:
@@ -134,29 +121,21 @@ def sand(tile: Tile, rng: np.random.Generator) -> Surface:
     coarse = tile.grains(size * 1.8, 0.6, 0.25)[0]
     height = fine * (size * 0.45) + coarse * (size * 0.5)
     height = height + tile.noise(3.0, 25.0, 2.4) * draw(0.05, 0.2)
-    softness, words = 0.4, ("granular", "fine-grained", "loose")
+    softness = 0.4
     if kind == "rippled":
         ripples = np.sin(tile.wave(draw(10.0, 20.0), draw(0.0, math.pi), 0.5))
         height = height * 0.8 + ripples * draw(0.5, 0.8)
-        words = ("granular", "rippled", "loose")
     elif kind == "packed":
-        height, softness, words = height * 0.5, 0.15, ("granular", "fine-grained", "firm")
+        height, softness = height * 0.5, 0.15
     color = hsv(draw(0.07, 0.13), draw(0.15, 0.45), draw(0.55, 0.9))
     speckle = np.clip(cells.each(rng, 1.0, 0.25), 0.4, 1.6)
     albedo = tint(color, speckle * (1.0 + 0.05 * tile.noise(3.0, 30.0)))
-    return Surface(height, albedo, kind, words, gloss=0.03, softness=softness)
-
-
-_SOIL = {
-    "crumbs": ("crumbly", "loose", "yielding"),
-    "clods": ("clumpy", "crumbly", "uneven"),
-    "litter": ("crumbly", "fibrous", "loose"),
-}
+    return Surface(height, albedo, kind, gloss=0.03, softness=softness)
 
 
 def soil(tile: Tile, rng: np.random.Generator) -> Surface:
     """Draw crumbs, clods, or soil with plant litter."""
-    kind, draw = pick(rng, *_SOIL), rng.uniform
+    kind, draw = pick(rng, "crumbs", "clods", "litter"), rng.uniform
     color = hsv(draw(0.04, 0.1), draw(0.3, 0.6), draw(0.15, 0.45))
     size = draw(4.0, 7.0) if kind == "clods" else draw(2.2, 3.5)
     clods = tile.grains(size, 0.6, 0.6)[0]
@@ -168,4 +147,4 @@ def soil(tile: Tile, rng: np.random.Generator) -> Surface:
         stalks = tile.strokes(25, 12.0, 0.6, spread=3.0, height=0.6)
         height = np.maximum(height, float(height.mean()) + stalks)
         albedo = blend(albedo, hsv(0.11, 0.35, 0.6), smoothstep(stalks, 0.05, 0.2))
-    return Surface(height, albedo, kind, _SOIL[kind], gloss=0.01, softness=0.55)
+    return Surface(height, albedo, kind, gloss=0.01, softness=0.55)

@@ -29,8 +29,7 @@ def leather(tile: Tile, rng: np.random.Generator) -> Surface:
         seam = smoothstep(tile.lines(16.0, 0.0), 0.8, 0.3)
         stitch = seam * smoothstep(np.sin(tile.wave(2.6, math.pi / 2.0)), -0.3, 0.2)
         height, albedo = height + stitch * 0.3, blend(albedo, hsv(0.12, 0.2, 0.85), stitch)
-    words = ("supple", "fine-grained" if kind == "fine" else kind, "soft")
-    return Surface(height, albedo, kind, words, gloss=draw(0.15, 0.45), softness=0.35)
+    return Surface(height, albedo, kind, gloss=draw(0.15, 0.45), softness=0.35)
 
 
 def _weave(tile: Tile, rng: np.random.Generator, kind: str, step: float, wobble: float) -> Array:
@@ -51,13 +50,7 @@ def _weave(tile: Tile, rng: np.random.Generator, kind: str, step: float, wobble:
     return smoothstep(np.cos(u) + np.cos(v), 0.9, -0.3)  # mesh
 
 
-_SYNTHETIC = {
-    "twill": "woven",
-    "knit": "knitted",
-    "mesh": "meshed",
-    "rib": "ribbed",
-    "plain": "woven",
-}
+_SYNTHETIC = ("twill", "knit", "mesh", "rib", "plain")
 
 
 def synthetic_fabric(tile: Tile, rng: np.random.Generator) -> Surface:
@@ -70,8 +63,7 @@ def synthetic_fabric(tile: Tile, rng: np.random.Generator) -> Surface:
     if flip(rng, 0.35):
         stripe = smoothstep(np.sin(tile.wave(draw(8.0, 20.0), draw(0.0, math.pi))), -0.1, 0.1)
         albedo = blend(albedo, tint(hsv(rng.random(), 0.7, 0.7), tone), stripe)
-    words = (_SYNTHETIC[kind], "fine", "soft")
-    return Surface(height, albedo, kind, words, gloss=draw(0.1, 0.35), softness=0.6)
+    return Surface(height, albedo, kind, gloss=draw(0.1, 0.35), softness=0.6)
 
 
 def natural_fabric(tile: Tile, rng: np.random.Generator) -> Surface:
@@ -86,5 +78,4 @@ def natural_fabric(tile: Tile, rng: np.random.Generator) -> Surface:
         color = hsv(rng.random(), draw(0.2, 0.7), draw(0.2, 0.8))
     tone = 0.5 + 0.5 * np.clip(relief * (1.0 / float(relief.max())), 0.0, 1.0)
     albedo = tint(color, tone * (1.0 + 0.1 * tile.noise(0.4, 6.0, 1.0)))
-    first = {"plain": "coarsely woven", "knit": "knitted", "rib": "corded"}[kind]
-    return Surface(height, albedo, kind, (first, "fuzzy", "soft"), gloss=0.02, softness=0.75)
+    return Surface(height, albedo, kind, gloss=0.02, softness=0.75)

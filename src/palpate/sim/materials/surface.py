@@ -26,20 +26,15 @@ class Surface:
         albedo: reflectance in [0, 1], shape (n, n, 3), float32; of man-made things it must not
             reveal the relief.
         subtype: the kind that was drawn, one of the material's ``subtypes``.
-        words: 2 to 4 adjectives that say how this piece feels, never its color or light.
         gloss: 0 matt to 1 mirror-like.
         softness: 0 rigid to 1 (yields under the gel).
-        noun: for captions, ``"tree bark"`` or, where it can be counted, ``"a leaf"``; '' takes the
-            material's.
     """
 
     height: Array
     albedo: Array
     subtype: str
-    words: tuple[str, ...]
     gloss: float = 0.0
     softness: float = 0.0
-    noun: str = ""
 
 
 #: Draws a piece of a material on a tile; all randomness comes from the generator, also the tile's.
@@ -52,13 +47,11 @@ class Material:
 
     Attributes:
         label: id in ``label.txt``.
-        noun: for captions, ``"tree bark"`` or, where it can be counted, ``"a leaf"``.
         draw: the function that draws a piece.
         subtypes: the kinds that ``draw`` chooses from.
     """
 
     label: int
-    noun: str
     draw: Draw
     subtypes: tuple[str, ...] = ()
 
@@ -92,8 +85,7 @@ def draw_surface(name: str, material: Material, n: int, rng: np.random.Generator
 
     Raises:
         PalpateError: naming the material, if its function failed, or returned a wrong shape,
-            numbers that are not finite or far out of range, an unknown subtype, or words that make
-            no caption.
+            numbers that are not finite or far out of range, or an unknown subtype.
     """
     function = getattr(material.draw, "__qualname__", type(material.draw).__name__)
 
@@ -120,19 +112,8 @@ def draw_surface(name: str, material: Material, n: int, rng: np.random.Generator
     require(-1.0 <= low <= high <= 4.0, "have an albedo in [0, 1]", f"{low:g} to {high:g}")
     known = not material.subtypes or surface.subtype in material.subtypes
     require(known, f"draw one of its subtypes {material.subtypes}", repr(surface.subtype))
-    words = tuple(surface.words)
-    fits = 2 <= len(words) == len(set(words)) <= 4 and all(is_line(word) for word in words)
-    require(fits, "say how it feels in 2 to 4 different words", words)
     shares = (surface.gloss, surface.softness)
     require(all(0.0 <= v <= 1.0 for v in shares), "have gloss and softness in [0, 1]", shares)
-    noun = surface.noun or material.noun
-    require(is_line(noun), "have a noun of one line", repr(noun))
     height = np.ascontiguousarray(height - float(np.median(height)))
     albedo = np.ascontiguousarray(np.clip(albedo, 0.01, 1.0))
-    gloss, softness = map(float, shares)
-    return Surface(height, albedo, surface.subtype, words, gloss, softness, noun)
-
-
-def is_line(value: object) -> bool:
-    """Return whether ``value`` is a single line of text that is not blank."""
-    return isinstance(value, str) and bool(value.strip()) and value.isprintable()
+    return Surface(height, albedo, surface.subtype, *map(float, shares))

@@ -19,8 +19,19 @@ from typing import Any
 import numpy as np
 import polars as pl
 
-from palpate.core import PalpateError, Problem, Progress, inside, read_json, rng_for, write_json
+from palpate.core import (
+    PalpateError,
+    Progress,
+    inside,
+    read_json,
+    require,
+    require_choice,
+    write_json,
+)
+from palpate.data.formats.base import Into, Scan
 from palpate.data.frames import (
+    IMAGE_FORMATS,
+    MEDIAN_OF,
     FolderFrames,
     Frames,
     ImageFormat,
@@ -30,23 +41,17 @@ from palpate.data.frames import (
     streams_of,
 )
 from palpate.data.images import Check, check_image, in_threads
+from palpate.data.imported import place_of, raise_if, require_some
 from palpate.data.listing import FrameList, FrameTable
 from palpate.data.streams import Finding, findings
 
 #: The background is this many frames before the contact.
 BACKGROUND_BEFORE = 4
-#: The typical frame of a recording is chosen from at most so many frames.
-MEDIAN_OF = 15
 MODALITIES = ("vision", "tactile")
 
 
-@dataclass(frozen=True)
-class VideoFiles:
-    """One recording: each modality is a folder of frames, a video file, or None."""
-
-    name: str
-    vision: Path | None
-    tactile: Path | None
+#: One recording: modality -> a folder of frames, a video file, or None.
+VideoFiles = Mapping[str, Path | None]
 
 
 @dataclass(frozen=True)
@@ -79,65 +84,50 @@ def first_frames(rows: Iterable[Row]) -> dict[str, int]:
     return {row.contact: row.frame for row in sorted(rows, key=lambda row: -row.frame)}
 
 
-def thin(rows: Sequence[Row], most: int | None, seed: int) -> list[Row]:
-    """At most ``most`` rows per contact, one from each of that many equal stretches.
-
-    Of a contact of n rows, row ``floor((i + u) n / most)`` is taken for i = 0, 1, ...; u = 1/2 for
-    seed 0, otherwise drawn in [0, 1) for each contact.
-    """
+def thin(rows: list[Row], max_per_contact: int | None) -> list[Row]:
+    """So many rows per contact at most: the middle one of each of that many equal stretches."""
+    most = max_per_contact
+    require(most is None or most >= 1, "max_per_contact", "must be at least 1", most)
+    if most is None:
+        return rows
     groups: dict[str, list[Row]] = {}
     for row in rows:
         groups.setdefault(row.contact, []).append(row)
-    taken: list[Row] = []
-    for contact, group in groups.items():
-        if most is None or len(group) <= most:
-            taken += group
-            continue
-        # The name of the stream is part of every thinned import so far.
-        phase = 0.5 if seed == 0 else rng_for(seed, "frames of a touch", contact).random()
-        taken += [group[int((i + phase) * len(group) / most)] for i in range(most)]
-    return taken
+    few = lambda group: [group[int((i + 0.5) * len(group) / most)] for i in range(most)]
+    return [row for g in groups.values() for row in (g if len(g) <= most else few(g))]
 
 
 @dataclass
 class Recordings:
-    """The recordings of one data set while it is imported.
+    """The recordings of one data set while it is read."""
 
-    Attributes:
-        root: the data set.
-        out: where extracted frames go.
-        videos: recordings on disk, by name.
-        in_contact: frames of each recording in which the sensor is in contact.
-        image_format, size: of extracted frames.
-        created: every new file is added here.
-        problems: what is wrong so far.
-        suspicious: what looks wrong, but can be used.
-        frames: recording -> modality -> frames, for those that could be opened.
-        backgrounds: contact -> background image.
-        background_frames: contact -> the frame before it that is its background, if there is one.
-        typical_of: contacts without such a frame -> their recording.
-        extracted: whether frames of videos are files by now.
-        modalities: those that every recording has.
-    """
-
-    root: Path
-    out: Path
-    videos: Mapping[str, VideoFiles]
-    in_contact: Mapping[str, set[int]]
-    image_format: ImageFormat
+    scan: Scan  # of the data set: gets the rows, what is wrong, and what looks wrong
+    into: Into | None  # where extracted frames go; None where nothing is written
+    videos: Mapping[str, VideoFiles]  # recordings on disk, by name
+    in_contact: Mapping[str, set[int]]  # frames of each recording in which the sensor is in contact
+    image_format: ImageFormat  # of extracted frames
     size: int | None
-    created: list[Path]
-    problems: list[Problem] = field(default_factory=list)
-    suspicious: list[Problem] = field(default_factory=list)
+    #: Recording -> modality -> frames, for those that could be opened.
     frames: dict[str, dict[str, Frames]] = field(default_factory=dict)
-    backgrounds: dict[str, Path] = field(default_factory=dict)
+    backgrounds: dict[str, Path] = field(default_factory=dict)  # contact -> background image
+    #: Contact -> the frame before it that is its background, if there is one.
     background_frames: dict[str, int] = field(default_factory=dict)
+    #: Contacts without such a frame -> their recording.
     typical_of: dict[str, str] = field(default_factory=dict)
-    extracted: bool = False
-    modalities: tuple[str, ...] = MODALITIES
+    extracted: bool = False  # whether frames of videos are files by now
+    modalities: tuple[str, ...] = MODALITIES  # those that every recording has
+
+    def __post_init__(self) -> None:
+        require(self.size is None or self.size >= 1, "size", "must be at least 1 pixel", self.size)
+        require_choice("image_format", self.image_format, IMAGE_FORMATS)
+
+    @property
+    def out(self) -> Path:
+        """Where extracted frames go, or would go."""
+        return self.scan.base if self.into is None else self.into.out
 
     def open(self, rows: Sequence[Row], progress: Progress) -> list[Row]:
-        """Open both modalities of every recording in use; keep the rows that have both images."""
+        """Open both modalities of every recording in use; keep the rows of those that opened."""
         first = {row.video: row for row in reversed(rows)}
         count = Counter(row.video for row in rows)
         results = in_threads(self._open_one, sorted(first), "reading recordings", progress)
@@ -145,15 +135,14 @@ class Recordings:
             if isinstance(opened, tuple):
                 kind, text = opened
                 lost = f"{text} ({count[name]} row{'s' * (count[name] != 1)} of this recording)"
-                self.problems.append(Problem(first[name].where, kind, lost))
+                self.scan.problem(first[name].where, kind, lost)
                 continue
             self.frames[name] = opened
             for frames in opened.values():
                 for duplicate, read in frames.duplicates:
                     text = f"{read} has the same number, and is read"
-                    place = str(frames.source / duplicate)
-                    self.suspicious.append(Problem(place, "duplicate-frame", text))
-        return [row for row in rows if row.video in self.frames and self._has(row)]
+                    self.scan.suspect(frames.source / duplicate, "duplicate-frame", text)
+        return [row for row in rows if row.video in self.frames]
 
     def _open_one(self, name: str) -> dict[str, Frames] | tuple[str, str]:
         """Both modalities of a recording, or (kind, text) of what is wrong."""
@@ -161,13 +150,13 @@ class Recordings:
             return "missing-video", f"the recording {name!r} is not in the data set"
         opened: dict[str, Frames] = {}
         for modality in self.modalities:
-            source: Path | None = getattr(self.videos[name], modality)
+            source = self.videos[name][modality]
             if source is None:
                 return "missing-video", f"the recording {name!r} has no {modality} frames"
             if source.is_dir():
-                if inside(self.root, os.path.relpath(source, self.root)) is None:
+                if inside(self.scan.base, os.path.relpath(source, self.scan.base)) is None:
                     return "outside-root", f"{source} is a link that leaves the data set"
-                opened[modality] = FolderFrames(source, self.root)
+                opened[modality] = FolderFrames(source, self.scan.base)
                 continue
             cache = self.out / "images" / name / modality
             try:
@@ -176,13 +165,13 @@ class Recordings:
                 return "bad-video", f"{source}: {error.got}"
         return opened
 
-    def _has(self, row: Row) -> bool:
+    def has(self, row: Row) -> bool:
         """Whether both modalities have the frame; if not, it is a problem."""
         opened = self.frames[row.video]
         length = min(map(len, opened.values()))
         if row.frame >= length:
             text = f"frame {row.frame} of {row.video!r}, which has {length} frames, counted from 0"
-            self.problems.append(Problem(row.where, "beyond-end", text))
+            self.scan.problem(row.where, "beyond-end", text)
             return False
         missing = [frames for frames in opened.values() if not frames.has(row.frame)]
         for frames in missing:
@@ -190,8 +179,33 @@ class Recordings:
             if row.frame in frames.leaving:
                 kind = "outside-root"
                 text = f"{frames.path(row.frame)} is a link that leaves the data set"
-            self.problems.append(Problem(row.where, kind, text))
+            self.scan.problem(row.where, kind, text)
         return not missing
+
+    def usable(
+        self,
+        rows: list[Row],
+        starts: Mapping[str, int],
+        listed: set[str],
+        *,
+        check: Check,
+        progress: Progress,
+    ) -> list[Row]:
+        """The rows whose images are whole, with a background chosen for each contact.
+
+        ``starts`` has the first frame of each contact. Recordings that are not ``listed`` are
+        reported.
+        """
+        self.choose_backgrounds(rows, starts)
+        rows = self._whole(rows, check, progress)
+        for video in sorted(set(self.videos) - listed):
+            text = f"no usable contact of the recording {video!r} is listed"
+            self.scan.suspect(self.scan.base, "unlisted-video", text)
+        with_background = {*self.background_frames, *self.typical_of}
+        for contact in sorted({row.contact for row in rows} - with_background):
+            text = "no frame of its recording shows the untouched gel"
+            self.scan.suspect(contact, "no-background", text)
+        return rows
 
     def choose_backgrounds(self, rows: Sequence[Row], starts: Mapping[str, int]) -> None:
         """Choose the background of every contact.
@@ -224,38 +238,59 @@ class Recordings:
                 return free[places.astype(int)].tolist()
         return []
 
-    def check(self, rows: list[Row], how: Check, progress: Progress) -> list[Row]:
+    def _whole(self, rows: list[Row], how: Check, progress: Progress) -> list[Row]:
         """Check every image of folders in use once; keep the rows whose images are whole."""
-        first: dict[Path, Row] = {}
-        for row in rows:
-            for _, path in self._folder_images(row):
-                first.setdefault(path, row)
+        if how == "none":
+            return rows
+        first = {path: row for row in reversed(rows) for path in self._folder_images(row)}
         bad: set[Path] = set()
-        paths = () if how == "none" else first
-        checked = in_threads(lambda p: check_image(p, how), paths, "checking images", progress)
+        checked = in_threads(lambda p: check_image(p, how), first, "checking images", progress)
         for path, reason in checked:
             if reason:
                 bad.add(path)
-                self.problems.append(Problem(first[path].where, "bad-image", f"{path}: {reason}"))
+                self.scan.problem(first[path].where, "bad-image", f"{path}: {reason}")
         # A bad background costs no row.
         self.backgrounds = {c: path for c, path in self.backgrounds.items() if path not in bad}
-        self.problems.sort(key=place_of)
-        return [row for row in rows if bad.isdisjoint(path for _, path in self._folder_images(row))]
+        return [row for row in rows if bad.isdisjoint(self._folder_images(row))]
 
-    def _folder_images(self, row: Row) -> list[tuple[str, Path]]:
-        """(modality, image) of a row and its background, without those of videos."""
+    def _folder_images(self, row: Row) -> list[Path]:
+        """The images of a row and its background that are files already."""
         frames = self.frames[row.video]
-        folders = [m for m in self.modalities if isinstance(frames[m], FolderFrames)]
-        images = [(m, frames[m].path(row.frame)) for m in folders]
-        if "tactile" in folders and row.contact in self.backgrounds:
-            images.append(("tactile", self.backgrounds[row.contact]))
-        return images
+        folders = [m for m in self.modalities if not self._is_video(row.video, m)]
+        images = [frames[m].path(row.frame) for m in folders]
+        with_background = "tactile" in folders and row.contact in self.backgrounds
+        return images + ([self.backgrounds[row.contact]] if with_background else [])
 
-    def decode(self, rows: list[Row], progress: Progress, *, videos: bool = True) -> list[Row]:
-        """Decode what ``extract`` would, and write nothing; keep the rows whose images are whole.
+    def add(
+        self,
+        rows: list[Row],
+        *,
+        check: Check,
+        progress: Progress,
+        sensor: str | None = None,
+        words: Mapping[str, FrameTable | None] | None = None,
+    ) -> None:
+        """Add usable rows to the scan, after extracting their frames, or only decoding them.
 
-        With ``videos=False`` only the typical frames of folders are determined, and every row
-        stays.
+        If nothing is written they have paths only if they are still to be checked and are files.
+        """
+        hidden: dict[str, Any] = {}
+        if self.into is not None:
+            rows = self.extract(rows, progress)
+            self.scan.facts |= self._facts(rows)
+            self.scan.base = self._base(rows)
+        else:
+            rows = self._decode(rows, progress, videos=check == "decode")
+            if check == "decode":
+                self._check_streams(progress)
+            hidden = {} if check == "none" else dict.fromkeys((*MODALITIES, "background"))
+        cells = self.cells(rows, self.scan.base.resolve(), sensor, words)
+        self.scan.rows = [(r.where, cell | hidden) for r, cell in zip(rows, cells, strict=True)]
+
+    def _decode(self, rows: list[Row], progress: Progress, *, videos: bool) -> list[Row]:
+        """Decode what ``extract`` would; keep the rows whose images are whole.
+
+        Without ``videos`` only the typical frames of folders are determined, and every row stays.
         """
         whole: set[tuple[str, str, int]] = set()
 
@@ -272,7 +307,7 @@ class Recordings:
             return rows
         return [r for r in rows if all((r.video, m, r.frame) in whole for m in self._videos_of(r))]
 
-    def check_streams(self, progress: Progress) -> None:
+    def _check_streams(self, progress: Progress) -> None:
         """Report what looks wrong with whole recordings: lag, frozen streams, another gel ..."""
 
         def check(video: str) -> list[Finding]:
@@ -282,27 +317,36 @@ class Recordings:
                 return []  # reported where its frames are read
 
         results = in_threads(check, sorted(self.frames), "checking streams", progress)
-        self.suspicious += [
-            Problem(video, *problem) for video, problems in sorted(results) for problem in problems
-        ]
+        for video, problems in sorted(results):
+            for problem in problems:
+                self.scan.suspect(video, *problem)
 
     def extract(self, rows: list[Row], progress: Progress) -> list[Row]:
-        """Extract the needed frames of videos; keep the rows whose images are there."""
+        """Extract the needed frames of videos; keep the rows whose images are there.
+
+        Raises:
+            ProblemsError: before, if something is bad that is not to be skipped, or no row is left.
+        """
+        into = self.into
+        assert into is not None
+        self.scan.problems.sort(key=place_of)
+        raise_if(self.scan.problems, into.skip_bad)
+        require_some(len(rows), self.scan.base, self.scan.problems)
 
         def work(job: _Job, stop: Event) -> None:
             frames = self.frames[job[0]][job[1]]
             assert isinstance(frames, VideoFrames)
-            frames.extract(job[2], self.created, stop)
+            frames.extract(job[2], into.created, stop)
 
         jobs = self._jobs(rows)
-        self._require_same_settings(jobs)
-        self._run("extracting frames", jobs, work, rows, progress, save=True)
+        self._require_same_settings(jobs, into)
+        self._run("extracting frames", jobs, work, rows, progress, save_to=into.created)
         self.extracted = True
         self.backgrounds = {c: path for c, path in self.backgrounds.items() if path.is_file()}
         there = lambda r, m: self.frames[r.video][m].path(r.frame).is_file()
         return [row for row in rows if all(there(row, m) for m in self._videos_of(row))]
 
-    def layout(self, rows: Iterable[Row]) -> str:
+    def _layout(self, rows: Iterable[Row]) -> str:
         """``raw`` if the frames are those of videos, ``extracted`` if of folders, or ``mixed``."""
         videos = {row.video for row in rows}
         raw = {self._is_video(video, m) for video in videos for m in self.modalities}
@@ -336,11 +380,12 @@ class Recordings:
         rows: Sequence[Row],
         progress: Progress,
         *,
-        save: bool = False,
+        save_to: list[Path] | None = None,
     ) -> None:
         """Run jobs in threads; a video that breaks off becomes a problem.
 
-        Jobs without frames choose a typical frame, and ``save`` it if it is not a file.
+        Jobs without frames choose a typical frame; one that is no file is written where there is a
+        list of new files, ``save_to``.
         """
         first = {row.video: row for row in reversed(rows)}
         typical: dict[str, Path] = {}
@@ -351,8 +396,8 @@ class Recordings:
             numbers, images = zip(*frames.read(self._without_contact(video)), strict=True)
             best = nearest_to_median(images, frames.source)
             path = typical[video] = frames.path(numbers[best])
-            if save and not path.is_file():
-                self.created.append(path)
+            if save_to is not None and not path.is_file():
+                save_to.append(path)
                 save_frame(path, images[best], self.size)
 
         def attempt(job: _Job) -> str | None:
@@ -364,17 +409,16 @@ class Recordings:
 
         for (video, _, _), text in in_threads(attempt, jobs, what, progress, stop=stop):
             if text:
-                self.problems.append(Problem(first[video].where, "bad-video", text))
+                self.scan.problem(first[video].where, "bad-video", text)
         chosen = {c: typical[video] for c, video in self.typical_of.items() if video in typical}
         self.backgrounds |= chosen
-        self.problems.sort(key=place_of)
 
-    def _require_same_settings(self, jobs: Sequence[_Job]) -> None:
+    def _require_same_settings(self, jobs: Sequence[_Job], into: Into) -> None:
         """Record the settings of extracted frames; reject a folder with others."""
         videos = [job[:2] for job in jobs if self._is_video(*job[:2])]
         if not videos:
             return
-        path = self.out / "images" / "settings.json"
+        path = into.out / "images" / "settings.json"
         settings = {"format": self.image_format, "size": self.size}
         source = lambda video, m: self.frames[video][m].source
         sizes = {f"{v}/{m}": source(v, m).stat().st_size for v, m in sorted(videos)}
@@ -389,7 +433,7 @@ class Recordings:
                 raise PalpateError(must, got, "Choose another folder, or remove that one")
             sizes = known | sizes
         else:
-            self.created.append(path)
+            into.created.append(path)
         write_json(path, {**settings, "videos": sizes})
 
     def cells(
@@ -399,13 +443,9 @@ class Recordings:
         sensor: str | None = None,
         words: Mapping[str, FrameTable | None] | None = None,
     ) -> list[dict[str, Any]]:
-        """Manifest cells of the rows; frames inside videos have no path before ``extract``.
+        """Manifest cells of the rows, with paths relative to ``root``, and further ``words``.
 
-        Args:
-            rows: frames of opened recordings.
-            root: folder that the paths shall be relative to.
-            sensor: the tactile sensor.
-            words: further columns by (video, frame).
+        Frames inside videos have no path before ``extract``.
         """
 
         @cache
@@ -431,26 +471,17 @@ class Recordings:
             cells.append(values)
         return cells
 
-    def facts(self, rows: Sequence[Row]) -> dict[str, str]:
+    def _facts(self, rows: Sequence[Row]) -> dict[str, str]:
         """How the frames are stored, and how many contacts have which background."""
         kinds: Counter[str] = Counter()
         for contact in {row.contact for row in rows}:
             kind = "frame" if contact in self.background_frames else "typical"
             kinds[kind if contact in self.backgrounds else "none"] += 1
         backgrounds = ", ".join(f"{kind} {count}" for kind, count in sorted(kinds.items()))
-        return {"layout": self.layout(rows), "backgrounds": backgrounds}
+        return {"layout": self._layout(rows), "backgrounds": backgrounds}
 
-    def base(self, rows: Sequence[Row]) -> Path:
+    def _base(self, rows: Sequence[Row]) -> Path:
         """The folder that holds all images: the data set, ``out``, or the one around both."""
-        roots = {"extracted": [self.root], "raw": [self.out]}
-        return Path(
-            os.path.commonpath(
-                [p.resolve() for p in roots.get(self.layout(rows), [self.root, self.out])]
-            )
-        )
-
-
-def place_of(problem: Problem) -> tuple[str, int]:
-    """``file:line`` to sort problems by."""
-    name, _, line = problem.where.rpartition(":")
-    return (name, int(line)) if line.isdecimal() else (problem.where, 0)
+        root, out = self.scan.base.resolve(), self.out.resolve()
+        both = Path(os.path.commonpath([root, out]))
+        return {"extracted": root, "raw": out}.get(self._layout(rows), both)

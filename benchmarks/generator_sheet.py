@@ -1,0 +1,127 @@
+"""Sheets for the eye: real and generated tactile images by material, the contact amplified.
+
+    python benchmarks/generator_sheet.py --write docs/images/generated.jpg
+    python benchmarks/generator_sheet.py --blind runs/blind       # to be sorted by somebody
+    python benchmarks/generator_sheet.py --blind runs/blind --answers answers.json
+
+New objects, videos and gel units of a world that no shipped model has seen. ``--blind`` writes
+``examples.png``, a strip of real images for each material by name, and ``sort-me.png``, five
+generated images of new videos of each material, numbered in random order; whoever sorts them writes
+``{"1": "Wood", ...}`` and sees nothing else. With the answers the number of materials above chance
+is printed: at least two of five right, which guessing reaches for one material in forty.
+"""
+
+import argparse
+import json
+import tempfile
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from PIL import Image, ImageDraw, ImageFont
+
+from palpate.core import rng_for
+from palpate.data.images import load_images
+from palpate.data.manifest import Manifest
+from palpate.diffusion.generation import generate
+from palpate.sim import PRESETS, write_world
+
+WORLD = replace(
+    PRESETS["pretrain"],
+    seed=63,
+    objects_per_material=5,
+    contacts_per_video=2,
+    frames_per_contact=1,
+    sensors=1,
+)
+EACH = 5  # images of a material, of as many videos
+SIDE = 96
+AMPLIFIED = 3.0
+
+
+def amplified(images, gels):
+    """The difference to the gel, `AMPLIFIED` times, on gray: bytes (n, h, w, 3)."""
+    change = np.asarray(images, float) - np.asarray(gels, float)
+    return (128 + AMPLIFIED * change).clip(0, 255).astype(np.uint8)
+
+
+def picked(world):
+    """Material -> ids of its samples, one a video, and as many other ones for the examples."""
+    first = world.table.group_by("material", "video", maintain_order=True).agg("id")
+    table, others = {}, {}
+    for material, _, ids in first.iter_rows():
+        table.setdefault(material, []).append(ids[0])
+        others.setdefault(material, []).append(ids[-1])
+    return {m: table[m][:EACH] for m in sorted(table)}, others
+
+
+def sheet(rows, names):
+    """Rows of images of one size, each with its name at the left."""
+    font = ImageFont.load_default(14)
+    width = max(len(images) for images in rows)
+    page = Image.new("RGB", (150 + SIDE * width, SIDE * len(rows)), "white")
+    draw = ImageDraw.Draw(page)
+    for k, (name, images) in enumerate(zip(names, rows, strict=True)):
+        draw.text((6, SIDE * k + SIDE // 2 - 8), str(name), "black", font=font)
+        for j, image in enumerate(images):
+            page.paste(Image.fromarray(image).resize((SIDE, SIDE)), (150 + SIDE * j, SIDE * k))
+    return page
+
+
+def numbered(images, columns=10):
+    """All images with their numbers, from 1."""
+    font = ImageFont.load_default(14)
+    lines = -(-len(images) // columns)
+    page = Image.new("RGB", (columns * (SIDE + 8), lines * (SIDE + 24)), "white")
+    draw = ImageDraw.Draw(page)
+    for k, image in enumerate(images):
+        left, top = (k % columns) * (SIDE + 8), (k // columns) * (SIDE + 24)
+        draw.text((left + 4, top + 2), str(k + 1), "black", font=font)
+        page.paste(Image.fromarray(image).resize((SIDE, SIDE)), (left, top + 20))
+    return page
+
+
+def main():
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--model", default="palpate/mini")
+    parser.add_argument("--write", type=Path, help="image of real and generated rows")
+    parser.add_argument("--blind", type=Path, help="folder for the sheets to be sorted")
+    parser.add_argument("--answers", type=Path, help="JSON: number -> material")
+    chosen = parser.parse_args()
+    with tempfile.TemporaryDirectory() as folder:
+        write_world(Path(folder) / "tree", WORLD, workers=2)
+        world = Manifest.load(Path(folder) / "tree")
+        ids, others = picked(world)
+        flat = [i for row in ids.values() for i in row]
+        size = generate(world.take(flat[:1]), model=chosen.model).images[0].size[0]
+        pixels = lambda names, column: load_images(world.take(names).paths(column), size)
+        made = np.stack(
+            [np.asarray(i) for i in generate(world.take(flat), model=chosen.model).images]
+        )
+        made = amplified(made, pixels(flat, "background"))
+        real = amplified(pixels(flat, "tactile"), pixels(flat, "background"))
+        shown = {
+            m: amplified(*(pixels(o, c) for c in ("tactile", "background")))
+            for m, o in others.items()
+        }
+    labels = [m for m, row in ids.items() for _ in row]
+    if chosen.write:
+        by = {m: [k for k, name in enumerate(labels) if name == m] for m in ids}
+        rows = [np.concatenate([real[k], made[k]]) for k in by.values()]
+        sheet(rows, by).save(chosen.write)
+    if chosen.blind:
+        order = rng_for(0, "blind").permutation(len(made))
+        key = {str(k + 1): labels[i] for k, i in enumerate(order)}
+        chosen.blind.mkdir(parents=True, exist_ok=True)
+        sheet([shown[m][:8] for m in ids], ids).save(chosen.blind / "examples.png")
+        numbered(made[order]).save(chosen.blind / "sort-me.png")
+        if chosen.answers:
+            answers = json.loads(chosen.answers.read_text())
+            right = {m: sum(answers.get(k) == m == v for k, v in key.items()) for m in ids}
+            above = sum(n >= 2 for n in right.values())
+            print(f"{sum(right.values())} of {len(key)} right; {above} materials above chance")
+            print(right)
+
+
+if __name__ == "__main__":
+    main()

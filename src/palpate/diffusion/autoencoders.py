@@ -1,0 +1,173 @@
+"""An autoencoder of either kind, trained on a data set, with the gels that it is given."""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from palpate.core import PalpateError, Progress, Split, digest_json, quiet
+from palpate.data.images import cached_images, image_stamp
+from palpate.data.manifest import Manifest
+from palpate.data.reading import load
+from palpate.diffusion.autoencoder import (
+    AnyAutoencoder,
+    Autoencoder,
+    BackgroundAutoencoder,
+    load_autoencoder,
+)
+from palpate.diffusion.autoencoder_training import measure_reconstruction
+from palpate.diffusion.autoencoder_training import train_autoencoder as train_vq
+from palpate.diffusion.background_training import train_background_autoencoder
+from palpate.diffusion.options import AutoencoderOptions, BackgroundOptions
+from palpate.diffusion.presets import DiffusionPreset, preset_named
+from palpate.encoders.contrastive import load_split, train_part
+from palpate.encoders.models import pick_device
+from palpate.encoders.rows import evenly
+from palpate.training.options import Compute
+from palpate.training.processes import connect, first_alone, keep_logs, place, work_folder
+
+MEDIAN = 500  # images that a stock gel is the median of, at most
+
+
+def train_autoencoder(
+    data: Manifest | str | Path,
+    split: Split | str | Path | None = None,
+    *,
+    preset: str | DiffusionPreset = "mini",
+    start: AnyAutoencoder | str | Path | None = None,
+    output: Path | str | None = None,
+    seed: int = 0,
+    device: str = "auto",
+    compute: Compute | None = None,
+    progress: Progress = quiet,
+) -> AnyAutoencoder:
+    """Train the autoencoder of a preset on the train part of a split; run again to resume.
+
+    Args:
+        data: a manifest, or anything that :func:`palpate.data.load` reads. The autoencoder of the
+            preset ``mini`` codes the difference to the gel without contact: the column
+            ``background``, or without it the median tactile image.
+        split: a split or its file. None: the one that lies with the data.
+        preset: gives kind, shape and length.
+        start: fine-tune a copy of this one instead of starting from random weights.
+        output: folder for the autoencoder, new or empty; None keeps it in memory.
+        seed: of weights, order, crops and noise.
+        device: ``auto``, ``cpu``, ``cuda`` or ``mps``.
+        compute: how to run it on the machine at hand.
+        progress: called while the work goes on.
+
+    Returns:
+        The autoencoder, frozen; ``card["held_out"]`` says how well it reconstructs images outside
+        of train.
+
+    Raises:
+        PalpateError: if the train part is empty, the preset has no autoencoder of its own, or
+            ``start`` is of another kind or shape.
+    """
+    chosen = preset if isinstance(preset, DiffusionPreset) else preset_named(preset)
+    if chosen.autoencoder is None:
+        must, fix = "must be one with an autoencoder of its own", "Choose mini, small or tiny"
+        raise PalpateError(must, chosen.name, fix, argument="preset")
+    device = connect(device)
+    manifest, split = load(data), load_split(data, split)
+    if start is not None and not isinstance(start, AnyAutoencoder):
+        start = load_autoencoder(start)
+    output = None if output is None else Path(output)
+    with work_folder(output) as work:
+        model = autoencoder_of(
+            manifest,
+            split,
+            chosen.autoencoder,
+            chosen.size,
+            work / "autoencoder",
+            start=start,
+            cache=work / "cache",
+            seed=seed,
+            device=device,
+            compute=compute,
+            progress=progress,
+        )
+        model.card |= {"manifest": manifest.digest, "split": split.digest}
+        if output is not None and place()[0] == 0:
+            model.save(output)
+            keep_logs(work, output)
+    return model
+
+
+def autoencoder_of(  # noqa: PLR0913 - one row per choice of the training
+    manifest: Manifest,
+    split: Split,
+    options: AutoencoderOptions | BackgroundOptions,
+    size: int,
+    folder: Path,
+    *,
+    start: AnyAutoencoder | None = None,
+    cache: Path | None = None,
+    seed: int = 0,
+    device: str = "auto",
+    compute: Compute | None = None,
+    progress: Progress = quiet,
+) -> AnyAutoencoder:
+    """Train one on images of the train part, ``size`` pixels square; ``folder`` for checkpoints."""
+    train, others = train_part(manifest, split), manifest.part(split, "val", "test")
+    with first_alone():
+        images, held_out = (
+            cached_images(p, "tactile", size, cache, progress) if len(p) else None
+            for p in (train, others)
+        )
+    assert images is not None
+    how: dict[str, Any] = {"seed": seed, "device": pick_device(device)}
+    how |= {"compute": compute, "progress": progress}
+    key = image_stamp(train, "tactile")
+    if isinstance(options, AutoencoderOptions):
+        if isinstance(start, BackgroundAutoencoder):
+            raise _other_kind("a VQ autoencoder")
+        return train_vq(images, options, folder, start=start, held_out=held_out, key=key, **how)
+    if isinstance(start, Autoencoder):
+        raise _other_kind("one that is given the gel")
+    with first_alone():
+        gels = gels_of(train, size, cache, progress)
+        held_gels = None if held_out is None else gels_of(others, size, cache, progress, like=gels)
+    columns = ("tactile", "background") if has_gels(train) else ("tactile",)
+    how["key"] = digest_json([image_stamp(train, c) for c in columns])
+    model = train_background_autoencoder(images, gels, options, folder, start=start, **how)
+    if held_out is not None:
+        model.card["held_out"] = asdict(measure_reconstruction(model, held_out, held_gels))
+    return model
+
+
+def _other_kind(kind: str) -> PalpateError:
+    return PalpateError(f"must be {kind}, as the preset's", "another kind", "", argument="start")
+
+
+def has_gels(part: Manifest) -> bool:
+    """Whether the samples name no-contact images."""
+    return any(part.column("background"))
+
+
+def gels_of(
+    part: Manifest,
+    size: int,
+    cache: Path | None = None,
+    progress: Progress = quiet,
+    like: NDArray[np.uint8] | None = None,
+) -> NDArray[np.uint8]:
+    """The no-contact image of each sample, bytes (n, size, size, 3).
+
+    Where no sample has one, all get one stock gel: the first of ``like``, or the median of up to
+    500 of the tactile images.
+
+    Raises:
+        PalpateError: if some samples have one and others have not.
+    """
+    if has_gels(part):
+        return cached_images(part, "background", size, cache, progress)
+    if like is not None:
+        return np.broadcast_to(like[0], (len(part), size, size, 3))
+    images = cached_images(part, "tactile", size, cache, progress)
+    stock = np.median(images[evenly(len(images), MEDIAN)], axis=0).astype(np.uint8)
+    return np.broadcast_to(stock, images.shape)

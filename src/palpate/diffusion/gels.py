@@ -1,0 +1,77 @@
+"""What speaks against a no-contact image of a gel, seen by itself.
+
+- *It shows contact.* Light falls on a gel smoothly, and markers are gray: of the opponent colors
+  (channel minus mean of the channels), markers left out, a polynomial of degree 4 leaves hardly
+  anything. A contact turns the surface towards and away from colored lights, and leaves more.
+  Gels of the world leave up to 2.4 gray levels, those of the real clips of Touch and Go 2.7 to 3.6;
+  87 % of the contacts of the world, and every listed one of the clips, leave more than 4
+  (``python benchmarks/gel_contacts.py``).
+- *It is of another sensor.* The lights of another one come from other sides: the relative opponent
+  colors of 4 x 4 cells, their mean left out, differ from those of the stock gel. GelSights of the
+  world differ by up to 3, the real ones by up to 7.4 from the world's, DIGITs by more than 12.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image
+from scipy import ndimage
+
+from palpate.core import Note
+from palpate.data.images import read_image, square
+from palpate.metrics.contact import marker_mask
+
+#: Gray levels that a smooth fit may leave of a gel without contact.
+SMOOTH = 4.0
+#: Difference of the light, on the scale of 0 to 128, from which it is another sensor.
+OTHER_LIGHT = 10.0
+_SIZE, _CELLS, _DEGREE = 64, 4, 4
+
+
+def gel_notes(file: Path, size: int, stock: NDArray[np.uint8] | None) -> list[Note]:
+    """What speaks against the no-contact image of a user.
+
+    Args:
+        file: the image.
+        size: side of the images that are made on it, in pixels.
+        stock: the no-contact image (h, w, 3) of the generator's own sensor, or None.
+    """
+    image, name, notes = read_image(file), file.name, list[Note]()
+    pixels = square(image, _SIZE)
+    if (left := unevenness(pixels)) > SMOOTH:
+        notes.append(Note("gel-contact", {"gel": name, "left": left}))
+    if stock is not None and light_difference(pixels, stock) > OTHER_LIGHT:
+        notes.append(Note("gel-sensor", {"gel": name}))
+    if (side := min(image.size)) < size:
+        notes.append(Note("gel-small", {"gel": name, "side": side, "size": size}))
+    return notes
+
+
+def unevenness(gel: NDArray[np.uint8]) -> float:
+    """Gray levels of color that a smooth fit leaves of an image (64, 64, 3)."""
+    image = gel / 255.0
+    away = ~np.asarray(ndimage.binary_dilation(marker_mask(image)), bool)
+    if away.mean() < 0.5:  # no gel is mostly markers
+        return float("inf")
+    y, x = np.mgrid[-1 : 1 : image.shape[0] * 1j, -1 : 1 : image.shape[1] * 1j]
+    powers = [(i, j) for i in range(_DEGREE + 1) for j in range(_DEGREE + 1 - i)]
+    smooth = np.stack([x[away] ** i * y[away] ** j for i, j in powers], axis=1)
+    colors = (image - image.mean(axis=2, keepdims=True))[away]
+    left = colors - smooth @ np.linalg.lstsq(smooth, colors, rcond=None)[0]
+    return 255 * float(np.sqrt((left**2).sum(axis=1).mean()))
+
+
+def light_difference(gel: NDArray[np.uint8], other: NDArray[np.uint8]) -> float:
+    """How differently two gels are lit: 0 for the same lights, of whatever brightness."""
+    return float(np.sqrt(((_light(gel) - _light(other)) ** 2).mean()))
+
+
+def _light(gel: NDArray[np.uint8]) -> NDArray[np.float64]:
+    small = Image.fromarray(gel).resize((_CELLS, _CELLS), Image.Resampling.BOX)
+    cells = np.asarray(small, np.float64)
+    mean = cells.mean(axis=2, keepdims=True)
+    colors = 128 * (cells - mean) / np.maximum(mean, 1)
+    return colors - colors.mean(axis=(0, 1))

@@ -1,0 +1,405 @@
+"""From folders of images to a study: the items, the trials, and the order of every rater.
+
+Items are ids that the reference and all methods have, at most one a video, taken from the materials
+in turn. Order and sides of a rater depend on the plan's secret, which no page holds.
+"""
+
+from __future__ import annotations
+
+import re
+import secrets
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import combinations, zip_longest
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from palpate.core import (
+    Note,
+    PalpateError,
+    Progress,
+    atomic_folder,
+    quiet,
+    require,
+    require_choice,
+    rng_for,
+    track,
+    write_text,
+)
+from palpate.evaluation.inputs import (
+    Samples,
+    complete,
+    keywords_of,
+    named_sources,
+    read,
+    with_known_ids,
+)
+from palpate.preference.images import QUALITY, data_uri, estimated_gel, load_square
+from palpate.preference.page import study_page
+from palpate.preference.plan import (
+    COPY,
+    EXAMPLE,
+    GEL,
+    PAGE,
+    PLAN,
+    REFERENCE,
+    SAME,
+    Item,
+    Plan,
+    Rater,
+    Trial,
+    last_day,
+)
+from palpate.preference.statistics import ASSUMED, FEW_RATERS, expected_half_width
+
+#: Code of a question -> what raters read. ``material-pattern`` is the paper's (section 7).
+QUESTIONS = {
+    "material-pattern": (
+        "Which image is closer to the reference in the pattern of its material? Look at lines, "
+        "grains and weaves, not at the sensor's background."
+    ),
+    "similar": "Which image is more similar to the reference?",
+    "material": "Which material does this image show? Compare it with the examples.",
+}
+TITLE = "Tactile images"
+#: Share of trials that are repeated, and that are catches; and the fewest of each, of which one
+#: may be missed.
+EXTRA, FEWEST = 0.1, 5
+#: Examples of a material in the task ``sort``.
+EXAMPLES = 4
+#: Of ``design="paper"``: items, commonest materials, raters; the first method against each other.
+PAPER_ITEMS, PAPER_MATERIALS, PAPER_RATERS = 40, 13, 2
+
+
+@dataclass(frozen=True)
+class Sources:
+    """Images by id: of the reference, its gel where known, and the methods."""
+
+    items: list[Item]
+    paths: Mapping[str, Mapping[str, Path]]
+    notes: list[Note]
+
+    def path(self, item: str, slot: str) -> Path | None:
+        """File of an image of the study; None for a gel that is not known."""
+        slot = REFERENCE if slot in (COPY, EXAMPLE) else slot
+        return self.paths.get(slot, {}).get(item)
+
+
+def make(  # noqa: PLR0913
+    reference: Any,
+    generated: Any,
+    output: str | Path | None = None,
+    *,
+    items: int | None = None,
+    raters: int | None = None,
+    task: str = "pair",
+    question: str | None = None,
+    design: str | None = None,
+    comparisons: str | None = None,
+    names: Sequence[str] | None = None,
+    labels: Any = None,
+    size: int = 256,
+    title: str = TITLE,
+    until: str | None = None,
+    seed: int = 0,
+    dry_run: bool = False,
+    progress: Progress = quiet,
+) -> Plan:
+    """Plan a blinded study and write its page.
+
+    Args:
+        reference: real tactile images: a folder or a manifest, as for ``palpate.score``.
+        generated: the methods, one folder or manifest each, or a mapping from names to these. Ids
+            are paths below the folder, without suffix.
+        output: new folder for ``plan.json`` (secret) and ``study.html`` (the page).
+        items: reference images; default 40.
+        raters: for whom an order is made; default 10.
+        task: ``pair``: which of two images is closer to the reference; ``sort``: which material
+            does an image show, among examples of all.
+        question: one of ``QUESTIONS``, or the text itself.
+        design: ``paper``: 40 items of the 13 commonest materials, two raters, the first method
+            against each of the others.
+        comparisons: ``all`` pairs of methods (the default), or the ``first`` against each of the
+            others (the default, and the only choice, of ``design="paper"``).
+        names: of the methods, instead of those of their folders.
+        labels: table with the columns id, material, video, for folders.
+        size: side of all images, in pixels.
+        title: heading of the page.
+        until: ISO date of the last day.
+        seed: another seed chooses other items.
+        dry_run: plan without reading an image or writing a file.
+        progress: progress callback.
+
+    Raises:
+        PalpateError: if there is too little to compare, or an option is out of range.
+        ProblemsError: if a manifest is inconsistent.
+    """
+    paper = design == "paper"
+    count = PAPER_ITEMS if items is None else items
+    raters = (PAPER_RATERS if paper else 10) if raters is None else raters
+    require_choice("task", task, ("pair", "sort"))
+    comparisons = comparisons or ("first" if paper else "all")
+    require_choice("comparisons", comparisons, ("first",) if paper else ("all", "first"))
+    require(design in (None, "paper"), "design", "must be paper, if given", design)
+    require(2 <= count <= 1000, "items", "must lie in 2 .. 1000", items, 40)
+    require(1 <= raters <= 999, "raters", "must lie in 1 .. 999", raters, 10)
+    require(32 <= size <= 1024, "size", "must lie in 32 .. 1024", size, 256)
+    until = None if until is None else last_day(until)
+    if output is None and not dry_run:
+        fix, example = "Name a new folder", {"output": "study/"}
+        raise PalpateError("A study needs a folder", "none", fix, example=example)
+    sources = read_sources(reference, generated, names, labels)
+    methods = [name for name in sources.paths if name not in (REFERENCE, GEL)]
+    if task == "pair" and len(methods) < 2:
+        fix = "Pass another method, or sort images by material, which one method can do"
+        example = {"task": "sort"}
+        raise PalpateError("There must be two methods to compare", "one", fix, example=example)
+    code, text = _question(task, question, title, methods)
+    chosen, examples, notes = choose_items(
+        sources.items,
+        count,
+        seed,
+        materials=PAPER_MATERIALS if paper else None,
+        examples=task == "sort",
+    )
+    few = [Note("these-raters", {"count": raters})] * (raters <= FEW_RATERS)
+    secret = secrets.token_hex(32)
+    plan = Plan(
+        secret=secret,
+        task=task,
+        question=code,
+        text=text,
+        title=title,
+        methods=methods,
+        items=chosen,
+        trials=[],
+        raters=[],
+        examples=examples,
+        seed=seed,
+        until=until,
+        size=size,
+        notes=[*sources.notes, *notes, *few],
+    )
+    codes = [f"r{k:0{max(2, len(str(raters)))}d}" for k in range(1, raters + 1)]
+    plan = replace(plan, trials=trials_of(plan, comparisons))
+    plan = replace(plan, raters=[rater_of(plan, code) for code in codes])
+    if task == "pair":
+        width = expected_half_width(len(chosen), raters)
+        facts = {"items": len(chosen), "raters": raters, "assumed": ASSUMED}
+        plan = replace(plan, expected={"half_width": round(width, 3), **facts})
+    if dry_run:
+        return plan
+    plan = replace(plan, images=_images(plan, sources, progress))
+    with atomic_folder(Path(str(output))) as part:
+        plan.save(part / PLAN)
+        write_text(part / PAGE, study_page(plan.public()))
+    return plan
+
+
+def _question(
+    task: str, question: str | None, title: str, methods: Sequence[str]
+) -> tuple[str, str]:
+    """Code and text of the question; the code of a custom text is ''."""
+    question = question or ("material" if task == "sort" else "material-pattern")
+    text = QUESTIONS.get(question, question)
+    for argument, words in (("title", title), ("question", text)):
+        require(bool(words.strip()), argument, "must not be blank", words)
+        named = [m for m in methods if re.search(rf"\b{re.escape(m)}\b", words, re.IGNORECASE)]
+        if named and words in (*QUESTIONS.values(), TITLE):
+            must, got = f"must hold no word of the {argument} {words!r}", f"{named[0]!r}"
+            raise PalpateError(must, got, "Pass other names", argument="names")
+        require(not named, argument, "must not name a method", words)
+    return (question if question in QUESTIONS else ""), text
+
+
+def read_sources(
+    reference: Any, generated: Any, names: Sequence[str] | None, labels: Any
+) -> Sources:
+    """Read reference and methods; items are the ids that all have.
+
+    Raises:
+        PalpateError: if one has no image files, or no id is common.
+    """
+    known = keywords_of(labels, None, "video", exact=False)
+    real = complete(_files(read(reference, REFERENCE)), known)
+    taken = (REFERENCE, GEL, COPY, EXAMPLE, SAME)
+    sources = named_sources(generated, names, taken)
+    made = {n: with_known_ids(_files(read(s, n)), real.ids) for n, s in sources.items()}
+    common = {*real.ids}.intersection(*(s.ids for s in made.values()))
+    if not common:
+        counts = (f"{n} has {len({*real.ids} & {*s.ids}):,}" for n, s in made.items())
+        got = f"of the {len(real):,} {', '.join(counts)}, and none is in all"
+        fix = "Ids are paths below each folder, without suffix: give them equal names"
+        raise PalpateError("Methods must have images of the reference's ids", got, fix)
+    notes = [
+        Note("items-left-out", {"name": name, "missing": missing, "unknown": unknown})
+        for name, samples in made.items()
+        for missing in [len({*real.ids} - {*samples.ids})]
+        for unknown in [len({*samples.ids} - {*real.ids})]
+        if missing or unknown
+    ]
+    labels_of = dict(zip(real.ids, real.labels or [""] * len(real), strict=True))
+    groups_of = dict(zip(real.ids, real.groups or [""] * len(real), strict=True))
+    items = [Item(i, labels_of[i] or None, groups_of[i] or None) for i in real.ids if i in common]
+    notes += [Note("videos-unknown")] if not any(item.video for item in items) else []
+    paths = {name: _paths(samples) for name, samples in [(REFERENCE, real), *made.items()]}
+    if real.has_background and real.manifest is not None:
+        paths[GEL] = dict(zip(real.ids, real.manifest.paths("background"), strict=True))
+    return Sources(items, paths, notes)
+
+
+def _files(samples: Samples) -> Samples:
+    """Samples that are image files.
+
+    Raises:
+        PalpateError: if they are embeddings or arrays.
+    """
+    if samples.manifest is None:
+        got = f"{samples.source}, {'arrays' if samples.features is None else 'embeddings'}"
+        fix = "Pass a folder of images or a manifest"
+        raise PalpateError("People look at image files", got, fix)
+    return samples
+
+
+def _paths(samples: Samples) -> dict[str, Path]:
+    assert samples.manifest is not None
+    return dict(zip(samples.ids, samples.manifest.paths("tactile"), strict=True))
+
+
+Piles = dict[str, list[Item]]
+
+
+def choose_items(
+    candidates: Sequence[Item], n: int, seed: int, *, materials: int | None, examples: bool
+) -> tuple[list[Item], list[Item], list[Note]]:
+    """Choose items, at most one a video, from the materials in turn, the commonest first.
+
+    Args:
+        candidates: ids that all methods have.
+        n: how many.
+        seed: of the choice.
+        materials: take the commonest so many only.
+        examples: also choose ``EXAMPLES`` items a material, of other videos.
+
+    Returns:
+        (items, examples, notes).
+
+    Raises:
+        PalpateError: if there are fewer than two items, or examples are needed and fewer than two
+            materials have videos for them.
+    """
+    order = rng_for(seed, "items").permutation(len(candidates))
+    videos: dict[str, Item] = {}
+    for item in (candidates[k] for k in order):
+        videos.setdefault(item.video or f"\x1f{item.id}", item)
+    piles: Piles = {}
+    for item in videos.values():
+        piles.setdefault(item.material or "", []).append(item)
+    single = sorted(name for name, pile in piles.items() if name and len(pile) == 1)
+    notes, shown = list[Note](), list[Item]()
+    if examples:
+        piles, shown = _with_examples(piles)
+    if set(piles) == {""}:
+        notes.append(Note("materials-unknown"))
+    elif single:
+        code = "one-video-materials" if examples else "one-video-classes"
+        notes.append(Note(code, {"materials": single}))
+    taken = _in_turn(piles, n, materials)
+    if len(taken) < 2:
+        got, fix = f"{len(taken)} of {len(candidates):,} images", "Add images of other videos"
+        raise PalpateError("A study needs two items, at most one a video", got, fix)
+    facts = {"n": len(taken), "candidates": len(candidates), "videos": len(videos)}
+    if len(taken) < n:
+        notes.append(Note("fewer-items", facts | {"wanted": n}))
+    elif len(taken) < len(candidates):
+        notes.append(Note("sampled-items", facts))
+    return taken, shown, notes
+
+
+def _with_examples(piles: Piles) -> tuple[Piles, list[Item]]:
+    """What remains of the materials of two videos and more, and up to half of each as examples."""
+    counts = {m: min(EXAMPLES, len(pile) // 2) for m, pile in piles.items() if m and len(pile) > 1}
+    if len(counts) < 2:
+        got, fix = str(len(counts)), "Pass labels with the columns id, material, video"
+        raise PalpateError("Sorting needs two materials with two videos each", got, fix)
+    shown = [item for name, count in counts.items() for item in piles[name][:count]]
+    return {name: piles[name][count:] for name, count in counts.items()}, shown
+
+
+def _in_turn(piles: Piles, n: int, materials: int | None) -> list[Item]:
+    """Up to ``n`` items: one of each material, the commonest first, then a second of each ..."""
+    common = sorted(piles, key=lambda name: (-len(piles[name]), name))[:materials]
+    rounds = zip_longest(*(piles[name] for name in common))
+    return [item for each in rounds for item in each if item is not None][:n]
+
+
+def trials_of(plan: Plan, comparisons: str) -> list[Trial]:
+    """All questions: one a comparison and item, repeats of a tenth of them, and catches."""
+    methods, rng = plan.methods, rng_for(plan.seed, plan.secret, "trials")
+    if plan.task == "sort":  # real images show how much people can know
+        pairs = [(name, "") for name in (REFERENCE, *methods)]
+        kind, known, sides = "sort", plan.examples, (COPY, "")
+    else:
+        first = comparisons == "first"
+        pairs = [p for p in combinations(methods, 2) if p[0] == methods[0] or not first]
+        kind, known, sides = "pair", plan.items, (COPY, GEL)
+    each = ((pair, item) for pair in pairs for item in plan.items)
+    base = [Trial(f"t{k:04d}", kind, item.id, *pair) for k, (pair, item) in enumerate(each)]
+    extra = min(len(base), max(FEWEST, round(EXTRA * len(base))))
+    again = [base[k] for k in rng.permutation(len(base))[:extra]]
+    repeats = [_repeat(f"r{k:04d}", trial) for k, trial in enumerate(again)]
+    caught = [known[k % len(known)] for k in rng.permutation(max(extra, len(known)))[:extra]]
+    catches = [Trial(f"c{k:04d}", "catch", item.id, *sides) for k, item in enumerate(caught)]
+    return [*base, *repeats, *catches]
+
+
+def _repeat(name: str, trial: Trial) -> Trial:
+    sides = (trial.right, trial.left) if trial.right else (trial.left, "")
+    return Trial(name, "repeat", trial.item, *sides, repeats=trial.id)
+
+
+def rater_of(plan: Plan, code: str) -> Rater:
+    """Order and sides of one rater: sides balanced in every comparison, repeats well apart."""
+    rng = rng_for(plan.seed, plan.secret, code)
+    swapped: dict[str, bool] = {}
+    for pair in dict.fromkeys((t.left, t.right) for t in plan.trials if t.kind != "repeat"):
+        members = [t.id for t in plan.trials if t.kind != "repeat" and (t.left, t.right) == pair]
+        half = (np.arange(len(members)) + rng.integers(2)) % 2 == 0
+        swapped |= dict(zip(members, rng.permutation(half).tolist(), strict=True))
+    place = dict(zip(plan.trial, rng.random(len(plan.trial)).tolist(), strict=True))
+    for trial in plan.trials:
+        if trial.kind == "repeat":  # a third of the study or more after the first time
+            swapped[trial.id] = swapped[trial.repeats]
+            place[trial.repeats] = rng.uniform(0, 0.6)
+            place[trial.id] = rng.uniform(place[trial.repeats] + 0.3, 1)
+    order = sorted(place, key=place.__getitem__)
+    return Rater(code, order, [swapped[name] and plan.task == "pair" for name in order])
+
+
+def _images(plan: Plan, sources: Sources, progress: Progress) -> dict[str, str]:
+    """Name -> data URI of every image that a trial or strip shows.
+
+    Raises:
+        PalpateError: if one is broken.
+    """
+    wanted = {(t.item, side) for t in plan.trials for side in (t.left, t.right) if side}
+    if plan.task == "pair":
+        wanted |= {(item.id, REFERENCE) for item in plan.items}
+    wanted |= {(item.id, EXAMPLE) for item in plan.examples}
+    files = {key: path for key in sorted(wanted) if (path := sources.path(*key)) is not None}
+    images: dict[tuple[str, str], NDArray[np.uint8]] = {
+        key: load_square(path, plan.size)
+        for key, path in track(list(files.items()), "reading images", progress)
+    }
+    if missing := wanted - set(images):  # no background is known
+        reference = [load_square(sources.paths[REFERENCE][i.id], plan.size) for i in plan.items]
+        gel = estimated_gel(np.stack(reference))
+        images |= dict.fromkeys(missing, gel)
+    # The copy in a catch is another file than the reference above it.
+    return {
+        plan.name(*key): data_uri(image, QUALITY - (key[1] in (COPY, GEL)))
+        for key, image in images.items()
+    }

@@ -1,0 +1,274 @@
+"""From votes to scores: preferences, strengths, agreement, and which metrics agree with people.
+
+The scores are :class:`palpate.core.Score`, so that tables, LaTeX and the page of other results take
+them as they are: ``palpate report scores.json preference.json -o page.html``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from palpate.core import Note, PalpateError, Progress, Score, few, plain, quiet, require
+from palpate.metrics.paired import holm
+from palpate.preference.agreement import agreement_scores, shown_metrics, table_metrics
+from palpate.preference.arrays import VoteArrays
+from palpate.preference.plan import REFERENCE, Plan
+from palpate.preference.raters import RaterFacts, rater_facts
+from palpate.preference.statistics import (
+    ENOUGH,
+    FEW_RATERS,
+    REPLICATES,
+    Array,
+    cohen_kappa,
+    krippendorff_alpha,
+    method_preferences,
+    outcome_counts,
+    preferences,
+    prior_decides,
+    raw_agreement,
+    sign_test,
+)
+from palpate.preference.votes import DATABASE, read_votes
+from palpate.report.results import Results
+
+PREFERENCE, STRENGTH = "human preference", "human strength"
+ACCURACY = "human accuracy of material"
+
+
+def score(
+    study: str | Path,
+    votes: str | Path | Iterable[str | Path] = (),
+    *,
+    metrics: Any = (),
+    lower: Sequence[str] = (),
+    replicates: int = REPLICATES,
+    seed: int = 0,
+    progress: Progress = quiet,
+) -> Results:
+    """Score the votes of a study.
+
+    Args:
+        study: its folder, with ``plan.json`` and, of a served study, ``study.db``.
+        votes: downloads of raters, or folders of them.
+        metrics: which of these agree with people? Tables of per-image values (CSV, Parquet, JSON, a
+            frame) with the columns id, method and one a metric, and files of ``palpate score``,
+            whose scores are of methods. SSIM and PSNR of the shown images are always compared.
+        lower: metrics of tables of which lower is better, besides LPIPS, MSE, RMSE, MAE, L1, FID,
+            KID, DISTS and the MMD family.
+        replicates: resamplings of an interval.
+        seed: of the resamplings.
+        progress: progress callback.
+
+    Returns:
+        Scores of the task ``pair``: ``human preference`` of each method in [0, 1], ties as half,
+        over its comparisons; their differences in [-1, 1]; ``human strength``, Davidson's, in
+        logits of mean 0; Kendall's tau-b of metrics with people. Of the task ``sort``: ``human
+        accuracy of material`` of all images and of each shown material. Intervals resample items
+        and raters; with two raters or fewer items alone, and say that they are for these raters.
+        ``settings["preference"]`` has agreement, raters, exclusions and comparisons.
+
+    Raises:
+        PalpateError: if there are no votes, a file is none of this study, or all raters are
+            excluded.
+    """
+    require(100 <= replicates <= 100_000, "replicates", "must lie in 100 .. 100,000", replicates)
+    plan, folder = Plan.load(study), Path(study)
+    folder = folder if folder.is_dir() else folder.parent
+    files = [Path(votes)] if isinstance(votes, str | Path) else [Path(path) for path in votes]
+    files += [folder / DATABASE] * (folder / DATABASE).is_file()
+    known = read_votes(plan, files)
+    everyone = rater_facts(plan, known)
+    kept = [rater.code for rater in everyone if not rater.excluded]
+    if not kept:
+        got = few(f"{r.code} excluded by the rule {r.excluded}" for r in everyone)
+        raise PalpateError("There must be votes to score", got, "Pass votes of further raters")
+    arrays = VoteArrays(plan, known, kept, seed, replicates)
+    agreement = agreement_of(arrays, everyone)
+    settings: dict[str, Any] = {
+        "study": plan.study,
+        "task": plan.task,
+        "question": plan.text,
+        "rule": plan.rule,
+        "expected": plan.expected,
+        "agreement": agreement,
+        "raters": everyone,
+    }
+    if plan.task == "sort":
+        scores = accuracy_scores(arrays)
+    else:
+        settings["comparisons"] = comparisons(arrays)
+        compared = [*shown_metrics(plan, progress), *table_metrics(plan, metrics, lower)]
+        scores = [*preference_scores(arrays), *strength_scores(arrays)]
+        scores += agreement_scores(compared, arrays, progress)
+    return Results(
+        title="Human preference" if plan.task == "pair" else "Materials sorted by people",
+        scores=scores,
+        settings={"preference": plain(settings)},
+        notes=[
+            *(note for note in plan.notes if note.code != "these-raters"),  # of those who voted
+            *known.notes,
+            *_unshown(plan),
+            *_rater_notes(plan, everyone, len(kept)),
+            Note("human-agreement", agreement),
+        ],
+    )
+
+
+def _unshown(plan: Plan) -> list[Note]:
+    """Materials that were answers but no trial."""
+    unshown = {*plan.choices} - {item.material for item in plan.items}
+    if plan.task == "pair" or not unshown:
+        return []
+    return [Note("materials-unshown", {"count": len(unshown), "of": len(plan.choices)})]
+
+
+def _rater_notes(plan: Plan, raters: Sequence[RaterFacts], kept: int) -> list[Note]:
+    notes = [
+        Note(
+            "rater-excluded", {"rater": r.code, "rule": r.excluded, "limit": limit, "value": value}
+        )
+        for r in raters
+        if r.excluded
+        for limit, value in [(getattr(plan.rule, r.excluded), getattr(r, r.excluded))]
+    ]
+    if kept <= FEW_RATERS:
+        return [*notes, Note("these-raters", {"count": kept})]
+    return [*notes, Note("few-raters", {"count": kept})] if kept < ENOUGH else notes
+
+
+def agreement_of(arrays: VoteArrays, raters: Sequence[RaterFacts]) -> dict[str, Any]:
+    """Raw agreement, kappa, alpha, agreement with oneself, and the bias to the left, as JSON."""
+    codes = arrays.codes  # chance of a pair is within its comparison
+    if arrays.plan.task == "sort":  # all answers are open to all images
+        codes = codes.reshape(len(arrays.raters), -1)
+    kept = [rater for rater in raters if not rater.excluded]
+    names = ("repeats", "consistent", "left", "right")
+    repeats, consistent, left, right = (sum(getattr(r, name) for r in kept) for name in names)
+    # Sides are random: without a bias each vote for a side is left with probability 1/2.
+    p = sign_test(left, right)
+    return plain(
+        {
+            "raters": len(kept),
+            "agree": raw_agreement(codes),
+            "kappa": cohen_kappa(codes),
+            "alpha": krippendorff_alpha(codes),
+            "self": consistent / repeats if repeats else None,
+            "repeats": repeats,
+            "left": left / (left + right) if left + right else None,
+            "sides": left + right,
+            "p_left": p,
+        }
+    )
+
+
+def comparisons(arrays: VoteArrays) -> list[dict[str, Any]]:
+    """Every comparison: votes, and the share of the first method with its interval."""
+    shares, replicates = preferences(arrays.counts), preferences(arrays.replicated)
+    rows: list[dict[str, Any]] = []
+    for c, (a, b) in enumerate(arrays.columns):
+        wins, ties, losses = (int(n) for n in arrays.counts[c])
+        row = {"a": a, "b": b, "votes_a": wins, "ties": ties, "votes_b": losses}
+        interval, _, _ = arrays.interval(shares[c], replicates[:, c], arrays.answered(c))
+        rows.append(row | {"share": shares[c], "interval": interval})
+    return rows
+
+
+def preference_scores(arrays: VoteArrays) -> list[Score]:
+    """The preference of each method, and the differences of all comparisons."""
+    methods, votes = arrays.plan.methods, arrays.counts.sum(axis=1)
+    shares, replicates = preferences(arrays.counts), preferences(arrays.replicated)
+    of_method = method_preferences(shares, arrays.pairs, len(methods))
+    spread = method_preferences(replicates, arrays.pairs, len(methods))
+    scores = [
+        arrays.score(PREFERENCE, name, of_method[k], spread[:, k], sum(votes[own]), items=items)
+        for k, name in enumerate(methods)
+        for own in [[c for c, pair in enumerate(arrays.pairs) if k in pair]]
+        for items in [arrays.answered(*own)]
+    ]
+    differences: list[Score] = []
+    for c, (a, b) in enumerate(arrays.columns):
+        name, items = f"{PREFERENCE} difference", arrays.answered(c)
+        made = _net(
+            arrays.score(name, f"{a} - {b}", shares[c], replicates[:, c], votes[c], items=items)
+        )
+        verdict = _verdict(made, (a, b), 2 * replicates[:, c] - 1, items)
+        differences.append(replace(made, details=verdict))
+    return [*scores, *holm(differences)]
+
+
+def _net(share: Score) -> Score:
+    """A share as the difference of two."""
+    if share.value is None:
+        return share
+    low, high = share.interval or (np.nan, np.nan)
+    interval = (2 * low - 1, 2 * high - 1) if share.interval else None
+    return replace(share, value=2 * share.value - 1, interval=interval)
+
+
+def _verdict(made: Score, pair: tuple[str, str], replicates: Array, items: int) -> dict[str, Any]:
+    """Which of two is ahead, and how sure that is; of unanimous votes by the sign test."""
+    a, b = pair
+    sure = made.interval is not None
+    above = float((replicates > 0).mean() + (replicates == 0).mean() / 2)
+    if sure and made.notes:
+        above = 0.5 + np.sign(float(made)) * (0.5 - 0.5**items)
+    return {
+        "a": a,
+        "b": b,
+        "better": a if float(made) > 0 else b if float(made) < 0 else None,
+        "p_better": above if sure else None,
+        "p_value": max(2 * min(above, 1 - above), 1 / len(replicates)) if sure else None,
+        "decided": made.interval is not None and not made.interval[0] <= 0 <= made.interval[1],
+    }
+
+
+def strength_scores(arrays: VoteArrays) -> list[Score]:
+    """Davidson's strength of each method; the tie parameter nu is in the details."""
+    votes, spread = arrays.counts.sum(), arrays.strength_replicates
+    unbounded = prior_decides(arrays.counts, arrays.pairs, len(arrays.plan.methods))
+    return [
+        replace(
+            arrays.score(STRENGTH, name, arrays.strength[k], spread[:, k], votes),
+            estimator="Davidson",
+            details={"nu": float(np.exp(arrays.strength[-1]))},
+            notes=(Note("strength-of-prior"),) * unbounded,
+        )
+        for k, name in enumerate(arrays.plan.methods)
+    ]
+
+
+def accuracy_scores(arrays: VoteArrays) -> list[Score]:
+    """How often people name the material of real images and of each method's: all, then each."""
+    names = arrays.plan.choices
+    truth = np.array([item.material for item in arrays.plan.items], dtype=object)
+    right = np.where(arrays.chosen == truth, 1.0, -1.0)  # as a vote without ties
+    right[arrays.codes < 0] = np.nan
+
+    def made(subject: str, c: int, own: NDArray[np.bool_]) -> Score:
+        votes = np.where(own, right[:, [c]], np.nan)
+        known = np.isfinite(votes)
+        share = preferences(outcome_counts(votes, arrays.once))[0, 0]
+        spread = preferences(outcome_counts(votes, arrays.resampled))[:, 0]
+        items = int(known.any(axis=(0, 1)).sum())
+        return arrays.score(ACCURACY, subject, share, spread, known.sum(), items=items)
+
+    scores: list[Score] = []
+    for c, (name, _) in enumerate(arrays.columns):
+        cells = arrays.chosen[:, c]
+        counts = np.array([[(cells[:, truth == m] == n).sum() for n in names] for m in names])
+        with np.errstate(invalid="ignore"):
+            matrix = plain((counts / counts.sum(axis=1, keepdims=True)).tolist())
+        subject = "real images" if name == REFERENCE else name
+        by_material = {m: matrix[k][k] for k, m in enumerate(names)}
+        details: dict[str, Any] = {"chance": 1 / len(names), "classes": names}
+        details |= {"matrix": matrix, "counts": counts.tolist(), "by_material": by_material}
+        scores.append(replace(made(subject, c, truth == truth), details=details))
+        shown = [m for m, share in by_material.items() if share is not None]
+        scores += [made(f"{subject}, {m}", c, truth == m) for m in shown]
+    return scores

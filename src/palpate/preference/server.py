@@ -1,0 +1,401 @@
+"""The server of a study: the page, and the votes of invited raters in one SQLite file.
+
+    GET /            the page; ``?token=`` is a rater's invitation, of which only a hash is kept
+    GET /study.json  what this rater sees
+    GET /votes       the votes of this rater, to go on with another device
+    POST /vote       {"study", "rater", "trial", "choice", "ms", "at", "undone"}
+                     -> {"stored": true}, or {"stored": "already"} for a vote that is there
+
+The last three take the token as ``Authorization: Bearer``. A vote is answered after it is on disk
+(write-ahead log, ``synchronous=FULL``); votes that arrive together share one transaction. Its key
+is (rater, trial), so that a vote sent again counts once, and only a later ``undone`` replaces it.
+Nothing but the routes above exists, and no request names a file.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import datetime
+import hashlib
+import json
+import re
+import secrets
+import socket
+import sqlite3
+import time
+from collections.abc import AsyncGenerator, Callable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import asynccontextmanager, closing, suppress
+from pathlib import Path
+from typing import Any
+
+import uvicorn
+from starlette.applications import Starlette
+from starlette.exceptions import HTTPException
+from starlette.requests import ClientDisconnect, Request
+from starlette.responses import HTMLResponse, JSONResponse, Response
+from starlette.routing import Route
+
+from palpate.core import PalpateError, require
+from palpate.preference.page import policy, study_page
+from palpate.preference.plan import last_day
+
+#: Longest body of a request, in bytes, and the longest wait for it, in seconds.
+LARGEST_BODY, LONGEST_WAIT = 4096, 10.0
+#: Requests a second of one rater; a page that was offline may send all its votes at once.
+RATE = 5.0
+#: Seconds after which a page tries again when the disk is full or it came too often.
+AGAIN = {"Retry-After": "5"}
+HEADERS = {"X-Content-Type-Options": "nosniff", "Cache-Control": "no-store"}
+PAGE_HEADERS = HEADERS | {
+    "Content-Security-Policy": f"{policy(served=True)}; frame-ancestors 'none'",
+    "Referrer-Policy": "no-referrer",
+}
+#: What a vote is made of.
+FIELDS = dict.fromkeys(("study", "rater", "trial", "choice", "at"), str) | {
+    "ms": int,
+    "undone": int,
+}
+Vote = Mapping[str, Any]
+
+_TABLES = """
+PRAGMA journal_mode=WAL;
+CREATE TABLE IF NOT EXISTS study (name TEXT PRIMARY KEY) WITHOUT ROWID;
+CREATE TABLE IF NOT EXISTS invitations (token TEXT PRIMARY KEY, rater TEXT UNIQUE) WITHOUT ROWID;
+CREATE TABLE IF NOT EXISTS votes (
+    rater TEXT, trial TEXT, choice TEXT, ms INTEGER, at TEXT, undone INTEGER, received TEXT,
+    PRIMARY KEY (rater, trial)
+) WITHOUT ROWID;
+"""
+_STORE = """
+INSERT INTO votes VALUES (:rater, :trial, :choice, :ms, :at, :undone, :received)
+ON CONFLICT (rater, trial) DO UPDATE SET choice = excluded.choice, ms = excluded.ms,
+    at = excluded.at, undone = excluded.undone, received = excluded.received
+WHERE excluded.undone > votes.undone
+"""
+
+
+class VoteStore:
+    """The votes and invitations of one study in a SQLite file; used by one thread at a time.
+
+    Args:
+        path: the file; it is made where there is none.
+        study: name of the study, which the file keeps.
+
+    Raises:
+        PalpateError: if the file is of another study, or cannot be written.
+    """
+
+    def __init__(self, path: Path, study: str) -> None:
+        try:
+            self._disk = sqlite3.connect(path, isolation_level=None, check_same_thread=False)
+            self._disk.executescript(_TABLES)
+            self._disk.execute("PRAGMA synchronous=FULL")
+            self._disk.execute("INSERT OR IGNORE INTO study VALUES (?)", (study,))
+            (names,) = zip(*self._disk.execute("SELECT name FROM study"), strict=True)
+        except sqlite3.Error as error:
+            must, fix = f"{path} must be a file of votes that can be written", "Choose another file"
+            raise PalpateError(must, str(error), fix) from None
+        if names != (study,):
+            self._disk.close()
+            fix = "Serve the study that they belong to, or move the file away"
+            raise PalpateError(f"The votes in {path} must be of study {study}", names[0], fix)
+
+    def close(self) -> None:
+        """Close the file."""
+        self._disk.close()
+
+    def invite(
+        self, raters: Sequence[str], count: int, again: Sequence[str] = ()
+    ) -> dict[str, str]:
+        """Make tokens for the next ``count`` raters that have none, and new ones for ``again``.
+
+        Returns:
+            Rater -> token, which is kept nowhere.
+
+        Raises:
+            PalpateError: if the study has too few raters, or not those named.
+        """
+        require(count >= 0, "invite", "must be 0 or more", count, 10)
+        for rater in again:
+            must = f"must be raters of the study, {raters[0]} to {raters[-1]}"
+            require(rater in raters, "reinvite", must, rater, raters[0])
+        taken = {*self.raters().values(), *again}
+        free = [rater for rater in raters if rater not in taken]
+        if count > len(free):
+            must = f"must be at most {len(free)}: the study has {len(raters)} raters"
+            got = f"{count} more, and {len(taken)} are invited"
+            raise PalpateError(must, got, "Plan a study with more raters", argument="invite")
+        tokens = {rater: secrets.token_urlsafe(16) for rater in [*again, *free[:count]]}
+        rows = [(_hash(token), rater) for rater, token in tokens.items()]
+        self._disk.execute("BEGIN IMMEDIATE")
+        self._disk.executemany("INSERT OR REPLACE INTO invitations VALUES (?, ?)", rows)
+        self._disk.execute("COMMIT")
+        return tokens
+
+    def raters(self) -> dict[str, str]:
+        """Hash of a token -> rater."""
+        return dict(self._disk.execute("SELECT token, rater FROM invitations").fetchall())
+
+    def store(self, votes: Sequence[Vote]) -> list[bool]:
+        """Put votes on disk, all or none; whether each is new.
+
+        Raises:
+            sqlite3.OperationalError: if the disk is full.
+        """
+        self._disk.execute("BEGIN IMMEDIATE")
+        try:
+            new = [self._disk.execute(_STORE, vote).rowcount == 1 for vote in votes]
+            self._disk.execute("COMMIT")
+        except BaseException:
+            if self._disk.in_transaction:
+                self._disk.execute("ROLLBACK")
+            raise
+        return new
+
+    def votes(self, rater: str) -> list[dict[str, Any]]:
+        """The votes of a rater."""
+        names = ("trial", "choice", "ms", "at", "undone")
+        rows = self._disk.execute(f"SELECT {', '.join(names)} FROM votes WHERE rater = ?", (rater,))
+        return [dict(zip(names, row, strict=True)) for row in rows]
+
+
+def _hash(token: str) -> str:
+    """A token has 128 random bits, so that a plain hash cannot be turned back."""
+    return hashlib.sha256(token.encode()).hexdigest()
+
+
+class _Study:
+    """One study being served: routes, and the thread that alone uses the file."""
+
+    def __init__(self, public: Mapping[str, Any], store: VoteStore, until: str | None) -> None:
+        self.public: dict[str, Any] = {**public, "until": until}
+        self.store, self.raters = store, store.raters()
+        self.page = study_page(self.public, served=True)
+        common = {k: v for k, v in self.public.items() if k != "raters"}
+        self.common = json.dumps(common, separators=(",", ":"))[:-1]
+        self.trials = {
+            rater: {row["trial"] for row in rows} for rater, rows in public["raters"].items()
+        }
+        self.budget = {rater: (self.burst(rater), 0.0) for rater in self.raters.values()}
+        self.disk = ThreadPoolExecutor(1)
+        self.arrived: asyncio.Queue[tuple[Vote, asyncio.Future[bool]]] = asyncio.Queue()
+
+    def burst(self, rater: str) -> float:
+        """Requests that a rater may send at once: all votes twice."""
+        return 2.0 * len(self.trials[rater]) + 20
+
+    def application(self) -> Starlette:
+        """Return the four routes; nothing else exists."""
+        routes = [
+            Route("/", self.show),
+            Route("/study.json", self.study),
+            Route("/votes", self.votes),
+            Route("/vote", self.vote, methods=["POST"]),
+        ]
+        handlers: dict[Any, Callable[[Request, Any], Response]] = {HTTPException: _error}
+        app = Starlette(routes=routes, exception_handlers=handlers, lifespan=self._running)
+        app.router.redirect_slashes = False
+        return app
+
+    @asynccontextmanager
+    async def _running(self, _: Starlette) -> AsyncGenerator[None]:
+        writer = asyncio.create_task(self._write())
+        yield
+        writer.cancel()
+        self.disk.shutdown()
+
+    async def _write(self) -> None:
+        """Store what arrived meanwhile in one transaction, then answer: one wait for the disk."""
+        while True:
+            batch = [await self.arrived.get()]
+            while not self.arrived.empty():
+                batch.append(self.arrived.get_nowait())
+            votes = [vote for vote, _ in batch]
+            try:
+                new = await self._on_disk(self.store.store, votes)
+            except sqlite3.Error as error:
+                for _, answer in batch:
+                    answer.set_exception(error)
+            else:
+                for (_, answer), first in zip(batch, new, strict=True):
+                    answer.set_result(first)
+
+    async def _on_disk(self, function: Callable[..., Any], *given: Any) -> Any:
+        return await asyncio.get_running_loop().run_in_executor(self.disk, function, *given)
+
+    def rater(self, token: str | None) -> str:
+        """Return whose token it is.
+
+        Raises:
+            HTTPException: 403 for no invitation, 429 for too many requests.
+        """
+        rater = self.raters.get(_hash(token)) if token else None
+        if rater is None:
+            raise HTTPException(403, "no such invitation")
+        left, since = self.budget[rater]
+        now = time.monotonic()
+        left = min(self.burst(rater), left + RATE * (now - since)) if since else left
+        self.budget[rater] = (max(0.0, left - 1), now)
+        if left < 1:
+            raise HTTPException(429, "too many requests", AGAIN)
+        return rater
+
+    def _bearer(self, request: Request) -> str:
+        scheme, _, token = request.headers.get("authorization", "").partition(" ")
+        return self.rater(token if scheme == "Bearer" else None)
+
+    async def show(self, request: Request) -> Response:
+        """Answer ``GET /``."""
+        self.rater(request.query_params.get("token"))
+        return HTMLResponse(self.page, headers=PAGE_HEADERS)
+
+    async def study(self, request: Request) -> Response:
+        """Answer ``GET /study.json``."""
+        rater = self._bearer(request)
+        own = json.dumps({rater: self.public["raters"][rater]}, separators=(",", ":"))
+        body = f'{self.common},"ended":{json.dumps(self._ended())},"raters":{own}}}'
+        return Response(body, media_type="application/json", headers=HEADERS)
+
+    async def votes(self, request: Request) -> Response:
+        """Answer ``GET /votes``."""
+        votes = await self._on_disk(self.store.votes, self._bearer(request))
+        return JSONResponse({"votes": votes}, headers=HEADERS)
+
+    async def vote(self, request: Request) -> Response:
+        """Answer ``POST /vote``."""
+        rater = self._bearer(request)
+        vote = self._checked(await _body(request), rater)
+        if self._ended():
+            raise HTTPException(410, "the study has ended")
+        now = datetime.datetime.now(datetime.UTC)
+        answer: asyncio.Future[bool] = asyncio.get_running_loop().create_future()
+        self.arrived.put_nowait((vote | {"received": now.isoformat(timespec="seconds")}, answer))
+        try:
+            new = await answer
+        except sqlite3.Error as error:
+            raise HTTPException(507, f"the vote could not be stored: {error}", AGAIN) from None
+        return JSONResponse({"stored": True if new else "already"}, headers=HEADERS)
+
+    def _ended(self) -> bool:
+        until, now = self.public["until"], datetime.datetime.now(datetime.UTC)
+        return until is not None and now.date().isoformat() > until
+
+    def _checked(self, body: bytes, rater: str) -> dict[str, Any]:
+        try:
+            vote: Any = json.loads(body)
+        except (ValueError, RecursionError):
+            raise HTTPException(400, "the body is no JSON") from None
+        if not isinstance(vote, dict) or vote.keys() != FIELDS.keys():
+            raise HTTPException(400, f"a vote has the fields {', '.join(FIELDS)}")
+        if wrong := [name for name, kind in FIELDS.items() if type(vote[name]) is not kind]:
+            raise HTTPException(400, f"{wrong[0]} is of a wrong type")
+        if vote["rater"] != rater:
+            raise HTTPException(403, "the invitation is another rater's")
+        holds = {
+            "study": vote["study"] == self.public["study"],
+            "trial": vote["trial"] in self.trials[rater],
+            "choice": vote["choice"] in self.public["choices"],
+            "ms": 0 <= vote["ms"] < 2**31,
+            "undone": 0 <= vote["undone"] < 1000,
+            "at": _is_time(vote["at"]),
+        }
+        if wrong := [name for name, good in holds.items() if not good]:
+            raise HTTPException(400, f"{wrong[0]} is not one of this study")
+        return vote
+
+
+def _is_time(text: str) -> bool:
+    """Whether a text is a time in UTC, as browsers write it; Python alone takes more forms."""
+    form = r"\d{4}-\d\d-\d\dT(?!24)\d\d:\d\d:\d\d(\.\d{1,6})?Z"
+    try:
+        datetime.datetime.fromisoformat(text)
+    except ValueError:
+        return False
+    return re.fullmatch(form, text, re.ASCII) is not None
+
+
+async def _body(request: Request) -> bytes:
+    """Read at most ``LARGEST_BODY`` bytes."""
+    body = b""
+    try:
+        async with asyncio.timeout(LONGEST_WAIT):
+            async for part in request.stream():
+                body += part
+                if len(body) > LARGEST_BODY:
+                    raise HTTPException(413, f"a vote has at most {LARGEST_BODY} bytes")
+    except (TimeoutError, ClientDisconnect):
+        raise HTTPException(408, "the body did not come") from None
+    return body
+
+
+def _error(request: Request, error: HTTPException) -> Response:
+    headers = HEADERS | dict(error.headers or {})
+    if request.url.path == "/" and error.status_code == 403:
+        text = "<!DOCTYPE html><title>No invitation</title><p>Open the link of your invitation."
+        return HTMLResponse(text, 403, headers=PAGE_HEADERS)
+    return JSONResponse({"error": error.detail}, error.status_code, headers=headers)
+
+
+def serve(
+    public: Mapping[str, Any],
+    database: Path,
+    *,
+    host: str = "127.0.0.1",
+    port: int = 8080,
+    invite: int = 0,
+    reinvite: Sequence[str] = (),
+    until: str | None = None,
+    ready: Callable[[str, Mapping[str, str]], None] = lambda url, tokens: None,
+) -> None:
+    """Serve a study until it is stopped (Ctrl-C, SIGTERM).
+
+    Args:
+        public: the public form of a plan; its images are all that is ever sent.
+        database: SQLite file of the votes; made where there is none.
+        host: address to listen at. The default is reached from this machine alone.
+        port: 0 for any free one.
+        invite: number of raters to invite now, in the order of the plan.
+        reinvite: raters whose link is lost: they get another, and the former opens nothing.
+        until: ISO date of the last day (UTC) whose votes count, instead of the plan's.
+        ready: called with the URL and the new tokens by rater, before the first request. Tokens
+            are kept nowhere else.
+
+    Raises:
+        PalpateError: if the file is of another study, a rater cannot be invited, ``until`` is no
+            date, or the address is taken.
+    """
+    until = public["until"] if until is None else until
+    until = None if until is None else last_day(until)
+    with closing(VoteStore(database, public["study"])) as store, _listening(host, port) as listener:
+        tokens = store.invite(list(public["raters"]), invite, reinvite)
+        study = _Study(public, store, until)
+        shown = f"[{host}]" if ":" in host else host
+        ready(f"http://{shown}:{listener.getsockname()[1]}/", tokens)
+        config = uvicorn.Config(
+            study.application(),
+            access_log=False,  # it would hold the tokens
+            log_level="warning",
+            server_header=False,
+            lifespan="on",
+            limit_concurrency=1000,
+            timeout_graceful_shutdown=5,
+        )
+        with suppress(KeyboardInterrupt):
+            uvicorn.Server(config).run(sockets=[listener])
+
+
+def _listening(host: str, port: int) -> socket.socket:
+    """Return a listening socket, which knows its protocol: asyncio sends at once only on these."""
+    family = socket.AF_INET6 if ":" in host else socket.AF_INET
+    listener = socket.socket(family, socket.SOCK_STREAM, socket.IPPROTO_TCP)
+    try:
+        listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        listener.bind((host, port))
+        listener.listen(1024)
+    except (OSError, OverflowError) as error:
+        listener.close()
+        got = f"{host}, port {port}: {error}"
+        fix = "Stop what listens there, or choose another port or address"
+        raise PalpateError("The server needs a free address", got, fix) from None
+    return listener

@@ -1,0 +1,191 @@
+"""Votes: read from what raters downloaded and from the server's file, and checked.
+
+A download is ``{"format", "study", "rater", "viewport", "votes": [...], "digest"}``; its digest is
+that of all else. Of several votes of one rater on one trial the last undone counts, then the later.
+"""
+
+from __future__ import annotations
+
+import datetime
+import sqlite3
+from collections.abc import Iterable, Mapping, Sequence
+from contextlib import closing
+from dataclasses import dataclass, field
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+from palpate.core import Note, PalpateError, digest_json, read_record
+from palpate.preference.plan import PLAN, SAME, Plan, Trial, require_rater
+
+FORMAT = "palpate/preference-votes@1"
+#: The server's file in the folder of a study.
+DATABASE = "study.db"
+AGAIN = "Let the rater download the votes again"
+
+
+@dataclass(frozen=True)
+class Vote:
+    """One answer.
+
+    Attributes:
+        rater: code.
+        trial: the trial of the plan.
+        swapped: whether its sides were swapped.
+        choice: ``left``, ``right``, ``same`` as shown; in the task ``sort`` a material.
+        ms: time from the first sight in milliseconds.
+        at: when, by the rater's clock.
+        undone: how often the rater took an answer to this trial back.
+    """
+
+    rater: str
+    trial: Trial
+    swapped: bool
+    choice: str
+    ms: int
+    at: datetime.datetime
+    undone: int
+
+    @property
+    def chosen(self) -> str:
+        """The chosen slot: a method, ``copy``, ``gel``, a material, or ``same``."""
+        if not self.trial.right or self.choice == SAME:
+            return self.choice
+        return self.trial.right if (self.choice == "left") is self.swapped else self.trial.left
+
+
+@dataclass(frozen=True)
+class Votes:
+    """Rater -> id of a trial -> vote, and what was skipped."""
+
+    of: Mapping[str, Mapping[str, Vote]]
+    notes: list[Note] = field(default_factory=list)
+
+    def __len__(self) -> int:
+        return sum(map(len, self.of.values()))
+
+
+def read_votes(plan: Plan, paths: Iterable[str | Path]) -> Votes:
+    """Read votes of a study.
+
+    Args:
+        plan: the study.
+        paths: downloads, folders of them (every ``.json`` but the plan), or the server's file.
+
+    Raises:
+        PalpateError: if a file is torn, edited, or of another study, or all votes are late.
+    """
+    files = _files(paths)
+    given = [v for path in files if path.suffix != ".db" for v in _of_download(plan, path)]
+    last = datetime.date.fromisoformat(plan.until) if plan.until else None
+    # By the clocks of raters, with a day for time zones; the server refused late votes by its own.
+    in_time = [v for v in given if last is None or (v.at.date() - last).days <= 1]
+    late = len(given) - len(in_time)
+    in_time += [v for path in files if path.suffix == ".db" for v in _of_server(plan, path)]
+    if late and not in_time:
+        got = f"{late:,} after {plan.until}, the last day, by the clocks of the raters"
+        fix = "Pass votes that were given in time"
+        raise PalpateError("There must be votes to score", got, fix)
+    kept: dict[str, dict[str, Vote]] = {}
+    twice = differing = 0
+    for vote in sorted(in_time, key=lambda v: (v.undone, v.at)):
+        earlier = kept.setdefault(vote.rater, {}).get(vote.trial.id)
+        twice += earlier == vote
+        differing += earlier not in (None, vote) and earlier.undone == vote.undone  # type: ignore[union-attr]
+        kept[vote.rater][vote.trial.id] = vote
+    facts = {
+        "votes-twice": twice,
+        "votes-differ": differing,
+        "votes-late": late,
+        "clock-backwards": sum(_backwards(plan, rater, votes) for rater, votes in kept.items()),
+    }
+    return Votes(kept, [Note(code, {"count": n}) for code, n in facts.items() if n])
+
+
+def _files(paths: Iterable[str | Path]) -> list[Path]:
+    files: list[Path] = []
+    for path in map(Path, paths):
+        inside = sorted(p for p in path.glob("*.json") if p.name != PLAN) if path.is_dir() else []
+        files += inside or [path]
+    return files
+
+
+def _of_download(plan: Plan, path: Path) -> list[Vote]:
+    try:
+        record = read_record(path, "votes file", form=FORMAT, keys=("study", "rater", "votes"))
+    except PalpateError as error:
+        raise PalpateError(error.must, error.got, AGAIN) from None
+    rest = {name: value for name, value in record.items() if name != "digest"}
+    _require_study(plan, record["study"], path)
+    if record.get("digest") != digest_json(rest):
+        got = "other content: it was edited, or a part is lost"
+        raise PalpateError(f"The digest in {path} must match its votes", got, AGAIN)
+    require_rater(plan, record["rater"])
+    rows = record["votes"] if isinstance(record["votes"], list) else [None]
+    return _checked(plan, record["rater"], rows, path)
+
+
+def _of_server(plan: Plan, path: Path) -> list[Vote]:
+    names = ("trial", "choice", "ms", "at", "undone")
+    try:
+        uri = f"{path.absolute().as_uri()}?mode=ro"
+        with closing(sqlite3.connect(uri, uri=True)) as disk:
+            (study,) = disk.execute("SELECT name FROM study").fetchone() or ("",)
+            columns = f"rater, received, {', '.join(names)}"
+            rows = disk.execute(f"SELECT {columns} FROM votes").fetchall()
+    except sqlite3.Error as error:
+        fix = "Name the file that the server wrote, with the files next to it"
+        raise PalpateError(f"{path} must be a file of votes", str(error), fix) from None
+    _require_study(plan, study, path)
+    of_rater: dict[str, list[dict[str, Any]]] = {}
+    for rater, received, *values in rows:
+        row: dict[str, Any] = dict(zip(names, values, strict=True))
+        if not _is_time(row["at"]):  # servers once took times of no day
+            row["at"] = received
+        of_rater.setdefault(rater, []).append(row)
+    for rater in of_rater:
+        require_rater(plan, rater)
+    return [vote for rater, row in of_rater.items() for vote in _checked(plan, rater, row, path)]
+
+
+def _is_time(text: str) -> bool:
+    try:
+        return bool(datetime.datetime.fromisoformat(text))
+    except ValueError:
+        return False
+
+
+def _require_study(plan: Plan, study: Any, path: Path) -> None:
+    if study != plan.study:
+        fix = "Pass the votes with the plan that they were given for"
+        must = f"The votes in {path} must be of study {plan.study}"
+        raise PalpateError(must, f"study {study}", fix)
+
+
+def _checked(plan: Plan, rater: str, rows: Sequence[Any], path: Path) -> list[Vote]:
+    """Rows as votes of trials of the plan.
+
+    Raises:
+        PalpateError: naming the first that is none.
+    """
+    shown, votes = plan.shown(rater), list[Vote]()
+    for row in rows:
+        try:
+            trial, swapped = shown[row["trial"]]
+            at = datetime.datetime.fromisoformat(row["at"])
+            at = at if at.tzinfo else at.replace(tzinfo=datetime.UTC)
+            ms, undone = int(row["ms"]), int(row["undone"])
+            if row["choice"] not in plan.choices or min(ms, undone) < 0:
+                raise ValueError
+        except (KeyError, TypeError, ValueError):
+            must = f"Every vote of {rater} in {path} must answer a trial of this rater"
+            raise PalpateError(must, repr(row), AGAIN) from None
+        votes.append(Vote(rater, trial, swapped, row["choice"], ms, at, undone))
+    return votes
+
+
+def _backwards(plan: Plan, rater: str, votes: Mapping[str, Vote]) -> bool:
+    """Whether the clock of a rater ran back by more than a second between two first answers."""
+    trials = (trial.id for trial, _ in plan.shown(rater).values())
+    times = [votes[t].at for t in trials if t in votes and not votes[t].undone]
+    return any((b - a).total_seconds() < -1 for a, b in pairwise(times))

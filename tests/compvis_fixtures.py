@@ -1,0 +1,151 @@
+"""Tiny autoencoders by the names of latent diffusion, and their forward pass in a few lines.
+
+Written from the published architecture (latent-diffusion, ldm/modules/diffusionmodules/model.py):
+GroupNorm of 32 groups (eps 1e-6), swish, residual blocks, one attention of one head in the middle,
+downsampling with padding (0, 1, 0, 1), nearest upsampling; `decoder.up.0` is the finest level.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+from torch.nn.functional import conv2d, group_norm, interpolate, pad, silu
+
+State = dict[str, Tensor]
+VQ_F4 = {"mult": (1, 2, 4), "z": 3, "codes": 64}
+KL_F8 = {"mult": (1, 2, 4, 4), "z": 4, "codes": None}
+
+
+def make_state(
+    mult: tuple[int, ...], z: int, codes: int | None, *, middle: bool = True, levels: tuple = ()
+) -> State:
+    """Random weights of a model of 32 channels with two blocks a level; `levels` attend as well."""
+    rng, state = torch.Generator().manual_seed(0), {}
+    widths = [32 * m for m in mult]
+
+    def weight(name: str, out: int, into: int, side: int) -> None:
+        scale = (into * side**2) ** -0.5
+        state[f"{name}.weight"] = scale * torch.randn(out, into, side, side, generator=rng)
+        state[f"{name}.bias"] = 0.1 * torch.randn(out, generator=rng)
+
+    def norm(name: str, width: int) -> None:
+        state[f"{name}.weight"] = 1 + 0.1 * torch.randn(width, generator=rng)
+        state[f"{name}.bias"] = 0.1 * torch.randn(width, generator=rng)
+
+    def block(name: str, into: int, out: int) -> None:
+        norm(f"{name}.norm1", into)
+        weight(f"{name}.conv1", out, into, 3)
+        norm(f"{name}.norm2", out)
+        weight(f"{name}.conv2", out, out, 3)
+        if into != out:
+            weight(f"{name}.nin_shortcut", out, into, 1)
+
+    def attention(name: str, width: int) -> None:
+        norm(f"{name}.norm", width)
+        for part in ("q", "k", "v", "proj_out"):
+            weight(f"{name}.{part}", width, width, 1)
+
+    def mid(name: str, width: int) -> None:
+        block(f"{name}.block_1", width, width)
+        if middle:
+            attention(f"{name}.attn_1", width)
+        block(f"{name}.block_2", width, width)
+
+    weight("encoder.conv_in", 32, 3, 3)
+    before = 32
+    for i, width in enumerate(widths):
+        for j in range(2):
+            block(f"encoder.down.{i}.block.{j}", before, width)
+            if i in levels:
+                attention(f"encoder.down.{i}.attn.{j}", width)
+            before = width
+        if i < len(widths) - 1:
+            weight(f"encoder.down.{i}.downsample.conv", width, width, 3)
+    mid("encoder.mid", before)
+    norm("encoder.norm_out", before)
+    moments = z if codes else 2 * z
+    weight("encoder.conv_out", moments, before, 3)
+    weight("quant_conv", moments, moments, 1)
+    if codes:
+        state["quantize.embedding.weight"] = torch.randn(codes, z, generator=rng)
+    weight("post_quant_conv", z, z, 1)
+    weight("decoder.conv_in", before, z, 3)
+    mid("decoder.mid", before)
+    for i in reversed(range(len(widths))):
+        for j in range(3):
+            block(f"decoder.up.{i}.block.{j}", before, widths[i])
+            if i in levels:
+                attention(f"decoder.up.{i}.attn.{j}", widths[i])
+            before = widths[i]
+        if i:
+            weight(f"decoder.up.{i}.upsample.conv", before, before, 3)
+    norm("decoder.norm_out", before)
+    weight("decoder.conv_out", 3, before, 3)
+    return state
+
+
+def encode(state: State, x: Tensor) -> Tensor:
+    """What `quant_conv` gives: latents before quantization, or mean and log variance."""
+    x = _conv(state, "encoder.conv_in", x)
+    for i in range(_levels(state)):
+        for j in range(2):
+            x = _block(state, f"encoder.down.{i}.block.{j}", x)
+            x = _attention(state, f"encoder.down.{i}.attn.{j}", x)
+        down = f"encoder.down.{i}.downsample.conv"
+        if f"{down}.weight" in state:
+            x = conv2d(pad(x, (0, 1, 0, 1)), state[f"{down}.weight"], state[f"{down}.bias"], 2)
+    x = silu(_norm(state, "encoder.norm_out", _middle(state, "encoder.mid", x)))
+    return _conv(state, "quant_conv", _conv(state, "encoder.conv_out", x))
+
+
+def decode(state: State, z: Tensor) -> Tensor:
+    """The image of latents; those of a model with codes are replaced by the nearest code first."""
+    codes = state.get("quantize.embedding.weight")
+    if codes is not None:
+        flat = z.permute(0, 2, 3, 1)
+        nearest = (flat[..., None, :] - codes).square().sum(-1).argmin(-1)
+        z = codes[nearest].permute(0, 3, 1, 2)
+    x = _conv(state, "decoder.conv_in", _conv(state, "post_quant_conv", z))
+    x = _middle(state, "decoder.mid", x)
+    for i in reversed(range(_levels(state))):
+        for j in range(3):
+            x = _block(state, f"decoder.up.{i}.block.{j}", x)
+            x = _attention(state, f"decoder.up.{i}.attn.{j}", x)
+        if i:
+            x = interpolate(x, scale_factor=2.0, mode="nearest")
+            x = _conv(state, f"decoder.up.{i}.upsample.conv", x)
+    return _conv(state, "decoder.conv_out", silu(_norm(state, "decoder.norm_out", x)))
+
+
+def _levels(state: State) -> int:
+    return 1 + max(int(name.split(".")[2]) for name in state if name.startswith("encoder.down."))
+
+
+def _conv(state: State, name: str, x: Tensor) -> Tensor:
+    weight = state[f"{name}.weight"]
+    return conv2d(x, weight, state[f"{name}.bias"], padding=weight.shape[-1] // 2)
+
+
+def _norm(state: State, name: str, x: Tensor) -> Tensor:
+    return group_norm(x, 32, state[f"{name}.weight"], state[f"{name}.bias"], eps=1e-6)
+
+
+def _block(state: State, name: str, x: Tensor) -> Tensor:
+    h = _conv(state, f"{name}.conv1", silu(_norm(state, f"{name}.norm1", x)))
+    h = _conv(state, f"{name}.conv2", silu(_norm(state, f"{name}.norm2", h)))
+    short = f"{name}.nin_shortcut"
+    return h + (_conv(state, short, x) if f"{short}.weight" in state else x)
+
+
+def _attention(state: State, name: str, x: Tensor) -> Tensor:
+    if f"{name}.q.weight" not in state:
+        return x
+    h = _norm(state, f"{name}.norm", x)
+    q, k, v = (_conv(state, f"{name}.{part}", h).flatten(2) for part in "qkv")
+    share = torch.softmax(q.transpose(1, 2) @ k * q.shape[1] ** -0.5, dim=2)
+    return x + _conv(state, f"{name}.proj_out", (v @ share.transpose(1, 2)).reshape(x.shape))
+
+
+def _middle(state: State, name: str, x: Tensor) -> Tensor:
+    x = _attention(state, f"{name}.attn_1", _block(state, f"{name}.block_1", x))
+    return _block(state, f"{name}.block_2", x)

@@ -1,0 +1,362 @@
+"""Autoencoders of others: KL, folders of whole generators, and files of latent diffusion."""
+
+import hashlib
+import json
+import os
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from diffusers import AutoencoderKL, AutoencoderTiny, VQModel
+from safetensors.torch import save_file
+
+import palpate as pp
+from compvis_fixtures import KL_F8, VQ_F4, decode, encode, make_state
+from diffusion_fixtures import make_pipeline
+from mini_fixtures import make_encoders
+from palpate.cli import main
+from palpate.core import PalpateError, Split
+from palpate.diffusion.autoencoder import Autoencoder, LatentStats, to_bytes
+from palpate.diffusion.autoencoder_training import measure_reconstruction
+from palpate.diffusion.presets import PAPER, TINY
+from palpate.diffusion.training import train_pipeline
+from palpate.encoders import EncoderSet
+from palpate.encoders.preprocess import to_unit
+
+
+def images(n=2, size=32):
+    return np.random.default_rng(0).integers(0, 256, (n, size, size, 3), dtype=np.uint8)
+
+
+def small_kl(**options):
+    torch.manual_seed(0)
+    blocks = {
+        "down_block_types": ("DownEncoderBlock2D",) * 2,
+        "up_block_types": ("UpDecoderBlock2D",) * 2,
+    }
+    options = {"latent_channels": 4, **blocks, **options}
+    return AutoencoderKL(block_out_channels=(8, 16), norm_num_groups=4, **options).eval()
+
+
+def small_vq():
+    torch.manual_seed(0)
+    return VQModel(block_out_channels=(8,), norm_num_groups=4, num_vq_embeddings=16).eval()
+
+
+def write(path, state, **others):
+    """A checkpoint as PyTorch Lightning 1.4 writes it: the key of a callback is its class."""
+    torch.save({"state_dict": state, "epoch": 3, "global_step": 7, **others}, path)
+    return path
+
+
+# --- the published architectures ---------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("shape", "kind"),
+    [
+        (VQ_F4, VQModel),
+        (KL_F8, AutoencoderKL),
+        (VQ_F4 | {"middle": False}, VQModel),  # vq-f4-noattn
+        (VQ_F4 | {"levels": (2,)}, VQModel),  # vq-f8 and f16 attend at some levels
+        (KL_F8 | {"levels": (3,)}, AutoencoderKL),
+    ],
+)
+def test_a_file_computes_what_the_published_architecture_computes(tmp_path, shape, kind):
+    state = make_state(**shape)
+    loss = {"loss.discriminator.main.0.weight": torch.zeros(3), "loss.logvar": torch.zeros(())}
+    model = Autoencoder.load(write(tmp_path / "model.ckpt", state | loss))
+    assert isinstance(model.net, kind)
+    assert (model.factor, model.channels) == (2 ** (len(shape["mult"]) - 1), shape["z"])
+    assert model.codebook == shape["codes"]
+    # In double precision: float32 adds rounding of 1e-5 where values are large.
+    model, x = model.double(), to_unit(images(), signed=True).double()
+    state = {name: value.double() for name, value in state.items()}
+    with torch.no_grad():
+        z, wanted = model.latents(x), encode(state, x)
+        if kind is VQModel:
+            assert torch.allclose(z, wanted, atol=1e-5, rtol=0)
+            assert torch.allclose(model.image(z)[0], decode(state, z), atol=1e-5, rtol=0)
+        else:  # the mode is the mean, times Stable Diffusion's factor
+            assert torch.allclose(z, 0.18215 * wanted[:, : shape["z"]], atol=1e-5, rtol=0)
+            assert torch.allclose(model.image(z)[0], decode(state, z / 0.18215), atol=1e-5, rtol=0)
+        assert np.array_equal(model.decode(z), to_bytes(model.image(z)[0]))
+
+
+def test_a_whole_checkpoint_and_safetensors_give_the_same_model(tmp_path):
+    for shape in (VQ_F4, KL_F8):
+        state = make_state(**shape)
+        alone = Autoencoder.load(write(tmp_path / "alone.ckpt", state))
+        whole = {f"first_stage_model.{name}": value for name, value in state.items()}
+        whole |= {"model.diffusion_model.out.2.bias": torch.zeros(4), "betas": torch.zeros(10)}
+        save_file({k: v.contiguous() for k, v in whole.items()}, tmp_path / "whole.safetensors")
+        again = Autoencoder.load(str(tmp_path / "whole.safetensors"))
+        assert again.digest == alone.digest
+        halves = {name: value.half() for name, value in state.items()}
+        half = Autoencoder.load(write(tmp_path / "half.ckpt", halves))
+        assert {p.dtype for p in half.parameters()} == {torch.float32}
+    # A latent diffusion model that was scaled by its first batch says so.
+    scaled = Autoencoder.load(
+        write(tmp_path / "scaled.ckpt", whole | {"scale_factor": torch.tensor(0.5)})
+    )
+    assert scaled.net.config["scaling_factor"] == 0.5
+    assert torch.allclose(scaled.encode(images()), again.encode(images()) * (0.5 / 0.18215))
+
+
+def test_a_file_that_names_lightnings_callback_is_read(tmp_path, monkeypatch):
+    """`sd-v1-4.ckpt` and `vq-f4` key the state of a callback by its class."""
+    import sys
+    from types import ModuleType
+
+    name = "pytorch_lightning.callbacks.model_checkpoint"
+    for part in ("pytorch_lightning", "pytorch_lightning.callbacks", name):
+        monkeypatch.setitem(sys.modules, part, ModuleType(part))
+    callback = type("ModelCheckpoint", (), {"__module__": name})
+    sys.modules[name].ModelCheckpoint = callback
+    state = make_state(**VQ_F4)
+    path = write(tmp_path / "model.ckpt", state, callbacks={callback: {"monitor": "val/rec_loss"}})
+    monkeypatch.undo()
+    assert Autoencoder.load(path).digest == Autoencoder.load(write(tmp_path / "b", state)).digest
+
+
+def test_what_is_saved_is_a_diffusers_model_that_names_its_file(tmp_path):
+    path = write(tmp_path / "vq-f4.ckpt", make_state(**VQ_F4))
+    model = Autoencoder.load(path)
+    model.save(tmp_path / "saved")
+    again = Autoencoder.load(tmp_path / "saved")
+    assert again.digest == model.digest
+    assert np.array_equal(again.encode(images()), model.encode(images()))
+    digest = hashlib.sha256(path.read_bytes()).hexdigest()
+    assert again.card["source"] == {"file": "vq-f4.ckpt", "sha256": digest}
+    page = (tmp_path / "saved" / "README.md").read_text()
+    assert digest in page
+    assert "license: unknown" in page
+    theirs = VQModel.from_pretrained(tmp_path / "saved").eval()
+    with torch.no_grad():
+        x = to_unit(images(), signed=True)
+        assert torch.equal(theirs.encode(x).latents, model.latents(x))
+
+
+# --- files that do not fit ---------------------------------------------------------------------
+
+
+def without(name):
+    return lambda state: {k: v for k, v in state.items() if k != name}
+
+
+def swapped(one, other):
+    return lambda state: state | {one: state[other], other: state[one]}
+
+
+def renamed(old, new):
+    return lambda state: {k.replace(old, new): v for k, v in state.items()}
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (without("encoder.mid.attn_1.q.weight"), r"1 missing: encoder\.mid\.attn_1\.q\.weight"),
+        (without("quantize.embedding.weight"), r"no weight quantize\.embedding\.weight"),
+        (without("encoder.conv_in.weight"), r"no weight encoder\.conv_in\.weight"),
+        (without("post_quant_conv.bias"), r"1 missing: post_quant_conv\.bias"),
+        (without("encoder.down.1.block.0.conv1.weight"), "no weight encoder.down.1.block.0.conv1"),
+        (lambda s: s | {"encoder.new": torch.zeros(1)}, r"1 not part of it: encoder\.new"),
+        (
+            swapped("decoder.up.1.block.2.conv1.weight", "decoder.up.0.block.2.conv1.weight"),
+            r"2 of another shape: decoder\.up\.\d\.block\.2\.conv1\.weight \(",
+        ),
+        (renamed("decoder.up.0.", "decoder.up.7."), "missing: decoder.up.0.*; .*not part of it"),
+        (renamed("encoder.down", "encoder.down_blocks"), "Pass the folder with its config.json"),
+        (
+            lambda s: s | {"encoder.down.0.block.0.conv1.weight": torch.zeros(33, 32, 3, 3)},
+            "multiples of 32. Got 33",
+        ),
+        (lambda s: s | {"encoder.conv_in.weight": torch.zeros(32, 4, 3, 3)}, "3 channels in and"),
+        (lambda s: {}, "no weight encoder.conv_in.weight"),
+    ],
+)
+def test_weights_that_do_not_fit_are_named(tmp_path, change, message):
+    path = write(tmp_path / "x.ckpt", change(make_state(**VQ_F4)))
+    with pytest.raises(PalpateError, match=message):
+        Autoencoder.load(path)
+
+
+class Evil:
+    def __reduce__(self):
+        return os.mkdir, ("ran",)
+
+
+def test_files_that_are_no_plain_weights_are_rejected(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    state = make_state(**VQ_F4)
+    good = write(tmp_path / "good.ckpt", state).read_bytes()
+    pointer = b"version https://git-lfs.github.com/spec/v1\noid sha256:0\nsize 12\n"
+    torch.save({"state_dict": state, "x": Evil()}, "evil.ckpt")
+    for name, content, message in (
+        ("evil.ckpt", None, "could run any program. Save its state_dict as .safetensors"),
+        ("cut.ckpt", good[: len(good) // 2], "cut.ckpt must hold weights"),
+        ("cut.safetensors", good[:100], "cut.safetensors must hold weights"),
+        ("empty.ckpt", b"", "empty.ckpt must hold weights"),
+        ("pointer.ckpt", pointer, r"pointer of Git LFS .* git lfs pull"),
+        ("pointer.safetensors", pointer, r"pointer of Git LFS .* git lfs pull"),
+    ):
+        if content is not None:
+            (tmp_path / name).write_bytes(content)
+        with pytest.raises(PalpateError, match=message):
+            Autoencoder.load(name)
+    assert not (tmp_path / "ran").exists()
+    with pytest.raises(PalpateError, match=r"The file weights/missing\.ckpt must exist"):
+        Autoencoder.load("weights/missing.ckpt")
+    with pytest.raises(PalpateError, match=r"no folder missing\. Name a .*\.ckpt of latent"):
+        Autoencoder.load("missing")
+
+
+# --- diffusers folders -------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("shift", [None, 0.3])
+def test_latents_of_a_kl_model_are_the_mode_scaled_as_its_generators_expect(tmp_path, shift):
+    kl = small_kl(scaling_factor=0.5, shift_factor=shift)
+    kl.save_pretrained(tmp_path / "kl")
+    model = Autoencoder.load(tmp_path / "kl")
+    assert (model.patch, model.factor, model.channels, model.codebook) == (1, 2, 4, None)
+    x = to_unit(images(), signed=True)
+    with torch.no_grad():
+        mode = kl.encode(x).latent_dist.mode()
+        wanted = 0.5 * (mode - (shift or 0.0))
+        assert torch.allclose(model.encode(images()), wanted, atol=1e-6)
+        assert np.abs(model.decode(wanted).astype(int) - to_bytes(kl.decode(mode).sample)).max() < 2
+    assert model.codes(wanted) is None
+    # What a denoiser sees: these with the scale "one", and the mode normalized with "std".
+    assert torch.equal(LatentStats.of(wanted, "one").normalize(wanted), wanted)
+    normal = [LatentStats.of(z).normalize(z) for z in (wanted, mode)]
+    assert torch.allclose(*normal, atol=1e-4)
+    result = measure_reconstruction(model, images())
+    assert (result.psnr_free, result.perplexity, result.dead, result.codes) == (None,) * 4
+    assert result.psnr > 0
+    model.save(tmp_path / "saved", half=True)
+    again = Autoencoder.load(tmp_path / "saved")
+    assert again.digest == model.digest
+    assert torch.equal(again.encode(images()), model.encode(images()))
+
+
+def test_scale_and_shift_are_part_of_the_digest():
+    scales = [{}, {"scaling_factor": 1.0}, {"shift_factor": 0.1}]
+    assert len({Autoencoder(small_kl(**options)).digest for options in scales}) == 3
+
+
+@pytest.mark.parametrize("inside", ["vae", "vqvae", "autoencoder"])
+def test_an_autoencoder_is_found_in_the_folder_of_a_whole_generator(tmp_path, inside):
+    net = small_vq() if inside == "vqvae" else small_kl()
+    net.save_pretrained(tmp_path / "sd" / inside)
+    (tmp_path / "sd" / "model_index.json").write_text("{}")
+    (tmp_path / "sd" / "README.md").write_text("---\nlicense: creativeml-openrail-m\n---\n")
+    model = Autoencoder.load(tmp_path / "sd")
+    assert model.digest == Autoencoder(net).digest
+    assert (model.card["source"], model.card["license"]) == ("sd", "creativeml-openrail-m")
+
+
+def test_a_hub_id_of_a_whole_generator_fetches_the_small_files_and_one_part(tmp_path, monkeypatch):
+    import huggingface_hub
+
+    small_kl().save_pretrained(tmp_path / "vae")
+    asked = {}
+
+    def snapshot(name, allow_patterns):
+        asked["files"] = (name, allow_patterns)
+        return str(tmp_path)
+
+    def from_pretrained(name, **options):
+        asked["model"] = (name, options.pop("subfolder"), options["local_files_only"])
+        return original(tmp_path / "vae", **options)
+
+    original = AutoencoderKL.from_pretrained
+    monkeypatch.setattr(huggingface_hub, "snapshot_download", snapshot)
+    monkeypatch.setattr(AutoencoderKL, "from_pretrained", from_pretrained)
+    assert Autoencoder.load("owner/sd").card["source"] == "owner/sd"
+    assert asked["model"] == ("owner/sd", "vae", False)
+    assert asked["files"][0] == "owner/sd"
+    assert "vae/*.json" in asked["files"][1]
+    assert not any(p.endswith(".safetensors") for p in asked["files"][1])
+
+
+def test_folders_of_other_models_are_rejected(tmp_path):
+    AutoencoderTiny().save_pretrained(tmp_path / "tiny")
+    small_kl().save_pretrained(tmp_path / "pointer")
+    (weights,) = (tmp_path / "pointer").glob("*.safetensors")
+    weights.write_bytes(b"version https://git-lfs.github.com/spec/v1\noid sha256:0\nsize 1\n")
+    small_kl().save_pretrained(tmp_path / "cut")
+    (weights,) = (tmp_path / "cut").glob("*.safetensors")
+    weights.write_bytes(weights.read_bytes()[:100])
+    small_kl(in_channels=1, out_channels=1).save_pretrained(tmp_path / "gray")
+    (tmp_path / "empty").mkdir()
+    (tmp_path / "text").mkdir()
+    (tmp_path / "text" / "config.json").write_text("{")
+    for name, message in (
+        ("tiny", "diffusers VQModel or AutoencoderKL. Got AutoencoderTiny"),
+        ("pointer", r"pointer of Git LFS .* git lfs pull"),
+        ("cut", "diffusers VQModel or AutoencoderKL"),
+        ("gray", "3 channels in and out. Got 1 and 1"),
+        ("empty", "Got no model in config.json"),
+        ("text", r"config\.json"),
+    ):
+        with pytest.raises(PalpateError, match=message):
+            Autoencoder.load(tmp_path / name)
+
+
+# --- in a generator ----------------------------------------------------------------------------
+
+
+def by_video(manifest):
+    train = [i for i in manifest.ids if i[1] in "0123"]
+    test = [i for i in manifest.ids if i not in train]
+    return Split.from_ids(train=train, test=test, manifest=manifest.digest)
+
+
+def test_an_autoencoder_that_does_not_fit_preset_or_start_is_rejected(small_manifest, tmp_path):
+    data, encoders = (small_manifest, by_video(small_manifest)), make_encoders()
+    path = write(tmp_path / "f64.ckpt", make_state((1,) * 7, 4, None))
+    with pytest.raises(PalpateError, match=r"`autoencoder` must reduce images of 32 .* Got 64"):
+        pp.train_generator(*data, encoders, preset=TINY, autoencoder=path)
+    start = replace(make_pipeline(width=encoders.dim), encoders=EncoderSet(encoders.clip))
+    wider = Autoencoder(small_kl())
+    with pytest.raises(PalpateError, match=r"`start` must share autoenc.*another autoenc"):
+        train_pipeline(*data, encoders, wider, TINY, tmp_path, start=start, device="cpu")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("name", "shape"), [("tiny-vq-f4", VQ_F4), ("tiny-kl-f8", KL_F8)])
+def test_the_papers_preset_runs_on_a_file(small_manifest, tmp_path, monkeypatch, name, shape):
+    monkeypatch.chdir(tmp_path)
+    write(tmp_path / f"{name}.ckpt", make_state(**shape))
+    manifest, encoders = small_manifest, make_encoders()
+    split = by_video(manifest)
+    unet = replace(PAPER.unet, widths=(32, 32, 64, 64), head_width=16, groups=16)
+    tiny = replace(PAPER, size=64, unet=unet, epochs=1, loop=replace(PAPER.loop, batch=8))
+    tiny = replace(tiny, sampler=replace(PAPER.sampler, steps=4))
+    common = {"preset": tiny, "autoencoder": f"{name}.ckpt", "device": "cpu"}
+    made = pp.train_generator(manifest, split, encoders, output="model", **common)
+    pipeline = pp.TactilePipeline.from_pretrained("model", device="cpu")
+    assert pipeline.digest == made.digest
+    assert pipeline.autoencoder.card["source"]["file"] == f"{name}.ckpt"
+    assert pipeline.stats.scale == "one"
+    side = 64 // pipeline.autoencoder.factor
+    assert pipeline.denoiser.unet.config["sample_size"] == side
+    about = json.loads((tmp_path / "model" / "autoencoder" / "config.json").read_text())
+    assert about["_class_name"] == type(made.autoencoder.net).__name__
+    generated = pp.generate(manifest, split=split, model=pipeline, output="out")
+    assert len(generated.ids) == len(split.ids("test"))
+    encoders.save(tmp_path / "encoders")
+    results = pp.score(
+        "out", manifest, encoder="encoders", split=split, presets=["paper"], permutations=0
+    )
+    assert any(score.metric == "TMMD" for score in results)
+    # The command line takes the file as well; its preset is too large for this test.
+    manifest.save(tmp_path / "tag" / "manifest.parquet")
+    split.save(tmp_path / "split.json")
+    options = ["--clip", "encoders", "--autoencoder", f"{name}.ckpt", "--steps", "1"]
+    command = ["train", "generator", "tag", "--split", "split.json", "--preset", "tiny"]
+    assert main([*command, *options, "-o", "small"]) == 0
+    small = pp.TactilePipeline.from_pretrained("small", device="cpu")
+    assert small.autoencoder.digest == pipeline.autoencoder.digest

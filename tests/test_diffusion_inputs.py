@@ -1,0 +1,228 @@
+"""Conditions other than embeddings: the map of a photo that is trained with the denoiser (GVST),
+the words of a text, the patches of a photo.
+"""
+
+import json
+from dataclasses import replace
+from itertools import pairwise
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from diffusion_fixtures import arrays, make_pipeline, photos
+from mini_fixtures import make_encoders
+from palpate.cli import main
+from palpate.core import PalpateError, Split
+from palpate.diffusion.autoencoder import LatentStats
+from palpate.diffusion.denoiser import Denoiser, PhotoMap, inputs_of, lengths_of, slots_of
+from palpate.diffusion.generation import generate
+from palpate.diffusion.options import ConditionPolicy
+from palpate.diffusion.pipeline import TactilePipeline
+from palpate.diffusion.presets import TINY
+from palpate.diffusion.training import DiffusionLoss, train_denoiser, train_generator
+from palpate.encoders.encoder_set import EncoderSet
+from palpate.training.options import LoopOptions
+from palpate.training.steps import Step
+
+GVST = ConditionPolicy(width=8, source="resnet", photo_size=16, photo_width=4)
+
+
+def by_video(manifest):
+    train = [i for i in manifest.ids if i < "v4"]
+    test = [i for i in manifest.ids if i not in train]
+    return Split.from_ids(train=train, test=test, manifest=manifest.digest)
+
+
+@pytest.mark.parametrize(("size", "width"), [(16, 4), (64, 32), (256, 64)])
+def test_a_photo_of_any_size_becomes_64_tokens_as_large_as_embeddings(size, width):
+    torch.manual_seed(0)
+    made = PhotoMap(replace(GVST, photo_size=size, photo_width=width))
+    tokens = made(torch.from_numpy(photos(2, size)))
+    assert tokens.shape == (2, 64, 8)
+    assert torch.allclose(tokens.norm(dim=2), torch.tensor(8**0.5), atol=1e-2)
+    # The rows of a batch do not see each other, so several processes take the steps of one.
+    alone = made(torch.from_numpy(photos(2, size)[1:]))
+    assert torch.allclose(alone, tokens[1:], atol=1e-4)
+
+
+def learned(folder, policy=GVST, **changes):
+    """A denoiser trained to make of a dark photo one latent, and of a bright one the opposite."""
+    bright = np.arange(32) % 2 == 1
+    images = np.where(bright, 230, 20).astype(np.uint8)[:, None, None, None]
+    z = torch.from_numpy(np.where(bright, 1.0, -1.0)).float().reshape(-1, 1, 1, 1)
+    return train_denoiser(
+        z.expand(-1, 3, 8, 8),
+        {"photos": np.broadcast_to(images, (32, 16, 16, 3))},
+        stats=LatentStats((0.0,) * 3, (1.0,) * 3, "one"),
+        policy=policy,
+        schedule=replace(TINY.schedule, prediction="flow"),
+        folder=folder,
+        **{"unet": TINY.unet, "loop": LoopOptions(60, 8, 3e-3, warmup=5, ema=0.9)} | changes,
+    )
+
+
+@pytest.mark.parametrize("modulate", [False, True])
+def test_the_map_is_trained_with_the_denoiser_and_decides_the_image(tmp_path, modulate):
+    unet = replace(TINY.unet, modulate=modulate)
+    model = learned(tmp_path / "run", unet=unet)
+    start = learned(tmp_path / "start", unet=unet, loop=LoopOptions(0, 8, 1e-3))
+    pairs = zip(model.maps.parameters(), start.maps.parameters(), strict=True)
+    assert not any(torch.equal(a, b) for a, b in pairs)
+    shades = torch.tensor([20, 230], dtype=torch.uint8).reshape(2, 1, 1, 1).expand(2, 16, 16, 3)
+    noise, late = torch.randn(1, 3, 8, 8).expand(2, -1, -1, -1), torch.full((2,), 990)
+    with torch.no_grad():  # at the end of the path the network predicts noise - z
+        made = noise - model(noise, late, model.condition(model.maps["photos"](shades)))
+    assert made[0].mean() < -0.5
+    assert made[1].mean() > 0.5
+
+
+def test_photos_drive_it_without_encoders_and_it_comes_back_from_its_folder(tmp_path):
+    pipeline = replace(make_pipeline(policy=GVST), encoders=None)
+    assert pipeline.vision_size == 16
+    images = photos(3, 20)
+    made = arrays(pipeline(images))
+    assert not np.array_equal(made, arrays(pipeline(images[::-1].copy())))
+    pipeline.save(tmp_path / "p")
+    again = TactilePipeline.from_pretrained(tmp_path / "p")
+    assert again.digest == pipeline.digest
+    assert np.array_equal(arrays(again(images)), made)
+    for call, message in (
+        (lambda: pipeline(text="rough"), "`text` must be left out for a generator without text"),
+        (
+            lambda: pipeline.sample(torch.randn(1, 8), ["a"], seed=0),
+            r"tokens of shape \(n, 64, 8\)",
+        ),
+        (lambda: pipeline.denoiser.condition(None, torch.randn(1, 8)), "knows photos alone"),
+        (lambda: learned(tmp_path / "n", ConditionPolicy(width=8)), "needs conditions of text"),
+    ):
+        with pytest.raises(PalpateError, match=message):
+            call()
+
+
+@pytest.mark.parametrize(
+    "change", [{"photo_size": 48}, {"photo_size": 8}, {"photo_width": 6}, {"photo_width": 0}]
+)
+def test_sizes_that_do_not_halve_to_8_are_rejected(change):
+    with pytest.raises(PalpateError, match=r"`photo_(size|width)` must be a "):
+        replace(TINY, condition=replace(GVST, **change))
+
+
+def test_gvst_from_the_command_line_needs_no_text_and_no_encoder(
+    small_manifest, tmp_path, monkeypatch, capsys
+):
+    monkeypatch.chdir(tmp_path)
+    small_manifest.save(tmp_path / "tag" / "manifest.parquet")
+    by_video(small_manifest).save(tmp_path / "split.json")
+    command = ["train", "generator", "tag", "--split", "split.json", "--preset", "tiny"]
+    small = ["--condition-photo-size", "16", "--condition-photo-width", "4"]
+    assert (
+        main([*command, "--source", "resnet", *small, "--steps", "2", "-o", "gvst", "--json"]) == 0
+    )
+    facts = json.loads(capsys.readouterr().out)
+    assert (facts["source"], facts["text_source"]) == ("resnet", None)
+    assert not (tmp_path / "gvst" / "encoders").exists()
+    photo = str(small_manifest.paths("vision")[0])
+    assert main(["generate", photo, "--model", "gvst", "-o", "t.png"]) == 0
+    assert Image.open("t.png").size == (32, 32)
+    capsys.readouterr()
+    assert main(["generate", "--text", "rough", "--model", "gvst", "-o", "u.png"]) == 2
+    assert "--text must be left out" in capsys.readouterr().err
+    assert main([*command, "--source", "text", "-o", "no"]) == 2
+    assert "--clip must have text and vision" in capsys.readouterr().err
+
+
+STATES = ConditionPolicy(width=12, source="both", words=5, patches=4, dropout=0.2)
+
+
+def state_pipeline(source="both", **changes):
+    encoders = make_encoders()
+    policy = replace(STATES, width=encoders.dim, source=source, **changes)
+    base = make_pipeline(policy=replace(policy, words=0, patches=0))
+    widths = dict.fromkeys(inputs_of(policy), encoders.clip.model.config.vision_config.hidden_size)
+    denoiser = Denoiser(base.unet, policy, widths=widths).eval()
+    return replace(base, denoiser=denoiser, encoders=EncoderSet(encoders.clip))
+
+
+def test_states_are_those_of_the_last_layer_of_transformers():
+    clip = make_encoders().clip
+    texts = ["a rough wall", "soft"]
+    ids = clip.tokenizer(texts, padding="max_length", max_length=6, truncation=True)["input_ids"]
+    pixels = torch.randn(2, 3, *[clip.preprocess.size] * 2)
+    with torch.no_grad():
+        words = clip.model.text_model(torch.tensor(ids)).last_hidden_state
+        whole = clip.model.vision_model(pixels).last_hidden_state[:, 1:]
+        encoders = EncoderSet(clip)
+        assert torch.equal(encoders.states("text", texts, 6), words)
+        assert torch.allclose(encoders.states("vision", pixels, whole.shape[1]), whole, atol=1e-6)
+        mean = encoders.states("vision", pixels, 1)
+    assert torch.allclose(mean[:, 0], whole.mean(1), atol=1e-5)
+    with pytest.raises(PalpateError, match="`words` must be at most"):
+        encoders.states("text", texts, 1000)
+
+
+def test_states_follow_their_embedding_and_are_null_where_there_are_none():
+    pipeline = state_pipeline()
+    photo, text = pipeline.embed(photos(2)), pipeline.embed_text("rough")
+    assert (photo.shape[1], text.shape[1]) == (1 + 4, 1 + 5)
+    condition = pipeline.denoiser.condition
+    both = condition(photo, text.expand(2, -1, -1))
+    assert both.shape[1] == 2 + 5 + 4  # two embeddings, words, patches
+    assert torch.equal(both[:, 2:7], text[:, 1:].expand(2, -1, -1))
+    assert torch.equal(both[:, 7:], photo[:, 1:])
+    assert not condition(photo)[:, 2:7].any()
+    assert not condition(None, text)[:, 7:].any()
+    # A bare embedding is known, too.
+    assert torch.equal(condition(photo[:, 0])[:, 1], condition(photo)[:, 1])
+    # A photo in the place of a text has no words.
+    alone = state_pipeline("text").denoiser
+    assert inputs_of(alone.policy) == ("words",)
+    assert not alone.condition(photo[:, 0])[:, 1:].any()
+
+
+@pytest.mark.parametrize("source", ["text", "vision", "both", "mixed"])
+def test_states_are_dropped_with_their_embedding_and_alone(source):
+    policy = replace(STATES, source=source)
+    n, ones = 4000, {"words": torch.ones(4000, 5, 12), "patches": torch.ones(4000, 4, 12)}
+    loss = DiffusionLoss(
+        torch.zeros(n, 3, 2, 2),
+        {s: torch.ones(n, 1, 12) for s in policy.sources},
+        None,
+        stats=LatentStats((0.0,) * 3, (1.0,) * 3),
+        schedule=TINY.schedule,
+        policy=policy,
+        inputs={name: ones[name] for name in inputs_of(policy)},
+    )
+    batch = loss.load(Step(0, np.arange(n), 0))
+    dropped = batch["dropped"][:, :, 0]
+    assert dropped.shape[1] == sum(lengths_of(policy))
+    ends = np.cumsum((0, *lengths_of(policy)))
+    parts = [dropped[:, a:b] for a, b in pairwise(ends)]
+    assert all(bool((p == p[:, :1]).all()) for p in parts)  # an input goes as a whole
+    vectors, states = parts[: slots_of(policy)], parts[slots_of(policy) :]
+    given = [~p[:, 0] for p in states]
+    for name, known in zip(inputs_of(policy), given, strict=True):
+        own = vectors[0 if name == "words" else -1][:, 0]
+        assert not (known & own).any()
+        share = 0.8 * 0.5 * (0.5 if source == "mixed" else 1)
+        assert float(known.float().mean()) == pytest.approx(share, abs=0.03)
+    if source == "mixed":  # a row is of the photo or of the text
+        assert not (given[0] & given[1]).any()
+
+
+@pytest.mark.parametrize("source", ["text", "both"])
+def test_words_and_patches_from_training_to_a_saved_pipeline(small_manifest, tmp_path, source):
+    condition = replace(TINY.condition, words=5, patches=4, tokens=2, learned=True)
+    preset = replace(TINY, condition=condition, loop=replace(TINY.loop, steps=2))
+    encoders, split = make_encoders(), by_video(small_manifest)
+    options = {"preset": preset, "source": source, "device": "cpu"}
+    made = train_generator(small_manifest, split, encoders, output=tmp_path / "m", **options)
+    again = TactilePipeline.from_pretrained(tmp_path / "m", device="cpu")
+    assert again.digest == made.digest
+    assert [*again.denoiser.maps] == (["words"] if source == "text" else ["words", "patches"])
+    first = small_manifest.paths("vision")[:2]
+    images = [arrays(again(first, text=text)) for text in (None, "rough", "smooth")]
+    assert not any(np.array_equal(a, b) for a, b in pairwise(images))
+    done = generate(first, text="rough", model=again)
+    assert np.array_equal(np.stack([np.asarray(i) for i in done.images]), images[1])

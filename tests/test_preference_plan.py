@@ -1,0 +1,285 @@
+"""The plan of a preference study: which items and trials, what the page knows, what is said."""
+
+import base64
+import io
+import json
+import re
+from collections import Counter
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from palpate import preference
+from palpate.core import PalpateError
+from palpate.preference import Plan
+from palpate.preference.images import QUALITY, data_uri, load_square
+from preference_crowd import write_folder, write_folders
+
+
+@pytest.fixture(scope="module")
+def folders(tmp_path_factory):
+    return write_folders(tmp_path_factory.mktemp("folders"))
+
+
+@pytest.fixture(scope="module")
+def study(folders, tmp_path_factory):
+    output = tmp_path_factory.mktemp("study") / "study"
+    preference.make(
+        folders.reference,
+        folders.methods,
+        output,
+        items=12,
+        raters=4,
+        labels=folders.labels,
+        size=32,
+    )
+    return output
+
+
+@pytest.fixture(scope="module")
+def plan(study):
+    return Plan.load(study)
+
+
+def codes(plan):
+    return {note.code: note.params for note in plan.notes}
+
+
+def test_items_are_of_all_materials_and_no_two_of_a_video(plan):
+    assert Counter(item.material for item in plan.items) == {"brick": 4, "grass": 4, "wood": 4}
+    assert len({item.video for item in plan.items}) == 12
+    assert codes(plan)["sampled-items"] == {"n": 12, "candidates": 60, "videos": 30}
+
+
+def test_every_comparison_has_every_item_a_tenth_again_and_a_tenth_caught(plan):
+    kinds = Counter(trial.kind for trial in plan.trials)
+    assert kinds == {"pair": 3 * 12, "repeat": 5, "catch": 5}
+    for trial in plan.trials:
+        if trial.kind == "repeat":
+            first = plan.trial[trial.repeats]
+            assert (trial.item, trial.left, trial.right) == (first.item, first.right, first.left)
+
+
+def test_order_and_sides_are_of_each_rater_and_balanced(plan):
+    assert len({tuple(rater.order) for rater in plan.raters}) == 4
+    for rater in plan.raters:
+        swapped = dict(zip(rater.order, rater.swapped, strict=True))
+        assert set(swapped) == set(plan.trial)
+        for pair in {(t.left, t.right) for t in plan.trials if t.kind == "pair"}:
+            sides = [swapped[t.id] for t in plan.trials if (t.left, t.right) == pair]
+            assert abs(2 * sum(sides) - len(sides)) <= 2
+        for trial in plan.trials:
+            if trial.kind == "repeat":  # the rater sees the sides the other way round, later
+                assert swapped[trial.id] == swapped[trial.repeats]
+                assert rater.order.index(trial.id) > rater.order.index(trial.repeats) + 5
+
+
+def test_the_page_knows_no_method_item_material_or_kind(plan):
+    text = json.dumps({**plan.public(), "images": sorted(plan.public()["images"])})
+    for word in ("ours", "gvst", "wbg", "v00", "brick", "catch", "repeat", "gel", plan.secret):
+        assert word not in text.replace("images", "")
+    rows = plan.public()["raters"]["r01"]
+    assert len({row["trial"] for row in rows}) == len(plan.trials)
+    others = {row["trial"] for row in plan.public()["raters"]["r02"]}
+    assert not others & {row["trial"] for row in rows}  # a vote of one rater is no vote of another
+    assert set(rows[0]) == {"trial", "reference", "left", "right"}
+
+
+def test_images_are_of_one_size_and_without_metadata(plan):
+    page = plan.public()
+    for image in page["images"].values():
+        data = base64.b64decode(image["src"].removeprefix("data:image/jpeg;base64,"))
+        opened = Image.open(io.BytesIO(data))
+        assert opened.size == (image["w"], image["h"]) == (32, 32)
+        assert set(opened.info) <= {"jfif", "jfif_version", "jfif_unit", "jfif_density"}
+        assert not opened.getexif()
+    used = {row[side] for rows in page["raters"].values() for row in rows for side in row}
+    assert {n for n in used if n in page["images"]} == set(page["images"])
+
+
+def test_a_catch_shows_the_reference_again_against_the_gel(plan):
+    def pixels(name):
+        data = base64.b64decode(plan.images[name].partition(",")[2])
+        return np.asarray(Image.open(io.BytesIO(data)), np.float64)
+
+    catch = next(trial for trial in plan.trials if trial.kind == "catch")
+    real = pixels(plan.name(catch.item, "reference"))
+    copy, gel = (pixels(plan.name(catch.item, slot)) for slot in ("copy", "gel"))
+    assert np.abs(real - copy).mean() < 10 < np.abs(real - gel).mean()
+    files = {plan.images[plan.name(catch.item, slot)] for slot in ("copy", "reference")}
+    assert len(files) == 2  # the copy is another file
+
+
+def test_the_plan_is_for_its_owner_and_reads_back(study, plan):
+    assert (study / "plan.json").stat().st_mode & 0o777 == 0o600
+    assert Plan.load(study / "plan.json").digest == plan.digest
+    assert plan.study == plan.public()["study"] == plan.digest[:12]
+
+
+def test_two_studies_have_two_secrets_and_one_choice_of_items(folders, plan):
+    again = preference.make(
+        folders.reference, folders.methods, items=12, raters=4, labels=folders.labels, dry_run=True
+    )
+    assert again.items == plan.items
+    assert again.secret != plan.secret
+    assert again.raters != plan.raters
+
+
+def test_design_of_the_paper(folders):
+    plan = preference.make(
+        folders.reference, folders.methods, labels=folders.labels, design="paper", dry_run=True
+    )
+    pairs = {(t.left, t.right) for t in plan.trials if t.kind == "pair"}
+    assert pairs == {("ours", "gvst"), ("ours", "wbg")}
+    assert len(plan.raters) == 2
+    assert codes(plan)["fewer-items"]["wanted"] == 40
+
+
+def test_sorting_shows_examples_of_other_videos(folders, tmp_path):
+    plan = preference.make(
+        folders.reference,
+        folders.methods[:1],
+        tmp_path / "sort",
+        items=9,
+        raters=2,
+        task="sort",
+        labels=folders.labels,
+        size=32,
+    )
+    page = plan.public()
+    assert page["choices"] == ["brick", "grass", "wood"]
+    assert [strip["answer"] for strip in page["strips"]] == page["choices"]
+    assert all(name in page["images"] for strip in page["strips"] for name in strip["images"])
+    assert not {i.video for i in plan.items} & {i.video for i in plan.examples}
+    assert {t.left for t in plan.trials if t.kind == "sort"} == {"reference", "ours"}
+    assert all(set(row) == {"trial", "image"} for row in page["raters"]["r01"])
+
+
+def test_what_a_method_lacks_is_left_out_and_counted(folders, tmp_path):
+    ids = [f"v{v:02d}/f0" for v in range(20)]
+    lacking = write_folder(tmp_path / "lacking", 4, [*ids, "stranger"], size=31, suffix=".jpg")
+    plan = preference.make(
+        folders.reference,
+        [folders.methods[0], lacking],
+        items=40,
+        dry_run=True,
+        labels=folders.labels,
+    )
+    said = codes(plan)
+    assert said["items-left-out"] == {"name": "lacking", "missing": 40, "unknown": 1}
+    assert said["fewer-items"] == {"n": 20, "wanted": 40, "candidates": 20, "videos": 20}
+
+
+def test_folders_without_a_table_are_one_pile(folders):
+    plan = preference.make(folders.reference, folders.methods, items=5, dry_run=True)
+    assert {"videos-unknown", "materials-unknown"} <= set(codes(plan))
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ({"generated": 1}, "two methods"),
+        ({"items": 1}, "2 .. 1000"),
+        ({"design": "paper", "comparisons": "all"}, "one of first"),
+        ({"question": " "}, "blank"),
+        ({"names": ["image", "b", "c"]}, "must hold no word of the question"),
+        ({"names": ["tactile", "b", "c"]}, "must hold no word of the title"),
+        ({"names": ["a", "b", "c"], "question": "Is it b?"}, "question. must not name a method"),
+        ({"raters": 1000}, "1 .. 999"),
+        ({"task": "rank"}, "pair, sort"),
+        ({"design": "ours"}, "paper"),
+        ({"until": "tomorrow"}, "date"),
+        ({"task": "sort", "labels": None}, "two materials"),
+        ({"output": None, "dry_run": False}, "folder"),
+    ],
+)
+def test_what_cannot_be_made_is_said(folders, options, words):
+    count = options.pop("generated", 3)
+    arguments = {"labels": folders.labels, "dry_run": True} | options
+    with pytest.raises(PalpateError, match=words):
+        preference.make(folders.reference, folders.methods[:count], **arguments)
+
+
+def test_no_common_image_is_said(folders, tmp_path):
+    other = write_folder(tmp_path / "other", 5, ["a", "b"])
+    with pytest.raises(PalpateError, match="of the 60 ours has 60, other has 0, and none"):
+        preference.make(folders.reference, [folders.methods[0], other], dry_run=True)
+
+
+def test_a_material_of_one_video_gives_one_item_and_cannot_be_sorted(folders, tmp_path):
+    labels = tmp_path / "labels.csv"
+    lines = folders.labels.read_text().splitlines()
+    labels.write_text("\n".join([*lines[:-2], *(x.replace("wood", "moss") for x in lines[-2:])]))
+    options = {"labels": labels, "dry_run": True}
+    pairs = preference.make(folders.reference, folders.methods, items=30, **options)
+    assert codes(pairs)["one-video-classes"] == {"materials": ["moss"]}
+    assert sum(item.material == "moss" for item in pairs.items) == 1
+    sort = preference.make(folders.reference, folders.methods, task="sort", items=15, **options)
+    assert codes(sort)["one-video-materials"] == {"materials": ["moss"]}
+    assert sort.choices == ["brick", "grass", "wood"]
+
+
+def test_of_10000_images_a_sample_is_taken_and_said(tmp_path):
+    file = write_folder(tmp_path / "one", 0, ["x"]) / "x.png"
+    for name in ("real", "a", "b"):
+        (tmp_path / name).mkdir()
+        for k in range(10_000):
+            (tmp_path / name / f"{k}.png").hardlink_to(file)
+    plan = preference.make(tmp_path / "real", [tmp_path / "a", tmp_path / "b"], dry_run=True)
+    assert codes(plan)["sampled-items"] == {"n": 40, "candidates": 10_000, "videos": 10_000}
+
+
+def test_a_manifest_gives_materials_videos_and_the_gel_of_catches(small_manifest, tmp_path):
+    small_manifest.save(tmp_path / "manifest.parquet")
+    folder = tmp_path / "root"
+    methods = {}
+    for name in ("x", "y"):
+        methods[name] = write_folder(tmp_path / name, len(methods), small_manifest.ids)
+    plan = preference.make(tmp_path / "manifest.parquet", methods, tmp_path / "s", raters=1)
+    assert {item.material for item in plan.items} == {"Wood", "Grass", "Brick"}
+    assert len({item.video for item in plan.items}) == 6
+    catch = next(trial for trial in plan.trials if trial.kind == "catch")
+    row = small_manifest.take([catch.item])
+    gel = load_square(folder / row.column("background")[0], 256)
+    assert plan.images[plan.name(catch.item, "gel")] == data_uri(gel, QUALITY - 1)
+
+
+def test_a_broken_image_is_named_and_nothing_is_left(folders, tmp_path):
+    ids = [f"v{v:02d}/f0" for v in range(3)]
+    broken = write_folder(tmp_path / "broken", 1, ids)
+    (broken / "v01" / "f0.png").write_bytes(b"")
+    with pytest.raises(PalpateError, match=r"f0\.png must be whole and readable"):
+        preference.make(folders.reference, [broken, folders.methods[0]], tmp_path / "s")
+    assert not (tmp_path / "s").exists()
+
+
+@pytest.mark.parametrize("suffix", ["tif", "webp"])
+def test_a_picture_too_large_for_its_format_is_to_be_saved_as_another(
+    tmp_path, suffix, monkeypatch
+):
+    from palpate.data import images
+
+    monkeypatch.setattr(images, "LARGEST", 10_000)
+    path = tmp_path / f"large.{suffix}"
+    Image.new("L", (200, 150), 200).convert("RGB").save(path)
+    with pytest.raises(PalpateError, match=r"200 x 150 pixels.*Save it as PNG or JPEG"):
+        load_square(path, 32)
+
+
+def test_one_video_is_no_study(folders, tmp_path):
+    labels = tmp_path / "labels.csv"
+    labels.write_text(re.sub(r"v\d\d$", "v00", folders.labels.read_text(), flags=re.MULTILINE))
+    with pytest.raises(PalpateError, match="two items"):
+        preference.make(folders.reference, folders.methods, labels=labels, dry_run=True)
+
+
+@pytest.mark.slow
+def test_a_picture_of_20000_by_15000_is_scaled(tmp_path):
+    ids = ["a", "b", "c"]
+    folders = [write_folder(tmp_path / name, k, ids) for k, name in enumerate(("real", "x", "y"))]
+    Image.new("L", (20_000, 15_000), 200).save(tmp_path / "x" / "a.png")
+    Image.new("L", (20_000, 15_000), 200).save(tmp_path / "y" / "a.jpg")
+    (tmp_path / "y" / "a.png").unlink()
+    plan = preference.make(folders[0], folders[1:], tmp_path / "study", raters=1)
+    assert plan.images[plan.name("a", "x")] == plan.images[plan.name("a", "y")]

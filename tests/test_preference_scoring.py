@@ -1,0 +1,432 @@
+"""Votes of simulated raters become scores; what is wrong with votes is said."""
+
+import json
+import sqlite3
+import subprocess
+import sys
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from palpate import preference
+from palpate.core import Note, PalpateError
+from palpate.preference.plan import Plan
+from palpate.preference.votes import read_votes
+from palpate.report.results import Results
+from preference_crowd import Crowd, signed, write_folders
+
+CROWD = Crowd({"ours": 2.0, "gvst": 0.5, "wbg": -1.0})
+
+
+@pytest.fixture(scope="module")
+def folders(tmp_path_factory):
+    return write_folders(tmp_path_factory.mktemp("folders"))
+
+
+@pytest.fixture(scope="module")
+def study(folders, tmp_path_factory):
+    top = tmp_path_factory.mktemp("study") / "study"
+    preference.make(
+        folders.reference, folders.methods, top, items=24, raters=12, labels=folders.labels, size=32
+    )
+    return top
+
+
+@pytest.fixture(scope="module")
+def plan(study):
+    return Plan.load(study)
+
+
+@pytest.fixture(scope="module")
+def downloads(plan, tmp_path_factory):
+    return CROWD.write(plan, tmp_path_factory.mktemp("votes") / "votes")
+
+
+@pytest.fixture(scope="module")
+def results(study, downloads):
+    return preference.score(study, downloads)
+
+
+def codes(results):
+    return {note.code: note.params for note in results.notes}
+
+
+def test_planted_preferences_lie_in_their_intervals(results):
+    for row in results.settings["preference"]["comparisons"]:
+        low, high = row["interval"]
+        assert low <= CROWD.preference(row["a"], row["b"]) <= high
+        assert row["votes_a"] + row["ties"] + row["votes_b"] == 24 * 12
+    strengths = [results["human strength", name].value for name in ("ours", "gvst", "wbg")]
+    assert strengths == sorted(strengths, reverse=True)
+    assert sum(strengths) == pytest.approx(0, abs=1e-6)
+
+
+def test_what_a_difference_says(results):
+    difference = results["human preference difference", "ours - wbg"]
+    row = next(r for r in results.settings["preference"]["comparisons"] if r["b"] == "wbg")
+    assert float(difference) == pytest.approx(2 * row["share"] - 1)
+    assert difference.details["better"] == "ours"
+    assert difference.details["decided"]
+    assert difference.details["p_adjusted"] < 0.05
+
+
+def test_results_are_tables_pages_and_files_as_others(results, tmp_path):
+    assert "human preference" in str(results)
+    latex = results.to_latex()
+    assert r"human preference $\uparrow$" in latex
+    assert "items and raters resampled" in latex
+    results.save(tmp_path / "people.json")
+    again = Results.load(tmp_path / "people.json")
+    assert again["human preference", "ours"] == results["human preference", "ours"]
+    results.to_html(tmp_path / "page.html")
+    assert "Raters agree in" in (tmp_path / "page.html").read_text()
+    assert {"human preference", "human strength"} < set(results.to_frame()["metric"])
+
+
+def test_sides_are_unswapped(plan, study, tmp_path):
+    """A rater who always takes the image of one method, wherever it is shown."""
+    fan = Crowd({"ours": 99.0, "gvst": 0.0, "wbg": -99.0}, item_sd=0, rater_sd=0)
+    results = preference.score(study, fan.write(plan, tmp_path / "votes", ["r01"]))
+    assert results["human preference", "ours"].value == 1
+    assert results["human preference", "wbg"].value == 0
+    agreement = results.settings["preference"]["agreement"]
+    assert agreement["self"] == 1
+    assert 0.4 < agreement["left"] < 0.6
+
+
+@pytest.mark.parametrize("count", [1, 2])
+def test_two_raters_stand_for_themselves(plan, study, downloads, count):
+    files = sorted(downloads.iterdir())[:count]
+    results = preference.score(study, files)
+    assert codes(results)["these-raters"] == {"count": count}
+    assert "for these raters alone" in results["human preference", "ours"].interval_method
+    assert f"For {'these 2 raters' if count == 2 else 'this 1 rater'} only" in str(results)
+
+
+def test_four_raters_are_few(study, downloads):
+    assert codes(preference.score(study, sorted(downloads.iterdir())[:4]))["few-raters"] == {
+        "count": 4
+    }
+
+
+def test_raters_are_excluded_by_rules_that_were_fixed_before(plan, study, tmp_path):
+    folder = CROWD.write(plan, tmp_path / "votes")
+    left = Crowd(CROWD.strengths, left_bias=99.0).download(plan, "r01")
+    careless = Crowd(CROWD.strengths, lapses=1.0).download(plan, "r02")
+    early = CROWD.download(plan, "r03")
+    early["votes"] = early["votes"][:20]
+    for download in (left, careless, early):
+        path = folder / f"votes-{plan.study}-{download['rater']}.json"
+        path.write_text(json.dumps(signed(download)))
+    results = preference.score(study, folder)
+    excluded = {n.params["rater"]: n.params["rule"] for n in results.notes if "rater" in n.params}
+    assert excluded == {"r01": "side", "r02": "catches", "r03": "finished"}
+    assert results.settings["preference"]["agreement"]["raters"] == 9
+    assert "Rater r02 is excluded by the rule catches, fixed before the votes" in str(results)
+
+
+def test_unanimous_votes_have_a_bound_and_say_so(plan, study, tmp_path):
+    """Resampling cannot vary what does not vary; 24 items are the sample."""
+    fan = Crowd({"ours": 99.0, "gvst": 0.0, "wbg": -99.0}, item_sd=0, rater_sd=0)
+    results = preference.score(study, fan.write(plan, tmp_path / "votes"))
+    best = results["human preference", "ours"]
+    assert best.interval == pytest.approx((0.025 ** (1 / 24), 1))
+    assert best.interval_method == "Clopper-Pearson, items as the sample, n = 24"
+    assert [note.code for note in best.notes] == ["votes-agree"]
+    difference = results["human preference difference", "ours - gvst"]
+    assert difference.interval == pytest.approx((2 * 0.025 ** (1 / 24) - 1, 1))
+    assert difference.details["decided"]
+    assert difference.details["p_value"] < 0.01
+    strength = results["human strength", "ours"]
+    assert [note.code for note in strength.notes] == ["strength-of-prior"]
+    assert "no resampled interval" in str(results)
+
+
+def test_raters_who_toss_coins_agree_by_chance(plan, study, tmp_path):
+    coin = Crowd(dict.fromkeys(plan.methods, 0.0), item_sd=0, rater_sd=0, tie_band=0)
+    results = preference.score(study, coin.write(plan, tmp_path / "votes"))
+    agreement = results.settings["preference"]["agreement"]
+    assert abs(agreement["alpha"]) < 0.05
+    assert abs(agreement["kappa"]) < 0.05
+
+
+def test_one_rater_agrees_with_nobody_known(study, downloads):
+    text = str(preference.score(study, sorted(downloads.iterdir())[:1]))
+    assert "whether raters agree is not known" in text
+    assert "agree in not known" not in text
+
+
+def test_left_bias_is_noticed(plan, study, tmp_path):
+    crowd = Crowd(CROWD.strengths, left_bias=1.5)
+    agreement = preference.score(study, crowd.write(plan, tmp_path / "votes")).settings[
+        "preference"
+    ]["agreement"]
+    assert agreement["left"] > 0.6
+    assert agreement["p_left"] < 0.001
+
+
+def test_metrics_that_agree_with_people_have_a_high_tau(plan, study, downloads, tmp_path):
+    rng = np.random.default_rng(0)
+    rows = ["id,method,good,lpips,I-TMMD,RMSE,noise"]
+    for item in plan.items:
+        for method in plan.methods:
+            felt = np.mean([CROWD.strength(r.code, item.id, method) for r in plan.raters])
+            rows.append(f"{item.id}.png,{method},{felt},{-felt},{-felt},{-felt},{rng.random()}")
+    table = tmp_path / "values.csv"
+    table.write_text("\n".join(rows) + "\n")
+    results = preference.score(study, downloads, metrics=table)
+    name = "Kendall's tau with people, by image"
+    good, lpips, noise = (results[name, metric] for metric in ("good", "lpips", "noise"))
+    assert good.value > 0.6
+    assert good.value == lpips.value  # of LPIPS lower is better
+    assert good.value == results[name, "I-TMMD"].value == results[name, "RMSE"].value
+    assert good.interval[0] > 0.5
+    assert noise.interval[0] < 0 < noise.interval[1]
+    assert results["Kendall's tau with people, by method", "good"].value == 1
+    assert results[name, "SSIM (shown images)"].n == 3 * 24
+
+
+def test_scores_of_methods_are_compared_too(study, downloads, results, tmp_path):
+    results.save(tmp_path / "scores.json")  # any file of scores of the same methods
+    again = preference.score(study, downloads, metrics=tmp_path / "scores.json")
+    assert again["Kendall's tau with people, by method", "human strength"].value == 1
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("id,method\na,b\n", "metrics of the study's methods"),
+        ("image,ssim\na,1\n", "columns id and method"),
+        ('{"format": 1}', "a table or a file of palpate score|columns id and method"),
+    ],
+)
+def test_what_is_no_table_of_metrics_is_said(study, downloads, tmp_path, text, words):
+    path = tmp_path / ("values.json" if text.startswith("{") else "values.csv")
+    path.write_text(text)
+    with pytest.raises(PalpateError, match=words):
+        preference.score(study, downloads, metrics=path)
+
+
+def test_votes_of_the_server_count_as_downloads_do(plan, study, downloads, results):
+    database = study / "study.db"
+    with sqlite3.connect(database) as disk:
+        disk.execute("CREATE TABLE study (name)")
+        disk.execute("CREATE TABLE votes (rater, trial, choice, ms, at, undone, received)")
+        disk.execute("INSERT INTO study VALUES (?)", (plan.study,))
+        for path in downloads.iterdir():
+            file = json.loads(path.read_text())
+            names = ("trial", "choice", "ms", "at", "undone")
+            rows = [[file["rater"], *(v[n] for n in names), ""] for v in file["votes"]]
+            disk.executemany("INSERT INTO votes VALUES (?, ?, ?, ?, ?, ?, ?)", rows)
+    disk.close()
+    try:
+        served = preference.score(study)
+        both = preference.score(study, downloads)
+    finally:
+        database.unlink()
+    assert served.scores == results.scores == both.scores
+    assert codes(both)["votes-twice"] == {"count": 12 * len(plan.trials)}
+
+
+def changed(plan, **changes):
+    return signed(CROWD.download(plan, "r01") | changes)
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (lambda f: f[: len(f) // 2], "must be JSON"),
+        (lambda f: f.replace('"left"', '"right"', 1), "digest .* must match"),
+        (lambda f: f.replace('"r01"', '"r02"'), "digest .* must match"),
+        (lambda f: "[]", "JSON object"),
+        (lambda f: "{}", "format"),
+    ],
+)
+def test_torn_and_edited_votes_are_said(plan, tmp_path, change, words):
+    path = tmp_path / "votes.json"
+    path.write_text(change(json.dumps(changed(plan))))
+    with pytest.raises(PalpateError, match=words) as error:
+        read_votes(plan, [path])
+    assert "download the votes again" in str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"study": "0123456789ab"}, "of study"),
+        ({"rater": "r99"}, "r01 to r12"),
+        ({"rater": "r02"}, "a trial of this rater"),
+        ({"votes": [{"trial": "x"}]}, "a trial of this rater"),
+        ({"votes": 3}, "a trial of this rater"),
+    ],
+)
+def test_votes_of_another_plan_are_said(plan, tmp_path, changes, words):
+    path = tmp_path / "votes.json"
+    path.write_text(json.dumps(changed(plan, **changes)))
+    with pytest.raises(PalpateError, match=words):
+        read_votes(plan, [path])
+
+
+@pytest.mark.parametrize(
+    ("field", "value"), [("choice", "both"), ("ms", -1), ("at", "soon"), ("undone", None)]
+)
+def test_a_vote_that_no_page_gives_is_said(plan, tmp_path, field, value):
+    download = changed(plan)
+    download["votes"][3][field] = value
+    path = tmp_path / "votes.json"
+    path.write_text(json.dumps(signed(download)))
+    with pytest.raises(PalpateError, match="a trial of this rater"):
+        read_votes(plan, [path])
+
+
+def test_the_same_votes_twice_count_once(plan, downloads):
+    first = sorted(downloads.iterdir())[0]
+    votes = read_votes(plan, [first, first])
+    assert len(votes) == len(plan.trials)
+    assert {n.code for n in votes.notes} == {"votes-twice"}
+
+
+def test_of_an_undone_vote_the_last_counts(plan, tmp_path):
+    download = changed(plan)
+    first = download["votes"][0]
+    other = "left" if first["choice"] != "left" else "right"
+    later = changed(plan, votes=[first | {"choice": other, "undone": 1}])
+    paths = [tmp_path / "a.json", tmp_path / "b.json"]
+    for path, content in zip(paths, (later, download), strict=True):
+        path.write_text(json.dumps(content))
+    votes = read_votes(plan, paths)
+    assert votes.of["r01"][plan.raters[0].order[0]].choice == other
+    assert not votes.notes
+
+
+def test_different_answers_under_one_code_are_said(plan, tmp_path):
+    other = Crowd(CROWD.strengths, seed=1).download(plan, "r01")
+    paths = [tmp_path / "a.json", tmp_path / "b.json"]
+    for path, content in zip(paths, (changed(plan), other), strict=True):
+        path.write_text(json.dumps(content))
+    notes = {note.code: note.params for note in read_votes(plan, paths).notes}
+    assert notes["votes-differ"]["count"] > 5
+
+
+def test_a_clock_that_runs_backwards_is_said(plan, tmp_path):
+    download = changed(plan)
+    download["votes"][5]["at"] = "2020-01-01T00:00:00Z"
+    path = tmp_path / "votes.json"
+    path.write_text(json.dumps(signed(download)))
+    assert [note.code for note in read_votes(plan, [path]).notes] == ["clock-backwards"]
+
+
+def test_votes_after_the_last_day_do_not_count(folders, tmp_path):
+    plan = preference.make(
+        folders.reference, folders.methods, items=4, raters=1, until="2026-10-01", dry_run=True
+    )
+    path = tmp_path / "votes.json"
+    path.write_text(json.dumps(CROWD.download(plan, "r01")))
+    with pytest.raises(PalpateError, match=f"{len(plan.trials)} after 2026-10-01"):
+        read_votes(plan, [path])
+    early = CROWD.download(plan, "r01")
+    early["votes"][0]["at"] = "2026-09-30T10:00:00Z"
+    path.write_text(json.dumps(signed(early)))
+    votes = read_votes(plan, [path])
+    assert len(votes) == 1
+    assert votes.notes == [Note("votes-late", {"count": len(plan.trials) - 1})]
+
+
+def test_what_the_server_took_counts_whatever_the_clock_of_the_rater(plan, tmp_path):
+    """Its own clock has refused what was late; a time of no day becomes that of the server."""
+    times = ["2099-01-01T00:00:00Z", "2026-02-30T10:00:00Z", "2026-13-45T99:99:99Z"]
+    rows = [
+        ("r01", name, "left", 900, at, 0, "2026-11-01T10:00:00+00:00")
+        for name, at in zip(plan.shown("r01"), times, strict=False)
+    ]
+    for day in ("2026-10-01", "9999-12-31"):
+        ended = replace(plan, until=day)
+        write_database(tmp_path / f"{day}.db", ended, rows)
+        votes = read_votes(ended, [tmp_path / f"{day}.db"])
+        years = sorted(vote.at.year for vote in votes.of["r01"].values())
+        assert years == [2026, 2026, 2099]
+
+
+@pytest.mark.parametrize("until", ["20301231", "2030-12-31"])
+def test_the_last_day_is_kept_in_one_form(folders, until):
+    plan = preference.make(
+        folders.reference, folders.methods, items=4, raters=1, until=until, dry_run=True
+    )
+    assert plan.until == plan.public()["until"] == "2030-12-31"
+
+
+def write_database(path, plan, rows):
+    """The server's file with these rows of votes."""
+    with sqlite3.connect(path) as disk:
+        disk.execute("CREATE TABLE study (name TEXT)")
+        disk.execute("INSERT INTO study VALUES (?)", (plan.study,))
+        disk.execute("CREATE TABLE votes (rater, trial, choice, ms, at, undone, received)")
+        disk.executemany("INSERT INTO votes VALUES (?, ?, ?, ?, ?, ?, ?)", rows)
+
+
+def test_no_vote_is_nothing_to_score(study):
+    with pytest.raises(PalpateError, match="votes to score"):
+        preference.score(study)
+
+
+def test_a_plan_that_was_edited_is_another_study(plan, study, downloads, tmp_path):
+    text = (study / "plan.json").read_text()
+    (tmp_path / "plan.json").write_text(text.replace('"catches": 0.8', '"catches": 0.1'))
+    with pytest.raises(PalpateError, match="of study"):
+        preference.score(tmp_path, downloads)
+
+
+def test_sorting_is_accuracy_by_material_against_chance(folders, tmp_path):
+    study = tmp_path / "study"
+    plan = preference.make(
+        folders.reference,
+        folders.methods[:1],
+        study,
+        items=15,
+        raters=6,
+        task="sort",
+        labels=folders.labels,
+        size=32,
+    )
+    crowd = Crowd({}, skill=0.8)
+    results = preference.score(study, crowd.write(plan, tmp_path / "votes"))
+    accuracy = results["human accuracy of material", "ours"]
+    assert accuracy.interval[0] <= 0.8 <= accuracy.interval[1]
+    assert accuracy.details["chance"] == pytest.approx(1 / 3)
+    assert set(accuracy.details["by_material"]) == {"brick", "grass", "wood"}
+    assert results["human accuracy of material", "real images"].n == 15 * 6
+    results.to_html(tmp_path / "page.html")
+
+
+def test_a_material_that_was_not_shown_has_no_accuracy(tmp_path):
+    materials = tuple(f"m{k}" for k in range(6))
+    folders = write_folders(tmp_path, videos=12, frames=1, materials=materials)
+    options = {"task": "sort", "labels": folders.labels, "items": 4, "raters": 4, "size": 32}
+    plan = preference.make(folders.reference, folders.methods[:1], tmp_path / "s", **options)
+    crowd = Crowd({}, skill=0.9)
+    results = preference.score(tmp_path / "s", crowd.write(plan, tmp_path / "votes"))
+    details = results["human accuracy of material", "ours"].details
+    shown = {item.material for item in plan.items}
+    assert {m for m, share in details["by_material"].items() if share is not None} == shown
+    rows = dict(zip(details["classes"], details["matrix"], strict=True))
+    assert {m for m, row in rows.items() if row == [None] * 6} == {*materials} - shown
+    assert codes(results)["materials-unshown"] == {"count": 2, "of": 6}
+    name = next(item.material for item in plan.items)
+    one = results["human accuracy of material", f"ours, {name}"]
+    assert (one.n, one.interval) == (4, None)  # one item is no sample
+    assert [note.code for note in one.notes] == ["one-item"]
+    assert f"ours, {name} &" in results.to_latex()
+    assert f"ours, {name}" in str(results)
+    results.to_html(tmp_path / "page.html")
+
+
+def test_neither_torch_nor_the_server_is_loaded(study, downloads, folders, tmp_path):
+    code = f"""
+import sys
+from palpate import preference
+preference.make({str(folders.reference)!r}, {[str(m) for m in folders.methods]!r}, dry_run=True)
+preference.score({str(study)!r}, {str(downloads)!r}, replicates=100)
+assert not {{"torch", "starlette", "uvicorn", "diffusers"}} & set(sys.modules)
+"""
+    subprocess.run([sys.executable, "-c", code], check=True)

@@ -1,0 +1,265 @@
+"""The server of a study: who gets what, what is refused, and that no vote is lost or doubled."""
+
+import json
+import resource
+import socket
+import sqlite3
+import sys
+from pathlib import Path
+
+import pytest
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "benchmarks"))
+from palpate.core import PalpateError
+from preference_fixtures import METHODS, pair_study
+from preference_serving import Serving
+
+pytest.importorskip("uvicorn", reason="uvicorn is not installed")
+
+from preference_load import measure
+
+from palpate.preference.server import VoteStore, serve
+
+
+@pytest.fixture(scope="module")
+def study():
+    return pair_study(40, 12)[0]
+
+
+@pytest.fixture(scope="module")
+def server(study, tmp_path_factory):
+    with Serving(tmp_path_factory.mktemp("served"), study, invite=10) as running:
+        yield running
+
+
+def stored(server, rater):
+    votes = server.json("GET", "/votes", rater)[1]["votes"]
+    return {vote["trial"]: (vote["choice"], vote["undone"]) for vote in votes}
+
+
+def test_an_invitation_opens_the_page_and_what_its_rater_sees(server, study):
+    status, headers, page = server.request("GET", f"/?token={server.tokens['r01']}")
+    assert status == 200
+    assert "frame-ancestors 'none'" in headers["content-security-policy"]
+    assert "default-src 'none'" in headers["content-security-policy"]
+    assert headers["referrer-policy"] == "no-referrer"
+    assert headers["cache-control"] == "no-store"
+    assert "server" not in headers
+    assert study["raters"]["r01"][0]["trial"] not in page.decode()
+
+    status, own = server.json("GET", "/study.json", "r01")
+    assert own["raters"] == {"r01": study["raters"]["r01"]}
+    assert own["images"] == study["images"]
+
+
+def test_no_method_is_named_in_any_answer(server):
+    answers = [server.request("GET", f"/?token={server.tokens['r02']}")]
+    answers += [server.request("GET", path, "r02") for path in ("/study.json", "/votes", "/plan")]
+    answers.append(server.request("POST", "/vote", "r02", server.vote("r02")))
+    assert not any(name in repr(answer) for name in METHODS for answer in answers)
+
+
+@pytest.mark.parametrize("token", [None, "", "guessed", "é", "a" * 3000])
+def test_a_token_that_is_absent_or_guessed_opens_nothing(server, token):
+    header = {} if token is None else {"Authorization": f"Bearer {token}".encode()}
+    assert server.request("GET", "/")[0] == 403
+    assert server.request("GET", "/?token=guessed%00")[0] == 403
+    for method, path in (("GET", "/study.json"), ("GET", "/votes"), ("POST", "/vote")):
+        assert server.request(method, path, headers=header)[0] == 403
+
+
+def test_an_invitation_used_twice_is_the_same_rater(server):
+    assert server.send("r03", 0, "left") == (200, {"stored": True})
+    assert server.send("r03", 0, "left") == (200, {"stored": "already"})
+    assert server.send("r03", 0, "right") == (200, {"stored": "already"})
+    assert server.send("r03", 1, "same") == (200, {"stored": True})
+    first, second = (row["trial"] for row in server.public["raters"]["r03"][:2])
+    assert stored(server, "r03") == {first: ("left", 0), second: ("same", 0)}
+
+
+def test_only_a_vote_after_an_undo_replaces_one(server):
+    assert server.send("r04", 0, "left", undone=1) == (200, {"stored": True})
+    assert server.send("r04", 0, "same", undone=0) == (200, {"stored": "already"})
+    assert server.send("r04", 0, "right", undone=2) == (200, {"stored": True})
+    assert list(stored(server, "r04").values()) == [("right", 2)]
+
+
+HOSTILE = {
+    "no JSON": b"left",
+    "no text": b"\xff\xfe",
+    "nested": b"[" * 4000,
+    "a long number": b"1" * 4090,
+    "a list": [1, 2],
+    "nothing": b"",
+    "a field too many": {"admin": True},
+    "another study": {"study": "0" * 12},
+    "an unknown trial": {"trial": "../../plan.json"},
+    "another rater's trial": {"trial": "' OR 1=1 --"},
+    "an unknown choice": {"choice": "<script>alert(1)</script>"},
+    "half a character": {"choice": "\ud800"},
+    "a list as choice": {"choice": ["left"]},
+    "a bool as time": {"ms": True},
+    "a negative time": {"ms": -1},
+    "a huge time": {"ms": 10**30},
+    "a fraction": {"ms": 1.5},
+    "no number": {"ms": float("nan")},
+    "no date": {"at": "yesterday"},
+    "month 13": {"at": "2026-13-45T99:99:99Z"},
+    "the 30th of February": {"at": "2026-02-30T10:00:00Z"},
+    "year 0": {"at": "0000-01-01T00:00:00Z"},
+    "hour 24": {"at": "2026-01-31T24:00:00Z"},
+    "Arabic digits": {"at": "\u0662\u0660\u0662\u0666-01-31T10:00:00Z"},
+    "undone a thousand times": {"undone": 1000},
+}
+
+
+@pytest.mark.parametrize("body", HOSTILE.values(), ids=HOSTILE)
+def test_a_hostile_body_is_answered_with_400(server, body):
+    if isinstance(body, dict):
+        body = server.vote("r05") | body
+    status, answer = server.json("POST", "/vote", "r05", body)
+    assert status == 400
+    assert list(answer) == ["error"]
+    assert stored(server, "r05") == {}
+
+
+def test_a_long_body_is_answered_with_413(server):
+    long = json.dumps(server.vote("r06")) + " " * 4096
+    assert server.request("POST", "/vote", "r06", long)[0] == 413
+    parts = (b" " * 1000 for _ in range(10))  # sent in chunks, without a length
+    assert server.request("POST", "/vote", "r06", parts)[0] == 413
+
+
+def test_the_vote_of_another_rater_is_forbidden(server):
+    body = server.vote("r08")
+    assert server.json("POST", "/vote", "r07", body)[0] == 403
+
+
+PATHS = ["/plan.json", "/study.db", "/../plan.json", "/%2e%2e/plan.json", "//etc/passwd", "/votes/"]
+PATHS += ["/..%2fplan.json", "/static/../../etc/passwd", "/%00", "/study.json%00.txt", "/vote/../x"]
+PATHS += ["/\\..\\plan.json", "/.git/config", "/docs", "/openapi.json"]
+
+
+def test_there_is_nothing_but_the_routes(server):
+    assert {server.request("GET", path, "r07")[0] for path in PATHS} == {404}
+    assert {server.request(method, "/vote", "r07")[0] for method in ("GET", "PUT", "DELETE")} == {
+        405
+    }
+
+
+def test_tokens_are_stored_hashed(server):
+    files = [p.read_bytes() for p in server.folder.glob("study.db*")]
+    assert not any(token.encode() in file for token in server.tokens.values() for file in files)
+
+
+def test_too_many_requests_of_one_rater_are_answered_with_429(server):
+    statuses = [server.request("GET", "/votes", "r09") for _ in range(130)]
+    status, headers, _ = statuses[-1]
+    assert (statuses[0][0], status, headers["retry-after"]) == (200, 429, "5")
+    assert server.request("GET", "/votes", "r10")[0] == 200
+
+
+def test_a_full_disk_loses_no_acknowledged_vote(study, tmp_path):
+    """The limit on file sizes of the server's process is a full disk that can be emptied."""
+    with Serving(tmp_path, study) as server:
+        pid, unlimited = server.process.pid, resource.prlimit(0, resource.RLIMIT_FSIZE)
+        assert server.send("r01", 0)[0] == 200
+        resource.prlimit(pid, resource.RLIMIT_FSIZE, (1, unlimited[1]))
+        status, headers, _ = server.request("POST", "/vote", "r01", server.vote("r01", 1))
+        assert (status, headers["retry-after"]) == (507, "5")
+        assert len(stored(server, "r01")) == 1
+        resource.prlimit(pid, resource.RLIMIT_FSIZE, unlimited)
+        assert server.send("r01", 1) == (200, {"stored": True})
+        assert len(stored(server, "r01")) == 2
+
+
+def test_a_full_file_system_rolls_back_the_whole_batch(tmp_path):
+    store = VoteStore(tmp_path / "study.db", "abc")
+    pages = store._disk.execute("PRAGMA page_count").fetchone()[0]
+    store._disk.execute(f"PRAGMA max_page_count = {pages}")
+    votes = [
+        {"rater": "r01", "trial": f"{k:020}", "choice": "left", "ms": 1, "at": "", "undone": 0}
+        | {"received": ""}
+        for k in range(200)
+    ]
+    with pytest.raises(sqlite3.OperationalError, match="full"):
+        store.store(votes)
+    assert store.votes("r01") == []
+    assert store.store(votes[:3]) == [True] * 3
+    assert store.store(votes[1:4]) == [False, False, True]
+    store.close()
+
+
+def test_no_vote_counts_after_the_last_day(study, tmp_path):
+    with Serving(tmp_path, study, until="2020-01-01") as server:
+        assert server.json("GET", "/study.json", "r01")[1]["until"] == "2020-01-01"
+        assert server.send("r01")[0] == 410
+        assert stored(server, "r01") == {}
+
+
+@pytest.mark.parametrize(("until", "status"), [("20200101", 410), ("99991231", 200)])
+def test_a_date_of_another_form_is_the_same_day(study, tmp_path, until, status):
+    with Serving(tmp_path, study | {"until": until}, invite=1) as server:
+        own = server.json("GET", "/study.json", "r01")[1]
+        assert own["until"] == f"{until[:4]}-{until[4:6]}-{until[6:]}"
+        assert own["ended"] is (status == 410)
+        assert server.send("r01")[0] == status
+
+
+def test_a_lost_link_is_replaced_and_its_votes_stay(study, tmp_path):
+    with Serving(tmp_path, study, invite=3) as server:
+        assert server.send("r03", 0, "left") == (200, {"stored": True})
+        lost, others = server.tokens["r03"], {r: server.tokens[r] for r in ("r01", "r02")}
+        server.kill()
+        server.start(port=0, invite=1, reinvite=["r03"])
+        assert server.request("GET", f"/?token={lost}")[0] == 403
+        assert list(stored(server, "r03").values()) == [("left", 0)]
+        assert {r: server.tokens[r] for r in others} == others
+        assert all(server.request("GET", "/votes", r)[0] == 200 for r in ("r01", "r02", "r04"))
+
+
+def test_a_killed_server_goes_on_with_its_votes_and_invitations(study, tmp_path):
+    with Serving(tmp_path, study, invite=2) as server:
+        server.send("r01", 0)
+        port = server.port
+        server.kill()
+        server.start(port=port, invite=1)
+        assert sorted(server.tokens) == ["r01", "r02", "r03"]
+        assert server.send("r01", 0) == (200, {"stored": "already"})
+        assert server.send("r03", 0) == (200, {"stored": True})
+
+
+def test_no_vote_is_lost_or_double_when_the_server_is_killed(tmp_path):
+    row = measure(tmp_path, raters=10, votes=10, kills=2)
+    assert (row["acknowledged"], row["stored"], row["lost"], row["double"]) == (100, 100, 0, 0)
+    assert row["again"] > 0
+
+
+def test_who_cannot_be_invited_is_said(tmp_path):
+    store = VoteStore(tmp_path / "study.db", "abc")
+    with pytest.raises(PalpateError, match=r"must be 0 or more\. Got -3"):
+        store.invite(["r01", "r02", "r03", "r04"], -3)
+    with pytest.raises(PalpateError, match=r"r01 to r02\. Got 'r99'"):
+        store.invite(["r01", "r02"], 1, ["r99"])
+    assert store.raters() == {}
+    store.close()
+
+
+def test_what_cannot_be_served_is_an_error(study, tmp_path):
+    VoteStore(tmp_path / "other.db", "another study").close()
+    (tmp_path / "text.db").write_text("no database" * 100)
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = taken.getsockname()[1]
+        cases = {
+            "must be of study": {"database": tmp_path / "other.db"},
+            "must be a file of votes": {"database": tmp_path / "text.db"},
+            "must be at most 12": {"invite": 13},
+            "must be a date. Got 'soon'": {"until": "soon", "port": port},
+            "must be a date. Got '2026-11-5'": {"until": "2026-11-5", "port": port},
+            "free address": {"port": port},
+            "needs a free": {"port": 99999},
+            "a free address. Got no-host.invalid": {"host": "no-host.invalid"},
+        }
+        for message, options in cases.items():
+            with pytest.raises(PalpateError, match=message):
+                serve(study, **{"database": tmp_path / "study.db"} | options)
