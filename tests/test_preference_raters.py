@@ -102,7 +102,7 @@ def invited(context, server, rater="r01"):
 
 
 def settled(person):
-    person.page.get_by_text("All votes are at the server.").wait_for()
+    person.page.get_by_text("All votes are at the server.", exact=True).wait_for()
 
 
 def test_no_method_stands_in_page_urls_or_headers(chromium, study, tmp_path):
