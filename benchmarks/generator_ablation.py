@@ -393,8 +393,10 @@ def main():
             counts = {"train": len(study.train), "test": len(study.test)}
             counts["videos"] = len(set(study.videos))
             record = {**counts, "ceilings": study.ceilings(), "rows": []}
-        record["rows"].append({**key, **study.row(name, seed, chosen.steps)})
-        records[str(materials)] = record
+        row = {**key, **study.row(name, seed, chosen.steps)}
+        records = json.loads(file.read_text()) if file.is_file() else {}  # others may have written
+        record = records.setdefault(str(materials), record)
+        record["rows"].append(row)
         write_json(file, records)
         chosen.page.write_text(page(records))
         print(tables(record).splitlines()[-1], flush=True)
