@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from functools import cache
 from types import UnionType
-from typing import Any, TypeVar, Union, get_args, get_origin, get_type_hints
+from typing import Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
 
 T = TypeVar("T")
 #: JSON has numbers of any size; no count of ours is larger.
@@ -46,8 +47,11 @@ def _value(hint: Any, value: Any, name: str) -> Any:
     if origin in (Union, UnionType):
         if value is None and type(None) in inner:
             return None
-        (hint,) = (kind for kind in inner if kind is not type(None))
-        return _value(hint, value, name)
+        kinds = [kind for kind in inner if kind is not type(None)]
+        for kind in kinds[:-1]:  # of a text or a record, say
+            with suppress(ValueError):
+                return _value(kind, value, name)
+        return _value(kinds[-1], value, name)
     if dataclasses.is_dataclass(hint):
         try:
             kind: Any = hint
@@ -60,6 +64,8 @@ def _value(hint: Any, value: Any, name: str) -> Any:
         return [_value(inner[0], item, name) for item in value]
     if origin is Mapping and isinstance(value, Mapping):
         return {key: _value(inner[1], item, name) for key, item in value.items()}
+    if get_origin(hint) is Literal and value in inner:
+        return value
     if _is(hint, value):
         return value
     raise ValueError(f"{name} of type {type(value).__name__}")

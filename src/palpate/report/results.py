@@ -21,6 +21,7 @@ from palpate.core.notes import Note
 from palpate.core.records import from_plain
 from palpate.core.samples import SampleRef
 from palpate.core.score import Score
+from palpate.report.study import Claim, Curve, StudyTable
 
 if TYPE_CHECKING:
     import polars as pl
@@ -348,6 +349,7 @@ class Results:
         notes: what a reader must see first (synthetic data, fallbacks, skipped inputs).
         commands: command lines that reproduce the run or say what to do next.
         strips: what an encoder retrieved for some queries.
+        tables, curves, claims: of a study.
     """
 
     title: str
@@ -359,6 +361,9 @@ class Results:
     notes: Sequence[Note] = ()
     commands: Sequence[str] = ()
     strips: Sequence[Strip] = ()
+    tables: Sequence[StudyTable] = ()
+    curves: Sequence[Curve] = ()
+    claims: Sequence[Claim] = ()
 
     def __iter__(self) -> Iterator[Score]:
         return iter(self.scores)

@@ -1,16 +1,21 @@
 """Run folders: a pipeline as named stages, each kept under the digest of what it read.
 
-``run/NAME/stage.json`` marks a finished stage and holds its inputs, facts and time. A stage is
-built in ``run/NAME.partial``, with its inputs in ``run/NAME.partial.json``, and renamed when
-complete. Running again with the same inputs reuses it; with other inputs the stage, and so every
-stage that read it, is built again. A killed stage finds its partial folder again if the inputs are
-the same, and may resume from there.
+``run/NAME/stage.json`` marks a finished stage and holds its inputs, its facts, the digest of its
+files, time, peak memory, date and versions. A stage is built in ``run/NAME.partial``, with its
+inputs in ``run/NAME.partial.json``, and renamed when complete. Running again with the same inputs
+reuses it; with other inputs the stage, and so every stage that read it, is built again. A killed
+stage finds its partial folder again if the inputs are the same, and may resume from there. The
+digest holds an integer version of each stage, raised by hand where the stage comes to write other
+bytes, and not the version of palpate: a release does not build everything again.
 """
 
 from __future__ import annotations
 
+import datetime
 import json
+import platform
 import shutil
+import sys
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
@@ -18,12 +23,11 @@ from pathlib import Path
 from typing import Any
 
 from palpate import __version__
-from palpate.core.digest import canonical_json, digest_json
+from palpate.core.digest import canonical_json, digest_folder, digest_json
 from palpate.core.errors import PalpateError
 from palpate.core.files import read_json, write_json
 
-#: In every stage's digest, with the version of palpate: other code may write other bytes.
-FORMAT = "palpate-stage/1"
+FORMAT = "palpate-stage/2"
 
 
 @dataclass(frozen=True)
@@ -34,6 +38,7 @@ class Stage:
         folder: its files.
         digest: SHA-256 of its name and inputs; it is one of the inputs of later stages.
         facts: what the builder returned.
+        outputs: SHA-256 of its files.
         seconds: how long the last call of the builder took.
         reused: True if it existed already.
     """
@@ -41,6 +46,7 @@ class Stage:
     folder: Path
     digest: str
     facts: Mapping[str, Any]
+    outputs: str
     seconds: float
     reused: bool
 
@@ -64,6 +70,8 @@ class Run:
         name: str,
         inputs: Mapping[str, Any],
         build: Callable[[Path], Mapping[str, Any] | None],
+        *,
+        version: int = 1,
     ) -> Stage:
         """Return the stage; build it unless it exists for the same inputs.
 
@@ -71,19 +79,20 @@ class Run:
             name: folder name, unique in the run.
             inputs: everything that the stage reads: options, digests of files and earlier stages.
             build: fills the folder it is given and returns facts (JSON) for ``stage.json``.
+            version: of what the stage does; raised by hand when it comes to write other bytes.
 
         Raises:
             PalpateError: if the run folder cannot be used.
         """
-        digest = digest_json([FORMAT, __version__, name, inputs])
+        digest = digest_json([FORMAT, version, name, inputs])
         final = self.folder / name
         record = _record(final / "stage.json")
         if record.get("digest") == digest:
             self.print_line(f"{name}: already done ({record['seconds']:.0f} s then)")
-            stage = Stage(final, digest, record["facts"], record["seconds"], reused=True)
+            stage = _of_record(final, record, reused=True)
         else:
             self.print_line(f"{name}: ...")
-            stage = _build(final, digest, inputs, build)
+            stage = _build(final, digest, {"version": version, "inputs": inputs}, build)
             self.print_line(f"{name}: done in {stage.seconds:.0f} s")
         self.stages[name] = stage
         return stage
@@ -92,7 +101,7 @@ class Run:
 def _build(
     final: Path,
     digest: str,
-    inputs: Mapping[str, Any],
+    read: Mapping[str, Any],
     build: Callable[[Path], Mapping[str, Any] | None],
 ) -> Stage:
     partial = final.with_name(f"{final.name}.partial")
@@ -104,7 +113,7 @@ def _build(
     except OSError as error:
         must = f"The run folder {final.parent} must be writable"
         raise PalpateError(must, str(error), "Choose another folder") from None
-    record = {"digest": digest, "inputs": json.loads(canonical_json(inputs))}
+    record = {"digest": digest, **json.loads(canonical_json(read))}
     write_json(partial_record, record)
     start = time.monotonic()
     try:
@@ -114,12 +123,31 @@ def _build(
             partial.rmdir()
             partial_record.unlink()
         raise
-    seconds = round(time.monotonic() - start, 2)
-    write_json(partial / "stage.json", {**record, "facts": facts, "seconds": seconds})
+    record |= {"facts": facts, "outputs": digest_folder(partial)}
+    record["seconds"] = round(time.monotonic() - start, 2)
+    record["peak_mb"] = _peak_mb()
+    record["date"] = datetime.datetime.now(datetime.UTC).date().isoformat()
+    record["versions"] = {"palpate": __version__, "python": platform.python_version()}
+    write_json(partial / "stage.json", record)
     shutil.rmtree(final, ignore_errors=True)
     partial.replace(final)
     partial_record.unlink()
-    return Stage(final, digest, facts, seconds, reused=False)
+    return _of_record(final, record, reused=False)
+
+
+def _of_record(folder: Path, record: Mapping[str, Any], *, reused: bool) -> Stage:
+    digest, facts, outputs = record["digest"], record["facts"], record["outputs"]
+    return Stage(folder, digest, facts, outputs, record["seconds"], reused)
+
+
+def _peak_mb() -> int | None:
+    """Peak memory of this process so far; None where the system does not say."""
+    try:
+        import resource
+    except ImportError:  # Windows
+        return None
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return round(peak / (1 << 20 if sys.platform == "darwin" else 1 << 10))
 
 
 def _record(path: Path) -> dict[str, Any]:
