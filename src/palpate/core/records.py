@@ -45,13 +45,7 @@ def _value(hint: Any, value: Any, name: str) -> Any:
     if hint is Any:
         return value
     if origin in (Union, UnionType):
-        if value is None and type(None) in inner:
-            return None
-        kinds = [kind for kind in inner if kind is not type(None)]
-        for kind in kinds[:-1]:  # of a text or a record, say
-            with suppress(ValueError):
-                return _value(kind, value, name)
-        return _value(kinds[-1], value, name)
+        return _value_of_any(inner, value, name)
     if dataclasses.is_dataclass(hint):
         try:
             kind: Any = hint
@@ -64,11 +58,20 @@ def _value(hint: Any, value: Any, name: str) -> Any:
         return [_value(inner[0], item, name) for item in value]
     if origin is Mapping and isinstance(value, Mapping):
         return {key: _value(inner[1], item, name) for key, item in value.items()}
-    if get_origin(hint) is Literal and value in inner:
-        return value
     if _is(hint, value):
         return value
     raise ValueError(f"{name} of type {type(value).__name__}")
+
+
+def _value_of_any(kinds: Sequence[Any], value: Any, name: str) -> Any:
+    """``value`` as the first of some types that fits, such as a text or a record."""
+    if value is None and type(None) in kinds:
+        return None
+    *others, last = (kind for kind in kinds if kind is not type(None))
+    for kind in others:
+        with suppress(ValueError):
+            return _value(kind, value, name)
+    return _value(last, value, name)
 
 
 def _is(hint: Any, value: Any) -> bool:
@@ -76,4 +79,6 @@ def _is(hint: Any, value: Any) -> bool:
     if hint in (int, float):
         kinds = int if hint is int else int | float
         return isinstance(value, kinds) and not isinstance(value, bool) and abs(value) < LARGEST
+    if get_origin(hint) is Literal:
+        return value in get_args(hint)
     return hint in (str, bool) and isinstance(value, hint)

@@ -1,0 +1,86 @@
+"""What a study adds to results: tables of scores and words, curves, and claims with verdicts.
+
+Every number in them is a :class:`~palpate.core.Score`; ``details["stage"]`` names the stage of the
+run folder that it was made in, which ``palpate verify`` follows.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+from palpate.core import Score
+
+Verdict = Literal["holds", "does not hold", "undecided"]
+
+
+@dataclass(frozen=True)
+class StudyTable:
+    """A table of a study, e.g. one of the paper's.
+
+    Attributes:
+        title: its heading.
+        text: what it shows and how to read it, in one or two sentences.
+        columns: labels, the first of the row labels.
+        rows: cells of each row, as many as ``columns``: words, scores, or None (nothing there).
+        best: mark the best score of each column, by its direction, among the rows that are no
+            controls.
+        controls: labels (first cells) of the rows that are controls.
+        folded: whether a page shows it closed.
+    """
+
+    title: str
+    text: str
+    columns: Sequence[str]
+    rows: Sequence[Sequence[Score | str | None]]
+    best: bool = False
+    controls: Sequence[str] = ()
+    folded: bool = True
+
+
+@dataclass(frozen=True)
+class Line:
+    """One line of a curve: its label, and (x, score) points in order of x."""
+
+    label: str
+    points: Sequence[tuple[float, Score]]
+
+
+@dataclass(frozen=True)
+class Curve:
+    """Scores over a number, such as accuracy over real videos a class.
+
+    Attributes:
+        title: its heading.
+        text: what it shows and how to read it.
+        x, y: labels of the axes, with units.
+        lines: what is drawn, in order of the legend; intervals as bands.
+        log_x: whether x is drawn on a logarithmic axis.
+    """
+
+    title: str
+    text: str
+    x: str
+    y: str
+    lines: Sequence[Line]
+    log_x: bool = False
+
+
+@dataclass(frozen=True)
+class Claim:
+    """A claim of the paper, or of ours, with our evidence.
+
+    Attributes:
+        claim: what is claimed, in one sentence.
+        source: where, e.g. ``"paper, table 1"``.
+        verdict: what the evidence says.
+        why: one sentence: the numbers that decide, or what is missing.
+        evidence: the scores (or paired differences) that the verdict follows from.
+    """
+
+    claim: str
+    source: str
+    verdict: Verdict
+    why: str
+    evidence: Sequence[Score] = ()
