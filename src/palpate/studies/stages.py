@@ -84,18 +84,28 @@ class Run:
         Raises:
             PalpateError: if the run folder cannot be used.
         """
-        digest = digest_json([FORMAT, version, name, inputs])
-        final = self.folder / name
-        record = _record(final / "stage.json")
-        if record.get("digest") == digest:
-            self.print_line(f"{name}: already done ({record['seconds']:.0f} s then)")
-            stage = _of_record(final, record, reused=True)
+        digest = stage_digest(name, inputs, version)
+        stage = finished_stage(self.folder / name, digest)
+        if stage is not None:
+            self.print_line(f"{name}: already done ({stage.seconds:.0f} s then)")
         else:
             self.print_line(f"{name}: ...")
-            stage = _build(final, digest, {"version": version, "inputs": inputs}, build)
+            read = {"version": version, "inputs": inputs}
+            stage = _build(self.folder / name, digest, read, build)
             self.print_line(f"{name}: done in {stage.seconds:.0f} s")
         self.stages[name] = stage
         return stage
+
+
+def stage_digest(name: str, inputs: Mapping[str, Any], version: int = 1) -> str:
+    """Return the SHA-256 that names what a stage reads."""
+    return digest_json([FORMAT, version, name, inputs])
+
+
+def finished_stage(folder: Path, digest: str) -> Stage | None:
+    """Return the stage in ``folder`` if it is finished and read what ``digest`` names."""
+    record = _record(folder / "stage.json")
+    return _of_record(folder, record, reused=True) if record.get("digest") == digest else None
 
 
 def _build(
@@ -115,6 +125,7 @@ def _build(
         raise PalpateError(must, str(error), "Choose another folder") from None
     record = {"digest": digest, **json.loads(canonical_json(read))}
     write_json(partial_record, record)
+    per_stage = _reset_peak()
     start = time.monotonic()
     try:
         facts = dict(build(partial) or {})
@@ -125,7 +136,7 @@ def _build(
         raise
     record |= {"facts": facts, "outputs": digest_folder(partial)}
     record["seconds"] = round(time.monotonic() - start, 2)
-    record["peak_mb"] = _peak_mb()
+    record["peak_mb"] = _peak_mb(per_stage)
     record["date"] = datetime.datetime.now(datetime.UTC).date().isoformat()
     record["versions"] = {"palpate": __version__, "python": platform.python_version()}
     write_json(partial / "stage.json", record)
@@ -140,8 +151,22 @@ def _of_record(folder: Path, record: Mapping[str, Any], *, reused: bool) -> Stag
     return Stage(folder, digest, facts, outputs, record["seconds"], reused)
 
 
-def _peak_mb() -> int | None:
-    """Peak memory of this process so far; None where the system does not say."""
+def _reset_peak() -> bool:
+    """Let the peak memory of this process begin anew; only Linux can."""
+    try:
+        Path("/proc/self/clear_refs").write_text("5")
+    except OSError:
+        return False
+    return True
+
+
+def _peak_mb(since_reset: bool) -> int | None:
+    """Peak memory of this process in MiB, without its children: since :func:`_reset_peak`, else
+    since it began; None where the system does not say (Windows).
+    """
+    if since_reset:
+        status = Path("/proc/self/status").read_text()
+        return round(int(status.partition("VmHWM:")[2].split()[0]) / 1024)  # kB
     try:
         import resource
     except ImportError:  # Windows

@@ -1,0 +1,350 @@
+"""A graph of stages: each node a stage of a run folder that reads earlier ones.
+
+A node is built by a function of its folder and of the folders of the nodes it comes after. Its
+digest holds those of the nodes before it (:mod:`palpate.studies.stages`), so that a changed option
+builds again what depends on it and nothing else. Nodes that do not depend on each other may be
+built by several processes; the result does not depend on how many.
+"""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import pickle
+import signal
+import time
+import traceback
+from collections.abc import Callable, Generator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from functools import partial
+from multiprocessing.connection import Connection, wait
+from multiprocessing.process import BaseProcess
+from pathlib import Path
+from typing import Any
+
+from palpate.core import PalpateError, Progress, few, locked, quiet, require
+from palpate.core.processes import exit_with_parent
+from palpate.studies.stages import Run, Stage, finished_stage, stage_digest
+
+Build = Callable[[Path, Mapping[str, Path], Progress], Mapping[str, Any] | None]
+PrintLine = Callable[[str], None]
+
+
+@dataclass(frozen=True)
+class Node:
+    """A stage of a study.
+
+    Attributes:
+        name: folder of the stage in the run folder.
+        build: fills its folder, and returns facts (JSON) for ``stage.json``; called with the
+            folder, the folders of ``after`` by name, and a progress. For several processes a
+            function of a module, or a ``functools.partial`` of one.
+        inputs: what it reads besides earlier stages: options, digests, seeds.
+        after: names of earlier nodes; their digests enter its own.
+        version: raised by hand when the stage comes to write other bytes.
+        cost: expected seconds on two cores; 0: unknown.
+    """
+
+    name: str
+    build: Build
+    inputs: Mapping[str, Any]
+    after: Sequence[str] = ()
+    version: int = 1
+    cost: float = 0.0
+
+
+@dataclass(frozen=True)
+class Planned:
+    """What running would do with a node.
+
+    Attributes:
+        name: of the node.
+        done: whether its stage exists for the same inputs.
+        cost: seconds: what it took, or else is expected to take (0: unknown).
+    """
+
+    name: str
+    done: bool
+    cost: float
+
+
+def plan_graph(nodes: Sequence[Node], folder: Path) -> list[Planned]:
+    """Return what :func:`run_graph` would do, in its order; nothing is written.
+
+    Raises:
+        PalpateError: as :func:`run_graph` does for the nodes.
+    """
+    ordered = in_order(nodes)
+    done = _finished(ordered, Path(folder))
+    return [
+        Planned(n.name, n.name in done, done[n.name].seconds if n.name in done else n.cost)
+        for n in ordered
+    ]
+
+
+def run_graph(
+    nodes: Sequence[Node],
+    folder: Path,
+    *,
+    jobs: int = 1,
+    print_line: PrintLine = lambda line: None,
+    progress: Progress = quiet,
+) -> dict[str, Stage]:
+    """Build the nodes whose stages are not there yet, each after those that it reads.
+
+    Run again with the same folder to go on after a stop of any kind, with the same result. One run
+    at a time holds the folder.
+
+    Args:
+        nodes: of the graph; those that are ready are begun in this order.
+        folder: run folder.
+        jobs: processes that build nodes; 1: this one. Each computes with OMP_NUM_THREADS threads,
+            or where that is not set with its share of the cores, when sums may differ from those of
+            other ``jobs`` in the last bits.
+        print_line: called with one line for each stage begun, reused or done, and with the time
+            left: from the costs, scaled by what finished nodes took.
+        progress: called with what is done within a node, and over the whole.
+
+    Returns:
+        the stages by name, in the order of ``nodes``.
+
+    Raises:
+        PalpateError: for two nodes of one name, an unknown ``after``, a circle, a folder that
+            another run holds; or the first that a node raises: finished stages stay.
+    """
+    require(jobs >= 1, "jobs", "must be at least 1", jobs)
+    ordered, folder = in_order(nodes), Path(folder)
+    with locked(folder):
+        whole = _Whole(ordered, jobs, print_line, progress)
+        for name, stage in _finished(ordered, folder).items():
+            print_line(f"{name}: already done ({stage.seconds:.0f} s then)")
+            whole.stages[name] = stage
+        if jobs == 1:
+            _run_here(ordered, folder, whole)
+        else:
+            _run_in_workers(ordered, folder, whole)
+    return {node.name: whole.stages[node.name] for node in nodes}
+
+
+def in_order(nodes: Sequence[Node]) -> list[Node]:
+    """Return the nodes so that each comes after those it reads, otherwise in the order given.
+
+    Raises:
+        PalpateError: for two nodes of one name, a name that is no folder's, an unknown ``after``,
+            or a circle.
+    """
+    names = [node.name for node in nodes]
+    if twice := sorted({name for name in names if names.count(name) > 1}):
+        raise PalpateError("Each stage must have a name of its own", few(twice), "Rename one")
+    if bad := [name for name in names if Path(name).name != name or name.startswith(".")]:
+        raise PalpateError("The name of a stage must be that of a folder", few(bad), "Rename it")
+    for node in nodes:
+        if unknown := sorted(set(node.after) - set(names)):
+            must = f"Stage {node.name} must come after stages of the same graph"
+            raise PalpateError(must, few(unknown), "Add it, or correct the name")
+    ordered: dict[str, Node] = {}
+    while len(ordered) < len(nodes):
+        ready = (n for n in nodes if n.name not in ordered and ordered.keys() >= set(n.after))
+        if (node := next(ready, None)) is None:
+            circle = few(name for name in names if name not in ordered)
+            raise PalpateError("No stage may come after itself", circle, "Break the circle")
+        ordered[node.name] = node
+    return list(ordered.values())
+
+
+def _reads(ordered: Sequence[Node]) -> dict[str, dict[str, Any]]:
+    """What each stage reads, by name: its inputs and the digests of the nodes before it."""
+    digests: dict[str, str] = {}
+    reads: dict[str, dict[str, Any]] = {}
+    for node in ordered:
+        reads[node.name] = {**node.inputs, "after": {name: digests[name] for name in node.after}}
+        digests[node.name] = stage_digest(node.name, reads[node.name], node.version)
+    return reads
+
+
+def _finished(ordered: Sequence[Node], folder: Path) -> dict[str, Stage]:
+    """The stages that exist for the same inputs."""
+    reads = _reads(ordered)
+    stages = {
+        n.name: finished_stage(folder / n.name, stage_digest(n.name, reads[n.name], n.version))
+        for n in ordered
+    }
+    return {name: stage for name, stage in stages.items() if stage is not None}
+
+
+@dataclass
+class _Whole:
+    """All nodes of a run: what is done, what is running, and the time left."""
+
+    ordered: Sequence[Node]
+    jobs: int
+    print_line: PrintLine
+    progress: Progress
+    stages: dict[str, Stage] = field(default_factory=dict[str, Stage])
+    begun: dict[str, float] = field(default_factory=dict[str, float])  # name -> when
+
+    def ready(self) -> Node | None:
+        """The first node that may begin."""
+        waiting = (n for n in self.ordered if n.name not in {*self.stages, *self.begun})
+        return next((n for n in waiting if self.stages.keys() >= set(n.after)), None)
+
+    def begin(self, node: Node) -> None:
+        self.begun[node.name] = time.monotonic()
+        self.show()
+
+    def end(self, stage: Stage) -> None:
+        self.begun.pop(stage.folder.name)
+        self.stages[stage.folder.name] = stage
+        self.show()
+        if len(self.stages) < len(self.ordered):
+            self.print_line(f"{len(self.stages)} of {len(self.ordered)} stages{self.remark()}")
+
+    def show(self) -> None:
+        done, total = len(self.stages), len(self.ordered)
+        self.progress("all stages", done, total, self.remark().removeprefix(", "))
+
+    def remark(self) -> str:
+        left = self.seconds_left()
+        return "" if left is None else f", about {_words(left)} left"
+
+    def seconds_left(self) -> float | None:
+        """Expected seconds until the end; None where no cost is known.
+
+        At least the longest chain, and at least an equal share of the work for each process.
+        """
+        known = [n for n in self.ordered if n.cost > 0]
+        if not known:
+            return None
+        took = [(n.cost, self.stages[n.name].seconds) for n in known if n.name in self.stages]
+        cost, seconds = (sum(column) for column in zip(*took, strict=True)) if took else (1, 1)
+        now, left, chain = time.monotonic(), dict[str, float](), dict[str, float]()
+        for node in self.ordered:
+            expected = node.cost * seconds / cost - (now - self.begun.get(node.name, now))
+            left[node.name] = 0.0 if node.name in self.stages else max(expected, 0.0)
+            before = max((chain[name] for name in node.after), default=0.0)
+            chain[node.name] = before + left[node.name]
+        return max(sum(left.values()) / self.jobs, *chain.values())
+
+
+def _words(seconds: float) -> str:
+    """A duration as people say it: ``40 s``, ``12 min``, ``3.5 h``."""
+    if seconds < 90:
+        return f"{seconds:.0f} s"
+    return f"{seconds / 60:.0f} min" if seconds < 90 * 60 else f"{seconds / 3600:.1f} h"
+
+
+def _build_node(
+    node: Node, read: Mapping[str, Any], folder: Path, print_line: PrintLine, progress: Progress
+) -> Stage:
+    """Build a node in this process."""
+    before = {name: folder / name for name in node.after}
+
+    def report(what: str, done: int, total: int, remark: str = "") -> None:
+        progress(f"{node.name}: {what}", done, total, remark)
+
+    def build(place: Path) -> Mapping[str, Any] | None:
+        return node.build(place, before, report)
+
+    try:
+        return Run(folder, print_line).stage(node.name, read, build, version=node.version)
+    except Exception:
+        print_line(f"{node.name}: stopped by an error")
+        raise
+
+
+def _run_here(ordered: Sequence[Node], folder: Path, whole: _Whole) -> None:
+    reads = _reads(ordered)
+
+    def report(what: str, done: int, total: int, remark: str = "") -> None:
+        whole.show()
+        whole.progress(what, done, total, remark)
+
+    while (node := whole.ready()) is not None:
+        whole.begin(node)
+        whole.end(_build_node(node, reads[node.name], folder, whole.print_line, report))
+
+
+def _run_in_workers(ordered: Sequence[Node], folder: Path, whole: _Whole) -> None:
+    reads = _reads(ordered)
+    workers: dict[Connection, BaseProcess] = {}
+    idle: list[Connection] = []
+    with _ended_with(workers):
+        while len(whole.stages) < len(ordered):
+            while (idle or len(workers) < whole.jobs) and (node := whole.ready()) is not None:
+                worker = idle.pop() if idle else _start_worker(workers, whole.jobs)
+                worker.send_bytes(pickle.dumps((node, reads[node.name], folder)))
+                whole.begin(node)
+            for worker in wait([w for w in workers if w not in idle], timeout=1.0):
+                assert isinstance(worker, Connection)
+                try:
+                    kind, value = worker.recv()
+                except (EOFError, OSError):
+                    raise _died(workers[worker]) from None
+                if kind == "stage":
+                    idle.append(worker)
+                    whole.end(value)
+                elif kind == "error":
+                    raise value
+                elif kind == "line":
+                    whole.print_line(value)
+                else:
+                    whole.progress(*value)
+            whole.show()
+
+
+@contextmanager
+def _ended_with(workers: Mapping[Connection, BaseProcess]) -> Generator[None]:
+    """Kill the workers at the end: what they were building stays, to go on from."""
+    try:
+        yield
+    finally:
+        for process in workers.values():
+            process.kill()
+        for process in workers.values():
+            process.join()
+
+
+def _start_worker(workers: dict[Connection, BaseProcess], jobs: int) -> Connection:
+    """Start a process that builds nodes; spawned, as a fork of threads can deadlock."""
+    affinity = getattr(os, "sched_getaffinity", None)
+    cores = len(affinity(0)) if affinity else os.cpu_count() or 1
+    context = multiprocessing.get_context("spawn")
+    ours, theirs = context.Pipe()
+    process = context.Process(target=_work, args=(theirs, max(1, cores // jobs)))
+    process.start()
+    theirs.close()
+    workers[ours] = process
+    return ours
+
+
+def _died(process: BaseProcess) -> PalpateError:
+    process.join()
+    got = f"one ended with status {process.exitcode}"
+    fix = "Free some memory, or use one process; run it again to go on. A script must call this "
+    fix += "under: if __name__ == '__main__'"
+    return PalpateError("The processes of a study must stay alive", got, fix)
+
+
+def _work(connection: Connection, threads: int) -> None:
+    """Build the nodes that arrive, in a worker, until its parent ends."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent handles Ctrl-C
+    exit_with_parent()
+    os.environ.setdefault("OMP_NUM_THREADS", str(threads))
+    send = partial(_send, connection)
+
+    def report(what: str, done: int, total: int, remark: str = "") -> None:
+        send("progress", (what, done, total, remark))
+
+    while True:
+        task = connection.recv_bytes()
+        try:
+            node, read, folder = pickle.loads(task)
+            send("stage", _build_node(node, read, folder, partial(send, "line"), report))
+        except Exception as error:
+            error.add_note(traceback.format_exc())  # a traceback is not sent along
+            send("error", error)
+
+
+def _send(connection: Connection, kind: str, value: Any) -> None:
+    connection.send((kind, value))

@@ -1,0 +1,223 @@
+"""The graph of stages: order, reuse, several processes, errors, and kill -9."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from functools import partial
+from pathlib import Path
+
+import pytest
+
+from palpate.core import PalpateError, locked
+from palpate.studies.graph import Node, plan_graph, run_graph
+
+
+def write(text, folder, before, progress):
+    """Write the text below those of the nodes before."""
+    texts = [(place / "text").read_text() for place in before.values()]
+    (folder / "text").write_text("".join([*texts, text]))
+    progress("writing", 1, 1)
+    return {"text": text, "process": os.getpid()}
+
+
+def node(name, *after, text=None, **fields):
+    text = text or name
+    return Node(name, partial(write, text), {"text": text}, after, **fields)
+
+
+DIAMOND = [node("d", "b", "c"), node("a"), node("b", "a"), node("c", "a")]
+
+
+def texts(folder):
+    return {p.parent.name: p.read_text() for p in Path(folder).glob("*/text")}
+
+
+@pytest.mark.parametrize("jobs", [1, 2])
+def test_each_node_reads_what_the_nodes_before_it_wrote(tmp_path, jobs):
+    lines = []
+    stages = run_graph(DIAMOND, tmp_path, jobs=jobs, print_line=lines.append)
+    assert texts(tmp_path) == {"a": "a", "b": "ab", "c": "ac", "d": "abacd"}
+    assert list(stages) == ["d", "a", "b", "c"]
+    assert not any(s.reused for s in stages.values())
+    processes = {s.facts["process"] for s in stages.values()}
+    assert (os.getpid() in processes) == (jobs == 1)
+    again = run_graph(DIAMOND, tmp_path, jobs=jobs)
+    assert all(s.reused for s in again.values())
+    assert {n: s.outputs for n, s in again.items()} == {n: s.outputs for n, s in stages.items()}
+
+
+def test_one_process_and_two_write_the_same_stages(tmp_path):
+    one = run_graph(DIAMOND, tmp_path / "one")
+    two = run_graph(DIAMOND, tmp_path / "two", jobs=2)
+    assert {n: (s.digest, s.outputs) for n, s in one.items()} == {
+        n: (s.digest, s.outputs) for n, s in two.items()
+    }
+
+
+@pytest.mark.parametrize(
+    ("changed", "built"),
+    [
+        (node("b", "a", text="other"), {"b", "d"}),
+        (node("b", "a", version=2), {"b", "d"}),
+        (node("b", "a", "c"), {"b", "d"}),
+        (node("b", "a", cost=9.0), set()),
+    ],
+)
+def test_a_changed_node_builds_itself_and_what_reads_it(tmp_path, changed, built):
+    run_graph(DIAMOND, tmp_path)
+    nodes = [changed if n.name == "b" else n for n in DIAMOND]
+    planned = plan_graph(nodes, tmp_path)
+    assert {p.name for p in planned if not p.done} == built
+    assert {n for n, s in run_graph(nodes, tmp_path).items() if not s.reused} == built
+
+
+def test_a_plan_writes_nothing_and_gives_costs_in_order(tmp_path):
+    nodes = [node("b", "a", cost=7.0), node("a", cost=5.0)]
+    planned = [(p.name, p.done, p.cost) for p in plan_graph(nodes, tmp_path / "run")]
+    assert planned == [("a", False, 5.0), ("b", False, 7.0)]
+    assert not (tmp_path / "run").exists()
+
+
+@pytest.mark.parametrize(
+    ("nodes", "words"),
+    [
+        ([node("a"), node("b"), node("a")], "must have a name of its own. Got a"),
+        ([node("a", "c")], "Stage a must come after stages of the same graph. Got c"),
+        ([node("a"), node("b", "d"), node("c", "b"), node("d", "c")], "itself. Got b, c, d"),
+        ([node("a/b")], "must be that of a folder. Got a/b"),
+    ],
+)
+def test_a_graph_that_cannot_be_run(tmp_path, nodes, words):
+    for call in (plan_graph, run_graph):
+        with pytest.raises(PalpateError, match=words):
+            call(nodes, tmp_path / "run")
+    assert not (tmp_path / "run").exists()
+
+
+def fail(error, folder, before, progress):
+    raise error
+
+
+@pytest.mark.parametrize("jobs", [1, 2])
+@pytest.mark.parametrize(
+    "error", [PalpateError("must", "got", "fix", argument="seed"), ZeroDivisionError("bug")]
+)
+def test_an_error_stops_the_run_and_finished_nodes_stay(tmp_path, jobs, error):
+    nodes = [node("a"), Node("b", partial(fail, error), {}, ("a",)), node("c", "b")]
+    lines = []
+    with pytest.raises(type(error)) as raised:
+        run_graph(nodes, tmp_path, jobs=jobs, print_line=lines.append)
+    assert str(raised.value) == str(error)
+    assert "b: stopped by an error" in lines
+    assert [p.done for p in plan_graph(nodes, tmp_path)] == [True, False, False]
+
+
+def die(folder, before, progress):
+    os.kill(os.getpid(), signal.SIGKILL)
+
+
+def test_a_process_that_dies_is_one_line(tmp_path):
+    with pytest.raises(PalpateError, match=r"must stay alive\. Got one ended with status -9"):
+        run_graph([Node("a", die, {})], tmp_path, jobs=2)
+
+
+def test_one_run_at_a_time_holds_the_folder(tmp_path):
+    with locked(tmp_path), pytest.raises(PalpateError, match="must be written by one run"):
+        run_graph(DIAMOND, tmp_path)
+
+
+def rest(seconds, folder, before, progress):
+    time.sleep(seconds)
+
+
+def test_time_left_follows_costs_and_what_finished_nodes_took(tmp_path):
+    chain = [
+        Node(f"n{k}", partial(rest, 0.2), {}, (f"n{k - 1}",) if k else (), cost=100.0)
+        for k in range(3)
+    ]
+    reports = []
+    run_graph(chain, tmp_path, progress=lambda *args: reports.append(args))
+    whole = [args for args in reports if args[0] == "all stages"]
+    assert whole[0][1:] == (0, 3, "about 5 min left")  # 300 s of costs
+    after = [args[3] for args in whole if args[1] == 1]
+    assert after[0] == "about 0 s left"  # 100 s took 0.2 s
+
+
+@pytest.mark.parametrize("jobs", [1, 2])
+def test_work_within_a_node_is_reported_under_its_name(tmp_path, jobs):
+    reports = []
+    run_graph([node("a")], tmp_path, jobs=jobs, progress=lambda *args: reports.append(args))
+    assert ("a: writing", 1, 1, "") in reports
+
+
+def hold(megabytes, folder, before, progress):
+    return {"bytes": len(b"x" * (megabytes << 20))}
+
+
+@pytest.mark.skipif(not Path("/proc/self/clear_refs").exists(), reason="Linux alone resets it")
+def test_peak_memory_is_that_of_the_stage(tmp_path):
+    run_graph([Node(f"s{n}", partial(hold, n), {}) for n in (300, 1)], tmp_path)
+    peak = [
+        json.loads((tmp_path / n / "stage.json").read_text())["peak_mb"] for n in ("s300", "s1")
+    ]
+    assert 250 < peak[0] - peak[1] < 350
+
+
+SCRIPT = """
+import sys, time
+from functools import partial
+from pathlib import Path
+from palpate.studies.graph import Node, run_graph
+
+def grow(name, folder, before, progress):
+    # Lines, one after the other, each of which holds what came before; resumes.
+    file = folder / "lines"
+    lines = file.read_text().splitlines() if file.exists() else []
+    (folder.parent / f"{name}.resumed").write_text(str(len(lines)))
+    for k in range(len(lines), 8):
+        lines.append(f"{name} {k} {len(''.join(lines))}")
+        file.write_text("\\n".join(lines))
+        time.sleep(0.05)
+
+if __name__ == "__main__":
+    names = ["a", "b", "c"]
+    nodes = [Node(n, partial(grow, n), {}, ("a",) if n == "c" else ()) for n in names]
+    run_graph(nodes, Path(sys.argv[1]), jobs=int(sys.argv[2]))
+"""
+
+
+def start(script, folder, jobs):
+    command = [sys.executable, str(script), str(folder), str(jobs)]
+    return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+
+
+@pytest.mark.parametrize("jobs", [1, 2])
+@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGINT])
+def test_a_stopped_run_goes_on_to_the_same_files(tmp_path, jobs, number):
+    script = tmp_path / "study.py"
+    script.write_text(SCRIPT)
+    with start(script, tmp_path / "run", jobs) as process:
+        begun = tmp_path / "run" / "a.partial" / "lines"
+        while not (begun.exists() and len(begun.read_text().splitlines()) >= 3):
+            time.sleep(0.02)
+        process.send_signal(number)
+        _, errors = process.communicate()
+    assert process.returncode != 0
+    assert errors.count("KeyboardInterrupt") == (number == signal.SIGINT)
+    assert not (tmp_path / "run" / "c").exists()
+    time.sleep(0.3)  # a worker ends with its parent
+    kept = begun.read_text().splitlines()
+    time.sleep(0.3)
+    assert begun.read_text().splitlines() == kept
+    for run in ("run", "whole"):
+        with start(script, tmp_path / run, jobs) as process:
+            process.communicate()
+        assert process.returncode == 0
+    assert int((tmp_path / "run" / "a.resumed").read_text()) == len(kept) >= 3
+    for name in "abc":
+        lines = (tmp_path / "run" / name / "lines").read_text()
+        assert lines == (tmp_path / "whole" / name / "lines").read_text()
+        assert len(lines.splitlines()) == 8
