@@ -1,0 +1,414 @@
+"""The paper's claims as rows: evidence over seeds and videos, a verdict, and why.
+
+A claim *holds* where the intervals of its evidence lie on its side of 0, *does not hold* where they
+lie on the other, and is *undecided* where they hold 0, contradict each other, or evidence is
+missing (weights of LPIPS, a human study). "Prefers" is always a paired difference on the same test
+samples, oriented by the metric (:func:`palpate.studies.evidence.ahead`).
+
+Effect size of a metric for two methods: ``|difference| / standard error``, with the standard error
+from the interval, ``(high - low) / (2 * 1.96)``. It is a difference in units of its error, so its
+error is 1, and a mean of effects of correlated metrics has an error of at most 1.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import groupby
+from statistics import fmean
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import special
+
+from palpate.core import Score, rng_for
+from palpate.core.score import ARROWS
+from palpate.metrics import mean_score
+from palpate.metrics.intervals import spread_of_values
+from palpate.report.study import Claim, StudyTable, Verdict
+from palpate.studies.evidence import DIFFERENCE, ahead, in_words, metric_of, over_seeds, side_of
+
+#: Metrics that compare pixels, or features of networks trained on photos (paper, table 3).
+TRADITIONAL = ("SSIM", "PSNR", "LPIPS", "FID", "CMMD")
+#: Metrics on features of a tactile encoder (paper, Eq. 2-7).
+FAMILY = ("TMMD", "I-TMMD", "CI-TMMD", "D-TMMD")
+#: What feature metrics are called whose features are of a tactile encoder: none of the paper's.
+TACTILE = "(tactile)"
+PEOPLE = "human preference"
+#: Items of the paper's human study and pairwise scores.
+FORTY = 40
+#: The 97.5 % point of the normal distribution.
+Z = float(special.ndtri(0.975))
+
+
+@dataclass(frozen=True)
+class Names:
+    """What the methods of the paper's claims are called in the scores."""
+
+    ours: str = "Ours"
+    images: Sequence[str] = ("GVST",)
+    background: str = "Ours w/ BG"
+
+
+def differences_over_seeds(runs: Sequence[Iterable[Score]]) -> list[Score]:
+    """The paired differences of a study, each over its seeds.
+
+    Args:
+        runs: all scores of each seed, as ``Results.scores`` has them. Of several presets of a
+            metric ``grouped`` counts.
+
+    Returns:
+        One score for each metric and pair of methods that every seed has.
+    """
+    listed = [_chosen(s for s in run if _is_difference(s)) for run in runs]
+    shared = [key for key in listed[0] if all(key in run for run in listed)] if listed else []
+    return [_combined([run[key] for run in listed]) for key in shared]
+
+
+def _is_difference(score: Score) -> bool:
+    return score.metric.endswith(DIFFERENCE) and {"a", "b"} <= {*score.details}
+
+
+def _chosen(scores: Iterable[Score]) -> dict[tuple[str, str], Score]:
+    """By metric and pair; of several presets ``grouped``, else the first."""
+    chosen: dict[tuple[str, str], Score] = {}
+    for score in scores:
+        key = score.metric, score.subject
+        if key not in chosen or score.settings.get("preset") == "grouped":
+            chosen[key] = score
+    return chosen
+
+
+def _combined(scores: Sequence[Score]) -> Score:
+    """A difference over seeds, and the difference of its distances to the floor."""
+    made = over_seeds(scores)
+    if any("gap" not in s.details for s in scores):
+        return made
+    gaps = [
+        replace(s, value=s.details["gap"], interval=s.details.get("gap_interval")) for s in scores
+    ]
+    gap = over_seeds(gaps)
+    more = {"gap": gap.value, "gap_interval": gap.interval}
+    return replace(made, details={**made.details, **more})
+
+
+def decide(sides: Sequence[int], *, every: bool = False) -> Verdict:
+    """The verdict of evidence for (1), against (-1) and undecided (0).
+
+    It holds with some evidence for and none against; ``every``: with all for. It does not hold with
+    some against and none for; ``every``: with any against.
+    """
+    if -1 in sides and (every or 1 not in sides):
+        return "does not hold"
+    if sides and -1 not in sides and (0 not in sides if every else 1 in sides):
+        return "holds"
+    return "undecided"
+
+
+def leak_claims(
+    tasks: Mapping[str, Score], names: tuple[str, str] = ("Orig", "NoLeak")
+) -> list[Claim]:
+    """Leakage inflates every task: one row for all, and one a task.
+
+    Args:
+        tasks: task -> paired difference of its score between the splits ``names``, of
+            :func:`palpate.studies.evidence.difference_between` or of
+            :func:`palpate.studies.split_study.compare_splits`.
+        names: of the leaking split and the leak-free one, as in the differences.
+    """
+    gains = {task: ahead(difference, names[0]) for task, difference in tasks.items()}
+    source, rows = "paper, tables 1 and 2", list[Claim]()
+    for task, gain in gains.items():
+        why = (
+            f"{metric_of(tasks[task])} is better under {names[0]} by {in_words(gain)}{_runs(gain)}"
+        )
+        verdict = decide([side_of(gain)])
+        rows.append(Claim(f"Leakage inflates {task}", source, verdict, f"{why}.", [gain]))
+    sides = [side_of(gain) for gain in gains.values()]
+    counts = f"{sides.count(1)} of {len(sides)} tasks inflated, {sides.count(-1)} deflated"
+    why = f"{counts}, {sides.count(0)} with an interval that holds 0 or is missing."
+    overall = Claim(
+        "Leakage inflates every task", source, decide(sides, every=True), why, [*gains.values()]
+    )
+    return [overall, *rows]
+
+
+def _runs(score: Score) -> str:
+    """The number of seeds in brackets, where it is known."""
+    count = len(score.details.get("by_seed", ()))
+    return f" ({count} seed{'s' * (count != 1)})" if count else ""
+
+
+def _of_metric(metric: str, difference: Score) -> bool:
+    """Whether a difference is of one of the paper's metrics, on features it may be called after."""
+    name = metric_of(difference)
+    if metric in FAMILY:
+        return name == metric
+    return name.partition(" (")[0] == metric and not name.endswith(TACTILE)
+
+
+def _between(differences: Iterable[Score], metric: str, a: str, b: str) -> list[Score]:
+    """Differences of a metric between two methods."""
+    return [
+        d
+        for d in differences
+        if {d.details["a"], d.details["b"]} == {a, b}
+        and (metric_of(d) == metric if metric == PEOPLE else _of_metric(metric, d))
+    ]
+
+
+def preference_claims(
+    differences: Sequence[Score], people: Sequence[Score], names: Names | None = None
+) -> list[Claim]:
+    """Which metrics prefer what people prefer: one row a metric, over the paper's two comparisons.
+
+    Args:
+        differences: of :func:`differences_over_seeds`.
+        people: scores of ``palpate preference score`` (``Results.load(path).scores``); empty
+            without a human study, and then every row is undecided.
+        names: of the methods.
+    """
+    names, votes = names or Names(), [s for s in people if _is_difference(s)]
+    return [
+        _preference_claim(metric, differences, votes, names) for metric in (*TRADITIONAL, *FAMILY)
+    ]
+
+
+def _preference_claim(
+    metric: str, differences: Sequence[Score], votes: Sequence[Score], names: Names
+) -> Claim:
+    against = metric in TRADITIONAL
+    does = "prefers what people do not" if against else "prefers what people prefer"
+    parts, evidence, signs = list[str](), list[Score](), list[int]()
+    for other in (*names.images, names.background):
+        pair = names.ours, other
+        of_people = [ahead(v, names.ours) for v in _between(votes, PEOPLE, *pair)]
+        for score in (ahead(d, names.ours) for d in _between(differences, metric, *pair)):
+            label = score.metric.removesuffix(", ahead")
+            parts.append(f"{label} puts {names.ours} ahead of {other} by {in_words(score)}")
+            evidence.append(score)
+            signs += [side_of(score) * side_of(vote) for vote in of_people]
+        if of_people:
+            parts.append(f"people put {names.ours} ahead of {other} by {in_words(of_people[0])}")
+            evidence.append(of_people[0])
+    known = any(s.metric.partition(",")[0] != PEOPLE for s in evidence)
+    missing = [] if known else [f"{metric} was not computed (its weights may be missing)"]
+    missing += [] if votes else ["no human study was given"]
+    verdict = decide([-sign if against else sign for sign in signs])
+    why = "; ".join([*missing, *parts])
+    return Claim(f"{metric} {does}", "paper, table 3", verdict, f"{_capital(why)}.", evidence)
+
+
+def _capital(sentence: str) -> str:
+    return sentence[:1].upper() + sentence[1:]
+
+
+def ranking_claims(
+    differences: Sequence[Score], people: Sequence[Score] = (), names: Names | None = None
+) -> list[Claim]:
+    """Text as a bridge beats images; conditioning on the background hurts.
+
+    TMMD and, if given, people decide; I-, CI- and D-TMMD, which look perfect when a generator
+    collapses, are listed as evidence alone.
+    """
+    names = names or Names()
+    wanted = [(f"Text as a bridge beats images ({other})", other) for other in names.images]
+    wanted.append(("Conditioning on the background hurts", names.background))
+    return [_ranking_claim(claim, other, differences, people, names) for claim, other in wanted]
+
+
+def _ranking_claim(
+    claim: str, other: str, differences: Sequence[Score], people: Sequence[Score], names: Names
+) -> Claim:
+    pair = names.ours, other
+    votes = [s for s in people if _is_difference(s)]
+    found = _between(differences, "TMMD", *pair) + _between(votes, PEOPLE, *pair)
+    deciding = [ahead(d, names.ours) for d in found]
+    others = [
+        ahead(d, names.ours) for metric in FAMILY[1:] for d in _between(differences, metric, *pair)
+    ]
+    words = [
+        f"{names.ours} is ahead of {other} in {s.metric.removesuffix(', ahead')} by"
+        f" {in_words(s)}{_runs(s)}"
+        for s in (*deciding, *others)
+    ]
+    why = "; ".join(words) or f"{other} was not compared with {names.ours}"
+    sides = [side_of(s) for s in deciding]
+    source = "paper, tables 3 and 4" if other in names.images else "paper, table 3"
+    return Claim(claim, source, decide(sides), f"{why}.", [*deciding, *others])
+
+
+def effect_size(difference: Score) -> Score | None:
+    """``|difference| / standard error`` of a metric for two methods; None without an interval."""
+    if difference.value is None or difference.interval is None:
+        return None
+    low, high = difference.interval
+    if not high > low:
+        return None
+    value = abs(difference.value) / ((high - low) / (2 * Z))
+    return replace(
+        difference,
+        metric=f"effect size of {metric_of(difference)}",
+        value=value,
+        interval=None,
+        interval_method="",
+        estimator="difference over its standard error",
+        scale=1.0,
+        higher_is_better=True,
+        details={k: difference.details[k] for k in ("a", "b")}
+        | {"difference": difference.value, "error": (high - low) / (2 * Z)},
+    )
+
+
+def effect_table(differences: Sequence[Score]) -> StudyTable:
+    """How well each metric tells methods apart: effect sizes, a row a metric, a column a pair."""
+    pairs = list(dict.fromkeys((d.details["a"], d.details["b"]) for d in differences))
+    rows: list[list[Score | str | None]] = []
+    for metric, own in groupby(sorted(differences, key=metric_of), key=metric_of):
+        of_pair = {(d.details["a"], d.details["b"]): effect_size(d) for d in own}
+        rows.append([metric, *(of_pair.get(pair) for pair in pairs)])
+    order = [*TRADITIONAL, *FAMILY]
+    rank = {name: k for k, name in enumerate(order)}
+    rows.sort(key=lambda row: rank.get(str(row[0]).partition(" (")[0], len(order)))
+    return StudyTable(
+        "What tells methods apart",
+        "The difference of two methods over its standard error, of every metric; 2 is about where "
+        "an interval of 95 % leaves 0. It says how sure a metric is, not whether it is right.",
+        ["metric", *(f"{a} against {b}" for a, b in pairs)],
+        rows,
+    )
+
+
+def discrimination_claim(differences: Sequence[Score]) -> Claim:
+    """Traditional metrics hardly discriminate: their mean effect size against the TMMD family's.
+
+    Over the pairs of methods that both kinds have; each mean has an error of at most 1, so means
+    that differ by less than ``1.96 sqrt(2)`` are undecided.
+    """
+    claim, source = "Traditional metrics hardly discriminate between methods", "paper, section 1"
+    sizes: dict[str, dict[tuple[str, str], list[float]]] = {"traditional": {}, "family": {}}
+    evidence: list[Score] = []
+    for kind, metrics in (("traditional", TRADITIONAL), ("family", FAMILY)):
+        for d in differences:
+            effect = effect_size(d) if any(_of_metric(m, d) for m in metrics) else None
+            if effect is not None and effect.value is not None:
+                pair = d.details["a"], d.details["b"]
+                sizes[kind].setdefault(pair, []).append(effect.value)
+                evidence.append(effect)
+    shared = [pair for pair in sizes["traditional"] if pair in sizes["family"]]
+    if not shared:
+        why = "No two methods were compared by both kinds of metrics with intervals."
+        return Claim(claim, source, "undecided", why, evidence)
+    means = {kind: fmean(fmean(of[pair]) for pair in shared) for kind, of in sizes.items()}
+    gap, reach = means["family"] - means["traditional"], Z * np.sqrt(2)
+    why = (
+        f"The mean effect size of the TMMD family is {means['family']:.2g}, of traditional metrics "
+        f"{means['traditional']:.2g}, over {len(shared)} pairs of methods; the difference is "
+        f"{gap:.2g} [{gap - reach:.2g}, {gap + reach:.2g}]."
+    )
+    return Claim(claim, source, decide([int(gap > reach) - int(gap < -reach)]), why, evidence)
+
+
+def paper_claims(
+    noleak: Sequence[Iterable[Score]],
+    *,
+    tasks: Mapping[str, Score],
+    people: Sequence[Score] = (),
+    names: Names | None = None,
+    splits: tuple[str, str] = ("Orig", "NoLeak"),
+) -> list[Claim]:
+    """All claims of the paper.
+
+    Args:
+        noleak: scores and differences of the methods under the leak-free split, a list a seed.
+        tasks: see :func:`leak_claims`.
+        people: see :func:`preference_claims`.
+        names: of the methods.
+        splits: see :func:`leak_claims`.
+    """
+    differences = differences_over_seeds(noleak)
+    return [
+        *leak_claims(tasks, splits),
+        *ranking_claims(differences, people, names),
+        *preference_claims(differences, people, names),
+        discrimination_claim(differences),
+    ]
+
+
+def seeded_items(ids: Sequence[str], seed: int = 0, count: int = FORTY) -> list[int]:
+    """Rows of ``count`` samples (or of all), chosen by seed and id alone."""
+    order = sorted(range(len(ids)), key=lambda k: rng_for(seed, "companions", ids[k]).random())
+    return sorted(order[:count])
+
+
+def forty_table(
+    values: Mapping[str, Mapping[str, NDArray[np.float64]]],
+    ids: Sequence[str],
+    groups: Sequence[str] | None,
+    *,
+    better: Mapping[str, bool],
+    seed: int = 0,
+    count: int = FORTY,
+) -> StudyTable:
+    """Companions on forty seeded items, as in the paper, beside all samples; what forty can carry.
+
+    Args:
+        values: metric -> method -> (n,) a value an image, e.g. of
+            :func:`palpate.metrics.per_image`; values that are not finite are skipped.
+        ids: of the n samples.
+        groups: their videos, or None.
+        better: metric -> whether higher is better.
+        seed: of the choice.
+        count: how many items.
+    """
+    items = seeded_items(ids, seed, count)
+    rows: list[list[Score | str | None]] = []
+    worst: list[str] = []
+    for metric, of_method in values.items():
+        for method, v in of_method.items():
+            few, everything = (
+                mean_score(
+                    metric,
+                    v[at],
+                    ids=[ids[k] for k in at],
+                    groups=None if groups is None else [groups[k] for k in at],
+                    higher_is_better=better[metric],
+                    subject=method,
+                    settings={"items": len(at)},
+                )
+                for at in (items, [*range(len(ids))])
+            )
+            rows.append([method, f"{metric} {ARROWS[better[metric]]}", few, everything])
+        worst += _needed(metric, of_method, groups, items)
+    text = (
+        f"Companions on {len(items)} items chosen by seed, as the paper's pairwise scores, and on "
+        f"all {len(ids)}. {' '.join(worst)}"
+    )
+    columns = ["method", "metric", f"{len(items)} items", f"all {len(ids)}"]
+    return StudyTable("Companions on forty items", text.strip(), columns, rows)
+
+
+def _needed(
+    metric: str,
+    of_method: Mapping[str, NDArray[np.float64]],
+    groups: Sequence[str] | None,
+    items: Sequence[int],
+) -> list[str]:
+    """What the items can carry: the least difference they decide, and items for that of all."""
+    names = list(of_method)
+    if len(names) < 2:
+        return []
+    a, b = names[:2]
+    delta = of_method[a] - of_method[b]
+    rows = [k for k in items if np.isfinite(delta[k])]
+    spread = spread_of_values(delta[rows], None if groups is None else [groups[k] for k in rows])
+    interval, whole = spread.interval(), float(delta[np.isfinite(delta)].mean())
+    if interval is None:
+        return []
+    reach = (interval[1] - interval[0]) / 2
+    needed = int(np.ceil(len(rows) * (reach / whole) ** 2)) if whole else 0
+    verdict = "decide" if reach < abs(whole) else f"cannot decide, which takes about {needed:,},"
+    return [
+        f"{metric}: {len(rows)} items tell {a} from {b} only where they differ by more than "
+        f"{reach:.2g}, and {verdict} the {abs(whole):.2g} of all."
+    ]

@@ -1,0 +1,212 @@
+"""Claims follow the numbers: planted differences decide, flip, and stay undecided."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy import stats
+
+from palpate.core import PalpateError, Score
+from palpate.metrics.intervals import spread_of_values
+from palpate.studies.claims import (
+    FAMILY,
+    TRADITIONAL,
+    differences_over_seeds,
+    discrimination_claim,
+    effect_size,
+    effect_table,
+    forty_table,
+    leak_claims,
+    paper_claims,
+    preference_claims,
+    ranking_claims,
+    seeded_items,
+)
+from palpate.studies.evidence import ahead, difference_between, over_seeds
+
+HIGHER = {"SSIM": True, "PSNR": True, "human preference": True}
+
+
+def difference(metric, value, reach=0.1, pair=("Ours", "GVST"), **details):
+    """A paired difference with a symmetric interval."""
+    up = HIGHER.get(metric, None if metric in FAMILY[1:] else False)
+    return Score(
+        f"{metric} difference",
+        " - ".join(pair),
+        value,
+        None if reach is None else (value - reach, value + reach),
+        higher_is_better=up,
+        details={"a": pair[0], "b": pair[1], **details},
+    )
+
+
+def verdicts(claims):
+    return {c.claim: c.verdict for c in claims}
+
+
+def test_seeds_add_their_deviation_to_the_interval_of_videos():
+    values, reaches = [1.0, 1.4, 1.2], [0.3, 0.2, 0.4]
+    made = over_seeds([difference("TMMD", v, r) for v, r in zip(values, reaches, strict=True)])
+    between = stats.t.ppf(0.975, 2) * np.std(values, ddof=1) / np.sqrt(3)
+    reach = np.sqrt(np.mean(np.square(reaches)) + between**2)
+    assert made.value == pytest.approx(1.2)
+    assert made.interval == pytest.approx((1.2 - reach, 1.2 + reach))
+    assert made.details["by_seed"] == values
+    assert over_seeds([difference("TMMD", 1.0, None)] * 2).interval is None
+    with pytest.raises(PalpateError, match="one metric and subject"):
+        over_seeds([difference("TMMD", 1.0), difference("SSIM", 1.0)])
+
+
+def test_intervals_of_two_splits_cover_their_difference():
+    """In 400 draws of two independent means the interval holds the true difference at its level."""
+    rng, hits = np.random.default_rng(0), 0
+    for _ in range(400):
+        scores = []
+        for mean in (0.7, 0.5):
+            spread = spread_of_values(rng.normal(mean, 0.1, 20), None)
+            scores.append(
+                Score("accuracy", "real", spread.value, spread.interval(), higher_is_better=True)
+            )
+        low, high = difference_between([scores[0]], [scores[1]], ("Orig", "NoLeak")).interval
+        hits += low <= 0.2 <= high
+    assert 0.93 <= hits / 400 <= 0.98
+
+
+def test_ahead_is_oriented_by_the_metric_and_the_floor():
+    assert ahead(difference("TMMD", -0.5), "Ours").interval == pytest.approx((0.4, 0.6))
+    assert ahead(difference("TMMD", -0.5), "GVST").value == -0.5
+    assert ahead(difference("SSIM", -0.5), "Ours").value == -0.5
+    # Collapsed: lower than the other, and further from the floor.
+    collapsed = difference("I-TMMD", -0.5, gap=0.4, gap_interval=[0.3, 0.5])
+    assert ahead(collapsed, "Ours").interval == pytest.approx((-0.5, -0.3))
+    assert ahead(difference("I-TMMD", -0.5), "Ours").value == 0.5  # no floor: as in the paper
+    with pytest.raises(PalpateError, match="'Theirs' and another"):
+        ahead(difference("TMMD", 1), "Theirs")
+
+
+def test_leaks_inflate_where_orig_is_better_and_the_verdict_flips_with_the_numbers():
+    pair = ("Orig", "NoLeak")
+    tasks = {
+        "material classification": replace(
+            difference("material accuracy", 0.2, pair=pair), higher_is_better=True
+        ),
+        "generation": difference("TMMD", -1.0, pair=pair),
+    }
+    made = verdicts(leak_claims(tasks))
+    assert made["Leakage inflates every task"] == "holds"
+    assert made["Leakage inflates generation"] == "holds"
+    tasks["generation"] = difference("TMMD", 1.0, pair=pair)
+    made = verdicts(leak_claims(tasks))
+    assert made["Leakage inflates every task"] == "does not hold"
+    assert made["Leakage inflates material classification"] == "holds"
+    tasks["generation"] = difference("TMMD", -1.0, 1.5, pair=pair)
+    claims = leak_claims(tasks)
+    assert verdicts(claims)["Leakage inflates every task"] == "undecided"
+    assert "1 of 2 tasks inflated" in claims[0].why
+    assert "1 [-0.5, 2.5]" in claims[2].why
+
+
+def study(tmmd, ssim):
+    """Differences of three methods as in the paper's table 3, if both are positive."""
+    return [
+        difference("TMMD", -tmmd),
+        difference("TMMD", -2 * tmmd, pair=("Ours", "Ours w/ BG")),
+        difference("SSIM", 0.0, 0.01),
+        difference("SSIM", -ssim, 0.01, pair=("Ours", "Ours w/ BG")),
+    ]
+
+
+PEOPLE = [
+    difference("human preference", 0.5, 0.3),
+    difference("human preference", 0.65, 0.3, pair=("Ours", "Ours w/ BG")),
+]
+
+
+def test_metrics_are_held_against_people():
+    made = verdicts(preference_claims(study(1, 0.05), PEOPLE))
+    assert made["SSIM prefers what people do not"] == "holds"
+    assert made["TMMD prefers what people prefer"] == "holds"
+    assert made["LPIPS prefers what people do not"] == "undecided"
+    assert len(made) == len(TRADITIONAL) + len(FAMILY)
+    flipped = verdicts(preference_claims(study(-1, -0.05), PEOPLE))
+    assert flipped["SSIM prefers what people do not"] == "does not hold"
+    assert flipped["TMMD prefers what people prefer"] == "does not hold"
+    alone = {c.claim: c for c in preference_claims(study(1, 0.05), [])}
+    assert {c.verdict for c in alone.values()} == {"undecided"}
+    assert "No human study was given" in alone["SSIM prefers what people do not"].why
+    assert "weights may be missing" in alone["LPIPS prefers what people do not"].why
+
+
+def test_features_of_a_tactile_encoder_are_no_fid_of_the_paper():
+    tactile = difference("FID (tactile)", 5, pair=("Ours", "Ours w/ BG"))
+    shipped = difference("FID (palpate/mini vision)", 5, pair=("Ours", "Ours w/ BG"))
+    claim = "FID prefers what people do not"
+    assert verdicts(preference_claims([tactile], PEOPLE))[claim] == "undecided"
+    made = {c.claim: c for c in preference_claims([shipped], PEOPLE)}[claim]
+    assert made.verdict == "holds"
+    assert "FID (palpate/mini vision)" in made.why
+
+
+def test_rankings_flip_and_contradictions_are_undecided():
+    bridge, background = (c.verdict for c in ranking_claims(study(1, 0.05), PEOPLE))
+    assert (bridge, background) == ("holds", "holds")
+    bridge, background = (c.verdict for c in ranking_claims(study(-1, 0.05)))
+    assert (bridge, background) == ("does not hold", "does not hold")
+    assert ranking_claims(study(-1, 0.05), PEOPLE)[0].verdict == "undecided"  # people object
+    assert ranking_claims(study(0.05, 0.05))[0].verdict == "undecided"  # holds 0
+    assert ranking_claims([])[0].why == "GVST was not compared with Ours."
+
+
+def test_effect_sizes_are_differences_over_errors_and_decide_who_discriminates():
+    made = effect_size(difference("TMMD", -1.0, 0.49))
+    assert made.value == pytest.approx(1.0 / (0.49 / 1.959964), rel=1e-5)
+    assert effect_size(difference("TMMD", -1.0, None)) is None
+    both = study(1, 0.005)
+    assert discrimination_claim(both).verdict == "holds"
+    strong = [difference("SSIM", 1.0), difference("TMMD", 0.01)]
+    assert discrimination_claim(strong).verdict == "does not hold"
+    alike = [difference("SSIM", 0.1), difference("TMMD", 0.15)]
+    assert discrimination_claim(alike).verdict == "undecided"
+    assert discrimination_claim([difference("SSIM", 1.0)]).verdict == "undecided"
+    table = effect_table(both)
+    assert table.columns == ["metric", "Ours against GVST", "Ours against Ours w/ BG"]
+    assert [row[0] for row in table.rows] == ["SSIM", "TMMD"]
+    assert float(table.rows[1][2]) == pytest.approx(2 * float(table.rows[1][1]))
+
+
+def test_differences_of_seeds_are_joined_by_metric_pair_and_preset():
+    paper = replace(difference("TMMD", 9.0), settings={"preset": "paper"})
+    runs = [
+        [
+            paper,
+            replace(difference("TMMD", v), settings={"preset": "grouped"}),
+            Score("TMMD", "x", 1),
+        ]
+        for v in (-1.0, -2.0)
+    ]
+    runs[0].append(difference("SSIM", 1.0))  # one seed alone
+    made = differences_over_seeds(runs)
+    assert [(d.metric, d.value) for d in made] == [("TMMD difference", -1.5)]
+    gap = difference("I-TMMD", -0.5, gap=0.4, gap_interval=[0.3, 0.5])
+    joined = differences_over_seeds([[gap], [gap]])[0]
+    assert joined.details["gap"] == pytest.approx(0.4)
+    assert joined.details["gap_interval"] == pytest.approx((0.3, 0.5))
+    claims = paper_claims([study(1, 0.005)], tasks={}, people=PEOPLE)
+    assert len({c.claim for c in claims}) == len(claims) == 1 + 2 + 9 + 1
+    assert claims[0].verdict == "undecided"  # no task was measured
+
+
+def test_forty_items_say_what_they_can_carry():
+    rng = np.random.default_rng(0)
+    ids, groups = [f"v{k // 5}/{k}" for k in range(400)], [f"v{k // 5}" for k in range(400)]
+    base = rng.normal(0.5, 0.1, 400)
+    values = {"SSIM": {"Ours": base, "GVST": base - 0.01 + rng.normal(0, 0.1, 400)}}
+    table = forty_table(values, ids, groups, better={"SSIM": True})
+    rows = seeded_items(ids)
+    assert len(rows) == 40
+    assert {ids[k] for k in rows} == {ids[::-1][k] for k in seeded_items(ids[::-1])}
+    assert float(table.rows[0][2]) == pytest.approx(base[rows].mean())
+    assert float(table.rows[0][3]) == pytest.approx(base.mean())
+    assert "cannot decide" in table.text
+    clear = {"SSIM": {"Ours": base, "GVST": base - 0.2 + rng.normal(0, 0.05, 400)}}
+    assert "and decide the 0.2" in forty_table(clear, ids, groups, better={"SSIM": True}).text
