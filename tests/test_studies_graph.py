@@ -129,6 +129,25 @@ def test_one_run_at_a_time_holds_the_folder(tmp_path):
         run_graph(DIAMOND, tmp_path)
 
 
+def test_torchrun_is_refused(tmp_path, monkeypatch):
+    monkeypatch.setenv("WORLD_SIZE", "2")
+    with pytest.raises(PalpateError, match="must be begun by one process"):
+        run_graph(DIAMOND, tmp_path)
+
+
+def settings(folder, before, progress):
+    time.sleep(0.3)  # the other process takes the other node
+    return {n: os.environ.get(n) for n in ("CUDA_VISIBLE_DEVICES", "OMP_NUM_THREADS")}
+
+
+def test_gpus_are_dealt_out_and_threads_are_those_of_one_process(tmp_path, monkeypatch):
+    monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "4,7")
+    monkeypatch.setenv("OMP_NUM_THREADS", "3")
+    stages = run_graph([Node(n, settings, {}) for n in "ab"], tmp_path, jobs=2)
+    facts = [tuple(stage.facts.values()) for stage in stages.values()]
+    assert sorted(facts) == [("4", "3"), ("7", "3")]
+
+
 def rest(seconds, folder, before, progress):
     time.sleep(seconds)
 

@@ -18,7 +18,7 @@ from collections.abc import Callable, Generator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from functools import partial
-from multiprocessing.connection import Connection, wait
+from multiprocessing.connection import wait
 from multiprocessing.process import BaseProcess
 from pathlib import Path
 from typing import Any
@@ -29,6 +29,7 @@ from palpate.studies.stages import Run, Stage, finished_stage, stage_digest
 
 Build = Callable[[Path, Mapping[str, Path], Progress], Mapping[str, Any] | None]
 PrintLine = Callable[[str], None]
+Channel = Any  # one end of a pipe, whose type depends on the system
 
 
 @dataclass(frozen=True)
@@ -101,7 +102,7 @@ def run_graph(
         folder: run folder.
         jobs: processes that build nodes; 1: this one. Each computes with OMP_NUM_THREADS threads,
             or where that is not set with its share of the cores, when sums may differ from those of
-            other ``jobs`` in the last bits.
+            other ``jobs`` in the last bits. Several GPUs are dealt out in turn.
         print_line: called with one line for each stage begun, reused or done, and with the time
             left: from the costs, scaled by what finished nodes took.
         progress: called with what is done within a node, and over the whole.
@@ -111,8 +112,12 @@ def run_graph(
 
     Raises:
         PalpateError: for two nodes of one name, an unknown ``after``, a circle, a folder that
-            another run holds; or the first that a node raises: finished stages stay.
+            another run holds, or under ``torchrun``; or the first that a node raises: finished
+            stages stay.
     """
+    if (processes := os.environ.get("WORLD_SIZE", "1")) != "1":
+        fix = "Run it once without torchrun, with several jobs"
+        raise PalpateError("A study must be begun by one process", processes, fix)
     require(jobs >= 1, "jobs", "must be at least 1", jobs)
     ordered, folder = in_order(nodes), Path(folder)
     with locked(folder):
@@ -267,8 +272,8 @@ def _run_here(ordered: Sequence[Node], folder: Path, whole: _Whole) -> None:
 
 def _run_in_workers(ordered: Sequence[Node], folder: Path, whole: _Whole) -> None:
     reads = _reads(ordered)
-    workers: dict[Connection, BaseProcess] = {}
-    idle: list[Connection] = []
+    workers: dict[Channel, BaseProcess] = {}
+    idle: list[Channel] = []
     with _ended_with(workers):
         while len(whole.stages) < len(ordered):
             while (idle or len(workers) < whole.jobs) and (node := whole.ready()) is not None:
@@ -276,11 +281,7 @@ def _run_in_workers(ordered: Sequence[Node], folder: Path, whole: _Whole) -> Non
                 worker.send_bytes(pickle.dumps((node, reads[node.name], folder)))
                 whole.begin(node)
             for worker in wait([w for w in workers if w not in idle], timeout=1.0):
-                assert isinstance(worker, Connection)
-                try:
-                    kind, value = worker.recv()
-                except (EOFError, OSError):
-                    raise _died(workers[worker]) from None
+                kind, value = _received(worker, workers[worker])
                 if kind == "stage":
                     idle.append(worker)
                     whole.end(value)
@@ -294,7 +295,7 @@ def _run_in_workers(ordered: Sequence[Node], folder: Path, whole: _Whole) -> Non
 
 
 @contextmanager
-def _ended_with(workers: Mapping[Connection, BaseProcess]) -> Generator[None]:
+def _ended_with(workers: Mapping[Channel, BaseProcess]) -> Generator[None]:
     """Kill the workers at the end: what they were building stays, to go on from."""
     try:
         yield
@@ -305,39 +306,55 @@ def _ended_with(workers: Mapping[Connection, BaseProcess]) -> Generator[None]:
             process.join()
 
 
-def _start_worker(workers: dict[Connection, BaseProcess], jobs: int) -> Connection:
+def _start_worker(workers: dict[Channel, BaseProcess], jobs: int) -> Channel:
     """Start a process that builds nodes; spawned, as a fork of threads can deadlock."""
     affinity = getattr(os, "sched_getaffinity", None)
     cores = len(affinity(0)) if affinity else os.cpu_count() or 1
+    gpus = os.environ.get("CUDA_VISIBLE_DEVICES", ",".join(_gpus())).split(",")
+    environment = {"CUDA_VISIBLE_DEVICES": gpus[len(workers) % len(gpus)]} if len(gpus) > 1 else {}
+    environment |= {"OMP_NUM_THREADS": os.environ.get("OMP_NUM_THREADS", f"{cores // jobs or 1}")}
     context = multiprocessing.get_context("spawn")
     ours, theirs = context.Pipe()
-    process = context.Process(target=_work, args=(theirs, max(1, cores // jobs)))
+    process = context.Process(target=_work, args=(theirs, environment))
     process.start()
     theirs.close()
     workers[ours] = process
     return ours
 
 
-def _died(process: BaseProcess) -> PalpateError:
-    process.join()
+def _gpus() -> list[str]:
+    """Numbers of the NVIDIA GPUs of a Linux machine."""
+    return [f"{number}" for number, _ in enumerate(Path("/dev").glob("nvidia[0-9]*"))]
+
+
+def _received(worker: Channel, process: BaseProcess) -> tuple[str, Any]:
+    """The next message of a worker: its kind and its value.
+
+    Raises:
+        PalpateError: if the worker has died.
+    """
+    try:
+        return worker.recv()
+    except (EOFError, OSError):
+        process.join()
     got = f"one ended with status {process.exitcode}"
     fix = "Free some memory, or use one process; run it again to go on. A script must call this "
     fix += "under: if __name__ == '__main__'"
-    return PalpateError("The processes of a study must stay alive", got, fix)
+    raise PalpateError("The processes of a study must stay alive", got, fix)
 
 
-def _work(connection: Connection, threads: int) -> None:
+def _work(channel: Channel, environment: Mapping[str, str]) -> None:
     """Build the nodes that arrive, in a worker, until its parent ends."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent handles Ctrl-C
     exit_with_parent()
-    os.environ.setdefault("OMP_NUM_THREADS", str(threads))
-    send = partial(_send, connection)
+    os.environ.update(environment)  # before torch is loaded
+    send = partial(_send, channel)
 
     def report(what: str, done: int, total: int, remark: str = "") -> None:
         send("progress", (what, done, total, remark))
 
     while True:
-        task = connection.recv_bytes()
+        task = channel.recv_bytes()
         try:
             node, read, folder = pickle.loads(task)
             send("stage", _build_node(node, read, folder, partial(send, "line"), report))
@@ -346,5 +363,5 @@ def _work(connection: Connection, threads: int) -> None:
             send("error", error)
 
 
-def _send(connection: Connection, kind: str, value: Any) -> None:
-    connection.send((kind, value))
+def _send(channel: Channel, kind: str, value: Any) -> None:
+    channel.send((kind, value))

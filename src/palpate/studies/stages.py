@@ -136,7 +136,7 @@ def _build(
         raise
     record |= {"facts": facts, "outputs": digest_folder(partial)}
     record["seconds"] = round(time.monotonic() - start, 2)
-    record["peak_mb"] = _peak_mb(per_stage)
+    record |= {"peak_mb": _peak_mb(per_stage)} | _gpu_peak()
     record["date"] = datetime.datetime.now(datetime.UTC).date().isoformat()
     record["versions"] = {"palpate": __version__, "python": platform.python_version()}
     write_json(partial / "stage.json", record)
@@ -152,7 +152,9 @@ def _of_record(folder: Path, record: Mapping[str, Any], *, reused: bool) -> Stag
 
 
 def _reset_peak() -> bool:
-    """Let the peak memory of this process begin anew; only Linux can."""
+    """Let the peak memory of this process begin anew; only Linux can. That of its GPU always."""
+    if (torch := sys.modules.get("torch")) is not None and torch.cuda.is_initialized():
+        torch.cuda.reset_peak_memory_stats()
     try:
         Path("/proc/self/clear_refs").write_text("5")
     except OSError:
@@ -173,6 +175,13 @@ def _peak_mb(since_reset: bool) -> int | None:
         return None
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     return round(peak / (1 << 20 if sys.platform == "darwin" else 1 << 10))
+
+
+def _gpu_peak() -> dict[str, int]:
+    """Peak memory of torch on this process's GPU in MiB, if it has used one."""
+    if (torch := sys.modules.get("torch")) is None or not torch.cuda.is_initialized():
+        return {}
+    return {"peak_gpu_mb": round(torch.cuda.max_memory_allocated() / (1 << 20))}
 
 
 def _record(path: Path) -> dict[str, Any]:
