@@ -270,6 +270,7 @@ class Study:
             progress=self.progress,
         )
         result = {"seconds": round(time.process_time() - began)}
+        pipeline.save(folder / "model")  # for a look at its images later
         gels = self.gels if pipeline.background else None
         pixels = cached_images(self.test, "vision", pipeline.vision_size, self.cache)
         photos = pipeline.embed(pixels)
@@ -283,7 +284,19 @@ class Study:
             made = pipeline.sample(photo, self.test.ids, texts=text, seed=seed, background=gels)
             result[drive] = self.judged(made)
             np.save(folder / f"{drive}.npy", made)
+        if gels is not None:  # what a gel costs that training has not seen
+            made = pipeline.sample(photos, self.test.ids, seed=seed, background=self.known_gels())
+            result["known gels"] = self.judged(made)
+            hits = [self.judge.names(np.load(folder / "photo.npy")), self.judge.names(made)]
+            loss = np.subtract(*((names == self.answers).astype(float) for names in hits[::-1]))
+            result["loss by new gels"] = by_video(loss, self.videos)
         return result
+
+    def known_gels(self):
+        """A gel of the training world for each judged sample."""
+        gels = gels_of(self.train, MINI.size, self.cache)
+        rows = rng_for(0, "known gels").integers(len(gels), size=len(self.test))
+        return np.stack([gels[row] for row in rows])
 
     def ceilings(self):
         """What is not generated, judged alike."""
@@ -328,12 +341,14 @@ def tables(record):
     lines = [line("not generated", "CNN, %", "probe, %", "TMMD"), "|---|---|---|---|"]
     lines += [line(name, *cells(c)) for name, c in record["ceilings"].items()]
     heads = ["by photo: CNN, %", "of real", "probe, %", "TMMD", "by caption: CNN, %"]
-    heads = ["row", "seed", "steps", "CPU s", *heads, "permuted photos: CNN, %"]
+    heads += ["permuted photos: CNN, %", "lost by new gels, points"]
+    heads = ["row", "seed", "steps", "CPU s", *heads]
     lines += ["", line(*heads), "|---" * len(heads) + "|"]
     order = list(ROWS)
     for r in sorted(record["rows"], key=lambda r: (order.index(r["row"]), r["steps"], r["seed"])):
         cnn, probe, far = cells(r["photo"])
         others = [percents(r[d]["cnn"]) if d in r else "" for d in ("caption", "permuted")]
+        others.append(percents(r["loss by new gels"]) if "loss by new gels" in r else "")
         ratio = f"{r['photo']['cnn'][0] / real['cnn'][0]:.2f}"
         lines.append(
             line(r["row"], r["seed"], r["steps"], r["seconds"], cnn, ratio, probe, far, *others)
