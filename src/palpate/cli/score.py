@@ -87,6 +87,9 @@ class Options(Common):
     split: Path | None = None
     """Split file: its test part is scored, its train part gives the floor of TMMD, a material probe
     and the controls."""
+    train: Path | None = None
+    """What the generator was trained on, e.g. a folder or manifest of train images: adds how near
+    its images lie to these (memorization). Of a manifest that --split knows, its train part."""
     allow_seen: Switch = False
     """Score with an encoder that was trained on some of the real images, or chose generated ones
     (--best-of); every score says so."""
@@ -114,6 +117,7 @@ def run(options: Options, terminal: Terminal) -> dict[str, Any]:
         "allow_seen": options.allow_seen,
         "split": options.split,
         "background": options.background,
+        "train": options.train,
         **vars(options.samples),
         **vars(metrics),
         "names": options.samples.names or None,
@@ -135,7 +139,8 @@ def run(options: Options, terminal: Terminal) -> dict[str, Any]:
 def _check_outputs(options: Options) -> None:
     """Raise before anything is computed if an output cannot be written."""
     samples = options.samples
-    read = (options.reference, options.split, samples.labels, samples.groups, *options.generated)
+    given = (options.split, options.train)
+    read = (options.reference, *given, samples.labels, samples.groups, *options.generated)
     inputs = [path for path in read if path]
     if options.output:
         guard_output(options.output, inputs)

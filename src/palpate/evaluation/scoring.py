@@ -60,8 +60,10 @@ from palpate.evaluation.inputs import (
     guard,
     guard_choice,
     load_encoders,
+    read,
     read_inputs,
 )
+from palpate.evaluation.memorization import FEATURES, PIXELS, contact_rows, memorization
 from palpate.metrics import PRESETS, compare, compare_tmmd, distance, require_same_ids, tmmd
 from palpate.metrics.kernels import MOMENT_BYTES
 from palpate.metrics.mmd import BLOCKS_OF_MANY, sample_units
@@ -237,6 +239,7 @@ def score(  # noqa: PLR0913
     groups: Source = None,
     group: str = "auto",
     background: Source = None,
+    train: Source = None,
     presets: Sequence[Preset] | None = None,
     sigma: float | str | Sequence[float | str] | None = None,
     estimator: Literal["unbiased", "biased", "grouped"] | None = None,
@@ -274,6 +277,9 @@ def score(  # noqa: PLR0913
             the split kept whole, else the video.
         background: one image (or its file) of the sensor without contact, for all real images: what
             contact scores need where the reference is no manifest with backgrounds.
+        train: what the generator was trained on, of the same kind as the reference: adds how near
+            generated images lie to it (:mod:`palpate.evaluation.memorization`). Of a manifest that
+            the split knows, its train part.
         presets: readings of the TMMD family (:data:`palpate.metrics.PRESETS`). Default: ``grouped``
             and ``paper`` where groups are known; else ``paper``, but ``grouped`` for TMMD of sets
             that share ids, whose pairs of one scene are dependent.
@@ -333,6 +339,7 @@ def score(  # noqa: PLR0913
         split=split,
         reserved=(REFERENCE,) if split is None else (REFERENCE, BACKGROUND, SAME_MATERIAL, REAL),
     )
+    seen = None if train is None else _train_samples(train, inputs, split)
     weights = Weights(inception=inception, clip=clip, lpips=lpips)
     images = inputs.reference.features is None
     if images:
@@ -357,7 +364,9 @@ def score(  # noqa: PLR0913
         outcome = score_streamed(inputs, family, requested, progress)
     else:
         with tempfile.TemporaryDirectory() if cache is None else nullcontext(cache) as folder:
-            run = _Run(inputs, family, encoders, weights, Path(folder), cache is not None, progress)
+            run = _Run(
+                inputs, family, encoders, weights, Path(folder), cache is not None, progress, seen
+            )
             run, of = run.clustered(clusters) if clusters else (run, "")
             outcome = run.score(chosen, pairs=pairs, controls=controls)
             outcome = _with_clusters(outcome, clusters, of) if clusters else outcome
@@ -375,6 +384,25 @@ def score(  # noqa: PLR0913
         settings=settings,
         notes=[*outcome.notes, *_copies(outcome)],
     )
+
+
+def _train_samples(source: Source, inputs: Inputs, split: Split | None) -> Samples:
+    """What the generators were trained on.
+
+    Raises:
+        PalpateError: if it is of another kind than the reference, or cannot be read.
+    """
+    train, real = read(source, "train"), inputs.reference
+    if (train.features is None) != (real.features is None):
+        must, fix = "must be of the kind of the reference", "Pass images with images"
+        got = "embeddings" if real.features is None else "images"
+        raise PalpateError(must, got, fix, argument="train")
+    if any(s.streamed for s in (train, real, *inputs.generators.values())):
+        must, fix = "must go with rows that fit in memory", "Pass groups, or drop it"
+        raise PalpateError(must, "rows that are streamed", fix, argument="train")
+    if split is not None and not {*train.ids}.isdisjoint(split.parts):
+        train = train.take([i for i in train.ids if split.parts.get(i) == "train"])
+    return train
 
 
 def _presets(presets: str | Sequence[str] | None) -> tuple[str, ...]:
@@ -473,6 +501,7 @@ class _Run:
     cache: Path
     keep: bool
     progress: Progress
+    seen: Samples | None = None
 
     def score(self, chosen: Chosen, *, pairs: bool, controls: bool) -> Outcome:
         """Everything that is scored."""
@@ -510,6 +539,8 @@ class _Run:
             outcome.notes.append(Note("no-pairs"))
         if images and train is not None:
             outcome.scores += material_accuracies(train, features)
+        if self.seen is not None:
+            outcome.scores += self._memorization(self.seen)
         if images:
             digest = real.digest
             for scores in (outcome.scores, outcome.differences):
@@ -559,6 +590,40 @@ class _Run:
         train = self.inputs.train and replace(self.inputs.train, labels=None)
         inputs = replace(self.inputs, generators=made, reference=real, train=train)
         return replace(self, inputs=inputs), of
+
+    def _memorization(self, train: Samples) -> list[Score]:
+        """How near each generator's images lie to its train images, in every space there is."""
+        real, made = self.inputs.reference, self.inputs.generators
+        split, scores = self.family.common["split"], list[Score]()
+        if self.encoders is not None or real.features is not None:
+            test, base = self._features(real), self._features(train)
+            for name, samples in made.items():
+                x = self._features(samples)
+                scores += memorization(x, test, base, space=FEATURES, subject=name, split=split)
+        if real.features is not None:
+            return scores
+        train = replace(train, background=train.background or real.background)
+        paired = all({*samples.ids} <= {*real.ids} for samples in made.values())
+        gels = real.has_background and train.has_background and paired
+        seen = train.pixels(self._size(), self.cache, self.progress)
+        mean = None if gels else np.mean(seen, axis=0, dtype=np.float64)
+        settings = {"ground": "no-contact images" if gels else "mean train image"}
+        base = self._contact_rows(train, train, mean)
+        test = self._contact_rows(real, real, mean)
+        for name, samples in made.items():
+            x = self._contact_rows(samples, real, mean)
+            how: dict[str, Any] = {"subject": name, "split": split, "settings": settings}
+            scores += memorization(x, test, base, space=PIXELS, **how)
+        return scores
+
+    def _contact_rows(self, samples: Samples, real: Samples, mean: Any) -> FeatureSet:
+        """Pixels without what is there before contact: no-contact images of ``real``, or a mean."""
+        size = self._size()
+        images = samples.pixels(size, self.cache, self.progress)
+        if mean is None:
+            known = real if samples is real else real.take(samples.ids)
+            mean = known.pixels(size, self.cache, self.progress, "background")
+        return samples.feature_set(contact_rows(images, mean), None)
 
     def _features(self, samples: Samples) -> FeatureSet:
         """Features by the tactile encoder; without one, zeros that carry ids, labels and groups."""

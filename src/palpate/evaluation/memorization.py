@@ -1,0 +1,191 @@
+"""Memorization: is a generated image a train image in disguise?
+
+``d(x)`` is the distance of an image to its nearest train image, ``d_i`` of generated images,
+``r_j`` of real test images, in one of two spaces:
+
+- *contact pixels*: image minus its no-contact image (without one, minus the mean train image),
+  averaged to 32 x 32, root mean square;
+- *tactile features*: Euclidean, of an encoder's L2-normalized features.
+
+Two scores for each. **memorized share**: share of d_i below the p-quantile of r_j; real images have
+p by construction, which is its floor. **nearness to train**: ``P(d < r) + P(d = r) / 2``, an AUC;
+1/2 is what real images score, 1 means that every generated image is nearer to train than every real
+one, 0 that none is (noise). Closer to the floor is better for both. Intervals leave out one video
+at a time, from both sets, so the quantile's error is in them.
+
+Real test images of a leaking split lie near train as well: the same copies then count for less,
+which is the leak and no virtue of the generator. A smooth generator is nearer in pixels to anything
+than a real image with its noise: read its score next to the autoencoder's reconstruction.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from palpate.core import FeatureSet, PalpateError, Score, require
+from palpate.metrics.inputs import Array, require_one_encoder
+from palpate.metrics.intervals import Spread, jackknife_errors
+
+#: Side that contact pixels are averaged to.
+SIDE = 32
+#: Quantile of real distances under which a generated image counts as memorized.
+QUANTILE = 0.05
+#: Distances in memory at a time.
+CELLS = 1 << 22
+PIXELS, FEATURES = "contact pixels", "tactile features"
+SHARE, NEARNESS = "memorized share", "nearness to train"
+
+
+def contact_rows(images: NDArray[np.uint8], ground: NDArray[Any]) -> NDArray[np.float32]:
+    """Rows (n, d) of which Euclidean distance is the root mean square of contact pixels.
+
+    Args:
+        images: (n, h, w, 3), square.
+        ground: what is subtracted: (n, h, w, 3), or one (h, w, 3) for all; 0 to 255.
+    """
+    side = min(SIDE, images.shape[1])
+    edges = np.array([k * images.shape[1] // side for k in range(side + 1)])
+    size = (edges[1:] - edges[:-1]).astype(np.float64)
+    area = np.outer(size, size)[..., None]
+    rows = np.empty((len(images), side * side * images.shape[3]), np.float32)
+    for k, image in enumerate(images):
+        gel = ground if ground.ndim == 3 else ground[k]
+        change = (image.astype(np.float32) - gel) / 255
+        total = np.add.reduceat(np.add.reduceat(change, edges[:-1], axis=0), edges[:-1], axis=1)
+        rows[k] = (total / area).ravel()
+    return rows / np.float32(np.sqrt(rows.shape[1]))
+
+
+def nearest(queries: NDArray[Any], train: NDArray[Any]) -> tuple[Array, NDArray[np.intp]]:
+    """Distance (n,) of each query (n, d) to its nearest train row (m, d), and which that is."""
+    base = np.asarray(train, np.float32)
+    squares = (base**2).sum(axis=1)
+    at = np.empty(len(queries), np.intp)
+    step = max(1, CELLS // max(1, len(base)))
+    for start in range(0, len(queries), step):
+        part = np.asarray(queries[start : start + step], np.float32)
+        at[start : start + step] = (squares - 2 * part @ base.T).argmin(axis=1)
+    change = np.asarray(queries, np.float64) - base[at]
+    return np.sqrt((change**2).sum(axis=1)), at
+
+
+def memorization(
+    generated: FeatureSet,
+    real: FeatureSet,
+    train: FeatureSet,
+    *,
+    space: str = FEATURES,
+    quantile: float = QUANTILE,
+    subject: str = "generated",
+    split: str | None = None,
+    settings: dict[str, Any] | None = None,
+) -> list[Score]:
+    """Memorized share and nearness to train of generated images; see the head of this module.
+
+    Args:
+        generated: rows of the space, with groups (videos) for the interval.
+        real: rows of real test images, with groups.
+        train: rows of the train images of the generator.
+        space: what the rows are, kept in the name of the scores.
+        quantile: p of the memorized share, in (0, 1).
+        subject: what is scored, kept in the scores.
+        split: digest of the split, kept in the scores.
+        settings: more to keep in the scores.
+
+    Returns:
+        Two scores; ``details`` holds the distances' medians and quantile, and the ten generated
+        images that are nearest to train, with the train image.
+
+    Raises:
+        PalpateError: if one of the three is empty, widths or encoders differ, or the quantile is
+            out of range.
+    """
+    require(0 < quantile < 1, "quantile", "must lie between 0 and 1", quantile, QUANTILE)
+    for name, features in (("generated", generated), ("real test", real), ("train", train)):
+        if not len(features.ids):
+            must, fix = f"There must be {name} images", "Check the folder or the split"
+            raise PalpateError(must, "none", fix)
+    for other, what in ((generated, "Generated and train"), (real, "Real and train")):
+        require_one_encoder(other, train, f"{what} images")
+        if other.features.shape[1] != train.features.shape[1]:
+            got = f"{other.features.shape[1]} and {train.features.shape[1]}"
+            must, fix = f"{what} images must have rows of one width", "Describe both alike"
+            raise PalpateError(must, got, fix)
+    made, at = nearest(generated.features, train.features)
+    test, _ = nearest(real.features, train.features)
+    groups = _units(generated), _units(real)
+    threshold = float(np.quantile(test, quantile))
+    first = [int(k) for k in np.argsort(made, kind="stable")[:10]]
+    details: dict[str, Any] = {
+        "quantile distance": threshold,
+        "median generated": float(np.median(made)),
+        "median real": float(np.median(test)),
+        "nearest": [
+            {"id": generated.ids[k], "train": train.ids[at[k]], "distance": float(made[k])}
+            for k in first
+        ],
+    }
+    common: dict[str, Any] = {
+        "subject": subject,
+        "n": len(made),
+        "m": len(test),
+        "split": split,
+        "encoder": train.encoder,
+        "higher_is_better": None,
+        "details": details,
+    }
+    settings = {"space": space, "train": len(train.ids), **(settings or {})}
+    share = _spread(lambda d, r: (d < np.quantile(r, quantile)).mean(), made, test, groups)
+    area = _spread(_nearness, made, test, groups)
+    return [
+        _score(f"{SHARE} ({space})", share, quantile, common, settings | {"quantile": quantile}),
+        _score(f"{NEARNESS} ({space})", area, 0.5, common, settings),
+    ]
+
+
+def _score(
+    metric: str, spread: Spread, floor: float, common: dict[str, Any], settings: dict[str, Any]
+) -> Score:
+    interval = spread.interval(0.0, 1.0)
+    return Score(
+        metric,
+        value=spread.value,
+        interval=interval,
+        interval_method=spread.method if interval else "",
+        floor=floor,
+        settings=settings,
+        **common,
+    )
+
+
+def _units(features: FeatureSet) -> NDArray[np.str_]:
+    """The group of each row; the id where there is none."""
+    groups: Sequence[Any] = features.groups or [None] * len(features.ids)
+    return np.array([g or i for g, i in zip(groups, features.ids, strict=True)], dtype=str)
+
+
+def _spread(
+    statistic: Callable[[Array, Array], float],
+    made: Array,
+    test: Array,
+    groups: tuple[NDArray[np.str_], NDArray[np.str_]],
+) -> Spread:
+    """A statistic of generated and real distances, left without one video after the other."""
+    names = np.unique(np.concatenate(groups))
+    kept = [(made[groups[0] != g], test[groups[1] != g]) for g in names]
+    replicates = np.array([statistic(*pair) for pair in kept if min(map(len, pair))])
+    error, df = float(jackknife_errors(replicates[:, None])[0]), len(names) - 1
+    method = f"leave-one-video-out jackknife, t, {df} df"
+    return Spread(statistic(made, test), error, df, method)
+
+
+def _nearness(made: Array, test: Array) -> float:
+    """``P(d < r) + P(d = r) / 2``."""
+    order = np.sort(test)
+    above = len(test) - np.searchsorted(order, made, "right")
+    equal = np.searchsorted(order, made, "right") - np.searchsorted(order, made, "left")
+    return float((above + equal / 2).mean() / len(test))
