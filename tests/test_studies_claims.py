@@ -210,3 +210,12 @@ def test_forty_items_say_what_they_can_carry():
     assert "cannot decide" in table.text
     clear = {"SSIM": {"Ours": base, "GVST": base - 0.2 + rng.normal(0, 0.05, 400)}}
     assert "and decide the 0.2" in forty_table(clear, ids, groups, better={"SSIM": True}).text
+
+
+def test_the_distance_of_patches_stands_in_for_lpips():
+    other = difference("patch distance (palpate/mini vision)", 5, pair=("Ours", "Ours w/ BG"))
+    made = {c.claim: c for c in preference_claims([other], PEOPLE)}
+    claim = made["LPIPS prefers what people do not"]
+    assert claim.verdict == "holds"
+    assert "patch distance (palpate/mini vision) puts Ours ahead" in claim.why
+    assert made["FID prefers what people do not"].verdict == "undecided"

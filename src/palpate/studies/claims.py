@@ -34,6 +34,8 @@ TRADITIONAL = ("SSIM", "PSNR", "LPIPS", "FID", "CMMD")
 FAMILY = ("TMMD", "I-TMMD", "CI-TMMD", "D-TMMD")
 #: What feature metrics are called whose features are of a tactile encoder: none of the paper's.
 TACTILE = "(tactile)"
+#: What counts for a metric without its weights (:mod:`palpate.studies.photo_companions`).
+STAND_INS = {"LPIPS": "patch distance"}
 PEOPLE = "human preference"
 #: Items of the paper's human study and pairwise scores.
 FORTY = 40
@@ -144,7 +146,8 @@ def _of_metric(metric: str, difference: Score) -> bool:
     name = metric_of(difference)
     if metric in FAMILY:
         return name == metric
-    return name.partition(" (")[0] == metric and not name.endswith(TACTILE)
+    known = metric, STAND_INS.get(metric)
+    return name.partition(" (")[0] in known and not name.endswith(TACTILE)
 
 
 def _between(differences: Iterable[Score], metric: str, a: str, b: str) -> list[Score]:
