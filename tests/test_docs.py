@@ -42,7 +42,7 @@ def examples(tmp_path_factory):
         shutil.copy(folder / "tag" / f"{part}.txt", folder / f"{part}.txt")
     rng = np.random.default_rng(0)
     frames = sorted((folder / "tag" / "dataset").glob("*/gelsight_frame/*.jpg"))[::5][:40]
-    for name, noise in (("real", 0), ("generated", 10), ("second", 30)):
+    for name, noise in (("real", 0), ("generated", 10), ("second", 30), ("train", 5)):
         (folder / name).mkdir()
         for k, path in enumerate(frames):
             image = np.asarray(Image.open(path)).astype(float)
