@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import os
+import re
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from functools import reduce
 from pathlib import Path
 from typing import Annotated, Any
@@ -16,11 +17,18 @@ from palpate.core import Note, PalpateError, inside, read_record, short
 from palpate.report.results import AUDIT_FORMATS, RESULTS_FORMATS, Audit, Results
 
 TITLE = "palpate report"
+#: Names of the files that folders of figures and of tables hold.
+WRITTEN = re.compile(
+    r"(background|claims|curve|pairs|samples|scores|strips|table)\b.*\.(csv|png|svg)"
+)
 
 
 @dataclass(frozen=True, kw_only=True)
 class Options(Common):
-    """Write one self-contained page, with JSON and Markdown of the same results next to it."""
+    """Write one self-contained page, with JSON and Markdown of the same results next to it.
+
+    Figures and tables for a paper can be written as files, too.
+    """
 
     results: Annotated[tuple[Path, ...], tyro.conf.Positional]
     """Any of: the JSON of `palpate audit -o`, of `palpate score -o`, or of an earlier page."""
@@ -30,6 +38,10 @@ class Options(Common):
     """Heading of the page."""
     images: tuple[Path, ...] = ()
     """Folders whose images the page may show, next to those of the results."""
+    figures: Path | None = None
+    """Folder for figures: curves and scores (.svg and .png), samples and pairs (.png)."""
+    csv: Path | None = None
+    """Folder for the tables, curves and claims of a study, and scores, as .csv."""
 
 
 def run(options: Options, terminal: Terminal) -> dict[str, Any]:
@@ -40,10 +52,12 @@ def run(options: Options, terminal: Terminal) -> dict[str, Any]:
     from palpate.report import write_report
 
     if options.output.suffix == ".html":
-        marks = (options.title.encode(), b"palpate")
+        marks = (options.title.encode(), b"palpate", b"What this page shows")
         guard_output(options.output, options.results, marks)
         guard_output(options.output.with_suffix(".json"), options.results)
         guard_output(options.output.with_suffix(".md"), options.results, marks)
+    for argument, folder in (("figures", options.figures), ("csv", options.csv)):
+        _guard_folder(argument, folder)
     results = [read(path, options.images) for path in options.results]
     merged = reduce(join, results, Results(title=options.title))
     for note in merged.notes:
@@ -53,8 +67,31 @@ def run(options: Options, terminal: Terminal) -> dict[str, Any]:
     with terminal.progress() as progress:
         files = write_report(merged, options.output, base=Path(), progress=progress)
     paths = {"page": str(files.page), "json": str(files.json), "markdown": str(files.markdown)}
+    if options.figures:
+        merged.save_figures(options.figures)
+        paths["figures"] = str(options.figures)
+    if options.csv:
+        merged.to_csv(options.csv)
+        paths["csv"] = str(options.csv)
     terminal.facts("Report", paths)
     return paths
+
+
+def _guard_folder(argument: str, folder: Path | None) -> None:
+    """Check that a folder of files holds no other ones, which might be replaced.
+
+    Raises:
+        PalpateError: if it holds one, or is a file.
+    """
+    if folder is None or not folder.exists():
+        return
+    if not folder.is_dir():
+        raise PalpateError("must be a folder", str(folder), "Name another", argument=argument)
+    foreign = sorted(path.name for path in folder.iterdir() if not WRITTEN.fullmatch(path.name))
+    if foreign:
+        must = "must be a new folder, or hold nothing but files of this command"
+        got = f"{folder} with {foreign[0]}"
+        raise PalpateError(must, got, "Choose another folder", argument=argument)
 
 
 def read(path: Path, folders: Sequence[Path] = ()) -> Results:
@@ -93,7 +130,7 @@ def read(path: Path, folders: Sequence[Path] = ()) -> Results:
 
 def join(first: Results, second: Results) -> Results:
     """Return both, one after the other; the first title of its own stays."""
-    names = ("facts", "audits", "scores", "gallery", "strips", "notes", "commands")
+    names = [f.name for f in fields(Results) if f.name not in ("title", "settings")]
     lists: dict[str, Any] = {n: [*getattr(first, n), *getattr(second, n)] for n in names}
     title = second.title if first.title == TITLE and second.title else first.title
     return Results(title=title, settings={**first.settings, **second.settings}, **lists)

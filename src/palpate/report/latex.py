@@ -1,4 +1,5 @@
-r"""Scores as LaTeX tables (``booktabs``): one a family of metrics, then one of its differences.
+r"""LaTeX tables (``booktabs``): of a study, of its claims, and of scores, one a family of metrics
+and one of its differences.
 
 The interval is below the value, the p-value of a permutation test below that. Bold is better than
 every other generator by a paired difference whose interval excludes 0. Notes have letters below the
@@ -11,10 +12,12 @@ import re
 import unicodedata
 from collections.abc import Callable, Iterable, Sequence
 
-from palpate.core import short
+from palpate.core import Note, short
 from palpate.report.notes import sentence
 from palpate.report.results import Results
-from palpate.report.tables import BASELINES, BEST, Cell, Column, Table, score_tables
+from palpate.report.study import Claim
+from palpate.report.study_tables import BEST_OF_COLUMN, Entry, Sheet, sheets, tally
+from palpate.report.tables import BASELINES, BEST, Cell, Column, Table, defined, score_tables
 from palpate.report.terminal import NAMES, difference_rows
 
 #: First line of the file: how the command recognizes its own file.
@@ -57,12 +60,13 @@ def escape(text: str) -> str:
 
 
 def latex_tables(results: Results) -> str:
-    """Return every table of the scores of ``results``.
+    """Return every table of a study, its claims, and the tables of the scores of ``results``.
 
     Raises:
         PalpateError: if two scores that share a column were not made with the same settings.
     """
-    lines: list[str] = []
+    lines = [line for table in sheets(results) for line in _sheet(table)]
+    lines += _claims(results.claims)
     for table in score_tables(results.scores):
         caption = [table.title, *_facts(table)]
         caption += [f"Command: {results.commands[0]}"] if results.commands else []
@@ -71,6 +75,53 @@ def latex_tables(results: Results) -> str:
     commands = (re.sub(r"[\x00-\x1f\x7f\u2028\u2029]", " ", c) for c in results.commands)
     head = [MARK, *(f"% {c}" for c in commands), r"% Needs \usepackage{booktabs}."]
     return "\n".join([*head, "", *lines]).rstrip() + "\n"
+
+
+def _sheet(table: Sheet) -> list[str]:
+    """A table of a study: controls in italics between rules, the interval below the value."""
+    if not table.rows:
+        return []
+    heads = (f"{escape(h.label)} {ARROWS[h.arrow] if h.arrow else ''}".strip() for h in table.heads)
+    rows = [_row(list(heads)), r"\midrule"]
+    for row in table.rows:
+        rows += [r"\midrule"] * row.rule
+        rows.append(_row([_entry(cell, row.control) for cell in row.cells]))
+        below = [_small_interval(cell) for cell in row.cells]
+        rows += [_row(below)] if any(below) else []
+    caption = [table.title, *([table.text] if table.text else [])]
+    caption += [f"Bold: {BEST_OF_COLUMN}"] * table.has_best
+    caption += ["Italics: controls"] * any(row.control for row in table.rows)
+    notes = _footnotes(range(1, len(table.notes) + 1), table.notes)
+    return _float(caption, "".join("r" if h.scores else "l" for h in table.heads), rows, notes)
+
+
+def _entry(cell: Entry, control: bool) -> str:
+    if cell.score is None:
+        words = escape(cell.value) if isinstance(cell.value, str) else "--"
+        return rf"\textit{{{words}}}" if control and cell.value else words
+    marks = _raised(cell.footnotes) if cell.footnotes else ""
+    if not defined(cell.score):
+        return "--" + marks
+    text = f"{cell.score.value:z.{cell.digits}f}"
+    return (rf"$\mathbf{{{text}}}$" if cell.best else f"${text}$") + marks
+
+
+def _small_interval(cell: Entry) -> str:
+    known = cell.score is not None and defined(cell.score)
+    text = _pair(cell.score.interval, cell.digits) if cell.score and known else ""
+    return rf"{{\scriptsize {text}}}" if text else ""
+
+
+def _claims(claims: Sequence[Claim]) -> list[str]:
+    if not claims:
+        return []
+    narrow: Callable[[str], str] = lambda text: rf"{{\raggedright {escape(text)}\par}}"
+    rows = [_row(["Claim", "Verdict", "Why"]), r"\midrule"]
+    rows += [
+        _row([narrow(f"{c.claim} ({c.source})"), escape(c.verdict), narrow(c.why)]) for c in claims
+    ]
+    columns = r"p{0.38\linewidth}lp{0.4\linewidth}"
+    return _float([f"Claims: {tally(claims)}"], columns, rows, [])
 
 
 def _scores(table: Table, caption: Sequence[str]) -> list[str]:
@@ -139,10 +190,13 @@ def _short(text: str) -> str:
 
 def _below(table: Table, cells: Iterable[Cell]) -> list[str]:
     """The footnotes of some cells."""
-    used = sorted({k for cell in cells for k in cell.footnotes})
-    notes = [f"{_raised([k])}~{escape(sentence(table.notes[k - 1]))}" for k in used]
-    text = ". ".join(note.rstrip(".") for note in notes)
-    return [rf"\par\smallskip\parbox{{\linewidth}}{{\footnotesize {text}.}}"] if notes else []
+    return _footnotes({k for cell in cells for k in cell.footnotes}, table.notes)
+
+
+def _footnotes(numbers: Iterable[int], notes: Sequence[Note]) -> list[str]:
+    texts = (f"{_raised([k])}~{escape(sentence(notes[k - 1]))}" for k in sorted(numbers))
+    text = ". ".join(note.rstrip(".") for note in texts)
+    return [rf"\par\smallskip\parbox{{\linewidth}}{{\footnotesize {text}.}}"] if text else []
 
 
 def _baseline(title: str, table: Table, value_of: Callable[[Cell], float | None]) -> list[str]:

@@ -13,8 +13,17 @@ from typing import Any
 from palpate.report.notes import HOW_TO_READ, sentence
 from palpate.report.results import Results
 from palpate.report.sentences import purpose, summary_lines
+from palpate.report.study import Claim
+from palpate.report.study_tables import BEST_OF_COLUMN, Sheet, curve_table, sheet, tally
 from palpate.report.tables import BEST, Table, score_tables, settings_of, table_facts
-from palpate.report.terminal import NAMES, audit_text, difference_rows, score_rows
+from palpate.report.terminal import (
+    NAMES,
+    audit_text,
+    difference_rows,
+    score_rows,
+    sheet_rows,
+    sheet_words,
+)
 
 _SPECIAL = str.maketrans({c: f"\\{c}" for c in "\\`*_[]|<>"})
 
@@ -30,7 +39,12 @@ def render_markdown(results: Results) -> str:
     if results.notes:
         lines += ["## Read this first", "", *_items(map(sentence, results.notes))]
     tables = [line for table in score_tables(results.scores) for line in _scores(table)]
+    studied = [line for table in map(sheet, results.tables) for line in _sheet(table)]
+    curves = [line for curve in results.curves for line in _sheet(sheet(curve_table(curve)))]
     sections = {
+        "Claims": _claims(results.claims),
+        "Tables": studied,
+        "Curves": curves,
         "Scores": [HOW_TO_READ, "", *tables] if tables else [],
         "Leakage audit": [line for a in results.audits for line in _fenced(audit_text(a))],
         "Settings and digests": _tree(settings_of(results)),
@@ -56,16 +70,20 @@ def code(text: str) -> str:
     return f"{fence}{pad}{text}{pad}{fence}"
 
 
-def pipe_table(rows: Sequence[Mapping[str, str]]) -> list[str]:
-    """Return rows as a padded table without the columns that are empty; numbers are flush right."""
+def pipe_table(rows: Sequence[Mapping[str, str]], words: Sequence[str] = NAMES) -> list[str]:
+    """Return rows as a padded table without the columns that are empty.
+
+    ``words`` are the columns of text; others are flush right.
+    """
     names = [name for name in rows[0] if any(row[name] for row in rows)]
+    heads = [esc(name) for name in names]
     cells = [[esc(row[name]) for name in names] for row in rows]
-    widths = [max(3, *map(len, column)) for column in zip(names, *cells, strict=True)]
-    right = [name not in NAMES for name in names]
+    widths = [max(3, *map(len, column)) for column in zip(heads, *cells, strict=True)]
+    right = [name not in words for name in names]
     rule = ["-" * (w - r) + ":" * r for w, r in zip(widths, right, strict=True)]
     padded = [
         [c.rjust(w) if r else c.ljust(w) for c, w, r in zip(row, widths, right, strict=True)]
-        for row in (names, *cells)
+        for row in (heads, *cells)
     ]
     return [f"| {' | '.join(row)} |" for row in (padded[0], rule, *padded[1:])] + [""]
 
@@ -91,6 +109,23 @@ def _scores(table: Table) -> list[str]:
         lines.append(f"- {esc(title)}: {facts}")
     lines += [f"- ({k}) {esc(sentence(note))}" for k, note in enumerate(table.notes, 1)]
     return [*lines, ""]
+
+
+def _sheet(table: Sheet) -> list[str]:
+    lines = [f"### {esc(table.title)}", "", *([esc(table.text), ""] if table.text else [])]
+    if table.rows:
+        lines += pipe_table(sheet_rows(table), sheet_words(table))
+    lines += [f"\\* {BEST_OF_COLUMN}", ""] if table.has_best else []
+    lines += [f"- {esc(what)}: {esc(how)}" for what, how in table.made]
+    lines += [f"- ({k}) {esc(sentence(note))}" for k, note in enumerate(table.notes, 1)]
+    return [*lines, ""]
+
+
+def _claims(claims: Sequence[Claim]) -> list[str]:
+    rows = [
+        {"claim": f"{c.claim} ({c.source})", "verdict": c.verdict, "why": c.why} for c in claims
+    ]
+    return [f"{tally(claims)}.", "", *pipe_table(rows, list(rows[0]))] if rows else []
 
 
 def _tree(value: Mapping[str, Any], depth: int = 0) -> list[str]:

@@ -24,10 +24,11 @@ from markupsafe import Markup, escape
 
 from palpate import __version__
 from palpate.core import PalpateError, Progress, SampleRef, plain, quiet, write_json, write_text
-from palpate.report import audits, first_screen, plots, sentences
+from palpate.report import audits, curves, first_screen, plots, sentences, study_tables
 from palpate.report.notes import confidence, count, number, percent, plural, sentence, where
 from palpate.report.results import GalleryItem, LeakPair, Results, Strip
-from palpate.report.tables import heat_tables, score_tables, settings_of, table_facts
+from palpate.report.study_tables import sheets
+from palpate.report.tables import defined, heat_tables, score_tables, settings_of, table_facts
 from palpate.report.thumbnails import Album, Wanted, fit
 
 #: Samples of the first screen; their images take at most a third of the bytes.
@@ -35,6 +36,8 @@ HERO_ROWS = 3
 #: Gallery rows and pairs of one list that show at once, and that the page holds at all.
 OPEN_ROWS, MAX_ROWS = 8, 160
 OPEN_PAIRS, MAX_PAIRS = 6, 24
+#: Claims that show at once.
+OPEN_CLAIMS = 10
 #: A list in the settings is cut here; the JSON keeps it whole.
 LONG_LIST = 24
 _DIGEST = re.compile(r"(?:sha256:)?[0-9a-f]{32,128}")
@@ -120,7 +123,7 @@ def render_page(
     tables = score_tables(results.scores)
     columns = first_screen.telling_columns(tables)
     cards = first_screen.cards(results, columns)
-    samples = _gallery_images(results.gallery)
+    samples = gallery_images(results.gallery)
     hero_rows: dict[Hashable, list[Wanted]] = {
         id(item): images for item, images in samples[:HERO_ROWS]
     }
@@ -133,6 +136,7 @@ def render_page(
         "facts": list(results.facts) or ([] if cards else sentences.summary_lines(results)),
         "cards": cards,
         "row_labels": [wanted.label for wanted in samples[0][1]] if samples else [],
+        "sheets": sheets(results),
         "tables": tables,
         "columns": columns,
         "verdict": first_screen.verdict(columns),
@@ -201,14 +205,14 @@ def image_rows(results: Results) -> tuple[dict[Hashable, list[Wanted]], int]:
         target = pairs if rank < OPEN_PAIRS else folded_pairs
         for a, k, members, head in lists:
             if rank < len(members):
-                target[a, k, rank] = _pair_images(members[rank], head)
-    gallery = [(id(i), w) for i, w in _gallery_images(results.gallery)[HERO_ROWS:MAX_ROWS]]
+                target[a, k, rank] = pair_images(members[rank], head)
+    gallery = [(id(i), w) for i, w in gallery_images(results.gallery)[HERO_ROWS:MAX_ROWS]]
     strips = [(id(strip), _strip_images(strip)) for strip in results.strips]
     first = [*gallery[:OPEN_ROWS], *pairs.items(), *strips]
     return dict([*first, *gallery[OPEN_ROWS:], *folded_pairs.items()]), len(first)
 
 
-def _pair_images(pair: LeakPair, head: str) -> list[Wanted]:
+def pair_images(pair: LeakPair, head: str) -> list[Wanted]:
     """Photos above, tactile images below, test left; without photos, tactile images and contact."""
     samples = (("Test", pair.test), (head, pair.train))
     kinds = ("photo", "tactile image") if pair.has_photos else ("tactile image", "contact")
@@ -225,7 +229,7 @@ def _pair_images(pair: LeakPair, head: str) -> list[Wanted]:
     ]
 
 
-def _gallery_images(gallery: Sequence[GalleryItem]) -> list[tuple[GalleryItem, list[Wanted]]]:
+def gallery_images(gallery: Sequence[GalleryItem]) -> list[tuple[GalleryItem, list[Wanted]]]:
     """Every sample with its images, materials in turn; a column that no sample has is skipped.
 
     Where a background is known, the contacts follow: without the background, amplified.
@@ -326,12 +330,15 @@ def environment() -> Environment:
         "long_list": LONG_LIST,
         "READING": first_screen.READING,
         "like_rows": _like_rows,
+        "open_claims": OPEN_CLAIMS,
+        "verdict_marks": study_tables.MARKS,
+        "best_of_column": study_tables.BEST_OF_COLUMN,
     }
-    for module in (audits, first_screen, plots, sentences):
+    for module in (audits, curves, first_screen, plots, sentences, study_tables):
         functions |= {k: v for k, v in vars(module).items() if callable(v)}
     env.globals.update(functions)
     words: dict[str, Any] = {"count": count, "number": number}
-    words |= {"percent": percent, "plural": plural}
+    words |= {"percent": percent, "plural": plural, "is_defined": defined}
     env.filters.update(words)
     env.filters.update(
         label=lambda key: str(key).replace("_", " "),

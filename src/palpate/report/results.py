@@ -399,7 +399,7 @@ class Results:
         return matches if isinstance(key, str) else matches[0]
 
     def __str__(self) -> str:
-        """The tables of scores, as in the terminal."""
+        """The tables of scores and of a study, and the claims, as in the terminal."""
         return _writer("terminal").as_text(self)
 
     def _repr_html_(self) -> str:
@@ -420,8 +420,31 @@ class Results:
         return _writer("markdown").render_markdown(self)
 
     def to_latex(self) -> str:
-        """The scores as LaTeX tables (booktabs)."""
+        """Scores, tables of a study and claims as LaTeX tables (booktabs)."""
         return _writer("latex").latex_tables(self)
+
+    def to_csv(self, folder: str | Path) -> list[Path]:
+        """Write each table and curve of a study, the claims and the scores as CSV files.
+
+        Numbers have full precision; an interval is the columns ``low`` and ``high``.
+
+        Returns:
+            The files.
+        """
+        return _writer("csv_files").save_csv(self, Path(folder))
+
+    def save_figures(self, folder: str | Path) -> list[Path]:
+        """Write the figures of a paper: curves and strips as SVG and PNG, images as PNG.
+
+        They are white and read without colors: lines differ by dashes and markers.
+
+        Returns:
+            The files.
+
+        Raises:
+            PalpateError: if scores of different settings would share a column.
+        """
+        return _writer("figures").save_figures(self, Path(folder), base=Path())
 
     def to_frame(self) -> pl.DataFrame:
         """A polars frame, one row a score, with its interval, null and settings."""

@@ -193,9 +193,14 @@ def purpose(results: Results) -> str:
         parts.append("how close tactile images generated from photos come to real ones")
     if results.audits:
         parts.append("whether the split behind the numbers leaks from train into test")
+    if results.claims:
+        parts.append("which claims hold on these data")
+    if not parts and (results.tables or results.curves):
+        parts.append("what a study measured")
     if not parts:
         return "Results of palpate; nothing has been measured yet."
-    return f"What this page shows: {', and '.join(parts)}."
+    *others, last = parts
+    return f"What this page shows: {', '.join(others)}{', and ' * bool(others)}{last}."
 
 
 def score_line(scores: Sequence[Score]) -> str:

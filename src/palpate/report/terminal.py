@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 from collections.abc import Sequence
+from itertools import takewhile
 
 from rich.console import Console
 from rich.table import Table as Grid
@@ -18,7 +19,9 @@ from palpate.report.sentences import (
     signal_notes,
     threshold_text,
 )
-from palpate.report.tables import BASELINES, BEST, Cell, Table, rankings, score_tables
+from palpate.report.study import Claim
+from palpate.report.study_tables import BEST_OF_COLUMN, Entry, Sheet, curve_table, sheet, tally
+from palpate.report.tables import BASELINES, BEST, Cell, Table, defined, rankings, score_tables
 
 #: Columns that are text; all others are numbers, flush right.
 NAMES = ("metric", "subject", "a", "b", "notes", "best first")
@@ -51,6 +54,10 @@ def print_result(result: Results | Audit, console: Console, style: Style = COMMA
         console.print()
     for audit in result.audits:
         print_result(audit, console, style)
+    tables = [*result.tables, *map(curve_table, result.curves)]
+    for table in map(sheet, tables):
+        _print_sheet(table, console, style)
+    _print_claims(result.claims, console)
     for note in result.notes:
         console.print(Text(sentence(note, style)), soft_wrap=True)
 
@@ -99,14 +106,67 @@ def difference_rows(table: Table) -> list[dict[str, str]]:
     ]
 
 
-def _print_rows(rows: Sequence[dict[str, str]], console: Console) -> None:
-    """Print rows as a table without empty columns, or as lists where that is too wide."""
+def sheet_rows(table: Sheet) -> list[dict[str, str]]:
+    """Return the rows of a table of a study; best scores have a star, controls are called so."""
+    return [
+        {
+            f"{head.label} {head.arrow}".strip(): _entry(cell)
+            + (" (control)" if row.control and not k else "")
+            for k, (head, cell) in enumerate(zip(table.heads, row.cells, strict=True))
+        }
+        for row in table.rows
+    ]
+
+
+def sheet_words(table: Sheet) -> list[str]:
+    """Return the columns of a table that hold words."""
+    return [head.label for head in table.heads if not head.scores]
+
+
+def _entry(cell: Entry) -> str:
+    if cell.score is None:
+        return cell.value if isinstance(cell.value, str) else ""
+    parts = ["undefined"]
+    if defined(cell.score):
+        interval = _pair(cell.score.interval, cell.digits)
+        parts = [_number(cell.score.value, cell.digits), interval]
+    marks = ["*"] * cell.best + [f"({k})" for k in cell.footnotes]
+    return " ".join(filter(None, [*parts, *marks]))
+
+
+def _print_sheet(table: Sheet, console: Console, style: Style) -> None:
+    console.print(Text(table.title, "bold"), soft_wrap=True)
+    _print_rows(sheet_rows(table), console, sheet_words(table))
+    lines = [f"* {BEST_OF_COLUMN}"] * table.has_best
+    lines += [f"({k}) {sentence(note, style)}" for k, note in enumerate(table.notes, 1)]
+    for line in lines:
+        console.print(Text(line), soft_wrap=True)
+    console.print()
+
+
+def _print_claims(claims: Sequence[Claim], console: Console) -> None:
+    if not claims:
+        return
+    console.print(Text(f"Claims: {tally(claims)}", "bold"))
+    for claim in claims:
+        console.print(Text(f"{claim.verdict}: {claim.claim} ({claim.source})"), soft_wrap=True)
+        console.print(Text(f"  {claim.why}"), soft_wrap=True)
+    console.print()
+
+
+def _print_rows(
+    rows: Sequence[dict[str, str]], console: Console, words: Sequence[str] = NAMES
+) -> None:
+    """Print rows as a table without empty columns, or as lists where that is too wide.
+
+    ``words`` are the columns of text.
+    """
     if not rows:
         return
     names = [name for name in rows[0] if any(row[name] for row in rows)]
     grid = Grid(box=None, pad_edge=False, padding=(0, 2, 0, 0))
     for name in names:
-        grid.add_column(name, justify="left" if name in NAMES else "right", no_wrap=True)
+        grid.add_column(Text(name), justify="left" if name in words else "right", no_wrap=True)
     for row in rows:
         grid.add_row(*(Text(row[name]) for name in names))
     wide = console.measure(grid, options=console.options.update(width=10_000)).maximum
@@ -114,7 +174,7 @@ def _print_rows(rows: Sequence[dict[str, str]], console: Console) -> None:
         console.print(grid)
         return
     for row in rows:
-        head = [row[name] for name in names[:3] if name in NAMES]
+        head = [row[name] for name in takewhile(words.__contains__, names[:3])]
         console.print(Text(", ".join(head), "bold"), soft_wrap=True)
         for name in names[len(head) :]:
             if row[name]:
@@ -162,4 +222,12 @@ def audit_text(audit: Audit, style: Style = PYTHON) -> str:
     return "\n".join([*lines, *(audit_text(other, style) for other in audit.others)])
 
 
-__all__ = ["as_text", "audit_text", "difference_rows", "print_result", "score_rows"]
+__all__ = [
+    "as_text",
+    "audit_text",
+    "difference_rows",
+    "print_result",
+    "score_rows",
+    "sheet_rows",
+    "sheet_words",
+]

@@ -26,8 +26,8 @@ TINY = 96
 SIZES = ((256, 88), (192, 86), (160, 84), (128, 82), (96, 78), (64, 72), (48, 64), (32, 60))
 #: Below this side, rows that are folded anyway are skipped before images shrink further.
 KEEP_ALL = 128
-#: Pixels of the largest image that is decoded.
-LARGEST = 50_000_000
+#: Pixels of the largest image that is decoded, and the problem of a larger one.
+LARGEST, TOO_LARGE = 50_000_000, "image too large"
 #: Bytes of markup around the images of one row, roughly.
 ROW_MARKUP = 1_500
 
@@ -113,18 +113,8 @@ def thumbnail(
     """Return one image with at most ``side`` pixels a side; ``less`` as in :class:`Wanted`."""
     if name is None:
         return Thumbnail(problem="not recorded")
-    if (base / name).is_fifo():  # it would be waited for
-        return Thumbnail(problem="file unreadable")
     try:
-        with Image.open(base / name) as file:
-            if file.width * file.height > LARGEST:
-                return Thumbnail(problem="image too large")
-            tiny = max(file.size) <= TINY
-            file.draft("RGB", (2 * side, 2 * side))
-            image = to_rgb(file)
-        image.thumbnail((side, side), Image.Resampling.LANCZOS)
-        if less is not None:
-            image = amplified(image, base / less if less else None)
+        image, tiny = read_image(base, name, side, less)
         data = io.BytesIO()
         exact = tiny and side == SIZES[0][0] and less is None
         kind = "webp" if exact else "jpeg"
@@ -133,10 +123,37 @@ def thumbnail(
         )
     except FileNotFoundError:
         return Thumbnail(problem="file missing")
-    except Exception:  # a damaged file makes PIL raise almost anything
-        return Thumbnail(problem="file unreadable")
+    except Exception as error:  # a damaged file makes PIL raise almost anything
+        return Thumbnail(problem=TOO_LARGE if TOO_LARGE in error.args else "file unreadable")
     uri = f"data:image/{kind};base64,{base64.b64encode(data.getvalue()).decode()}"
     return Thumbnail(uri, image.width, image.height, tiny)
+
+
+def read_image(
+    base: Path, name: str, side: int, less: str | None = None
+) -> tuple[Image.Image, bool]:
+    """Return an image with at most ``side`` pixels a side, and whether its file has at most 96.
+
+    Args:
+        base: folder that relative paths start from.
+        name: path of the file.
+        side: in pixels.
+        less: as in :class:`Wanted`.
+
+    Raises:
+        OSError: if the file is missing, a pipe, or of too many pixels; PIL raises almost anything
+            for a damaged one.
+    """
+    if (base / name).is_fifo():  # it would be waited for
+        raise OSError("a pipe")
+    with Image.open(base / name) as file:
+        if file.width * file.height > LARGEST:
+            raise OSError(TOO_LARGE)
+        tiny = max(file.size) <= TINY
+        file.draft("RGB", (2 * side, 2 * side))
+        image = to_rgb(file)
+    image.thumbnail((side, side), Image.Resampling.LANCZOS)
+    return (image if less is None else amplified(image, base / less if less else None)), tiny
 
 
 def amplified(image: Image.Image, background: Path | None) -> Image.Image:

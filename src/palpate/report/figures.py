@@ -1,0 +1,173 @@
+"""Figures of a paper as files: curves and strips as SVG and PNG, images as PNG.
+
+Drawings differ by dashes and markers as well as by color and are white, whatever the page is; a
+figure has no title, which belongs into its caption.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from PIL import Image, ImageDraw, ImageOps
+
+from palpate.core import atomic_path, write_text
+from palpate.report import audits
+from palpate.report.curves import curve_drawing, panels_of, score_panels, strips_drawing
+from palpate.report.drawing import COLORS, Drawing, font_of, in_ascii
+from palpate.report.first_screen import telling_columns
+from palpate.report.page import gallery_images, in_turns, material_of, pair_images
+from palpate.report.results import Audit, Results
+from palpate.report.study_tables import sheets, slug
+from palpate.report.tables import score_tables
+from palpate.report.thumbnails import Wanted, read_image
+
+#: Samples and pairs side by side.
+SAMPLES, PAIRS = 8, 6
+#: Pixels of an image, between two, and of the letters.
+SIDE, GAP, LETTERS = 256, 10, 26
+
+
+@dataclass(frozen=True)
+class Picture:
+    """Images in rows and columns: a heading for each column, a label for each row."""
+
+    headings: Sequence[str]
+    rows: Sequence[tuple[str, Sequence[Wanted]]]
+    crop: bool = True
+
+
+def save_figures(results: Results, folder: Path, *, base: Path) -> list[Path]:
+    """Write every figure of ``results`` into ``folder``.
+
+    Curves and strips (score tables, and tables of a study with intervals) are SVG and PNG; samples,
+    what the background is of an image, and leaking pairs are PNG.
+
+    Args:
+        results: what to draw.
+        folder: made if it is not there; files of the same names are replaced.
+        base: folder that relative image paths start from.
+
+    Returns:
+        The files.
+
+    Raises:
+        PalpateError: if nothing can be written there, or scores of different settings would share a
+            column.
+    """
+    drawings = _drawings(results)  # scores are checked before anything is written
+    files: list[Path] = []
+    for name, drawing in drawings.items():
+        svg, png = folder / f"{name}.svg", folder / f"{name}.png"
+        write_text(svg, str(drawing.to_svg()))
+        with atomic_path(png) as part:
+            part.write_bytes(drawing.to_png())
+        files += [svg, png]
+    for name, picture in _pictures(results).items():
+        with atomic_path(path := folder / f"{name}.png") as part:
+            _grid(picture, base).save(part, "png")
+        files.append(path)
+    return files
+
+
+def _drawings(results: Results) -> dict[str, Drawing]:
+    drawings = {
+        f"curve-{slug(k, curve.title)}": curve_drawing(curve)
+        for k, curve in enumerate(results.curves, 1)
+    }
+    panels = score_panels(telling_columns(score_tables(results.scores)))
+    if panels:
+        drawings["strips-scores"] = strips_drawing("Scores", panels)
+    for k, table in enumerate(sheets(results), 1):
+        panels = [p for p in panels_of(table) if any(s.interval for _, s, _ in p.rows)]
+        if panels:
+            drawings[f"strips-{slug(k, table.title)}"] = strips_drawing(table.title, panels)
+    return drawings
+
+
+def _pictures(results: Results) -> dict[str, Picture]:
+    pictures: dict[str, Picture] = {}
+    samples = gallery_images(results.gallery)[:SAMPLES]
+    if samples:
+        headings = [material_of(item.sample) for item, _ in samples]
+        rows = zip(*(images for _, images in samples), strict=True)
+        pictures["samples"] = Picture(headings, [(row[0].label, row) for row in rows])
+    if background := _background(results):
+        pictures["background"] = background
+    for k, audit in enumerate(results.audits, 1):
+        if pairs := _pairs(audit):
+            pictures[f"pairs-{slug(k, audit.name)}"] = pairs
+    return pictures
+
+
+def _background(results: Results) -> Picture | None:
+    """How much of a tactile image is the sensor's: without contact, with it, and what differs."""
+    items = [
+        (item.sample, background, item.sample.tactile)
+        for item in in_turns(results.gallery)
+        if (background := item.background or item.sample.background) and item.sample.tactile
+    ][:SAMPLES]
+    rows = [
+        ("No contact", [Wanted(background, "", "") for _, background, _ in items]),
+        ("Real", [Wanted(tactile, "", "") for *_, tactile in items]),
+        ("Contact", [Wanted(tactile, "", "", background) for _, background, tactile in items]),
+    ]
+    return Picture([material_of(sample) for sample, *_ in items], rows) if items else None
+
+
+def _pairs(audit: Audit) -> Picture | None:
+    known = [pair_list for pair_list in audits.pair_lists(audit) if pair_list.has_images]
+    if not known:
+        return None
+    nearest = [pair_list for pair_list in known if pair_list.kind in ("", "time gap")]
+    pairs = (nearest or known)[0].pairs[:PAIRS]
+    headings = [audits.pair_facts(pair, "")[0] for pair in pairs]
+    columns = [{w.label: w for w in pair_images(pair, audits.head_of(audit))} for pair in pairs]
+    labels = list(dict.fromkeys(label for column in columns for label in column))
+    rows = [(n, [column.get(n, Wanted(None, "", n)) for column in columns]) for n in labels]
+    return Picture(headings, rows, crop=False)
+
+
+def _grid(picture: Picture, base: Path) -> Image.Image:
+    """Draw the images; one that is missing or broken is an empty field."""
+    font, whole = font_of(LETTERS)
+
+    def text(words: str, room: float) -> str:
+        words = words if whole else in_ascii(words)
+        while font.getlength(words) > room and len(words) > 1:
+            words = words[:-2].rstrip() + ("…" if whole else ".")
+        return words
+
+    left = max(round(font.getlength(label)) for label, _ in picture.rows) + 2 * GAP
+    top = LETTERS + 2 * GAP
+    size = (left + len(picture.headings) * (SIDE + GAP), top + len(picture.rows) * (SIDE + GAP))
+    image = Image.new("RGB", size, COLORS["paper"])
+    pen = ImageDraw.Draw(image)
+    for k, heading in enumerate(picture.headings):
+        middle = left + k * (SIDE + GAP) + SIDE // 2
+        pen.text((middle, top - GAP), text(heading, SIDE), COLORS["ink"], font, "ms")
+    for r, (label, row) in enumerate(picture.rows):
+        y = top + r * (SIDE + GAP)
+        place = (left - 2 * GAP, y + SIDE // 2)
+        pen.text(place, label if whole else in_ascii(label), COLORS["ink"], font, "rm")
+        for k, wanted in enumerate(row):
+            image.paste(_field(wanted, base, picture.crop), (left + k * (SIDE + GAP), y))
+    return image
+
+
+def _field(wanted: Wanted, base: Path, crop: bool) -> Image.Image:
+    """An image in a square: its center, or all of it on white."""
+    try:
+        if wanted.path is None:
+            raise FileNotFoundError
+        image, tiny = read_image(base, wanted.path, 4 * SIDE, wanted.less)
+    except Exception:  # as for thumbnails
+        field = Image.new("RGB", (SIDE, SIDE), COLORS["paper"])
+        ImageDraw.Draw(field).rectangle((0, 0, SIDE - 1, SIDE - 1), outline=COLORS["line"], width=3)
+        return field
+    # Small images keep their pixels, as on the page.
+    how = Image.Resampling.NEAREST if tiny else Image.Resampling.LANCZOS
+    if crop:
+        return ImageOps.fit(image, (SIDE, SIDE), how)
+    return ImageOps.pad(image, (SIDE, SIDE), how, COLORS["paper"])

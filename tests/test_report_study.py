@@ -1,0 +1,483 @@
+"""Tables, curves and claims of a study: on the page, in text, in LaTeX, as CSV and as figures."""
+
+import csv
+import dataclasses
+import io
+import itertools
+import json
+import math
+import re
+import xml.etree.ElementTree as ET
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image, ImageFont
+
+from palpate.cli import main
+from palpate.core import SampleRef
+from palpate.report import drawing, write_report
+from palpate.report.curves import curve_drawing, panels_of, strips_drawing
+from palpate.report.page import OPEN_CLAIMS, render_page
+from palpate.report.results import GalleryItem, Results
+from palpate.report.study import Claim, Curve, Line, StudyTable
+from palpate.report.study_tables import curve_table, sheet, tally
+from report_fixtures import Tree, images, score, study_results, text_note
+
+NASTY = "<script>alert(1)</script> & \"q\" 'q' 100% $x_1$ \\input{a} | `c` [d]"
+LONG = "a_method_with_a_name_that_no_line_of_a_phone_can_hold_2024_11_21_rig_b_second_run"
+
+
+def up(subject, value, **changes):
+    """A score that is better when higher."""
+    return score("accuracy", subject, value, **({"higher_is_better": True} | changes))
+
+
+def best_of(table):
+    return [
+        {head.label for head, cell in zip(laid.heads, row.cells, strict=True) if cell.best}
+        for laid in [sheet(table)]
+        for row in laid.rows
+    ]
+
+
+def page_text(results, folder):
+    html = render_page(results, folder, max_bytes=1_500_000)
+    return html, Tree(html).text
+
+
+# --- tables ---------------------------------------------------------------------------------
+
+
+def test_the_best_of_a_column_follows_its_direction_and_is_no_control():
+    rows = [
+        ["a", score(value=2.0), up("a", 0.6), score("D-TMMD", "a", 0.3, higher_is_better=None)],
+        ["b", score(value=1.0), up("b", 0.4), score("D-TMMD", "b", -0.5, higher_is_better=None)],
+        ["photo", score(value=0.1), up("photo", 0.9), score("D-TMMD", higher_is_better=None)],
+    ]
+    table = StudyTable("T", "", ["method", "TMMD", "accuracy", "D"], rows, True, ["photo"])
+    assert best_of(table) == [{"accuracy", "D"}, {"TMMD"}, set()]
+    assert best_of(dataclasses.replace(table, best=False)) == [set()] * 3
+    assert best_of(dataclasses.replace(table, controls=["photo", "b"])) == [set()] * 3
+    heads = [(head.arrow, head.scores) for head in sheet(table).heads]
+    assert heads == [("", False), ("↓", True), ("↑", True), ("→", True)]
+
+
+def test_equal_numbers_are_equally_good_and_what_cannot_be_compared_is_never_best():
+    def table(*scores):
+        rows = [[str(k), s] for k, s in enumerate(scores)]
+        return StudyTable("T", "", ["", "value"], rows, best=True)
+
+    assert best_of(table(up("a", 0.50004), up("b", 0.50001), up("c", 0.4))) == [
+        {"value"},
+        {"value"},
+        set(),
+    ]
+    for scores in (
+        (up("a", 0.5), None, up("b", None)),
+        (up("a", 0.5), up("b", math.nan)),
+        (up("a", 0.5), score("TMMD", "b", 1.0)),
+        (
+            score("D", "a", 1.0, higher_is_better=None),
+            score("D", "b", 2.0, higher_is_better=None, floor=None),
+        ),
+        (up("a", 0.5), "not run"),
+    ):
+        assert not sheet(table(*scores)).has_best
+
+
+def test_a_column_has_one_number_of_decimals_and_a_table_of_metrics_one_a_row():
+    column = [
+        ["a", score(value=12.3456, interval=None)],
+        ["b", score(value=0.01234, interval=None)],
+    ]
+    text = str(Results("T", tables=[StudyTable("T", "", ["", "v"], column)]))
+    assert re.findall(r"\d+\.\d+", text) == ["12.35", "0.01"]
+    metrics = [["FID", score("FID", value=123.456)], ["SSIM", score("SSIM", value=0.45678)]]
+    text = str(Results("T", tables=[StudyTable("T", "", ["", "v"], metrics)]))
+    assert "123.5" in text.replace("123.46", "123.5")
+    assert "0.457" in text or "0.4568" in text
+
+
+def test_labels_of_columns_may_repeat_and_rows_may_be_short():
+    table = StudyTable("T", "", ["", "a", "a"], [["x", up("x", 0.5)], ["y"]])
+    laid = sheet(table)
+    assert [head.label for head in laid.heads] == ["", "a", "a (2)"]
+    assert [len(row.cells) for row in laid.rows] == [3, 3]
+    assert "0.500" in str(Results("T", tables=[table]))
+
+
+def test_how_a_table_was_made_names_stages_sizes_and_intervals():
+    rows = [["a", up("a", 0.5, n=40, details={"stage": "probe-0"})]]
+    rows.append(["b", up("b", 0.6, n=1200, details={"stage": "probe-1"}, seed=3)])
+    made = dict(sheet(StudyTable("T", "", ["", "v"], rows)).made)
+    assert made == {
+        "n": "40 to 1,200",
+        "interval": "95 %, jackknife, t, 9 df",
+        "estimator": "unbiased",
+        "seed": "3",
+        "stages": "probe-0, probe-1",
+    }
+
+
+# --- every front end ------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def study(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("study")
+    return study_results(folder, 6), folder
+
+
+def test_every_front_end_has_every_number_verdict_and_reason(study):
+    results, folder = study
+    _html, shown = page_text(results, folder)
+    texts = [str(results), results.to_markdown(), results.to_latex(), shown]
+    for text in texts:
+        text = text.replace("\u00a0", " ").replace("−", "-").replace("\\", "")
+        for part in ("2.600", "2.340, 2.860", "nearest photo", "0.340"):
+            assert part in text, part
+        for part in ("does not hold", "undecided", "No weights of Inception", "paper, table 1"):
+            assert part in text, part
+        assert "Table 4: generators" in text
+        assert "1 holds, 1 does not hold, 1 undecided" in text
+    for text in (texts[0], texts[1], shown):  # curves are figures in LaTeX
+        assert "What generation is for" in text
+        assert "real and generated" in text
+    assert (
+        Results.from_json(json.loads(json.dumps(results.to_json()))).to_json() == results.to_json()
+    )
+
+
+def test_the_page_has_its_sections_in_order_and_folds_what_is_folded(study):
+    results, folder = study
+    html, _ = page_text(results, folder)
+    parts = ['class="card"', 'id="claims"', 'id="scores"', 'id="study"', 'id="curves"']
+    places = [html.index(part) for part in [*parts, 'id="gallery"', 'id="leakage"', 'id="cite"']]
+    assert places == sorted(places)
+    assert "<h3>Table 4: generators</h3>" in html
+    assert "<details><summary>Compute</summary>" in html
+    for mark, verdict in (("✓", "holds"), ("✗", "does not hold"), ("?", "undecided")):
+        assert f'aria-hidden="true">{mark}</span> {verdict}' in html
+    tree = Tree(html)
+    assert html.count("<b>1.200</b>") == 1
+    rows = [attrs.get("class") for attrs in tree.all("tr") if "control" in attrs.get("class", "")]
+    assert rows == ["control rule", "control", "control"]
+    assert not re.findall(r"<h[1-4][^>]*>\s*</h", html)
+
+
+def test_claims_beyond_the_first_are_folded(tmp_path):
+    claims = [Claim(f"Claim {k}", "paper", "holds", "Why.") for k in range(OPEN_CLAIMS + 3)]
+    html, text = page_text(Results("T", claims=claims), tmp_path)
+    assert "3 more claims: 3 hold" in text
+    assert (
+        html.index(f"Claim {OPEN_CLAIMS - 1}<")
+        < html.index("more claims")
+        < html.index(f"Claim {OPEN_CLAIMS}<")
+    )
+    assert "which claims hold on these data" in text
+    assert tally(claims[:1]) == "1 holds"
+
+
+def test_everything_is_escaped(tmp_path):
+    bad = score(NASTY, NASTY, 0.5, notes=(text_note(NASTY),))
+    table = StudyTable(
+        NASTY, NASTY, [NASTY, NASTY], [[NASTY, bad], [NASTY, None]], True, [NASTY], False
+    )
+    curve = Curve(NASTY, NASTY, NASTY, NASTY, [Line(NASTY, [(1, bad), (2, bad)])])
+    claim = Claim(NASTY, NASTY, "holds", NASTY, [bad])
+    results = Results(NASTY, tables=[table], curves=[curve], claims=[claim])
+    html, text = page_text(results, tmp_path)
+    assert "<script>alert" not in html
+    assert html.count("<script") == 1
+    assert text.count('<script>alert(1)</script> & "q"') > 8
+    assert "<script>alert(1)" not in results.to_markdown().replace("\\<", "&lt;")
+    latex = "\n".join(li for li in results.to_latex().splitlines() if not li.startswith("%"))
+    assert r"\input" not in latex
+    assert "$x_1$" not in latex
+    files = results.save_figures(tmp_path / "f")
+    assert {path.parent.name for path in files} == {"f"}
+    for path in files:
+        if path.suffix == ".svg":
+            assert {tag.tag.rpartition("}")[2] for tag in ET.parse(path).iter()} <= {
+                *("svg", "title", "desc", "rect", "path", "text")
+            }
+    assert str(results).count(NASTY[:20]) > 5
+
+
+def test_many_rows_long_words_and_empty_things_are_drawn(tmp_path):
+    rows = [[f"{LONG} {k}", up("a", 0.01 * k, interval=None), LONG, None] for k in range(20)]
+    tables = [
+        StudyTable(
+            LONG, LONG, ["method", LONG, "words", "nothing"], rows, True, [rows[-1][0]], False
+        ),
+        StudyTable("No rows", "", ["method", "value"], []),
+    ]
+    curves = [
+        Curve("Nothing", "", "x", "y", []),
+        Curve("No points", "", "x", "y", [Line(LONG, [])]),
+    ]
+    claims = [Claim(LONG, LONG, "undecided", LONG, [up(LONG, None)])]
+    results = Results("T", tables=tables, curves=curves, claims=claims)
+    _html, text = page_text(results, tmp_path)
+    assert text.count("undefined") == 1
+    for text in (str(results), results.to_markdown(), results.to_latex()):
+        assert (
+            text.count(
+                f"{LONG}".replace("_", r"\_") if "toprule" in text or "###" in text else LONG
+            )
+            > 20
+        )
+    assert len(results.to_csv(tmp_path / "csv")) == 5
+    assert len(results.save_figures(tmp_path / "figures")) == 4
+
+
+# --- CSV ------------------------------------------------------------------------------------
+
+
+def test_csv_files_hold_the_scores_in_full_precision(study, tmp_path):
+    results, _ = study
+    files = {path.name: path for path in results.to_csv(tmp_path / "tables")}
+    table = next(path for name, path in files.items() if name.startswith("table-1-table-4-gen"))
+    head, *rows = list(csv.reader(table.open(encoding="utf-8")))
+    assert head[:4] == ["method", "TMMD", "TMMD low", "TMMD high"]
+    assert [row[-1] for row in rows] == ["false"] * 4 + ["true"] * 3
+    for row, cells in zip(rows, results.tables[0].rows, strict=True):
+        assert float(row[1]) == cells[1].value
+        assert (float(row[2]), float(row[3])) == cells[1].interval
+    assert rows[1][head.index("D-TMMD")] == ""
+    curve = next(path for name, path in files.items() if name.startswith("curve-1-"))
+    rows = list(csv.DictReader(curve.open(encoding="utf-8")))
+    points = [
+        (li.label, x, s.value, *s.interval) for li in results.curves[0].lines for x, s in li.points
+    ]
+    assert points == [
+        (r["line"], *(float(r[k]) for k in ("x", "value", "low", "high"))) for r in rows
+    ]
+    claims = list(csv.DictReader(files["claims.csv"].open(encoding="utf-8")))
+    assert [row["verdict"] for row in claims] == ["holds", "does not hold", "undecided"]
+    assert len(list(csv.DictReader(files["scores.csv"].open(encoding="utf-8")))) == len(results)
+
+
+# --- curves ---------------------------------------------------------------------------------
+
+
+def curve_of(points, **changes):
+    return Curve("C", "", "x", "y", [Line("a", points)], **changes)
+
+
+def shapes(curve, *, fill, ink="line1"):
+    parts = curve_drawing(curve).parts
+    return [p for p in parts if isinstance(p, drawing.Shape) and p.ink == ink and p.fill == fill]
+
+
+def markers(curve):
+    """Centers of the first line's markers, without that of the legend."""
+    filled = [s for s in shapes(curve, fill=True) if s.opacity == 1]
+    return np.array([np.mean(s.points, axis=0) for s in filled])[:-1]
+
+
+@pytest.mark.parametrize("log", [False, True])
+def test_points_bands_and_labels_of_a_curve_are_on_one_scale(log):
+    rng = np.random.default_rng(0)
+    xs, ys = [1, 2, 4, 8], rng.uniform(0.2, 0.8, 4)
+    points = [(x, up("a", y, interval=(y - 0.05, y + 0.1))) for x, y in zip(xs, ys, strict=True)]
+    curve = curve_of(points, log_x=log)
+    drawn = markers(curve)
+    across, down = (
+        np.polyfit(np.log(xs) if log else xs, drawn[:, 0], 1),
+        np.polyfit(ys, drawn[:, 1], 1),
+    )
+    assert np.allclose(np.polyval(across, np.log(xs) if log else xs), drawn[:, 0], atol=1e-6)
+    assert np.allclose(np.polyval(down, ys), drawn[:, 1], atol=1e-6)
+    assert across[0] > 0 > down[0]
+    (band,) = [s for s in shapes(curve, fill=True) if s.opacity < 1]
+    expected = [*np.polyval(down, ys - 0.05), *np.polyval(down, ys + 0.1)[::-1]]
+    assert np.allclose([y for _, y in band.points], expected)
+    words = [p for p in curve_drawing(curve).parts if isinstance(p, drawing.Words)]
+    labels = {w.text: w.x for w in words if w.anchor == "middle"}
+    assert [labels[f"{x}"] for x in xs] == pytest.approx(drawn[:, 0])
+    heights = {float(w.text): w.y - 4 for w in words if w.anchor == "end" and w.text != "x"}
+    assert np.polyval(down, [*heights]) == pytest.approx([*heights.values()])
+
+
+def test_an_undefined_score_interrupts_a_line_and_a_lone_point_has_a_bar():
+    gap = curve_of([(1, up("a", 0.5)), (2, up("a", 0.6)), (3, up("a", None)), (4, up("a", 0.7))])
+    runs = [s for s in shapes(gap, fill=False) if s.width == 2]
+    assert [len(s.points) for s in runs] == [2, 2]  # the second is the legend's
+    assert len(markers(gap)) == 3
+    lone = curve_of([(5, up("a", 0.5, interval=(0.4, 0.7)))])
+    whiskers = [s for s in shapes(lone, fill=False) if s.width == 1.4]
+    assert len(whiskers) == 3
+    assert not [s for s in shapes(lone, fill=True) if s.opacity < 1]
+    bare = curve_of([(1, up("a", 0.5, interval=None)), (2, up("a", 0.5, interval=None))])
+    assert not [s for s in shapes(bare, fill=True) if s.opacity < 1]
+    zero = [(x, up("a", 0.1 * x)) for x in (0, 1, 10)]  # has no logarithm
+    assert np.allclose(markers(curve_of(zero, log_x=True)), markers(curve_of(zero)))
+
+
+def test_lines_differ_without_their_colors():
+    lines = [Line(f"l{k}", [(x, up("a", 0.1 * k)) for x in (1, 2)]) for k in range(20)]
+    parts = curve_drawing(Curve("C", "", "x", "y", lines)).parts
+    dashes = [p.dash for p in parts if isinstance(p, drawing.Shape) and p.width == 2][:20]
+    marks = [drawing.marker(k, 0, 0, "line1")[-1] for k in range(20)]
+    forms = {(d, str(m.points), m.fill) for d, m in zip(dashes, marks, strict=True)}
+    assert len(forms) == 20
+
+
+def test_numbers_of_a_curve_are_a_table_of_all_its_x():
+    a, b = up("a", 0.5), up("b", 0.6)
+    table = curve_table(Curve("C", "Text.", "k", "y", [Line("a", [(1, a)]), Line("b", [(0.5, b)])]))
+    assert (list(table.columns), table.rows) == (
+        ["k", "a", "b"],
+        [["0.5", None, b], ["1", a, None]],
+    )
+
+
+# --- drawings as files ----------------------------------------------------------------------
+
+
+def test_dashes_cover_the_same_share_as_a_walk_along_the_line():
+    line, pattern = [(0.0, 0.0), (30.0, 40.0), (30.0, 100.0), (100.0, 100.0)], (7.0, 3.0, 2.0, 3.0)
+    pieces = drawing.dashed(line, pattern, 2)
+
+    def place(t):  # a point at a length along the line
+        for (x0, y0), (x1, y1) in itertools.pairwise(line):
+            length = math.dist((x0, y0), (x1, y1))
+            if t <= length:
+                return x0 + (x1 - x0) * t / length, y0 + (y1 - y0) * t / length
+            t -= length
+        raise AssertionError
+
+    for t in np.arange(0.5, 180, 1.0):
+        drawn = (t % 30) < 14 or 20 <= (t % 30) < 24
+        near = min(
+            np.linalg.norm(np.subtract(place(t), np.add(a, np.subtract(b, a) * s)))
+            for piece in pieces
+            for a, b in itertools.pairwise(piece)
+            for s in np.linspace(0, 1, 60)
+        )
+        assert (near < 0.4) == drawn, t
+    assert drawing.dashed(line, (), 2) == [line]
+
+
+def test_png_and_svg_are_the_same_drawing(tmp_path):
+    red = drawing.Shape([(10, 10), (30, 10), (30, 30), (10, 30)], "line2", fill=True)
+    veil = drawing.Shape([(40, 0), (80, 0), (80, 40), (40, 40)], "line1", fill=True, opacity=0.5)
+    rule = drawing.Shape([(0, 50), (80, 50)], "ink", width=4)
+    text = drawing.Words(40, 75, "Ours é ↓", "middle", ink="ink", size=16)
+    picture = drawing.Drawing(80, 80, [red, veil, rule, text], "a <drawing>")
+    image = Image.open(io.BytesIO(picture.to_png()))
+    assert image.size == (320, 320)
+
+    def color(x, y):
+        return "#{:02x}{:02x}{:02x}".format(*image.convert("RGB").getpixel((4 * x, 4 * y)))
+
+    assert [color(20, 20), color(5, 5), color(40, 50)] == ["#d55e00", "#ffffff", "#15191e"]
+    halves = [int(color(60, 20)[k : k + 2], 16) for k in (1, 3, 5)]
+    assert halves == pytest.approx([(255 + c) / 2 for c in (0x00, 0x72, 0xB2)], abs=1)
+    letters = np.asarray(image.convert("L"))[4 * 58 : 4 * 80] < 100
+    assert letters.any()
+    columns = np.flatnonzero(letters.any(axis=0)) / 4
+    assert abs((columns[0] + columns[-1]) / 2 - 40) < 3
+    root = ET.fromstring(str(picture.to_svg()))
+    assert root.find("{*}title").text == "a <drawing>"
+    assert [p.get("d")[0] for p in root.findall(".//{*}path")] == ["M"] * 3
+    assert "var(--line2)" in picture.to_svg(themed=True)
+    assert "var(" not in picture.to_svg()
+
+
+def test_without_fonts_words_are_written_in_ascii(monkeypatch):
+    drawing.font_of.cache_clear()
+
+    true = ImageFont.truetype
+
+    def missing(font, *_, **options):
+        if isinstance(font, str):
+            raise OSError
+        return true(font, *_, **options)
+
+    monkeypatch.setattr(ImageFont, "truetype", missing)
+    try:
+        words = drawing.Words(2, 20, "TMMD ↓ é", ink="ink")
+        assert drawing.font_of(20)[1] is False
+        assert drawing.Drawing(200, 30, [words], "").to_png()
+    finally:
+        drawing.font_of.cache_clear()
+    assert drawing.in_ascii("é − 中") == "e - ?"
+
+
+def test_strips_draw_value_interval_null_and_floor_and_hollow_controls(study):
+    results, _ = study
+    table = sheet(results.tables[0])
+    panels = panels_of(table)
+    assert [p.title for p in panels] == ["TMMD ↓", "material accuracy ↑", "D-TMMD →", "LPIPS ↓"]
+    parts = strips_drawing("T", panels[:1]).parts
+    dots = [
+        p
+        for p in parts
+        if isinstance(p, drawing.Shape) and p.ink == "line1" and len(p.points) == 16
+    ]
+    assert [p.fill for p in dots] == [True] * 4 + [False] * 3
+    centers = [np.mean(p.points, axis=0)[0] for p in dots]
+    values = [row[1].value for row in results.tables[0].rows]
+    slope, start = np.polyfit(values, centers, 1)
+    assert centers == pytest.approx([start + slope * v for v in values])
+    spans = [p for p in parts if isinstance(p, drawing.Shape) and p.width == 1.8]
+    ends = [x for p in spans for x, _ in p.points]
+    assert ends == pytest.approx(
+        [start + slope * v for row in results.tables[0].rows for v in row[1].interval]
+    )
+    texts = [p.text for p in parts if isinstance(p, drawing.Words)]
+    assert "1.200 [1.080, 1.320]" in texts
+    text = next(
+        p for p in strips_drawing("T", panels[2:3]).parts if getattr(p, "text", "") == "undefined"
+    )
+    assert text.x > 400
+
+
+# --- figures of images ----------------------------------------------------------------------
+
+
+def test_figures_hold_samples_pairs_and_the_background(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    results = study_results(Path(), 4)
+    names = images(Path(), 2)
+    Image.new("RGB", (64, 64), (10, 20, 30)).save("flat.png")
+    Image.new("RGB", (64, 64), (200, 20, 30)).save("real.png")
+    sample = SampleRef("s", "v", 1, "gold", "real.png", "real.png", background="flat.png")
+    gallery = [GalleryItem(sample, "absent.png"), *results.gallery]
+    results = dataclasses.replace(results, gallery=gallery)
+    files = {path.name: path for path in results.save_figures("figures")}
+    assert {"samples.png", "background.png", "pairs-1-orig.png"} <= set(files)
+    assert {
+        path.suffix for name, path in files.items() if name.startswith(("curve", "strips"))
+    } == {".svg", ".png"}
+    samples = np.asarray(Image.open(files["samples.png"]).convert("RGB"))
+    assert (samples == (200, 20, 30)).all(axis=-1).sum() == 2 * 256 * 256
+    background = np.asarray(Image.open(files["background.png"]).convert("RGB"))
+    assert (background == (10, 20, 30)).all(axis=-1).sum() == 256 * 256
+    assert names
+
+
+# --- the command ----------------------------------------------------------------------------
+
+
+def test_the_command_writes_figures_and_tables_and_replaces_no_other_file(tmp_path, capsys):
+    results = study_results(tmp_path, 2)
+    results = dataclasses.replace(results, curves=results.curves[:1], audits=results.audits[1:])
+    page = write_report(results, tmp_path / "first.html", base=tmp_path).page
+    given = [str(page.with_suffix(".json")), "-o", str(tmp_path / "page.html"), "-q"]
+    folders = ["--figures", str(tmp_path / "figures"), "--csv", str(tmp_path / "tables")]
+    for _ in range(2):  # its own files are replaced
+        assert main(["report", *given, *folders]) == 0
+    again = Results.load(tmp_path / "page.json")
+    assert [len(getattr(again, n)) for n in ("tables", "curves", "claims")] == [2, 1, 3]
+    assert {p.suffix for p in (tmp_path / "figures").iterdir()} == {".svg", ".png"}
+    assert {p.suffix for p in (tmp_path / "tables").iterdir()} == {".csv"}
+    (tmp_path / "tables" / "thesis.csv").touch()
+    capsys.readouterr()
+    assert main(["report", *given, *folders]) == 2
+    assert "--csv must be a new folder" in capsys.readouterr().err
+    assert main(["report", *given, "--figures", str(page)]) == 2
+    assert "--figures must be a folder" in capsys.readouterr().err
