@@ -387,6 +387,15 @@ def test_png_and_svg_are_the_same_drawing(tmp_path):
     assert "var(" not in picture.to_svg()
 
 
+def test_long_words_are_cut_to_the_lines_that_there_are():
+    cut = drawing.lines_of("x" * 100, 120, size=12, most=2)
+    letters = len(cut[0])
+    assert [len(line) for line in cut] == [letters, letters]
+    assert cut[1].endswith("x...")
+    assert drawing.lines_of("short", 120) == ["short"]
+    assert drawing.lines_of("", 120) == [""]
+
+
 def test_without_fonts_words_are_written_in_ascii(monkeypatch):
     drawing.font_of.cache_clear()
 

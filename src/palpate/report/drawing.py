@@ -148,7 +148,10 @@ def text_width(text: str, size: float = 12.0) -> float:
 def lines_of(text: str, width: float, size: float = 12.0, most: int = 3) -> list[str]:
     """Return a text cut into lines of at most ``width`` units; a longer one ends in ``...``."""
     letters = max(4, int(width / (LETTER * size)))
-    return textwrap.wrap(text, letters, max_lines=most, placeholder=" ...") or [""]
+    lines = textwrap.wrap(text, letters)
+    if len(lines) > most:
+        lines = [*lines[: most - 1], f"{lines[most - 1][: letters - 3].rstrip()}..."]
+    return lines or [""]
 
 
 def _svg(part: Shape | Words, themed: bool) -> str:
