@@ -31,6 +31,17 @@ from palpate.sim.tile import TILE_MM, wrapped_offset
 
 
 @dataclass(frozen=True)
+class Thing:
+    """Something beside the surface, in the plane of the view; lengths in half widths."""
+
+    place: tuple[float, float]  # y and x of its center
+    size: float  # its radius, of a box half the side
+    angle: float
+    color: Array
+    box: bool
+
+
+@dataclass(frozen=True)
 class Camera:
     """Light and camera of one video; angles in radians, distances in the view in half widths."""
 
@@ -49,6 +60,8 @@ class Camera:
     shadow: tuple[float, float, float] | None  # direction, offset and factor of a cast shadow
     edge: tuple[float, float] | None  # direction and distance of the object's edge
     beyond: Array  # color behind the edge
+    balance: Array | None = None  # RGB gain of another white balance
+    things: tuple[Thing, ...] = ()  # clutter beside the surface
 
 
 @dataclass(frozen=True)
@@ -166,6 +179,8 @@ def photo(
         past = smoothstep(turned(wy, wx, angle)[0], distance, distance + 0.03)
         shading = 0.8 + 0.25 * np.sin(5.0 * wx + 3.0 * wy + float(video))
         image = over(image, camera.beyond[:, None, None] * shading, past)
+    for thing in camera.things:
+        image = _thing(image, thing)
     if camera.shadow is not None:
         angle, offset, factor = camera.shadow
         dark = smoothstep(turned(y, x, angle)[0], offset, offset + 0.12)
@@ -177,8 +192,19 @@ def photo(
     if blur > 0.2:
         image = ndimage.gaussian_filter(image, (0.0, blur, blur), truncate=2.5)
     image = np.ascontiguousarray(np.moveaxis(image, 0, 2))
+    if camera.balance is not None:
+        image *= camera.balance
     image += rng.standard_normal((size, size, 3), dtype=np.float32) * np.float32(camera.noise)
     return np.clip(image, 0.0, 1.0) ** 0.8
+
+
+def _thing(image: Array, thing: Thing) -> Array:
+    """Draw a disk or a box, darker towards one side."""
+    y, x = grid(image.shape[1])
+    u, v = turned(y - thing.place[0], x - thing.place[1], thing.angle)
+    distance = np.maximum(np.abs(u), np.abs(v)) if thing.box else np.hypot(u, v)
+    shaded = thing.color[:, None, None] * (0.8 + 0.25 * u / thing.size)
+    return over(image, shaded, smoothstep(distance, thing.size, thing.size * 0.94))
 
 
 def _hand(image: Array, skin: Array, angle: float, tip: float) -> Array:

@@ -7,6 +7,7 @@ from functools import cached_property
 import numpy as np
 
 from palpate.core import PalpateError
+from palpate.sim.appearance import Appearance, with_appearance
 from palpate.sim.arrays import Array, f32, grid, sample_periodic, to_bytes
 from palpate.sim.camera import Scene, light_object, make_camera, photo
 from palpate.sim.felt import caption, measure
@@ -23,12 +24,15 @@ class Video:
     Args:
         options: the world's.
         plan: which video (:func:`~palpate.sim.plan.plan_world`), or its index.
+        appearance: how its photos look (:mod:`palpate.sim.appearance`).
 
     Raises:
-        PalpateError: if there is no such video.
+        PalpateError: if there is no such video, or no such appearance.
     """
 
-    def __init__(self, options: WorldOptions, plan: VideoPlan | int) -> None:
+    def __init__(
+        self, options: WorldOptions, plan: VideoPlan | int, appearance: Appearance = "as recorded"
+    ) -> None:
         if isinstance(plan, int):
             plans = plan_world(options)
             if not 0 <= plan < len(plans):
@@ -38,7 +42,8 @@ class Video:
         self.options, self.plan = options, plan
         self.sensor = make_sensor(options, plan.sensor)
         self.contacts = make_contacts(options, plan)
-        self.camera = make_camera(options, plan.index)
+        camera = make_camera(options, plan.index)
+        self.camera = with_appearance(options, camera, plan.index, appearance)
         rng, spread = options.rng("gain", plan.index), 2.0 * options.hard
         balance, exposure = rng.standard_normal(3), rng.standard_normal()
         self.gain: Array = f32(np.exp(0.03 * spread * balance + 0.05 * spread * exposure))

@@ -15,10 +15,11 @@ from functools import cached_property, lru_cache, partial
 from pathlib import Path
 from typing import Any, SupportsIndex
 
-from palpate.core import PalpateError, Progress, Split, quiet, require
+from palpate.core import PalpateError, Progress, Split, quiet, require, require_choice
 from palpate.data.formats.hct import sessions_of
 from palpate.data.formats.touch_and_go import CATEGORIES
 from palpate.data.manifest import Manifest
+from palpate.sim.appearance import APPEARANCES, Appearance
 from palpate.sim.layouts import Parts, contact_id, image_paths, manifest_root, sample_id, video_id
 from palpate.sim.leak import cut
 from palpate.sim.materials import MATERIALS
@@ -39,23 +40,33 @@ class World:
         options: the world, or the name of a preset (``"tiny"``, ``"small"``, ...); default
             ``WorldOptions()``.
         cache: videos kept ready (about 1 MB each at 64 px, 4 MB at 128 px).
+        appearance: of the photos: ``as recorded``, ``other light``, ``other white balance`` or
+            ``clutter`` (:mod:`palpate.sim.appearance`); the rest of a sample stays as it is.
 
     Raises:
-        PalpateError: for an unknown preset, or a cache below 1.
+        PalpateError: for an unknown preset or appearance, or a cache below 1.
     """
 
-    def __init__(self, options: WorldOptions | str | None = None, *, cache: int = 4) -> None:
+    def __init__(
+        self,
+        options: WorldOptions | str | None = None,
+        *,
+        cache: int = 4,
+        appearance: Appearance = "as recorded",
+    ) -> None:
         if isinstance(options, str) and options not in PRESETS:
             must = f"must be options, or one of {', '.join(PRESETS)}"
             raise PalpateError(must, repr(options), "Choose a preset", argument="options")
         require(cache >= 1, "cache", "must be at least 1", cache)
         self.options = PRESETS[options] if isinstance(options, str) else options or WorldOptions()
+        require_choice("appearance", appearance, APPEARANCES)
         self.cache = cache
-        self._video = lru_cache(cache)(partial(Video, self.options))
+        self.appearance: Appearance = appearance
+        self.video = lru_cache(cache)(partial(Video, self.options, appearance=appearance))
 
     def __reduce__(self) -> Any:
         """Pickle the options alone: a copy in another process renders for itself."""
-        return partial(World, self.options, cache=self.cache), ()
+        return partial(World, self.options, cache=self.cache, appearance=self.appearance), ()
 
     def __repr__(self) -> str:
         """Show length and digest."""
@@ -93,7 +104,7 @@ class World:
             must = f"A sample of this world must be 0 to {len(self) - 1}"
             raise NoSampleError(must, str(number), "Choose another sample")
         row = contact_row(self.options, self.plans, number % len(self))
-        video = self._video(row.video)
+        video = self.video(row.video)
         return _cells(self.options, row, video.text(row.contact)) | {
             "label": MATERIALS[row.object.material].label,
             "vision": video.vision(row.frame),
@@ -105,7 +116,7 @@ class World:
         """Make the world's manifest, without images; draws every object once for its captions."""
         captions: dict[str, list[str]] = {}
         for count, plan in enumerate(self.plans, 1):
-            video = self._video(plan)
+            video = self.video(plan)
             captions[plan.name] = [video.text(k) for k in range(self.options.contacts_per_video)]
             progress("describing videos", count, len(self.plans))
         return world_manifest(self.options, self.plans, captions, None)
