@@ -51,7 +51,7 @@ from palpate.encoders.encoder_set import EncoderSet, load_clip
 from palpate.encoders.models import SHIPPED, shipped_root
 from palpate.encoders.presets import preset
 from palpate.sim import PRESETS, VERSION, WorldOptions, write_world
-from palpate.studies.demo import fresh
+from palpate.studies.making import fresh
 from palpate.studies.stages import Run
 from palpate.training.options import Compute
 

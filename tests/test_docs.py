@@ -27,7 +27,7 @@ QUICK = {
     "score": ["--permutations", "19"],
     "world": ["--preset", "tiny"],
 }
-SLOW = {"docs/start/train.md"}
+SLOW = {"docs/start/train.md", "docs/start/reproduce.md"}
 
 
 @pytest.fixture(scope="session")

@@ -111,6 +111,11 @@ VERBS: dict[str, Verb] = {
     "demo": Verb(
         "demo", "Run everything once, from photos to a page", "palpate demo --data touch_and_go/"
     ),
+    "reproduce": Verb(
+        "reproduce",
+        "Run a whole study of the paper: its tables, with controls, from one command",
+        "palpate reproduce world-gelsight -o study/ --seeds 0 1 2",
+    ),
     "completion": Verb(
         "completion",
         "Print the completion script of a shell",

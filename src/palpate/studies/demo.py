@@ -18,15 +18,11 @@ from __future__ import annotations
 import dataclasses
 import os
 import platform
-import shutil
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from importlib import metadata
 from pathlib import Path
 from typing import Any
-
-import numpy as np
-from PIL import Image
 
 from palpate import __version__
 from palpate.core import (
@@ -54,7 +50,6 @@ from palpate.diffusion.pipeline import TactilePipeline
 from palpate.diffusion.presets import preset_named as diffusion_preset
 from palpate.diffusion.training import train_pipeline
 from palpate.encoders.contrastive import train_clip, train_tactile
-from palpate.encoders.embed import embed
 from palpate.encoders.encoder_set import EncoderSet, load_clip
 from palpate.encoders.models import Part, is_shipped, shipped_folder
 from palpate.encoders.presets import preset as encoder_preset
@@ -64,11 +59,10 @@ from palpate.leakage.splitting import split as leak_free_split
 from palpate.report.results import Audit
 from palpate.sim import WorldOptions, write_world
 from palpate.sim.presets import MINI_SEEDS
+from palpate.studies.controls import NEAREST, nearest_rows
+from palpate.studies.making import fresh, write_images
 from palpate.studies.presets import PRESETS
 from palpate.studies.stages import Run, Stage
-
-#: The control that retrieves instead of generating.
-NEAREST = "real, nearest photo"
 
 
 @dataclass(frozen=True)
@@ -264,7 +258,7 @@ class _Demo:
                 "facts": dict(imported.facts),
             }
 
-        inputs = {"source": str(source.resolve()), "stamp": _stamp(source), "size": size}
+        inputs = {"source": str(source.resolve()), "stamp": stamp(source), "size": size}
         inputs |= {"skip_bad": self.options.skip_bad}
         world = self.run.stages["world"].digest if "world" in self.run.stages else None
         stage = self.run.stage("data", {**inputs, "world": world}, build)
@@ -488,16 +482,8 @@ class _Demo:
     def nearest(self, manifest: Manifest, split: Split, encoders: EncoderSet, folder: Path) -> Path:
         """For each test photo the tactile image of the nearest train photo, as generators' are."""
         train, test = manifest.part(split, "train"), manifest.part(split, "test")
-        photos, queries = (
-            embed(part, encoders, "vision", cache=self.cache, still=True, progress=self.progress)
-            for part in (train, test)
-        )
-        nearest = (np.asarray(queries.features) @ np.asarray(photos.features).T).argmax(axis=1)
-        folder.mkdir(exist_ok=True)
-        rows = [{"id": i, "tactile": f"{k}.png"} for k, i in enumerate(test.ids)]
-        for row, image in zip(rows, self.pixels(train)[nearest], strict=True):
-            Image.fromarray(image).save(folder / row["tactile"])
-        Manifest.from_rows(rows, folder).save(folder / "manifest.parquet")
+        rows = nearest_rows(train, test, encoders, cache=self.cache, progress=self.progress)
+        write_images(folder, test.ids, self.pixels(train)[rows])
         return folder
 
     def _model_stamp(self, part: Part, source: str) -> str:
@@ -533,19 +519,13 @@ def require_unseen(source: Path, facts: Mapping[str, str] | None = None) -> None
         raise PalpateError(must, f"{source}", fix, example=example)
 
 
-def fresh(folder: Path) -> Path:
-    """The folder, without what a killed call left in it between saving and finishing its stage."""
-    shutil.rmtree(folder, ignore_errors=True)
-    return folder
-
-
 def _all_train(manifest: Manifest) -> Split:
     """A split whose train part is everything."""
     rule = {"name": "pretraining"}
     return Split.from_ids(train=manifest.ids, rule=rule, manifest=manifest.digest)
 
 
-def _stamp(source: Path) -> str:
+def stamp(source: Path) -> str:
     """Names, sizes and modification times of the files of a data set: changes when it does."""
     files = sorted(p for p in source.rglob("*") if p.is_file()) if source.is_dir() else [source]
     return digest_lines(

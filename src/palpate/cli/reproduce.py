@@ -1,0 +1,111 @@
+"""``palpate reproduce``: the paper's tables from one command."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any
+
+import tyro
+
+from palpate.cli.terminal import Common, OutPath, Switch, Terminal, require_extra
+from palpate.core import PalpateError
+
+
+@dataclass(frozen=True, kw_only=True)
+class Options(Common):
+    """Run a whole study of the paper: train, generate, score, and write its tables and page.
+
+    Run the same command again to go on where it was stopped; with more seeds, methods or splits
+    what is there is kept.
+    """
+
+    study: Annotated[str, tyro.conf.Positional]
+    """`world-gelsight` (tables 1, 3 and 4) or `world-digit` (tables 2 and 4)."""
+    output: OutPath
+    """Run folder: results.json, page.html, tables.tex, scores.csv, and a folder a stage."""
+    preset: str = "mini"
+    """`mini` takes about an hour a seed on two cores; `smoke` only shows that everything runs."""
+    seeds: tuple[int, ...] = (0,)
+    """One training of every encoder and generator each; intervals are over these, too."""
+    root: Path | None = None
+    """The data set on disk, for studies that are not of the world."""
+    method: tuple[str, ...] = ()
+    """NAME=FOLDER: images of the test part that another system made, scored like ours. The test
+    part is that of FOLDER/split/NoLeak.json of an earlier run."""
+    jobs: int = 1
+    """Processes that run stages at the same time."""
+    device: str = "auto"
+    """auto, cpu, cuda, mps."""
+    dry_run: Switch = False
+    """Print the stages, which are done, and what the others cost; write nothing."""
+
+
+def run(options: Options, terminal: Terminal) -> dict[str, Any]:
+    """Run the stages and write what shows them."""
+    require_extra("palpate reproduce")
+    from palpate.core import require_choice, write_text
+    from palpate.report import summary_lines
+    from palpate.studies.reproduce import plan_of, planned, run_study
+    from palpate.studies.study import STUDIES
+
+    require_choice("study", options.study, STUDIES)
+    output = options.output
+    plan = plan_of(
+        STUDIES[options.study],
+        preset=options.preset,
+        seeds=options.seeds,
+        root=options.root,
+        others=_folders(options.method),
+        device=options.device,
+    )
+    if options.dry_run:
+        return _print_plan(planned(plan, output), terminal)
+    kept = any(output.glob("*.partial")) or any(output.glob("*/stage.json"))
+    if output.is_dir() and any(output.iterdir()) and not kept:
+        must, got = "must be new, empty, or a run folder", f"{output}, with other files"
+        raise PalpateError(must, got, "Choose another folder", argument="output")
+    with terminal.progress() as progress:
+        results = run_study(
+            plan,
+            output,
+            command=terminal.command,
+            jobs=options.jobs,
+            print_line=terminal.print_line,
+            progress=progress,
+        )
+    page = output / "page.html"
+    results.to_html(page)
+    write_text(output / "tables.tex", results.to_latex())
+    results.to_frame().write_csv(output / "scores.csv")
+    terminal.print("")
+    for line in summary_lines(results):
+        terminal.print(line)
+    terminal.print(f"Page: {page}")
+    files = {"results": output / "results.json", "page": page}
+    digests = results.settings["digests"]
+    return {**{k: str(v) for k, v in files.items()}, "facts": results.facts, "digests": digests}
+
+
+def _folders(values: tuple[str, ...]) -> dict[str, Path]:
+    """``NAME=FOLDER`` of other systems."""
+    folders: dict[str, Path] = {}
+    for value in values:
+        name, equals, folder = value.partition("=")
+        if not (name and equals and folder) or name in folders:
+            must, example = "must be NAME=FOLDER, each name once", {"method": "flowtouch=dir/"}
+            raise PalpateError(must, value, "", argument="method", example=example)
+        folders[name] = Path(folder)
+    return folders
+
+
+def _print_plan(stages: Any, terminal: Terminal) -> dict[str, Any]:
+    """The stages with their costs."""
+    left = sum(stage.cost for stage in stages if not stage.done)
+    for stage in stages:
+        state = "done" if stage.done else "to do"
+        terminal.print(f"{state:>5}  {stage.cost:>6.0f} s  {stage.name}")
+    done = sum(stage.done for stage in stages)
+    terminal.print(f"{len(stages)} stages, {done} done; about {left / 60:.0f} minutes of one core")
+    rows = [{"name": s.name, "done": s.done, "seconds": s.cost} for s in stages]
+    return {"stages": rows, "seconds_left": left}

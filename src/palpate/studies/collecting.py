@@ -1,0 +1,153 @@
+"""The last stage of a study: scores of all stages -> means over seeds, tables, samples."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from palpate.core import Note, Progress, Score, Split, read_json
+from palpate.data.manifest import Manifest
+from palpate.diffusion.generation import Generated
+from palpate.evaluation.probing import results_of
+from palpate.report.notes import percent
+from palpate.report.results import Audit, Results
+from palpate.studies.claims import Names, differences_over_seeds, effect_table, paper_claims
+from palpate.studies.controls import FLOOR, NEAREST
+from palpate.studies.demo_page import gallery as gallery_of
+from palpate.studies.evidence import DIFFERENCE, difference_between, in_words, metric_of
+from palpate.studies.judging import MATERIAL, probing_plan, read_probed, read_scores, stage_of
+from palpate.studies.making import After, Facts
+from palpate.studies.memorization import memorization_table
+from palpate.studies.methods import OURS
+from palpate.studies.study import NOLEAK, ORIG, SPLITS, Study
+from palpate.studies.study_tables import FAMILY, READING, RETRIEVAL, Scores, same_task, study_tables
+
+
+def collect(
+    place: Path,
+    after: After,
+    progress: Progress,
+    *,
+    study: Study,
+    methods: Sequence[str],
+    judgments: Mapping[tuple[str, str], Sequence[str]],
+    probes: Mapping[str, Sequence[str]],
+    gallery: str,
+) -> Facts:
+    """Write ``results.json``: everything but the record of the run.
+
+    ``judgments``: (split of the images, split of the judge) -> nodes, one a seed; ``probes``: split
+    -> nodes; ``gallery``: node of the images that are shown.
+    """
+    manifest = Manifest.load(after["data"])
+    splits = {name: Split.load(after["split"] / f"{name}.json") for name in SPLITS}
+    audits = [Audit.from_json(a) for a in read_json(after["split"] / "audits.json", "audits")]
+    stage = stage_of(place)
+    seeds = {pair: [read_scores(after[n]) for n in nodes] for pair, nodes in judgments.items()}
+    judged = {pair: Scores.over_seeds(scores, stage) for pair, scores in seeds.items()}
+    runs = {split: [read_probed(after[node]) for node in nodes] for split, nodes in probes.items()}
+    plan = probing_plan(manifest, splits)
+    probed = results_of(study.title, runs, plan, manifest, splits)
+    known = {(s.metric, s.subject): s for s in probed.scores}
+    own, noleak = judged[NOLEAK, NOLEAK], seeds[NOLEAK, NOLEAK]
+    extra = [m for m in own.metrics if any(s.details.get("extra") for s in own.of(m))]
+    names: dict[str, Sequence[str]] = {"methods": methods, "controls": list(study.controls)}
+    tables = [
+        *study_tables(study, judged, known, **names, extra=extra),
+        effect_table([d for d in differences_over_seeds(noleak) if _compares(d, methods)]),
+        memorization_table(
+            {split: [*judged[split, split].by_name.values()] for split in SPLITS},
+            controls=names["controls"],
+        ),
+    ]
+    images = [m for m in methods if m.startswith("GVST")]
+    tasks = {**_tasks_of_encoders(probed.scores), **_tasks_of_generators(seeds)}
+    claims = paper_claims(noleak, tasks=tasks, names=Names(OURS, images))
+    notes = [*probed.notes, *([Note("synthetic-data")] if manifest.facts.get("synthetic") else [])]
+    results = Results(
+        title=study.title,
+        facts=[_leak(audits), *_distance(own), *_material(own), *probed.facts[:1]],
+        audits=audits,
+        scores=[s for (metric, _), s in own.by_name.items() if DIFFERENCE not in metric],
+        gallery=gallery_of(manifest, Generated.load(after[gallery] / "images"), 0),
+        settings={"split rule": {name: dict(s.rule) for name, s in splits.items()}},
+        notes=notes,
+        tables=[replace(t, rows=_staged_rows(t.rows, stage)) for t in tables],
+        claims=[replace(c, evidence=[_staged(s, stage) for s in c.evidence]) for c in claims],
+    )
+    results.save(place / "results.json")
+    return {"tables": len(tables), "claims": len(claims), "scores": len(results.scores)}
+
+
+def _compares(difference: Score, methods: Sequence[str]) -> bool:
+    """Whether a difference is of the paper's two comparisons or of the best method."""
+    pair = [difference.details[k] for k in ("a", "b")]
+    return pair[0] == OURS and pair[1] in (*methods, NEAREST)
+
+
+def _tasks_of_encoders(scores: Sequence[Score]) -> dict[str, Score]:
+    """Task -> what it loses from the data set's own split to ours, as the encoders measure it."""
+    tasks = (MATERIAL, *RETRIEVAL)
+    return {
+        task: s
+        for task in tasks
+        for s in scores
+        if s.metric.endswith(DIFFERENCE) and same_task(metric_of(s), task)
+    }
+
+
+def _tasks_of_generators(
+    seeds: Mapping[tuple[str, str], Sequence[Sequence[Score]]],
+) -> dict[str, Score]:
+    """The same of generated images, each split judged by its encoder."""
+    tasks: dict[str, Score] = {}
+    for metric in FAMILY:
+        each = [
+            [s for run in seeds[split, split] for s in run if _is(s, metric)] for split in SPLITS
+        ]
+        if all(each):
+            tasks[f"generation, {metric}"] = difference_between(*each, names=SPLITS)
+    return tasks
+
+
+def _is(score: Score, metric: str) -> bool:
+    known = score.metric, score.subject, score.settings.get("preset")
+    return known == (metric, OURS, READING)
+
+
+def _staged(score: Score, stage: str) -> Score:
+    return replace(score, details={**score.details, "stage": stage})
+
+
+def _staged_rows(rows: Sequence[Sequence[Any]], stage: str) -> list[list[Any]]:
+    return [[_staged(c, stage) if isinstance(c, Score) else c for c in row] for row in rows]
+
+
+def _leak(audits: Sequence[Audit]) -> str:
+    shares = {audit.name: percent(audit.leaked_fraction) for audit in audits}
+    return (
+        f"Leak: {shares[ORIG]} of the test samples of the data set's own split leak from train, "
+        f"{shares[NOLEAK]} of those of NoLeak."
+    )
+
+
+def _distance(scores: Scores) -> list[str]:
+    ours, floor, near = (scores.get("TMMD", name) for name in (OURS, FLOOR, NEAREST))
+    if ours is None:
+        return []
+    more = f", real images of other videos {in_words(floor)}" if floor else ""
+    more += f", the real image of the nearest photo {in_words(near)}" if near else ""
+    return [f"Distance: on new videos the images of {OURS} have TMMD {in_words(ours)}{more}."]
+
+
+def _material(scores: Scores) -> list[str]:
+    ours, real = scores.get(MATERIAL, OURS), scores.get(MATERIAL, "real")
+    if ours is None or real is None:
+        return []
+    chance = percent(ours.details["chance"])
+    return [
+        f"Material: a probe of real train images names {percent(float(ours))} of the images of "
+        f"{OURS} and {percent(float(real))} of the real ones; chance is {chance}."
+    ]

@@ -1,0 +1,152 @@
+"""Controls: images that no generator made, scored as if one had.
+
+=====================  ===========================================================================
+control                for each test sample
+=====================  ===========================================================================
+real, other videos     a real train image of its material from another video: the floor
+real, wrong material   a real train image of another material
+empty background       its no-contact image (paper, section 1: scores of pixels reward it)
+mean image             the mean of all train images
+real, nearest photo    the real image of the train photo most similar to its photo
+reconstruction         its real image through the autoencoder: the ceiling
+one image for all      one real train image: a generator that collapsed
+one video a material   images of one train video of its material: memorized
+=====================  ===========================================================================
+
+Without materials the floor is of other videos, there is no wrong material, and one video stands for
+all. Random choices depend on (seed, sample) alone.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from palpate.core import Progress, quiet, rng_for
+from palpate.data.manifest import Manifest
+from palpate.diffusion.autoencoder import BackgroundAutoencoder
+from palpate.diffusion.autoencoders import load_autoencoder
+from palpate.encoders.embed import embed
+from palpate.encoders.encoder_set import EncoderSet, load_clip
+from palpate.studies.methods import Images, Make, Setting
+
+#: Real images of other videos: the score that no generator needs to beat.
+FLOOR = "real, other videos"
+#: The control that retrieves instead of generating.
+NEAREST = "real, nearest photo"
+EMPTY, MEAN, WRONG = "empty background", "mean image", "real, wrong material"
+CEILING, ONE, MEMORIZED = "reconstruction", "one image for all", "one video a material"
+#: One half of a generator's images against the other half.
+HALVES = "halves of Ours"
+Mask = NDArray[np.bool_]
+
+
+def _columns(setting: Setting, name: str) -> tuple[NDArray[Any], NDArray[Any]]:
+    """A column of train and of test, '' where unknown."""
+    parts = (setting.train.column(name), setting.test.column(name))
+    train, test = (np.array(["" if v is None else str(v) for v in part]) for part in parts)
+    return train, test
+
+
+def _drawn(setting: Setting, purpose: str, fits: Callable[[int], Mask]) -> Images:
+    """For each test sample a random train image among those that fit it; else among all."""
+    chosen: list[int] = []
+    for k, i in enumerate(setting.test.ids):
+        rows = np.flatnonzero(fits(k))
+        rows = rows if len(rows) else np.arange(len(setting.train))
+        rng = rng_for(setting.seed, "control", purpose, i)
+        chosen.append(int(rows[rng.integers(len(rows))]))
+    return setting.pixels(setting.train)[chosen]
+
+
+def other_videos(setting: Setting) -> Images:
+    """Real train images of the same material, from other videos."""
+    (known, material), (videos, video) = (_columns(setting, c) for c in ("material", "video"))
+    return _drawn(setting, "floor", lambda k: (known == material[k]) & (videos != video[k]))
+
+
+def wrong_material(setting: Setting) -> Images:
+    """Real train images of another material."""
+    known, material = _columns(setting, "material")
+    return _drawn(setting, "wrong", lambda k: known != material[k])
+
+
+def empty_background(setting: Setting) -> Images:
+    """The no-contact images."""
+    return setting.pixels(setting.test, "background")
+
+
+def mean_image(setting: Setting) -> Images:
+    """The mean of the train images, for all."""
+    mean = setting.pixels(setting.train).mean(axis=0, dtype=np.float64).round().astype(np.uint8)
+    return np.broadcast_to(mean, (len(setting.test), *mean.shape))
+
+
+def nearest_photo(setting: Setting) -> Images:
+    """The real tactile images of the train photos most similar to the test photos."""
+    encoders = EncoderSet(load_clip(setting.clip, device=setting.device))
+    how: dict[str, Any] = {"cache": setting.cache, "progress": setting.progress}
+    rows = nearest_rows(setting.train, setting.test, encoders, **how)
+    return setting.pixels(setting.train)[rows]
+
+
+def nearest_rows(
+    train: Manifest,
+    test: Manifest,
+    encoders: EncoderSet,
+    *,
+    cache: Path | None = None,
+    progress: Progress = quiet,
+) -> NDArray[np.intp]:
+    """For each test sample the row of the train photo most similar to its photo (cosine)."""
+    options: dict[str, Any] = {"cache": cache, "still": True, "progress": progress}
+    photos, queries = (
+        np.asarray(embed(part, encoders, "vision", **options).features) for part in (train, test)
+    )
+    return (queries @ photos.T).argmax(axis=1)
+
+
+def reconstruction(setting: Setting) -> Images:
+    """The real test images through the autoencoder."""
+    assert setting.autoencoder is not None
+    model, real = load_autoencoder(setting.autoencoder), np.asarray(setting.pixels(setting.test))
+    if isinstance(model, BackgroundAutoencoder):
+        gels = setting.pixels(setting.test, "background")
+        return model.decode(model.encode(real, gels), gels)
+    return model.decode(model.encode(real))
+
+
+def one_image(setting: Setting) -> Images:
+    """One real train image, for all."""
+    row = int(rng_for(setting.seed, "control", "one").integers(len(setting.train)))
+    image = setting.pixels(setting.train)[row]
+    return np.broadcast_to(image, (len(setting.test), *image.shape))
+
+
+def memorized(setting: Setting) -> Images:
+    """Images of one train video of the sample's material."""
+    (known, material), (videos, video) = (_columns(setting, c) for c in ("material", "video"))
+    one: dict[str, str] = {}
+    for name in sorted({*material}):
+        names = sorted({*videos[known == name]} - {*video}) or sorted({*videos[known == name]})
+        names = names or sorted({*videos})
+        one[name] = names[
+            int(rng_for(setting.seed, "control", "one video", name).integers(len(names)))
+        ]
+    return _drawn(setting, "memorized", lambda k: videos == one[material[k]])
+
+
+CONTROLS: Mapping[str, Make] = {
+    FLOOR: other_videos,
+    WRONG: wrong_material,
+    EMPTY: empty_background,
+    MEAN: mean_image,
+    NEAREST: nearest_photo,
+    CEILING: reconstruction,
+    ONE: one_image,
+    MEMORIZED: memorized,
+}

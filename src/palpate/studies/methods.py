@@ -1,0 +1,137 @@
+"""The generators that a study compares: name -> what differs, and what drives it.
+
+All of them are trained from random weights with the same data, U-Net, schedule, batch and number of
+steps; the row of :data:`METHODS` is all that differs. Another one is another row, or a function
+that makes images (``Method.make``).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from palpate.core import Progress, quiet
+from palpate.data.images import cached_images
+from palpate.data.manifest import Manifest
+from palpate.diffusion.autoencoders import gels_of
+from palpate.diffusion.presets import DiffusionPreset
+
+Images = NDArray[np.uint8]
+#: The paper's training, driven at test time by the photo in the place of the text.
+OURS = "Ours"
+#: Text conditions the training, with nothing that bridges to photos.
+BARE: Mapping[str, Any] = {"source": "text", "gap": "none", "noise": 0.0}
+
+
+@dataclass(frozen=True)
+class Setting:
+    """What makes images: a split of one data set.
+
+    Attributes:
+        train, test: its parts; one image is made for each sample of ``test``.
+        size: side of the images in pixels.
+        seed: of weights, order and noise.
+        steps: optimizer steps of each compared method.
+        clip: frozen vision and text encoders: a shipped name, hub id or folder.
+        cache: folder for decoded images and embeddings.
+        folder: empty folder for checkpoints.
+        device: ``auto``, ``cpu``, ``cuda`` or ``mps``.
+        autoencoder: folder of the autoencoder of this split.
+        progress: called with what is done.
+    """
+
+    train: Manifest
+    test: Manifest
+    size: int
+    seed: int
+    steps: int
+    clip: str
+    cache: Path
+    folder: Path
+    device: str = "auto"
+    autoencoder: Path | None = None
+    progress: Progress = quiet
+
+    def pixels(self, part: Manifest, column: str = "tactile") -> Images:
+        """One image column as squares (n, size, size, 3); gels that are absent are the stock gel.
+
+        Raises:
+            PalpateError: if a sample has no such image.
+        """
+        if column == "background":
+            like = gels_of(self.train, self.size, self.cache, self.progress)
+            return gels_of(part, self.size, self.cache, self.progress, like=like)
+        return cached_images(part, column, self.size, self.cache, self.progress)
+
+
+#: Images (n, size, size, 3) of the samples of ``setting.test``, in their order.
+Make = Callable[[Setting], Images]
+
+
+@dataclass(frozen=True)
+class Method:
+    """A generator.
+
+    Attributes:
+        name: in the tables.
+        text: what it is, in one sentence.
+        condition: fields of :class:`~palpate.diffusion.options.ConditionPolicy` that differ from
+            the preset's.
+        background: the denoiser sees the no-contact image.
+        gel: the autoencoder is given the no-contact image instead of being the VQ one.
+        drive: what it is given for a test sample: its photo, or its text.
+        make: makes the images in place of a diffusion model, in any way.
+    """
+
+    name: str
+    text: str
+    condition: Mapping[str, Any] = field(default_factory=dict[str, Any])
+    background: bool = False
+    gel: bool = False
+    drive: Literal["photo", "text"] = "photo"
+    make: Make | None = None
+
+    def preset(self, base: DiffusionPreset) -> DiffusionPreset:
+        """The preset with what differs."""
+        return replace(base, condition=replace(base.condition, **self.condition))
+
+    @property
+    def training(self) -> dict[str, Any]:
+        """What its training depends on: methods of one training differ in what drives them."""
+        return {"condition": self.condition, "background": self.background, "gel": self.gel}
+
+
+METHODS: Mapping[str, Method] = {
+    method.name: method
+    for method in (
+        Method(OURS, "Trained on texts, driven by the photo's embedding in their place.", BARE),
+        Method("Ours, by text", "Ours, driven by each sample's own text.", BARE, drive="text"),
+        Method(
+            "Ours w/ memory bridge",
+            "Ours; the photo is replaced by its projection on the training texts.",
+            {**BARE, "gap": "memory"},
+        ),
+        Method("Ours w/ BG", "Ours, which also sees the no-contact image.", BARE, background=True),
+        Method(
+            "GVST",
+            "The same token from photos in training, too: no text.",
+            {**BARE, "source": "vision"},
+        ),
+        Method(
+            "GVST as published",
+            "A residual network, trained along, makes a map of 8 x 8 tokens of the photo.",
+            {**BARE, "source": "resnet"},
+        ),
+        Method(
+            "best",
+            "Preset mini: a token of the text and one of the photo, memory bridge, noise, and an "
+            "autoencoder that is given the gel.",
+            gel=True,
+        ),
+    )
+}

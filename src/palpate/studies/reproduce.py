@@ -1,0 +1,342 @@
+"""From a study to its results: the nodes, and what is written of the finished ones.
+
+::
+
+    world -> data -> split -> encoder-SPLIT-SEED -> probe-SPLIT-SEED
+                     split -> autoencoder-SPLIT -> controls-SPLIT
+             autoencoder-SPLIT -> METHOD-SPLIT-SEED -> images-METHOD-SPLIT-SEED
+    images, controls, encoder -> scores-SPLIT-by-JUDGE-SEED; scores and probes -> results
+
+``results`` holds the means over seeds, tables and samples; ``results.json`` of the run folder is
+that with the record of the run (settings, versions, times), and ``page.html`` and others show it.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import inspect
+import os
+import platform
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
+from functools import partial
+from importlib import metadata
+from itertools import product
+from pathlib import Path
+from typing import Any
+
+from palpate import __version__
+from palpate.core import PalpateError, Progress, quiet, read_json, require
+from palpate.evaluation.inputs import read as read_samples
+from palpate.report.results import Results
+from palpate.sim.presets import MINI_SEEDS
+from palpate.studies import making
+from palpate.studies.collecting import collect
+from palpate.studies.demo import require_unseen, stamp
+from palpate.studies.graph import Node, Planned, plan_graph, run_graph
+from palpate.studies.judging import Judging, judge_images, probe_encoders
+from palpate.studies.making import slug
+from palpate.studies.methods import Method
+from palpate.studies.stages import Stage
+from palpate.studies.study import NOLEAK, SPLITS, Preset, Study
+
+
+@dataclasses.dataclass(frozen=True)
+class Plan:
+    """A study with everything that a run of it chooses.
+
+    Attributes:
+        study: what is run.
+        preset: how large.
+        seeds: one training of everything each.
+        root: the data set on disk, for a study that is not of the world.
+        others: name -> folder of images of the test part (of the split without leaks) that another
+            system made.
+        device: ``auto``, ``cpu``, ``cuda`` or ``mps``.
+    """
+
+    study: Study
+    preset: Preset
+    seeds: Sequence[int]
+    root: Path | None = None
+    others: Mapping[str, Path] = dataclasses.field(default_factory=dict[str, Path])
+    device: str = "auto"
+
+    @property
+    def methods(self) -> list[str]:
+        """Names of all methods, of others last."""
+        return [*(m.name for m in self.study.methods), *self.others]
+
+
+def plan_of(
+    study: Study,
+    *,
+    preset: str = "mini",
+    seeds: Sequence[int] = (0,),
+    root: Path | str | None = None,
+    others: Mapping[str, Path | str] | None = None,
+    device: str = "auto",
+) -> Plan:
+    """The plan of a run, checked before any work.
+
+    Raises:
+        PalpateError: for an unknown preset, no seeds, a root that is missing or not wanted, or a
+            folder that is not there or has the name of a method.
+    """
+    names = ", ".join(study.presets)
+    require(preset in study.presets, "preset", f"must be one of {names}", preset)
+    once = 0 < len(seeds) == len({*seeds})
+    require(once, "seeds", "must hold at least one seed, each once", list(seeds), (0, 1, 2))
+    if (root is None) == (study.world is None):
+        must = "must be given" if root is None else "must be left out"
+        must += f" for the study {study.name}"
+        fix = "Name the folder of the data set" if root is None else "Its data are made"
+        raise PalpateError(must, "none" if root is None else str(root), fix, argument="root")
+    if root is not None and not Path(root).exists():
+        raise PalpateError("must exist", f"nothing at {root}", "Check the path", argument="root")
+    folders = {name: Path(folder) for name, folder in (others or {}).items()}
+    for name, folder in folders.items():
+        if slug(name) in {slug(m.name) for m in study.methods} | {slug(c) for c in study.controls}:
+            must, fix = "must have a name of its own", "Choose another name"
+            raise PalpateError(must, name, fix, argument="method")
+        if not folder.is_dir():
+            must, fix = f"{name} must be a folder of images", "Check the path"
+            raise PalpateError(must, f"nothing at {folder}", fix, argument="method")
+    chosen = study.presets[preset]
+    if study.world is not None and chosen.clip == "palpate/mini":
+        seed = _world(study, chosen).seed
+        require(seed not in MINI_SEEDS, "world", "must be one that no shipped model saw", seed)
+    elif root is not None and chosen.clip == "palpate/mini":
+        require_unseen(Path(root))
+    return Plan(study, chosen, tuple(seeds), None if root is None else Path(root), folders, device)
+
+
+def nodes_of(plan: Plan) -> list[Node]:
+    """The nodes of a run; those of another seed, method or split come on top of what is there."""
+    study, preset, device = plan.study, plan.preset, plan.device
+    nodes = [*_data_nodes(plan)]
+    trained = set[str]()
+    for split in SPLITS:
+        nodes += _autoencoder_nodes(plan, split)
+        after = ["data", "split", f"autoencoder-{split}"]
+        make = partial(making.make_controls, split=split, controls=study.controls, preset=preset)
+        inputs = {"controls": {n: _source(f) for n, f in study.controls.items()}}
+        inputs |= {"size": preset.diffusion.size, "clip": preset.clip}
+        name = f"controls-{split}"
+        nodes.append(Node(name, partial(make, device=device), inputs, after, cost=20))
+    for seed, split in product(plan.seeds, SPLITS):
+        encoder = f"encoder-{split}-{seed}"
+        how: dict[str, Any] = {"preset": preset.encoder, "clip": preset.clip}
+        build = partial(making.make_encoders, split=split, seed=seed, device=device, **how)
+        nodes.append(
+            Node(encoder, build, {**how, "seed": seed}, ["data", "split"], cost=preset.seconds[0])
+        )
+        build = partial(probe_encoders, split=split, encoders=encoder, device=device)
+        nodes.append(Node(f"probe-{split}-{seed}", build, {}, ["data", "split", encoder], cost=15))
+        for method in study.trained_on(split):
+            nodes += _method_nodes(plan, method, split, seed, trained)
+    nodes += [
+        Node(
+            f"images-{slug(name)}-{NOLEAK}",
+            partial(making.take_images, split=NOLEAK, folder=folder, size=preset.diffusion.size),
+            {"folder": read_samples(folder, str(folder)).image_digest()},
+            ["data", "split"],
+            cost=5,
+        )
+        for name, folder in plan.others.items()
+    ]
+    for seed, split, judge in product(plan.seeds, SPLITS, SPLITS):
+        nodes.append(_score_node(plan, split, judge, seed))
+    judgments = {(s, j): [_scores(s, j, n) for n in plan.seeds] for s, j in product(SPLITS, SPLITS)}
+    probes = {split: [f"probe-{split}-{seed}" for seed in plan.seeds] for split in SPLITS}
+    first = _images(study.on_both[0], NOLEAK, plan.seeds[0])
+    build = partial(
+        collect,
+        study=study,
+        methods=plan.methods,
+        judgments=judgments,
+        probes=probes,
+        gallery=first,
+    )
+    read = [node for of in (judgments, probes) for nodes in of.values() for node in nodes]
+    after = ["data", "split", first, *read]
+    inputs = {"study": study.name, "title": study.title, "tables": study.tables}
+    nodes.append(Node("results", build, inputs, after, cost=10))
+    return nodes
+
+
+def run_study(
+    plan: Plan,
+    folder: Path | str,
+    *,
+    command: str = "",
+    jobs: int = 1,
+    print_line: Callable[[str], None] = lambda line: None,
+    progress: Progress = quiet,
+) -> Results:
+    """Run a study, or what is not there yet of it; write ``results.json`` and its tables.
+
+    Args:
+        plan: see :func:`plan_of`.
+        folder: run folder; run again with the same one to go on.
+        command: the command line that makes the run again.
+        jobs: processes.
+        print_line: called with one line a stage.
+        progress: called with what is done.
+
+    Raises:
+        PalpateError: on bad data or a folder in use; finished stages stay.
+    """
+    folder = Path(folder)
+    stages = run_graph(nodes_of(plan), folder, jobs=jobs, print_line=print_line, progress=progress)
+    results = Results.load(folder / "results" / "results.json")
+    settings = {**results.settings, **_settings(plan, stages)}
+    results = dataclasses.replace(results, settings=settings, commands=[command] if command else [])
+    results.save(folder / "results.json")
+    return results
+
+
+def planned(plan: Plan, folder: Path) -> list[Planned]:
+    """What a run would do with each stage; nothing is written."""
+    return plan_graph(nodes_of(plan), folder)
+
+
+def _world(study: Study, preset: Preset) -> Any:
+    return dataclasses.replace(preset.world, **(study.world or {}))
+
+
+def _data_nodes(plan: Plan) -> list[Node]:
+    """World, data and splits."""
+    study, nodes = plan.study, list[Node]()
+    if study.world is not None:
+        world = _world(study, plan.preset)
+        build = partial(making.make_world, options=world)
+        nodes.append(Node("world", build, {"options": world, "digest": world.digest}, cost=30))
+    build = partial(making.read_data, study=study, root=plan.root)
+    inputs: dict[str, Any] = {"read": _source(study.read)}
+    if plan.root is not None:
+        inputs |= {"root": str(plan.root.resolve()), "stamp": stamp(plan.root)}
+    nodes.append(Node("data", build, inputs, [node.name for node in nodes], cost=10))
+    nodes.append(Node("split", making.make_splits, {}, ["data"], cost=30))
+    return nodes
+
+
+def _autoencoder_nodes(plan: Plan, split: str) -> list[Node]:
+    preset = plan.preset
+    kinds: dict[str, Any] = {f"autoencoder-{split}": preset.autoencoder}
+    if not isinstance(preset.gel, str) and any(m.gel for m in plan.study.trained_on(split)):
+        kinds[f"autoencoder-gel-{split}"] = preset.gel
+    nodes: list[Node] = []
+    for name, options in kinds.items():
+        how: dict[str, Any] = {"split": split, "options": options, "size": preset.diffusion.size}
+        build = partial(making.make_autoencoder, device=plan.device, **how)
+        nodes.append(Node(name, build, how, ["data", "split"], cost=preset.seconds[1]))
+    return nodes
+
+
+def _images(method: str, split: str, seed: int) -> str:
+    return f"images-{slug(method)}-{split}-{seed}"
+
+
+def _scores(split: str, judge: str, seed: int) -> str:
+    return f"scores-{split}-by-{judge}-{seed}"
+
+
+def _method_nodes(
+    plan: Plan, method: Method, split: str, seed: int, trained: set[str]
+) -> list[Node]:
+    """Training, unless another method shares it and has its node, and images."""
+    preset, study = plan.preset, plan.study
+    how: dict[str, Any] = {"split": split, "seed": seed, "preset": preset, "device": plan.device}
+    nodes, generator = list[Node](), ""
+    autoencoder = f"autoencoder-{split}"
+    if method.gel:
+        gel = preset.gel
+        autoencoder = gel if isinstance(gel, str) else f"autoencoder-gel-{split}"
+    own = [] if "/" in autoencoder else [autoencoder]
+    if method.make is None:
+        first = next(m for m in study.methods if m.make is None and m.training == method.training)
+        generator = f"{slug(first.name)}-{split}-{seed}"
+        if generator not in trained:
+            trained.add(generator)
+            inputs = {"method": method.training, "diffusion": method.preset(preset.diffusion)}
+            inputs |= {"steps": preset.steps, "clip": preset.clip, "seed": seed}
+            inputs |= {"autoencoder": autoencoder}
+            build = partial(making.make_generator, method=method, autoencoder=autoencoder, **how)
+            after = ["data", "split", *own]
+            nodes.append(Node(generator, build, inputs, after, cost=preset.seconds[2]))
+    build = partial(making.make_images, method=method, generator=generator, **how)
+    inputs = {"drive": method.drive, "seed": seed}
+    inputs |= (
+        {}
+        if method.make is None
+        else {"make": _source(method.make), "size": preset.diffusion.size, "steps": preset.steps}
+    )
+    after = ["data", "split", generator or autoencoder]
+    nodes.append(Node(_images(method.name, split, seed), build, inputs, after, cost=30))
+    return nodes
+
+
+def _score_node(plan: Plan, split: str, judge: str, seed: int) -> Node:
+    """What the encoder of ``judge`` says of the images of ``split``: of other splits the first."""
+    study, preset, encoder = plan.study, plan.preset, f"encoder-{judge}-{seed}"
+    chosen = [m.name for m in study.trained_on(split)]
+    if judge != split:
+        chosen = list(study.on_both)
+    methods = {name: _images(name, split, seed) for name in chosen}
+    if split == judge == NOLEAK:
+        methods |= {name: f"images-{slug(name)}-{NOLEAK}" for name in plan.others}
+    judging = Judging(
+        split,
+        encoder,
+        methods,
+        list(study.controls),
+        study.metrics,
+        preset.clip,
+        preset.diffusion.size,
+        seed,
+        preset.permutations,
+    )
+    build = partial(judge_images, judging=judging, device=plan.device)
+    inputs = {**vars(judging), "metrics": [_source(m) for m in study.metrics]}
+    after = ["data", "split", encoder, f"controls-{split}", *methods.values()]
+    return Node(_scores(split, judge, seed), build, inputs, after, cost=60)
+
+
+def _source(function: Callable[..., Any]) -> str:
+    """What names a function: its module, its name, and the digest of its source where known."""
+    text = ""
+    with suppress(OSError, TypeError, SyntaxError):
+        text = hashlib.sha256(inspect.getsource(function).encode()).hexdigest()
+    name = getattr(function, "__qualname__", type(function).__name__)
+    return f"{function.__module__}.{name} {text}"
+
+
+def _settings(plan: Plan, stages: Mapping[str, Stage]) -> dict[str, Any]:
+    """The record of a run: what was chosen, digests, versions, machine, and every stage."""
+    packages = ("numpy", "torch", "diffusers", "transformers", "polars", "pillow")
+    records = {n: read_json(s.folder / "stage.json", "stage record") for n, s in stages.items()}
+    kept = ("digest", "outputs", "seconds", "peak_mb", "date")
+    digests: dict[str, Any] = {"manifest": stages["data"].facts["digest"]}
+    digests |= {f"split {s}": stages["split"].facts[s]["digest"] for s in SPLITS}
+    for seed, split in product(plan.seeds, SPLITS):
+        name = f"encoder-{split}-{seed}"
+        digests[f"encoder {split} {seed}"] = stages[name].facts["digest"]
+    return {
+        "study": plan.study.name,
+        "dataset": stages["data"].facts["dataset"],
+        "preset": plan.preset.name,
+        "seeds": list(plan.seeds),
+        "options": {
+            "root": str(plan.root) if plan.root else None,
+            "methods of others": {name: str(folder) for name, folder in plan.others.items()},
+            "steps of a method": plan.preset.steps,
+        },
+        "digests": digests,
+        "stages": {n: {k: r[k] for k in kept if k in r} for n, r in records.items()},
+        "seconds": {"all stages": round(sum(s.seconds for s in stages.values()))},
+        "versions": {"palpate": __version__, "python": platform.python_version()}
+        | {p: metadata.version(p) for p in packages},
+        "machine": f"{platform.machine()}, {os.cpu_count()} cores",
+    }

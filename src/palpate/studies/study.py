@@ -1,0 +1,208 @@
+"""Studies as typed objects: on what data, with which methods, controls and metrics, how large.
+
+A study is one entry of :data:`STUDIES`. The data are the embedded world (``world`` names the
+options that differ), or a data set on disk that ``read`` imports from ``--root``. Everything else
+about the size of a run is its :class:`Preset`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+from palpate.core import FeatureSet, Progress, Score
+from palpate.data.importing import import_dataset
+from palpate.diffusion.options import AutoencoderOptions, BackgroundOptions, UNetOptions
+from palpate.diffusion.presets import MINI, DiffusionPreset
+from palpate.encoders.presets import PRESETS as ENCODERS
+from palpate.encoders.presets import EncoderPreset
+from palpate.sim import PRESETS as WORLDS
+from palpate.sim import WorldOptions
+from palpate.studies.controls import CONTROLS
+from palpate.studies.methods import METHODS, OURS, Images, Make, Method
+
+#: The data set's own split, and ours.
+ORIG, NOLEAK = "Orig", "NoLeak"
+SPLITS = (ORIG, NOLEAK)
+
+
+@dataclass(frozen=True)
+class Preset:
+    """The size of a study.
+
+    Attributes:
+        name: of the preset.
+        world: the embedded world, before what a study changes in it.
+        encoder: the tactile encoder; one is trained for each split and seed.
+        diffusion: U-Net, schedule and sampler of all methods; its condition is that of ``best``.
+        steps: optimizer steps of each method.
+        autoencoder: of the methods, trained on the train part of each split.
+        gel: the autoencoder that is given the no-contact image: shipped, or trained likewise.
+        clip: frozen vision and text encoders: a shipped name, hub id or folder.
+        permutations: of the permutation test of TMMD.
+        cost: what a seed takes, and where that was measured.
+        seconds: expected of one training of an encoder, of the autoencoder, and of a method.
+    """
+
+    name: str
+    world: WorldOptions
+    encoder: EncoderPreset
+    diffusion: DiffusionPreset
+    steps: int
+    autoencoder: AutoencoderOptions
+    gel: str | BackgroundOptions
+    clip: str
+    permutations: int = 999
+    cost: str = ""
+    seconds: tuple[float, float, float] = (0.0, 0.0, 0.0)
+
+
+@dataclass(frozen=True)
+class Judged:
+    """What a metric sees: generated images of the test samples, and the real ones, in one order.
+
+    Attributes:
+        subject: name of the method or control.
+        images, real: (n, size, size, 3) uint8.
+        features, reference: their embeddings by the tactile encoder, with materials and videos.
+        seed: of the training.
+    """
+
+    subject: str
+    images: Images
+    real: Images
+    features: FeatureSet
+    reference: FeatureSet
+    seed: int
+
+
+#: One score of the images of one subject; its ``metric`` is a further column of the tables.
+Metric = Callable[[Judged], Score]
+
+
+def imported(root: Path, folder: Path, progress: Progress) -> None:
+    """Import any data set that ``palpate import`` reads into ``folder``."""
+    import_dataset(root, folder, overwrite=True, progress=progress)
+
+
+@dataclass(frozen=True)
+class Study:
+    """What is run.
+
+    Attributes:
+        name: of the study.
+        title: heading of its page.
+        tables: the paper's tables that it makes, by number.
+        world: options of the embedded world that differ from the preset's; None: data on disk.
+        read: writes the imported data set; called with its root, the folder to fill, and progress.
+        methods: what is compared, on the split without leaks.
+        on_both: names of methods that are trained on the data set's own split as well.
+        controls: name -> what makes their images.
+        metrics: further metrics.
+        presets: sizes by name.
+        paper: whether the data are those of the paper, whose numbers then stand beside ours.
+    """
+
+    name: str
+    title: str
+    tables: Sequence[int]
+    world: Mapping[str, Any] | None = None
+    read: Callable[[Path, Path, Progress], None] = imported
+    methods: Sequence[Method] = tuple(METHODS.values())
+    on_both: Sequence[str] = (OURS,)
+    controls: Mapping[str, Make] = field(default_factory=lambda: dict(CONTROLS))
+    metrics: Sequence[Metric] = ()
+    presets: Mapping[str, Preset] = field(default_factory=lambda: PRESETS)
+    paper: bool = False
+
+    def trained_on(self, split: str) -> list[Method]:
+        """The methods that make images for the test part of a split."""
+        return [m for m in self.methods if split == NOLEAK or m.name in self.on_both]
+
+
+#: Materials that feel different: with all twenty, minutes of training stay close to chance.
+_TEN = (
+    *("Wood", "Brick", "Tile", "Leather", "Synthetic Fabric"),
+    *("Rubber", "Tree", "Grass", "Gravel", "Sand"),
+)
+_WORLD = replace(
+    WORLDS["small"],
+    two_videos=0.0,
+    materials=_TEN,
+    objects_per_material=24,
+    contacts_per_video=3,
+    frames_per_contact=3,
+)
+_SMOKE_WORLD = replace(
+    _WORLD,
+    materials=("Wood", "Brick", "Leather", "Grass"),
+    objects_per_material=8,
+    contacts_per_video=2,
+    frames_per_contact=2,
+    test=0.375,
+)
+_VQ = AutoencoderOptions(
+    patch=2, widths=(32, 64), channels=4, codes=8192, steps_free=3000, steps_quantized=400
+)
+
+PRESETS: Mapping[str, Preset] = {
+    preset.name: preset
+    for preset in (
+        Preset(
+            "smoke",
+            _SMOKE_WORLD,
+            ENCODERS["tiny"],
+            replace(
+                MINI,
+                name="smoke",
+                size=32,
+                unet=UNetOptions(
+                    widths=(32, 48), attention=(False, True), layers=1, head_width=16, groups=8
+                ),
+                condition=replace(MINI.condition, photo_size=32, photo_width=16),
+                sampler=replace(MINI.sampler, steps=4),
+            ),
+            steps=12,
+            autoencoder=replace(
+                _VQ, widths=(16, 32), codes=256, steps_free=60, steps_quantized=20, crop=0
+            ),
+            gel="palpate/mini",
+            clip="palpate/mini",
+            permutations=99,
+            cost="for tests: under 8 minutes on two x86-64 cores",
+            seconds=(5, 5, 5),
+        ),
+        Preset(
+            "mini",
+            _WORLD,
+            ENCODERS["mini"],
+            MINI,
+            steps=2000,
+            autoencoder=_VQ,
+            gel="palpate/mini",
+            clip="palpate/mini",
+            cost="under 90 minutes a seed on two x86-64 cores",
+            seconds=(180, 180, 370),
+        ),
+    )
+}
+
+STUDIES: Mapping[str, Study] = {
+    study.name: study
+    for study in (
+        Study(
+            "world-gelsight",
+            "The study on the procedural world, GelSight",
+            (1, 3, 4),
+            {"look": "gelsight", "layout": "frames", "leak": "contact", "seed": 71},
+        ),
+        Study(
+            "world-digit",
+            "The study on the procedural world, DIGIT",
+            (2, 4),
+            {"look": "digit", "layout": "hct", "leak": "frame", "seed": 72},
+        ),
+    )
+}

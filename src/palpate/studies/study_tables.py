@@ -1,0 +1,217 @@
+"""The paper's tables in our shape, from the scores of finished stages.
+
+Rows are splits, methods and controls, columns are tasks and metrics. A cell is the mean over seeds
+with its interval over videos and seeds. The paper's own numbers are words, not scores: nobody can
+compute them again. They stand beside ours where the data are the paper's; elsewhere the text says
+which way they point.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+from palpate.core import Score
+from palpate.report.study import StudyTable
+from palpate.studies.controls import FLOOR, HALVES
+from palpate.studies.evidence import DIFFERENCE, over_seeds
+from palpate.studies.judging import MATERIAL
+from palpate.studies.methods import OURS
+from palpate.studies.study import NOLEAK, ORIG, SPLITS, Study
+
+#: Scores by (split of the images, split of the judge): means over seeds.
+Judgments = Mapping[tuple[str, str], "Scores"]
+Cell = Score | str | None
+#: The reading of the TMMD family that tables show; the scores hold the others as well.
+READING = "grouped"
+FAMILY = ("TMMD", "I-TMMD", "CI-TMMD", "D-TMMD")
+#: Metrics on features of networks that know photos, and the stand-in of LPIPS.
+BY_PHOTOS = ("LPIPS", "patch distance", "FID", "CMMD")
+RETRIEVAL = tuple(
+    f"top-{k} ({a} by {b})" for a, b in (("text", "tactile"), ("vision", "tactile")) for k in (1, 5)
+)
+
+
+def _printed(columns: Sequence[str], numbers: str) -> Mapping[str, str]:
+    """Numbers as the paper prints them; a share ends in %."""
+    return dict(zip(columns, numbers.replace("%", " %").split("  "), strict=True))
+
+
+_SPLIT_1, _SPLIT_2 = (MATERIAL, *FAMILY), (*RETRIEVAL, *FAMILY[:2])
+_METHOD = ("SSIM", "PSNR", "LPIPS", "FID", "CMMD", *FAMILY)
+#: What the paper prints: (table, row) -> column -> number. Table 4 of DIGIT is "HCT".
+PAPER: Mapping[tuple[int | str, str], Mapping[str, str]] = {
+    (1, ORIG): _printed(_SPLIT_1, "54.7%  0.33  0.04  0.21  0.06"),
+    (1, NOLEAK): _printed(_SPLIT_1, "37.8%  1.37  0.15  1.43  0.44"),
+    (2, ORIG): _printed(_SPLIT_2, "36.7%  70.3%  79.5%  95.7%  0.46  0.13"),
+    (2, NOLEAK): _printed(_SPLIT_2, "4.1%  17.4%  7.9%  27.4%  2.12  0.39"),
+    (3, OURS): _printed(_METHOD, "0.49  15.5  0.53  43.9  2.52  1.37  0.15  1.43  0.44"),
+    (3, "GVST"): _printed(_METHOD, "0.49  15.4  0.51  43.6  2.49  1.98  0.77  2.97  0.92"),
+    (3, "Ours w/ BG"): _printed(_METHOD, "0.54  16.0  0.43  46.9  2.44  2.39  1.24  5.33  1.40"),
+    ("HCT", OURS): _printed(FAMILY[:2], "2.12  0.39"),
+    ("HCT", "GVST"): _printed(FAMILY[:2], "2.67  0.61"),
+}
+
+
+@dataclass(frozen=True)
+class Scores:
+    """Scores by (metric, subject), in the order of their making; readings other than ours aside."""
+
+    by_name: Mapping[tuple[str, str], Score]
+
+    @classmethod
+    def over_seeds(cls, seeds: Sequence[Sequence[Score]], stage: str) -> Scores:
+        """The means of what each seed scores; a score that a seed lacks is left out."""
+        tables = [{_key(s): s for s in scores} for scores in seeds]
+        merged: dict[tuple[str, str], Score] = {}
+        for key in tables[0]:
+            if not all(key in table for table in tables):
+                continue
+            each = [table[key] for table in tables]
+            floors = [s.floor for s in each if s.floor is not None]
+            floor = sum(floors) / len(floors) if len(floors) == len(each) else None
+            mean = over_seeds(each)
+            of = [s.details["stage"] for s in each]
+            merged[key] = replace(
+                mean, floor=floor, details={**mean.details, "stage": stage, "of": of}
+            )
+        return cls(merged)
+
+    def get(self, metric: str, subject: str) -> Score | None:
+        """One score, or None."""
+        return self.by_name.get((metric, subject))
+
+    def of(self, metric: str) -> list[Score]:
+        """Everything that a metric says."""
+        return [s for (name, _), s in self.by_name.items() if name == metric]
+
+    @property
+    def metrics(self) -> list[str]:
+        """The metrics in their order, without differences."""
+        return [m for m in dict.fromkeys(m for m, _ in self.by_name) if DIFFERENCE not in m]
+
+
+def _key(score: Score) -> tuple[str, str]:
+    reading = score.settings.get("preset")
+    return score.metric + (f", {reading}" if reading == "paper" else ""), score.subject
+
+
+def study_tables(
+    study: Study,
+    judged: Judgments,
+    probed: Mapping[tuple[str, str], Score],
+    *,
+    methods: Sequence[str],
+    controls: Sequence[str],
+    extra: Sequence[str] = (),
+) -> list[StudyTable]:
+    """The tables of a study.
+
+    Args:
+        study: which tables it makes, and whether the paper's numbers stand beside.
+        judged: see :data:`Judgments`.
+        probed: (metric, split) -> what the encoder of the split scores on its test part.
+        methods: compared on the split without leaks, in their order.
+        controls: that were scored.
+        extra: names of further metrics.
+    """
+    make = {1: _of_splits, 2: _of_splits, 3: _of_methods, 4: _of_methods}
+    context = _Context(study, judged, probed, methods, [*controls, HALVES], extra)
+    return [make[number](context, number) for number in study.tables]
+
+
+@dataclass(frozen=True)
+class _Context:
+    study: Study
+    judged: Judgments
+    probed: Mapping[tuple[str, str], Score]
+    methods: Sequence[str]
+    controls: Sequence[str]
+    extra: Sequence[str]
+
+    def present(self, split: str, names: Iterable[str]) -> list[str]:
+        """Those that are scored on a split."""
+        known = {subject for _, subject in self.judged[split, split].by_name}
+        return [name for name in names if name in known]
+
+
+def _of_splits(context: _Context, number: int) -> StudyTable:
+    """Tables 1 and 2: what the encoders know, and how far the images of each split are."""
+    tasks = (MATERIAL,) if number == 1 else RETRIEVAL
+    heads = {task: f"{task}, real images" for task in tasks}
+    family = FAMILY if number == 1 else FAMILY[:2]
+    rows: list[list[Cell]] = []
+    controls: list[str] = []
+    for split in SPLITS:
+        crossed = [(e, (OURS, FLOOR)) for e in SPLITS if e != split]
+        named = [*context.study.on_both, *context.controls]
+        for judge, names in [(split, named), *crossed]:
+            for name in context.present(split, names):
+                label = f"{name}, {split}"
+                knows = judge == split and name == OURS
+                tasked = [_probed(context, t, split) if knows else None for t in tasks]
+                scores = context.judged[split, judge]
+                rows.append([label, judge, *tasked, *(scores.get(m, name) for m in family)])
+                if name in context.controls:
+                    controls.append(label)
+        if context.study.paper:
+            printed = PAPER[number, split]
+            rows.append([f"paper, {split}", split, *(printed.get(k) for k in (*tasks, *family))])
+            controls.append(f"paper, {split}")
+    text = (
+        "Encoder and generator are trained once for each split; each encoder judges the images of "
+        "both generators. Real images of other videos are the floor. The paper: without leaks "
+        "every column is worse."
+    )
+    names = {1: "material and generation", 2: "retrieval and generation"}
+    columns = ["images", "judged by encoder of", *heads.values(), *family]
+    title = f"Table {number}: {names[number]} by split"
+    return StudyTable(title, text, columns, rows, controls=[*dict.fromkeys(controls)])
+
+
+def _probed(context: _Context, task: str, split: str) -> Score | None:
+    metric = next((m for m, s in context.probed if s == split and same_task(m, task)), None)
+    return None if metric is None else context.probed[metric, split]
+
+
+def same_task(metric: str, task: str) -> bool:
+    """``top-1 of 480 (text by tactile)`` is ``top-1 (text by tactile)``."""
+    first, _, rest = metric.partition(" of ")
+    return metric == task or (bool(rest) and f"{first} {rest.partition(' ')[2]}" == task)
+
+
+def _of_methods(context: _Context, number: int) -> StudyTable:
+    """Tables 3 and 4: methods and controls on the split without leaks, by metric."""
+    scores = context.judged[NOLEAK, NOLEAK]
+    prior = [m for m in context.methods if m == OURS or m.startswith("GVST")]
+    known = {m.name for m in context.study.methods}
+    prior += [m for m in context.methods if m not in known]  # other people's
+    methods = context.methods if number == 3 else prior
+    metrics = [*FAMILY]
+    if number == 3:
+        of_photos = [
+            m for m in scores.metrics if m.startswith(("LPIPS", "FID", "CMMD", "patch distance"))
+        ]
+        metrics = ["SSIM", "PSNR", *of_photos, *FAMILY, MATERIAL, *context.extra]
+    subjects = context.present(NOLEAK, [*methods, *context.controls])
+    metrics = [m for m in metrics if any(scores.get(m, s) for s in subjects)]
+    rows: list[list[Cell]] = [[s, *(scores.get(m, s) for m in metrics)] for s in subjects]
+    controls = [s for s in subjects if s in context.controls]
+    if context.study.paper:
+        for name in ("GVST", OURS, *(("Ours w/ BG",) if number == 3 else ())):
+            printed = PAPER["HCT" if 2 in context.study.tables else 3, name]
+            rows.append([f"paper, {name}", *(printed.get(m.partition(" (")[0]) for m in metrics)])
+            controls.append(f"paper, {name}")
+    text = (
+        "All methods are trained from random weights for the same number of steps. Controls are no "
+        "generators: a metric that ranks one of them first rewards something else than touch. "
+    )
+    text += {
+        3: "The paper: TMMD and its relatives rank Ours before GVST before Ours w/ BG; SSIM, PSNR, "
+        "LPIPS and CMMD prefer Ours w/ BG.",
+        4: "The paper: Ours before GVST in every column.",
+    }[number]
+    title = {3: "Table 3: methods by metric", 4: "Table 4: against prior art"}[number]
+    more: dict[str, Any] = {"best": True, "controls": controls, "folded": number != 3}
+    return StudyTable(title, text, ["images", *metrics], rows, **more)

@@ -1,0 +1,302 @@
+"""Studies: their objects and nodes, controls against planted truths, tables from forged scores."""
+
+import json
+from dataclasses import replace
+from itertools import combinations
+
+import numpy as np
+import pytest
+
+from palpate.cli import main
+from palpate.core import PalpateError, Score, Split
+from palpate.report.results import Results
+from palpate.sim import WorldOptions
+from palpate.sim.presets import MINI_SEEDS
+from palpate.studies import controls
+from palpate.studies.controls import CONTROLS, FLOOR, NEAREST
+from palpate.studies.making import slug
+from palpate.studies.methods import METHODS, OURS, Method, Setting
+from palpate.studies.reproduce import nodes_of, plan_of, planned
+from palpate.studies.study import NOLEAK, ORIG, STUDIES, Study
+from palpate.studies.study_tables import Scores, study_tables
+
+WORLD = STUDIES["world-gelsight"]
+
+
+def test_no_two_names_share_a_folder():
+    names = [slug(n) for n in (*METHODS, *CONTROLS)]
+    assert len({*names}) == len(names)
+
+
+def test_compared_methods_differ_in_what_their_row_says():
+    """By-text shares the training of Ours; every other pair of methods has trainings of its own."""
+    shared = [
+        {a.name, b.name} for a, b in combinations(METHODS.values(), 2) if a.training == b.training
+    ]
+    assert shared == [{OURS, "Ours, by text"}]
+    for preset in WORLD.presets.values():
+        made = {m.name: m.preset(preset.diffusion) for m in METHODS.values()}
+        for other in made.values():
+            assert replace(other, condition=made[OURS].condition) == made[OURS]
+
+
+def test_no_shipped_model_has_seen_the_worlds():
+    for study in STUDIES.values():
+        for preset in study.presets.values():
+            if study.world is not None:
+                world = replace(preset.world, **study.world)
+                assert isinstance(world, WorldOptions)
+                assert world.seed not in MINI_SEEDS
+    seen = replace(WORLD, world={**(WORLD.world or {}), "seed": MINI_SEEDS[0]})
+    with pytest.raises(PalpateError, match="must be one that no shipped model saw"):
+        plan_of(seen)
+
+
+def test_nodes_train_once_for_each_split_and_seed():
+    nodes = {n.name: n for n in nodes_of(plan_of(WORLD, preset="smoke", seeds=(0, 1)))}
+    for seed, split in ((s, p) for s in (0, 1) for p in (ORIG, NOLEAK)):
+        assert {f"encoder-{split}-{seed}", f"ours-{split}-{seed}"} <= {*nodes}
+        for judge in (ORIG, NOLEAK):  # both encoders judge both generators
+            after = nodes[f"scores-{split}-by-{judge}-{seed}"].after
+            assert {f"encoder-{judge}-{seed}", f"images-ours-{split}-{seed}"} <= {*after}
+    assert "ours-by-text-NoLeak-0" not in nodes
+    assert "gvst-Orig-0" not in nodes
+    judged = nodes["scores-NoLeak-by-NoLeak-1"]
+    assert {*judged.inputs["methods"]} == {*METHODS}
+    assert judged.inputs["controls"] == [*CONTROLS]
+
+
+def test_another_seed_leaves_the_nodes_of_the_first(tmp_path):
+    one, two = (
+        {n.name: (n.inputs, n.after, n.version) for n in nodes_of(plan_of(WORLD, seeds=seeds))}
+        for seeds in ((0,), (0, 1))
+    )
+    assert {name for name in one if one[name] != two[name]} == {"results"}
+
+
+def test_a_method_of_your_own_trains_nothing():
+    mine = Method("mine", "", make=controls.mean_image)
+    study = replace(WORLD, methods=[METHODS[OURS], mine])
+    nodes = {n.name: n for n in nodes_of(plan_of(study, preset="smoke"))}
+    assert "images-mine-NoLeak-0" in nodes
+    assert "mine-NoLeak-0" not in nodes
+    assert "mine" in nodes["scores-NoLeak-by-NoLeak-0"].inputs["methods"]
+
+
+def test_a_dry_run_writes_nothing(tmp_path, capsys):
+    run = tmp_path / "run"
+    assert main(["reproduce", "world-digit", "-o", str(run), "--dry-run", "--json"]) == 0
+    stages = json.loads(capsys.readouterr().out)["stages"]
+    assert not run.exists()
+    assert [s["name"] for s in stages[:2]] == ["world", "data"]
+    assert stages[-1]["name"] == "results"
+    assert not any(s["done"] for s in stages)
+    minutes = sum(s["seconds"] for s in stages) / 60
+    assert minutes < 90, "preset mini must stay under 90 minutes a seed"
+
+
+@pytest.mark.parametrize(
+    ("args", "words"),
+    [
+        (["world-gelsigt", "-o", "r"], "study"),
+        (["world-gelsight", "-o", "r", "--preset", "huge"], "--preset must be one of smoke, mini"),
+        (["world-gelsight", "-o", "r", "--seeds", "1", "1"], "--seeds must hold"),
+        (["world-gelsight", "-o", "r", "--root", "x"], "--root must be left out"),
+        (["world-gelsight", "-o", "r", "--method", "dir"], "--method must be NAME=FOLDER"),
+        (["world-gelsight", "-o", "r", "--method", "a=dir"], "a must be a folder of images"),
+        (["world-gelsight", "-o", "r", "--method", "GVST=dir"], "a name of its own"),
+    ],
+)
+def test_mistakes_are_reported_in_one_line(args, words, capsys, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert main(["reproduce", *args]) == 2
+    lines = capsys.readouterr().err.splitlines()
+    assert words in lines[0]
+    assert not (tmp_path / "r").exists()
+
+
+def test_a_study_on_disk_needs_a_root(small_manifest, tmp_path):
+    study = Study("mine", "Mine", (1, 3, 4))
+    with pytest.raises(PalpateError, match="must be given for the study mine"):
+        plan_of(study)
+    small_manifest.save(tmp_path / "data" / "manifest.parquet")
+    names = [s.name for s in planned(plan_of(study, root=tmp_path / "data"), tmp_path / "run")]
+    assert "world" not in names
+    assert names[0] == "data"
+
+
+@pytest.fixture
+def setting(small_manifest, tmp_path):
+    """Two contacts of each of six videos of three materials; each video's last contact is test."""
+    rows = [*small_manifest.table.iter_rows(named=True)]
+    parts = {r["id"]: "train" if r["frame"] < 100 else "test" for r in rows}
+    split = Split(parts)
+    train, test = (small_manifest.part(split, part) for part in ("train", "test"))
+    return Setting(train, test, 32, 0, 1, "palpate/mini", tmp_path / "cache", tmp_path)
+
+
+def rows_of(setting, images):
+    """The rows of train that images are copies of."""
+    train = setting.pixels(setting.train)
+    return [int(np.flatnonzero((train == image).all(axis=(1, 2, 3)))[0]) for image in images]
+
+
+def columns_of(setting, rows, name):
+    return np.array(setting.train.column(name))[rows], np.array(setting.test.column(name))
+
+
+def test_the_floor_is_of_other_videos_of_the_material(setting):
+    rows = rows_of(setting, controls.other_videos(setting))
+    material, wanted = columns_of(setting, rows, "material")
+    video, own = columns_of(setting, rows, "video")
+    assert (material == wanted).all()
+    assert (video != own).all()
+
+
+def test_a_wrong_material_is_never_right(setting):
+    material, wanted = columns_of(
+        setting, rows_of(setting, controls.wrong_material(setting)), "material"
+    )
+    assert (material != wanted).all()
+
+
+def test_a_memorized_video_is_one_a_material(setting):
+    rows = rows_of(setting, controls.memorized(setting))
+    material, wanted = columns_of(setting, rows, "material")
+    video, _ = columns_of(setting, rows, "video")
+    assert (material == wanted).all()
+    assert len({*video}) == len({*wanted}) == 3
+
+
+def test_constant_controls(setting):
+    mean, one = controls.mean_image(setting), controls.one_image(setting)
+    train = np.asarray(setting.pixels(setting.train), float)
+    assert np.abs(mean[0] - train.mean(axis=0)).max() <= 0.5
+    assert (mean == mean[0]).all()
+    assert (one == one[0]).all()
+    assert len(one) == len(setting.test)
+    rows_of(setting, one[:1])  # a train image
+
+
+def test_the_nearest_photo_by_a_slow_loop(setting):
+    from palpate.encoders.embed import embed
+    from palpate.encoders.encoder_set import EncoderSet
+
+    encoders = EncoderSet.load("palpate/mini")
+    photos, queries = (
+        embed(part, encoders, "vision").features for part in (setting.train, setting.test)
+    )
+    slow = [max(range(len(photos)), key=lambda k: float(q @ photos[k])) for q in queries]
+    expected = setting.pixels(setting.train)[slow]
+    assert (controls.nearest_photo(setting) == expected).all()
+
+
+def forged(subject, metric, value, stage="s", half=0.1, **fields):
+    return Score(
+        metric,
+        subject,
+        value,
+        (value - half, value + half),
+        settings={"preset": "grouped"},
+        details={"stage": stage},
+        n=10,
+        **fields,
+    )
+
+
+def test_cells_are_means_over_seeds_that_name_their_stages():
+    seeds = [
+        [forged(OURS, "TMMD", v, f"scores-{k}", floor=v / 10)] for k, v in enumerate((1, 2, 6))
+    ]
+    score = Scores.over_seeds(seeds, "results").get("TMMD", OURS)
+    assert score is not None
+    assert score.value == pytest.approx(3)
+    assert score.floor == pytest.approx(0.3)
+    assert score.details["by_seed"] == [1, 2, 6]
+    assert score.details["stage"] == "results"
+    assert score.details["of"] == ["scores-0", "scores-1", "scores-2"]
+    assert score.interval is not None
+    assert score.interval[1] - score.interval[0] > 0.2  # wider than that of one seed
+
+
+def test_tables_hold_methods_controls_and_both_judges():
+    values = {
+        (s, j): 1.0 + 10 * a + b
+        for a, s in enumerate((ORIG, NOLEAK))
+        for b, j in enumerate((ORIG, NOLEAK))
+    }
+    metrics = ("SSIM", "TMMD", "I-TMMD", "CI-TMMD", "D-TMMD")
+    subjects = (OURS, "GVST", "other", FLOOR, NEAREST)
+    judged = {
+        pair: Scores.over_seeds([[forged(n, m, v) for n in subjects for m in metrics]], "results")
+        for pair, v in values.items()
+    }
+    probed = {
+        ("material accuracy", split): forged(split, "material accuracy", 0.5)
+        for split in (ORIG, NOLEAK)
+    }
+    names = {"methods": [*METHODS, "other"], "controls": [*CONTROLS]}
+    one, three, four = study_tables(WORLD, judged, probed, **names)
+    assert one.columns[:3] == ["images", "judged by encoder of", "material accuracy, real images"]
+    cells = {(row[0], row[1]): row for row in one.rows}
+    for split in (ORIG, NOLEAK):
+        assert cells[f"{OURS}, {split}", split][2].value == 0.5
+        for judge in (ORIG, NOLEAK):
+            for name in (OURS, FLOOR):
+                assert cells[f"{name}, {split}", judge][3].value == values[split, judge]
+    assert [row[0] for row in three.rows] == [OURS, "GVST", "other", FLOOR, NEAREST]
+    assert [row[0] for row in four.rows] == [OURS, "GVST", "other", FLOOR, NEAREST]
+    assert three.controls == [FLOOR, NEAREST]
+    assert three.columns[:2] == ["images", "SSIM"]
+    for table in (one, three, four):
+        assert all(len(row) == len(table.columns) for row in table.rows)
+        assert not any("paper" in str(row[0]) for row in table.rows)
+
+
+def test_the_papers_numbers_stand_beside_its_own_data_alone():
+    judged = {
+        (s, j): Scores.over_seeds(
+            [[forged(OURS, "TMMD", 1.0), forged(OURS, "SSIM", 0.5)]], "results"
+        )
+        for s in (ORIG, NOLEAK)
+        for j in (ORIG, NOLEAK)
+    }
+    study = replace(WORLD, paper=True)
+    one, three, four = study_tables(study, judged, {}, methods=[OURS], controls=[])
+    assert {row[0]: row[3] for row in one.rows}["paper, NoLeak"] == "1.37"
+    assert {row[0]: row[1] for row in three.rows}["paper, Ours w/ BG"] == "0.54"
+    assert {row[0]: row[1] for row in four.rows}["paper, GVST"] == "1.98"
+    digit = replace(STUDIES["world-digit"], paper=True)
+    assert {
+        r[0]: r[1] for r in study_tables(digit, judged, {}, methods=[OURS], controls=[])[1].rows
+    }["paper, GVST"] == "2.67"
+
+
+@pytest.mark.slow
+def test_the_study_at_smoke(tmp_path):
+    """Every table, method and control; other people's images; running again builds nothing."""
+    run, command = tmp_path / "run", ["reproduce", "world-gelsight", "--preset", "smoke", "-q"]
+    assert main([*command, "-o", str(run)]) == 0
+    for name in ("results.json", "page.html", "page.md", "tables.tex", "scores.csv"):
+        assert (run / name).stat().st_size > 0, name
+    results = Results.load(run / "results.json")
+    titles = [table.title.partition(":")[0] for table in results.tables]
+    assert titles[:3] == ["Table 1", "Table 3", "Table 4"]
+    rows = [row[0] for row in results.tables[1].rows]
+    assert {*METHODS, *CONTROLS, controls.HALVES} == {*rows}
+    assert len(results.audits) == 2
+    assert results.audits[1].leaked_fraction == 0 < results.audits[0].leaked_fraction
+    assert results.claims
+    for table in results.tables:
+        for cell in (c for row in table.rows for c in row if isinstance(c, Score)):
+            assert (run / cell.details["stage"] / "stage.json").is_file()
+    times = {p: p.stat().st_mtime_ns for p in run.glob("*/stage.json")}
+    # The images of a method, given as another system's, score as that method's.
+    given = f"theirs={run / 'images-gvst-NoLeak-0' / 'images'}"
+    assert main([*command, "-o", str(run), "--method", given]) == 0
+    changed = {p.parent.name for p, t in times.items() if p.stat().st_mtime_ns != t}
+    assert changed == {"scores-NoLeak-by-NoLeak-0", "results"}
+    again = Results.load(run / "results.json")
+    for metric in ("TMMD", "SSIM", "material accuracy"):
+        assert again[metric, "theirs"].value == pytest.approx(again[metric, "GVST"].value)
+        assert again[metric, "GVST"].value == pytest.approx(results[metric, "GVST"].value)
