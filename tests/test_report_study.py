@@ -17,11 +17,12 @@ from PIL import Image, ImageFont
 from palpate.cli import main
 from palpate.core import SampleRef
 from palpate.report import drawing, write_report
-from palpate.report.curves import curve_drawing, panels_of, strips_drawing
+from palpate.report.curves import curve_drawing, matrix_drawing, panels_of, strips_drawing
 from palpate.report.page import OPEN_CLAIMS, render_page
 from palpate.report.results import GalleryItem, Results
 from palpate.report.study import Claim, Curve, Line, StudyTable
 from palpate.report.study_tables import curve_table, sheet, tally
+from palpate.report.tables import heat_tables
 from report_fixtures import Tree, images, score, study_results, text_note
 
 NASTY = "<script>alert(1)</script> & \"q\" 'q' 100% $x_1$ \\input{a} | `c` [d]"
@@ -438,11 +439,34 @@ def test_strips_draw_value_interval_null_and_floor_and_hollow_controls(study):
         [start + slope * v for row in results.tables[0].rows for v in row[1].interval]
     )
     texts = [p.text for p in parts if isinstance(p, drawing.Words)]
+    assert texts.count("nearest photo") == 1
     assert "1.200 [1.080, 1.320]" in texts
     text = next(
         p for p in strips_drawing("T", panels[2:3]).parts if getattr(p, "text", "") == "undefined"
     )
     assert text.x > 400
+
+
+def test_labels_of_strips_are_all_words_before_the_scores():
+    rows = [["Ours", "Orig", up("a", 0.5), "note"], ["Ours", "NoLeak", up("a", 0.4), "note"]]
+    (panel,) = panels_of(sheet(StudyTable("T", "", ["method", "split", "accuracy", "why"], rows)))
+    assert [label for label, *_ in panel.rows] == ["Ours, Orig", "Ours, NoLeak"]
+
+
+def test_a_matrix_has_its_numbers_on_squares_of_their_strength():
+    details = {"matrix": [[0.0, 4.0], [1.0, 2.0]], "classes": ["wood", LONG]}
+    (heat,) = heat_tables([score("D-TMMD", "a", details=details)])
+    parts = matrix_drawing(heat).parts
+    boxes = [p for p in parts if isinstance(p, drawing.Shape)]
+    words = {p.text: (p.x, p.y) for p in parts if isinstance(p, drawing.Words)}
+    texts = [text for row in heat.values for text in row]
+    strength = {float(t): b.opacity for t, b in zip(texts, boxes, strict=True)}
+    assert sorted(strength, key=strength.get) == [0.0, 1.0, 2.0, 4.0]
+    for text, box in zip(texts, boxes, strict=True):
+        (left, top), (right, bottom) = box.points[0], box.points[2]
+        assert left < words[text][0] < right
+        assert top < words[text][1] < bottom
+    assert "1  wood" in words
 
 
 # --- figures of images ----------------------------------------------------------------------

@@ -19,7 +19,7 @@ from palpate.report.results import AUDIT_FORMATS, RESULTS_FORMATS, Audit, Result
 TITLE = "palpate report"
 #: Names of the files that folders of figures and of tables hold.
 WRITTEN = re.compile(
-    r"(background|claims|curve|pairs|samples|scores|strips|table)\b.*\.(csv|png|svg)"
+    r"(background|claims|curve|matrix|pairs|samples|scores|strips|table)\b.*\.(csv|png|svg)"
 )
 
 

@@ -1,10 +1,11 @@
-"""Curves and strips as drawings: scores over a number, and scores of many subjects on one axis."""
+"""Drawings of a study: curves, strips of many subjects on one axis, and matrices by class."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
+from itertools import takewhile
 
 from palpate.core import Score
 from palpate.report.drawing import DASHES, MARKERS, Drawing, Shape, Words, lines_of, marker
@@ -12,8 +13,8 @@ from palpate.report.drawing import text_width as wide
 from palpate.report.notes import decimals, number
 from palpate.report.plots import Axis, axis_of, ticks_of
 from palpate.report.study import Curve, Line
-from palpate.report.study_tables import Sheet
-from palpate.report.tables import Column
+from palpate.report.study_tables import Row, Sheet
+from palpate.report.tables import Column, Heat
 
 #: Units of a curve: the whole width, the plot's height, and the places of its edges.
 WIDTH, PLOT, TOP, RIGHT = 400.0, 200.0, 26.0, 392.0
@@ -21,6 +22,8 @@ WIDTH, PLOT, TOP, RIGHT = 400.0, 200.0, 26.0, 392.0
 INKS = tuple(f"line{k}" for k in range(1, 7))
 #: Units of a strip: label, axis and number.
 STRIP, LABEL, AXIS, ROW = 640.0, 212.0, 240.0, 20.0
+#: Units of a square of a matrix.
+CELL = 30.0
 #: Most different x that are all labeled.
 LABELED = 8
 
@@ -195,7 +198,7 @@ def panels_of(table: Sheet) -> list[Panel]:
     panels: list[Panel] = []
     for k, head in enumerate(table.heads):
         rows = [
-            (_label(row.cells[0].value), score, row.control)
+            (_label(row), score, row.control)
             for row in table.rows
             if (score := row.cells[k].score) is not None
         ]
@@ -204,8 +207,10 @@ def panels_of(table: Sheet) -> list[Panel]:
     return panels
 
 
-def _label(value: Score | str | None) -> str:
-    return value if isinstance(value, str) else "" if value is None else f"{float(value):g}"
+def _label(row: Row) -> str:
+    """The words before the first score."""
+    words = takewhile(lambda value: not isinstance(value, Score), (c.value for c in row.cells))
+    return ", ".join(word for word in words if isinstance(word, str))
 
 
 def strips_drawing(title: str, panels: Sequence[Panel]) -> Drawing:
@@ -295,3 +300,27 @@ def score_panels(columns: Sequence[Column]) -> list[Panel]:
         for column in columns
         if any(cell.defined for cell in column.cells)
     ]
+
+
+def matrix_drawing(heat: Heat) -> Drawing:
+    """Draw a matrix by class: numbers on squares that are stronger the larger the number.
+
+    Columns have the numbers of the rows, so that long names need no turned letters.
+    """
+    names = [
+        lines_of(f"{k}  {label}", LABEL - 6, most=1)[0] for k, label in enumerate(heat.labels, 1)
+    ]
+    parts: list[Shape | Words] = []
+    width = max([CELL, *(wide(text, 11) + 6 for row in heat.values for text in row)])
+    for k, name in enumerate(names):
+        x, y = LABEL + k * width, ROW + k * CELL
+        parts.append(Words(x + width / 2, ROW - 6, f"{k + 1}", "middle"))
+        parts.append(Words(0, y + CELL / 2 + 4, name, ink="ink"))
+        for n, (text, share) in enumerate(zip(heat.values[k], heat.shares[k], strict=True)):
+            left = LABEL + n * width
+            box = [(left, y), (left + width, y), (left + width, y + CELL), (left, y + CELL)]
+            parts.append(Shape(box, "line1", fill=True, opacity=0.05 + 0.45 * share))
+            middle = left + width / 2
+            parts.append(Words(middle, y + CELL / 2 + 4, text, "middle", ink="ink", size=11))
+    size = (LABEL + len(names) * width + 2, ROW + len(names) * CELL + 2)
+    return Drawing(*size, parts, f"{heat.title}. {heat.meaning}")

@@ -14,13 +14,19 @@ from PIL import Image, ImageDraw, ImageOps
 
 from palpate.core import atomic_path, write_text
 from palpate.report import audits
-from palpate.report.curves import curve_drawing, panels_of, score_panels, strips_drawing
+from palpate.report.curves import (
+    curve_drawing,
+    matrix_drawing,
+    panels_of,
+    score_panels,
+    strips_drawing,
+)
 from palpate.report.drawing import COLORS, Drawing, font_of, in_ascii
 from palpate.report.first_screen import telling_columns
 from palpate.report.page import gallery_images, in_turns, material_of, pair_images
 from palpate.report.results import Audit, Results
 from palpate.report.study_tables import sheets, slug
-from palpate.report.tables import score_tables
+from palpate.report.tables import heat_tables, score_tables
 from palpate.report.thumbnails import Wanted, read_image
 
 #: Samples and pairs side by side.
@@ -41,8 +47,8 @@ class Picture:
 def save_figures(results: Results, folder: Path, *, base: Path) -> list[Path]:
     """Write every figure of ``results`` into ``folder``.
 
-    Curves and strips (score tables, and tables of a study with intervals) are SVG and PNG; samples,
-    what the background is of an image, and leaking pairs are PNG.
+    Curves, strips (score tables, and tables of a study with intervals) and matrices by class are
+    SVG and PNG; samples, what the background is of an image, and leaking pairs are PNG.
 
     Args:
         results: what to draw.
@@ -83,6 +89,8 @@ def _drawings(results: Results) -> dict[str, Drawing]:
         panels = [p for p in panels_of(table) if any(s.interval for _, s, _ in p.rows)]
         if panels:
             drawings[f"strips-{slug(k, table.title)}"] = strips_drawing(table.title, panels)
+    for k, heat in enumerate(heat_tables(results.scores), 1):
+        drawings[f"matrix-{slug(k, heat.title)}"] = matrix_drawing(heat)
     return drawings
 
 
