@@ -26,6 +26,7 @@ from palpate.core import FeatureSet, Note, PalpateError, Progress, Score, Split,
 from palpate.data.manifest import Manifest
 from palpate.metrics.means import mean_of
 from palpate.metrics.probe import fit_probe
+from palpate.report.calls import Call
 from palpate.report.results import Results
 
 #: Words from which a caption is overlong.
@@ -87,6 +88,8 @@ def check_captions(
     Raises:
         PalpateError: if there are no captions, or they are of other samples.
     """
+    given = {"captions": captions, "data": data, "split": split, "seed": seed, **options}
+    call = Call.of("caption check", check_captions, given)
     manifest, table = read_captions(captions, data, **options)
     flags = dict(table.select("id", "flags").iter_rows())
     split = None if split is None else Split.load(split)
@@ -110,6 +113,7 @@ def check_captions(
             "text source": manifest.facts.get("text_source", "unknown"),
             "options": {"seed": seed, "folds": FOLDS, "words": WORDS, "penalty": PENALTY},
         },
+        calls=[call.with_digests(digests)],
     )
 
 

@@ -124,6 +124,7 @@ def read(path: Path, folders: Sequence[Path] = ()) -> Results:
         return None
 
     results = results.with_paths(place)
+    results = results.with_call_paths(lambda name: os.path.normpath(path.parent / name))
     note = Note("images-outside", {"count": len(outside), "file": str(path)})
     return replace(results, notes=[*results.notes, note]) if outside else results
 

@@ -108,6 +108,11 @@ VERBS: dict[str, Verb] = {
         "Write the page: audit, gallery, scores, settings",
         "palpate report audit.json scores.json -o page.html",
     ),
+    "verify": Verb(
+        "verify",
+        "Make the numbers of a results file again, and compare",
+        "palpate verify scores.json",
+    ),
     "demo": Verb(
         "demo", "Run everything once, from photos to a page", "palpate demo --data touch_and_go/"
     ),

@@ -12,6 +12,7 @@ from palpate.core import FeatureSet, Note, Progress, Split, quiet
 from palpate.data.manifest import MODALITIES, Manifest
 from palpate.evaluation.inputs import guard, load_encoders
 from palpate.leakage.auditing import audit as audit_leakage
+from palpate.report.calls import Call
 from palpate.report.results import Audit, Impact
 
 if TYPE_CHECKING:
@@ -53,6 +54,8 @@ def audit(
     Raises:
         PalpateError: as :func:`palpate.leakage.audit`, and if the encoders cannot be loaded.
     """
+    given = {"train_or_data": train_or_data, "test": test, "encoder": encoder, "impact": impact}
+    call = Call.of("audit", audit, {**given, "allow_seen": allow_seen, **options})
     folder = None if cache is None else Path(cache)
 
     @lru_cache
@@ -86,7 +89,7 @@ def audit(
         result = measure_impact(samples, split, group=group, **how)
         return replace(result, notes=[*notes, *result.notes])
 
-    return audit_leakage(
+    result = audit_leakage(
         train_or_data,
         test,
         encoder=None if encoder is None else lambda samples, m: embed(samples, m).features,
@@ -95,6 +98,7 @@ def audit(
         progress=progress,
         **options,
     )
+    return replace(result, call=call)
 
 
 # In the order of leakage.audit, with the types of the two that differ, and the one more.

@@ -34,6 +34,7 @@ from palpate.metrics.means import Mean, over_seeds
 from palpate.metrics.paired import differences_of_means
 from palpate.metrics.probe import class_accuracies
 from palpate.metrics.retrieval import TIE, Floats, retrieval, unit_rows
+from palpate.report.calls import Call
 from palpate.report.results import Match, Results, Strip
 
 if TYPE_CHECKING:
@@ -127,11 +128,15 @@ def probe(  # noqa: PLR0913 - one argument a choice
         PalpateError: if nothing can be measured, images are missing or unreadable, or the encoder
             was trained on test images.
     """
+    given = locals()
     require_choice("modality", modality, ("tactile", "vision"))
     from palpate.data.reading import load
 
     manifest = load(data)
     splits, encoders = named(split, "split"), named(encoder, "encoder")
+    several = {"split": splits, "encoder": encoders}  # names are those of today's files
+    given |= {name: of for name, of in several.items() if len(of) > 1}
+    call = Call.of("probe", probe, given)
     if len(splits) > 1 and len(encoders) > 1:
         must, fix = "must be one where several splits are compared", "Compare one at a time"
         raise PalpateError(must, f"{len(encoders)}", fix, argument="encoder")
@@ -154,8 +159,9 @@ def probe(  # noqa: PLR0913 - one argument a choice
         f"{modality} encoder{f' {name}' if axis == 'encoder' else ''}": e.digest(modality)
         for name, e in sets.items()
     }
-    known: Any = results.settings["digests"]
-    return replace(results, settings={**results.settings, "digests": {**known, **digests}})
+    digests = {**results.settings["digests"], **digests}
+    settings, calls = {**results.settings, "digests": digests}, [call.with_digests(digests)]
+    return replace(results, settings=settings, calls=calls)
 
 
 def plan_of(manifest: Manifest, splits: Mapping[str, Split], plan: Plan) -> Plan:

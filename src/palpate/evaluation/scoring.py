@@ -67,6 +67,7 @@ from palpate.evaluation.memorization import FEATURES, PIXELS, contact_rows, memo
 from palpate.metrics import PRESETS, compare, compare_tmmd, distance, require_same_ids, tmmd
 from palpate.metrics.kernels import MOMENT_BYTES
 from palpate.metrics.mmd import BLOCKS_OF_MANY, sample_units
+from palpate.report.calls import OBJECT, PATH, Call
 from palpate.report.results import GalleryItem, Results
 
 if TYPE_CHECKING:
@@ -318,6 +319,7 @@ def score(  # noqa: PLR0913
         >>> results["TMMD", "generated"].n
         40
     """
+    call = Call.of("score", score, locals())
     split = None if split is None else Split.load(split)
     labels, clusters = _clusters(labels)
     requested: Any = [companions] if isinstance(companions, str) else companions
@@ -374,8 +376,7 @@ def score(  # noqa: PLR0913
         outcome.scores, inputs, split, digest, of_encoder, choices=choices
     )
     settings = _settings(inputs, family, outcome, encoders)
-    if split is not None:
-        settings["split rule"] = dict(split.rule)
+    settings |= {"split rule": dict(split.rule)} if split is not None else {}
     settings |= {"encoder": str(encoder)} if encoders is not None else {}
     return Results(
         title=f"Scores of {', '.join(inputs.generators)}",
@@ -383,6 +384,7 @@ def score(  # noqa: PLR0913
         gallery=_gallery(inputs, seed),
         settings=settings,
         notes=[*outcome.notes, *_copies(outcome)],
+        calls=[_named(call, inputs).with_digests(_digests_read(settings))],
     )
 
 
@@ -403,6 +405,20 @@ def _train_samples(source: Source, inputs: Inputs, split: Split | None) -> Sampl
     if split is not None and not {*train.ids}.isdisjoint(split.parts):
         train = train.take([i for i in train.ids if split.parts.get(i) == "train"])
     return train
+
+
+def _named(call: Call, inputs: Inputs) -> Call:
+    """The call with the names of the generators, whatever their folders come to be called."""
+    made = call.arguments["generated"]
+    if isinstance(made, Mapping) and not {PATH, OBJECT} & {*made}:
+        return call  # a mapping has names
+    return replace(call, arguments={**call.arguments, "names": [*inputs.generators]})
+
+
+def _digests_read(settings: Mapping[str, Any]) -> dict[str, Any]:
+    """Of everything that was read: images, or files of embeddings; encoder and split."""
+    files: Mapping[str, Any] = settings.get("embeddings", {})
+    return {**settings["digests"], **{f"rows of {n}": f["digest"] for n, f in files.items()}}
 
 
 def _presets(presets: str | Sequence[str] | None) -> tuple[str, ...]:

@@ -35,6 +35,7 @@ from palpate.preference.statistics import (
     sign_test,
 )
 from palpate.preference.votes import DATABASE, read_votes
+from palpate.report.calls import Call
 from palpate.report.results import Results
 
 PREFERENCE, STRENGTH = "human preference", "human strength"
@@ -77,6 +78,7 @@ def score(
         PalpateError: if there are no votes, a file is none of this study, or all raters are
             excluded.
     """
+    call = Call.of("preference score", score, locals())
     require(100 <= replicates <= 100_000, "replicates", "must lie in 100 .. 100,000", replicates)
     plan, folder = Plan.load(study), Path(study)
     folder = folder if folder.is_dir() else folder.parent
@@ -117,6 +119,7 @@ def score(
             *_rater_notes(plan, everyone, len(kept)),
             Note("human-agreement", agreement),
         ],
+        calls=[call],
     )
 
 

@@ -21,6 +21,7 @@ from palpate.core.notes import Note
 from palpate.core.records import from_plain
 from palpate.core.samples import SampleRef
 from palpate.core.score import Score
+from palpate.report.calls import Call
 from palpate.report.study import Claim, Curve, StudyTable
 
 if TYPE_CHECKING:
@@ -198,6 +199,7 @@ class Audit:
         impact: what the leak does to scores, if requested.
         commands: command lines that say what to do next.
         others: audits of the same test part against other data (an encoder's pretraining list).
+        call: what made it, for ``palpate verify``; None in files of earlier versions.
         table: a polars frame with every signal of every test sample; not in the JSON.
     """
 
@@ -231,6 +233,7 @@ class Audit:
     impact: Impact | None = None
     commands: Sequence[str] = ()
     others: Sequence[Audit] = ()
+    call: Call | None = None
     table: Any = field(default=None, compare=False, repr=False)
 
     def __post_init__(self) -> None:
@@ -278,8 +281,10 @@ class Audit:
         return from_plain(cls, {k: v for k, v in data.items() if k not in COMMAND_KEYS})
 
     def save(self, path: str | Path) -> None:
-        """Write the audit as JSON, atomically."""
-        write_json(Path(path), self.to_json())
+        """Write the audit as JSON, atomically; paths of inputs become relative to its folder."""
+        place = _from_folder(Path(path).parent, Path())
+        call = self.call and self.call.with_paths(place)
+        write_json(Path(path), replace(self, call=call).to_json())
 
     @classmethod
     def load(cls, path: str | Path) -> Audit:
@@ -290,7 +295,9 @@ class Audit:
         """
         data = read_record(Path(path), "audit file", form=AUDIT_FORMATS)
         with reading_entry(Path(path), "The audit"):
-            return cls.from_json(data)
+            audit = cls.from_json(data)
+        call = audit.call and audit.call.with_paths(_below(Path(path).parent))
+        return replace(audit, call=call)
 
 
 @dataclass(frozen=True)
@@ -350,6 +357,7 @@ class Results:
         commands: command lines that reproduce the run or say what to do next.
         strips: what an encoder retrieved for some queries.
         tables, curves, claims: of a study.
+        calls: what made the scores, for ``palpate verify``; audits have their own.
     """
 
     title: str
@@ -364,6 +372,7 @@ class Results:
     tables: Sequence[StudyTable] = ()
     curves: Sequence[Curve] = ()
     claims: Sequence[Claim] = ()
+    calls: Sequence[Call] = ()
 
     def __iter__(self) -> Iterator[Score]:
         return iter(self.scores)
@@ -468,17 +477,22 @@ class Results:
         return pl.DataFrame(rows, infer_schema_length=None)
 
     def relative_to(self, folder: Path, base: Path) -> Results:
-        """The results with image paths relative to ``folder`` instead of ``base``.
+        """The results with paths relative to ``folder`` instead of ``base``.
 
         So they stay right when a run folder is moved as a whole.
         """
-        start, end = base.resolve(), folder.resolve()
-        return self.with_paths(lambda name: Path(os.path.relpath(start / name, end)).as_posix())
+        place = _from_folder(folder, base)
+        return self.with_paths(place).with_call_paths(place)
 
     def with_paths(self, change: Callable[[str], str | None]) -> Results:
         """The results with ``change`` applied to the path of every image; None removes it."""
 
         return _with_paths(self, change)
+
+    def with_call_paths(self, change: Callable[[str], str]) -> Results:
+        """The results with ``change`` applied to the path of every input of their calls."""
+        audits = [replace(a, call=a.call and a.call.with_paths(change)) for a in self.audits]
+        return replace(self, audits=audits, calls=[c.with_paths(change) for c in self.calls])
 
     def to_json(self) -> dict[str, Any]:
         """A JSON object with ``format: palpate-results/2``."""
@@ -490,7 +504,7 @@ class Results:
         return from_plain(cls, {k: v for k, v in data.items() if k not in COMMAND_KEYS})
 
     def save(self, path: str | Path) -> None:
-        """Write the results as JSON, atomically; image paths become relative to its folder."""
+        """Write the results as JSON, atomically; paths become relative to its folder."""
         folder = Path(path).parent
         write_json(Path(path), self.relative_to(folder, base=Path()).to_json())
 
@@ -505,7 +519,19 @@ class Results:
         data = read_record(path, "results file", form=RESULTS_FORMATS)
         with reading_entry(path, "The results"):
             results = cls.from_json(data)
-        return results.with_paths(lambda name: os.path.normpath(path.parent / name))
+        place = _below(path.parent)
+        return results.with_paths(place).with_call_paths(place)
+
+
+def _from_folder(folder: Path, base: Path) -> Callable[[str], str]:
+    """Paths from ``base`` as paths from ``folder``."""
+    start, end = base.resolve(), folder.resolve()
+    return lambda name: Path(os.path.relpath(start / name, end)).as_posix()
+
+
+def _below(folder: Path) -> Callable[[str], str]:
+    """Paths from ``folder`` as paths from the working directory."""
+    return lambda name: os.path.normpath(folder / name)
 
 
 #: Fields of a sample, and of a row of the gallery, that are paths of images.

@@ -1,0 +1,125 @@
+"""Numbers of two runs side by side: scores and audits, field by field.
+
+Numbers agree if ``|a - b| <= tolerance * max(|a|, |b|, scale / 1000)``: relative, but for values
+near zero, which are differences of sums of the size of the scale. Words, counts and digests agree
+if they are equal. Notes, times and versions are no numbers.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any
+
+from palpate.core import Score, plain, short
+from palpate.report.results import Audit
+
+_DIGEST = re.compile("[0-9a-f]{64}")
+#: Relative, for sums whose order may change from run to run.
+TOLERANCE = 1e-6
+#: Fields of a score that say what it is, not how large.
+_WORDS = ("metric", "subject", "notes", "details", "interval_method", "higher_is_better")
+#: Entries of details that no later run repeats.
+_PASSING = ("version", "stage", "seconds")
+#: Fields of an audit that are no numbers, or are compared on their own.
+_OF_AUDITS = ("name", "notes", "commands", "call", "others", "impact")
+#: Keys of samples that are places on one machine.
+_PLACES = ("vision", "tactile", "background", "notes")
+
+
+def score_name(score: Score) -> str:
+    """What a table calls it: ``TMMD of ours (grouped)``."""
+    preset = score.settings.get("preset")
+    return f"{score.metric} of {score.subject}" + (f" ({preset})" if preset else "")
+
+
+def score_difference(before: Score, after: Score, tolerance: float) -> str:
+    """The first field in which two scores differ, with both values; '' where none does."""
+    a, b, scale = plain(before), plain(after), abs(before.scale)
+    for name in (name for name in a if name not in _WORDS):
+        if difference := _difference(a[name], b[name], tolerance, scale, name):
+            return difference
+    for name, value in a["details"].items():
+        if name in _PASSING or not _holds_numbers(value):
+            continue
+        again = b["details"].get(name)
+        if difference := _difference(value, again, tolerance, scale, name.replace("_", " ")):
+            return difference
+    return ""
+
+
+def audit_numbers(audit: Audit, start: str = "") -> dict[str, Any]:
+    """The numbers of an audit by name; each row of a table, and each signal, is one."""
+    numbers: dict[str, Any] = {}
+    for name, value in plain(audit).items():
+        if name in _OF_AUDITS:
+            continue
+        label = f"{start}{name.replace('_', ' ')}"
+        if name in ("signals", "materials", "matrix"):
+            numbers |= {f"{label}: {_label(row)}": row for row in value}
+        else:
+            numbers[label] = value
+    if audit.impact is not None:
+        impact = plain(audit.impact)
+        rows = {f"{r['features']}, {r['classifier']}": r for r in impact.pop("rows")}
+        numbers |= {f"{start}impact: {name}": row for name, row in rows.items()}
+        impact.pop("notes")
+        numbers[f"{start}impact"] = impact
+    for other in audit.others:
+        numbers |= audit_numbers(other, f"{start}against {other.against}: ")
+    return numbers
+
+
+def number_difference(before: Any, after: Any, tolerance: float) -> str:
+    """Where two numbers, or rows of numbers, differ, with both values; '' where they do not."""
+    return _difference(before, after, tolerance, 1.0, "")
+
+
+def _label(row: Mapping[str, Any]) -> str:
+    """What a row is of: its first words."""
+    return next((str(v) for v in row.values() if isinstance(v, str)), "of no name")
+
+
+def _holds_numbers(value: Any) -> bool:
+    if isinstance(value, Mapping):
+        return any(map(_holds_numbers, value.values()))
+    if isinstance(value, list):
+        return any(map(_holds_numbers, value))
+    return isinstance(value, int | float)
+
+
+def _difference(a: Any, b: Any, tolerance: float, scale: float, name: str) -> str:
+    if isinstance(a, Mapping) and isinstance(b, Mapping):
+        keys = [key for key in dict.fromkeys([*a, *b]) if key not in (*_PLACES, *_PASSING)]
+        pairs = ((f"{name} {key}".strip(), a.get(key), b.get(key)) for key in keys)
+        return _first(pairs, tolerance, scale)
+    if isinstance(a, list) and isinstance(b, list) and len(a) == len(b):
+        short = len(a) == 2 and all(isinstance(v, int | float) for v in (*a, *b))
+        pairs = ((name if short else f"{name} {k + 1}", *v) for k, v in enumerate(zip(a, b)))  # noqa: B905 - of one length
+        return _first(pairs, tolerance, scale)
+    if _close(a, b, tolerance, scale):
+        return ""
+    return f"{name} {_text(a)} in the file, {_text(b)} now".strip()
+
+
+def _first(pairs: Iterator[tuple[str, Any, Any]], tolerance: float, scale: float) -> str:
+    differences = (_difference(a, b, tolerance, scale, name) for name, a, b in pairs)
+    return next(filter(None, differences), "")
+
+
+def _close(a: Any, b: Any, tolerance: float, scale: float) -> bool:
+    numbers = [v for v in (a, b) if isinstance(v, int | float) and not isinstance(v, bool)]
+    if len(numbers) < 2 or all(isinstance(v, int) for v in numbers):
+        return type(a) is type(b) and a == b
+    return abs(a - b) <= tolerance * max(abs(a), abs(b), scale / 1000)
+
+
+def _text(value: Any) -> str:
+    """A value in a line: a float by the digits that tell it from others, a list by its length."""
+    if isinstance(value, float):
+        return f"{value:.8g}"
+    if isinstance(value, Sequence | Mapping) and not isinstance(value, str):
+        return f"{len(value)} entries"
+    if isinstance(value, str) and _DIGEST.fullmatch(value):
+        return short(value)
+    return "nothing" if value is None else f"{value}"[:80]
