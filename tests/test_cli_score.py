@@ -239,3 +239,38 @@ def test_probe_scores_material_and_retrieval(capsys, tmp_path, small_manifest):
     assert results.settings["options"]["group"] == "video"
     assert "material accuracy" in out
     assert "majority" in out
+
+
+def test_verify_counts_prints_what_differs_and_exits_1(capsys, sets):
+    assert call(capsys, *PAIR, "-o", "s.json", "-q")[0] == 0
+    status, out, err = call(capsys, "s.json", "-o", "v.json", verb="verify")
+    assert (status, err) == (0, "")
+    checks = json.loads(Path("v.json").read_text())
+    assert out == f"same {len(checks['checks'])}, differs 0, cannot check 0, untraced 0\n"
+    data = json.loads(Path("s.json").read_text())
+    data["scores"][0]["value"] = 0.0
+    Path("s.json").write_text(json.dumps(data))
+    status, out, err = call(capsys, "s.json", "--json", verb="verify")
+    assert (status, json.loads(out)["counts"]["differs"]) == (1, 1)
+    status, out, err = call(capsys, "s.json", verb="verify")
+    count, line = out.splitlines()
+    assert "differs 1," in count
+    assert line.startswith("differs: TMMD of near (grouped): value 0 in the file, ")
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        (None, "The results file must exist"),
+        ("[]", "must be a JSON object"),
+        ('{"format": "palpate-split/1"}', "must have the format palpate-results/2"),
+        ('{"format": "palpate-results/2", "title": "", "calls": [3]}', "must be as palpate writes"),
+        ('{"format": "palpate-results/2", "title": "", "calls": [{"verb": 1}]}', "must be as"),
+    ],
+)
+def test_verify_says_in_one_line_that_a_file_is_no_results(capsys, sets, text, words):
+    if text is not None:
+        Path("x.json").write_text(text)
+    status, out, err = call(capsys, "x.json", verb="verify")
+    assert (status, out, err.count("\n")) == (2, "", 1)
+    assert words in err

@@ -1,6 +1,6 @@
 """Numbers of two runs side by side: scores and audits, field by field.
 
-Numbers agree if ``|a - b| <= tolerance * max(|a|, |b|, scale / 1000)``: relative, but for values
+Numbers agree if ``|a - b| <= tolerance * max(|a|, |b|, scale / 1e6)``: relative, but for values
 near zero, which are differences of sums of the size of the scale. Words, counts and digests agree
 if they are equal. Notes, times and versions are no numbers.
 """
@@ -111,7 +111,7 @@ def _close(a: Any, b: Any, tolerance: float, scale: float) -> bool:
     numbers = [v for v in (a, b) if isinstance(v, int | float) and not isinstance(v, bool)]
     if len(numbers) < 2 or all(isinstance(v, int) for v in numbers):
         return type(a) is type(b) and a == b
-    return abs(a - b) <= tolerance * max(abs(a), abs(b), scale / 1000)
+    return abs(a - b) <= tolerance * max(abs(a), abs(b), scale / 1e6)
 
 
 def _text(value: Any) -> str:
