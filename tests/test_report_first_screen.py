@@ -33,6 +33,19 @@ def test_the_verdict_has_each_metric_once_and_the_best_but_never_the_real_images
     assert [text for text, _ in rows["real images (floor)"]] == ["0.042", "0.900", "0.042"]
 
 
+def test_controls_of_a_study_follow_the_methods_and_are_never_the_best():
+    columns = telling_columns(score_tables(measured()))
+    rows = verdict(columns, ["theirs"])
+    assert [(row.subject, row.control) for row in rows] == [
+        ("ours", False),
+        ("background only", False),
+        ("theirs", True),
+        ("real images (floor)", False),
+    ]
+    assert [is_best for _, is_best in rows[0].cells] == [True, True, True]
+    assert not any(is_best for row in rows[1:] for _, is_best in row.cells)
+
+
 def test_one_method_alone_is_best_of_nothing():
     (row, floor) = verdict(telling_columns(score_tables([score()])))
     assert (row.cells, floor.subject) == ([("1.374", False)], "real images (floor)")

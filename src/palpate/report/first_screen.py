@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, replace
 
 from markupsafe import Markup
@@ -55,6 +55,7 @@ class VerdictRow:
 
     subject: str
     cells: Sequence[tuple[str, bool]]
+    control: bool = False
 
 
 def about(results: Results, date: str, version: str) -> list[str]:
@@ -80,13 +81,19 @@ def telling_columns(tables: Sequence[Table]) -> list[Column]:
     return [*known, *first.values()][:COLUMNS]
 
 
-def verdict(columns: Sequence[Column]) -> list[VerdictRow]:
-    """Return methods and controls by ``columns``; last what real images score: the floor."""
+def verdict(columns: Sequence[Column], controls: Collection[str] = ()) -> list[VerdictRow]:
+    """Return methods and controls by ``columns``; last what real images score: the floor.
+
+    ``controls`` are the subjects that a study names so: they come after the methods and are never
+    the best.
+    """
     subjects = list(dict.fromkeys(cell.score.subject for c in columns for cell in c.cells))
-    subjects.sort(key=lambda subject: subject == REAL)
-    best = [_best(column) for column in columns]
+    subjects.sort(key=lambda subject: (subject == REAL, subject in controls))
+    best = [_best(column, controls) for column in columns]
     rows = [
-        VerdictRow(s, [_verdict_cell(c, s, b) for c, b in zip(columns, best, strict=True)])
+        VerdictRow(
+            s, [_verdict_cell(c, s, b) for c, b in zip(columns, best, strict=True)], s in controls
+        )
         for s in subjects
     ]
     floors = [next((c.score.floor for c in column.cells), None) for column in columns]
@@ -106,9 +113,10 @@ def _verdict_cell(column: Column, subject: str, best: str | None) -> tuple[str, 
     return text, subject == best
 
 
-def _best(column: Column) -> str | None:
-    """The subject with the best value, controls included; None where one alone was scored."""
-    scores = [c.score for c in column.cells if c.defined and c.score.subject != REAL]
+def _best(column: Column, controls: Collection[str]) -> str | None:
+    """The subject with the best value that is no control; None where one alone was scored."""
+    apart = {REAL, *controls}
+    scores = [c.score for c in column.cells if c.defined and c.score.subject not in apart]
     if column.higher_is_better is None:
         scores = [s for s in scores if s.floor is not None]
     if len(scores) < 2:

@@ -123,6 +123,7 @@ def render_page(
     tables = score_tables(results.scores)
     columns = first_screen.telling_columns(tables)
     cards = first_screen.cards(results, columns)
+    controls = {name for table in results.tables for name in table.controls}
     samples = gallery_images(results.gallery)
     hero_rows: dict[Hashable, list[Wanted]] = {
         id(item): images for item, images in samples[:HERO_ROWS]
@@ -139,7 +140,8 @@ def render_page(
         "sheets": sheets(results),
         "tables": tables,
         "columns": columns,
-        "verdict": first_screen.verdict(columns),
+        "verdict": first_screen.verdict(columns, controls),
+        "controls": controls,
         "folded": len(tables) > 1,
         "reading": first_screen.annotated(tables),
         "heats": heat_tables(results.scores),
