@@ -233,7 +233,7 @@ def test_a_world_is_a_data_set_for_loaders():
     batches = list(data.DataLoader(world, batch_size=8, num_workers=0))
     assert [tuple(batch["vision"].shape) for batch in batches] == [(8, 16, 16, 3)] * 4
     assert list(itertools.chain(*(batch["id"] for batch in batches))) == world.ids
-    assert world._video.cache_info().currsize == 2
+    assert world.video.cache_info().currsize == 2
 
 
 def test_missing_samples_and_presets_are_rejected():
