@@ -8,7 +8,7 @@ from collections import Counter
 
 import numpy as np
 import pytest
-from PIL import Image
+from PIL import Image, ImageFilter, ImageOps
 
 from palpate import preference
 from palpate.core import PalpateError
@@ -186,6 +186,11 @@ def test_folders_without_a_table_are_one_pile(folders):
         ({"names": ["image", "b", "c"]}, "must hold no word of the question"),
         ({"names": ["tactile", "b", "c"]}, "must hold no word of the title"),
         ({"names": ["a", "b", "c"], "question": "Is it b?"}, "question. must not name a method"),
+        (
+            {"names": ["a", "b", "C++"], "question": "Is C++ it?"},
+            "question. must not name a method",
+        ),
+        ({"seed": 2**63}, "seed. must lie between"),
         ({"raters": 1000}, "1 .. 999"),
         ({"task": "rank"}, "pair, sort"),
         ({"design": "ours"}, "paper"),
@@ -252,6 +257,34 @@ def test_a_broken_image_is_named_and_nothing_is_left(folders, tmp_path):
     with pytest.raises(PalpateError, match=r"f0\.png must be whole and readable"):
         preference.make(folders.reference, [broken, folders.methods[0]], tmp_path / "s")
     assert not (tmp_path / "s").exists()
+
+
+def test_an_image_looks_the_same_whatever_file_it_came_in(tmp_path):
+    """A JPEG that is decoded at a fraction is sharper than a PNG that is resized."""
+    noise = np.random.default_rng(0).integers(0, 255, (256, 256, 3), np.uint8)
+    image = Image.fromarray(noise).filter(ImageFilter.GaussianBlur(1))
+    image.save(tmp_path / "a.png")
+    image.save(tmp_path / "a.jpg", quality=98, subsampling=0)
+    png, jpg = (load_square(tmp_path / f"a.{s}", 64).astype(float) for s in ("png", "jpg"))
+    assert np.abs(png - jpg).mean() < 0.5
+
+
+@pytest.mark.parametrize("mode", ["1", "L", "LA", "P", "RGB", "RGBA", "I;16"])
+def test_a_large_picture_of_any_mode_is_scaled_as_a_small_one(tmp_path, monkeypatch, mode):
+    from palpate.data import images as small
+    from palpate.preference import images as large
+
+    y, x = np.mgrid[:150, :200]
+    gray = Image.fromarray(np.uint8(127 + 60 * np.sin(x / 20) + 60 * np.cos(y / 15)))
+    image = Image.merge("RGBA", [gray, ImageOps.invert(gray), gray, gray.point(lambda v: v // 2)])
+    if mode == "I;16":
+        Image.fromarray(np.asarray(gray, np.uint16) * 257).save(tmp_path / "a.png")
+    else:
+        image.convert("RGB" if mode == "P" else "RGBA").convert(mode).save(tmp_path / "a.png")
+    direct = load_square(tmp_path / "a.png", 32).astype(float)
+    monkeypatch.setattr(small, "LARGEST", 10_000)
+    monkeypatch.setattr(large, "LARGEST", 10_000)
+    assert np.abs(direct - load_square(tmp_path / "a.png", 32)).mean() < 6
 
 
 @pytest.mark.parametrize("suffix", ["tif", "webp"])

@@ -86,7 +86,7 @@ def read_image(path: Path, at_least: tuple[int, int] | None = None) -> Image.Ima
                 image.draft("RGB", at_least)
             image.load()
             ImageOps.exif_transpose(image, in_place=True)
-            return _rgb(image)
+            return rgb(image)
     except BROKEN as error:
         must = f"The image {path} must be whole and readable"
         raise PalpateError(must, _reason(path, error), "Fetch the file again") from None
@@ -293,7 +293,7 @@ def file_digest(path: Path) -> str | None:
     return None
 
 
-def _rgb(image: Image.Image) -> Image.Image:
+def rgb(image: Image.Image) -> Image.Image:
     """8-bit RGB by the rules in the head of this file."""
     if image.mode == "RGB":
         return image

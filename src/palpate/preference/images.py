@@ -17,11 +17,13 @@ from PIL.JpegImagePlugin import JpegImageFile
 from PIL.PngImagePlugin import PngImageFile
 
 from palpate.core import PalpateError
-from palpate.data.images import BROKEN, LARGEST, opened, read_image, square
+from palpate.data.images import BROKEN, LARGEST, opened, read_image, rgb, square
 
 QUALITY = 92
 #: Pixels of the largest image that is scaled down: a byte or three each.
 LARGEST_SCALED = 400_000_000
+#: Modes that Pillow does not reduce -> those that hold as much, and are reduced.
+WIDER = {"1": "L", "P": "RGBA", "I;16": "I"}
 
 
 def load_square(path: Path, size: int) -> NDArray[np.uint8]:
@@ -33,7 +35,7 @@ def load_square(path: Path, size: int) -> NDArray[np.uint8]:
     large = _opened_large(path)
     if large is None:
         _require_decodable(path)
-    return square(read_image(path, (size, size)) if large is None else _reduced(large, size), size)
+    return square(read_image(path) if large is None else _reduced(large, size), size)
 
 
 def _require_decodable(path: Path) -> None:
@@ -63,11 +65,11 @@ def _reduced(image: Image.Image, size: int) -> Image.Image:
     try:
         image.draft("RGB", (2 * size, 2 * size))
         factor = max(1, min(image.size) // (2 * size))
-        small = ImageOps.exif_transpose(image.reduce(factor))
+        wide = image.convert(WIDER[image.mode]) if image.mode in WIDER else image
+        return rgb(ImageOps.exif_transpose(wide.reduce(factor)))
     except BROKEN as error:
         must = f"The image {image.filename} must be whole and readable"  # type: ignore[attr-defined]
         raise PalpateError(must, str(error), "Fetch the file again") from None
-    return small.convert("RGB")
 
 
 def data_uri(image: NDArray[np.uint8], quality: int = QUALITY) -> str:

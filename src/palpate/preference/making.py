@@ -29,6 +29,7 @@ from palpate.core import (
     track,
     write_text,
 )
+from palpate.core.records import LARGEST
 from palpate.evaluation.inputs import (
     Samples,
     complete,
@@ -147,6 +148,7 @@ def make(  # noqa: PLR0913
     require(2 <= count <= 1000, "items", "must lie in 2 .. 1000", items, 40)
     require(1 <= raters <= 999, "raters", "must lie in 1 .. 999", raters, 10)
     require(32 <= size <= 1024, "size", "must lie in 32 .. 1024", size, 256)
+    require(abs(seed) < LARGEST, "seed", "must lie between -2^63 and 2^63", seed, 0)
     until = None if until is None else last_day(until)
     if output is None and not dry_run:
         fix, example = "Name a new folder", {"output": "study/"}
@@ -207,7 +209,8 @@ def _question(
     text = QUESTIONS.get(question, question)
     for argument, words in (("title", title), ("question", text)):
         require(bool(words.strip()), argument, "must not be blank", words)
-        named = [m for m in methods if re.search(rf"\b{re.escape(m)}\b", words, re.IGNORECASE)]
+        forms = {m: rf"(?<!\w){re.escape(m)}(?!\w)" for m in methods}
+        named = [m for m, form in forms.items() if re.search(form, words, re.IGNORECASE)]
         if named and words in (*QUESTIONS.values(), TITLE):
             must, got = f"must hold no word of the {argument} {words!r}", f"{named[0]!r}"
             raise PalpateError(must, got, "Pass other names", argument="names")
