@@ -192,6 +192,23 @@ def test_a_vote_that_the_server_refuses_is_left_for_the_download(chromium, serve
         person.press("1")
         person.page.get_by_text("The server refused 1 vote: download your votes.").wait_for()
         assert list(person.choices().values()) == ["left"]
+        person.page.unroute("**/vote")
+        person.page.reload()  # with another link, say: it is sent again
+        settled(person)
+    assert stored(server) == ["left"]
+
+
+def test_a_page_of_a_proxy_is_no_acknowledgment(chromium, server):
+    with opened(chromium) as context:
+        person = invited(context, server)
+        person.page.route("**/vote", lambda route: route.fulfill(status=200, body="<p>Sign in"))
+        with person.page.expect_response("**/vote"):
+            person.press("1")
+        person.page.get_by_text("1 vote not yet at the server").wait_for()
+        assert "All votes" not in person.page.inner_text("#kept")
+        person.page.unroute("**/vote")
+        settled(person)
+    assert stored(server) == ["left"]
 
 
 def test_a_guessed_invitation_opens_nothing(chromium, server):

@@ -10,6 +10,7 @@ const served = document.body.dataset.served !== undefined;
 const token = new URLSearchParams(location.search).get("token");
 let study, rater, trials; // trials: those of the rater, in their order
 let shown = null; // the trial on the screen, once its images are; no vote counts before
+const refusals = new Set(); // trials whose votes the server refused since this page was loaded
 let turn = 0, sending = false, failures = 0, timer = 0, ended = false, keeps = true;
 
 // Votes are kept one an entry, palpate/STUDY/RATER/TRIAL, so that no tab overwrites what another
@@ -59,7 +60,7 @@ async function restore() {
 }
 const voted = () => trials.filter(trial => read(trial.trial));
 const unsent = () => voted().filter(trial => !read(trial.trial).sent);
-const refused = () => unsent().some(trial => read(trial.trial).refused);
+const refused = () => unsent().some(({ trial }) => refusals.has(trial));
 const waiting = () =>
   trials.find(trial => trial.trial === read("again")) ?? trials.find(trial => !read(trial.trial));
 // Served, the clock of the server counts, not that of the rater.
@@ -72,6 +73,7 @@ function vote(choice) {
   const ms = Math.round(performance.now() - since);
   write(trial, { choice, ms, at: new Date().toISOString(), undone: before + 1 });
   write("again", null);
+  refusals.delete(trial);
   show();
   send();
 }
@@ -149,14 +151,18 @@ async function send() {
   if (!served || sending) return;
   sending = true;
   let next;
-  while ((next = unsent().find(trial => !read(trial.trial).refused)) && !ended) {
+  while ((next = unsent().find(({ trial }) => !refusals.has(trial))) && !ended) {
     const { choice, ms, at, undone } = read(next.trial);
     const body = { study: study.study, rater, trial: next.trial, choice, ms, at, undone };
-    const status = await ask("vote", body).then(answer => answer.status, () => 0);
+    // A page of something between here and the server is no acknowledgment.
+    const status = await ask("vote", body)
+      .then(async answer => (!answer.ok || (await answer.json()).stored ? answer.status : 0))
+      .catch(() => 0);
     if (status === 410) ended = true;
     else if (LATER.includes(status) || status >= 500) break;
-    else if (read(next.trial).undone === undone)
-      write(next.trial, { choice, ms, at, undone, [status === 200 ? "sent" : "refused"]: true });
+    else if (read(next.trial).undone !== undone) continue; // voted again meanwhile
+    else if (status === 200) write(next.trial, { choice, ms, at, undone, sent: true });
+    else refusals.add(next.trial);
     failures = 0;
     refresh(waiting());
   }
