@@ -8,7 +8,7 @@ import re
 import pytest
 
 from palpate.preference.page import policy, study_page
-from preference_fixtures import METHODS, pair_study, sort_study
+from preference_fixtures import pair_study, sort_study
 
 STUDIES = {"pair": pair_study(3, 2)[0], "sort": sort_study()}
 
@@ -52,8 +52,3 @@ def test_names_of_strangers_become_no_markup():
     assert page.count("<script") == 2
     assert "alert(1)</script>" not in page
     assert inlined(page) == study
-
-
-def test_no_method_is_named():
-    for served in (False, True):
-        assert not any(name in study_page(STUDIES["pair"], served=served) for name in METHODS)

@@ -11,10 +11,11 @@ import pytest
 
 from palpate import preference
 from palpate.core import Note, PalpateError
+from palpate.preference.agreement import lower_is_better
 from palpate.preference.plan import Plan
 from palpate.preference.votes import read_votes
 from palpate.report.results import Results
-from preference_crowd import Crowd, signed, write_folders
+from preference_crowd import Crowd, signed, write_folder, write_folders
 
 CROWD = Crowd({"ours": 2.0, "gvst": 0.5, "wbg": -1.0})
 
@@ -69,6 +70,25 @@ def test_what_a_difference_says(results):
     assert difference.details["better"] == "ours"
     assert difference.details["decided"]
     assert difference.details["p_adjusted"] < 0.05
+
+
+def test_resamples_without_a_vote_say_nothing_about_who_is_better(plan, study, tmp_path):
+    """Of one comparison two items alone are answered, one for each method: no one is ahead."""
+    first, second = (item.id for item in plan.items[:2])
+    for code in ("r01", "r02", "r03"):
+        download, shown = CROWD.download(plan, code), plan.shown(code)
+        kept = []
+        for vote in download["votes"]:
+            trial, swapped = shown[vote["trial"]]
+            if (trial.kind, trial.left, trial.right) == ("pair", "gvst", "wbg"):
+                if trial.item not in (first, second):
+                    continue
+                vote["choice"] = "left" if (trial.item == first) is not swapped else "right"
+            kept.append(vote)
+        (tmp_path / f"{code}.json").write_text(json.dumps(signed(download | {"votes": kept})))
+    results = preference.score(study, tmp_path, replicates=4000)
+    details = results["human preference difference", "gvst - wbg"].details
+    assert details["p_better"] == pytest.approx(0.5, abs=0.03)  # not 0.44
 
 
 def test_results_are_tables_pages_and_files_as_others(results, tmp_path):
@@ -187,6 +207,67 @@ def test_metrics_that_agree_with_people_have_a_high_tau(plan, study, downloads, 
     assert results[name, "SSIM (shown images)"].n == 3 * 24
 
 
+def metric_table(plan, value):
+    """Rows of a table of one metric ``q``, a function of item number and method number."""
+    cells = [(k, item, m) for k, item in enumerate(plan.items) for m in range(len(plan.methods))]
+    return [
+        {"id": item.id, "method": plan.methods[m], "q": float(value(k, m))} for k, item, m in cells
+    ]
+
+
+def tau(study, votes, table, how):
+    """Kendall's tau of ``q`` with people."""
+    results = preference.score(study, votes, metrics=table, replicates=100)
+    return results[f"Kendall's tau with people, by {how}", "q"]
+
+
+def test_an_infinite_value_is_the_best(plan, study, downloads):
+    """As the PSNR of a perfect image is: it counts, and two perfect images are equal."""
+    best = metric_table(plan, lambda k, m: np.inf if m == 0 else 9 - m)
+    perfect = tau(study, downloads, best, "image")
+    assert perfect.n == 3 * 24
+    assert perfect.value > 0.4
+    equal = tau(study, downloads, metric_table(plan, lambda k, m: np.inf), "image")
+    assert (equal.n, equal.value) == (3 * 24, None)
+
+
+def test_by_method_the_items_of_a_metric_are_resampled_as_those_of_votes(plan, study, downloads):
+    """Means over items that differ by chance alone order the methods by chance."""
+    chance = metric_table(plan, lambda k, m: np.sin(7 * k + 3 * m) - m / 100)
+    low, high = tau(study, downloads, chance, "method").interval
+    assert low < 0 < high
+    sure = metric_table(plan, lambda k, m: np.sin(7 * k + 3 * m) - 100 * m)
+    assert tau(study, downloads, sure, "method").value == 1
+
+
+def test_ids_and_methods_that_look_like_numbers_are_text(tmp_path):
+    ids = [f"{k:06}" for k in range(6)]
+    folders = [write_folder(tmp_path / n, k, ids) for k, n in enumerate(("real", "10", "020"))]
+    plan = preference.make(folders[0], folders[1:], tmp_path / "s", raters=3, size=32)
+    votes = Crowd({"10": 1.0, "020": 0.0}).write(plan, tmp_path / "v")
+    rows = [f"{i},{m},{k}" for i in ids for k, m in enumerate(plan.methods)]
+    (tmp_path / "t.csv").write_text("\n".join(["id,method,q", *rows]))
+    assert tau(tmp_path / "s", votes, tmp_path / "t.csv", "image").n == 6
+
+
+def test_names_of_metrics_of_which_lower_is_better():
+    lower = ["lpips", "lpips_alex", "fid", "fid2048", "rmse", "cmmd", "i-tmmd", "l1"]
+    higher = ["ssim", "psnr", "fidelity", "maestro"]
+    assert [name for name in (*lower, *higher) if lower_is_better(name)] == lower
+
+
+def test_a_table_that_would_be_misread_is_said(plan, study, downloads):
+    rows = metric_table(plan, lambda k, m: k)
+    for table, words in (
+        ([row | {"id": f"x{row['id']}"} for row in rows], "values of the study's items"),
+        ([*rows, rows[0]], "each image of a method once"),
+    ):
+        with pytest.raises(PalpateError, match=words):
+            preference.score(study, downloads, metrics=table)
+    with pytest.raises(PalpateError, match=r"lower. must be one of q"):
+        preference.score(study, downloads, metrics=rows, lower=["Q"])
+
+
 def test_scores_of_methods_are_compared_too(study, downloads, results, tmp_path):
     results.save(tmp_path / "scores.json")  # any file of scores of the same methods
     again = preference.score(study, downloads, metrics=tmp_path / "scores.json")
@@ -196,7 +277,7 @@ def test_scores_of_methods_are_compared_too(study, downloads, results, tmp_path)
 @pytest.mark.parametrize(
     ("text", "words"),
     [
-        ("id,method\na,b\n", "metrics of the study's methods"),
+        ("id,method\na,b\n", "values of the study's items"),
         ("image,ssim\na,1\n", "columns id and method"),
         ('{"format": 1}', "a table or a file of palpate score|columns id and method"),
     ],
@@ -269,7 +350,15 @@ def test_votes_of_another_plan_are_said(plan, tmp_path, changes, words):
 
 
 @pytest.mark.parametrize(
-    ("field", "value"), [("choice", "both"), ("ms", -1), ("at", "soon"), ("undone", None)]
+    ("field", "value"),
+    [
+        ("choice", "both"),
+        ("ms", -1),
+        ("ms", 10**400),
+        ("at", "soon"),
+        ("undone", None),
+        ("undone", 1000),
+    ],
 )
 def test_a_vote_that_no_page_gives_is_said(plan, tmp_path, field, value):
     download = changed(plan)
@@ -397,6 +486,18 @@ def test_sorting_is_accuracy_by_material_against_chance(folders, tmp_path):
     assert set(accuracy.details["by_material"]) == {"brick", "grass", "wood"}
     assert results["human accuracy of material", "real images"].n == 15 * 6
     results.to_html(tmp_path / "page.html")
+    with pytest.raises(PalpateError, match=r"metrics. must be left out where people sort"):
+        preference.score(study, tmp_path / "votes", metrics=tmp_path / "values.csv")
+
+
+def test_a_material_may_be_called_left(tmp_path):
+    """It is no side: nobody is excluded for it."""
+    folders = write_folders(tmp_path, videos=24, frames=1, materials=("left", "moss"))
+    options = {"task": "sort", "labels": folders.labels, "items": 12, "raters": 3, "size": 32}
+    plan = preference.make(folders.reference, folders.methods[:1], tmp_path / "s", **options)
+    votes = Crowd({}, skill=0.9).write(plan, tmp_path / "votes")
+    agreement = preference.score(tmp_path / "s", votes).settings["preference"]["agreement"]
+    assert (agreement["raters"], agreement["sides"]) == (3, 0)
 
 
 def test_a_material_that_was_not_shown_has_no_accuracy(tmp_path):

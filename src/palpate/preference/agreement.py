@@ -1,14 +1,17 @@
 """Which metric agrees with people: Kendall's tau-b of metrics with votes, with intervals.
 
 By image: the difference of a metric between the two methods of a trial, against the share of votes
-for the first less that for the second. By method: the value of a method, against its strength. Both
-are resampled as the votes are. 1: the metric orders as people do; 0: no relation.
+for the first less that for the second. By method: the value of a method, its mean over the items of
+the study where it is known by image, against its strength. Items and raters are resampled for both
+at once. 1: the metric orders as people do; 0: no relation.
 """
 
 from __future__ import annotations
 
 import base64
 import io
+import re
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -17,7 +20,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 from PIL import Image
 
-from palpate.core import PalpateError, Progress, Score, read_json, track
+from palpate.core import PalpateError, Progress, Score, read_json, require_choice, track
 from palpate.evaluation.inputs import without_suffix
 from palpate.metrics.images import per_image
 from palpate.preference.arrays import FEWER, VoteArrays
@@ -29,15 +32,15 @@ if TYPE_CHECKING:
     import polars as pl
 
 BY_IMAGE, BY_METHOD = "Kendall's tau with people, by image", "Kendall's tau with people, by method"
-#: Beginnings of the names of metrics of which lower is better, besides the MMD family.
-LOWER = ("lpips", "mse", "rmse", "mae", "l1", "fid", "kid", "dists")
+#: How the names of metrics begin of which lower is better, besides the MMD family.
+LOWER = "(lpips|r?mse|mae|l1|fid|kid|dists)(?![a-z])"
 #: Columns of a table that are no metric.
 WORDS = ("id", "method", "material", "video")
 
 
 def lower_is_better(name: str) -> bool:
     """Whether it is, by a metric's name in lower case; ``i-tmmd`` is of the MMD family too."""
-    return name.startswith(LOWER) or "mmd" in name
+    return re.match(LOWER, name) is not None or "mmd" in name
 
 
 @dataclass(frozen=True)
@@ -55,9 +58,9 @@ class Metric:
     methods: Mapping[str, float] = field(default_factory=dict)
 
     def difference(self, item: str, a: str, b: str) -> float:
-        """Value of ``a`` less that of ``b``; NaN where one is not known or both are infinite."""
+        """Value of ``a`` less that of ``b``; NaN where one is not known."""
         x, y = (self.images.get((item, method), np.nan) for method in (a, b))
-        return np.nan if x == y == np.inf else x - y
+        return 0.0 if x == y else x - y  # the PSNR of two perfect images is infinite
 
 
 def shown_metrics(plan: Plan, progress: Progress) -> list[Metric]:
@@ -88,14 +91,17 @@ def table_metrics(plan: Plan, sources: Any, lower: Sequence[str]) -> list[Metric
     """Metrics of tables of images and of files of ``palpate score``.
 
     Raises:
-        PalpateError: if a source is neither, or knows none of the study's methods.
+        PalpateError: if a source is neither, or knows none of the study's methods, or no metric
+            has a name of ``lower``.
     """
     several = isinstance(sources, list | tuple) and not (
         sources and isinstance(sources[0], Mapping)
     )
-    return [
-        metric for s in (sources if several else [sources]) for metric in _metrics(plan, s, lower)
-    ]
+    metrics = [m for s in (sources if several else [sources]) for m in _metrics(plan, s, lower)]
+    names = list(dict.fromkeys(m.name for m in metrics))
+    for name in lower:
+        require_choice("lower", name, names)
+    return metrics
 
 
 def _metrics(plan: Plan, source: Any, lower: Sequence[str]) -> list[Metric]:
@@ -135,7 +141,10 @@ def _table(source: Any, where: str) -> pl.DataFrame:
     try:
         if isinstance(source, Path):
             parquet = source.suffix.lower() == ".parquet"
-            return pl.read_parquet(source) if parquet else pl.read_csv(source, glob=False)
+            if parquet:
+                return pl.read_parquet(source)
+            text: dict[str, Any] = {"id": pl.String, "method": pl.String}  # 000123 is an id
+            return pl.read_csv(source, glob=False, schema_overrides=text)
         return source if isinstance(source, pl.DataFrame) else pl.DataFrame(source)
     except Exception as error:  # polars raises many kinds
         got, fix = str(error).splitlines()[0], "Write one with the columns id, method, SSIM ..."
@@ -150,14 +159,25 @@ def _of_table(plan: Plan, table: pl.DataFrame, where: str, lower: Sequence[str])
         raise PalpateError(f"{where} must have the columns id and method", got, fix)
     known = {item.id for item in plan.items}
     ids = [i if i in known else without_suffix(i) for i in map(str, table["id"])]
-    keys = list(zip(ids, table["method"].to_list(), strict=True))
+    if table.height and known.isdisjoint(ids):
+        got, fix = f"none of them, but e.g. {ids[0]!r}", "Ids are those of the reference's images"
+        raise PalpateError(f"{where} must hold values of the study's items", got, fix)
+    keys = list(zip(ids, map(str, table["method"]), strict=True))
+    if len(keys) > len({*keys}):
+        item, method = Counter(keys).most_common(1)[0][0]
+        got, fix = f"{item} of {method} twice", "Keep one row"
+        raise PalpateError(f"{where} must have each image of a method once", got, fix)
     metrics: list[Metric] = []
     for name in table.columns:
         if name in WORDS or not table[name].dtype.is_numeric():
             continue
         sign = -1 if name in lower or lower_is_better(name.lower()) else 1
         cells = zip(keys, table[name].to_list(), strict=True)
-        values = {k: sign * float(v) for k, v in cells if v is not None and k[1] in plan.methods}
+        values = {
+            (item, method): sign * float(v)
+            for (item, method), v in cells
+            if v is not None and item in known and method in plan.methods
+        }
         metrics += [_of_images(name, values)] * bool(values)
     return metrics
 
@@ -181,24 +201,34 @@ def _by_image(metric: Metric, arrays: VoteArrays) -> Score:
     x = np.array(
         [[metric.difference(i, a, b) for i in items] for a, b in arrays.columns], np.float64
     ).ravel()
+    x = np.clip(x, -1e300, 1e300)  # infinite differences have an order too
+    cells, weights = np.nan_to_num(arrays.values), np.isfinite(arrays.values)
+    known = np.isfinite(x) & weights.any(axis=0).ravel()
 
     def tau(of_raters: Array, of_items: Array) -> float:
-        cells, weights = np.nan_to_num(arrays.values), np.isfinite(arrays.values)
         total = np.tensordot(of_raters, weights.astype(np.float64), 1).ravel()
         net = np.tensordot(of_raters, cells, 1).ravel() / np.maximum(total, 1e-12)
-        keep = np.isfinite(x) & (total > 0)
+        keep = known & (total > 0)
         each = np.tile(of_items, len(arrays.columns))[keep]
         return tau_b(x[keep], net[keep], each, mirrored=True)
 
     value = tau(arrays.once.raters[0], arrays.once.items[0])
     drawn = zip(arrays.resampled.raters[:FEWER], arrays.resampled.items[:FEWER], strict=True)
     replicates = np.array([tau(*weights) for weights in drawn])
-    return arrays.score(BY_IMAGE, metric.name, value, replicates, np.isfinite(x).sum())
+    return arrays.score(BY_IMAGE, metric.name, value, replicates, known.sum())
 
 
 def _by_method(metric: Metric, arrays: VoteArrays) -> Score:
-    """Over methods: value of the metric against strength."""
-    x = np.array([metric.methods[name] for name in arrays.plan.methods])
-    rows = [arrays.strength, *arrays.strength_replicates]
-    value, *replicates = (tau_b(x, row[:-1], np.ones(len(x))) for row in rows)
-    return arrays.score(BY_METHOD, metric.name, value, np.array(replicates), len(x))
+    """Over methods: value of the metric, over the same items where it is by image, and strength."""
+    names, items = arrays.plan.methods, arrays.plan.items
+    strength = [arrays.strength, *arrays.strength_replicates]
+    x = np.tile([metric.methods[name] for name in names], (len(strength), 1))
+    if metric.images:
+        drawn = np.vstack([arrays.once.items, arrays.resampled.items[:FEWER]])
+        cells = np.array([[metric.images.get((i.id, n), np.nan) for n in names] for i in items])
+        known = np.isfinite(cells)
+        with np.errstate(invalid="ignore"):
+            x = drawn @ np.where(known, cells, 0) / (drawn @ known)
+    pairs = zip(x, strength, strict=True)
+    value, *replicates = (tau_b(row, of[:-1], np.ones(len(names))) for row, of in pairs)
+    return arrays.score(BY_METHOD, metric.name, value, np.array(replicates), len(names))

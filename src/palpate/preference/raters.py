@@ -66,7 +66,7 @@ def _facts(plan: Plan, code: str, votes: Mapping[str, Vote]) -> RaterFacts:
         for vote in votes.values()
         if vote.trial.repeats in votes
     ]
-    sides = [v.choice for v in votes.values() if v.trial.kind != "catch"]
+    sides = [v.choice for v in votes.values() if v.trial.right and v.trial.kind != "catch"]
     left, right = sides.count("left"), sides.count("right")
     finished = len(votes) / len(plan.trials)
     catches = float(np.mean(caught)) if caught else None

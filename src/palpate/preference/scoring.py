@@ -102,6 +102,8 @@ def score(
         "raters": everyone,
     }
     if plan.task == "sort":
+        given = metrics if isinstance(metrics, list | tuple) else [metrics]
+        require(not given, "metrics", "must be left out where people sort", f"{len(given)} given")
         scores = accuracy_scores(arrays)
     else:
         settings["comparisons"] = comparisons(arrays)
@@ -218,7 +220,8 @@ def _verdict(made: Score, pair: tuple[str, str], replicates: Array, items: int) 
     """Which of two is ahead, and how sure that is; of unanimous votes by the sign test."""
     a, b = pair
     sure = made.interval is not None
-    above = float((replicates > 0).mean() + (replicates == 0).mean() / 2)
+    known = replicates[np.isfinite(replicates)]
+    above = float((known > 0).mean() + (known == 0).mean() / 2) if sure else np.nan
     if sure and made.notes:
         above = 0.5 + np.sign(float(made)) * (0.5 - 0.5**items)
     return {

@@ -23,9 +23,9 @@ import secrets
 import socket
 import sqlite3
 import time
-from collections.abc import AsyncGenerator, Callable, Mapping, Sequence
+from collections.abc import AsyncGenerator, Callable, Generator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import asynccontextmanager, closing, suppress
+from contextlib import asynccontextmanager, closing, contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -39,6 +39,7 @@ from starlette.routing import Route
 from palpate.core import PalpateError, require
 from palpate.preference.page import policy, study_page
 from palpate.preference.plan import last_day
+from palpate.preference.votes import LONGEST_MS, MOST_UNDONE
 
 #: Longest body of a request, in bytes, and the longest wait for it, in seconds.
 LARGEST_BODY, LONGEST_WAIT = 4096, 10.0
@@ -87,15 +88,13 @@ class VoteStore:
     """
 
     def __init__(self, path: Path, study: str) -> None:
-        try:
+        self._path = path
+        with _writing(path):
             self._disk = sqlite3.connect(path, isolation_level=None, check_same_thread=False)
             self._disk.executescript(_TABLES)
             self._disk.execute("PRAGMA synchronous=FULL")
             self._disk.execute("INSERT OR IGNORE INTO study VALUES (?)", (study,))
             (names,) = zip(*self._disk.execute("SELECT name FROM study"), strict=True)
-        except sqlite3.Error as error:
-            must, fix = f"{path} must be a file of votes that can be written", "Choose another file"
-            raise PalpateError(must, str(error), fix) from None
         if names != (study,):
             self._disk.close()
             fix = "Serve the study that they belong to, or move the file away"
@@ -114,7 +113,7 @@ class VoteStore:
             Rater -> token, which is kept nowhere.
 
         Raises:
-            PalpateError: if the study has too few raters, or not those named.
+            PalpateError: if the study has too few raters, or not those named, or the disk is full.
         """
         require(count >= 0, "invite", "must be 0 or more", count, 10)
         for rater in again:
@@ -128,9 +127,10 @@ class VoteStore:
             raise PalpateError(must, got, "Plan a study with more raters", argument="invite")
         tokens = {rater: secrets.token_urlsafe(16) for rater in [*again, *free[:count]]}
         rows = [(_hash(token), rater) for rater, token in tokens.items()]
-        self._disk.execute("BEGIN IMMEDIATE")
-        self._disk.executemany("INSERT OR REPLACE INTO invitations VALUES (?, ?)", rows)
-        self._disk.execute("COMMIT")
+        with _writing(self._path):
+            self._disk.execute("BEGIN IMMEDIATE")
+            self._disk.executemany("INSERT OR REPLACE INTO invitations VALUES (?, ?)", rows)
+            self._disk.execute("COMMIT")
         return tokens
 
     def raters(self) -> dict[str, str]:
@@ -158,6 +158,16 @@ class VoteStore:
         names = ("trial", "choice", "ms", "at", "undone")
         rows = self._disk.execute(f"SELECT {', '.join(names)} FROM votes WHERE rater = ?", (rater,))
         return [dict(zip(names, row, strict=True)) for row in rows]
+
+
+@contextmanager
+def _writing(path: Path) -> Generator[None]:
+    """Raise what SQLite raises inside as an error of the file."""
+    try:
+        yield
+    except sqlite3.Error as error:
+        must, fix = f"{path} must be a file of votes that can be written", "Choose another file"
+        raise PalpateError(must, str(error), fix) from None
 
 
 def _hash(token: str) -> str:
@@ -296,8 +306,8 @@ class _Study:
             "study": vote["study"] == self.public["study"],
             "trial": vote["trial"] in self.trials[rater],
             "choice": vote["choice"] in self.public["choices"],
-            "ms": 0 <= vote["ms"] < 2**31,
-            "undone": 0 <= vote["undone"] < 1000,
+            "ms": 0 <= vote["ms"] < LONGEST_MS,
+            "undone": 0 <= vote["undone"] < MOST_UNDONE,
             "at": _is_time(vote["at"]),
         }
         if wrong := [name for name, good in holds.items() if not good]:

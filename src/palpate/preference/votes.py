@@ -22,6 +22,8 @@ FORMAT = "palpate/preference-votes@1"
 #: The server's file in the folder of a study.
 DATABASE = "study.db"
 AGAIN = "Let the rater download the votes again"
+#: What a vote holds is below these.
+LONGEST_MS, MOST_UNDONE = 2**31, 1000
 
 
 @dataclass(frozen=True)
@@ -175,7 +177,8 @@ def _checked(plan: Plan, rater: str, rows: Sequence[Any], path: Path) -> list[Vo
             at = datetime.datetime.fromisoformat(row["at"])
             at = at if at.tzinfo else at.replace(tzinfo=datetime.UTC)
             ms, undone = int(row["ms"]), int(row["undone"])
-            if row["choice"] not in plan.choices or min(ms, undone) < 0:
+            in_range = 0 <= ms < LONGEST_MS and 0 <= undone < MOST_UNDONE
+            if row["choice"] not in plan.choices or not in_range:
                 raise ValueError
         except (KeyError, TypeError, ValueError):
             must = f"Every vote of {rater} in {path} must answer a trial of this rater"
