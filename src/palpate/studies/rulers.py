@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from itertools import combinations
+from typing import Any
 
 import numpy as np
 from scipy import stats
@@ -94,7 +95,7 @@ def _agreement(
     own = [[k for k, (method, _) in enumerate(generators) if method == m] for m in methods]
     mean_x, mean_y = (np.array([v[rows].mean() for rows in own]) for v in (x, y))
     by_method = tau_b(mean_x, mean_y, np.ones(len(methods)))
-    _, p_value = stats.kendalltau(mean_x, mean_y)
+    test: Any = stats.kendalltau(mean_x, mean_y)
     known = bool(np.isfinite(tau))
     return Score(
         TAU,
@@ -107,7 +108,7 @@ def _agreement(
         seed=seed,
         higher_is_better=True,
         settings={"methods": len(methods), "generators": len(generators)},
-        details={"a": pair[0], "b": pair[1], "by_method": by_method, "p_value": float(p_value)},
+        details={"a": pair[0], "b": pair[1], "by_method": by_method, "p_value": float(test.pvalue)},
         notes=() if interval else (Note("no-interval", {"reason": "no-change"}),),
     )
 
