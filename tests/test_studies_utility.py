@@ -166,7 +166,6 @@ def test_an_encoder_that_saw_test_videos_is_rejected(tmp_path):
     from mini_fixtures import make_encoders
     from palpate.core import Split
     from palpate.data.manifest import Manifest
-    from palpate.diffusion.generation import Generated
     from palpate.sim import WorldOptions, write_world
 
     options = WorldOptions(
@@ -189,7 +188,9 @@ def test_an_encoder_that_saw_test_videos_is_rejected(tmp_path):
         row = manifest.take([i])
         Image.open(row.paths("tactile")[0]).save(folder / "images" / f"{k}.png")
         files[i] = f"{k}.png"
-    generated = {"Ours": Generated(folder, files)}
+    rows = [{"id": i, "tactile": f"images/{name}"} for i, name in files.items()]
+    Manifest.from_rows(rows, folder).save(folder / "manifest.parquet")
+    generated = {"Ours": folder}
     encoders = make_encoders()
     tables, curve = utility(manifest, split, encoders, generated, Draws(shots=(1,), draws=2))
     assert [t.title for t in tables] == [

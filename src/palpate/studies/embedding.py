@@ -3,32 +3,39 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 from palpate.core import FeatureSet, Progress, quiet
 from palpate.data.manifest import Manifest
-from palpate.diffusion.generation import Generated
 from palpate.encoders.embed import embed
 from palpate.encoders.encoder_set import EncoderSet
+from palpate.evaluation.inputs import read
 
 
-def generated_manifest(generated: Generated, manifest: Manifest) -> Manifest:
+def generated_manifest(folder: Path | str, manifest: Manifest) -> Manifest:
     """The samples of a folder of generated images, with these as their tactile images.
 
     Materials, videos, sensors and no-contact images are those of the manifest's samples.
 
+    Args:
+        folder: of ``palpate generate``, or with a manifest of its own.
+        manifest: samples of the same ids, and perhaps others.
+
     Raises:
-        PalpateError: if an id is not in the manifest.
+        PalpateError: if the folder is none of images, or an id is not in the manifest.
     """
     import polars as pl
 
-    part = manifest.take(generated.ids)
-    paths = [str(generated.path(i).resolve()) for i in generated.ids]
+    made = read(str(folder), "generated").manifest
+    assert made is not None  # a folder holds images
+    paths = [str(path.resolve()) for path in made.paths("tactile")]
+    part = manifest.take(made.ids)
     return replace(part, table=part.table.with_columns(pl.Series("tactile", paths)))
 
 
 def embed_generated(
-    generated: Generated, manifest: Manifest, encoders: EncoderSet, progress: Progress = quiet
+    folder: Path | str, manifest: Manifest, encoders: EncoderSet, progress: Progress = quiet
 ) -> FeatureSet:
     """Tactile features (n, d) of generated images, with material and video of their samples."""
-    part = generated_manifest(generated, manifest)
+    part = generated_manifest(folder, manifest)
     return embed(part, encoders, "tactile", still=True, progress=progress)

@@ -25,6 +25,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -32,7 +33,6 @@ from numpy.typing import NDArray
 
 from palpate.core import FeatureSet, PalpateError, Progress, Score, Split, quiet, require, rng_for
 from palpate.data.manifest import Manifest
-from palpate.diffusion.generation import Generated
 from palpate.encoders.embed import embed
 from palpate.encoders.encoder_set import EncoderSet
 from palpate.evaluation.inputs import guard
@@ -369,7 +369,7 @@ def utility(
     manifest: Manifest,
     split: Split,
     encoders: EncoderSet,
-    generated: Mapping[str, Generated],
+    generated: Mapping[str, Path],
     draws: Draws | None = None,
     *,
     progress: Progress = quiet,
@@ -380,7 +380,7 @@ def utility(
         manifest: the samples.
         split: leak-free; its train part gives the real videos, its test part is tested.
         encoders: tactile, vision and text, of which the tactile one must not have seen test images.
-        generated: name -> images that were generated for photos of the test part.
+        generated: name -> folder of images that were generated for photos of the test part.
         draws: how videos are drawn.
         progress: progress callback.
 
