@@ -133,3 +133,76 @@ def test_claims_follow_who_moves_less():
 def test_recorded_photos_are_needed():
     with pytest.raises(PalpateError, match="as recorded"):
         moves({"clutter": rows(0, 0)}, rows(0, 0), rows(0, 0), subject="m")
+
+
+@pytest.fixture(scope="module")
+def small(tmp_path_factory):
+    """A tiny world on disk, its manifest and its split without leaks."""
+    from palpate.core import Split
+
+    folder = tmp_path_factory.mktemp("small") / "w"
+    options = WorldOptions(
+        materials=2,
+        objects_per_material=6,
+        contacts_per_video=1,
+        frames_per_contact=2,
+        size=32,
+        tile=64,
+        mixed=0.0,
+        leak="none",
+    )
+    write_world(folder, options)
+    split = Split.load(folder / "splits" / "Orig.json")
+    return options, Manifest.load(folder), split
+
+
+def test_photos_are_rendered_generated_from_and_measured(small, tmp_path):
+    from diffusion_fixtures import make_pipeline
+    from mini_fixtures import make_encoders
+    from palpate.studies.appearance import Moves, measure_moves
+
+    options, manifest, split = small
+    how = {"subject": "Ours", "folder": tmp_path / "m", "device": "cpu"}
+    made = measure_moves(manifest, split, options, make_pipeline(), make_encoders(), **how)
+    assert set(made.distances) == {*CHANGES, AGAIN}
+    # The stand-in encoder sees mean color and contrast: a white balance must move it.
+    assert made.distances["other white balance"].score.value > 1e-4
+    assert len(made.distances["clutter"].values) == len(split.ids("test"))
+    made.save(tmp_path / "moves.json")
+    again = Moves.load(tmp_path / "moves.json")
+    a, b = (appearance_table({"Ours": [m]}).rows for m in (made, again))
+    for row, other in zip(a, b, strict=True):
+        for x, y in zip(row[2:], other[2:], strict=True):
+            assert (x and x.value) == (y and y.value)
+            assert (x and x.interval) == (y and y.interval)
+
+
+def test_every_ruler_measures_every_folder(small, tmp_path):
+    from mini_fixtures import make_encoders
+    from palpate.encoders.embed import embed
+    from palpate.metrics import tmmd
+    from palpate.studies.rulers import measure_rulers
+
+    _, manifest, split = small
+    test = manifest.part(split, "test")
+    rng, images = np.random.default_rng(0), {}
+    for seed, noise in enumerate((0, 60)):
+        folder, cells = tmp_path / str(seed), []
+        folder.mkdir()
+        for k, (i, path) in enumerate(zip(test.ids, test.paths("tactile"), strict=True)):
+            x = np.asarray(Image.open(path)).astype(float)
+            x = np.clip(x + noise * rng.normal(size=x.shape), 0, 255).astype(np.uint8)
+            Image.fromarray(x).save(folder / f"{k}.png")
+            cells.append({"id": i, "tactile": f"{k}.png"})
+        Manifest.from_rows(cells, folder).save(folder / "manifest.parquet")
+        images["m", seed] = folder
+    rulers = {"a": make_encoders(0), "b": make_encoders(1)}
+    made = measure_rulers(rulers, images, manifest, split)
+    for name, encoders in rulers.items():
+        assert float(made[name]["m", 0]) == pytest.approx(0, abs=1e-9)  # the real images
+        real = embed(test, encoders, still=True)
+        x = embed(Manifest.load(images["m", 1]), encoders, still=True).features
+        same = {"ids": test.ids, "groups": test.column("video")}
+        how = {"reference_ids": test.ids, "reference_groups": test.column("video")}
+        want = tmmd(x, real.features, **same, **how, preset="grouped", permutations=0)
+        assert float(made[name]["m", 1]) == pytest.approx(want.value, rel=1e-4)
