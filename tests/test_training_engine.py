@@ -4,6 +4,7 @@ import json
 import math
 import os
 import signal
+import time
 
 import numpy as np
 import pytest
@@ -17,7 +18,7 @@ from palpate.core import PalpateError, quiet
 from palpate.training import engine
 from palpate.training.engine import Losses, Task
 from palpate.training.options import Compute, LoopOptions, RowOrder, learning_rate
-from palpate.training.processes import barrier, place, work_folder
+from palpate.training.processes import barrier, first_alone, merged, place, work_folder
 
 N = 23
 STEPS = 14
@@ -306,6 +307,30 @@ def test_processes_without_an_output_share_a_folder_until_all_are_done(on_two_pr
     one, two = on_two_processes(folder)
     assert one == two
     assert one[1] == 2
+
+
+@pytest.mark.parametrize("wait", [barrier, lambda: merged({})])
+def test_who_waits_for_a_process_that_has_ended_says_so(on_two_processes, wait):
+    def message():
+        if place()[0]:
+            return None  # and ends
+        with pytest.raises(PalpateError, match="All processes must stay alive") as caught:
+            wait()
+        return caught.value.got
+
+    got, _ = on_two_processes(message)
+    assert got.startswith("one has ended")
+
+
+def test_the_first_process_goes_alone_and_before_the_others(tmp_path, on_two_processes):
+    def files():
+        with first_alone():
+            before = sorted(p.name for p in tmp_path.glob("mark-*"))
+            time.sleep(0.2)
+            (tmp_path / f"mark-{place()[0]}").touch()
+        return before
+
+    assert on_two_processes(files) == [[], ["mark-0"]]
 
 
 @pytest.mark.parametrize("clip", [None, 1.0])

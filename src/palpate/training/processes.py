@@ -67,19 +67,34 @@ def place() -> tuple[int, int]:
 @contextmanager
 def first_alone() -> Generator[None]:
     """Let one process of each machine go first: it fills caches that the others then read."""
-    if place()[1] == 1:
+    first = place()[1] == 1 or os.environ.get("LOCAL_RANK", "0") == "0"
+    if not first:
+        barrier()
+    try:
         yield
-        return
-    from accelerate import PartialState
+    finally:
+        if first:
+            barrier()
 
-    with PartialState().local_main_process_first():
+
+@contextmanager
+def _together() -> Generator[None]:
+    """Turn the error of a message to a process that is gone into one line."""
+    try:
         yield
+    except RuntimeError as error:
+        raise _ended(error) from None
 
 
 def barrier() -> None:
-    """Wait until all processes are here."""
+    """Wait until all processes are here.
+
+    Raises:
+        PalpateError: if another process has ended.
+    """
     if place()[1] > 1:
-        dist.barrier()
+        with _together():
+            dist.barrier()
 
 
 def average(tensors: Sequence[Tensor]) -> None:
@@ -92,10 +107,8 @@ def average(tensors: Sequence[Tensor]) -> None:
         return
     for some in _utils._take_tensors(tensors, BUCKET):  # pyright: ignore
         flat = _utils._flatten_dense_tensors(some)  # pyright: ignore
-        try:
+        with _together():
             dist.all_reduce(flat)
-        except RuntimeError as error:
-            raise _ended(error) from None
         means = _utils._unflatten_dense_tensors(flat / size, some)  # pyright: ignore
         torch._foreach_copy_(some, means)  # pyright: ignore
 
@@ -105,10 +118,8 @@ def merged(table: dict[str, T]) -> dict[str, T]:
     if place()[1] == 1:
         return table
     tables: list[Any] = [None] * place()[1]
-    try:
+    with _together():
         dist.all_gather_object(tables, table)
-    except RuntimeError as error:
-        raise _ended(error) from None
     return {key: value for each in tables for key, value in each.items()}
 
 
@@ -131,10 +142,8 @@ def gather_rows(rows: Tensor, batch: int | None = None) -> Tensor:
     if size == 1 or len(rows) == batch:
         return rows
     parts = [torch.empty_like(rows, requires_grad=False) for _ in range(size)]
-    try:
+    with _together():
         dist.all_gather(parts, rows.detach().contiguous())
-    except RuntimeError as error:
-        raise _ended(error) from None
     parts[rank] = rows.detach() + size * (rows - rows.detach())  # the value of rows, size gradients
     return torch.cat(parts)
 
