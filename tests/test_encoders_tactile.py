@@ -228,6 +228,42 @@ def test_a_missing_further_or_permuted_name_is_refused(tmp_path, kind):
             load_tactile(write(kind, tmp_path, state))
 
 
+def drawn(*shape):
+    return torch.rand(shape, generator=torch.Generator().manual_seed(0))
+
+
+@pytest.mark.parametrize(
+    ("kind", "name", "value"),
+    [
+        ("sparsh", "pos_embed.frequency_bands", drawn(2, 50)),  # one that would be cut
+        ("sparsh", "pos_embed.frequency_bands", drawn(32)),  # one that would be spread
+        ("sparsh", "pos_embed.frequency_bands", drawn(2, 10)),
+        ("sparsh", "register_tokens", drawn(1, 2, WIDTH)),
+        ("sparsh", "patch_embed.proj.weight", drawn(WIDTH, 6, 500, 500)),
+        ("sparsh", "norm.weight", drawn(200)),
+        ("sparsh", "norm.weight", torch.tensor(1.0)),
+        ("tvl", "pos_embed", drawn(1, 18, WIDTH)),
+        ("tvl", "pos_embed", drawn(1, 0, WIDTH)),
+        ("tvl", "patch_embed.proj.weight", drawn(WIDTH, 6, 16, 16)),
+        ("tvl", "head.weight", drawn(48, 200)),
+        ("tvl", "head.weight", drawn(48, WIDTH).to(torch.complex64)),
+        ("tvl", "head.weight", drawn(48, WIDTH).to_sparse()),
+        ("anytouch", "sensor_token", drawn(2, 5, WIDTH)),
+        ("anytouch", "sensor_token", drawn(10, 1, WIDTH)),
+        ("anytouch", "touch_projection.weight", torch.tensor(1.0)),
+        ("anytouch", "touch_projection.weight", drawn(48, 200)),
+        ("anytouch", "touch_model.embeddings.position_embedding.weight", drawn(0, WIDTH)),
+        ("anytouch", "touch_model.encoder.layers.0.mlp.fc1.weight", torch.tensor(1.0)),
+    ],
+)
+def test_what_no_published_file_holds_is_refused_not_cut_or_spread(tmp_path, kind, name, value):
+    good = {"sparsh": sparsh, "tvl": tvl, "anytouch": anytouch}[kind]()
+    prefix = {"sparsh": "", "tvl": "tactile_encoder.", "anytouch": "touch_mae_model."}[kind]
+    assert prefix + name in good
+    with pytest.raises(PalpateError, match="must hold the weights of"):
+        load_tactile(write(kind, tmp_path, good | {prefix + name: value}))
+
+
 def test_models_of_published_widths_have_all_their_blocks():
     for width, depth in ((192, 12), (384, 12), (768, 12), (1024, 24)):
         assert _depth(width, set(range(depth))) == depth
@@ -238,7 +274,7 @@ def test_models_of_published_widths_have_all_their_blocks():
 def test_sparsh_takes_two_frames(tmp_path):
     good = sparsh()
     state = good | {"patch_embed.proj.weight": good["patch_embed.proj.weight"][:, :3].clone()}
-    with pytest.raises(PalpateError, match="patches of 3 channels"):
+    with pytest.raises(PalpateError, match=r"\(128, 3, 16, 16\), not \(128, 6, 16, 16\)"):
         load_tactile(write("sparsh", tmp_path, state))
 
 
@@ -372,7 +408,7 @@ def test_they_score_probe_and_are_guarded_by_what_their_authors_name(tmp_path, d
     assert own["TMMD"] is not None
     results = score(tmp_path / "g", digits, encoder=path, companions=[], permutations=0)
     notes = [n for s in results["TMMD"] for n in s.notes if n.code == "encoder-license"]
-    assert {n.params["name"] for n in notes} == {"Sparsh"}
+    assert {(n.params["name"], n.params["license"]) for n in notes} == {("Sparsh", "CC-BY-NC-4.0")}
 
 
 def test_an_encoder_trains_on_whole_turned_images_minus_their_background(tmp_path, digits):

@@ -24,6 +24,7 @@ one Sparsh file disagree in size and background, so that preprocessing is part o
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -40,7 +41,7 @@ from palpate.encoders.models import Origin, first_line, read_weights
 from palpate.encoders.preprocess import Preprocess
 
 State = Mapping[str, Tensor]
-NON_COMMERCIAL = "CC-BY-NON_COMMERCIAL-4.0"
+NON_COMMERCIAL = "CC-BY-NC-4.0"
 IMAGENET = ((0.485, 0.456, 0.406), (0.229, 0.224, 0.225))
 SPARSH = "the .safetensors file of facebook/sparsh-{mae,dino,dinov2,ijepa}-{small,base}"
 KNOWN = f"{SPARSH}, tvl_enc_vit{{t,s,b}}.pth of TVL, or checkpoint.pth of AnyTouch 1"
@@ -48,8 +49,10 @@ KNOWN = f"{SPARSH}, tvl_enc_vit{{t,s,b}}.pth of TVL, or checkpoint.pth of AnyTou
 SENSOR_NUMBERS = {"digit": 1, "gelslim": 2, "mini": 3, "duragel": 4, "gelsight": 0}
 #: Width of a published model -> its number of blocks: a file that lost its last ones looks whole.
 DEPTHS = {192: 12, 384: 12, 768: 12, 1024: 24}
-#: Width of a head of every vision transformer here; a narrower model has one head.
+#: Width of a head of every vision transformer here.
 HEAD_WIDTH = 64
+#: Sides in pixels of the patches of Sparsh and TVL, and of AnyTouch.
+PATCH, ANYTOUCH_PATCH = 16, 14
 
 
 @dataclass(frozen=True)
@@ -95,7 +98,7 @@ class Attention(nn.Module):
     def __init__(self, width: int) -> None:
         super().__init__()
         self.qkv, self.proj = nn.Linear(width, 3 * width), nn.Linear(width, width)
-        self.heads = max(1, width // HEAD_WIDTH)
+        self.heads = width // HEAD_WIDTH
 
     def forward(self, x: Tensor) -> Tensor:
         """(n, tokens, width) to the same."""
@@ -130,10 +133,10 @@ class LayerScale(nn.Module):
 class Block(nn.Module):
     """One block of a vision transformer."""
 
-    def __init__(self, width: int, hidden: int, *, scaled: bool) -> None:
+    def __init__(self, width: int, *, scaled: bool) -> None:
         super().__init__()
         self.norm1, self.norm2 = (nn.LayerNorm(width, eps=1e-6) for _ in range(2))
-        self.attn, self.mlp = Attention(width), Mlp(width, hidden)
+        self.attn, self.mlp = Attention(width), Mlp(width, 4 * width)
         self.ls1, self.ls2 = (LayerScale(width) if scaled else nn.Identity() for _ in range(2))
 
     def forward(self, x: Tensor) -> Tensor:
@@ -145,10 +148,9 @@ class Block(nn.Module):
 class PatchEmbedding(nn.Module):
     """The image's patches as tokens."""
 
-    def __init__(self, weight: Tensor) -> None:
+    def __init__(self, width: int, channels: int) -> None:
         super().__init__()
-        width, channels, rows, columns = weight.shape
-        self.proj = nn.Conv2d(channels, width, (rows, columns), (rows, columns))
+        self.proj = nn.Conv2d(channels, width, PATCH, PATCH)
 
     def forward(self, x: Tensor) -> Tensor:
         """(n, channels, h, w) to (n, width, h', w')."""
@@ -158,31 +160,33 @@ class PatchEmbedding(nn.Module):
 class SinusoidalPositions(nn.Module):
     """Sparsh's positions: sines and cosines of row and column."""
 
-    def __init__(self, bands: Tensor) -> None:
+    def __init__(self, width: int) -> None:
         super().__init__()
-        self.register_buffer("frequency_bands", torch.empty_like(bands))
+        self.register_buffer("frequency_bands", torch.empty(2, width // 4))
 
     def forward(self, rows: int, columns: int) -> Tensor:
-        """(rows * columns, 4 * bands)."""
+        """(rows * columns, width)."""
         bands = self.get_buffer("frequency_bands")
         axes = [torch.arange(n, device=bands.device) for n in (rows, columns)]
         angles = torch.cartesian_prod(*axes)[:, :, None] * bands
         return torch.cat([angles.sin(), angles.cos()], dim=2).flatten(1)
 
 
-def _blocks(state: State, *, scaled: bool) -> nn.ModuleList:
-    hidden, width = state["blocks.0.mlp.fc1.weight"].shape
+def _blocks(state: State, width: int, *, scaled: bool) -> nn.ModuleList:
     names = [name for name in state if name.startswith("blocks.")]
     depth = _depth(width, {int(name.split(".")[1]) for name in names})
-    return nn.ModuleList(Block(width, hidden, scaled=scaled) for _ in range(depth))
+    return nn.ModuleList(Block(width, scaled=scaled) for _ in range(depth))
 
 
 def _depth(width: int, numbers: set[int]) -> int:
     """The number of blocks.
 
     Raises:
-        ValueError: if it is not that of the published model of this width.
+        ValueError: if it is not that of the published model of this width, or no heads make the
+            width.
     """
+    if width % HEAD_WIDTH or not width:
+        raise ValueError(f"width {width}, no multiple of {HEAD_WIDTH}, that of a head")
     if len(numbers) != (depth := DEPTHS.get(width, len(numbers))):
         raise ValueError(f"{len(numbers)} blocks of width {width}, not {depth}")
     return depth
@@ -205,21 +209,18 @@ class Sparsh(TactileModule):
 
     def __init__(self, state: State) -> None:
         super().__init__()
-        weight = state["patch_embed.proj.weight"]
-        if weight.shape[1] != 6:
-            raise ValueError(f"patches of {weight.shape[1]} channels, not 6: two frames")
-        self.dim = weight.shape[0]
-        self.patch_embed = PatchEmbedding(weight)
-        self.pos_embed = SinusoidalPositions(state["pos_embed.frequency_bands"])
+        self.dim = width = state["norm.weight"].shape[0]
+        self.blocks, self.norm = _blocks(state, width, scaled=True), nn.LayerNorm(width, eps=1e-6)
+        self.patch_embed = PatchEmbedding(width, 6)  # two frames
+        self.pos_embed = SinusoidalPositions(width)
         if "register_tokens" in state:  # all but MAE
-            self.register_tokens = nn.Parameter(torch.empty_like(state["register_tokens"]))
-        self.blocks, self.norm = _blocks(state, scaled=True), nn.LayerNorm(self.dim, eps=1e-6)
+            self.register_tokens = nn.Parameter(torch.empty(1, 1, width))
 
     def forward(self, pixels: Tensor, sensors: Tensor | None = None) -> Tensor:
         """(n, 6, 320, 240) to (n, width)."""
         patches = self.patch_embed(pixels)
         x = patches.flatten(2).transpose(1, 2)
-        x = x + self.pos_embed(*patches.shape[2:])[:, : self.dim].to(x.dtype)
+        x = x + self.pos_embed(*patches.shape[2:]).to(x.dtype)
         registers = getattr(self, "register_tokens", x[:1, :0])
         x = torch.cat([registers.expand(len(x), -1, -1), x], dim=1)
         for block in self.blocks:
@@ -242,14 +243,14 @@ class Tvl(TactileModule):
 
     def __init__(self, state: State) -> None:
         super().__init__()
-        weight = state["patch_embed.proj.weight"]
-        width, self.dim = weight.shape[0], state["head.weight"].shape[0]
-        size = round((state["pos_embed"].shape[1] - 1) ** 0.5) * weight.shape[3]
-        self.preprocess = replace(self.preprocess, size=size, resize=size)
-        self.patch_embed = PatchEmbedding(weight)
+        self.dim, width = state["head.weight"].shape
+        side = math.isqrt(state["pos_embed"].shape[1] - 1)
+        self.preprocess = replace(self.preprocess, size=side * PATCH, resize=side * PATCH)
+        self.blocks = _blocks(state, width, scaled=False)
+        self.fc_norm = nn.LayerNorm(width, eps=1e-6)
+        self.patch_embed = PatchEmbedding(width, 3)
         self.cls_token = nn.Parameter(torch.empty(1, 1, width))
-        self.pos_embed = nn.Parameter(torch.empty_like(state["pos_embed"]))
-        self.blocks, self.fc_norm = _blocks(state, scaled=False), nn.LayerNorm(width, eps=1e-6)
+        self.pos_embed = nn.Parameter(torch.empty(1, side**2 + 1, width))
         self.head = nn.Linear(width, self.dim)
 
     def forward(self, pixels: Tensor, sensors: Tensor | None = None) -> Tensor:
@@ -269,26 +270,24 @@ class AnyTouch(TactileModule):
 
     def __init__(self, state: State) -> None:
         super().__init__()
-        weight = state["touch_model.embeddings.patch_embedding.weight"]
-        width, _, patch, _ = weight.shape
+        self.dim, width = state["touch_projection.weight"].shape
         layers = re.findall(r"encoder\.layers\.(\d+)\.", " ".join(state))
-        tokens = len(state["touch_model.embeddings.position_embedding.weight"])
-        size = round((tokens - 1) ** 0.5) * patch
+        tokens = state["touch_model.embeddings.position_embedding.weight"].shape[0]
+        size = math.isqrt(tokens - 1) * ANYTOUCH_PATCH
         self.preprocess = replace(self.preprocess, size=size, resize=size)
         config = CLIPVisionConfig(
             hidden_size=width,
-            intermediate_size=len(state["touch_model.encoder.layers.0.mlp.fc1.weight"]),
+            intermediate_size=4 * width,
             num_hidden_layers=_depth(width, set(map(int, layers))),
-            num_attention_heads=max(1, width // HEAD_WIDTH),
+            num_attention_heads=width // HEAD_WIDTH,
             image_size=size,
-            patch_size=patch,
+            patch_size=ANYTOUCH_PATCH,
             hidden_act="gelu",
             layer_norm_eps=1e-5,
         )
         model: Any = CLIPVisionModel(config)
         self.touch_model = getattr(model, "vision_model", model)  # a level less in transformers 5
-        self.sensor_token = nn.Parameter(torch.empty_like(state["sensor_token"]))
-        self.dim = len(state["touch_projection.weight"])
+        self.sensor_token = nn.Parameter(torch.empty(10, 5, width))  # sensors, tokens
         self.touch_projection = nn.Linear(width, self.dim, bias=False)
 
     def forward(self, pixels: Tensor, sensors: Tensor | None = None) -> Tensor:
@@ -360,11 +359,16 @@ def load_tactile(path: Path) -> TactileModule:
     if wrong:
         got = f"{len(wrong)} of them otherwise, first {', '.join(wrong[:3])}"
         raise PalpateError(must, got, "Fetch the file again; weights are never filled in")
-    if bad := [name for name in wanted if not bool(state[name].isfinite().all())]:
-        raise PalpateError(f"{must}, all finite", f"NaN or infinity in {bad[0]}", "")
+    if bad := [name for name in wanted if not _finite(state[name])]:
+        raise PalpateError(f"{must}, all finite", f"NaN or infinity in {bad[0]}, or no floats", "")
     module.load_state_dict({name: state[name].float() for name in wanted}, assign=True)
     module.format = form
     return module.eval().requires_grad_(False)
+
+
+def _finite(weight: Tensor) -> bool:
+    plain = weight.layout is torch.strided and weight.is_floating_point()
+    return plain and bool(weight.float().isfinite().all())
 
 
 def sensor_numbers(names: list[str], device: torch.device) -> Tensor:
