@@ -24,7 +24,7 @@ from palpate.encoders.contrastive import (
     train_tactile,
 )
 from palpate.encoders.embed import embed
-from palpate.encoders.encoder_set import EncoderSet, encode_tactile, new_tactile
+from palpate.encoders.encoder_set import EncoderSet, encode_tactile, load_clip, new_tactile
 from palpate.encoders.losses import (
     Labels,
     clamped_scale,
@@ -286,6 +286,57 @@ def test_a_batch_of_one_and_one_sample_are_rejected(world, clip, tmp_path):
         preset = quick(tactile_course=replace(TINY.tactile_course, batch=batch))
         with pytest.raises(PalpateError, match=must):
             train_tactile(world, by_video(world), clip, preset, tmp_path, device="cpu")
+
+
+def test_vision_and_text_are_not_trained_on_one_row_or_what_is_held_out(world, tmp_path):
+    def train(folder, manifest=world, course=TINY.clip_course, **how):
+        preset, how = replace(TINY, clip_course=course), {"device": "cpu", **how}
+        return train_clip(manifest, by_video(world), preset, tmp_path / folder, **how)
+
+    one = [{**r, "vision": None} if k else r for k, r in enumerate(world.table.to_dicts())]
+    with pytest.raises(PalpateError, match=r"must hold two photos.*Got one, v0/0"):
+        train("one", Manifest.from_rows(one, world.root))
+    with pytest.raises(PalpateError, match="`clip_batch_size` must be at least 2"):
+        train("batch", course=replace(TINY.clip_course, batch=1))
+    for change in ({"keep": "best"}, {"patience": 1}):
+        with pytest.raises(PalpateError, match="must keep its last weights and run to its end"):
+            train("best", course=replace(TINY.clip_course, **change))
+    clip = train("held", held_out=0.34)
+    encoders = train_encoder(world, by_video(world), preset=TINY, device="cpu", held_out=0.34)
+    assert clip.card["train_samples"] == encoders.card["train_samples"] == 12  # four of six videos
+    assert encoders.card["clip_card"]["train_manifest"] == encoders.card["train_manifest"]
+
+
+def test_a_test_part_without_materials_or_tactile_images_costs_no_training(world, tmp_path):
+    split = by_video(world)
+    test = split.ids("test")
+    for bare, count in ((test, 0), (test[:2], len(test) - 2)):
+        for column in ("material", "tactile"):
+            rows = [{**r, column: None} if r["id"] in bare else r for r in world.table.to_dicts()]
+            manifest, how = Manifest.from_rows(rows, world.root), {"clip": "palpate/mini"}
+            encoders = train_encoder(manifest, split, preset=TINY, device="cpu", epochs=0.1, **how)
+            assert [row["n"] for row in encoders.card.get("scores", ())] == [count] * bool(count)
+
+
+def test_a_public_partner_that_learns_keeps_what_it_saw_as_it_saw_it(world, tmp_path):
+    rows = world.table.to_dicts()
+    for k in range(len(rows)):
+        wide = np.random.default_rng(k).integers(0, 256, (12, 24, 3), dtype=np.uint8)
+        Image.fromarray(wide).save(tmp_path / f"{k}.png")
+    rows = [{**r, "vision": f"{k}.png", "tactile": f"{k}.png"} for k, r in enumerate(rows)]
+    manifest, split = Manifest.from_rows(rows, tmp_path), by_video(world)
+    public = load_clip("palpate/mini")
+    public.preprocess = replace(public.preprocess, fitting="squash")
+    public.seen, public.card = None, {"license": "MIT", "trained_on": ["photos"]}
+    how = {"clip": public, "device": "cpu", "epochs": 0.1}
+    encoders = train_encoder(manifest, split, preset=TINY, partners="trainable", **how)
+    encoders.save(tmp_path / "e")
+    again = EncoderSet.load(tmp_path / "e")
+    assert again.saw("vision", manifest.part(split, "train")).all()
+    assert not again.saw("vision", manifest.part(split, "test")).any()
+    assert not again.knows_seen("vision")  # what its authors took
+    assert public.seen is None
+    assert not public.card.get("seen_in_part")
 
 
 def test_a_training_that_would_change_nothing_is_rejected(world, clip, tmp_path):

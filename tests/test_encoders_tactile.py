@@ -301,6 +301,15 @@ def test_pickles_with_code_and_other_files_are_refused(tmp_path):
     save_file({"a": torch.zeros(2)}, tmp_path / "a.safetensors")
     with pytest.raises(PalpateError, match="recognized by the names of its weights"):
         load_tactile(tmp_path / "a.safetensors")
+    weight = torch.zeros(2)
+    old = {"_use_new_zipfile_serialization": False}
+    torch.save({"model": {"a": weight}}, tmp_path / "old.pth", **old)
+    data, key = (tmp_path / "old.pth").read_bytes(), str(weight.untyped_storage()._cdata).encode()
+    (tmp_path / "old.pth").write_bytes(
+        data[: data.rindex(key)] + b"0" + data[data.rindex(key) + 1 :]
+    )
+    with pytest.raises(PalpateError, match="must hold weights and nothing else"):
+        load_tactile(tmp_path / "old.pth")
     (tmp_path / "b.safetensors").write_bytes(b"rubbish")
     with pytest.raises(PalpateError, match="must hold weights and nothing else"):
         load_tactile(tmp_path / "b.safetensors")

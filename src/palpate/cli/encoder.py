@@ -10,7 +10,9 @@ from palpate.cli.terminal import Switch, Terminal, require_extra
 from palpate.core import PalpateError
 from palpate.encoders.presets import PRESETS, EncoderPreset
 
-_FLAGS = ("tactile_course", ("name", "cost", "pretrained", "tactile_course.epochs", "targets"))
+_SKIP = ("name", "cost", "pretrained", "tactile_course.epochs", "targets")
+_IDLE = tuple(f"clip_course.{name}" for name in ("evaluations", "patience", "keep"))
+_FLAGS = ("tactile_course", _SKIP + _IDLE)
 _Preset = preset_flags("Preset", EncoderPreset, *_FLAGS)
 
 

@@ -53,7 +53,7 @@ from palpate.encoders.losses import (
 )
 from palpate.encoders.models import move, pick_device
 from palpate.encoders.preprocess import CLIP_MEAN, CLIP_STD, digest_images, prepared_images, union
-from palpate.encoders.presets import EncoderPreset, Targets, preset
+from palpate.encoders.presets import Course, EncoderPreset, Targets, preset
 from palpate.encoders.rows import Rows, augmented, draw, numbers, unit
 from palpate.encoders.tokenizer import train_tokenizer
 from palpate.metrics.probe import material_accuracy
@@ -133,17 +133,18 @@ def train_encoder(  # noqa: PLR0913 - a public verb
     with work_folder(output) as work:
         common: dict[str, Any] = {"seed": seed, "targets": targets, "cache": work / "cache"}
         common |= {"device": device, "compute": compute, "progress": progress}
+        common["held_out"] = held_out
         source = clip or chosen.pretrained
         if source is None:
             source = train_clip(manifest, split, chosen, work / "clip", **common)
         elif not isinstance(source, ClipEncoders):
             source = load_clip(source, device=device)
-        common |= {"weights": weights, "partners": partners, "held_out": held_out}
+        common |= {"weights": weights, "partners": partners}
         encoders = train_tactile(
             manifest, split, source, chosen, work / "tactile", epochs=epochs, **common
         )
-        parts = [manifest.part(split, part) for part in ("train", "test")]
-        if len(parts[1]) and len(set(parts[0].column("material")) - {None}) > 1:
+        parts = [_labeled(manifest.part(split, part)) for part in ("train", "test")]
+        if len(parts[1]) and len(set(parts[0].column("material"))) > 1:
             cache = work / "cache"
             with first_alone():
                 features = [embed(p, encoders, cache=cache, progress=progress) for p in parts]
@@ -182,6 +183,12 @@ def plan_encoder(
 
     options = chosen.tactile_course.options(len(train), 0, epochs)
     return estimate(build, forward, options, len(train), pick_device(device))
+
+
+def _labeled(part: Manifest) -> Manifest:
+    """The samples that have a tactile image and a material."""
+    columns = (part.ids, part.column("tactile"), part.column("material"))
+    return part.take([i for i, image, name in zip(*columns, strict=True) if image and name])
 
 
 def load_split(data: Manifest | str | Path, split: Split | str | Path | None = None) -> Split:
@@ -364,9 +371,16 @@ def train_tactile(  # noqa: PLR0913 - one row per choice of the training
         plain = replace(preset.preprocess, subtract=())
         images = prepared_images(train, "tactile", plain, cache, progress)
     seen = union(digest_images(images), start.seen if start else None)
-    if trainable and rows.photos is not None and clip.seen is not None:
-        clip.seen = union(digest_images(rows.photos), clip.seen)
+    if rows.photos is not None:
+        _note_seen(clip, rows.photos)
     return EncoderSet(clip, model.tactile.eval().requires_grad_(False), preprocess, card, seen)
+
+
+def _note_seen(clip: ClipEncoders, photos: NDArray[np.uint8]) -> None:
+    """Keep that vision was trained on photos; of a public one they are a part of what it saw."""
+    if clip.seen is None:
+        clip.card = {**clip.card, "seen_in_part": True}
+    clip.seen = union(digest_images(photos), clip.seen)
 
 
 def _require_pairs(
@@ -377,10 +391,7 @@ def _require_pairs(
     Raises:
         PalpateError: if not.
     """
-    if len(rows.manifest) == 1:
-        must = "The train part must hold two samples: the loss compares them with each other"
-        got, fix = f"one, {rows.manifest.ids[0]}", "Make another split: palpate split"
-        raise shared(PalpateError(must, got, fix))
+    _require_rows(rows.manifest, options)
     if not (weights[0] or weights[2] or trainable):
         must = "must keep a pair with the tactile encoder, which trains alone"
         raise shared(
@@ -391,9 +402,18 @@ def _require_pairs(
         raise shared(
             PalpateError(must, f"{tuple(weights)}", "Photos are missing", argument="weights")
         )
+
+
+def _require_rows(
+    train: Manifest, options: LoopOptions, what: str = "samples", argument: str = "batch"
+) -> None:
+    if len(train) == 1:
+        must = f"The train part must hold two {what}: the loss compares them with each other"
+        got, fix = f"one, {train.ids[0]}", "Make another split: palpate split"
+        raise shared(PalpateError(must, got, fix))
     if options.batch == 1:
         must, fix = "must be at least 2: the loss compares rows", "Pass a larger one"
-        raise shared(PalpateError(must, "1", fix, argument="batch"))
+        raise shared(PalpateError(must, "1", fix, argument=argument))
 
 
 def _require_held_out(held: Manifest | None, options: LoopOptions) -> None:
@@ -495,6 +515,7 @@ def train_clip(  # noqa: PLR0913 - as train_tactile
     epochs: float | None = None,
     seed: int = 0,
     targets: Targets | None = None,
+    held_out: float = 0.0,
     cache: Path | None = None,
     device: str = "auto",
     compute: Compute | None = None,
@@ -502,24 +523,26 @@ def train_clip(  # noqa: PLR0913 - as train_tactile
 ) -> ClipEncoders:
     """Train a fresh vision and text encoder on the train part of a split, by InfoNCE of that pair.
 
-    Arguments as :func:`train_tactile`. Without photos the vision encoder is trained on the tactile
-    images, as the text encoder needs a partner; the card says so. Run again to resume.
+    Arguments as :func:`train_tactile`; what is held out is left out. Without photos the vision
+    encoder is trained on the tactile images, as the text encoder needs a partner; the card says so.
+    Run again to resume.
 
     Returns:
         The CLIP, frozen, with a card.
 
     Raises:
-        PalpateError: if the train part is empty, or the preset takes a pretrained CLIP.
+        PalpateError: if the train part is empty or has one photo, or the preset takes a pretrained
+            CLIP, or has this course keep the best weights or stop early.
     """
     where, compute = pick_device(connect(device)), compute or Compute()
-    train = train_part(manifest, split)
-    side, course = _sides(train)[0], preset.clip_course
-    if course is None:
-        must, got = "must describe a fresh CLIP", f"{preset.name}, which takes {preset.pretrained}"
-        raise PalpateError(must, got, "Pass a clip, or use the preset mini", argument="preset")
+    train = _parts(manifest, split, held_out, seed)[0]
+    side, course = _sides(train)[0], _clip_course(preset)
     missing = train.column(side).count(None)
     has = zip(train.ids, train.column(side), strict=True)
     train = train.take([i for i, image in has if image is not None])
+    options = course.options(len(train), seed, epochs)
+    words = "photos" if side == "vision" else "samples"
+    _require_rows(train, options, words, "clip_batch_size")
     texts, source = texts_of(train)
     with first_alone():
         images = cached_images(train, side, preset.image, cache, progress)
@@ -527,7 +550,6 @@ def train_clip(  # noqa: PLR0913 - as train_tactile
     clip = new_clip(preset, texts, seed, _preprocess(preset, images, plain))
     move(clip.model, where)
     clip.model.requires_grad_(True)
-    options = course.options(len(train), seed, epochs)
     mode, words, distinct = targets or preset.targets, numbers(texts), sorted(set(texts))
 
     def load(step: Step) -> Batch:
@@ -556,6 +578,17 @@ def train_clip(  # noqa: PLR0913 - as train_tactile
     clip.card = _card(facts, options, log, where)
     clip.seen = union(digest_images(images))
     return clip
+
+
+def _clip_course(preset: EncoderPreset) -> Course:
+    course = preset.clip_course
+    if course is None:
+        must, got = "must describe a fresh CLIP", f"{preset.name}, which takes {preset.pretrained}"
+        raise PalpateError(must, got, "Pass a clip, or use the preset mini", argument="preset")
+    if course.keep == "best" or course.patience:
+        must = "The course of vision and text must keep its last weights and run to its end"
+        raise shared(PalpateError(must, f"keep {course.keep}, patience {course.patience}", ""))
+    return course
 
 
 def train_part(manifest: Manifest, split: Split) -> Manifest:

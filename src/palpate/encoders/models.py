@@ -269,7 +269,7 @@ def read_weights(path: Path, fix: str) -> dict[str, Tensor]:
             return load_file(path)
         with torch.serialization.safe_globals(safe):
             content = torch.load(path, map_location="cpu", weights_only=True, mmap=is_zipfile(path))
-    except (*UNREADABLE, EOFError) as error:
+    except Exception as error:  # of a damaged file torch raises many kinds
         raise PalpateError(must, first_line(error)[:160], fix) from None
     for key in ("model", "state_dict"):
         content = content.get(key, content) if isinstance(content, Mapping) else content

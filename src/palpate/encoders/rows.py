@@ -13,7 +13,6 @@ from torch import Tensor
 from torch.nn.functional import affine_grid, grid_sample
 
 from palpate.core import FeatureSet, Progress, atomic_path, digest_json, quiet, short
-from palpate.data.images import cached_images
 from palpate.data.manifest import Manifest
 from palpate.encoders.embed import embed, embed_texts, texts_of
 from palpate.encoders.encoder_set import ClipEncoders, EncoderSet
@@ -71,8 +70,8 @@ class Rows:
         self.photos = self.text = self.vision = None
         if trainable:
             if len(pictured):
-                side = clip.preprocess.resize
-                self.photos = cached_images(pictured, "vision", side, cache, progress)
+                how = clip.preprocess
+                self.photos = prepared_images(pictured, "vision", how, cache, progress)
             return
         frozen = EncoderSet(clip)
         if clip.tokenizer is not None:
