@@ -126,7 +126,11 @@ def test_undo_shows_the_last_trial_again_and_is_recorded(chromium, pairs):
         person.press("2")
         person.press("3")
         votes = person.download()["votes"]
-    assert [(v["choice"], v["undone"]) for v in votes] == [("right", 1), ("same", 0)]
+        assert [(v["choice"], v["undone"]) for v in votes] == [("right", 1), ("same", 0)]
+        person.finish()
+        person.page.keyboard.press("u")  # also of the last trial
+        person.page.wait_for_selector(READY)
+        assert person.place == "Trial 6 of 6"
 
 
 def test_a_reload_shows_the_same_trial(chromium, pairs):

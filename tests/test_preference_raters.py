@@ -38,7 +38,9 @@ def study(tmp_path_factory):
         "size": 48,
         "names": [*STRENGTHS],
     }
-    preference.make(folders.reference, folders.methods, top / "study", **options)
+    with pytest.MonkeyPatch.context() as patch:  # of 100 secrets some leave a truth outside
+        patch.setattr("palpate.preference.making.secrets.token_hex", lambda size: "07" * size)
+        preference.make(folders.reference, folders.methods, top / "study", **options)
     return top / "study"
 
 

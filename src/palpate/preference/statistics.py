@@ -8,7 +8,7 @@ or NaN (none), in an array (R, C, N).
 **Two-way interval**: raters and items are resampled at once, each with replacement, and a vote
 weighs the product of the two counts (the pigeonhole bootstrap, Owen 2007). Percentiles of the
 replicates. Votes are not independent: of 40 items and 10 raters, intervals that take them so cover
-64 % instead of 95 %. Two raters are no sample of people: with ``FEW_RATERS`` or fewer, items alone
+67 % instead of 95 %. Two raters are no sample of people: with ``FEW_RATERS`` or fewer, items alone
 are resampled, and the interval is for these raters.
 
 **Davidson's model** (1970) of methods with strengths ``theta`` and a tie parameter ``nu``::

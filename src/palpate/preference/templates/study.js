@@ -335,7 +335,7 @@ function listen() {
     start();
   });
   document.addEventListener("keydown", event => {
-    if (event.ctrlKey || event.metaKey || event.altKey || $("trial").hidden) return;
+    if (event.ctrlKey || event.metaKey || event.altKey || $("footer").hidden) return;
     const place = KEYS.indexOf(event.key.toLowerCase()), single = event.key.length === 1;
     if (event.repeat) { // a key held down is one answer
       if (event.key === "Enter") event.preventDefault();
