@@ -27,10 +27,10 @@ def test_the_verdict_has_each_metric_once_and_the_best_but_never_the_real_images
     assert [c.metric for c in columns] == ["TMMD", "material accuracy", "D-TMMD"]
     rows = {row.subject: row.cells for row in verdict(columns)}
     assert list(rows) == ["ours", "theirs", "background only", "real images (floor)"]
-    best = {subject: [is_best for _, is_best in cells] for subject, cells in rows.items()}
+    best = {subject: [cell.best for cell in cells] for subject, cells in rows.items()}
     assert best["theirs"] == [True, True, True]
     assert not any(best["ours"] + best["background only"] + best["real images (floor)"])
-    assert [text for text, _ in rows["real images (floor)"]] == ["0.042", "0.900", "0.042"]
+    assert [cell.text for cell in rows["real images (floor)"]] == ["0.042", "0.900", "0.042"]
 
 
 def test_controls_of_a_study_follow_the_methods_and_are_never_the_best():
@@ -42,13 +42,16 @@ def test_controls_of_a_study_follow_the_methods_and_are_never_the_best():
         ("theirs", True),
         ("real images (floor)", False),
     ]
-    assert [is_best for _, is_best in rows[0].cells] == [True, True, True]
-    assert not any(is_best for row in rows[1:] for _, is_best in row.cells)
+    assert [cell.best for cell in rows[0].cells] == [True, True, True]
+    assert not any(cell.best for row in rows[1:] for cell in row.cells)
 
 
 def test_one_method_alone_is_best_of_nothing():
     (row, floor) = verdict(telling_columns(score_tables([score()])))
-    assert (row.cells, floor.subject) == ([("1.374", False)], "real images (floor)")
+    assert (row.cells, floor.subject) == (
+        [("1.374", False, "[1.010, 1.750]")],
+        "real images (floor)",
+    )
 
 
 def test_cards_hold_the_leak_the_distance_and_the_material():
@@ -62,6 +65,14 @@ def test_cards_hold_the_leak_the_distance_and_the_material():
     assert distance.foot.endswith("outside the gray band: it differs from real.")
     assert [r.text for r in material.rows] == ["50.0 %", "60.0 %", "20.0 %", "90.0 %"]
     assert "chance, 10.0 %" in material.foot
+
+
+def test_the_card_of_the_material_always_holds_the_real_images():
+    accuracy = {"higher_is_better": True, "null": None, "floor": None}
+    scores = [score("material accuracy", f"m{k}", k / 10, **accuracy) for k in range(6)]
+    scores.append(score("material accuracy", "real", 0.9, **accuracy))
+    (card,) = cards(Results("T", scores=scores), telling_columns(score_tables(scores)))
+    assert [row.label for row in card.rows] == ["m0", "m1", "m2", "real"]
 
 
 @pytest.mark.parametrize(

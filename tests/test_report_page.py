@@ -107,6 +107,13 @@ def shown_images(html):
     return [np.asarray(Image.open(io.BytesIO(base64.b64decode(d)))) for d in data]
 
 
+def test_a_page_in_a_new_folder_shows_images_of_another(tmp_path):
+    write_report(full_results(tmp_path), tmp_path / "new" / "page.html", base=tmp_path)
+    html = (tmp_path / "new" / "page.html").read_text(encoding="utf-8")
+    assert 'class="lost"' not in html
+    assert len(Tree(html).all("img")) > 6
+
+
 def test_a_page_is_well_formed_and_complete(tmp_path):
     html = page_of(full_results(tmp_path), tmp_path)
     tree = Tree(html)

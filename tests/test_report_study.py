@@ -21,7 +21,7 @@ from palpate.report.curves import curve_drawing, matrix_drawing, panels_of, stri
 from palpate.report.page import OPEN_CLAIMS, render_page
 from palpate.report.results import GalleryItem, Results
 from palpate.report.study import Claim, Curve, Line, StudyTable
-from palpate.report.study_tables import curve_table, sheet, tally
+from palpate.report.study_tables import brief, curve_table, file_names, sheet, tally
 from palpate.report.tables import heat_tables
 from report_fixtures import Tree, images, score, study_results, text_note
 
@@ -167,17 +167,38 @@ def test_the_page_has_its_sections_in_order_and_folds_what_is_folded(study):
     assert not re.findall(r"<h[1-4][^>]*>\s*</h", html)
 
 
-def test_claims_beyond_the_first_are_folded(tmp_path):
-    claims = [Claim(f"Claim {k}", "paper", "holds", "Why.") for k in range(OPEN_CLAIMS + 3)]
+def test_claims_take_turns_by_source_and_the_others_are_folded(tmp_path):
+    claims = [Claim(f"Claim {k}", "table 1", "holds", "Why.") for k in range(OPEN_CLAIMS)]
+    claims += [Claim(f"Claim {k}", "table 3", "undecided", "Why.") for k in (20, 21)]
     html, text = page_text(Results("T", claims=claims), tmp_path)
-    assert "3 more claims: 3 hold" in text
-    assert (
-        html.index(f"Claim {OPEN_CLAIMS - 1}<")
-        < html.index("more claims")
-        < html.index(f"Claim {OPEN_CLAIMS}<")
-    )
+    assert "2 more claims: 2 hold" in text
+    assert [int(k) for k in re.findall(r"Claim (\d+)<", html)] == [
+        *range(OPEN_CLAIMS - 2),
+        *(20, 21, OPEN_CLAIMS - 2, OPEN_CLAIMS - 1),
+    ]
     assert "which claims hold on these data" in text
     assert tally(claims[:1]) == "1 holds"
+
+
+def test_a_long_reason_is_cut_where_a_clause_ends_and_is_whole_in_the_evidence(tmp_path):
+    why = "; ".join(f"metric {k} puts Ours ahead by 0.0{k}" for k in range(20))
+    claim = Claim("C", "paper", "holds", why, [up("a", 0.5)])
+    many = dataclasses.replace(claim, evidence=[up(f"a{k}", 0.5) for k in range(600)])
+    assert "576 more in the JSON" in page_text(Results("T", claims=[many]), tmp_path)[1]
+    assert brief(why) == f"{why[: why.index('; metric 6')]} …"
+    assert len(brief("x" * 500)) == 222
+    assert brief("Short.") == "Short."
+    html, text = page_text(Results("T", claims=[claim]), tmp_path)
+    assert html.index(brief(why)) < html.index("Evidence (1)") < html.index(why)
+    assert why in Results("T", claims=[claim]).to_markdown().replace("\\", "")
+    assert why in text
+
+
+def test_files_are_named_by_kind_and_title_and_differ():
+    titles = ["Table 3: methods", "Table 3: methods!", "中", "x" * 90]
+    names = file_names("table", titles)
+    assert names == ["table-3-methods", "table-3-methods-2", "table", f"table-{'x' * 48}"]
+    assert len({*file_names("curve", ["a", "a 2", "a", "a"])}) == 4
 
 
 def test_everything_is_escaped(tmp_path):
@@ -239,7 +260,7 @@ def test_many_rows_long_words_and_empty_things_are_drawn(tmp_path):
 def test_csv_files_hold_the_scores_in_full_precision(study, tmp_path):
     results, _ = study
     files = {path.name: path for path in results.to_csv(tmp_path / "tables")}
-    table = next(path for name, path in files.items() if name.startswith("table-1-table-4-gen"))
+    table = next(path for name, path in files.items() if name == "table-4-generators.csv")
     head, *rows = list(csv.reader(table.open(encoding="utf-8")))
     assert head[:4] == ["method", "TMMD", "TMMD low", "TMMD high"]
     assert [row[-1] for row in rows] == ["false"] * 4 + ["true"] * 3
@@ -247,7 +268,7 @@ def test_csv_files_hold_the_scores_in_full_precision(study, tmp_path):
         assert float(row[1]) == cells[1].value
         assert (float(row[2]), float(row[3])) == cells[1].interval
     assert rows[1][head.index("D-TMMD")] == ""
-    curve = next(path for name, path in files.items() if name.startswith("curve-1-"))
+    curve = next(path for name, path in files.items() if name.startswith("curve-what-"))
     rows = list(csv.DictReader(curve.open(encoding="utf-8")))
     points = [
         (li.label, x, s.value, *s.interval) for li in results.curves[0].lines for x, s in li.points
@@ -482,7 +503,7 @@ def test_figures_hold_samples_pairs_and_the_background(tmp_path, monkeypatch):
     gallery = [GalleryItem(sample, "absent.png"), *results.gallery]
     results = dataclasses.replace(results, gallery=gallery)
     files = {path.name: path for path in results.save_figures("figures")}
-    assert {"samples.png", "background.png", "pairs-1-orig.png"} <= set(files)
+    assert {"samples.png", "background.png", "pairs-orig.png"} <= set(files)
     assert {
         path.suffix for name, path in files.items() if name.startswith(("curve", "strips"))
     } == {".svg", ".png"}

@@ -11,11 +11,11 @@ from typing import Any
 from palpate.core import Score, write_text
 from palpate.report.results import Results
 from palpate.report.study import Curve
-from palpate.report.study_tables import Sheet, sheets, slug
+from palpate.report.study_tables import Sheet, file_names, sheets
 
 
 def save_csv(results: Results, folder: Path) -> list[Path]:
-    """Write one file a table (``table-1-...``) and a curve (``curve-1-...``), and all others.
+    """Write one file a table (``table-...``) and a curve (``curve-...``), and all others.
 
     A column of scores is three: value, ``low`` and ``high`` of the interval. A curve has the
     columns ``line, x, value, low, high``. ``claims.csv`` has the claims, ``scores.csv`` the rows of
@@ -25,10 +25,13 @@ def save_csv(results: Results, folder: Path) -> list[Path]:
         PalpateError: if nothing can be written there.
     """
     texts: dict[str, str] = {}
-    for k, table in enumerate(sheets(results), 1):
-        texts[f"table-{slug(k, table.title)}.csv"] = _csv(_table(table))
-    for k, curve in enumerate(results.curves, 1):
-        texts[f"curve-{slug(k, curve.title)}.csv"] = _csv(_curve(curve))
+    tables = sheets(results)
+    names = file_names("table", [table.title for table in tables])
+    texts |= {f"{n}.csv": _csv(_table(table)) for n, table in zip(names, tables, strict=True)}
+    names = file_names("curve", [curve.title for curve in results.curves])
+    texts |= {
+        f"{n}.csv": _csv(_curve(curve)) for n, curve in zip(names, results.curves, strict=True)
+    }
     if results.claims:
         claims = [(c.claim, c.source, c.verdict, c.why) for c in results.claims]
         texts["claims.csv"] = _csv([("claim", "source", "verdict", "why"), *claims])

@@ -12,9 +12,10 @@ from pathlib import Path
 
 from PIL import Image, ImageDraw, ImageOps
 
-from palpate.core import atomic_path, write_text
+from palpate.core import Score, atomic_path, write_text
 from palpate.report import audits
 from palpate.report.curves import (
+    Panel,
     curve_drawing,
     matrix_drawing,
     panels_of,
@@ -22,10 +23,10 @@ from palpate.report.curves import (
     strips_drawing,
 )
 from palpate.report.drawing import COLORS, Drawing, font_of, in_ascii
-from palpate.report.first_screen import telling_columns
+from palpate.report.first_screen import COLUMNS, REAL, TELLING, telling_columns
 from palpate.report.page import gallery_images, in_turns, material_of, pair_images
 from palpate.report.results import Audit, Results
-from palpate.report.study_tables import sheets, slug
+from palpate.report.study_tables import file_names, sheets
 from palpate.report.tables import heat_tables, score_tables
 from palpate.report.thumbnails import Wanted, read_image
 
@@ -78,20 +79,34 @@ def save_figures(results: Results, folder: Path, *, base: Path) -> list[Path]:
 
 
 def _drawings(results: Results) -> dict[str, Drawing]:
-    drawings = {
-        f"curve-{slug(k, curve.title)}": curve_drawing(curve)
-        for k, curve in enumerate(results.curves, 1)
-    }
-    panels = score_panels(telling_columns(score_tables(results.scores)))
-    if panels:
+    names = file_names("curve", [curve.title for curve in results.curves])
+    drawings = dict(zip(names, map(curve_drawing, results.curves), strict=True))
+    if panels := score_panels(telling_columns(score_tables(results.scores))):
         drawings["strips-scores"] = strips_drawing("Scores", panels)
-    for k, table in enumerate(sheets(results), 1):
+    tables = sheets(results)
+    for name, table in zip(file_names("strips", [t.title for t in tables]), tables, strict=True):
         panels = [p for p in panels_of(table) if any(s.interval for _, s, _ in p.rows)]
-        if panels:
-            drawings[f"strips-{slug(k, table.title)}"] = strips_drawing(table.title, panels)
-    for k, heat in enumerate(heat_tables(results.scores), 1):
-        drawings[f"matrix-{slug(k, heat.title)}"] = matrix_drawing(heat)
-    return drawings
+        if panels := sorted(panels, key=_telling)[:COLUMNS]:
+            drawings[name] = strips_drawing(table.title, panels)
+    heats = heat_tables(_by_method(results))
+    names = file_names("matrix", [heat.title for heat in heats])
+    return drawings | dict(zip(names, map(matrix_drawing, heats), strict=True))
+
+
+def _telling(panel: Panel) -> int:
+    """The place of a panel among those that say most."""
+    metric = panel.rows[0][1].metric
+    return TELLING.index(metric) if metric in TELLING else len(TELLING)
+
+
+def _by_method(results: Results) -> list[Score]:
+    """The scores of methods: without controls, and of several presets the first."""
+    controls = {REAL, *(name for table in results.tables for name in table.controls)}
+    first: dict[tuple[str, str], Score] = {}
+    for score in results.scores:
+        if score.subject not in controls:
+            first.setdefault((score.metric, score.subject), score)
+    return [*first.values()]
 
 
 def _pictures(results: Results) -> dict[str, Picture]:
@@ -103,9 +118,10 @@ def _pictures(results: Results) -> dict[str, Picture]:
         pictures["samples"] = Picture(headings, [(row[0].label, row) for row in rows])
     if background := _background(results):
         pictures["background"] = background
-    for k, audit in enumerate(results.audits, 1):
+    leaking = [audit for audit in results.audits if audit.leaked_fraction]
+    for name, audit in zip(file_names("pairs", [a.name for a in leaking]), leaking, strict=True):
         if pairs := _pairs(audit):
-            pictures[f"pairs-{slug(k, audit.name)}"] = pairs
+            pictures[name] = pairs
     return pictures
 
 
@@ -147,7 +163,7 @@ def _grid(picture: Picture, base: Path) -> Image.Image:
             words = words[:-2].rstrip() + ("…" if whole else ".")
         return words
 
-    left = max(round(font.getlength(label)) for label, _ in picture.rows) + 2 * GAP
+    left = max(round(font.getlength(label)) for label, _ in picture.rows) + 3 * GAP
     top = LETTERS + 2 * GAP
     size = (left + len(picture.headings) * (SIDE + GAP), top + len(picture.rows) * (SIDE + GAP))
     image = Image.new("RGB", size, COLORS["paper"])

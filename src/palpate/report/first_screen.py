@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 from markupsafe import Markup
 
@@ -49,12 +50,20 @@ class Card:
     strip: Markup | None = None
 
 
+class VerdictCell(NamedTuple):
+    """A number as text, whether it is the best of its column, and its interval as text."""
+
+    text: str
+    best: bool = False
+    interval: str = ""
+
+
 @dataclass(frozen=True)
 class VerdictRow:
-    """One method or control: for each column the number as text, and whether it is the best."""
+    """One method or control: a cell for each column."""
 
     subject: str
-    cells: Sequence[tuple[str, bool]]
+    cells: Sequence[VerdictCell]
     control: bool = False
 
 
@@ -99,18 +108,21 @@ def verdict(columns: Sequence[Column], controls: Collection[str] = ()) -> list[V
     floors = [next((c.score.floor for c in column.cells), None) for column in columns]
     texts = ["" if f is None else number(f, c.digits) for f, c in zip(floors, columns, strict=True)]
     if any(texts):
-        known = rows.pop().cells if REAL in subjects else [("", False)] * len(columns)
-        cells = [(t or text, False) for t, (text, _) in zip(texts, known, strict=True)]
+        known = rows.pop().cells if REAL in subjects else [VerdictCell("")] * len(columns)
+        cells = [VerdictCell(t) if t else cell for t, cell in zip(texts, known, strict=True)]
         rows.append(VerdictRow("real images (floor)", cells))
     return rows
 
 
-def _verdict_cell(column: Column, subject: str, best: str | None) -> tuple[str, bool]:
+def _verdict_cell(column: Column, subject: str, best: str | None) -> VerdictCell:
     cell = next((c for c in column.cells if c.score.subject == subject), None)
     if cell is None:
-        return "", False
-    text = number(cell.score.value, column.digits) if cell.defined else "undefined"
-    return text, subject == best
+        return VerdictCell("")
+    if not cell.defined:
+        return VerdictCell("undefined")
+    low_high = ", ".join(number(v, column.digits) for v in cell.score.interval or ())
+    interval = f"[{low_high}]" if low_high else ""
+    return VerdictCell(number(cell.score.value, column.digits), subject == best, interval)
 
 
 def _best(column: Column, controls: Collection[str]) -> str | None:
@@ -189,7 +201,11 @@ def _score_card(column: Column) -> Card:
     first = cells[0]
     share = "accuracy" in column.metric
     mark = first.baselines.get("chance") if share else first.score.floor
-    rows = [_score_row(cell, column, mark) for cell in cells[:CARD_ROWS]]
+    shown = cells[:CARD_ROWS]
+    shown[CARD_ROWS - 1 :] = [c for c in cells[CARD_ROWS - 1 :] if c.score.subject == REAL] or (
+        shown[CARD_ROWS - 1 :]
+    )
+    rows = [_score_row(cell, column, mark) for cell in shown]
     title = f"{QUESTIONS.get(column.metric, column.metric)} {column.arrow}"
     if share:
         return Card(title, rows, f"Share right; dashed: chance, {percent(mark)}." if mark else "")

@@ -37,7 +37,7 @@ HERO_ROWS = 3
 OPEN_ROWS, MAX_ROWS = 8, 160
 OPEN_PAIRS, MAX_PAIRS = 6, 24
 #: Claims that show at once.
-OPEN_CLAIMS = 10
+OPEN_CLAIMS = 8
 #: A list in the settings is cut here; the JSON keeps it whole.
 LONG_LIST = 24
 _DIGEST = re.compile(r"(?:sha256:)?[0-9a-f]{32,128}")
@@ -98,6 +98,7 @@ def write_report(
     files = ReportFiles(page, page.with_suffix(".json"), page.with_suffix(".md"))
     names = (files.json.name, files.markdown.name)
     markdown = results.to_markdown()
+    folder.mkdir(parents=True, exist_ok=True)  # paths of images lead through it
     html = render_page(results, folder, max_bytes=max_bytes, names=names, progress=progress)
     write_json(files.json, results.to_json())
     write_text(files.markdown, markdown)

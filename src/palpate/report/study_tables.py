@@ -10,6 +10,7 @@ import re
 from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from itertools import count
 
 from palpate.core import Note, Score
 from palpate.core.score import ARROWS, BETTER
@@ -146,10 +147,38 @@ def tally(claims: Sequence[Claim]) -> str:
     )
 
 
-def slug(k: int, title: str) -> str:
-    """Return a number and a short form of a title, as part of a file name."""
-    words = re.sub("[^a-z0-9]+", "-", title.lower()).strip("-")
-    return f"{k}-{words[:40]}".strip("-")
+def in_turns_by_source(claims: Sequence[Claim], most: int) -> tuple[list[Claim], list[Claim]]:
+    """Return at most ``most`` claims, and the others, both in their order.
+
+    Sources take turns: every one shows its first claim before any shows its second.
+    """
+    turns: Counter[str] = Counter()
+    ranks: list[tuple[int, int]] = []
+    for k, claim in enumerate(claims):
+        ranks.append((turns[claim.source], k))
+        turns[claim.source] += 1
+    chosen = {k for _, k in sorted(ranks)[:most]}
+    shown = [claim for k, claim in enumerate(claims) if k in chosen]
+    return shown, [claim for k, claim in enumerate(claims) if k not in chosen]
+
+
+def brief(text: str, most: int = 220) -> str:
+    """Return the first clauses of a long reason; its evidence has all of it."""
+    if len(text) <= most:
+        return text
+    ends = (text.rfind("; ", 0, most), text.rfind(" ", 0, most), most)
+    return f"{text[: next(end for end in ends if end > 0)]} …"
+
+
+def file_names(kind: str, titles: Sequence[str]) -> list[str]:
+    """Return a name for each file: its kind and title in a short form, and a number if needed."""
+    names: list[str] = []
+    for title in titles:
+        words = re.sub("[^a-z0-9]+", "-", title.lower()).strip("-")[:48].strip("-")
+        name = words if words.startswith(f"{kind}-") else f"{kind}-{words}".strip("-")
+        same = (f"{name}-{k}" for k in count(2))
+        names.append(name if name not in names else next(n for n in same if n not in names))
+    return names
 
 
 def evidence_digits(claim: Claim) -> list[int]:

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 from palpate.core import Score
 from palpate.report.study import StudyTable
@@ -213,5 +212,4 @@ def _of_methods(context: _Context, number: int) -> StudyTable:
         4: "The paper: Ours before GVST in every column.",
     }[number]
     title = {3: "Table 3: methods by metric", 4: "Table 4: against prior art"}[number]
-    more: dict[str, Any] = {"best": True, "controls": controls, "folded": number != 3}
-    return StudyTable(title, text, ["images", *metrics], rows, **more)
+    return StudyTable(title, text, ["images", *metrics], rows, best=True, controls=controls)
