@@ -23,7 +23,7 @@ class Options(Common):
     study: Annotated[str, tyro.conf.Positional]
     """`world-gelsight` (tables 1, 3 and 4) or `world-digit` (tables 2 and 4)."""
     output: OutPath
-    """Run folder: results.json, page.html, tables.tex, scores.csv, and a folder a stage."""
+    """Run folder: results.json, page.html, tables.tex, tables/ (CSV), and a folder a stage."""
     preset: str = "mini"
     """`mini` takes about an hour a seed on two cores; `smoke` only shows that everything runs."""
     seeds: tuple[int, ...] = (0,)
@@ -77,7 +77,7 @@ def run(options: Options, terminal: Terminal) -> dict[str, Any]:
     page = output / "page.html"
     results.to_html(page)
     write_text(output / "tables.tex", results.to_latex())
-    results.to_frame().write_csv(output / "scores.csv")
+    results.to_csv(output / "tables")
     terminal.print("")
     for line in summary_lines(results):
         terminal.print(line)

@@ -13,6 +13,7 @@ from palpate.diffusion.generation import Generated
 from palpate.evaluation.probing import results_of
 from palpate.report.notes import percent
 from palpate.report.results import Audit, Results
+from palpate.report.study import Curve
 from palpate.studies.claims import Names, differences_over_seeds, effect_table, paper_claims
 from palpate.studies.controls import FLOOR, NEAREST
 from palpate.studies.demo_page import gallery as gallery_of
@@ -35,11 +36,13 @@ def collect(
     judgments: Mapping[tuple[str, str], Sequence[str]],
     probes: Mapping[str, Sequence[str]],
     gallery: str,
+    questions: Sequence[str] = (),
 ) -> Facts:
     """Write ``results.json``: everything but the record of the run.
 
     ``judgments``: (split of the images, split of the judge) -> nodes, one a seed; ``probes``: split
-    -> nodes; ``gallery``: node of the images that are shown.
+    -> nodes; ``gallery``: node of the images that are shown; ``questions``: nodes of further
+    tables, curves and claims.
     """
     manifest = Manifest.load(after["data"])
     splits = {name: Split.load(after["split"] / f"{name}.json") for name in SPLITS}
@@ -62,9 +65,12 @@ def collect(
             controls=names["controls"],
         ),
     ]
+    answers = [Results.load(after[node] / "results.json") for node in questions]
+    tables += [table for answer in answers for table in answer.tables]
     images = [m for m in methods if m.startswith("GVST")]
     tasks = {**_tasks_of_encoders(probed.scores), **_tasks_of_generators(seeds)}
     claims = paper_claims(noleak, tasks=tasks, names=Names(OURS, images))
+    claims += [claim for answer in answers for claim in answer.claims]
     notes = [*probed.notes, *([Note("synthetic-data")] if manifest.facts.get("synthetic") else [])]
     results = Results(
         title=study.title,
@@ -75,6 +81,7 @@ def collect(
         settings={"split rule": {name: dict(s.rule) for name, s in splits.items()}},
         notes=notes,
         tables=[replace(t, rows=_staged_rows(t.rows, stage)) for t in tables],
+        curves=[_staged_curve(c, stage) for a in answers for c in a.curves],
         claims=[replace(c, evidence=[_staged(s, stage) for s in c.evidence]) for c in claims],
     )
     results.save(place / "results.json")
@@ -123,6 +130,11 @@ def _staged(score: Score, stage: str) -> Score:
 
 def _staged_rows(rows: Sequence[Sequence[Any]], stage: str) -> list[list[Any]]:
     return [[_staged(c, stage) if isinstance(c, Score) else c for c in row] for row in rows]
+
+
+def _staged_curve(curve: Curve, stage: str) -> Curve:
+    lines = [replace(n, points=[(x, _staged(s, stage)) for x, s in n.points]) for n in curve.lines]
+    return replace(curve, lines=lines)
 
 
 def _leak(audits: Sequence[Audit]) -> str:

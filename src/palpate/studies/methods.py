@@ -24,6 +24,7 @@ from palpate.diffusion.presets import DiffusionPreset
 Images = NDArray[np.uint8]
 #: The paper's training, driven at test time by the photo in the place of the text.
 OURS = "Ours"
+BRIDGE, GVST, BEST = "Ours w/ memory bridge", "GVST", "best"
 #: Text conditions the training, with nothing that bridges to photos.
 BARE: Mapping[str, Any] = {"source": "text", "gap": "none", "noise": 0.0}
 
@@ -112,13 +113,13 @@ METHODS: Mapping[str, Method] = {
         Method(OURS, "Trained on texts, driven by the photo's embedding in their place.", BARE),
         Method("Ours, by text", "Ours, driven by each sample's own text.", BARE, drive="text"),
         Method(
-            "Ours w/ memory bridge",
+            BRIDGE,
             "Ours; the photo is replaced by its projection on the training texts.",
             {**BARE, "gap": "memory"},
         ),
         Method("Ours w/ BG", "Ours, which also sees the no-contact image.", BARE, background=True),
         Method(
-            "GVST",
+            GVST,
             "The same token from photos in training, too: no text.",
             {**BARE, "source": "vision"},
         ),
@@ -128,7 +129,7 @@ METHODS: Mapping[str, Method] = {
             {**BARE, "source": "resnet"},
         ),
         Method(
-            "best",
+            BEST,
             "Preset mini: a token of the text and one of the photo, memory bridge, noise, and an "
             "autoencoder that is given the gel.",
             gel=True,

@@ -38,8 +38,21 @@ from palpate.studies.graph import Node, Planned, plan_graph, run_graph
 from palpate.studies.judging import Judging, judge_images, probe_encoders
 from palpate.studies.making import slug
 from palpate.studies.methods import Method
+from palpate.studies.questions import (
+    MOVED,
+    compare_rulers,
+    measure_moves,
+    measure_utility,
+    move_images,
+)
 from palpate.studies.stages import Stage
 from palpate.studies.study import NOLEAK, SPLITS, Preset, Study
+from palpate.studies.utility import Draws
+
+#: Stages whose tables, curves and claims come after those of the paper.
+QUESTIONS = ("utility", "appearance", "rulers")
+#: The judge that is not trained in the run.
+RULER = "shipped"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -138,7 +151,7 @@ def nodes_of(plan: Plan) -> list[Node]:
             nodes += _method_nodes(plan, method, split, seed, trained)
     nodes += [
         Node(
-            f"images-{slug(name)}-{NOLEAK}",
+            _images_of_others(name),
             partial(making.take_images, split=NOLEAK, folder=folder, size=preset.diffusion.size),
             {"folder": read_samples(folder, str(folder)).image_digest()},
             ["data", "split"],
@@ -148,6 +161,8 @@ def nodes_of(plan: Plan) -> list[Node]:
     ]
     for seed, split, judge in product(plan.seeds, SPLITS, SPLITS):
         nodes.append(_score_node(plan, split, judge, seed))
+    questions = _question_nodes(plan)
+    nodes += questions
     judgments = {(s, j): [_scores(s, j, n) for n in plan.seeds] for s, j in product(SPLITS, SPLITS)}
     probes = {split: [f"probe-{split}-{seed}" for seed in plan.seeds] for split in SPLITS}
     first = _images(study.on_both[0], NOLEAK, plan.seeds[0])
@@ -158,9 +173,10 @@ def nodes_of(plan: Plan) -> list[Node]:
         judgments=judgments,
         probes=probes,
         gallery=first,
+        questions=[node.name for node in questions if node.name in QUESTIONS],
     )
     read = [node for of in (judgments, probes) for nodes in of.values() for node in nodes]
-    after = ["data", "split", first, *read]
+    after = ["data", "split", first, *read, *(n.name for n in questions if n.name in QUESTIONS)]
     inputs = {"study": study.name, "title": study.title, "tables": study.tables}
     nodes.append(Node("results", build, inputs, after, cost=10))
     return nodes
@@ -212,13 +228,13 @@ def _data_nodes(plan: Plan) -> list[Node]:
     if study.world is not None:
         world = _world(study, plan.preset)
         build = partial(making.make_world, options=world)
-        nodes.append(Node("world", build, {"options": world, "digest": world.digest}, cost=30))
+        nodes.append(Node("world", build, {"options": world, "digest": world.digest}, cost=60))
     build = partial(making.read_data, study=study, root=plan.root)
     inputs: dict[str, Any] = {"read": _source(study.read)}
     if plan.root is not None:
         inputs |= {"root": str(plan.root.resolve()), "stamp": stamp(plan.root)}
     nodes.append(Node("data", build, inputs, [node.name for node in nodes], cost=10))
-    nodes.append(Node("split", making.make_splits, {}, ["data"], cost=30))
+    nodes.append(Node("split", making.make_splits, {}, ["data"], cost=60))
     return nodes
 
 
@@ -233,6 +249,59 @@ def _autoencoder_nodes(plan: Plan, split: str) -> list[Node]:
         build = partial(making.make_autoencoder, device=plan.device, **how)
         nodes.append(Node(name, build, how, ["data", "split"], cost=preset.seconds[1]))
     return nodes
+
+
+def _question_nodes(plan: Plan) -> list[Node]:
+    """What generation is for, what moves it, and which ruler: as far as the data allow."""
+    study, preset, first = plan.study, plan.preset, plan.seeds[0]
+    trained = {m.name: m for m in study.trained_on(NOLEAK) if m.make is None}
+    nodes: list[Node] = []
+    made = {n: _images(n, NOLEAK, first) for n in study.useful if n in trained}
+    if 2 not in study.tables and made:
+        judge, draws = f"encoder-{NOLEAK}-{first}", Draws()
+        build = partial(measure_utility, encoders=judge, images=made, draws=draws)
+        after = ["data", "split", judge, *made.values()]
+        build = partial(build, device=plan.device)
+        nodes.append(Node("utility", build, {"draws": draws}, after, cost=120))
+    names = [n for n in study.moved if n in trained]
+    if study.world is not None and len(names) > 1:
+        nodes += _appearance_nodes(plan, {n: trained[n] for n in names})
+    if len(trained) > 2:
+        rulers = {f"trained on {j}": {s: _scores(NOLEAK, j, s) for s in plan.seeds} for j in SPLITS}
+        if preset.ruler is not None:
+            nodes += [_score_node(plan, NOLEAK, RULER, seed) for seed in plan.seeds]
+            rulers[preset.ruler] = {s: _scores(NOLEAK, RULER, s) for s in plan.seeds}
+        read = [node for of in rulers.values() for node in of.values()]
+        nodes.append(Node("rulers", partial(compare_rulers, rulers=rulers), {}, read, cost=5))
+    return nodes
+
+
+def _appearance_nodes(plan: Plan, methods: Mapping[str, Method]) -> list[Node]:
+    nodes, moved = list[Node](), dict[str, list[tuple[str, str]]]()
+    options = _world(plan.study, plan.preset)
+    for (name, method), seed in product(methods.items(), plan.seeds):
+        generator, judge = _generator(plan.study, method, NOLEAK, seed), f"encoder-{NOLEAK}-{seed}"
+        node = f"moved-{slug(name)}-{seed}"
+        build = partial(move_images, generator=generator, encoders=judge, options=options)
+        build = partial(build, seed=seed, device=plan.device)
+        after = ["data", "split", generator, judge]
+        nodes.append(Node(node, build, {"samples": MOVED, "seed": seed}, after, cost=90))
+        moved.setdefault(name, []).append((node, judge))
+    read = [node for pairs in moved.values() for pair in pairs for node in pair]
+    ours, other = plan.study.moved[:2]
+    build = partial(measure_moves, moved=moved, ours=ours, other=other, device=plan.device)
+    after = ["data", "split", *dict.fromkeys(read)]
+    return [*nodes, Node("appearance", build, {}, after, cost=10)]
+
+
+def _generator(study: Study, method: Method, split: str, seed: int) -> str:
+    """The node that trains a method: that of the first one of the same training."""
+    same = (m for m in study.methods if m.make is None and m.training == method.training)
+    return f"{slug(next(same).name)}-{split}-{seed}"
+
+
+def _images_of_others(name: str) -> str:
+    return f"images-{slug(name)}-{NOLEAK}"
 
 
 def _images(method: str, split: str, seed: int) -> str:
@@ -256,8 +325,7 @@ def _method_nodes(
         autoencoder = gel if isinstance(gel, str) else f"autoencoder-gel-{split}"
     own = [] if "/" in autoencoder else [autoencoder]
     if method.make is None:
-        first = next(m for m in study.methods if m.make is None and m.training == method.training)
-        generator = f"{slug(first.name)}-{split}-{seed}"
+        generator = _generator(study, method, split, seed)
         if generator not in trained:
             trained.add(generator)
             inputs = {"method": method.training, "diffusion": method.preset(preset.diffusion)}
@@ -274,19 +342,18 @@ def _method_nodes(
         else {"make": _source(method.make), "size": preset.diffusion.size, "steps": preset.steps}
     )
     after = ["data", "split", generator or autoencoder]
-    nodes.append(Node(_images(method.name, split, seed), build, inputs, after, cost=30))
+    nodes.append(Node(_images(method.name, split, seed), build, inputs, after, cost=60))
     return nodes
 
 
 def _score_node(plan: Plan, split: str, judge: str, seed: int) -> Node:
-    """What the encoder of ``judge`` says of the images of ``split``: of other splits the first."""
+    """What the encoder of ``judge``, or the other ruler, says of the images of ``split``."""
     study, preset, encoder = plan.study, plan.preset, f"encoder-{judge}-{seed}"
+    encoder = str(preset.ruler) if judge == RULER else encoder
     chosen = [m.name for m in study.trained_on(split)]
-    if judge != split:
-        chosen = list(study.on_both)
     methods = {name: _images(name, split, seed) for name in chosen}
     if split == judge == NOLEAK:
-        methods |= {name: f"images-{slug(name)}-{NOLEAK}" for name in plan.others}
+        methods |= {name: _images_of_others(name) for name in plan.others}
     judging = Judging(
         split,
         encoder,
@@ -300,8 +367,9 @@ def _score_node(plan: Plan, split: str, judge: str, seed: int) -> Node:
     )
     build = partial(judge_images, judging=judging, device=plan.device)
     inputs = {**vars(judging), "metrics": [_source(m) for m in study.metrics]}
-    after = ["data", "split", encoder, f"controls-{split}", *methods.values()]
-    return Node(_scores(split, judge, seed), build, inputs, after, cost=60)
+    own = [] if judge == RULER else [encoder]
+    after = ["data", "split", *own, f"controls-{split}", *methods.values()]
+    return Node(_scores(split, judge, seed), build, inputs, after, version=2, cost=60)
 
 
 def _source(function: Callable[..., Any]) -> str:

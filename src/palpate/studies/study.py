@@ -21,7 +21,7 @@ from palpate.encoders.presets import EncoderPreset
 from palpate.sim import PRESETS as WORLDS
 from palpate.sim import WorldOptions
 from palpate.studies.controls import CONTROLS
-from palpate.studies.methods import METHODS, OURS, Images, Make, Method
+from palpate.studies.methods import BEST, BRIDGE, GVST, METHODS, OURS, Images, Make, Method
 
 #: The data set's own split, and ours.
 ORIG, NOLEAK = "Orig", "NoLeak"
@@ -41,6 +41,7 @@ class Preset:
         autoencoder: of the methods, trained on the train part of each split.
         gel: the autoencoder that is given the no-contact image: shipped, or trained likewise.
         clip: frozen vision and text encoders: a shipped name, hub id or folder.
+        ruler: another set of encoders that ranks the methods: a shipped name, or none.
         permutations: of the permutation test of TMMD.
         cost: what a seed takes, and where that was measured.
         seconds: expected of one training of an encoder, of the autoencoder, and of a method.
@@ -54,6 +55,7 @@ class Preset:
     autoencoder: AutoencoderOptions
     gel: str | BackgroundOptions
     clip: str
+    ruler: str | None = "palpate/mini"
     permutations: int = 999
     cost: str = ""
     seconds: tuple[float, float, float] = (0.0, 0.0, 0.0)
@@ -101,6 +103,9 @@ class Study:
         on_both: names of methods that are trained on the data set's own split as well.
         controls: name -> what makes their images.
         metrics: further metrics.
+        useful: names of methods whose images train classifiers, where there are materials.
+        moved: names of methods whose photos are shown otherwise, on the world; text is said to be a
+            filter of the first one, against images in the second one.
         presets: sizes by name.
         paper: whether the data are those of the paper, whose numbers then stand beside ours.
     """
@@ -114,6 +119,8 @@ class Study:
     on_both: Sequence[str] = (OURS,)
     controls: Mapping[str, Make] = field(default_factory=lambda: dict(CONTROLS))
     metrics: Sequence[Metric] = ()
+    useful: Sequence[str] = (OURS, BEST)
+    moved: Sequence[str] = (OURS, GVST, BRIDGE)
     presets: Mapping[str, Preset] = field(default_factory=lambda: PRESETS)
     paper: bool = False
 
@@ -144,7 +151,7 @@ _SMOKE_WORLD = replace(
     test=0.375,
 )
 _VQ = AutoencoderOptions(
-    patch=2, widths=(32, 64), channels=4, codes=8192, steps_free=3000, steps_quantized=400
+    patch=2, widths=(32, 64), channels=4, codes=8192, steps_free=1000, steps_quantized=200
 )
 
 PRESETS: Mapping[str, Preset] = {
@@ -183,8 +190,8 @@ PRESETS: Mapping[str, Preset] = {
             autoencoder=_VQ,
             gel="palpate/mini",
             clip="palpate/mini",
-            cost="under 90 minutes a seed on two x86-64 cores",
-            seconds=(180, 180, 370),
+            cost="about 90 minutes of one x86-64 core a seed",
+            seconds=(180, 450, 370),
         ),
     )
 }

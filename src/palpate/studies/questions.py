@@ -1,0 +1,165 @@
+"""Further questions of a study as stages: what generation is for, what moves it, which ruler.
+
+Bodies of nodes, as :mod:`palpate.studies.making`; each writes tables, curves and claims as
+``results.json``, which the last stage takes over.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from palpate.core import FeatureSet, Progress, Score, read_json
+from palpate.data.images import cached_images
+from palpate.data.manifest import Manifest
+from palpate.diffusion.autoencoders import gels_of
+from palpate.diffusion.generation import Generated
+from palpate.diffusion.pipeline import TactilePipeline
+from palpate.encoders.embed import embed, embed_images
+from palpate.encoders.encoder_set import EncoderSet
+from palpate.encoders.models import pick_device
+from palpate.encoders.rows import evenly
+from palpate.report.results import Results
+from palpate.report.study import Claim, Curve, StudyTable
+from palpate.sim.appearance import APPEARANCES, Appearance
+from palpate.sim.options import WorldOptions
+from palpate.sim.photos import with_photos
+from palpate.studies.appearance import AGAIN, RECORDED, appearance_claims, appearance_table, moves
+from palpate.studies.judging import read_scores
+from palpate.studies.making import After, Facts, cache_of, data_of, slug
+from palpate.studies.rulers import ruler_claim, ruler_scores, ruler_tables
+from palpate.studies.study import NOLEAK
+from palpate.studies.study_tables import READING
+from palpate.studies.utility import Draws, utility
+
+#: Samples whose photos are shown otherwise.
+MOVED = 200
+
+
+def measure_utility(
+    place: Path,
+    after: After,
+    progress: Progress,
+    *,
+    encoders: str,
+    images: Mapping[str, str],
+    draws: Draws,
+    device: str,
+) -> Facts:
+    """What generated images are worth for a classifier and for retrieval of real touch.
+
+    ``images``: method -> node of its images, made for photos.
+    """
+    manifest, split = data_of(after, NOLEAK)
+    judge = EncoderSet.load(after[encoders] / "encoders", device=device)
+    made = {name: Generated.load(after[node] / "images") for name, node in images.items()}
+    tables, curve = utility(manifest, split, judge, made, draws, progress=progress)
+    return _write(place, tables, [curve])
+
+
+def move_images(
+    place: Path,
+    after: After,
+    progress: Progress,
+    *,
+    generator: str,
+    encoders: str,
+    options: WorldOptions,
+    seed: int,
+    device: str,
+) -> Facts:
+    """Features of one training's images for the same contacts, photographed otherwise."""
+    manifest, split = data_of(after, NOLEAK)
+    test = manifest.part(split, "test")
+    test = test.take([test.ids[k] for k in evenly(len(test), MOVED)])
+    judge = EncoderSet.load(after[encoders] / "encoders", device=device)
+    pipeline = TactilePipeline.from_pretrained(after[generator] / "model").to(pick_device(device))
+    cache, gels = cache_of(place), None
+    if pipeline.background or pipeline.gel is not None:
+        gels = gels_of(test, pipeline.size, cache, progress)
+    of = embed(test, judge, "tactile", cache=cache, still=True)
+    for name in (*APPEARANCES, AGAIN):
+        shown = _photographed(test, options, name, place / "photos", progress)
+        photos = pipeline.embed(cached_images(shown, "vision", pipeline.vision_size))
+        noise = seed + 1000 if name == AGAIN else seed
+        images = pipeline.sample(photos, test.ids, seed=noise, background=gels)
+        FeatureSet(
+            test.ids, embed_images(images, judge), of.labels, of.groups, judge.digest("tactile")
+        ).save(place / f"{slug(name)}.npz")
+    return {"samples": len(test)}
+
+
+def _photographed(
+    test: Manifest, options: WorldOptions, name: str, folder: Path, progress: Progress
+) -> Manifest:
+    """The samples with photos of another appearance."""
+    if name in (RECORDED, AGAIN):
+        return test
+    appearance: Appearance = next(a for a in APPEARANCES if a == name)
+    return with_photos(test, options, appearance, folder / slug(name), progress=progress)
+
+
+def measure_moves(
+    place: Path,
+    after: After,
+    progress: Progress,
+    *,
+    moved: Mapping[str, Sequence[tuple[str, str]]],
+    ours: str,
+    other: str,
+    device: str,
+) -> Facts:
+    """How far images and scores move when the photo alone changes.
+
+    ``moved``: method -> (node of the features, node of the judge), one a seed.
+    """
+    manifest, split = data_of(after, NOLEAK)
+    train, cache = manifest.part(split, "train"), cache_of(place)
+    runs: dict[str, list[Any]] = {}
+    for method, nodes in moved.items():
+        for node, encoders in nodes:
+            judge = EncoderSet.load(after[encoders] / "encoders", device=device)
+            sets = {n: FeatureSet.load(after[node] / f"{slug(n)}.npz") for n in APPEARANCES}
+            again = FeatureSet.load(after[node] / f"{slug(AGAIN)}.npz")
+            real = embed(manifest.take(again.ids), judge, "tactile", cache=cache, still=True)
+            known = embed(train, judge, "tactile", cache=cache) if real.labels else None
+            how: dict[str, Any] = {"train": known, "subject": method, "split": split.digest}
+            runs.setdefault(method, []).append(moves(sets, again, real, **how))
+    return _write(place, [appearance_table(runs)], claims=appearance_claims(runs, ours, other))
+
+
+def compare_rulers(
+    place: Path, after: After, progress: Progress, *, rulers: Mapping[str, Mapping[int, str]]
+) -> Facts:
+    """Whether encoders of other training rank the generators alike.
+
+    ``rulers``: name of an encoder -> seed -> node of its scores.
+    """
+    ranked: dict[str, dict[tuple[str, int], Score]] = {}
+    for ruler, nodes in rulers.items():
+        for seed, node in nodes.items():
+            methods = _methods_of(after[node])
+            for s in read_scores(after[node]):
+                of = s.metric, s.settings.get("preset")
+                if of == ("TMMD", READING) and s.subject in methods and s.value is not None:
+                    ranked.setdefault(ruler, {})[s.subject, seed] = s
+    shared = set.intersection(*({*of} for of in ranked.values()))
+    same = {name: {g: of[g] for g in sorted(shared)} for name, of in ranked.items()}
+    agreement = ruler_scores(same)
+    return _write(place, ruler_tables(same, agreement), claims=[ruler_claim(agreement)])
+
+
+def _methods_of(folder: Path) -> Sequence[str]:
+    """The methods among the subjects that a stage scored."""
+    return read_json(folder / "stage.json", "stage record")["facts"]["methods"]
+
+
+def _write(
+    place: Path,
+    tables: Sequence[StudyTable],
+    curves: Sequence[Curve] = (),
+    claims: Sequence[Claim] = (),
+) -> Facts:
+    Results(title="", tables=tables, curves=curves, claims=claims).save(place / "results.json")
+    return {"tables": len(tables), "curves": len(curves), "claims": len(claims)}
