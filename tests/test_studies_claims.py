@@ -15,12 +15,10 @@ from palpate.studies.claims import (
     discrimination_claim,
     effect_size,
     effect_table,
-    forty_table,
     leak_claims,
     paper_claims,
     preference_claims,
     ranking_claims,
-    seeded_items,
 )
 from palpate.studies.evidence import ahead, difference_between, over_seeds
 
@@ -194,22 +192,6 @@ def test_differences_of_seeds_are_joined_by_metric_pair_and_preset():
     claims = paper_claims([study(1, 0.005)], tasks={}, people=PEOPLE)
     assert len({c.claim for c in claims}) == len(claims) == 1 + 2 + 9 + 1
     assert claims[0].verdict == "undecided"  # no task was measured
-
-
-def test_forty_items_say_what_they_can_carry():
-    rng = np.random.default_rng(0)
-    ids, groups = [f"v{k // 5}/{k}" for k in range(400)], [f"v{k // 5}" for k in range(400)]
-    base = rng.normal(0.5, 0.1, 400)
-    values = {"SSIM": {"Ours": base, "GVST": base - 0.01 + rng.normal(0, 0.1, 400)}}
-    table = forty_table(values, ids, groups, better={"SSIM": True})
-    rows = seeded_items(ids)
-    assert len(rows) == 40
-    assert {ids[k] for k in rows} == {ids[::-1][k] for k in seeded_items(ids[::-1])}
-    assert float(table.rows[0][2]) == pytest.approx(base[rows].mean())
-    assert float(table.rows[0][3]) == pytest.approx(base.mean())
-    assert "cannot decide" in table.text
-    clear = {"SSIM": {"Ours": base, "GVST": base - 0.2 + rng.normal(0, 0.05, 400)}}
-    assert "and decide the 0.2" in forty_table(clear, ids, groups, better={"SSIM": True}).text
 
 
 def test_the_distance_of_patches_stands_in_for_lpips():

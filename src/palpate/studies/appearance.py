@@ -18,38 +18,18 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from palpate.core import (
-    FeatureSet,
-    PalpateError,
-    Progress,
-    Score,
-    Split,
-    quiet,
-    read_json,
-    write_json,
-)
-from palpate.core.digest import plain
-from palpate.data.manifest import Manifest
-from palpate.diffusion.generation import generate
-from palpate.diffusion.pipeline import TactilePipeline
-from palpate.encoders.embed import embed
-from palpate.encoders.encoder_set import EncoderSet
+from palpate.core import FeatureSet, PalpateError, Score
 from palpate.metrics import compare_tmmd, mean_score
 from palpate.metrics.intervals import Spread
 from palpate.metrics.means import Mean, mean_of, spread_of
 from palpate.metrics.paired import differences_of_means
 from palpate.metrics.probe import Probe, fit_probe
 from palpate.report.study import Claim, StudyTable
-from palpate.sim import WorldOptions
-from palpate.sim.appearance import APPEARANCES
-from palpate.sim.photos import with_photos
 from palpate.studies.claims import decide
-from palpate.studies.embedding import embed_generated
 from palpate.studies.evidence import in_words, over_seeds, side_of
 
 RECORDED, AGAIN = "as recorded", "another noise seed"
@@ -68,26 +48,6 @@ class Moves:
 
     distances: Mapping[str, Mean]
     changes: Mapping[str, Sequence[Score]]
-
-    def save(self, path: Path) -> None:
-        """Write everything as JSON, for :meth:`load`."""
-        distances = {
-            name: {"score": mean.score, "values": mean.values.tolist(), "groups": [*mean.groups]}
-            for name, mean in self.distances.items()
-        }
-        write_json(path, plain({"distances": distances, "changes": self.changes}))
-
-    @classmethod
-    def load(cls, path: Path) -> Moves:
-        """Read what :meth:`save` wrote."""
-        data = read_json(path, "moves of a method")
-        distances: dict[str, Mean] = {}
-        for name, of in data["distances"].items():
-            values, groups = np.array(of["values"]), np.array(of["groups"], dtype=str)
-            score = Score.from_json(of["score"])
-            distances[name] = Mean(score, values, np.ones(len(values)), groups)
-        changes = {n: [Score.from_json(s) for s in of] for n, of in data["changes"].items()}
-        return cls(distances, changes)
 
 
 def moves(
@@ -138,57 +98,6 @@ def moves(
             found.append((ACCURACY, differences_of_means(hits)[0]))
         changes[name] = [replace(d, metric=m, subject=fields["subject"]) for m, d in found]
     return Moves(distances, changes)
-
-
-def measure_moves(
-    manifest: Manifest,
-    split: Split,
-    options: WorldOptions,
-    pipeline: TactilePipeline | str | Path,
-    encoders: EncoderSet,
-    *,
-    subject: str,
-    folder: Path,
-    seed: int = 0,
-    device: str = "auto",
-    progress: Progress = quiet,
-) -> Moves:
-    """Render the test part's photos anew, generate from them, and compare: one training.
-
-    Args:
-        manifest: samples of a world.
-        split: whose test part is used; its train part fits the probe of material.
-        options: of the world.
-        pipeline: the generator, or its folder.
-        encoders: whose tactile encoder gives the features.
-        subject: name of the method.
-        folder: for photos and images; run again with the same one to go on.
-        seed: of the noise; the other noise is that of ``seed + 1000``.
-        device: ``auto``, ``cpu``, ``cuda`` or ``mps``.
-        progress: progress callback.
-
-    Raises:
-        PalpateError: as :func:`palpate.sim.photos.with_photos`, generating and :func:`moves` do.
-    """
-    test, train = (manifest.part(split, part) for part in ("test", "train"))
-
-    def features_of(photos: Manifest, name: str, noise: int) -> FeatureSet:
-        output = folder / "images" / name.replace(" ", "-")
-        how: dict[str, Any] = {"seed": noise, "device": device, "progress": progress}
-        generate(photos, model=pipeline, output=output, **how)
-        return embed_generated(output, test, encoders, progress)
-
-    renderings = {RECORDED: features_of(test, RECORDED, seed)}
-    for name in APPEARANCES[1:]:
-        place = folder / "photos" / name.replace(" ", "-")
-        photos = with_photos(test, options, name, place, progress=progress)
-        renderings[name] = features_of(photos, name, seed)
-    again = features_of(test, AGAIN, seed + 1000)
-    real = embed(test, encoders, "tactile", still=True, progress=progress)
-    known = embed(train, encoders, "tactile", progress=progress)
-    has = len({*(known.labels or ())} - {""}) > 1
-    how: dict[str, Any] = {"subject": subject, "split": split.digest}
-    return moves(renderings, again, real, train=known if has else None, **how)
 
 
 def _accuracy(

@@ -7,18 +7,19 @@ from pathlib import Path
 
 from palpate.core import FeatureSet, Progress, quiet
 from palpate.data.manifest import Manifest
+from palpate.diffusion.generation import Generated
 from palpate.encoders.embed import embed
 from palpate.encoders.encoder_set import EncoderSet
 from palpate.evaluation.inputs import read
 
 
-def generated_manifest(folder: Path | str, manifest: Manifest) -> Manifest:
-    """The samples of a folder of generated images, with these as their tactile images.
+def generated_manifest(images: Generated | Path | str, manifest: Manifest) -> Manifest:
+    """The samples of generated images, with these as their tactile images.
 
     Materials, videos, sensors and no-contact images are those of the manifest's samples.
 
     Args:
-        folder: of ``palpate generate``, or with a manifest of its own.
+        images: a folder of ``palpate generate``, also as it was returned, or one with a manifest.
         manifest: samples of the same ids, and perhaps others.
 
     Raises:
@@ -26,6 +27,7 @@ def generated_manifest(folder: Path | str, manifest: Manifest) -> Manifest:
     """
     import polars as pl
 
+    folder = images.folder if isinstance(images, Generated) else images
     made = read(str(folder), "generated").manifest
     assert made is not None  # a folder holds images
     paths = [str(path.resolve()) for path in made.paths("tactile")]
@@ -34,8 +36,11 @@ def generated_manifest(folder: Path | str, manifest: Manifest) -> Manifest:
 
 
 def embed_generated(
-    folder: Path | str, manifest: Manifest, encoders: EncoderSet, progress: Progress = quiet
+    images: Generated | Path | str,
+    manifest: Manifest,
+    encoders: EncoderSet,
+    progress: Progress = quiet,
 ) -> FeatureSet:
     """Tactile features (n, d) of generated images, with material and video of their samples."""
-    part = generated_manifest(folder, manifest)
+    part = generated_manifest(images, manifest)
     return embed(part, encoders, "tactile", still=True, progress=progress)

@@ -71,11 +71,7 @@ def photo_companions(
         options,
     )
     outcome = score_features(["fid", "cmmd"], features, False, progress)
-    real = _patches(reference, encoders)
-    values = {
-        method: ((_patches(images, encoders) - real) ** 2).sum(axis=2).mean(axis=1)
-        for method, images in generators.items()
-    }
+    values = {n: patch_distances(x, reference, encoders) for n, x in generators.items()}
     common: dict[str, Any] = {"higher_is_better": False, "encoder": digest, "split": split}
     scores = {
         method: mean_score(
@@ -85,6 +81,12 @@ def photo_companions(
     }
     between = mean_differences(scores, values, groups) if len(scores) > 1 else []
     return [*outcome.scores, *scores.values(), *outcome.differences, *between]
+
+
+def patch_distances(images: Images, reference: Images, encoders: EncoderSet) -> NDArray[np.float64]:
+    """The distance of patches (n,) of each pair of images (n, h, w, 3); 0: equal."""
+    x, y = (_patches(pair, encoders).astype(np.float64) for pair in (images, reference))
+    return ((x - y) ** 2).sum(axis=2).mean(axis=1)
 
 
 def _patches(images: Images, encoders: EncoderSet, batch: int = 128) -> NDArray[np.float32]:

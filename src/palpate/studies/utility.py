@@ -33,6 +33,7 @@ from numpy.typing import NDArray
 
 from palpate.core import FeatureSet, PalpateError, Progress, Score, Split, quiet, require, rng_for
 from palpate.data.manifest import Manifest
+from palpate.diffusion.generation import Generated
 from palpate.encoders.embed import embed
 from palpate.encoders.encoder_set import EncoderSet
 from palpate.evaluation.inputs import guard
@@ -369,7 +370,7 @@ def utility(
     manifest: Manifest,
     split: Split,
     encoders: EncoderSet,
-    generated: Mapping[str, Path],
+    generated: Mapping[str, Generated | Path],
     draws: Draws | None = None,
     *,
     progress: Progress = quiet,
@@ -380,7 +381,7 @@ def utility(
         manifest: the samples.
         split: leak-free; its train part gives the real videos, its test part is tested.
         encoders: tactile, vision and text, of which the tactile one must not have seen test images.
-        generated: name -> folder of images that were generated for photos of the test part.
+        generated: name -> images that were generated for photos of the test part, or their folder.
         draws: how videos are drawn.
         progress: progress callback.
 
