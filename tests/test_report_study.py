@@ -23,6 +23,7 @@ from palpate.report.results import GalleryItem, Results
 from palpate.report.study import Claim, Curve, Line, StudyTable
 from palpate.report.study_tables import brief, curve_table, file_names, sheet, tally
 from palpate.report.tables import heat_tables
+from palpate.report.terminal import as_text
 from report_fixtures import Tree, images, score, study_results, text_note
 
 NASTY = "<script>alert(1)</script> & \"q\" 'q' 100% $x_1$ \\input{a} | `c` [d]"
@@ -148,6 +149,31 @@ def test_every_front_end_has_every_number_verdict_and_reason(study):
     assert (
         Results.from_json(json.loads(json.dumps(results.to_json()))).to_json() == results.to_json()
     )
+
+
+@pytest.mark.parametrize("width", [70, 90, 140])
+def test_wide_tables_are_printed_in_blocks_of_columns_and_cut_no_number(study, width):
+    results, _ = study
+    text = as_text(Results("T", tables=results.tables), width)
+    assert max(map(len, text.splitlines())) <= width
+    blocks = {70: 4, 90: 2, 140: 1}[width]
+    assert text.count("real images of other videos") == blocks
+    for row in results.tables[0].rows:
+        for s in row[1:]:
+            if s is not None and s.value is not None and s.interval:
+                assert f"{s.value:.3f} [{s.interval[0]:.3f}, {s.interval[1]:.3f}]" in text
+    names = as_text(
+        Results("T", tables=[StudyTable("T", "", ["", "v"], [[LONG, up("a", 0.5)]])]), 40
+    )
+    assert names.splitlines()[1:3] == [LONG, "  v: 0.500 [1.010, 1.750]"]
+
+
+def test_the_terminal_shows_the_tables_of_a_study_instead_of_every_score(study):
+    results, _ = study
+    text = str(results)
+    assert "The 4 scores behind them" in text
+    assert "1.374" not in text
+    assert "1.374" in str(dataclasses.replace(results, tables=[]))
 
 
 def test_the_page_has_its_sections_in_order_and_folds_what_is_folded(study):

@@ -10,6 +10,7 @@ from rich.console import Console
 from rich.table import Table as Grid
 from rich.text import Text
 
+from palpate.core import Score
 from palpate.report.notes import COMMAND_LINE, PYTHON, Style, confidence, count, percent, sentence
 from palpate.report.results import Audit, Results
 from palpate.report.sentences import (
@@ -30,11 +31,26 @@ RANKED = "Best first on the same samples: > decided, ~ not decided"
 
 
 def print_result(result: Results | Audit, console: Console, style: Style = COMMAND_LINE) -> None:
-    """Print a result as wide as the console."""
+    """Print a result as wide as the console; of a study its tables instead of every score."""
     if isinstance(result, Audit):
         console.print(audit_text(result, style), markup=False, soft_wrap=True)
         return
-    for table in score_tables(result.scores):
+    if not result.tables:
+        _print_scores(result.scores, console, style)
+    for audit in result.audits:
+        print_result(audit, console, style)
+    tables = [*result.tables, *map(curve_table, result.curves)]
+    for table in map(sheet, tables):
+        _print_sheet(table, console, style)
+    if result.tables and result.scores:
+        console.print(f"The {len(result.scores):,} scores behind them: Results.to_frame()\n")
+    _print_claims(result.claims, console)
+    for note in result.notes:
+        console.print(Text(sentence(note, style)), soft_wrap=True)
+
+
+def _print_scores(scores: Sequence[Score], console: Console, style: Style) -> None:
+    for table in score_tables(scores):
         console.print(Text(table.title, "bold"))
         _print_rows(score_rows(table), console)
         marked = [cell for column in table.columns for cell in column.cells]
@@ -52,14 +68,6 @@ def print_result(result: Results | Audit, console: Console, style: Style = COMMA
         for line in lines:
             console.print(Text(line), soft_wrap=True)
         console.print()
-    for audit in result.audits:
-        print_result(audit, console, style)
-    tables = [*result.tables, *map(curve_table, result.curves)]
-    for table in map(sheet, tables):
-        _print_sheet(table, console, style)
-    _print_claims(result.claims, console)
-    for note in result.notes:
-        console.print(Text(sentence(note, style)), soft_wrap=True)
 
 
 def as_text(result: Results | Audit, width: int = 140) -> str:
@@ -136,12 +144,31 @@ def _entry(cell: Entry) -> str:
 
 def _print_sheet(table: Sheet, console: Console, style: Style) -> None:
     console.print(Text(table.title, "bold"), soft_wrap=True)
-    _print_rows(sheet_rows(table), console, sheet_words(table))
+    words = sheet_words(table)
+    for rows in _blocks(sheet_rows(table), words, console.width):
+        _print_rows(rows, console, words)
     lines = [f"* {BEST_OF_COLUMN}"] * table.has_best
     lines += [f"({k}) {sentence(note, style)}" for k, note in enumerate(table.notes, 1)]
     for line in lines:
         console.print(Text(line), soft_wrap=True)
     console.print()
+
+
+def _blocks(
+    rows: Sequence[dict[str, str]], words: Sequence[str], width: int
+) -> list[list[dict[str, str]]]:
+    """Columns of rows in blocks that fit, each with the words that the rows begin with."""
+    names = [name for name in rows[0] if any(row[name] for row in rows)] if rows else []
+    lead = [*takewhile(words.__contains__, names)]
+    size = {name: 2 + max(len(name), *(len(row[name]) for row in rows)) for name in names}
+    blocks: list[list[str]] = [[]]
+    for name in names[len(lead) :]:
+        if blocks[-1] and sum(size[n] for n in (*lead, *blocks[-1], name)) > width:
+            blocks.append([])
+        blocks[-1].append(name)
+    if any(sum(size[n] for n in (*lead, *block)) > width for block in blocks):
+        return [[*rows]]  # a list then
+    return [[{n: row[n] for n in (*lead, *block)} for row in rows] for block in blocks]
 
 
 def _print_claims(claims: Sequence[Claim], console: Console) -> None:
