@@ -131,6 +131,23 @@ def test_splits_are_compared_with_pools_of_one_size(manifest, encoders):
     assert len(str(results)) > 100  # both stand in one column
 
 
+def test_splits_are_compared_where_samples_lack_an_image(manifest, encoders):
+    splits = {"a": split_of(manifest, "v3", "v4", "v5"), "b": split_of(manifest, "v0", "v1", "v2")}
+    lost = manifest.ids[0], manifest.ids[-1], manifest.ids[-2]  # one of v0, two of v5
+    for column, pools in (("vision", {"vision": 22, "text": 24}), ("tactile", {"vision": 22})):
+        rows = zip(manifest.ids, manifest.column(column), strict=True)
+        some = with_columns(
+            manifest, **{column: pl.Series([None if i in lost else v for i, v in rows])}
+        )
+        results = probe(some, splits, encoder=encoders, top=(1,))
+        for other, n in {"text": 22, **pools}.items():
+            name = f"top-1 of {n} ({other} by tactile)"
+            a, b = (results[name, subject].value for subject in "ab")
+            assert results[f"{name} difference", "a - b"].value == pytest.approx(a - b)
+        counts = {n.params["count"] for n in results.notes if n.code == "probe-no-image"}
+        assert counts == ({3} if column == "tactile" else set())
+
+
 def test_several_labels_and_rows_without_one(manifest, split, encoders):
     rng = np.random.default_rng(0)
     hard = [None if k % 5 == 0 else str(rng.integers(2)) for k in range(len(manifest))]
@@ -185,6 +202,7 @@ def test_a_vision_encoder_needs_no_tactile_encoder(manifest, split):
         ({"neighbors": 0}, "`neighbors` must be at least 1"),
         ({"top": (0, 1)}, "`top` must be ranks from 1"),
         ({"pool": 100}, "`pool` must lie in 2 to 24"),
+        ({"text_threshold": float("nan")}, r"`text_threshold` must lie in \[-1, 1\]"),
         ({"encoder": []}, "`encoder` must hold at least one"),
         ({"label": "session", "top": ()}, "a label of two classes, or another"),
     ],

@@ -51,8 +51,9 @@ STRIPS, SHOWN = 4, 6
 class Plan:
     """What is measured.
 
-    Attributes: see :func:`probe`; ``axis`` is what several subjects differ in (``encoder``,
-    ``split``), '' for one; ``trained`` if an encoder was trained for each split.
+    Attributes: see :func:`probe`; ``pools`` are the test samples that every split has of each
+    other modality; ``axis`` is what several subjects differ in (``encoder``, ``split``), '' for
+    one; ``trained`` if an encoder was trained for each split.
     """
 
     modality: Modality = "tactile"
@@ -66,6 +67,7 @@ class Plan:
     allow_seen: bool = False
     axis: str = ""
     trained: bool = False
+    pools: Mapping[str, int] = field(default_factory=dict[str, int])
 
 
 @dataclass
@@ -165,7 +167,7 @@ def probe(  # noqa: PLR0913 - one argument a choice
 
 
 def plan_of(manifest: Manifest, splits: Mapping[str, Split], plan: Plan) -> Plan:
-    """The plan with its labels listed, its group chosen, and one pool size for all splits."""
+    """The plan with its labels listed, its group chosen, and the pool sizes of all splits."""
     labels = [plan.label] if isinstance(plan.label, str) else list(plan.label)
     for name in labels:
         manifest.column(name)  # raises for a column that is not there
@@ -174,10 +176,15 @@ def plan_of(manifest: Manifest, splits: Mapping[str, Split], plan: Plan) -> Plan
     groups = {str(split.rule.get("group", "video")) for split in splits.values()}
     group = plan.group if plan.group != "auto" else groups.pop() if len(groups) == 1 else "video"
     sizes = [len(split.ids("test")) for split in splits.values()]
-    pool = min(sizes) if plan.pool is None and len(sizes) > 1 else plan.pool
     must = f"must lie in 2 to {min(sizes)}, the number of test samples"
     require(plan.pool is None or 2 <= plan.pool <= min(sizes), "pool", must, plan.pool)
-    return replace(plan, label=labels, top=tuple(plan.top), group=group, pool=pool)
+    threshold = plan.text_threshold
+    require(-1 <= threshold <= 1, "text_threshold", "must lie in [-1, 1]", threshold, TVL_THRESHOLD)
+    tests = [manifest.part(split, "test") for split in splits.values()]
+    tests = [test.take(_with(test, plan.modality)) for test in tests]
+    counts = {other: [len(_with(test, other)) for test in tests] for other in _others(plan)}
+    pools = {other: min((n for n in of if n > 1), default=0) for other, of in counts.items()}
+    return replace(plan, label=labels, top=tuple(plan.top), group=group, pools=pools)
 
 
 def measure(
@@ -201,6 +208,7 @@ def measure(
     options["cache"] = None if cache is None else Path(cache)
     how: dict[str, Any] = {"split": split, "allow_seen": plan.allow_seen, "progress": progress}
     parts = [manifest.part(split, part) for part in ("train", "test")]
+    count = sum(map(len, parts))
     parts = [part.take(_with(part, plan.modality)) for part in parts]
     notes = guard(encoders, plan.modality, parts[1], **how)
     features = [embed(part, encoders, plan.modality, **options) for part in parts]
@@ -209,10 +217,11 @@ def measure(
     common: dict[str, Any] = {"subject": subject, "split": split.digest}
     common["settings"] = {"axis": plan.axis} if plan.axis else {}
     result = Probed()
+    if count := count - sum(map(len, parts)):
+        result.notes.append(Note("probe-no-image", {"modality": plan.modality, "count": count}))
     for label in plan.label:
         _classify(result, parts, features, label, plan=plan, common=common)
-    others = ("text", "vision" if plan.modality == "tactile" else "tactile")
-    for other in others if plan.top else ():
+    for other in _others(plan) if plan.top else ():
         ids = _with(parts[1], other) if other in encoders.modalities else []
         if len(ids) < 2:
             code = "no-partner" if other in encoders.modalities else "no-encoder"
@@ -276,7 +285,7 @@ def _retrieve(
     common: Mapping[str, Any],
 ) -> None:
     """Add both directions between the plan's modality and another one."""
-    pool = None if plan.pool is None else min(plan.pool, len(test))
+    pool = min(plan.pool or len(test), plan.pools[other])
     options: dict[str, Any] = {"top": plan.top, "pool": pool, "seed": plan.seed, **common}
     ways = list(retrieval(queries, keys, names=(plan.modality, other), **options))
     if other == "text":
@@ -400,6 +409,11 @@ def named(value: Any, argument: str) -> dict[str, Any]:
         must, fix = "must hold at least one, each once", "Name each of them once"
         raise PalpateError(must, f"{value!r}", fix, argument=argument)
     return named
+
+
+def _others(plan: Plan) -> tuple[Literal["text"], Modality]:
+    """What is retrieved besides the plan's modality."""
+    return "text", "vision" if plan.modality == "tactile" else "tactile"
 
 
 def _with(manifest: Manifest, modality: str) -> list[str]:

@@ -425,6 +425,7 @@ EVALUATION: dict[str, Sentence] = {
     ),
     "materials-excluded": _materials_excluded,
     "probe-no-label": "The samples have no {label} in {part}: nothing was predicted from it",
+    "probe-no-image": "{count} samples without a {modality} image are excluded",
     "probe-unlabeled": "{count} test samples without a {label} are excluded from its accuracy",
     "probe-unseen-classes": lambda p, _: (
         f"{p['subject']}: test samples whose {p['label']} train lacks count as wrong "
