@@ -1,6 +1,7 @@
 """Encoders, tokenizer and preprocessing: saved and loaded, they give the same embeddings."""
 
 import json
+import math
 import types
 
 import huggingface_hub
@@ -11,6 +12,7 @@ from PIL import Image
 from safetensors.torch import load_file, save_file
 from transformers import AutoTokenizer, CLIPModel
 
+from mini_fixtures import make_encoders
 from palpate.core import PalpateError
 from palpate.encoders import encoder_set as module
 from palpate.encoders.contrastive import new_clip
@@ -309,3 +311,39 @@ def test_a_card_that_cannot_be_used_is_named(encoders, tmp_path):
             assert str(file) in caught.value.must
         file.write_text(text)
     EncoderSet.load(tmp_path / "t")
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"palpate": {"unknown": 1}},
+        {"palpate": {"fitting": "stretch"}},
+        {"palpate": {"lag": 5}},
+        {"palpate": {"size": 3}},
+        {"resample": 99, "palpate": {}},
+        {"image_std": [0, 1, 1]},
+        {"image_mean": [math.nan, 0, 0]},
+        {"size": {"shortest_edge": 10**6}},
+    ],
+)
+def test_an_image_processor_that_nobody_writes_is_refused(tmp_path, change):
+    path = tmp_path / "preprocessor_config.json"
+    good = Preprocess(16, 16, fitting="pad", turn="left", resample=0, subtract=("",))
+    path.write_text(json.dumps(good.to_config()))
+    assert Preprocess.from_config(path, 16) == good  # 0 is the nearest pixel, not the default
+    path.write_text(json.dumps(good.to_config() | change))
+    with pytest.raises(PalpateError, match=r"preprocessor_config\.json must"):
+        Preprocess.from_config(path, 16)
+
+
+@pytest.mark.parametrize("place", ["", "clip"])
+@pytest.mark.parametrize(
+    "change",
+    [{"digests": None}, {"digests": ["a"]}, {"card": 3}, {"seen": []}, {"seen": {"vision": "7"}}],
+)
+def test_a_card_of_other_values_is_refused(tmp_path, place, change):
+    make_encoders().save(tmp_path / "e")
+    card = tmp_path / "e" / place / "palpate.json"
+    card.write_text(json.dumps(json.loads(card.read_text()) | change))
+    with pytest.raises(PalpateError, match=r"digests, card and seen in .* must be as palpate"):
+        EncoderSet.load(tmp_path / "e")

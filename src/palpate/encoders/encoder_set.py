@@ -269,7 +269,7 @@ def load_clip(source: str | Path, *, device: str = "cpu") -> ClipEncoders:
         return EncoderSet.load(source, device=device).clip
     config = folder / "config.json"
     family = read_record(config, "model").get("model_type") if config.is_file() else "clip"
-    if family not in FAMILIES:
+    if not isinstance(family, str) or family not in FAMILIES:
         got = f"model_type {family!r} in {config}"
         raise PalpateError(f"{source} must be one of {', '.join(FAMILIES)}", got, CLIP_FIX)
     if local:
@@ -294,7 +294,7 @@ def load_clip(source: str | Path, *, device: str = "cpu") -> ClipEncoders:
         about = _read_card(folder, CLIP_FORMAT)
         clip.card = about["card"]
         clip.name = clip.name if is_shipped(source) else str(about["name"])
-        clip.seen = load_seen(folder, about.get("seen", {}).get("vision"))
+        clip.seen = load_seen(folder, about["seen"].get("vision"))
         _require_digests(clip, about["digests"], folder)
     model.to(pick_device(device))
     return clip
@@ -543,7 +543,7 @@ class EncoderSet:
             encoders.tactile = tactile = load_model(kind, str(place), must, SAVE_AGAIN, **options)
             path, size = place / "preprocessor_config.json", _config(tactile).image_size
             encoders.tactile_preprocess = Preprocess.from_config(path, size)
-            encoders.seen = load_seen(place, about.get("seen", {}).get("tactile"))
+            encoders.seen = load_seen(place, about["seen"].get("tactile"))
         _require_digests(encoders, about["digests"], folder)
         return encoders.to(device)
 
@@ -652,6 +652,11 @@ def _read_card(folder: Path, form: str | tuple[str, ...]) -> dict[str, Any]:
     about = read_record(
         folder / "palpate.json", "card of the encoders", form=form, keys=("digests", "card")
     )
+    parts = [about["digests"], about["card"], about.setdefault("seen", {})]
+    kinds = [type(count) for count in parts[2].values()] if isinstance(parts[2], dict) else [str]
+    if not all(isinstance(part, dict) for part in parts) or {*kinds} - {int}:
+        must = f"digests, card and seen in {folder / 'palpate.json'} must be as palpate writes them"
+        raise PalpateError(must, "other values", "Fetch the encoder again")
     if about["format"] == FORMAT_1:
         names = {"touch": "tactile"}
         about["digests"] = {names.get(k, k): v for k, v in about["digests"].items()}

@@ -14,6 +14,7 @@ take 800 kB; that any of 100,000 other images has one of them by chance has the 
 from __future__ import annotations
 
 import hashlib
+import math
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import KW_ONLY, asdict, dataclass
@@ -49,8 +50,16 @@ from palpate.data.images import (
 from palpate.data.manifest import Manifest
 
 SAVE_AGAIN = "Save the encoders again"
+#: What an image processor may have of these; the first is the default.
+CHOICES = {
+    "fitting": ("crop", "pad", "squash"),
+    "turn": ("none", "left", "portrait"),
+    "resample": (3, 0, 1, 2, 4, 5),
+}
 CLIP_MEAN = (0.48145466, 0.4578275, 0.40821073)
 CLIP_STD = (0.26862954, 0.26130258, 0.27577711)
+#: A square before the crop is at most so many times what the encoder sees.
+MOST_TIMES = 16
 #: What an image is prepared from: itself, the sensor's no-contact image, an earlier frame.
 Frame = tuple[Path | Image.Image, Path | None, Path | None]
 #: Digests of images, (n,) uint64.
@@ -122,22 +131,30 @@ class Preprocess:
             (r, g, b), (sr, sg, sb) = map(float, mean), map(float, std)
             whole = isinstance(config.get("size"), Mapping) and "height" in config["size"]
             whole = whole or patches is not None
-            more: dict[str, Any] = {"resample": int(config.get("resample") or 3)}
-            more |= {"fitting": "squash"} if whole else {}
+            more: dict[str, Any] = {"fitting": "squash"} if whole else {}
+            more |= {"resample": config["resample"]} if config.get("resample") is not None else {}
             more |= config.get("palpate") or {}
-            more |= {"subtract": tuple(more.get("subtract", ()))}
+            chosen: dict[str, Any] = {name: more.pop(name, of[0]) for name, of in CHOICES.items()}
+            bad = [
+                f"{name} {v!r}" for name, v in chosen.items() if v not in CHOICES.get(name, (v,))
+            ]
+            chosen["subtract"] = tuple(map(str, more.pop("subtract", ())))
+            bad += [f"std {v}" for v in (sr, sg, sb) if not 1e-6 < v < math.inf]
+            bad += [f"mean {v}" for v in (r, g, b) if not math.isfinite(v)]
+            if bad or more:
+                raise ValueError(", ".join([*bad, *more]))
         except (AttributeError, KeyError, TypeError, ValueError) as error:
             must = f"Size, crop and statistics in {path} must be those of an image processor"
             raise PalpateError(must, str(error), SAVE_AGAIN) from None
         if not config.get("do_center_crop", "crop_size" in config or not whole):
             crop = resize
         side = size or crop
-        if crop != side or resize < side:
+        if crop != side or not 0 < side <= resize <= MOST_TIMES * side:
             must, got = f"{path} must give the encoder's {side} px", f"{crop} px from {resize} px"
             raise PalpateError(must, got, "Set size and crop_size to the encoder's")
         if not config.get("do_normalize", True):
-            return cls(side, resize, (0.0,) * 3, (1.0,) * 3, **more)
-        return cls(side, resize, (r, g, b), (sr, sg, sb), **more)
+            return cls(side, resize, (0.0,) * 3, (1.0,) * 3, **chosen)
+        return cls(side, resize, (r, g, b), (sr, sg, sb), **chosen)
 
     def to_config(self) -> dict[str, Any]:
         """The same as a ``preprocessor_config.json`` for transformers' ``CLIPImageProcessor``."""
