@@ -94,6 +94,7 @@ def test_images_are_of_one_size_and_without_metadata(plan):
         assert opened.size == (image["w"], image["h"]) == (32, 32)
         assert set(opened.info) <= {"jfif", "jfif_version", "jfif_unit", "jfif_density"}
         assert not opened.getexif()
+    assert list(page["images"]) == sorted(page["images"])  # the order says nothing either
     used = {row[side] for rows in page["raters"].values() for row in rows for side in row}
     assert {n for n in used if n in page["images"]} == set(page["images"])
 
@@ -124,6 +125,7 @@ def test_two_studies_have_two_secrets_and_one_choice_of_items(folders, plan):
     assert again.items == plan.items
     assert again.secret != plan.secret
     assert again.raters != plan.raters
+    assert again.name("v00/f0", "ours") != plan.name("v00/f0", "ours")  # nobody can guess names
 
 
 def test_design_of_the_paper(folders):

@@ -5,13 +5,16 @@ import sqlite3
 import subprocess
 import sys
 from dataclasses import replace
+from itertools import combinations
 
 import numpy as np
 import pytest
+from scipy import stats
 
 from palpate import preference
 from palpate.core import Note, PalpateError
 from palpate.preference.agreement import lower_is_better
+from palpate.preference.arrays import VoteArrays
 from palpate.preference.plan import Plan
 from palpate.preference.votes import read_votes
 from palpate.report.results import Results
@@ -219,6 +222,40 @@ def tau(study, votes, table, how):
     """Kendall's tau of ``q`` with people."""
     results = preference.score(study, votes, metrics=table, replicates=100)
     return results[f"Kendall's tau with people, by {how}", "q"]
+
+
+def test_tau_by_image_is_scipys_of_repeated_items(plan, study, downloads):
+    """Value and interval: an item that is drawn twice is there twice, a rater's votes weigh."""
+    rng = np.random.default_rng(0)
+    table = metric_table(plan, lambda k, m: rng.integers(5) - m)
+    q = {(row["id"], row["method"]): row["q"] for row in table}
+    votes = read_votes(plan, [downloads])
+    arrays = VoteArrays(plan, votes, [r.code for r in plan.raters], 0, 100)
+    chosen = {
+        (r, v.trial.left, v.trial.right, v.trial.item): v.chosen
+        for r, of in votes.of.items()
+        for v in of.values()
+        if v.trial.kind == "pair"
+    }
+
+    def slow(raters, items):
+        x, y = [], []
+        for a, b in combinations(plan.methods, 2):
+            for item, count in zip(plan.items, items, strict=True):
+                net = sum(
+                    w
+                    * ((chosen[r.code, a, b, item.id] == a) - (chosen[r.code, a, b, item.id] == b))
+                    for r, w in zip(plan.raters, raters, strict=True)
+                )
+                x += [q[item.id, a] - q[item.id, b]] * int(count)
+                y += [net / sum(raters)] * int(count)
+        return stats.kendalltau(np.r_[x, np.negative(x)], np.r_[y, np.negative(y)]).statistic
+
+    score = tau(study, downloads, table, "image")
+    assert score.value == pytest.approx(slow(np.ones(12), np.ones(24)))
+    drawn = zip(arrays.resampled.raters, arrays.resampled.items, strict=True)
+    replicates = [slow(*weights) for weights in drawn]
+    assert score.interval == pytest.approx(np.quantile(replicates, [0.025, 0.975]))
 
 
 def test_an_infinite_value_is_the_best(plan, study, downloads):
