@@ -66,6 +66,59 @@ def test_planted_preferences_lie_in_their_intervals(results):
     assert sum(strengths) == pytest.approx(0, abs=1e-6)
 
 
+def counted(plan, downloads):
+    """Counts of raters and items of 100 replicates; (rater, a, b, item) -> the chosen method."""
+    votes = read_votes(plan, [downloads])
+    drawn = VoteArrays(plan, votes, [r.code for r in plan.raters], 0, 100).resampled
+    chosen = {
+        (r, v.trial.left, v.trial.right, v.trial.item): v.chosen
+        for r, of in votes.of.items()
+        for v in of.values()
+        if v.trial.kind == "pair"
+    }
+    return list(zip(drawn.raters, drawn.items, strict=True)), chosen
+
+
+def test_preferences_and_differences_are_those_of_a_slow_count(plan, study, downloads):
+    drawn, chosen = counted(plan, downloads)
+    results = preference.score(study, downloads, replicates=100)
+    codes, ids = ([x.code for x in plan.raters], [x.id for x in plan.items])
+
+    def share(a, b, raters, items):
+        weight = {r: {i: n * m for i, m in zip(ids, items, strict=True)} for r, n in raters}
+        cells = [(weight[r][i], c) for (r, x, y, i), c in chosen.items() if (x, y) == (a, b)]
+        points = sum(w * ((c == a) + 0.5 * (c == "same")) for w, c in cells)
+        return points / sum(w for w, _ in cells)
+
+    once = [(np.ones(12), np.ones(24))]
+    shares = {
+        pair: [share(*pair, list(zip(codes, r, strict=True)), i) for r, i in [*once, *drawn]]
+        for pair in combinations(plan.methods, 2)
+    }
+
+    def require_equal(score, values):
+        assert score.value == pytest.approx(values[0])
+        assert score.interval == pytest.approx(np.quantile(values[1:], [0.025, 0.975]))
+
+    for pair, values in shares.items():
+        difference = results["human preference difference", f"{pair[0]} - {pair[1]}"]
+        require_equal(difference, 2 * np.array(values) - 1)
+    for name in plan.methods:
+        of = [v if p[0] == name else 1 - np.array(v) for p, v in shares.items() if name in p]
+        require_equal(results["human preference", name], np.mean(of, axis=0))
+
+
+def test_davidson_expects_as_many_ties_as_there_are(results):
+    rows = results.settings["preference"]["comparisons"]
+    strength = {s.subject: np.exp(s.value) for s in results.scores if s.metric == "human strength"}
+    nu, expected = results["human strength", "ours"].details["nu"], 0.0
+    for row in rows:
+        a, b = strength[row["a"]], strength[row["b"]]
+        tie = nu * np.sqrt(a * b)
+        expected += (row["votes_a"] + row["ties"] + row["votes_b"]) * tie / (a + b + tie)
+    assert expected == pytest.approx(sum(row["ties"] for row in rows), rel=0.02)
+
+
 def test_what_a_difference_says(results):
     difference = results["human preference difference", "ours - wbg"]
     row = next(r for r in results.settings["preference"]["comparisons"] if r["b"] == "wbg")
@@ -229,14 +282,7 @@ def test_tau_by_image_is_scipys_of_repeated_items(plan, study, downloads):
     rng = np.random.default_rng(0)
     table = metric_table(plan, lambda k, m: rng.integers(5) - m)
     q = {(row["id"], row["method"]): row["q"] for row in table}
-    votes = read_votes(plan, [downloads])
-    arrays = VoteArrays(plan, votes, [r.code for r in plan.raters], 0, 100)
-    chosen = {
-        (r, v.trial.left, v.trial.right, v.trial.item): v.chosen
-        for r, of in votes.of.items()
-        for v in of.values()
-        if v.trial.kind == "pair"
-    }
+    drawn, chosen = counted(plan, downloads)
 
     def slow(raters, items):
         x, y = [], []
@@ -253,7 +299,6 @@ def test_tau_by_image_is_scipys_of_repeated_items(plan, study, downloads):
 
     score = tau(study, downloads, table, "image")
     assert score.value == pytest.approx(slow(np.ones(12), np.ones(24)))
-    drawn = zip(arrays.resampled.raters, arrays.resampled.items, strict=True)
     replicates = [slow(*weights) for weights in drawn]
     assert score.interval == pytest.approx(np.quantile(replicates, [0.025, 0.975]))
 
@@ -516,15 +561,30 @@ def test_sorting_is_accuracy_by_material_against_chance(folders, tmp_path):
         size=32,
     )
     crowd = Crowd({}, skill=0.8)
-    results = preference.score(study, crowd.write(plan, tmp_path / "votes"))
+    for rater in plan.raters:
+        download = crowd.download(plan, rater.code)
+        download["votes"] = download["votes"][: 25 + 2 * int(rater.code[1:])]  # not all are done
+        (tmp_path / f"{rater.code}.json").write_text(json.dumps(signed(download)))
+    votes = [tmp_path / f"{rater.code}.json" for rater in plan.raters]
+    results = preference.score(study, votes)
     accuracy = results["human accuracy of material", "ours"]
     assert accuracy.interval[0] <= 0.8 <= accuracy.interval[1]
     assert accuracy.details["chance"] == pytest.approx(1 / 3)
-    assert set(accuracy.details["by_material"]) == {"brick", "grass", "wood"}
-    assert results["human accuracy of material", "real images"].n == 15 * 6
+    material = {item.id: item.material for item in plan.items}
+    for method, subject in (("ours", "ours"), ("reference", "real images")):
+        right = {"brick": [], "grass": [], "wood": []}
+        for vote in (v for of in read_votes(plan, votes).of.values() for v in of.values()):
+            if (vote.trial.kind, vote.trial.left) == ("sort", method):
+                right[material[vote.trial.item]].append(vote.choice == material[vote.trial.item])
+        score = results["human accuracy of material", subject]
+        assert score.n == sum(map(len, right.values())) < 15 * 6
+        assert score.value == pytest.approx(np.mean([x for of in right.values() for x in of]))
+        means = {name: np.mean(of) for name, of in right.items()}
+        assert score.details["by_material"] == pytest.approx(means)
+        assert results["human accuracy of material", f"{subject}, wood"].value == means["wood"]
     results.to_html(tmp_path / "page.html")
     with pytest.raises(PalpateError, match=r"metrics. must be left out where people sort"):
-        preference.score(study, tmp_path / "votes", metrics=tmp_path / "values.csv")
+        preference.score(study, votes, metrics=tmp_path / "values.csv")
 
 
 def test_a_material_may_be_called_left(tmp_path):
