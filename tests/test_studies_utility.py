@@ -13,6 +13,7 @@ from palpate.studies.utility import (
     material_utility,
     retrieval_utility,
     utility,
+    utility_claims,
 )
 
 CLASSES, FRAMES, DIM = 4, 3, 12
@@ -66,6 +67,29 @@ def test_noise_does_not_help_and_real_images_of_other_videos_do(material):
     assert float(rows["noise alone"][0]) == pytest.approx(0.25, abs=0.12)
     accuracies = [float(score) for score in rows[REAL]]
     assert accuracies == sorted(accuracies)
+
+
+def test_the_claim_follows_the_gain_at_one_video(material):
+    made = {c.claim: c for c in utility_claims(material[0])}
+    assert made["Images of good help a classifier of real touch"].verdict == "holds"
+    noise = made["Images of noise help a classifier of real touch"]
+    assert noise.verdict in ("undecided", "does not hold")
+    assert noise.why.startswith("Accuracy on real images of new videos gains -0.")
+    assert "at k = 4 real videos a class" in noise.why
+    assert len(noise.evidence) == 3
+    reversed_rows = [
+        [
+            row[0],
+            *(
+                replace(c, value=-c.value, interval=(-c.interval[1], -c.interval[0]))
+                for c in row[1:]
+            ),
+        ]
+        for row in material[0].rows
+        if str(row[0]).startswith("gain")
+    ]
+    flipped = utility_claims(replace(material[0], rows=reversed_rows))
+    assert flipped[1].verdict == "does not hold"
 
 
 def test_no_image_trains_what_names_its_video(material):

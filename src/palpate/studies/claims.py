@@ -115,9 +115,7 @@ def leak_claims(
     gains = {task: ahead(difference, names[0]) for task, difference in tasks.items()}
     source, rows = "paper, tables 1 and 2", list[Claim]()
     for task, gain in gains.items():
-        why = (
-            f"{metric_of(tasks[task])} is better under {names[0]} by {in_words(gain)}{_runs(gain)}"
-        )
+        why = f"In {metric_of(tasks[task])} {names[0]} gains {in_words(gain)}{_runs(gain)}"
         verdict = decide([side_of(gain)])
         rows.append(Claim(f"Leakage inflates {task}", source, verdict, f"{why}.", [gain]))
     sides = [side_of(gain) for gain in gains.values()]
@@ -176,24 +174,44 @@ def _preference_claim(
 ) -> Claim:
     against = metric in TRADITIONAL
     does = "prefers what people do not" if against else "prefers what people prefer"
-    parts, evidence, signs = list[str](), list[Score](), list[int]()
+    of_metric, of_people, signs = list[Score](), list[Score](), list[int]()
     for other in (*names.images, names.background):
         pair = names.ours, other
-        of_people = [ahead(v, names.ours) for v in _between(votes, PEOPLE, *pair)]
-        for score in (ahead(d, names.ours) for d in _between(differences, metric, *pair)):
-            label = score.metric.removesuffix(", ahead")
-            parts.append(f"{label} puts {names.ours} ahead of {other} by {in_words(score)}")
-            evidence.append(score)
-            signs += [side_of(score) * side_of(vote) for vote in of_people]
-        if of_people:
-            parts.append(f"people put {names.ours} ahead of {other} by {in_words(of_people[0])}")
-            evidence.append(of_people[0])
-    known = any(s.metric.partition(",")[0] != PEOPLE for s in evidence)
-    missing = [] if known else [f"{metric} was not computed (its weights may be missing)"]
-    missing += [] if votes else ["no human study was given"]
+        scores = [ahead(d, names.ours) for d in _between(differences, metric, *pair)]
+        people = [ahead(v, names.ours) for v in _between(votes, PEOPLE, *pair)]
+        signs += [side_of(score) * side_of(vote) for score in scores for vote in people]
+        of_metric, of_people = of_metric + scores, of_people + people
+    parts = [_puts(of_metric, names.ours), _puts(of_people, names.ours)]
+    if not of_metric:
+        parts[0] = f"{metric} was not computed (its weights may be missing)"
+    if not of_people:
+        parts[1] = "the human study compared other methods" if votes else "no human study was given"
     verdict = decide([-sign if against else sign for sign in signs])
-    why = "; ".join([*missing, *parts])
-    return Claim(f"{metric} {does}", "paper, table 3", verdict, f"{_capital(why)}.", evidence)
+    why, evidence = f"{_capital('; '.join(parts))}.", [*of_metric, *of_people]
+    return Claim(f"{metric} {does}", "paper, table 3", verdict, why, evidence)
+
+
+def _puts(scores: Sequence[Score], ours: str) -> str:
+    """``TMMD puts Ours ahead of GVST by 0.6 [0.3, 0.9], of Ours w/ BG by 1 [0.5, 1.5]``."""
+    parts: list[str] = []
+    for label, own in groupby(scores, key=_label):
+        each = [f"of {_other(s, ours)} {_by(s)}" for s in own]
+        puts = "people put" if label == PEOPLE else f"{label} puts"
+        parts.append(f"{puts} {ours} ahead {', '.join(each)}")
+    return "; ".join(parts)
+
+
+def _label(score: Score) -> str:
+    return score.metric.removesuffix(", ahead")
+
+
+def _other(score: Score, ours: str) -> str:
+    pair = score.details["a"], score.details["b"]
+    return str(pair[1] if pair[0] == ours else pair[0])
+
+
+def _by(score: Score) -> str:
+    return "(undefined)" if score.value is None else f"by {in_words(score)}"
 
 
 def _capital(sentence: str) -> str:
@@ -224,12 +242,12 @@ def _ranking_claim(
     others = [
         ahead(d, names.ours) for metric in FAMILY[1:] for d in _between(differences, metric, *pair)
     ]
-    words = [
-        f"{names.ours} is ahead of {other} in {s.metric.removesuffix(', ahead')} by"
-        f" {in_words(s)}{_runs(s)}"
-        for s in (*deciding, *others)
-    ]
-    why = "; ".join(words) or f"{other} was not compared with {names.ours}"
+    parts = ", ".join(f"in {_label(s)} {_by(s)}" for s in (*deciding, *others))
+    why = (
+        f"{names.ours} is ahead of {other} {parts}" + _runs((*deciding, *others)[0])
+        if parts
+        else (f"{other} was not compared with {names.ours}")
+    )
     sides = [side_of(s) for s in deciding]
     source = "paper, tables 3 and 4" if other in names.images else "paper, table 3"
     return Claim(claim, source, decide(sides), f"{why}.", [*deciding, *others])
@@ -276,12 +294,15 @@ def effect_table(differences: Sequence[Score]) -> StudyTable:
     )
 
 
-def discrimination_claim(differences: Sequence[Score]) -> Claim:
+def discrimination_claim(differences: Sequence[Score], names: Names | None = None) -> Claim:
     """Traditional metrics hardly discriminate: their mean effect size against the TMMD family's.
 
-    Over the pairs of methods that both kinds have; each mean has an error of at most 1, so means
-    that differ by less than ``1.96 sqrt(2)`` are undecided.
+    Over the pairs of the paper's methods that both kinds have; each mean has an error of at most 1,
+    so means that differ by less than ``1.96 sqrt(2)`` are undecided.
     """
+    names = names or Names()
+    known = {names.ours, *names.images, names.background}
+    differences = [d for d in differences if {d.details["a"], d.details["b"]} <= known]
     claim, source = "Traditional metrics hardly discriminate between methods", "paper, section 1"
     sizes: dict[str, dict[tuple[str, str], list[float]]] = {"traditional": {}, "family": {}}
     evidence: list[Score] = []
@@ -298,10 +319,11 @@ def discrimination_claim(differences: Sequence[Score]) -> Claim:
         return Claim(claim, source, "undecided", why, evidence)
     means = {kind: fmean(fmean(of[pair]) for pair in shared) for kind, of in sizes.items()}
     gap, reach = means["family"] - means["traditional"], Z * np.sqrt(2)
+    pairs = f"{len(shared)} pair{'s' * (len(shared) != 1)}"
     why = (
         f"The mean effect size of the TMMD family is {means['family']:.2g}, of traditional metrics "
-        f"{means['traditional']:.2g}, over {len(shared)} pairs of methods; the difference is "
-        f"{gap:.2g} [{gap - reach:.2g}, {gap + reach:.2g}]."
+        f"{means['traditional']:.2g}, over {pairs} of methods; the difference is {gap:.2g} "
+        f"[{gap - reach:.2g}, {gap + reach:.2g}]."
     )
     return Claim(claim, source, decide([int(gap > reach) - int(gap < -reach)]), why, evidence)
 
@@ -328,5 +350,5 @@ def paper_claims(
         *leak_claims(tasks, splits),
         *ranking_claims(differences, people, names),
         *preference_claims(differences, people, names),
-        discrimination_claim(differences),
+        discrimination_claim(differences, names),
     ]

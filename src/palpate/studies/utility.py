@@ -26,7 +26,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeGuard
 
 import numpy as np
 from numpy.typing import NDArray
@@ -42,12 +42,16 @@ from palpate.metrics.means import Mean, mean_of, over_seeds
 from palpate.metrics.paired import differences_of_means
 from palpate.metrics.probe import fit_probe
 from palpate.metrics.retrieval import retrieval
-from palpate.report.study import Curve, Line, StudyTable
+from palpate.report.study import Claim, Curve, Line, StudyTable
+from palpate.studies.claims import decide
 from palpate.studies.embedding import embed_generated
+from palpate.studies.evidence import in_words, side_of
 
 #: Real videos a class.
 SHOTS = (1, 2, 4, 8)
 REAL = "k real"
+#: Beginning of the label of a row of gains.
+GAIN = "gain by "
 #: (features to train on) -> for rows of real test features (m, d), one value or row each.
 Fit = Callable[[FeatureSet], Callable[[FeatureSet], Any]]
 
@@ -276,7 +280,7 @@ def _table(
     for label in dict.fromkeys(label for label, _ in means):
         cells = (means.get((label, k)) for k in shots)
         rows.append([label, *(over_seeds(runs) if runs else None for runs in cells)])
-    gains = [f"gain by {name}" for name in generated]
+    gains = [f"{GAIN}{name}" for name in generated]
     for gain, name in zip(gains, generated, strict=True):
         pairs = ((means.get((f"{REAL} + {name}", k)), means.get((REAL, k))) for k in shots)
         rows.append([gain, *(_gain(a, b) if a and b else None for a, b in pairs)])
@@ -285,6 +289,30 @@ def _table(
 
 def _gain(more: Sequence[Mean], less: Sequence[Mean]) -> Score:
     return differences_of_means({more[0].score.subject: more, less[0].score.subject: less})[0]
+
+
+def utility_claims(table: StudyTable) -> list[Claim]:
+    """Generated images help a classifier of real touch: one row a generator of a table of material.
+
+    The gain at the fewest real videos a class decides, where help is needed most; the others are
+    listed.
+    """
+    claims: list[Claim] = []
+    for label, *cells in table.rows:
+        gains = [(k, c) for k, c in zip(table.columns[1:], cells, strict=True) if _is_score(c)]
+        if not str(label).startswith(GAIN) or not gains:
+            continue
+        scores = [score for _, score in gains]
+        each = ", ".join(f"{in_words(score)} at {k}" for k, score in gains)
+        why = f"Accuracy on real images of new videos gains {each} real videos a class."
+        name = str(label).removeprefix(GAIN)
+        claim = f"Images of {name} help a classifier of real touch"
+        claims.append(Claim(claim, "ours", decide([side_of(scores[0])]), why, scores))
+    return claims
+
+
+def _is_score(cell: Any) -> TypeGuard[Score]:
+    return isinstance(cell, Score)
 
 
 def retrieval_utility(
