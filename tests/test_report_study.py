@@ -17,12 +17,19 @@ from PIL import Image, ImageFont
 from palpate.cli import main
 from palpate.core import SampleRef
 from palpate.report import drawing, write_report
-from palpate.report.curves import curve_drawing, matrix_drawing, panels_of, strips_drawing
+from palpate.report.curves import (
+    curve_drawing,
+    matrix_drawing,
+    panels_of,
+    score_panels,
+    strips_drawing,
+)
+from palpate.report.first_screen import telling_columns
 from palpate.report.page import OPEN_CLAIMS, render_page
 from palpate.report.results import GalleryItem, Results
 from palpate.report.study import Claim, Curve, Line, StudyTable
 from palpate.report.study_tables import brief, curve_table, file_names, sheet, tally
-from palpate.report.tables import heat_tables
+from palpate.report.tables import heat_tables, score_tables
 from palpate.report.terminal import as_text
 from report_fixtures import Tree, images, score, study_results, text_note
 
@@ -492,6 +499,14 @@ def test_strips_draw_value_interval_null_and_floor_and_hollow_controls(study):
         p for p in strips_drawing("T", panels[2:3]).parts if getattr(p, "text", "") == "undefined"
     )
     assert text.x > 400
+
+
+def test_strips_of_scores_know_the_controls_of_the_study():
+    scores = [score("TMMD", name) for name in ("ours", "photo", "real")]
+    columns = telling_columns(score_tables(scores))
+    (panel,) = score_panels(columns, {"photo", "real"})
+    assert [control for *_, control in panel.rows] == [False, True, True]
+    assert panel.title == "TMMD ↓"
 
 
 def test_labels_of_strips_are_all_words_before_the_scores():

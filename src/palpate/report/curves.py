@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Collection, Iterable, Sequence
 from dataclasses import dataclass
 from itertools import takewhile
 
@@ -290,12 +290,12 @@ def _strip_axis(axis: Axis | None, y: float) -> Iterable[Shape | Words]:
         yield Words(x, y + 16, number(tick, digits), "middle")
 
 
-def score_panels(columns: Sequence[Column]) -> list[Panel]:
+def score_panels(columns: Sequence[Column], controls: Collection[str]) -> list[Panel]:
     """Return a panel for each column of scores that has a defined one."""
     return [
         Panel(
             f"{column.metric} {column.arrow}",
-            [(cell.score.subject, cell.score, False) for cell in column.cells],
+            [(c.score.subject, c.score, c.score.subject in controls) for c in column.cells],
         )
         for column in columns
         if any(cell.defined for cell in column.cells)

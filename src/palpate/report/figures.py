@@ -26,7 +26,7 @@ from palpate.report.drawing import COLORS, Drawing, font_of, in_ascii
 from palpate.report.first_screen import COLUMNS, REAL, TELLING, telling_columns
 from palpate.report.page import gallery_images, in_turns, material_of, pair_images
 from palpate.report.results import Audit, Results
-from palpate.report.study_tables import file_names, sheets
+from palpate.report.study_tables import controls_of, file_names, sheets
 from palpate.report.tables import heat_tables, score_tables
 from palpate.report.thumbnails import Wanted, read_image
 
@@ -81,7 +81,8 @@ def save_figures(results: Results, folder: Path, *, base: Path) -> list[Path]:
 def _drawings(results: Results) -> dict[str, Drawing]:
     names = file_names("curve", [curve.title for curve in results.curves])
     drawings = dict(zip(names, map(curve_drawing, results.curves), strict=True))
-    if panels := score_panels(telling_columns(score_tables(results.scores))):
+    columns = telling_columns(score_tables(results.scores))
+    if panels := score_panels(columns, {REAL, *controls_of(results)}):
         drawings["strips-scores"] = strips_drawing("Scores", panels)
     tables = sheets(results)
     for name, table in zip(file_names("strips", [t.title for t in tables]), tables, strict=True):
@@ -101,7 +102,7 @@ def _telling(panel: Panel) -> int:
 
 def _by_method(results: Results) -> list[Score]:
     """The scores of methods: without controls, and of several presets the first."""
-    controls = {REAL, *(name for table in results.tables for name in table.controls)}
+    controls = {REAL, *controls_of(results)}
     first: dict[tuple[str, str], Score] = {}
     for score in results.scores:
         if score.subject not in controls:

@@ -124,7 +124,7 @@ def render_page(
     tables = score_tables(results.scores)
     columns = first_screen.telling_columns(tables)
     cards = first_screen.cards(results, columns)
-    controls = {name for table in results.tables for name in table.controls}
+    controls = study_tables.controls_of(results)
     samples = gallery_images(results.gallery)
     hero_rows: dict[Hashable, list[Wanted]] = {
         id(item): images for item, images in samples[:HERO_ROWS]

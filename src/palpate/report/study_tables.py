@@ -98,6 +98,11 @@ def sheets(results: Results) -> list[Sheet]:
     return [sheet(table) for table in results.tables]
 
 
+def controls_of(results: Results) -> set[str]:
+    """Return the subjects that a table of the study names as controls."""
+    return {name for table in results.tables for name in table.controls}
+
+
 def sheet(table: StudyTable) -> Sheet:
     """Return a table with its digits, directions, best marks and footnotes."""
     footnotes = Footnotes()
