@@ -2,6 +2,7 @@
 
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -12,6 +13,7 @@ from PIL import Image
 
 from palpate.cli import main
 from palpate.report.results import Results
+from palpate.studies.verifying import verify
 
 pytestmark = pytest.mark.slow
 
@@ -58,6 +60,17 @@ def whole(tmp_path_factory) -> Path:
     run = tmp_path_factory.mktemp("whole") / "run"
     finished(run)
     return run
+
+
+def test_the_page_is_made_again_number_by_number_where_the_run_was_moved(whole, tmp_path):
+    shutil.copytree(whole, tmp_path / "moved")
+    checked = verify(tmp_path / "moved" / "page.json")
+    assert checked.counts["same"] == len(checked.checks) > 100
+    image = next((tmp_path / "moved" / "generated").rglob("*.png"))
+    Image.effect_noise(Image.open(image).size, 64).convert("RGB").save(image)
+    changed = {c.name for c in verify(tmp_path / "moved" / "page.json").checks if c.why}
+    assert {"stage generated", "stage scores, made again", "fact Distance"} <= changed
+    assert "stage split, made again" not in changed
 
 
 def test_the_demo_ends_in_a_page_with_everything_on_it(whole):

@@ -9,7 +9,8 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator, Mapping, Sequence
-from typing import Any
+from dataclasses import dataclass
+from typing import Any, Literal
 
 from palpate.core import Score, plain, short
 from palpate.report.results import Audit
@@ -17,6 +18,8 @@ from palpate.report.results import Audit
 _DIGEST = re.compile("[0-9a-f]{64}")
 #: Relative, for sums whose order may change from run to run.
 TOLERANCE = 1e-6
+Status = Literal["same", "differs", "cannot check", "untraced"]
+STATUSES: tuple[Status, ...] = ("same", "differs", "cannot check", "untraced")
 #: Fields of a score that say what it is, not how large.
 _WORDS = ("metric", "subject", "notes", "details", "interval_method", "higher_is_better")
 #: Entries of details that no later run repeats.
@@ -24,7 +27,27 @@ _PASSING = ("version", "stage", "seconds")
 #: Fields of an audit that are no numbers, or are compared on their own.
 _OF_AUDITS = ("name", "notes", "commands", "call", "others", "impact")
 #: Keys of samples that are places on one machine.
-_PLACES = ("vision", "tactile", "background", "notes")
+_PLACES = ("vision", "tactile", "background", "generated")
+#: Keys of what holds no numbers of a measurement.
+_BESIDES = ("notes", "settings")
+
+
+@dataclass(frozen=True)
+class Check:
+    """What became of one number, or of one input.
+
+    Attributes:
+        name: what a table calls it.
+        status: ``same``; ``differs``; ``cannot check``: an input is missing, or was in memory
+            alone; ``untraced``: the file does not say where it comes from.
+        why: the values that differ, or what is missing; '' where they are the same.
+        kind: ``number`` or ``input``.
+    """
+
+    name: str
+    status: Status
+    why: str = ""
+    kind: Literal["number", "input"] = "number"
 
 
 def score_name(score: Score) -> str:
@@ -90,7 +113,7 @@ def _holds_numbers(value: Any) -> bool:
 
 def _difference(a: Any, b: Any, tolerance: float, scale: float, name: str) -> str:
     if isinstance(a, Mapping) and isinstance(b, Mapping):
-        keys = [key for key in dict.fromkeys([*a, *b]) if key not in (*_PLACES, *_PASSING)]
+        keys = [key for key in dict.fromkeys([*a, *b]) if not _passes(key, a, b)]
         pairs = ((f"{name} {key}".strip(), a.get(key), b.get(key)) for key in keys)
         return _first(pairs, tolerance, scale)
     if isinstance(a, list) and isinstance(b, list) and len(a) == len(b):
@@ -100,6 +123,12 @@ def _difference(a: Any, b: Any, tolerance: float, scale: float, name: str) -> st
     if _close(a, b, tolerance, scale):
         return ""
     return f"{name} {_text(a)} in the file, {_text(b)} now".strip()
+
+
+def _passes(key: str, a: Mapping[str, Any], b: Mapping[str, Any]) -> bool:
+    """Whether an entry is no number of a measurement: a time, a note, the path of an image."""
+    path = all(isinstance(value, str | None) for value in (a.get(key), b.get(key)))
+    return key in (*_PASSING, *_BESIDES) or (key in _PLACES and path)
 
 
 def _first(pairs: Iterator[tuple[str, Any, Any]], tolerance: float, scale: float) -> str:

@@ -164,6 +164,11 @@ def run_demo(
         return _run(demo)
 
 
+def run_again(options: DemoOptions, run: Run, progress: Progress = quiet) -> DemoRun:
+    """The demo on a run that makes its stages in its own way."""
+    return _run(_Demo(options, run, progress))
+
+
 def _run(demo: _Demo) -> DemoRun:
     manifest = demo.data()
     split, audits = demo.split(manifest)

@@ -45,6 +45,7 @@ class Node:
         after: names of earlier nodes; their digests enter its own.
         version: raised by hand when the stage comes to write other bytes.
         cost: expected seconds on two cores; 0: unknown.
+        measures: it trains nothing: ``palpate verify`` builds it again, to compare.
     """
 
     name: str
@@ -53,6 +54,7 @@ class Node:
     after: Sequence[str] = ()
     version: int = 1
     cost: float = 0.0
+    measures: bool = False
 
 
 @dataclass(frozen=True)

@@ -146,7 +146,9 @@ def nodes_of(plan: Plan) -> list[Node]:
             Node(encoder, build, {**how, "seed": seed}, ["data", "split"], cost=preset.seconds[0])
         )
         build = partial(probe_encoders, split=split, encoders=encoder, device=device)
-        nodes.append(Node(f"probe-{split}-{seed}", build, {}, ["data", "split", encoder], cost=15))
+        after = ["data", "split", encoder]
+        name = f"probe-{split}-{seed}"
+        nodes.append(Node(name, build, {}, after, cost=15, measures=True))
         for method in study.trained_on(split):
             nodes += _method_nodes(plan, method, split, seed, trained)
     nodes += [
@@ -178,7 +180,7 @@ def nodes_of(plan: Plan) -> list[Node]:
     read = [node for of in (judgments, probes) for nodes in of.values() for node in nodes]
     after = ["data", "split", first, *read, *(n.name for n in questions if n.name in QUESTIONS)]
     inputs = {"study": study.name, "title": study.title, "tables": study.tables}
-    nodes.append(Node("results", build, inputs, after, cost=10))
+    nodes.append(Node("results", build, inputs, after, cost=10, measures=True))
     return nodes
 
 
@@ -234,7 +236,7 @@ def _data_nodes(plan: Plan) -> list[Node]:
     if plan.root is not None:
         inputs |= {"root": str(plan.root.resolve()), "stamp": stamp(plan.root)}
     nodes.append(Node("data", build, inputs, [node.name for node in nodes], cost=10))
-    nodes.append(Node("split", making.make_splits, {}, ["data"], cost=60))
+    nodes.append(Node("split", making.make_splits, {}, ["data"], cost=60, measures=True))
     return nodes
 
 
@@ -369,7 +371,8 @@ def _score_node(plan: Plan, split: str, judge: str, seed: int) -> Node:
     inputs = {**vars(judging), "metrics": [_source(m) for m in study.metrics]}
     own = [] if judge == RULER else [encoder]
     after = ["data", "split", *own, f"controls-{split}", *methods.values()]
-    return Node(_scores(split, judge, seed), build, inputs, after, version=2, cost=60)
+    name = _scores(split, judge, seed)
+    return Node(name, build, inputs, after, version=2, cost=60, measures=True)
 
 
 def _source(function: Callable[..., Any]) -> str:

@@ -8,26 +8,28 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib import import_module
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 from palpate.core import PalpateError, Progress, Score, few, plain, quiet, read_record, require
 from palpate.core.files import reading_entry
 from palpate.report.calls import DIGEST, OBJECT, PATH, ROWS, Call, digest_of, is_there
 from palpate.report.results import AUDIT_FORMATS, RESULTS_FORMATS, Audit, Results, Strip
 from palpate.studies.comparing import (
+    STATUSES,
     TOLERANCE,
+    Check,
+    Status,
     audit_numbers,
     number_difference,
     score_difference,
     score_name,
 )
+from palpate.studies.verifying_runs import is_run, verify_run
 
 FORMAT = "palpate-verification/1"
-Status = Literal["same", "differs", "cannot check", "untraced"]
-STATUSES: tuple[Status, ...] = ("same", "differs", "cannot check", "untraced")
 #: Verb -> module and function of its calls.
 FUNCTIONS = {
     "score": ("palpate.evaluation.scoring", "score"),
@@ -37,24 +39,6 @@ FUNCTIONS = {
     "preference score": ("palpate.preference.scoring", "score"),
 }
 NO_CALL = "no call in the file makes it"
-
-
-@dataclass(frozen=True)
-class Check:
-    """What became of one number, or of one input.
-
-    Attributes:
-        name: what a table calls it.
-        status: ``same``; ``differs``; ``cannot check``: an input is missing, or was in memory
-            alone; ``untraced``: the file does not say where it comes from.
-        why: the values that differ, or what is missing; '' where they are the same.
-        kind: ``number`` or ``input``.
-    """
-
-    name: str
-    status: Status
-    why: str = ""
-    kind: Literal["number", "input"] = "number"
 
 
 @dataclass(frozen=True)
@@ -132,10 +116,14 @@ def verify(
     require(0 <= tolerance < 1, "tolerance", "must lie in [0, 1)", tolerance, TOLERANCE)
     file = Path(path)
     results = read_results(file)
+    scores, checks = numbers_of(results), list[Check]()
+    if is_run(results):
+        checks, scores = verify_run(file, results, tolerance, progress)
+        results = replace(results, audits=[], facts=[], strips=[])  # verified with the run
     calls = [*results.calls, *(a.call for a in results.audits if a.call is not None)]
     made = [repeat(call, file, progress) for call in calls]
-    checks = [check for again in made for check in input_checks(again)]
-    checks += _score_checks(numbers_of(results), made, tolerance)
+    checks += [check for again in made for check in input_checks(again)]
+    checks += _score_checks(scores, made, tolerance)
     checks += _audit_checks(results.audits, made, tolerance)
     checks += _fact_checks(results.facts, made)
     checks += _strip_checks(results.strips, made, tolerance)
