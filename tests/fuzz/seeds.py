@@ -185,11 +185,13 @@ def _results(folder: Path) -> None:
     models, results = folder / "models", folder / "results"
     call("split", manifest, "-o", split, "--train", "0.5")
     shutil.copytree(manifest, results)  # a report shows images next to the results alone
-    call("audit", results, "--split", split, "-o", results / "audit.json")
+    shutil.copy(split, results / "split.json")  # what is verified lies next to its inputs
+    call("audit", results, "--split", results / "split.json", "-o", results / "audit.json")
     for name in ("encoders", "autoencoder", "generator"):
         shutil.copytree(MINI / name, models / name)
     call("generate", manifest, "-o", folder / "generated", "--steps", "1")
-    scored = ("--generated", folder / "generated", "--reference", results)
+    shutil.copytree(folder / "generated", results / "generated")
+    scored = ("--generated", results / "generated", "--reference", results)
     call("score", *scored, "--companions", "psnr", "-o", results / "scores.json")
     with patch("secrets.token_hex", return_value=64 * "0"):
         reference, methods = folder / "manifest", {"a": folder / "manifest", "b": results}

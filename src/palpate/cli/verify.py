@@ -22,8 +22,9 @@ class Options(Common):
     """
 
     results: Annotated[Path, tyro.conf.Positional]
-    """The JSON of `palpate score -o`, `palpate probe -o`, `palpate audit -o` or of a page. It may
-    have been moved with what it was made of."""
+    """The JSON of `palpate score -o`, `palpate probe -o`, `palpate audit -o`, of a page, or in the
+    run folder of `palpate demo` or `palpate reproduce`. It may have been moved with what it was
+    made of."""
     tolerance: float = 1e-6
     """Relative difference up to which two numbers are the same: another machine adds in another
     order. Counts and digests must be equal."""

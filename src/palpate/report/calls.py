@@ -33,7 +33,7 @@ FILES = (
         "root",
         "classes",
     ),
-    *("study", "votes", "metrics"),
+    *("study", "votes", "metrics", "splits"),
 )
 #: Arguments that change no number.
 SILENT = ("progress", "cache", "threads")

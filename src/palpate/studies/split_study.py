@@ -18,6 +18,7 @@ from palpate.data.reading import load
 from palpate.encoders import EncoderSet, train_encoder
 from palpate.encoders.encoder_set import load_clip
 from palpate.evaluation.probing import Plan, Probed, measure, named, plan_of, results_of
+from palpate.report.calls import Call
 from palpate.report.results import Results
 from palpate.studies.stages import Run
 from palpate.training.options import Compute
@@ -36,6 +37,7 @@ def compare_splits(  # noqa: PLR0913 - those of training
     compute: Compute | None = None,
     print_line: Callable[[str], None] = lambda line: None,
     progress: Progress = quiet,
+    run: Run | None = None,
     **options: Any,
 ) -> Results:
     """Train a tactile encoder on each split with each seed, and score it under that split.
@@ -52,6 +54,7 @@ def compare_splits(  # noqa: PLR0913 - those of training
         compute: how to train on the machine at hand; see :func:`palpate.train_encoder`.
         print_line: called with one line a training.
         progress: called with what is done.
+        run: in place of ``work``, one that makes its stages in its own way.
         options: of probing; see :func:`palpate.probe`.
 
     Returns:
@@ -66,7 +69,11 @@ def compare_splits(  # noqa: PLR0913 - those of training
         raise PalpateError("A study of splits must run in one process", processes, fix)
     once = 0 < len(seeds) == len(set(seeds))
     require(once, "seeds", "must hold at least one seed, each once", list(seeds), (0, 1, 2))
-    manifest, folder = load(data), Path(work)
+    given = {"data": data, "splits": named(splits, "split"), "work": Path(work), "clip": clip}
+    given |= {"preset": preset, "epochs": epochs, "seeds": seeds, **options}
+    call = Call.of("probe --train", compare_splits, given)
+    run = run or Run(Path(work), print_line)
+    manifest, folder = load(data), run.folder
     loaded = {name: Split.load(split) for name, split in named(splits, "split").items()}
     axis = "split" if len(loaded) > 1 else ""
     # A leaking split may hold a test image in train as well: that is what is measured.
@@ -77,7 +84,6 @@ def compare_splits(  # noqa: PLR0913 - those of training
     runs: dict[str, list[Probed]] = {}
     facts: dict[str, dict[str, Any]] = {}
     with locked(folder):
-        run = Run(folder, print_line)
         for name, split in loaded.items():
             for number in seeds:
                 stage = f"{name}-{number}"
@@ -110,7 +116,9 @@ def compare_splits(  # noqa: PLR0913 - those of training
     settings = {**training, "preset": getattr(preset, "name", preset), "seeds": list(seeds)}
     settings |= frozen
     more = {"training": settings, "trainings": facts}
-    return replace(results, settings={**results.settings, **more})
+    encoders = {"encoder": {name: fact["encoder"] for name, fact in facts.items()}}
+    call = call.with_digests({**results.settings["digests"], **encoders})
+    return replace(results, settings={**results.settings, **more}, calls=[call])
 
 
 def _digests(clip: str) -> dict[str, str]:

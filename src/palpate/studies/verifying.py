@@ -35,6 +35,7 @@ FUNCTIONS = {
     "score": ("palpate.evaluation.scoring", "score"),
     "probe": ("palpate.evaluation.probing", "probe"),
     "audit": ("palpate.evaluation.auditing", "audit"),
+    "probe --train": ("palpate.studies.verifying_runs", "compare_splits_again"),
     "caption check": ("palpate.captions.checking", "check_captions"),
     "preference score": ("palpate.preference.scoring", "score"),
 }
@@ -105,7 +106,8 @@ def verify(
 
     Args:
         path: a file of ``palpate score -o``, ``palpate probe -o``, ``palpate audit -o``,
-            ``palpate preference score -o``, ``palpate caption check -o``, or the JSON of a page.
+            ``palpate preference score -o``, ``palpate caption check -o``, the JSON of a page, or
+            results in a run folder (:mod:`palpate.studies.verifying_runs`).
         tolerance: relative difference up to which two numbers are the same, in [0, 1); the default
             is for sums whose order may change. Digests and counts must be equal.
         progress: called with what is done.

@@ -186,11 +186,25 @@ def _demo_again(results: Results, folder: Path, place: Path, progress: Progress)
     return results_of(demo, "")
 
 
+def compare_splits_again(*, work: Path, progress: Progress, **arguments: Any) -> Results:
+    """What :func:`palpate.studies.split_study.compare_splits` gives with encoders of ``work``.
+
+    Raises:
+        PalpateError: if one is missing.
+    """
+    from palpate.studies.split_study import compare_splits
+
+    with tempfile.TemporaryDirectory() as place:
+        run = _Again(Path(place), source=Path(work), measures=())
+        return compare_splits(work=work, run=run, progress=progress, **arguments)
+
+
 @dataclass
 class _Again(Run):
     """A run whose stages are those of another folder, but for those that measure."""
 
     source: Path = field(kw_only=True)
+    measures: Sequence[str] = MEASURES
 
     def stage(
         self,
@@ -209,7 +223,7 @@ class _Again(Run):
         if not record:
             raise PalpateError(f"The stage {name} must be there", f"no record at {folder}", "")
         facts = record["facts"]
-        if name in MEASURES:
+        if name in self.measures:
             folder = self.folder / name
             folder.mkdir()
             facts = dict(build(folder) or {})
