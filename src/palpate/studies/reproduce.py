@@ -264,7 +264,7 @@ def _question_nodes(plan: Plan) -> list[Node]:
         build = partial(measure_utility, encoders=judge, images=made, draws=draws)
         after = ["data", "split", judge, *made.values()]
         build = partial(build, device=plan.device)
-        nodes.append(Node("utility", build, {"draws": draws}, after, cost=120))
+        nodes.append(Node("utility", build, {"draws": draws}, after, cost=120, measures=True))
     names = [n for n in study.moved if n in trained]
     if study.world is not None and len(names) > 1:
         nodes += _appearance_nodes(plan, {n: trained[n] for n in names})
@@ -274,7 +274,8 @@ def _question_nodes(plan: Plan) -> list[Node]:
             nodes += [_score_node(plan, NOLEAK, RULER, seed) for seed in plan.seeds]
             rulers[preset.ruler] = {s: _scores(NOLEAK, RULER, s) for s in plan.seeds}
         read = [node for of in rulers.values() for node in of.values()]
-        nodes.append(Node("rulers", partial(compare_rulers, rulers=rulers), {}, read, cost=5))
+        build = partial(compare_rulers, rulers=rulers)
+        nodes.append(Node("rulers", build, {}, read, cost=5, measures=True))
     return nodes
 
 
@@ -293,7 +294,7 @@ def _appearance_nodes(plan: Plan, methods: Mapping[str, Method]) -> list[Node]:
     ours, other = plan.study.moved[:2]
     build = partial(measure_moves, moved=moved, ours=ours, other=other, device=plan.device)
     after = ["data", "split", *dict.fromkeys(read)]
-    return [*nodes, Node("appearance", build, {}, after, cost=10)]
+    return [*nodes, Node("appearance", build, {}, after, cost=10, measures=True)]
 
 
 def _generator(study: Study, method: Method, split: str, seed: int) -> str:
