@@ -466,6 +466,20 @@ def test_held_out_loss_is_logged_and_its_best_weights_are_kept(tmp_path):
     assert len(steps) == count  # a run that has stopped stays so
 
 
+def test_the_best_weights_are_those_of_the_run_that_goes_on(tmp_path):
+    def best(folder, progress=quiet, loss=loss, **change):
+        net, how = Net(), options(evaluations=7, keep="best", lr=0.5, **change)
+        fit(net, loss, N, how, folder, held_out=(9, load), progress=progress)
+        return weights(net)
+
+    whole, stop = best(tmp_path / "whole"), StopAt(11, None, "progress")
+    with pytest.raises(KeyboardInterrupt):
+        best(tmp_path, stop.progress)
+    with pytest.raises(PalpateError, match="gradient"):  # another run, which leaves no checkpoint
+        best(tmp_path, loss=overflowing({9}), seed=6)
+    assert same(best(tmp_path), whole)
+
+
 @pytest.mark.parametrize("rows", [1, 3, 9])
 def test_held_out_loss_is_that_of_all_rows_on_any_number_of_processes(
     tmp_path, on_two_processes, rows

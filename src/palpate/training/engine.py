@@ -29,7 +29,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import load_file, save_file
 from torch import Tensor, nn
 
-from palpate.core import PalpateError, Progress, atomic_path, digest_json, quiet, rng_for
+from palpate.core import PalpateError, Progress, atomic_path, digest_json, quiet, rng_for, short
 from palpate.training.options import Compute, LoopOptions, RowOrder, Tracker, learning_rate
 from palpate.training.processes import average, barrier, merged, place, shared
 from palpate.training.steps import Step
@@ -37,7 +37,7 @@ from palpate.training.steps import Step
 Batch = dict[str, Tensor]
 #: The data of a step, on the CPU; called in a thread, ahead of the step.
 Load = Callable[[Step], Batch]
-CHECKPOINT, BEST, LOG = "checkpoint.safetensors", "best.safetensors", "log.jsonl"
+CHECKPOINT, LOG = "checkpoint.safetensors", "log.jsonl"
 SAMPLES = "samples"
 MOMENTS = ("step", "exp_avg", "exp_avg_sq")  # of AdamW, which counts the steps it did not skip
 DTYPES = {"bf16": torch.bfloat16, "fp16": torch.float16}
@@ -104,8 +104,8 @@ def fit(
         module: parameters that require gradients are trained, on the module's device.
         task: see :class:`Task`.
         options: see :class:`LoopOptions`; no batch is larger than the set.
-        folder: receives ``checkpoint.safetensors`` and ``log.jsonl``, ``best.safetensors`` where
-            there is a held-out part, and ``samples/<step>.png`` where the task draws them. A
+        folder: receives ``checkpoint.safetensors`` and ``log.jsonl``, ``best-<key>.safetensors``
+            where there is a held-out part, and ``samples/<step>.png`` where the task draws them. A
             checkpoint of other rows, options, shapes or ``key`` is ignored and then replaced.
             Several processes must share it.
         compute: see :class:`Compute`.
@@ -174,6 +174,7 @@ class _Run:
         self.average = {name: p.detach().clone() for name, p in averaged.items()}
         shapes = {name: list(p.shape) for name, p in self.parameters.items()}
         self.key = digest_json(["palpate-checkpoint/2", task.key, task.n, shapes, options.facts])
+        self.best_file = folder / f"best-{short(self.key)}.safetensors"  # not of another run
         self.order = RowOrder(task.n, batch, options.seed)
         self.loss = torch.compile(task.loss) if compute.compile else task.loss
         if compute.gradient_checkpointing:
@@ -329,7 +330,7 @@ class _Run:
             if self.task.probe is not None:
                 values |= self.task.probe(self.module)
             if "held_out" in values and values["held_out"] < self.best[0] and not self.part[0]:
-                _save(_copies(self.module.state_dict()), self.folder / BEST)
+                _save(_copies(self.module.state_dict()), self.best_file)
         self.write_log({"step": step - 1} | values)
 
     def held_out_loss(self, n: int, load: Load) -> float:
@@ -395,7 +396,7 @@ class _Run:
         """Leave the weights that are the result in the module, in evaluation mode."""
         if self.options.keep == "best" and self.best[0] < math.inf:
             barrier()  # the first process writes it
-            best = load_file(self.folder / BEST, device=str(self.device))
+            best = load_file(self.best_file, device=str(self.device))
             self.module.load_state_dict(best)
         else:
             self.copy(self.average)
