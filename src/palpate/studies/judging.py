@@ -91,7 +91,7 @@ class Judging:
 
     Attributes:
         split: the images are of its test part.
-        encoders: node of the judge, or the name of a shipped one.
+        encoders: node of the judge.
         methods: name -> node of its images.
         controls: names.
         metrics: further ones.
@@ -118,9 +118,7 @@ def judge_images(
     """Every score of the images of a split's test part, by one encoder."""
     name, methods, cache = judging.split, judging.methods, cache_of(place)
     manifest, split = data_of(after, name)
-    shipped = judging.encoders not in after
-    source = judging.encoders if shipped else after[judging.encoders] / "encoders"
-    judge = EncoderSet.load(source, device=device)
+    judge = EncoderSet.load(after[judging.encoders] / "encoders", device=device)
     folders = {method: after[node] / "images" for method, node in methods.items()}
     folders |= {c: after[f"controls-{name}"] / slug(c) for c in judging.controls}
     test = manifest.part(split, "test")
@@ -171,8 +169,7 @@ def judge_images(
             details = {**one.details, "extra": True}  # a column of the tables
             scores.append(replace(one, subject=subject, split=split.digest, details=details))
     write_json(place / "scores.json", [_stamped(s, stage_of(place)).to_json() for s in scores])
-    facts = {"methods": list(methods), "judge": judge.digest("tactile")}
-    return {"scores": len(scores), **facts}
+    return {"scores": len(scores), "judge": judge.digest("tactile")}
 
 
 def stage_of(place: Path) -> str:

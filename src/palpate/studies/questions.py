@@ -10,11 +10,10 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from palpate.core import FeatureSet, Progress, Score, read_json
+from palpate.core import FeatureSet, Progress
 from palpate.data.images import cached_images
 from palpate.data.manifest import Manifest
 from palpate.diffusion.autoencoders import gels_of
-from palpate.diffusion.generation import Generated
 from palpate.diffusion.pipeline import TactilePipeline
 from palpate.encoders.embed import embed, embed_images
 from palpate.encoders.encoder_set import EncoderSet
@@ -26,11 +25,9 @@ from palpate.sim.appearance import APPEARANCES, Appearance
 from palpate.sim.options import WorldOptions
 from palpate.sim.photos import with_photos
 from palpate.studies.appearance import AGAIN, RECORDED, appearance_claims, appearance_table, moves
-from palpate.studies.judging import read_scores
 from palpate.studies.making import After, Facts, cache_of, data_of, slug
-from palpate.studies.rulers import ruler_claim, ruler_scores, ruler_tables
+from palpate.studies.rulers import measure_rulers, ruler_claim, ruler_scores, ruler_tables
 from palpate.studies.study import NOLEAK
-from palpate.studies.study_tables import READING
 from palpate.studies.utility import Draws, utility
 
 #: Samples whose photos are shown otherwise.
@@ -53,7 +50,7 @@ def measure_utility(
     """
     manifest, split = data_of(after, NOLEAK)
     judge = EncoderSet.load(after[encoders] / "encoders", device=device)
-    made = {name: Generated.load(after[node] / "images") for name, node in images.items()}
+    made = {name: after[node] / "images" for name, node in images.items()}
     tables, curve = utility(manifest, split, judge, made, draws, progress=progress)
     return _write(place, tables, [curve])
 
@@ -130,29 +127,30 @@ def measure_moves(
 
 
 def compare_rulers(
-    place: Path, after: After, progress: Progress, *, rulers: Mapping[str, Mapping[int, str]]
+    place: Path,
+    after: After,
+    progress: Progress,
+    *,
+    rulers: Mapping[str, str],
+    images: Mapping[tuple[str, int], str],
+    device: str,
 ) -> Facts:
     """Whether encoders of other training rank the generators alike.
 
-    ``rulers``: name of an encoder -> seed -> node of its scores.
+    ``rulers``: name of an encoder -> its node, or the name of a shipped one; ``images``: (method,
+    seed) -> node.
     """
-    ranked: dict[str, dict[tuple[str, int], Score]] = {}
-    for ruler, nodes in rulers.items():
-        for seed, node in nodes.items():
-            methods = _methods_of(after[node])
-            for s in read_scores(after[node]):
-                of = s.metric, s.settings.get("preset")
-                if of == ("TMMD", READING) and s.subject in methods and s.value is not None:
-                    ranked.setdefault(ruler, {})[s.subject, seed] = s
-    shared = set.intersection(*({*of} for of in ranked.values()))
-    same = {name: {g: of[g] for g in sorted(shared)} for name, of in ranked.items()}
+    manifest, split = data_of(after, NOLEAK)
+    loaded = {
+        name: EncoderSet.load(after[of] / "encoders" if of in after else of, device=device)
+        for name, of in rulers.items()
+    }
+    folders = {generator: after[node] / "images" for generator, node in images.items()}
+    ranked = measure_rulers(loaded, folders, manifest, split, progress=progress)
+    defined = [g for g in folders if all(of[g].value is not None for of in ranked.values())]
+    same = {name: {g: of[g] for g in defined} for name, of in ranked.items()}
     agreement = ruler_scores(same)
     return _write(place, ruler_tables(same, agreement), claims=[ruler_claim(agreement)])
-
-
-def _methods_of(folder: Path) -> Sequence[str]:
-    """The methods among the subjects that a stage scored."""
-    return read_json(folder / "stage.json", "stage record")["facts"]["methods"]
 
 
 def _write(

@@ -51,8 +51,6 @@ from palpate.studies.utility import Draws
 
 #: Stages whose tables, curves and claims come after those of the paper.
 QUESTIONS = ("utility", "appearance", "rulers")
-#: The judge that is not trained in the run.
-RULER = "shipped"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -269,13 +267,13 @@ def _question_nodes(plan: Plan) -> list[Node]:
     if study.world is not None and len(names) > 1:
         nodes += _appearance_nodes(plan, {n: trained[n] for n in names})
     if len(trained) > 2:
-        rulers = {f"trained on {j}": {s: _scores(NOLEAK, j, s) for s in plan.seeds} for j in SPLITS}
-        if preset.ruler is not None:
-            nodes += [_score_node(plan, NOLEAK, RULER, seed) for seed in plan.seeds]
-            rulers[preset.ruler] = {s: _scores(NOLEAK, RULER, s) for s in plan.seeds}
-        read = [node for of in rulers.values() for node in of.values()]
-        build = partial(compare_rulers, rulers=rulers)
-        nodes.append(Node("rulers", build, {}, read, cost=5, measures=True))
+        rulers = {f"trained on {s}": f"encoder-{s}-{first}" for s in SPLITS}
+        images = {(n, seed): _images(n, NOLEAK, seed) for n, seed in product(trained, plan.seeds)}
+        after = ["data", "split", *rulers.values(), *images.values()]
+        rulers |= {} if preset.ruler is None else {preset.ruler: preset.ruler}
+        build = partial(compare_rulers, rulers=rulers, images=images, device=plan.device)
+        ranking = {"rulers": rulers}
+        nodes.append(Node("rulers", build, ranking, after, cost=60, measures=True))
     return nodes
 
 
@@ -350,10 +348,11 @@ def _method_nodes(
 
 
 def _score_node(plan: Plan, split: str, judge: str, seed: int) -> Node:
-    """What the encoder of ``judge``, or the other ruler, says of the images of ``split``."""
+    """What the encoder of ``judge`` says of the images of ``split``."""
     study, preset, encoder = plan.study, plan.preset, f"encoder-{judge}-{seed}"
-    encoder = str(preset.ruler) if judge == RULER else encoder
     chosen = [m.name for m in study.trained_on(split)]
+    if judge != split:
+        chosen = list(study.on_both)
     methods = {name: _images(name, split, seed) for name in chosen}
     if split == judge == NOLEAK:
         methods |= {name: _images_of_others(name) for name in plan.others}
@@ -370,8 +369,7 @@ def _score_node(plan: Plan, split: str, judge: str, seed: int) -> Node:
     )
     build = partial(judge_images, judging=judging, device=plan.device)
     inputs = {**vars(judging), "metrics": [_source(m) for m in study.metrics]}
-    own = [] if judge == RULER else [encoder]
-    after = ["data", "split", *own, f"controls-{split}", *methods.values()]
+    after = ["data", "split", encoder, f"controls-{split}", *methods.values()]
     name = _scores(split, judge, seed)
     return Node(name, build, inputs, after, version=2, cost=60, measures=True)
 
