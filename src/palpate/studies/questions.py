@@ -10,7 +10,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from palpate.core import FeatureSet, Progress
+from palpate.core import FeatureSet, Progress, Score
 from palpate.data.images import cached_images
 from palpate.data.manifest import Manifest
 from palpate.diffusion.autoencoders import gels_of
@@ -19,15 +19,19 @@ from palpate.encoders.embed import embed, embed_images
 from palpate.encoders.encoder_set import EncoderSet
 from palpate.encoders.models import pick_device
 from palpate.encoders.rows import evenly
+from palpate.metrics import tmmd
 from palpate.report.results import Results
 from palpate.report.study import Claim, Curve, StudyTable
 from palpate.sim.appearance import APPEARANCES, Appearance
 from palpate.sim.options import WorldOptions
 from palpate.sim.photos import with_photos
 from palpate.studies.appearance import AGAIN, RECORDED, appearance_claims, appearance_table, moves
+from palpate.studies.embedding import embed_generated
+from palpate.studies.judging import SIGMA
 from palpate.studies.making import After, Facts, cache_of, data_of, slug
-from palpate.studies.rulers import measure_rulers, ruler_claim, ruler_scores, ruler_tables
+from palpate.studies.rulers import Generator, ruler_claim, ruler_scores, ruler_tables
 from palpate.studies.study import NOLEAK
+from palpate.studies.study_tables import READING
 from palpate.studies.utility import Draws, utility
 
 #: Samples whose photos are shown otherwise.
@@ -137,6 +141,9 @@ def compare_rulers(
 ) -> Facts:
     """Whether encoders of other training rank the generators alike.
 
+    One trained under the leaking split has seen test images of the other: what that does to its
+    ranking is the question.
+
     ``rulers``: name of an encoder -> its node, or the name of a shipped one; ``images``: (method,
     seed) -> node.
     """
@@ -145,9 +152,15 @@ def compare_rulers(
         name: EncoderSet.load(after[of] / "encoders" if of in after else of, device=device)
         for name, of in rulers.items()
     }
-    folders = {generator: after[node] / "images" for generator, node in images.items()}
-    ranked = measure_rulers(loaded, folders, manifest, split, progress=progress)
-    defined = [g for g in folders if all(of[g].value is not None for of in ranked.values())]
+    test = manifest.part(split, "test")
+    ranked: dict[str, dict[Generator, Score]] = {name: {} for name in loaded}
+    for name, encoders in loaded.items():
+        real = embed(test, encoders, "tactile", cache=cache_of(place), still=True)
+        for generator, node in images.items():
+            x = embed_generated(after[node] / "images", test, encoders, progress)
+            how: Facts = {"subject": generator[0], "split": split.digest, "permutations": 0}
+            ranked[name][generator] = tmmd(x, real, preset=READING, sigma=SIGMA, **how)
+    defined = [g for g in images if all(of[g].value is not None for of in ranked.values())]
     same = {name: {g: of[g] for g in defined} for name, of in ranked.items()}
     agreement = ruler_scores(same)
     return _write(place, ruler_tables(same, agreement), claims=[ruler_claim(agreement)])
