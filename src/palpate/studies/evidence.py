@@ -15,6 +15,7 @@ import numpy as np
 from scipy import special
 
 from palpate.core import PalpateError, Score
+from palpate.report.notes import decimals, number
 
 #: End of the metric of every difference.
 DIFFERENCE = " difference"
@@ -149,9 +150,11 @@ def side_of(score: Score) -> int:
 
 
 def in_words(score: Score) -> str:
-    """The number with its interval: ``0.61 [0.3, 0.92]``."""
+    """The number with its interval, rounded as on the page: ``0.610 [0.300, 0.920]``."""
     if score.value is None:
         return "undefined"
     if score.interval is None:
-        return f"{score.value:.3g} (no interval)"
-    return "{:.3g} [{:.3g}, {:.3g}]".format(score.value, *score.interval)
+        return f"{number(score.value)} (no interval)"
+    digits = decimals([score.value, *score.interval])
+    value, low, high = (number(v, digits) for v in (score.value, *score.interval))
+    return f"{value} [{low}, {high}]"
