@@ -2,10 +2,16 @@
 
 import numpy as np
 import pytest
+from PIL import Image
 from scipy.stats import kendalltau
 
-from palpate.core import PalpateError, Score
-from palpate.studies.rulers import ruler_claim, ruler_scores, ruler_tables
+from mini_fixtures import make_encoders
+from palpate.core import PalpateError, Score, Split
+from palpate.data.manifest import Manifest
+from palpate.encoders.embed import embed
+from palpate.metrics import tmmd
+from palpate.sim import WorldOptions, write_world
+from palpate.studies.rulers import measure_rulers, ruler_claim, ruler_scores, ruler_tables
 
 METHODS, SEEDS = [f"m{k}" for k in range(8)], range(3)
 KEYS = [(m, s) for m in METHODS for s in SEEDS]
@@ -87,3 +93,42 @@ def test_perfect_agreement_has_no_interval_and_mistakes_are_named():
     empty = {**same["a"], ("m0", 0): Score("TMMD", "m0", None)}
     with pytest.raises(PalpateError, match="must have a score"):
         ruler_scores({"a": same["a"], "b": empty})
+
+
+def test_every_ruler_measures_every_folder(tmp_path):
+
+    options = WorldOptions(
+        materials=2,
+        objects_per_material=6,
+        contacts_per_video=1,
+        frames_per_contact=2,
+        size=32,
+        tile=64,
+        mixed=0.0,
+        leak="none",
+    )
+    write_world(tmp_path / "w", options)
+    manifest = Manifest.load(tmp_path / "w")
+    split = Split.load(tmp_path / "w" / "splits" / "Orig.json")
+    test = manifest.part(split, "test")
+    rng, images = np.random.default_rng(0), {}
+    for seed, noise in enumerate((0, 60)):
+        folder, cells = tmp_path / str(seed), []
+        folder.mkdir()
+        for k, (i, path) in enumerate(zip(test.ids, test.paths("tactile"), strict=True)):
+            x = np.asarray(Image.open(path)).astype(float)
+            x = np.clip(x + noise * rng.normal(size=x.shape), 0, 255).astype(np.uint8)
+            Image.fromarray(x).save(folder / f"{k}.png")
+            cells.append({"id": i, "tactile": f"{k}.png"})
+        Manifest.from_rows(cells, folder).save(folder / "manifest.parquet")
+        images["m", seed] = folder
+    rulers = {"a": make_encoders(0), "b": make_encoders(1)}
+    made = measure_rulers(rulers, images, manifest, split)
+    for name, encoders in rulers.items():
+        assert float(made[name]["m", 0]) == pytest.approx(0, abs=1e-9)  # the real images
+        real = embed(test, encoders, still=True)
+        x = embed(Manifest.load(images["m", 1]), encoders, still=True).features
+        same = {"ids": test.ids, "groups": test.column("video")}
+        how = {"reference_ids": test.ids, "reference_groups": test.column("video")}
+        want = tmmd(x, real.features, **same, **how, preset="grouped", permutations=0)
+        assert float(made[name]["m", 1]) == pytest.approx(want.value, rel=1e-4)

@@ -11,23 +11,65 @@ rankings (Kendall 1938) decides.
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from itertools import combinations
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from scipy import stats
 
-from palpate.core import Note, PalpateError, Score, require, rng_for
+from palpate.core import Note, PalpateError, Progress, Score, Split, quiet, require, rng_for
+from palpate.data.manifest import Manifest
+from palpate.encoders.embed import embed
+from palpate.encoders.encoder_set import EncoderSet
+from palpate.evaluation.inputs import guard
+from palpate.metrics import tmmd
 from palpate.metrics.inputs import Array
 from palpate.preference.statistics import percentiles, tau_b
 from palpate.report.study import Claim, StudyTable
 from palpate.studies.claims import decide
+from palpate.studies.embedding import embed_generated
 from palpate.studies.evidence import in_words, side_of
 
 #: (method, seed) of a generator.
 Generator = tuple[str, int]
 REPLICATES = 2000
 TAU = "Kendall's tau of rankings"
+
+
+def measure_rulers(
+    rulers: Mapping[str, EncoderSet],
+    images: Mapping[Generator, Path],
+    manifest: Manifest,
+    split: Split,
+    *,
+    progress: Progress = quiet,
+) -> dict[str, dict[Generator, Score]]:
+    """TMMD of every generator's images by every encoder, for :func:`ruler_scores`.
+
+    An encoder that was trained under Orig has seen test images of NoLeak; what that does to its
+    ranking is the question, and its scores say it.
+
+    Args:
+        rulers: name -> encoders with a tactile one.
+        images: (method, seed) -> folder of the images of the test part.
+        manifest: the samples.
+        split: whose test part the images are of.
+        progress: progress callback.
+    """
+    test = manifest.part(split, "test")
+    made: dict[str, dict[Generator, Score]] = {}
+    for name, encoders in rulers.items():
+        notes = guard(encoders, "tactile", test, split=split, allow_seen=True, progress=progress)
+        real = embed(test, encoders, "tactile", still=True, progress=progress)
+        made[name] = {}
+        for (method, seed), folder in images.items():
+            x = embed_generated(folder, test, encoders, progress)
+            how: dict[str, Any] = {"subject": f"{method}, seed {seed}", "split": split.digest}
+            score = tmmd(x, real, preset="grouped", permutations=0, **how)
+            made[name][method, seed] = replace(score, notes=[*score.notes, *notes])
+    return made
 
 
 def ruler_scores(
