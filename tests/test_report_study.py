@@ -108,6 +108,20 @@ def test_a_column_has_one_number_of_decimals_and_a_table_of_metrics_one_a_row():
     assert "0.457" in text or "0.4568" in text
 
 
+def test_ranks_have_no_decimals_and_empty_columns_stand_with_the_scores():
+    rows = [
+        [name, score("rank", name, value, interval=None), None]
+        for name, value in (("a", 2.0), ("b", 1.0))
+    ]
+    laid = sheet(StudyTable("T", "", ["", "rank", "k = 8"], rows))
+    assert [row.cells[1].digits for row in laid.rows] == [0, 0]
+    assert [head.scores for head in laid.heads] == [False, True, True]
+    lost = [["a", score("rank", "a", math.nan, interval=None)], *rows]
+    assert sheet(StudyTable("T", "", ["", "rank"], lost)).rows[1].cells[1].digits == 0
+    shares = [["a", up("a", 1.0, interval=None)], ["b", up("b", 0.0, interval=None)]]
+    assert sheet(StudyTable("T", "", ["", "share"], shares)).rows[0].cells[1].digits == 3
+
+
 def test_labels_of_columns_may_repeat_and_rows_may_be_short():
     table = StudyTable("T", "", ["", "a", "a"], [["x", up("x", 0.5)], ["y"]])
     laid = sheet(table)

@@ -59,7 +59,7 @@ def curve_drawing(curve: Curve) -> Drawing:
     parts.append(Words(RIGHT, bottom + 33, label, "end", ink="ink"))
     drawn = [(k, points) for k, _, points in lines]
     for k, points in drawn:
-        parts += _bands(k, points, x, y)
+        parts += _bands(k, points, x, y, 0.16 if len(drawn) < 4 else 0.08)
     for k, points in drawn:
         parts += _line(k, points, x, y)
     legend, height = _legend([line.label for line in curve.lines], bottom + 48)
@@ -121,14 +121,16 @@ def _middle(x: float, text: str) -> float:
     return min(x, WIDTH - wide(text) / 2)
 
 
-def _bands(k: int, points: Sequence[tuple[float, Score]], x: Scale, y: Scale) -> list[Shape]:
+def _bands(
+    k: int, points: Sequence[tuple[float, Score]], x: Scale, y: Scale, opacity: float
+) -> list[Shape]:
     parts: list[Shape] = []
     for run in _runs(points, lambda s: s.value is not None and s.interval is not None):
         edges = [(x.at(v), *map(y.at, s.interval or ())) for v, s in run]
         if len(run) > 1:
             around = [(px, low) for px, low, _ in edges]
             around += [(px, high) for px, _, high in reversed(edges)]
-            parts.append(Shape(around, INKS[k % len(INKS)], fill=True, opacity=0.16))
+            parts.append(Shape(around, INKS[k % len(INKS)], fill=True, opacity=opacity))
         else:
             ((px, low, high),) = edges
             ends = [[(px - 4, v), (px + 4, v)] for v in (low, high)]

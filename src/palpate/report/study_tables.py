@@ -28,7 +28,10 @@ _ARROW = re.compile("[↑↓→]")
 
 @dataclass(frozen=True)
 class Head:
-    """One column: label and better direction ('' where none is shown); whether it holds scores."""
+    """One column: label and better direction ('' where none is shown); whether it holds scores.
+
+    One that is empty is among the scores.
+    """
 
     label: str
     arrow: str
@@ -203,12 +206,21 @@ def _different(labels: Sequence[str]) -> list[str]:
 
 def _digits(column: Sequence[Score | str | None]) -> list[int]:
     """Decimals of each cell: equal ones for the scores of one metric in one column."""
-    values: dict[str, list[float]] = {}
+    by_metric: dict[str, list[Score]] = {}
     for score in column:
         if isinstance(score, Score):
-            known = [v for v in (score.value, *(score.interval or ())) if v is not None]
-            values.setdefault(score.metric, []).extend(known)
-    return [decimals(values[s.metric]) if isinstance(s, Score) else 0 for s in column]
+            by_metric.setdefault(score.metric, []).append(score)
+    digits = {metric: _digits_of(scores) for metric, scores in by_metric.items()}
+    return [digits[s.metric] if isinstance(s, Score) else 0 for s in column]
+
+
+def _digits_of(scores: Sequence[Score]) -> int:
+    """Decimals of the scores of one metric; none of ranks and counts."""
+    values = [float(s) for s in scores if defined(s)]
+    bounds = [v for s in scores for v in s.interval or ()]
+    if not bounds and max(values, default=0) > 1 and all(v == round(v) for v in values):
+        return 0
+    return decimals([*values, *bounds])
 
 
 def _head(label: str, column: Sequence[Score | str | None], best: bool) -> Head:
@@ -217,7 +229,7 @@ def _head(label: str, column: Sequence[Score | str | None], best: bool) -> Head:
     shown = best and len(directions) == 1 and not _ARROW.search(label)
     direction = scores[0].higher_is_better if shown else None
     words = (ARROWS[direction], BETTER[direction]) if shown else ("", "")
-    return Head(label, *words, bool(scores))
+    return Head(label, *words, bool(scores) or not any(column))
 
 
 def _best(
