@@ -34,8 +34,8 @@ SIGNATURES = {
         "allow_seen cache progress"
     ),
     "score": (
-        "generated reference * encoder split names labels groups group background presets sigma "
-        "estimator backend normalize companions controls inception clip lpips "
+        "generated reference * encoder split names labels groups group background train presets "
+        "sigma estimator backend normalize companions controls inception clip lpips "
         "permutations seed allow_seen cache progress"
     ),
     "split": (
@@ -58,7 +58,7 @@ SIGNATURES = {
         "self photos * text weight ids seed guidance steps gel generator callback_on_step_end"
         " progress"
     ),
-    "World.__init__": "self options * cache",
+    "World.__init__": "self options * cache appearance",
     "Manifest.load": "path root",
     "Split.from_ids": "* rule manifest **parts",
 }
