@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import multiprocessing
 import os
-import pickle
 import signal
 import time
 import traceback
@@ -280,7 +279,7 @@ def _run_in_workers(ordered: Sequence[Node], folder: Path, whole: _Whole) -> Non
         while len(whole.stages) < len(ordered):
             while (idle or len(workers) < whole.jobs) and (node := whole.ready()) is not None:
                 worker = idle.pop() if idle else _start_worker(workers, whole.jobs)
-                worker.send_bytes(pickle.dumps((node, reads[node.name], folder)))
+                worker.send((node, reads[node.name], folder))
                 whole.begin(node)
             for worker in wait([w for w in workers if w not in idle], timeout=1.0):
                 kind, value = _received(worker, workers[worker])
@@ -356,9 +355,8 @@ def _work(channel: Channel, environment: Mapping[str, str]) -> None:
         send("progress", (what, done, total, remark))
 
     while True:
-        task = channel.recv_bytes()
         try:
-            node, read, folder = pickle.loads(task)
+            node, read, folder = channel.recv()
             send("stage", _build_node(node, read, folder, partial(send, "line"), report))
         except Exception as error:
             error.add_note(traceback.format_exc())  # a traceback is not sent along
