@@ -141,7 +141,9 @@ def test_the_command_reports_planted_copies(capsys, world, tmp_path):
     args = (*args, "--train", world / "train", "--encoder", "palpate/mini", "--allow-seen")
     status, out, err = call(capsys, *args, "--json")
     assert status == 0, err
-    scores = {(s["metric"], s["subject"]): s for s in json.loads(out)["scores"]}
+    data = json.loads(out)
+    assert len(data["settings"]["digests"]["train"]) == 64
+    scores = {(s["metric"], s["subject"]): s for s in data["scores"]}
     for space in ("contact pixels", "tactile features"):
         copied = scores[f"memorized share ({space})", "copies"]
         assert 0.4 < copied["value"] < 0.65, space

@@ -375,7 +375,7 @@ def score(  # noqa: PLR0913
     outcome.scores = with_warnings(
         outcome.scores, inputs, split, digest, of_encoder, choices=choices
     )
-    settings = _settings(inputs, family, outcome, encoders)
+    settings = _settings(inputs, family, outcome, encoders, seen)
     settings |= {"split rule": dict(split.rule)} if split is not None else {}
     settings |= {"encoder": str(encoder)} if encoders is not None else {}
     return Results(
@@ -744,11 +744,14 @@ class _Run:
         )
 
 
-def _settings(inputs: Inputs, family: Family, outcome: Outcome, encoders: Any) -> dict[str, Any]:
+def _settings(
+    inputs: Inputs, family: Family, outcome: Outcome, encoders: Any, train: Samples | None
+) -> dict[str, Any]:
     """Digests and options, for the page and for a later comparison."""
     real, made = inputs.reference, inputs.generators
     split = family.common["split"]
     digests: dict[str, Any] = {"split": split} if split else {}
+    digests |= {"train": train.digest} if train is not None else {}
     options: dict[str, Any] = {"group": inputs.group, "seed": family.common["seed"]}
     settings: dict[str, Any] = {"digests": digests, "options": options}
     if real.features is None:
