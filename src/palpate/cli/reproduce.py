@@ -33,6 +33,8 @@ class Options(Common):
     method: tuple[str, ...] = ()
     """NAME=FOLDER: images of the test part that another system made, scored like ours. The test
     part is that of FOLDER/split/NoLeak.json of an earlier run."""
+    people: Path | None = None
+    """Results of `palpate preference score -o`, for the claims on what people prefer."""
     jobs: int = 1
     """Processes that run stages at the same time."""
     device: str = "auto"
@@ -58,6 +60,7 @@ def run(options: Options, terminal: Terminal) -> dict[str, Any]:
         root=options.root,
         others=_folders(options.method),
         device=options.device,
+        people=options.people,
     )
     if options.dry_run:
         return _print_plan(planned(plan, output), terminal)

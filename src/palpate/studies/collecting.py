@@ -36,12 +36,14 @@ def collect(
     judgments: Mapping[tuple[str, str], Sequence[str]],
     probes: Mapping[str, Sequence[str]],
     gallery: str,
+    people: Path | None = None,
     questions: Sequence[str] = (),
 ) -> Facts:
     """Write ``results.json``: everything but the record of the run.
 
     ``judgments``: (split of the images, split of the judge) -> nodes, one a seed; ``probes``: split
-    -> nodes; ``gallery``: node of the images that are shown; ``questions``: nodes of further
+    -> nodes; ``gallery``: node of the images that are shown; ``people``: results of a human study,
+    whose preferences are among the claims; ``questions``: nodes of further
     tables, curves and claims.
     """
     manifest = Manifest.load(after["data"])
@@ -69,7 +71,8 @@ def collect(
     tables += [table for answer in answers for table in answer.tables]
     images = [m for m in methods if m.startswith("GVST")]
     tasks = {**_tasks_of_encoders(probed.scores), **_tasks_of_generators(seeds)}
-    claims = paper_claims(noleak, tasks=tasks, names=Names(OURS, images))
+    votes = [] if people is None else [*Results.load(people).scores]
+    claims = paper_claims(noleak, tasks=tasks, people=votes, names=Names(OURS, images))
     claims += [claim for answer in answers for claim in answer.claims]
     notes = [*probed.notes, *([Note("synthetic-data")] if manifest.facts.get("synthetic") else [])]
     results = Results(

@@ -140,7 +140,7 @@ def judge_images(
         progress=progress,
     )
     scores = [s for s in results if s.metric != MATERIAL or s.subject not in OF_TRAIN]
-    images = {n: load_images(_files(f, test.ids), judging.size) for n, f in folders.items()}
+    images = {n: load_images(image_files(f, test.ids), judging.size) for n, f in folders.items()}
     real = load_images(test.paths("tactile"), judging.size)
     features = embed(test, judge, "tactile", cache=cache, still=True)
     made = {n: replace(features, features=embed_images(x, judge)) for n, x in images.items()}
@@ -190,7 +190,8 @@ def _compares(score: Score, methods: Mapping[str, str]) -> bool:
     return pair == [None, None] or any(name in methods for name in pair)
 
 
-def _files(folder: Path, ids: Sequence[str]) -> list[Path]:
+def image_files(folder: Path, ids: Sequence[str]) -> list[Path]:
+    """The files of images of either kind of folder, in the order of ``ids``."""
     if (folder / "index.json").is_file():
         from palpate.diffusion.generation import Generated
 

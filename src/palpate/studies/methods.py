@@ -24,7 +24,7 @@ from palpate.diffusion.presets import DiffusionPreset
 Images = NDArray[np.uint8]
 #: The paper's training, driven at test time by the photo in the place of the text.
 OURS = "Ours"
-BRIDGE, GVST, BEST = "Ours w/ memory bridge", "GVST", "best"
+BRIDGE, BACKGROUND, GVST, BEST = "Ours w/ memory bridge", "Ours w/ BG", "GVST", "best"
 #: Text conditions the training, with nothing that bridges to photos.
 BARE: Mapping[str, Any] = {"source": "text", "gap": "none", "noise": 0.0}
 

@@ -11,12 +11,12 @@ from pathlib import Path
 from typing import Any
 
 from palpate.core import FeatureSet, Progress, Score
-from palpate.data.images import cached_images
+from palpate.data.images import cached_images, load_images
 from palpate.data.manifest import Manifest
 from palpate.diffusion.autoencoders import gels_of
 from palpate.diffusion.pipeline import TactilePipeline
 from palpate.encoders.embed import embed, embed_images
-from palpate.encoders.encoder_set import EncoderSet
+from palpate.encoders.encoder_set import EncoderSet, load_clip
 from palpate.encoders.models import pick_device
 from palpate.encoders.rows import evenly
 from palpate.metrics import tmmd
@@ -27,12 +27,13 @@ from palpate.sim.options import WorldOptions
 from palpate.sim.photos import with_photos
 from palpate.studies.appearance import AGAIN, RECORDED, appearance_claims, appearance_table, moves
 from palpate.studies.embedding import embed_generated
-from palpate.studies.judging import SIGMA
+from palpate.studies.forty import companions_on_forty
+from palpate.studies.judging import SIGMA, image_files
 from palpate.studies.making import After, Facts, cache_of, data_of, slug
 from palpate.studies.rulers import Generator, ruler_claim, ruler_scores, ruler_tables
 from palpate.studies.study import NOLEAK
 from palpate.studies.study_tables import READING
-from palpate.studies.utility import Draws, utility
+from palpate.studies.utility import Draws, utility, utility_claims
 
 #: Samples whose photos are shown otherwise.
 MOVED = 200
@@ -56,7 +57,7 @@ def measure_utility(
     judge = EncoderSet.load(after[encoders] / "encoders", device=device)
     made = {name: after[node] / "images" for name, node in images.items()}
     tables, curve = utility(manifest, split, judge, made, draws, progress=progress)
-    return _write(place, tables, [curve])
+    return _write(place, tables, [curve], utility_claims(tables[0]))
 
 
 def move_images(
@@ -164,6 +165,30 @@ def compare_rulers(
     same = {name: {g: of[g] for g in defined} for name, of in ranked.items()}
     agreement = ruler_scores(same)
     return _write(place, ruler_tables(same, agreement), claims=[ruler_claim(agreement)])
+
+
+def compare_on_forty(
+    place: Path,
+    after: After,
+    progress: Progress,
+    *,
+    images: Mapping[str, str],
+    clip: str,
+    size: int,
+    device: str,
+) -> Facts:
+    """Companions on forty items, as in the paper; ``images``: method -> node of its images."""
+    manifest, split = data_of(after, NOLEAK)
+    test = manifest.part(split, "test")
+    made = {
+        n: load_images(image_files(after[of] / "images", test.ids), size)
+        for n, of in images.items()
+    }
+    real = load_images(test.paths("tactile"), size)
+    groups = [str(v or i) for i, v in zip(test.ids, test.column("video"), strict=True)]
+    vision = EncoderSet(load_clip(clip, device=device))
+    table = companions_on_forty(made, real, test.ids, groups, vision, name=clip)
+    return _write(place, [table])
 
 
 def _write(

@@ -27,7 +27,7 @@ from pathlib import Path
 from typing import Any
 
 from palpate import __version__
-from palpate.core import PalpateError, Progress, quiet, read_json, require
+from palpate.core import PalpateError, Progress, digest_file, quiet, read_json, require
 from palpate.evaluation.inputs import read as read_samples
 from palpate.report.results import Results
 from palpate.sim.presets import MINI_SEEDS
@@ -37,9 +37,10 @@ from palpate.studies.demo import require_unseen, stamp
 from palpate.studies.graph import Node, Planned, plan_graph, run_graph
 from palpate.studies.judging import Judging, judge_images, probe_encoders
 from palpate.studies.making import slug
-from palpate.studies.methods import Method
+from palpate.studies.methods import BACKGROUND, GVST, OURS, Method
 from palpate.studies.questions import (
     MOVED,
+    compare_on_forty,
     compare_rulers,
     measure_moves,
     measure_utility,
@@ -50,7 +51,7 @@ from palpate.studies.study import NOLEAK, SPLITS, Preset, Study
 from palpate.studies.utility import Draws
 
 #: Stages whose tables, curves and claims come after those of the paper.
-QUESTIONS = ("utility", "appearance", "rulers")
+QUESTIONS = ("utility", "appearance", "forty", "rulers")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -65,6 +66,7 @@ class Plan:
         others: name -> folder of images of the test part (of the split without leaks) that another
             system made.
         device: ``auto``, ``cpu``, ``cuda`` or ``mps``.
+        people: results of ``palpate preference score`` on images of the methods, or None.
     """
 
     study: Study
@@ -73,6 +75,7 @@ class Plan:
     root: Path | None = None
     others: Mapping[str, Path] = dataclasses.field(default_factory=dict[str, Path])
     device: str = "auto"
+    people: Path | None = None
 
     @property
     def methods(self) -> list[str]:
@@ -88,6 +91,7 @@ def plan_of(
     root: Path | str | None = None,
     others: Mapping[str, Path | str] | None = None,
     device: str = "auto",
+    people: Path | str | None = None,
 ) -> Plan:
     """The plan of a run, checked before any work.
 
@@ -114,13 +118,16 @@ def plan_of(
         if not folder.is_dir():
             must, fix = f"{name} must be a folder of images", "Check the path"
             raise PalpateError(must, f"nothing at {folder}", fix, argument="method")
+    if people is not None:
+        Results.load(people)  # raises for a file that holds none
     chosen = study.presets[preset]
     if study.world is not None and chosen.clip == "palpate/mini":
         seed = _world(study, chosen).seed
         require(seed not in MINI_SEEDS, "world", "must be one that no shipped model saw", seed)
     elif root is not None and chosen.clip == "palpate/mini":
         require_unseen(Path(root))
-    return Plan(study, chosen, tuple(seeds), None if root is None else Path(root), folders, device)
+    place, votes = (None if path is None else Path(path) for path in (root, people))
+    return Plan(study, chosen, tuple(seeds), place, folders, device, votes)
 
 
 def nodes_of(plan: Plan) -> list[Node]:
@@ -173,11 +180,13 @@ def nodes_of(plan: Plan) -> list[Node]:
         judgments=judgments,
         probes=probes,
         gallery=first,
+        people=plan.people,
         questions=[node.name for node in questions if node.name in QUESTIONS],
     )
     read = [node for of in (judgments, probes) for nodes in of.values() for node in nodes]
     after = ["data", "split", first, *read, *(n.name for n in questions if n.name in QUESTIONS)]
     inputs = {"study": study.name, "title": study.title, "tables": study.tables}
+    inputs |= {"people": plan.people and digest_file(plan.people)}
     nodes.append(Node("results", build, inputs, after, cost=10, measures=True))
     return nodes
 
@@ -266,6 +275,12 @@ def _question_nodes(plan: Plan) -> list[Node]:
     names = [n for n in study.moved if n in trained]
     if study.world is not None and len(names) > 1:
         nodes += _appearance_nodes(plan, {n: trained[n] for n in names})
+    made = {n: _images(n, NOLEAK, first) for n in (OURS, GVST, BACKGROUND) if n in trained}
+    if len(made) > 1:
+        how: dict[str, Any] = {"clip": preset.clip, "size": preset.diffusion.size}
+        build = partial(compare_on_forty, images=made, device=plan.device, **how)
+        after = ["data", "split", *made.values()]
+        nodes.append(Node("forty", build, how, after, cost=15, measures=True))
     if len(trained) > 2:
         rulers = {f"trained on {s}": f"encoder-{s}-{first}" for s in SPLITS}
         images = {(n, seed): _images(n, NOLEAK, seed) for n, seed in product(trained, plan.seeds)}
