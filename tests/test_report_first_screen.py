@@ -46,6 +46,14 @@ def test_controls_of_a_study_follow_the_methods_and_are_never_the_best():
     assert not any(cell.best for row in rows[1:] for cell in row.cells)
 
 
+def test_numbers_that_are_written_alike_are_equally_good():
+    scores = [score("SSIM", s, v, higher_is_better=True) for s, v in (("a", 0.50004), ("b", 0.5))]
+    rows = verdict(
+        telling_columns(score_tables([*scores, score("SSIM", "c", 0.4, higher_is_better=True)]))
+    )
+    assert [row.cells[0].best for row in rows[:3]] == [True, True, False]
+
+
 def test_one_method_alone_is_best_of_nothing():
     (row, floor) = verdict(telling_columns(score_tables([score()])))
     assert (row.cells, floor.subject) == (

@@ -114,7 +114,7 @@ def verdict(columns: Sequence[Column], controls: Collection[str] = ()) -> list[V
     return rows
 
 
-def _verdict_cell(column: Column, subject: str, best: str | None) -> VerdictCell:
+def _verdict_cell(column: Column, subject: str, best: Collection[str]) -> VerdictCell:
     cell = next((c for c in column.cells if c.score.subject == subject), None)
     if cell is None:
         return VerdictCell("")
@@ -122,20 +122,21 @@ def _verdict_cell(column: Column, subject: str, best: str | None) -> VerdictCell
         return VerdictCell("undefined")
     low_high = ", ".join(number(v, column.digits) for v in cell.score.interval or ())
     interval = f"[{low_high}]" if low_high else ""
-    return VerdictCell(number(cell.score.value, column.digits), subject == best, interval)
+    return VerdictCell(number(cell.score.value, column.digits), subject in best, interval)
 
 
-def _best(column: Column, controls: Collection[str]) -> str | None:
-    """The subject with the best value that is no control; None where one alone was scored."""
+def _best(column: Column, controls: Collection[str]) -> set[str]:
+    """The subjects with the best value as it is written, no controls; none where one competes."""
     apart = {REAL, *controls}
     scores = [c.score for c in column.cells if c.defined and c.score.subject not in apart]
     if column.higher_is_better is None:
         scores = [s for s in scores if s.floor is not None]
     if len(scores) < 2:
-        return None
+        return set()
     distance: Callable[[Score], float] = lambda s: abs(float(s) - float(s.floor or 0))
     keys = {True: lambda s: -float(s), False: float, None: distance}
-    return min(scores, key=keys[column.higher_is_better]).subject
+    values = {s.subject: round(keys[column.higher_is_better](s), column.digits) for s in scores}
+    return {subject for subject, value in values.items() if value == min(values.values())}
 
 
 def cards(results: Results, columns: Sequence[Column]) -> list[Card]:
