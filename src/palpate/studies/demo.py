@@ -6,7 +6,7 @@
           -> generated -> scores
 
 Each stage is kept in the run folder under the digest of what it read
-(:class:`palpate.studies.stages.Run`): a killed run resumes from its last finished stage, and a
+(:mod:`palpate.studies.graph`): a killed run resumes from its last finished stage, and a
 changed option rebuilds only what depends on it. ``world`` is skipped where data is given. The
 stages in brackets train small stand-ins for pretrained models; they are skipped where such models
 are given, or ship with the package and the preset takes them. What each model saw is in its card,
@@ -20,6 +20,7 @@ import os
 import platform
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from functools import partial
 from importlib import metadata
 from pathlib import Path
 from typing import Any
@@ -33,7 +34,6 @@ from palpate.core import (
     digest_file,
     digest_folder,
     digest_lines,
-    locked,
     quiet,
     read_json,
     require_choice,
@@ -57,12 +57,12 @@ from palpate.evaluation.scoring import score
 from palpate.leakage.auditing import audit
 from palpate.leakage.splitting import split as leak_free_split
 from palpate.report.results import Audit
-from palpate.sim import WorldOptions, write_world
 from palpate.sim.presets import MINI_SEEDS
 from palpate.studies.controls import NEAREST, nearest_rows
-from palpate.studies.making import fresh, write_images
+from palpate.studies.graph import Node, run_graph
+from palpate.studies.making import After, cache_of, fresh, make_world, write_images
 from palpate.studies.presets import PRESETS
-from palpate.studies.stages import Run, Stage
+from palpate.studies.stages import Stage
 
 
 @dataclass(frozen=True)
@@ -80,7 +80,6 @@ class DemoOptions:
         skip_bad: skip bad rows and images of ``data`` and list them.
         background: train the variant that sees the no-contact image.
         device: ``auto``, ``cpu``, ``cuda`` ...
-        workers: processes that render the world.
     """
 
     preset: str = "mini"
@@ -93,7 +92,6 @@ class DemoOptions:
     skip_bad: bool = False
     background: bool = False
     device: str = "auto"
-    workers: int = 2
 
 
 @dataclass(frozen=True)
@@ -153,353 +151,297 @@ def run_demo(
     Args:
         options: what to run.
         folder: run folder; running again with the same folder resumes.
-        print_line: called with one line per stage.
-        progress: called with what is done within a stage.
+        print_line: called with one line per stage, and with the time left.
+        progress: called with what is done within a stage, and over the whole.
 
     Raises:
         PalpateError: on bad data or options; finished stages stay.
     """
-    demo = _Demo(options, Run(Path(folder), print_line), progress)
-    with locked(Path(folder)):
-        return _run(demo)
+    stages = run_graph(demo_nodes(options), folder, print_line=print_line, progress=progress)
+    return demo_of(options, stages)
 
 
-def run_again(options: DemoOptions, run: Run, progress: Progress = quiet) -> DemoRun:
-    """The demo on a run that makes its stages in its own way."""
-    return _run(_Demo(options, run, progress))
+def demo_nodes(options: DemoOptions) -> list[Node]:
+    """The graph of a demo.
+
+    Raises:
+        PalpateError: on bad options.
+    """
+    return _Demo(options).nodes()
 
 
-def _run(demo: _Demo) -> DemoRun:
-    manifest = demo.data()
-    split, audits = demo.split(manifest)
-    pretraining = None
-    if not (demo.models["clip"] and demo.models["autoencoder"]):
-        pretraining = demo.pretraining(manifest, split)
-    clip = demo.models["clip"] or demo.clip(pretraining)
-    autoencoder = demo.models["autoencoder"] or demo.autoencoder(pretraining, manifest, split)
-    encoders = demo.encoders(manifest, split, clip, pretraining)
-    model = demo.generator(manifest, split, encoders, autoencoder)
-    generated = demo.generated(manifest, split, model)
-    scores = demo.scores(manifest, split, generated, encoders)
-    stages = demo.run.stages
-    return DemoRun(manifest, split, audits, generated, scores, stages, demo.options, demo.models)
+def demo_of(options: DemoOptions, stages: Mapping[str, Stage]) -> DemoRun:
+    """What finished stages hold."""
+    after = {name: stage.folder for name, stage in stages.items()}
+    manifest, split = _data(after)
+    audits = [Audit.from_json(a) for a in read_json(after["split"] / "audits.json", "audits")]
+    generated = Generated.load(after["generated"] / "generated")
+    scores = [Score.from_json(s) for s in read_json(after["scores"] / "scores.json", "scores")]
+    models = _Demo(options).models
+    return DemoRun(manifest, split, audits, generated, scores, stages, options, models)
 
 
 class _Demo:
-    """The stages; each method returns what later ones read."""
+    """The nodes, and the methods that build them: each fills its folder and reads earlier ones."""
 
-    def __init__(self, options: DemoOptions, run: Run, progress: Progress) -> None:
+    def __init__(self, options: DemoOptions) -> None:
         if options.data is not None and not options.data.exists():
             must, got = "must exist", f"nothing at {options.data}"
             raise PalpateError(must, got, "Check the path", argument="data")
-        self.options, self.run, self.progress = options, run, progress
+        self.options = options
         require_choice("preset", options.preset, PRESETS)
         self.preset = PRESETS[options.preset]
         self.encoder = encoder_preset(self.preset.encoder)
         self.diffusion = diffusion_preset(self.preset.diffusion)
-        self.cache = run.folder / "cache"
-        self.shipped = None if options.from_scratch else self.preset.models
+        shipped = None if options.from_scratch else self.preset.models
         self.models = {
-            "clip": options.clip or self.shipped,
-            "autoencoder": options.autoencoder or self.shipped,
+            "clip": options.clip or shipped,
+            "autoencoder": options.autoencoder or shipped,
         }
+        all_shipped = shipped is not None and {*self.models.values()} == {shipped}
+        # What the trainings of the tactile encoder and of the generator start from.
+        self.ready = self.models["clip"] if is_shipped(self.models["clip"] or "") else None
+        self.start = (
+            shipped if all_shipped and self.preset.start and not options.background else None
+        )
+        self.judged = any(map(is_shipped, filter(None, self.models.values())))
         parts: tuple[Part, ...] = ("clip", "encoders", "autoencoder", "generator")
         for part in parts:  # an unknown or absent model is reported before any work
             for name in filter(None, self.models.values()):
                 shipped_folder(name, part)
 
-    def stage(
-        self,
-        name: str,
-        inputs: Mapping[str, Any],
-        after: tuple[str, ...],
-        build: Callable[[Path], Mapping[str, Any]],
-    ) -> Stage:
-        """The stage, built unless it is there for the same inputs and the same earlier stages."""
-        earlier = {n: self.run.stages[n].digest for n in after if n in self.run.stages}
-        return self.run.stage(name, {**inputs, "seed": self.options.seed, **earlier}, build)
+    def nodes(self) -> list[Node]:
+        """The graph; what is given, or ships, has no node."""
+        options, preset, seed = self.options, self.preset, {"seed": self.options.seed}
+        clip, autoencoder = self.models["clip"], self.models["autoencoder"]
+        here = [name for name, model in self.models.items() if model is None]  # trained in the run
+        data, train = self.options.data, ("data", "split")
+        nodes: list[Node] = []
+        if data is None:
+            build = partial(make_world, options=preset.world)
+            nodes.append(Node("world", build, {"options": preset.world}))
+        inputs = {"skip_bad": options.skip_bad, "judged": self.judged, "size": self.diffusion.size}
+        inputs |= {"source": data and str(data.resolve()), "stamp": data and stamp(data)}
+        nodes.append(Node("data", self.data, inputs, ("world",) if data is None else ()))
+        inputs = seed | {"train": preset.train, "by": options.by}
+        nodes.append(Node("split", self.split, inputs, ("data",), measures=True))
+        if here:
+            build, inputs = (
+                partial(make_world, options=preset.pretraining),
+                {"options": preset.pretraining},
+            )
+            nodes.append(Node("pretraining", build, inputs))
+            nodes.append(Node("pretraining-data", self.other_data, {}, ("pretraining",)))
+            train = (*train, "pretraining-data")
+        if clip is None:
+            nodes.append(Node("clip", self.clip, seed | {"preset": self.encoder}, train))
+        if autoencoder is None:
+            inputs = {"options": self.diffusion.autoencoder, "size": self.diffusion.size}
+            nodes.append(Node("autoencoder", self.autoencoder, seed | inputs, train))
+        inputs = {"preset": self.encoder, "epochs": preset.tactile_epochs}
+        inputs |= {"clip": _stamp_of("clip", clip), "start": _stamp_of("encoders", self.ready)}
+        after = [*train, *({"clip"} & {*here})]
+        nodes.append(Node("encoders", self.encoders, seed | inputs, after))
+        inputs = {"preset": self.diffusion, "background": options.background}
+        inputs |= {"autoencoder": _stamp_of("autoencoder", autoencoder)}
+        inputs |= {"start": _stamp_of("generator", self.start)}
+        after = ["data", "split", "encoders", *({"autoencoder"} & {*here})]
+        nodes.append(Node("generator", self.generator, seed | inputs, after))
+        nodes.append(Node("generated", self.generated, seed, ("data", "split", "generator")))
+        after = ["data", "split", "generated", "encoders"]
+        inputs = seed | {"controls": [NEAREST]}
+        return [*nodes, Node("scores", self.scores, inputs, after, measures=True)]
 
-    @property
-    def training(self) -> dict[str, Any]:
+    def how(self, place: Path, progress: Progress) -> dict[str, Any]:
         """Options of every training."""
         options = self.options
-        common = {"seed": options.seed, "cache": self.cache, "device": options.device}
-        return {**common, "progress": self.progress}
+        common = {"seed": options.seed, "cache": cache_of(place), "device": options.device}
+        return {**common, "progress": progress}
 
-    def pixels(self, manifest: Manifest) -> Any:
-        """The tactile images at the generator's size."""
-        size = self.diffusion.size
-        return cached_images(manifest, "tactile", size, self.cache, self.progress)
-
-    def world(self, name: str, options: WorldOptions) -> Path:
-        """A rendered world; it does not depend on the run's seed."""
-
-        def build(folder: Path) -> dict[str, Any]:
-            workers, progress = self.options.workers, self.progress
-            record = write_world(folder / "tree", options, workers=workers, progress=progress)
-            return {"digest": record.digest, "preset": self.options.preset}
-
-        stage = self.run.stage(name, {"options": options, "digest": options.digest}, build)
-        return stage.folder / "tree"
-
-    def data(self) -> Manifest:
+    def data(self, place: Path, after: After, progress: Progress) -> dict[str, Any]:
         """The manifest of the given data, or of the embedded world."""
-        source = self.options.data or self.world("world", self.preset.world)
-        judged = any(map(is_shipped, filter(None, self.models.values())))
-        if judged:
-            require_unseen(source)
+        source = self.options.data or after["world"] / "tree"
         size = None if self.options.data is None else 4 * self.diffusion.size
+        options: dict[str, Any] = {"size": size, "overwrite": True, "progress": progress}
+        if self.judged:
+            require_unseen(source)
+        imported = import_dataset(source, place, skip_bad=self.options.skip_bad, **options)
+        if self.judged:  # images may lie elsewhere than the source
+            require_unseen(imported.manifest.root, imported.manifest.facts)
+        return {
+            "digest": imported.manifest.digest,
+            "dataset": imported.facts.get("dataset", source.name),
+            "samples": len(imported.manifest),
+            "skipped": [str(p) for p in imported.skipped],
+            "inconclusive": imported.inconclusive,
+            "facts": dict(imported.facts),
+        }
 
-        def build(folder: Path) -> dict[str, Any]:
-            options: dict[str, Any] = {"size": size, "overwrite": True, "progress": self.progress}
-            options["skip_bad"] = self.options.skip_bad
-            imported = import_dataset(source, folder, **options)
-            return {
-                "digest": imported.manifest.digest,
-                "dataset": imported.facts.get("dataset", source.name),
-                "samples": len(imported.manifest),
-                "skipped": [str(p) for p in imported.skipped],
-                "inconclusive": imported.inconclusive,
-                "facts": dict(imported.facts),
-            }
-
-        inputs = {"source": str(source.resolve()), "stamp": stamp(source), "size": size}
-        inputs |= {"skip_bad": self.options.skip_bad}
-        world = self.run.stages["world"].digest if "world" in self.run.stages else None
-        stage = self.run.stage("data", {**inputs, "world": world}, build)
-        manifest = Manifest.load(stage.folder)
-        if judged:  # images may lie elsewhere than the source
-            require_unseen(manifest.root, manifest.facts)
-        return manifest
-
-    def split(self, manifest: Manifest) -> tuple[Split, list[Audit]]:
+    def split(self, place: Path, after: After, progress: Progress) -> dict[str, Any]:
         """The leak-free split, and the audits of it and of the data set's own splits."""
-        splits = sorted((self.run.stages["data"].folder / "splits").glob("*.json"))
-        options, preset = self.options, self.preset
+        manifest, options = Manifest.load(after["data"]), self.options
+        clean = leak_free_split(manifest, train=self.preset.train, by=options.by, seed=options.seed)
+        clean.save(place / "noleak.json")
+        how: dict[str, Any] = {"cache": cache_of(place), "progress": progress}
+        audits = [
+            audit(manifest, split=path, name=path.stem, by="video", **how)
+            for path in sorted((after["data"] / "splits").glob("*.json"))
+            if Split.load(path).ids("test")
+        ]
+        group = str(clean.rule["group"])
+        name = "NoLeak" if group == "video" else f"NoLeak by {group}"
+        audits.append(audit(manifest, split=clean, by=group, name=name, **how))
+        if group != "video" and not manifest.table["video"].null_count():
+            name = f"{name}, seen by video"
+            audits.append(audit(manifest, split=clean, by="video", name=name, images=False))
+        write_json(place / "audits.json", [a.to_json() for a in audits])
+        return {"digest": clean.digest, "counts": clean.counts(), "rule": dict(clean.rule)}
 
-        def build(folder: Path) -> dict[str, Any]:
-            clean = leak_free_split(manifest, train=preset.train, by=options.by, seed=options.seed)
-            clean.save(folder / "noleak.json")
-            how: dict[str, Any] = {"cache": self.cache, "progress": self.progress}
-            audits = [
-                audit(manifest, split=path, name=path.stem, by="video", **how)
-                for path in splits
-                if Split.load(path).ids("test")
-            ]
-            group = str(clean.rule["group"])
-            name = "NoLeak" if group == "video" else f"NoLeak by {group}"
-            audits.append(audit(manifest, split=clean, by=group, name=name, **how))
-            if group != "video" and not manifest.table["video"].null_count():
-                name = f"{name}, seen by video"
-                audits.append(audit(manifest, split=clean, by="video", name=name, images=False))
-            write_json(folder / "audits.json", [a.to_json() for a in audits])
-            return {"digest": clean.digest, "counts": clean.counts(), "rule": dict(clean.rule)}
+    def other_data(self, place: Path, after: After, progress: Progress) -> dict[str, Any]:
+        """The manifest of the other world."""
+        tree = after["pretraining"] / "tree"
+        imported = import_dataset(tree, place, overwrite=True, progress=progress)
+        return {"digest": imported.manifest.digest, "samples": len(imported.manifest)}
 
-        inputs = {"manifest": manifest.digest, "root": str(manifest.root), "train": preset.train}
-        inputs |= {"by": options.by, "own": [digest_file(p) for p in splits]}
-        folder = self.stage("split", inputs, (), build).folder
-        audits = [Audit.from_json(a) for a in read_json(folder / "audits.json", "audits")]
-        return Split.load(folder / "noleak.json"), audits
+    def clip(self, place: Path, after: After, progress: Progress) -> dict[str, Any]:
+        """A small CLIP trained on photos and texts."""
+        everything, how = _pretraining(after), self.how(place, progress)
+        clip = train_clip(
+            everything, _all_train(everything), self.encoder, place / "training", **how
+        )
+        clip.save(fresh(place / "clip"))
+        digests = {"digest": clip.digest("vision"), "text": clip.digest("text")}
+        return {**digests, "samples": len(everything)}
 
-    def pretraining(self, manifest: Manifest, split: Split) -> Manifest:
-        """Another world's samples and the train part: what the frozen models may see."""
-        tree = self.world("pretraining", self.preset.pretraining)
-
-        def build(folder: Path) -> dict[str, Any]:
-            imported = import_dataset(tree, folder, overwrite=True, progress=self.progress)
-            return {"digest": imported.manifest.digest, "samples": len(imported.manifest)}
-
-        world = {"pretraining": self.run.stages["pretraining"].digest}
-        stage = self.run.stage("pretraining-data", world, build)
-        other = Manifest.load(stage.folder)
-        # Prefixed, so that a user's copy of this world does not collide with it.
-        return Manifest.join(other.prefixed("pretraining/"), manifest.part(split, "train"))
-
-    def clip(self, pretraining: Manifest | None) -> str:
-        """A small CLIP trained on photos and texts; returns its folder."""
-        assert pretraining is not None
-
-        def build(folder: Path) -> dict[str, Any]:
-            everything, place = _all_train(pretraining), folder / "training"
-            clip = train_clip(pretraining, everything, self.encoder, place, **self.training)
-            clip.save(fresh(folder / "clip"))
-            digests = {"digest": clip.digest("vision"), "text": clip.digest("text")}
-            return {**digests, "samples": len(pretraining)}
-
-        inputs = {"preset": self.encoder, "train": pretraining.digest}
-        stage = self.stage("clip", inputs, ("pretraining-data", "split", "data"), build)
-        return str(stage.folder / "clip")
-
-    def autoencoder(self, pretraining: Manifest | None, manifest: Manifest, split: Split) -> str:
-        """A small autoencoder of tactile images; returns its folder."""
-        assert pretraining is not None
-        options = self.diffusion.autoencoder
+    def autoencoder(self, place: Path, after: After, progress: Progress) -> dict[str, Any]:
+        """A small autoencoder of tactile images."""
+        options, everything, (manifest, split) = (
+            self.diffusion.autoencoder,
+            _pretraining(after),
+            _data(after),
+        )
         if options is None:
             must = f"must be given for the preset {self.diffusion.name}"
             raise PalpateError(must, "none", "Pass a hub id or a folder", argument="autoencoder")
         test = manifest.part(split, "test")
-        both = Manifest.join(pretraining, test)  # the first holds the train part
+        both = Manifest.join(everything, test)  # the first holds the train part
         parts = Split.from_ids(
-            train=pretraining.ids, test=test.ids, rule={"name": "pretraining"}, manifest=both.digest
+            train=everything.ids, test=test.ids, rule={"name": "pretraining"}, manifest=both.digest
         )
+        size, how = self.diffusion.size, self.how(place, progress)
+        model = autoencoder_of(both, parts, options, size, place / "training", **how)
+        model.save(fresh(place / "autoencoder"))
+        ceiling = model.card["held_out"]
+        return {"digest": model.digest, "images": len(everything), "ceiling on test": ceiling}
 
-        def build(folder: Path) -> dict[str, Any]:
-            model = autoencoder_of(
-                both,
-                parts,
-                options,
-                self.diffusion.size,
-                folder / "training",
-                cache=self.cache,
-                seed=self.options.seed,
-                device=self.options.device,
-                progress=self.progress,
-            )
-            model.save(fresh(folder / "autoencoder"))
-            ceiling = model.card["held_out"]
-            return {"digest": model.digest, "images": len(pretraining), "ceiling on test": ceiling}
-
-        inputs = {"options": options, "size": self.diffusion.size, "train": pretraining.digest}
-        after = ("pretraining-data", "split", "data")
-        return str(self.stage("autoencoder", inputs, after, build).folder / "autoencoder")
-
-    def encoders(
-        self, manifest: Manifest, split: Split, clip: str, pretraining: Manifest | None
-    ) -> EncoderSet:
+    def encoders(self, place: Path, after: After, progress: Progress) -> dict[str, Any]:
         """The frozen CLIP with a tactile encoder trained on the train part.
 
         The training starts from the shipped tactile encoder of a shipped CLIP, from one trained on
         the pretraining samples first, or from random weights.
         """
-        ready = clip if is_shipped(clip) else None
+        clip = self.models["clip"] or str(after["clip"] / "clip")
+        common = (load_clip(clip, device=self.options.device), self.encoder)
+        first, epochs = self.preset.tactile_epochs
+        how = self.how(place, progress)
+        if self.ready:
+            how |= {"start": EncoderSet.load(self.ready), "epochs": epochs}
+        elif "pretraining-data" in after:
+            other, folder = _pretraining(after), place / "pretraining"
+            start = train_tactile(other, _all_train(other), *common, folder, epochs=first, **how)
+            how |= {"start": start, "epochs": epochs}
+        encoders = train_tactile(*_data(after), *common, place / "training", **how)
+        encoders.save(fresh(place / "encoders"))
+        source = encoders.card.get("text_source")
+        return {"digest": encoders.digest("tactile"), "text_source": source}
 
-        def build(folder: Path) -> dict[str, Any]:
-            frozen = load_clip(clip, device=self.options.device)
-            before, after = self.preset.tactile_epochs
-            common = (frozen, self.encoder)
-            how: dict[str, Any] = dict(self.training)
-            if ready is not None:
-                how |= {"start": EncoderSet.load(ready), "epochs": after}
-            elif pretraining is not None:
-                everything, place = _all_train(pretraining), folder / "pretraining"
-                first = train_tactile(pretraining, everything, *common, place, epochs=before, **how)
-                how |= {"start": first, "epochs": after}
-            encoders = train_tactile(manifest, split, *common, folder / "training", **how)
-            encoders.save(fresh(folder / "encoders"))
-            source = encoders.card.get("text_source")
-            return {"digest": encoders.digest("tactile"), "text_source": source}
-
-        inputs = {
-            "preset": self.encoder,
-            "clip": self._model_stamp("clip", clip),
-            "start": ready and self._model_stamp("encoders", ready),
-            "epochs": self.preset.tactile_epochs,
-        }
-        names = ("split", "data") + (("pretraining-data",) if pretraining is not None else ())
-        return EncoderSet.load(self.stage("encoders", inputs, names, build).folder / "encoders")
-
-    def generator(
-        self, manifest: Manifest, split: Split, encoders: EncoderSet, autoencoder: str
-    ) -> TactilePipeline:
+    def generator(self, place: Path, after: After, progress: Progress) -> dict[str, Any]:
         """The trained pipeline."""
-        all_shipped = self.shipped is not None and {*self.models.values()} == {self.shipped}
-        fits = all_shipped and self.preset.start and not self.options.background
-        start = self.shipped if fits else None
-
-        def build(folder: Path) -> dict[str, Any]:
-            pipeline = train_pipeline(
-                manifest,
-                split,
-                encoders,
-                load_autoencoder(autoencoder),
-                self.diffusion,
-                folder / "training",
-                background=self.options.background,
-                start=TactilePipeline.from_pretrained(start) if start else None,
-                **self.training,
-            )
-            pipeline.save(fresh(folder / "model"))
-            loop, test = pipeline.training["loop"], manifest.part(split, "test")
-            images, gels = self.pixels(test), gels_of(test, self.diffusion.size, self.cache)
-            given = gels if isinstance(pipeline.autoencoder, BackgroundAutoencoder) else None
-            ceiling = measure_reconstruction(pipeline.autoencoder, images, given)
-            return {
-                "ceiling on test": dataclasses.asdict(ceiling),
-                "digest": pipeline.digest,
-                "parameters": pipeline.training["parameters"],
-                "steps": loop["steps"],
-                "batch": loop["batch"],
-                "learning_rate": loop["lr"],
-                "source": pipeline.training["source"],
-                "background": pipeline.background,
-                "sampler": dataclasses.asdict(pipeline.sampler),
-            }
-
-        inputs = {
-            "preset": self.diffusion,
-            "autoencoder": self._model_stamp("autoencoder", autoencoder),
-            "background": self.options.background,
-            "start": start and self._model_stamp("generator", start),
+        manifest, split = _data(after)
+        autoencoder = self.models["autoencoder"] or after["autoencoder"] / "autoencoder"
+        pipeline = train_pipeline(
+            manifest,
+            split,
+            EncoderSet.load(after["encoders"] / "encoders"),
+            load_autoencoder(autoencoder),
+            self.diffusion,
+            place / "training",
+            background=self.options.background,
+            start=TactilePipeline.from_pretrained(self.start) if self.start else None,
+            **self.how(place, progress),
+        )
+        pipeline.save(fresh(place / "model"))
+        loop, test = pipeline.training["loop"], manifest.part(split, "test")
+        size, cache = self.diffusion.size, cache_of(place)
+        images, gels = cached_images(test, "tactile", size, cache), gels_of(test, size, cache)
+        given = gels if isinstance(pipeline.autoencoder, BackgroundAutoencoder) else None
+        ceiling = measure_reconstruction(pipeline.autoencoder, images, given)
+        return {
+            "ceiling on test": dataclasses.asdict(ceiling),
+            "digest": pipeline.digest,
+            "parameters": pipeline.training["parameters"],
+            "steps": loop["steps"],
+            "batch": loop["batch"],
+            "learning_rate": loop["lr"],
+            "source": pipeline.training["source"],
+            "background": pipeline.background,
+            "sampler": dataclasses.asdict(pipeline.sampler),
         }
-        stage = self.stage("generator", inputs, ("split", "data", "encoders"), build)
-        return TactilePipeline.from_pretrained(stage.folder / "model")
 
-    def generated(self, manifest: Manifest, split: Split, pipeline: TactilePipeline) -> Generated:
+    def generated(self, place: Path, after: After, progress: Progress) -> dict[str, Any]:
         """A tactile image for each photo of the test part."""
+        manifest, split = _data(after)
+        pipeline = TactilePipeline.from_pretrained(after["generator"] / "model")
+        how: dict[str, Any] = {"seed": self.options.seed, "progress": progress}
+        made = generate(manifest, split=split, model=pipeline, output=place / "generated", **how)
+        return {"images": len(made.ids)}
 
-        def build(folder: Path) -> dict[str, Any]:
-            how: dict[str, Any] = {"seed": self.options.seed, "progress": self.progress}
-            output = folder / "generated"
-            generated = generate(manifest, split=split, model=pipeline, output=output, **how)
-            return {"images": len(generated.ids)}
-
-        inputs = {"pipeline": pipeline.digest, "sampler": pipeline.sampler}
-        stage = self.stage("generated", inputs, ("split", "data"), build)
-        return Generated.load(stage.folder / "generated")
-
-    def scores(
-        self, manifest: Manifest, split: Split, generated: Generated, encoders: EncoderSet
-    ) -> list[Score]:
+    def scores(self, place: Path, after: After, progress: Progress) -> dict[str, Any]:
         """The scores of the generated images and of the controls."""
-
-        def build(folder: Path) -> dict[str, Any]:
-            nearest = self.nearest(manifest, split, encoders, folder / "nearest")
-            results = score(
-                [generated.folder, nearest],
-                manifest,
-                encoder=encoders,
-                split=split,
-                names=["generated", NEAREST],
-                presets=("grouped", "paper"),
-                companions=("ssim", "psnr"),
-                seed=self.options.seed,
-                cache=self.cache,
-                progress=self.progress,
-                allow_seen=True,  # data may be a copy of the pretraining world; the scores say so
-            )
-            write_json(folder / "scores.json", [s.to_json() for s in results])
-            return {"scores": len(results)}
-
-        inputs = {"encoder": encoders.digest("tactile"), "controls": [NEAREST]}
-        stage = self.stage("scores", inputs, ("split", "data", "generated", "encoders"), build)
-        return [Score.from_json(s) for s in read_json(stage.folder / "scores.json", "scores")]
-
-    def nearest(self, manifest: Manifest, split: Split, encoders: EncoderSet, folder: Path) -> Path:
-        """For each test photo the tactile image of the nearest train photo, as generators' are."""
+        manifest, split = _data(after)
+        encoders, cache = EncoderSet.load(after["encoders"] / "encoders"), cache_of(place)
         train, test = manifest.part(split, "train"), manifest.part(split, "test")
-        rows = nearest_rows(train, test, encoders, cache=self.cache, progress=self.progress)
-        write_images(folder, test.ids, self.pixels(train)[rows])
-        return folder
+        rows = nearest_rows(train, test, encoders, cache=cache, progress=progress)
+        images = cached_images(train, "tactile", self.diffusion.size, cache)
+        write_images(place / "nearest", test.ids, images[rows])
+        results = score(
+            [after["generated"] / "generated", place / "nearest"],
+            manifest,
+            encoder=encoders,
+            split=split,
+            names=["generated", NEAREST],
+            presets=("grouped", "paper"),
+            companions=("ssim", "psnr"),
+            seed=self.options.seed,
+            cache=cache,
+            progress=progress,
+            allow_seen=True,  # data may be a copy of the pretraining world; the scores say so
+        )
+        write_json(place / "scores.json", [s.to_json() for s in results])
+        return {"scores": len(results)}
 
-    def _model_stamp(self, part: Part, source: str) -> str:
-        """What names a model: its stage's digest, that of its folder or file, or its hub id."""
-        if (shipped := shipped_folder(source, part)) is not None:
-            return digest_folder(shipped, "**/*.json")  # they hold the digests of the weights
-        if part in self.run.stages:
-            return self.run.stages[part].digest
-        if Path(source).is_file():
-            return digest_file(Path(source))
-        return digest_folder(Path(source)) if Path(source).is_dir() else source
+
+def _data(after: After) -> tuple[Manifest, Split]:
+    """The manifest and the leak-free split."""
+    return Manifest.load(after["data"]), Split.load(after["split"] / "noleak.json")
+
+
+def _pretraining(after: After) -> Manifest:
+    """Another world's samples and the train part: what the frozen models may see."""
+    other, (manifest, split) = Manifest.load(after["pretraining-data"]), _data(after)
+    # Prefixed, so that a user's copy of this world does not collide with it.
+    return Manifest.join(other.prefixed("pretraining/"), manifest.part(split, "train"))
+
+
+def _stamp_of(part: Part, source: str | None) -> str | None:
+    """What names a given model: the digest of its folder or file, or its hub id."""
+    if source is None:
+        return None
+    if (shipped := shipped_folder(source, part)) is not None:
+        return digest_folder(shipped, "**/*.json")  # they hold the digests of the weights
+    if Path(source).is_file():
+        return digest_file(Path(source))
+    return digest_folder(Path(source)) if Path(source).is_dir() else source
 
 
 def require_unseen(source: Path, facts: Mapping[str, str] | None = None) -> None:

@@ -11,7 +11,7 @@ from __future__ import annotations
 import tempfile
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -26,10 +26,9 @@ from palpate.studies.comparing import (
     score_difference,
     score_name,
 )
+from palpate.studies.graph import Node, in_order
 from palpate.studies.stages import Run, Stage, stage_digest
 
-#: Stages of the demo that measure.
-MEASURES = ("split", "scores")
 #: The stage of a study that holds its results.
 LAST = "results"
 
@@ -146,7 +145,6 @@ def _made_again(results: Results, folder: Path, place: Path, progress: Progress)
 
 
 def _make_nodes(settings: Mapping[str, Any], folder: Path, place: Path, progress: Progress) -> None:
-    from palpate.studies.graph import in_order
     from palpate.studies.making import slug
     from palpate.studies.reproduce import nodes_of, plan_of
     from palpate.studies.study import NOLEAK, STUDIES
@@ -164,26 +162,54 @@ def _make_nodes(settings: Mapping[str, Any], folder: Path, place: Path, progress
         root=options["root"] and folder / "data",
         others={method: images(method) for method in options["methods of others"]},
     )
-    nodes = [node for node in in_order(nodes_of(plan)) if node.measures]
-    for done, node in enumerate(nodes):
-        progress("measurements made again", done, len(nodes), node.name)
-        again = {n.name for n in nodes[:done]}
-        after = {n: (place if n in again else folder) / n for n in node.after}
+    _measure(nodes_of(plan), folder, place, progress)
+
+
+def _measure(
+    nodes: Sequence[Node], folder: Path, place: Path, progress: Progress
+) -> dict[str, Mapping[str, Any]]:
+    """Build the nodes that measure below ``place``; returns their facts by name.
+
+    Raises:
+        PalpateError: if a stage that one reads is not there.
+    """
+    again, facts = [node for node in in_order(nodes) if node.measures], dict[str, Any]()
+    for done, node in enumerate(again):
+        progress("measurements made again", done, len(again), node.name)
+        after = {n: (place if n in facts else folder) / n for n in node.after}
         if missing := next((n for n, f in after.items() if not f.is_dir()), None):
             raise PalpateError(f"The stage {missing} must be there", "no such folder", "")
         (place / node.name).mkdir()
-        node.build(place / node.name, after, quiet)
-    progress("measurements made again", len(nodes), len(nodes))
+        facts[node.name] = dict(node.build(place / node.name, after, quiet) or {})
+    progress("measurements made again", len(again), len(again))
+    return facts
 
 
 def _demo_again(results: Results, folder: Path, place: Path, progress: Progress) -> Results:
-    from palpate.studies.demo import DemoOptions, run_again
+    from palpate.studies.demo import DemoOptions, demo_nodes, demo_of
     from palpate.studies.demo_page import results_of
 
     given = dict(results.settings["options"])
     given["data"] = given["data"] and Path(given["data"])
-    demo = run_again(DemoOptions(**given), _Again(place, source=folder), progress)
-    return results_of(demo, "")
+    options = DemoOptions(**given)
+    nodes = demo_nodes(options)
+    facts = _measure(nodes, folder, place, progress)
+    stages = {node.name: _stage(folder / node.name) for node in nodes}
+    for name, made in facts.items():
+        stages[name] = replace(stages[name], folder=place / name, facts=made)
+    return results_of(demo_of(options, stages), "")
+
+
+def _stage(folder: Path) -> Stage:
+    """A finished stage.
+
+    Raises:
+        PalpateError: if there is none.
+    """
+    if not (record := _record(folder)):
+        raise PalpateError(f"The stage {folder.name} must be there", f"no record at {folder}", "")
+    facts, outputs = record["facts"], record["outputs"]
+    return Stage(folder, record["digest"], facts, outputs, record["seconds"], reused=True)
 
 
 def compare_splits_again(*, work: Path, progress: Progress, **arguments: Any) -> Results:
@@ -195,16 +221,15 @@ def compare_splits_again(*, work: Path, progress: Progress, **arguments: Any) ->
     from palpate.studies.split_study import compare_splits
 
     with tempfile.TemporaryDirectory() as place:
-        run = _Again(Path(place), source=Path(work), measures=())
+        run = _Again(Path(place), source=Path(work))
         return compare_splits(work=work, run=run, progress=progress, **arguments)
 
 
 @dataclass
 class _Again(Run):
-    """A run whose stages are those of another folder, but for those that measure."""
+    """A run whose stages are those of another folder."""
 
     source: Path = field(kw_only=True)
-    measures: Sequence[str] = MEASURES
 
     def stage(
         self,
@@ -214,22 +239,13 @@ class _Again(Run):
         *,
         version: int = 1,
     ) -> Stage:
-        """The stage of the other folder, or what ``build`` makes now.
+        """The stage of the other folder.
 
         Raises:
             PalpateError: if there is no such stage.
         """
-        folder, record = self.source / name, _record(self.source / name)
-        if not record:
-            raise PalpateError(f"The stage {name} must be there", f"no record at {folder}", "")
-        facts = record["facts"]
-        if name in self.measures:
-            folder = self.folder / name
-            folder.mkdir()
-            facts = dict(build(folder) or {})
-        stage = Stage(folder, record["digest"], facts, record["outputs"], record["seconds"], True)
-        self.stages[name] = stage
-        return stage
+        self.stages[name] = _stage(self.source / name)
+        return self.stages[name]
 
 
 def _stored(folder: Path) -> Results | None:
