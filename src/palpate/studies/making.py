@@ -83,17 +83,22 @@ def read_data(
     return {"digest": manifest.digest, "dataset": dataset, **counts}
 
 
-def make_splits(place: Path, after: After, progress: Progress) -> Facts:
-    """The data set's own split, one by whole videos with as large a train part, and their audits.
+def make_splits(
+    place: Path, after: After, progress: Progress, *, noleak: str | None = None
+) -> Facts:
+    """The data set's own split, one without leaks, and their audits.
 
-    A data set without a split of its own gets one by whole contacts in its place.
+    That is the published one of ``noleak``, or one by whole videos with as large a train part. A
+    data set without a split of its own gets one by whole contacts in its place.
     """
     manifest, own = Manifest.load(after["data"]), after["data"] / "splits" / f"{ORIG}.json"
     made = partial(leak_free_split, manifest, seed=0)
     original = Split.load(own) if own.is_file() else made(by="contact")
     counts = original.counts()
     share = counts["train"] / (counts["train"] + counts["test"])
-    clean = made(by="video", train=share)
+    if noleak == "touch-and-go":
+        share = 0.8  # of the record
+    clean = made(by="video", train=share) if noleak is None else made(noleak=noleak, train=share)
     splits, audits = {ORIG: original, NOLEAK: clean}, list[Any]()
     for name, split in splits.items():
         split.save(place / f"{name}.json")

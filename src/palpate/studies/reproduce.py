@@ -243,7 +243,9 @@ def _data_nodes(plan: Plan) -> list[Node]:
     if plan.root is not None:
         inputs |= {"root": str(plan.root.resolve()), "stamp": stamp(plan.root)}
     nodes.append(Node("data", build, inputs, [node.name for node in nodes], cost=10))
-    nodes.append(Node("split", making.make_splits, {}, ["data"], cost=60, measures=True))
+    inputs = {} if study.noleak is None else {"noleak": study.noleak}
+    build = partial(making.make_splits, noleak=study.noleak)
+    nodes.append(Node("split", build, inputs, ["data"], cost=60, measures=True))
     return nodes
 
 

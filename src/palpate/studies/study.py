@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from palpate.core import FeatureSet, Progress, Score
 from palpate.data.importing import import_dataset
@@ -99,6 +99,8 @@ class Study:
         tables: the paper's tables that it makes, by number.
         world: options of the embedded world that differ from the preset's; None: data on disk.
         read: writes the imported data set; called with its root, the folder to fill, and progress.
+        noleak: the published split without leaks of this data set, or its rule; None: whole videos,
+            with as large a train part as the data set's own split has.
         methods: what is compared, on the split without leaks.
         on_both: names of methods that are trained on the data set's own split as well.
         controls: name -> what makes their images.
@@ -115,6 +117,7 @@ class Study:
     tables: Sequence[int]
     world: Mapping[str, Any] | None = None
     read: Callable[[Path, Path, Progress], None] = imported
+    noleak: Literal["touch-and-go", "hct"] | None = None
     methods: Sequence[Method] = tuple(METHODS.values())
     on_both: Sequence[str] = (OURS,)
     controls: Mapping[str, Make] = field(default_factory=lambda: dict(CONTROLS))
@@ -211,5 +214,8 @@ STUDIES: Mapping[str, Study] = {
             (2, 4),
             {"look": "digit", "layout": "hct", "leak": "frame", "seed": 72},
         ),
+        Study("tag", "The study on Touch and Go", (1, 3, 4), noleak="touch-and-go", paper=True),
+        Study("hct", "The study on HCT", (2, 4), noleak="hct", paper=True),
+        Study("clips", "The study on clips of Touch and Go", (1, 3, 4)),
     )
 }
