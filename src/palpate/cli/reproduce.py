@@ -21,7 +21,8 @@ class Options(Common):
     """
 
     study: Annotated[str, tyro.conf.Positional]
-    """`world-gelsight` (tables 1, 3 and 4) or `world-digit` (tables 2 and 4)."""
+    """On the world: `world-gelsight` (tables 1, 3 and 4) or `world-digit` (tables 2 and 4); on data
+    at --root: `tag` (Touch and Go), `hct`, or `clips` (of Touch and Go)."""
     output: OutPath
     """Run folder: results.json, page.html, tables.tex, tables/ (CSV), and a folder a stage."""
     preset: str = "mini"
