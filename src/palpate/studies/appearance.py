@@ -92,11 +92,11 @@ def moves(
         distances[name] = Mean(score, values, np.ones(len(values)), np.array(groups, dtype=str))
         pair = {name: x, RECORDED: base}
         made = compare_tmmd(pair, real, preset="grouped", permutations=0, split=split)
-        found = [(TMMD, made.differences[0])]
+        measured = [(TMMD, made.differences[0])]
         if probe is not None:
             hits = {n: [_accuracy(probe, y, groups, n, split)] for n, y in pair.items()}
-            found.append((ACCURACY, differences_of_means(hits)[0]))
-        changes[name] = [replace(d, metric=m, subject=fields["subject"]) for m, d in found]
+            measured.append((ACCURACY, differences_of_means(hits)[0]))
+        changes[name] = [replace(d, metric=m, subject=fields["subject"]) for m, d in measured]
     return Moves(distances, changes)
 
 

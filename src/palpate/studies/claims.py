@@ -194,8 +194,8 @@ def _preference_claim(
 def _puts(scores: Sequence[Score], ours: str) -> str:
     """``TMMD puts Ours ahead of GVST by 0.6 [0.3, 0.9], of Ours w/ BG by 1 [0.5, 1.5]``."""
     parts: list[str] = []
-    for label, own in groupby(scores, key=_label):
-        each = [f"of {_other(s, ours)} {_by(s)}" for s in own]
+    for label, same in groupby(scores, key=_label):
+        each = [f"of {_other(s, ours)} {_by(s)}" for s in same]
         puts = "people put" if label == PEOPLE else f"{label} puts"
         parts.append(f"{puts} {ours} ahead {', '.join(each)}")
     return "; ".join(parts)
@@ -237,8 +237,8 @@ def _ranking_claim(
 ) -> Claim:
     pair = names.ours, other
     votes = [s for s in people if _is_difference(s)]
-    found = _between(differences, "TMMD", *pair) + _between(votes, PEOPLE, *pair)
-    deciding = [ahead(d, names.ours) for d in found]
+    compared = _between(differences, "TMMD", *pair) + _between(votes, PEOPLE, *pair)
+    deciding = [ahead(d, names.ours) for d in compared]
     others = [
         ahead(d, names.ours) for metric in FAMILY[1:] for d in _between(differences, metric, *pair)
     ]
@@ -279,8 +279,8 @@ def effect_table(differences: Sequence[Score]) -> StudyTable:
     """How well each metric tells methods apart: effect sizes, a row a metric, a column a pair."""
     pairs = list(dict.fromkeys((d.details["a"], d.details["b"]) for d in differences))
     rows: list[list[Score | str | None]] = []
-    for metric, own in groupby(sorted(differences, key=metric_of), key=metric_of):
-        of_pair = {(d.details["a"], d.details["b"]): effect_size(d) for d in own}
+    for metric, same in groupby(sorted(differences, key=metric_of), key=metric_of):
+        of_pair = {(d.details["a"], d.details["b"]): effect_size(d) for d in same}
         rows.append([metric, *(of_pair.get(pair) for pair in pairs)])
     order = [*TRADITIONAL, *FAMILY]
     rank = {name: k for k, name in enumerate(order)}

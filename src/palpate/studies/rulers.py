@@ -134,8 +134,8 @@ def _agreement(
     tau = tau_b(x, y, np.ones(len(x)))
     interval = percentiles(np.array([tau_b(x, y, weight) for weight in draws]))
     methods = sorted({method for method, _ in generators})
-    own = [[k for k, (method, _) in enumerate(generators) if method == m] for m in methods]
-    mean_x, mean_y = (np.array([v[rows].mean() for rows in own]) for v in (x, y))
+    of_method = [[k for k, (method, _) in enumerate(generators) if method == m] for m in methods]
+    mean_x, mean_y = (np.array([v[rows].mean() for rows in of_method]) for v in (x, y))
     by_method = tau_b(mean_x, mean_y, np.ones(len(methods)))
     test: Any = stats.kendalltau(mean_x, mean_y)
     known = bool(np.isfinite(tau))
