@@ -39,7 +39,7 @@ def forged(tmp_path) -> Path:
         replace(made, curves=[curve], claims=[claim]).save(folder / "results.json")
 
     made = run.stage("images", {"seed": 0}, images)
-    run.stage("results", {"after": {"images": made.digest}}, results)
+    run.stage("results", {"after": {"images": made.digest}, "images": "no stage"}, results)
     records = {n: read_json(s.folder / "stage.json", "") for n, s in run.stages.items()}
     settings = {"study": "forged", "stages": {n: _stated(r) for n, r in records.items()}}
     whole = Results.load(run.folder / "results" / "results.json")
