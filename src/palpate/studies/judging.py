@@ -159,7 +159,7 @@ def judge_images(
     if NEAREST in made and features.labels is not None:
         train = manifest.part(split, "train")
         rows = nearest_rows(train, test, vision, cache=cache)
-        scores.append(_cross_fitted(embed(train, judge, cache=cache), made[NEAREST], rows, split))
+        scores += _cross_fitted(embed(train, judge, cache=cache), made[NEAREST], rows, split)
     if OURS in made:
         scores += _halves(made[OURS], judging.permutations, split)
     for metric in judging.metrics:
@@ -200,16 +200,18 @@ def image_files(folder: Path, ids: Sequence[str]) -> list[Path]:
     return Manifest.load(folder).take(ids).paths("tactile")
 
 
-def _cross_fitted(train: FeatureSet, features: FeatureSet, rows: Any, split: Split) -> Score:
+def _cross_fitted(train: FeatureSet, features: FeatureSet, rows: Any, split: Split) -> list[Score]:
     """Material accuracy of the images of nearest photos, which are train images.
 
     By probes that were not fitted to them: of two halves of the train videos, each names the images
-    of the other.
+    of the other. None where a half holds fewer than two materials.
     """
     videos = np.array(train.groups or train.ids, dtype=str)
     names = np.unique(videos)
     half = np.isin(videos, names[::2])
-    hits = np.zeros(len(rows))
+    labels, hits = np.array(train.labels), np.zeros(len(rows))
+    if min(len({*labels[side]} - {"", None}) for side in (half, ~half)) < 2:
+        return []
     for side in (half, ~half):
         ids = [i for i, inside in zip(train.ids, side, strict=True) if inside]
         probe = fit_probe(train.take(ids))
@@ -224,7 +226,7 @@ def _cross_fitted(train: FeatureSet, features: FeatureSet, rows: Any, split: Spl
         "encoder": features.encoder,
     }
     groups = list(features.groups or features.ids)
-    return mean_of(MATERIAL, hits, groups, estimator="mean", details=details, **fields).score
+    return [mean_of(MATERIAL, hits, groups, estimator="mean", details=details, **fields).score]
 
 
 def _halves(features: FeatureSet, permutations: int, split: Split) -> list[Score]:
