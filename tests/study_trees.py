@@ -67,3 +67,12 @@ def forge_hct(folder: Path) -> Path:
     root = forge(folder / "forged", layout="hct", look="digit", leak="frame")
     remove_marks(root)
     return root / "hct"
+
+
+def forge_clips(folder: Path) -> Path:
+    """Videos with the list of frames in contact, and no lists of train and test."""
+    root = forge(folder / "clips", layout="videos")
+    remove_marks(root)
+    for name in ("train.txt", "test.txt"):
+        (root / name).unlink()
+    return root
