@@ -5,6 +5,7 @@ from dataclasses import replace
 from itertools import combinations
 
 import numpy as np
+import polars as pl
 import pytest
 
 from palpate.cli import main
@@ -159,6 +160,17 @@ def test_a_wrong_material_is_never_right(setting):
         setting, rows_of(setting, controls.wrong_material(setting)), "material"
     )
     assert (material != wanted).all()
+
+
+def test_without_materials_none_is_wrong(setting):
+    none = pl.lit(None, pl.String).alias("material")
+    parts = (setting.train, setting.test)
+    train, test = (replace(p, table=p.table.with_columns(none)) for p in parts)
+    bare = replace(setting, train=train, test=test)
+    assert controls.wrong_material(bare) is None
+    rows = rows_of(bare, controls.other_videos(bare))
+    video, own = columns_of(bare, rows, "video")
+    assert (video != own).all()
 
 
 def test_a_memorized_video_is_one_a_material(setting):

@@ -69,9 +69,11 @@ def other_videos(setting: Setting) -> Images:
     return _drawn(setting, "floor", lambda k: (known == material[k]) & (videos != video[k]))
 
 
-def wrong_material(setting: Setting) -> Images:
-    """Real train images of another material."""
+def wrong_material(setting: Setting) -> Images | None:
+    """Real train images of another material; None without materials."""
     known, material = _columns(setting, "material")
+    if len({*known}) < 2:
+        return None
     return _drawn(setting, "wrong", lambda k: known != material[k])
 
 

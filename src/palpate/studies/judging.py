@@ -120,7 +120,8 @@ def judge_images(
     manifest, split = data_of(after, name)
     judge = EncoderSet.load(after[judging.encoders] / "encoders", device=device)
     folders = {method: after[node] / "images" for method, node in methods.items()}
-    folders |= {c: after[f"controls-{name}"] / slug(c) for c in judging.controls}
+    controls = {c: after[f"controls-{name}"] / slug(c) for c in judging.controls}
+    folders |= {c: folder for c, folder in controls.items() if folder.is_dir()}
     test = manifest.part(split, "test")
     gels = not test.table["background"].null_count()
     results = score(

@@ -220,7 +220,8 @@ def make_images(
             autoencoder=autoencoder and autoencoder / "autoencoder",
             progress=progress,
         )
-        write_images(output, setting.test.ids, _made(method.name, method.make, setting))
+        made = _checked(method.name, method.make(setting), setting)
+        write_images(output, setting.test.ids, made)
         return {"images": len(setting.test)}
     pipeline = TactilePipeline.from_pretrained(after[generator] / "model").to(pick_device(device))
     if method.drive == "photo":
@@ -262,10 +263,13 @@ def make_controls(
         autoencoder=after[f"autoencoder-{split}"] / "autoencoder",
         progress=progress,
     )
+    made: list[str] = []
     for done, (name, make) in enumerate(controls.items()):
         progress("controls", done, len(controls), name)
-        write_images(place / slug(name), setting.test.ids, _made(name, make, setting))
-    return {"controls": list(controls)}
+        if (images := make(setting)) is not None:
+            write_images(place / slug(name), setting.test.ids, _checked(name, images, setting))
+            made.append(name)
+    return {"controls": made}
 
 
 def take_images(
@@ -292,13 +296,13 @@ def write_images(folder: Path, ids: Sequence[str], images: Images) -> None:
     Manifest.from_rows(rows, folder).save(folder / "manifest.parquet")
 
 
-def _made(name: str, make: Make, setting: Setting) -> Images:
-    """The images of a function.
+def _checked(name: str, made: Images | None, setting: Setting) -> Images:
+    """The images that a function made.
 
     Raises:
-        PalpateError: if it returns another number of images, or another kind of array.
+        PalpateError: if it returned another number of images, or another kind of array.
     """
-    images = np.asarray(make(setting))
+    images = np.asarray(made)
     shape = (len(setting.test), setting.size, setting.size, 3)
     if images.shape != shape or images.dtype != np.uint8:
         must = f"{name} must make an array {shape} of uint8, an image a test sample"

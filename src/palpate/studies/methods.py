@@ -70,8 +70,9 @@ class Setting:
         return cached_images(part, column, self.size, self.cache, self.progress)
 
 
-#: Images (n, size, size, 3) of the samples of ``setting.test``, in their order.
-Make = Callable[[Setting], Images]
+#: Images (n, size, size, 3) of the samples of ``setting.test``, in their order; a control may be
+#: None where the data do not allow it.
+Make = Callable[[Setting], Images | None]
 
 
 @dataclass(frozen=True)

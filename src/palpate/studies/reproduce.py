@@ -142,7 +142,7 @@ def nodes_of(plan: Plan) -> list[Node]:
         inputs = {"controls": {n: _source(f) for n, f in study.controls.items()}}
         inputs |= {"size": preset.diffusion.size, "clip": preset.clip}
         name = f"controls-{split}"
-        nodes.append(Node(name, partial(make, device=device), inputs, after, cost=20))
+        nodes.append(Node(name, partial(make, device=device), inputs, after, version=2, cost=20))
     for seed, split in product(plan.seeds, SPLITS):
         encoder = f"encoder-{split}-{seed}"
         how: dict[str, Any] = {"preset": preset.encoder, "clip": preset.clip}
