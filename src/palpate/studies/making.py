@@ -116,7 +116,7 @@ def make_encoders(
     ``how``: clip, preset and device, as of :func:`palpate.train_encoder`.
     """
     manifest, parts = data_of(after, split)
-    folder = place / "encoders"
+    folder = fresh(place / "encoders")
     encoders = train_encoder(manifest, parts, output=folder, seed=seed, progress=progress, **how)
     return {"digest": encoders.digest("tactile"), "scores": encoders.card.get("scores")}
 

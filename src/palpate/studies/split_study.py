@@ -20,6 +20,7 @@ from palpate.encoders.encoder_set import load_clip
 from palpate.evaluation.probing import Plan, Probed, measure, named, plan_of, results_of
 from palpate.report.calls import Call
 from palpate.report.results import Results
+from palpate.studies.making import fresh
 from palpate.studies.stages import Run
 from palpate.training.options import Compute
 
@@ -91,7 +92,7 @@ def compare_splits(  # noqa: PLR0913 - those of training
                 def build(
                     place: Path, split: Split = split, number: int = number
                 ) -> dict[str, Any]:
-                    output = place / "encoders"
+                    output = fresh(place / "encoders")
                     encoders = train_encoder(
                         manifest,
                         split,
