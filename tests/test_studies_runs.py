@@ -1,0 +1,148 @@
+"""A whole small study: what its stages read and write, killed at the mark, by two processes."""
+
+import json
+import os
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+from safetensors.numpy import load_file
+
+import small_study
+from palpate.core import digest_json, short
+from palpate.studies.graph import in_order
+from palpate.studies.reproduce import nodes_of, plan_of
+from palpate.studies.stages import stage_digest
+from palpate.studies.study import STUDIES
+
+GOLDEN = Path(__file__).parent / "golden" / "study_stages.json"
+#: What holds no times.
+KEPT = ("*.png", "*.safetensors", "*.npz", "*.parquet", "scores.json", "results.json", "*.jpg")
+
+
+def kind_of(node) -> str:
+    """What builds a node: ``make_encoders`` for that of every split and seed."""
+    return getattr(node.build, "func", node.build).__name__
+
+
+NODES = in_order(nodes_of(small_study.plan()))
+
+
+def outcome(run):
+    """The bytes of what a run is judged by."""
+    stages = (run / node.name for node in NODES)
+    files = {p for folder in stages for pattern in KEPT for p in folder.rglob(pattern)}
+    return {p.relative_to(run).as_posix(): p.read_bytes() for p in files}
+
+
+def differing(run, other):
+    """Names of the files that are not the same in two runs."""
+    a, b = outcome(run), outcome(other)
+    return sorted(name for name in a.keys() | b.keys() if a.get(name) != b.get(name))
+
+
+# --- what stages read: cheap
+
+
+def digests(study: str, preset: str) -> dict[str, str]:
+    """Kind of stage -> digest over what each of them reads."""
+    read, of_kind = {}, {}
+    for node in in_order(nodes_of(plan_of(STUDIES[study], preset=preset))):
+        inputs = {**node.inputs, "after": {name: read[name] for name in node.after}}
+        read[node.name] = stage_digest(node.name, inputs, node.version)
+        of_kind.setdefault(kind_of(node), []).append(read[node.name])
+    return {kind: short(digest_json(values)) for kind, values in of_kind.items()}
+
+
+def golden(part, now):
+    """The committed values; with PALPATE_GOLDEN=write these ones are written in their place."""
+    known = json.loads(GOLDEN.read_text()) if GOLDEN.is_file() else {}
+    if os.environ.get("PALPATE_GOLDEN") == "write":
+        GOLDEN.write_text(json.dumps(known | {part: now}, indent=1, sort_keys=True) + "\n")
+        return now
+    return known[part]
+
+
+WRITE = "then run: PALPATE_GOLDEN=write pytest tests/test_studies_runs.py -k golden"
+
+
+@pytest.mark.parametrize("study", ["world-gelsight", "world-digit"])
+@pytest.mark.parametrize("preset", ["smoke", "mini"])
+def test_golden_what_stages_read(study, preset):
+    now = digests(study, preset)
+    known = golden(f"{study} {preset}", now)
+    changed = [kind for kind in now if now[kind] != known.get(kind)]
+    assert not changed, (
+        f"What {', '.join(changed)} read has changed: with this release every run builds them "
+        f"again. If that is meant, {WRITE}"
+    )
+
+
+# --- what stages write: a run each
+
+slow = pytest.mark.slow
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory):
+    run = tmp_path_factory.mktemp("whole") / "run"
+    small_study.run(run)
+    return run
+
+
+def summary(folder) -> dict[str, float]:
+    """A stage in numbers that other machines give, too, to three digits."""
+    numbers = {}
+    for path in sorted(folder.rglob("*.safetensors")):
+        weights = load_file(path).values()
+        values = np.concatenate([np.ravel(w).astype(float) for w in weights])
+        numbers[path.relative_to(folder).as_posix()] = np.abs(values).mean()
+    images = [*folder.rglob("*.png"), *folder.rglob("*.jpg")]
+    if images:
+        numbers["images"] = len(images)
+        numbers["mean of images"] = np.mean([np.asarray(Image.open(p)).mean() for p in images])
+    for path in sorted(folder.glob("*.json")):
+        record = json.loads(path.read_text())
+        rows = record.get("scores", []) if isinstance(record, dict) else record
+        values = [r["value"] for r in rows if r.get("value") is not None]
+        numbers[f"{path.name}: scores"] = len(values)
+        numbers[f"{path.name}: mean"] = np.abs(values).mean() if values else 0.0
+    return numbers
+
+
+@slow
+def test_golden_what_stages_write(whole):
+    last = {kind_of(node): node for node in NODES}
+    now = {
+        kind: {"version": n.version, **{k: float(f"{v:.4g}") for k, v in found.items()}}
+        for kind, n in last.items()
+        for found in [summary(whole / n.name)]
+    }
+    known = golden("outputs", now)
+    for kind, numbers in now.items():
+        assert numbers == pytest.approx(known[kind], rel=2e-3, abs=1e-3), (
+            f"{kind} writes other results. If that is meant, raise the version of its Node in "
+            f"palpate/studies/reproduce.py, so that no run takes the old ones for new; {WRITE}"
+        )
+
+
+@slow
+def test_two_processes_write_what_one_does(whole, tmp_path):
+    small_study.run(tmp_path / "run", jobs=2)
+    assert differing(whole, tmp_path / "run") == []
+
+
+@slow
+def test_stages_killed_between_their_last_file_and_their_mark_go_on(whole, tmp_path):
+    run = shutil.copytree(whole, tmp_path / "run")
+    for node in NODES:  # as each stage was just before it was marked as finished
+        record = json.loads((run / node.name / "stage.json").read_text())
+        inputs = {key: record[key] for key in ("digest", "version", "inputs")}
+        (run / f"{node.name}.partial.json").write_text(json.dumps(inputs))
+        (run / node.name / "stage.json").unlink()
+        (run / node.name).rename(run / f"{node.name}.partial")
+    small_study.run(run)
+    assert not list(run.glob("*.partial*"))
+    assert differing(whole, run) == []
