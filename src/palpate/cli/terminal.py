@@ -168,7 +168,7 @@ class Terminal:
         page: Path | None = None,
         latex: Path | None = None,
     ) -> dict[str, Any]:
-        """Show results, write them where asked, and return them as JSON."""
+        """Show results, write the files, and return what ``--json`` prints."""
         results = dataclasses.replace(results, commands=[self.command])
         try:
             self.show(results)  # before saving: a full disk loses nothing
@@ -179,7 +179,7 @@ class Terminal:
                 results.to_html(page)
             if latex:
                 write_text(latex, results.to_latex())
-        return results.to_json()
+        return results.to_json() if self.json else {}
 
     def problems(self, title: str, problems: Sequence[Problem]) -> None:
         """List problems on standard error, below a title and their number."""
