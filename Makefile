@@ -26,12 +26,13 @@ demo: $(READY)   ## the whole pipeline on the embedded world; DATA=path runs it 
 test: test-fast test-slow  ## all tests, fast ones first
 
 test-fast: $(DEV)  ## tests of under about five seconds each
-	$(PYTEST) -m "not slow and not browser"
+	$(PYTEST) -m "not slow and not browser and not nightly"
 
 test-slow: $(DEV)  ## the slow ones, and the page in a browser
-	$(PYTEST) -m "slow or browser"
+	$(PYTEST) -m "(slow or browser) and not nightly"
 
-nightly: $(DEV)  ## what takes longer: the metrics at full size, the shipped models scored again, the study of splits, small, 50 raters in browsers
+nightly: $(DEV)  ## what takes longer: tests of minutes, the metrics at full size, the shipped models scored again, the study of splits, small, 50 raters in browsers
+	$(PYTEST) -m nightly
 	$(BIN)/python benchmarks/metrics.py
 	$(BIN)/python recipes/mini.py --work runs/mini --verify
 	$(BIN)/python benchmarks/split_drop.py --small
@@ -40,7 +41,7 @@ nightly: $(DEV)  ## what takes longer: the metrics at full size, the shipped mod
 	PALPATE_RATERS=50 $(BIN)/python -m pytest -q tests/test_preference_raters.py
 
 coverage: $(DEV)  ## line and branch coverage of the fast tests
-	$(PYTEST) -m "not slow and not browser" --cov --cov-report=term --cov-report=xml
+	$(PYTEST) -m "not slow and not browser and not nightly" --cov --cov-report=term --cov-report=xml
 
 lint: $(DEV)     ## style, types, and the direction of imports
 	$(BIN)/ruff format --check .

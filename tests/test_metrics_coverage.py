@@ -57,6 +57,7 @@ def test_truth_is_that_of_a_closed_form():
     )
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", study.KINDS)
 def test_tmmd_by_video_covers_and_frames_fail(model, truth, kind):
@@ -80,6 +81,7 @@ def test_tmmd_by_video_covers_and_frames_fail(model, truth, kind):
         assert share(tallies, "TMMD null, frames") < 0.5
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_what_needs_no_reference_covers(model, truth):
     tallies = [
@@ -98,6 +100,7 @@ def test_what_needs_no_reference_covers(model, truth):
     assert share(tallies, "D: mean inter-class, frames") < 0.75
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_the_excess_covers_where_videos_have_1_to_60_frames(model, truth):
     tallies = [
@@ -108,6 +111,7 @@ def test_the_excess_covers_where_videos_have_1_to_60_frames(model, truth):
         assert study.COVERAGE[0] <= share(tallies, name) <= study.COVERAGE[1], name
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 @pytest.mark.parametrize("scenes", study.SCENES)
 def test_shared_ids_alone_cover_and_the_formula_lies_below_the_truth(model, truth, scenes):
@@ -123,6 +127,7 @@ def test_shared_ids_alone_cover_and_the_formula_lies_below_the_truth(model, trut
             assert tally.coverage < 0.6
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_paired_differences_cover(model, truth):
     tallies, wider = zip(

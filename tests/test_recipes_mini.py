@@ -64,6 +64,7 @@ def test_only_reserved_seeds_are_read_and_none_twice(mini):
     assert all(seed in MINI_SEEDS for seed in seeds)
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_every_part_is_made_shipped_and_verified(small, tmp_path, capsys):
     recipe = small.Recipe(tmp_path / "work", 1.0)

@@ -62,6 +62,7 @@ def whole(tmp_path_factory) -> Path:
     return run
 
 
+@pytest.mark.nightly
 def test_the_page_is_made_again_number_by_number_where_the_run_was_moved(whole, tmp_path):
     shutil.copytree(whole, tmp_path / "moved")
     checked = verify(tmp_path / "moved" / "page.json")
@@ -104,7 +105,9 @@ def test_the_leak_of_the_world_is_what_the_audit_reports(whole):
     assert (orig.test_samples_in_shared_groups, orig.test_samples) == (shared, leak["test_frames"])
 
 
-@pytest.mark.parametrize("stage", ["autoencoder", "generated"])
+@pytest.mark.parametrize(
+    "stage", ["autoencoder", pytest.param("generated", marks=pytest.mark.nightly)]
+)
 def test_a_killed_demo_resumes_from_its_last_finished_stage(whole, tmp_path, stage):
     run = tmp_path / "run"
     status, lines = demo(run, kill_at=stage)
@@ -117,6 +120,7 @@ def test_a_killed_demo_resumes_from_its_last_finished_stage(whole, tmp_path, sta
     assert outcome(run) == outcome(whole)
 
 
+@pytest.mark.nightly
 def test_a_demo_killed_between_the_last_file_of_a_stage_and_its_mark_resumes(whole, tmp_path):
     run = tmp_path / "run"
     finished(run)
@@ -142,6 +146,7 @@ def test_a_finished_demo_runs_nothing_again_and_another_seed_does(whole):
     finished(whole)  # as it was, for the tests that follow
 
 
+@pytest.mark.nightly
 def test_images_that_change_in_place_rebuild_everything_that_read_them(tmp_path):
     data, run = tmp_path / "data", tmp_path / "run"
     assert main(["world", "-o", str(data), "--preset", "tiny", "--seed", "5", "-q"]) == 0
@@ -157,6 +162,7 @@ def test_images_that_change_in_place_rebuild_everything_that_read_them(tmp_path)
     }
 
 
+@pytest.mark.nightly
 def test_a_copy_of_the_pretraining_world_may_be_the_data(tmp_path):
     args = ["--preset", "tiny", "--seed", "1000", "--objects-per-material", "4", "-q"]
     assert main(["world", "-o", str(tmp_path / "w"), *args]) == 0

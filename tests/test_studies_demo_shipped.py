@@ -73,6 +73,7 @@ def test_shipped_models_replace_three_stages(mini, tmp_path):
         assert {line.split(":")[0] for line in lines if "already done" in line} == stages
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_from_scratch_and_with_backgrounds_the_generator_starts_from_random_weights(mini, tmp_path):
     demo = run_demo(replace(OPTIONS, from_scratch=True), tmp_path / "a")

@@ -35,6 +35,7 @@ def test_the_papers_data_sets_reach_the_page(study, forge, rule, tables, tmp_pat
     assert {f"paper, {ORIG}", f"paper, {NOLEAK}"} <= {*rows}
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_clips_reach_the_page(tmp_path):
     place = shared_data()

@@ -20,6 +20,7 @@ from palpate.studies.methods import METHODS, OURS, Method, Setting
 from palpate.studies.reproduce import nodes_of, plan_of, planned
 from palpate.studies.study import NOLEAK, ORIG, STUDIES, Study
 from palpate.studies.study_tables import Scores, study_tables
+from palpate.studies.verifying import verify
 
 WORLD = STUDIES["world-gelsight"]
 
@@ -307,6 +308,9 @@ def test_the_study_at_smoke(tmp_path):
     for table in results.tables:
         for cell in (c for row in table.rows for c in row if isinstance(c, Score)):
             assert (run / cell.details["stage"] / "stage.json").is_file()
+    checked = verify(run / "results.json").counts
+    assert checked["same"] > 1000
+    assert checked["differs"] == checked["untraced"] == 0
     times = {p: p.stat().st_mtime_ns for p in run.glob("*/stage.json")}
     # The images of a method, given as another system's, score as that method's.
     given = f"theirs={run / 'images-gvst-NoLeak-0' / 'images'}"

@@ -1,8 +1,11 @@
-"""A whole small study: what its stages read and write, killed at the mark, by two processes."""
+"""A small study: what its stages read and write; killed in each kind of stage; two processes."""
 
 import json
 import os
 import shutil
+import signal
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -28,6 +31,7 @@ def kind_of(node) -> str:
 
 
 NODES = in_order(nodes_of(small_study.plan()))
+KINDS = list(dict.fromkeys(map(kind_of, NODES)))
 
 
 def outcome(run):
@@ -112,6 +116,7 @@ def summary(folder) -> dict[str, float]:
     return numbers
 
 
+@pytest.mark.nightly
 @slow
 def test_golden_what_stages_write(whole):
     last = {kind_of(node): node for node in NODES}
@@ -128,12 +133,14 @@ def test_golden_what_stages_write(whole):
         )
 
 
+@pytest.mark.nightly
 @slow
 def test_two_processes_write_what_one_does(whole, tmp_path):
     small_study.run(tmp_path / "run", jobs=2)
     assert differing(whole, tmp_path / "run") == []
 
 
+@pytest.mark.nightly
 @slow
 def test_stages_killed_between_their_last_file_and_their_mark_go_on(whole, tmp_path):
     run = shutil.copytree(whole, tmp_path / "run")
@@ -146,3 +153,32 @@ def test_stages_killed_between_their_last_file_and_their_mark_go_on(whole, tmp_p
     small_study.run(run)
     assert not list(run.glob("*.partial*"))
     assert differing(whole, run) == []
+
+
+def run_until(folder, kinds):
+    """Run the study in a process of its own; kill it within the first stage of these kinds.
+
+    Returns:
+        the kind, or None if the run ended.
+    """
+    names = {f"{node.name}: ...\n": kind_of(node) for node in NODES if kind_of(node) in kinds}
+    command = [sys.executable, small_study.__file__, str(folder)]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
+        assert process.stdout is not None
+        for line in process.stdout:
+            if line in names:
+                next(process.stdout)  # until it has done something
+                process.send_signal(signal.SIGKILL)
+                return names[line]
+    assert process.returncode == 0
+    return None
+
+
+@pytest.mark.nightly
+@slow
+def test_a_study_killed_in_each_kind_of_stage_ends_as_one_that_was_not(whole, tmp_path):
+    killed = []
+    while (kind := run_until(tmp_path / "run", {*KINDS} - {*killed})) is not None:
+        killed.append(kind)
+    assert killed == KINDS
+    assert differing(whole, tmp_path / "run") == []

@@ -78,7 +78,9 @@ def test_two_processes_take_the_steps_of_one(place):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("processes", "most"), [(1, 3), (2, 1)])
+@pytest.mark.parametrize(
+    ("processes", "most"), [pytest.param(1, 3, marks=pytest.mark.nightly), (2, 1)]
+)
 def test_killed_again_and_again_it_ends_in_the_same_bytes(place, processes, most):
     more = ("--clip", "palpate/mini", "--epochs", "8")
     run(place, "encoder", "whole", *more, processes=processes)

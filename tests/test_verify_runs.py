@@ -176,6 +176,7 @@ def copied(toy, tmp_path):
     return tmp_path / "moved"
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 @pytest.mark.timeout(900)
 def test_a_run_that_was_moved_is_made_again_number_by_number(copied):
@@ -186,6 +187,7 @@ def test_a_run_that_was_moved_is_made_again_number_by_number(copied):
     assert not (copied / ".verify").exists()
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 @pytest.mark.timeout(900)
 def test_a_pixel_and_a_number_are_found_in_a_run(copied):
@@ -204,6 +206,7 @@ def test_a_pixel_and_a_number_are_found_in_a_run(copied):
     assert not any(name.startswith("SSIM of mean image") for name in changed)
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 @pytest.mark.timeout(900)
 def test_a_swapped_encoder_and_an_edited_split_are_found_in_a_run(copied):
