@@ -216,7 +216,7 @@ def test_a_swapped_encoder_and_an_edited_split_are_found_in_a_run(copied):
     changed = differing(copied / "results.json")
     assert "stage encoder-NoLeak-0" in changed
     assert "stage probe-NoLeak-0, made again" in changed
-    assert any(name.startswith("TMMD of Ours") for name in changed)
+    assert "stage scores-NoLeak-by-NoLeak-0, made again" in changed
     split = copied / "split" / "NoLeak.json"
     shutil.copy(copied / "split" / "Orig.json", split)
     changed = differing(copied / "results.json")
