@@ -60,6 +60,7 @@ def test_a_cut_video_is_named(clip, tmp_path):
         generate(tmp_path / "cut.mkv", model=make_pipeline())
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_two_processes_make_the_images_of_one(tmp_path):
     folder = tmp_path / "photos"
@@ -92,6 +93,7 @@ def test_two_processes_make_the_images_of_one(tmp_path):
         assert np.abs(a - b).max() <= 1
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_a_killed_run_goes_on_to_the_same_images(tmp_path):
     folder = tmp_path / "photos"

@@ -134,6 +134,7 @@ def test_every_part_is_made_shipped_and_verified(small, tmp_path, capsys):
     assert capsys.readouterr().out.count("DIFFERS") == 1
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_a_stop_between_saving_and_the_end_of_a_part_is_repaired(small, tmp_path, monkeypatch):
     from palpate.encoders.encoder_set import ClipEncoders

@@ -137,6 +137,7 @@ def test_a_demo_killed_between_the_last_file_of_a_stage_and_its_mark_resumes(who
     assert outcome(run) == outcome(whole)
 
 
+@pytest.mark.nightly
 def test_a_finished_demo_runs_nothing_again_and_another_seed_does(whole):
     assert not [line for line in finished(whole) if ": done in" in line]
     _, lines = demo(whole, "--seed", "1", kill_at="clip")

@@ -147,6 +147,7 @@ def test_when_a_process_dies_the_others_end_without_a_traceback_and_the_run_can_
     close(logs(place / "whole"), logs(place / "out"))
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_what_all_processes_raise_is_printed_once(place):
     def stderr(*more):
