@@ -47,6 +47,7 @@ class Options(Common):
 def run(options: Options, terminal: Terminal) -> dict[str, Any]:
     """Run the stages and write what shows them."""
     require_extra("palpate reproduce")
+    others = _folders(options.method)
     from palpate.core import require_choice, write_text
     from palpate.report import summary_lines
     from palpate.studies.reproduce import plan_of, planned, run_study
@@ -59,7 +60,7 @@ def run(options: Options, terminal: Terminal) -> dict[str, Any]:
         preset=options.preset,
         seeds=options.seeds,
         root=options.root,
-        others=_folders(options.method),
+        others=others,
         device=options.device,
         people=options.people,
     )

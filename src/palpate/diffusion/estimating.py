@@ -3,7 +3,7 @@
     seconds = batches (t_1 + (s - s_1) (t_2 - t_1) / (s_2 - s_1))
 
 t_1 and t_2 are the seconds of a batch with few steps of the scheduler (s_1 and s_2), s the number
-that was asked for. Photos are read and images written meanwhile.
+that was requested. Photos are read and images written meanwhile.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Images of a study: all of one size, encoded anew, so that no file tells its method.
+"""Images of a study: all of one size, encoded anew, so that no file gives its method away.
 
 The center square of every image, as generators see it, is resized to ``size`` pixels and written as
 JPEG without metadata. Very large images are decoded at a fraction where they are JPEG.

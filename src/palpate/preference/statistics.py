@@ -42,7 +42,7 @@ from scipy.sparse import csgraph
 Array = NDArray[np.float64]
 Interval = tuple[float, float]
 
-#: So many raters or fewer stand for themselves alone; fewer than ``ENOUGH`` are said to be few.
+#: So many raters or fewer stand for themselves alone; a note reports fewer than ``ENOUGH``.
 FEW_RATERS, ENOUGH = 2, 5
 REPLICATES = 1000
 #: Standard deviation of the prior of strengths, in logits.

@@ -133,7 +133,7 @@ function finish() {
   const missing = trials.length - voted().length;
   $("thanks").textContent = missing ? `This study ended on ${study.until ?? "the server"}.` : "Done. Thank you.";
   $("next-step").textContent = !served || refused() || unsent().length && closed()
-    ? "Download your votes and send the file to whoever gave you this page."
+    ? "Download your votes and send the file to the person who gave you this page."
     : unsent().length ? "Leave this page open until all votes are at the server."
     : "You may close this page.";
   $("another").hidden = served;
