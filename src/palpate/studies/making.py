@@ -36,6 +36,7 @@ from palpate.leakage.splitting import split as leak_free_split
 from palpate.sim import WorldOptions, write_world
 from palpate.studies.methods import Images, Make, Method, Setting
 from palpate.studies.study import NOLEAK, ORIG, Preset, Study
+from palpate.training.options import Compute
 from palpate.training.processes import keep_logs
 
 Facts = dict[str, Any]
@@ -178,6 +179,7 @@ def make_generator(
         background=method.background,
         cache=cache_of(place),
         device=device,
+        compute=Compute(precision=preset.precision),
         progress=progress,
     )
     pipeline.save(fresh(place / "model"))

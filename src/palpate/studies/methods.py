@@ -1,8 +1,8 @@
 """The generators that a study compares: name -> what differs, and what drives it.
 
-All of them are trained from random weights with the same data, U-Net, schedule, batch and number of
-steps; the row of :data:`METHODS` is all that differs. Another one is another row, or a function
-that makes images (``Method.make``).
+All of them but :data:`SHIPPED` are trained from random weights with the same data, U-Net, schedule,
+batch and number of steps; the row of :data:`METHODS` is all that differs. Another one is another
+row, or a function that makes images (``Method.make``).
 """
 
 from __future__ import annotations
@@ -14,17 +14,21 @@ from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
+from PIL import Image
 
 from palpate.core import Progress, quiet
 from palpate.data.images import cached_images
 from palpate.data.manifest import Manifest
 from palpate.diffusion.autoencoders import gels_of
+from palpate.diffusion.generation import generate
 from palpate.diffusion.presets import DiffusionPreset
 
 Images = NDArray[np.uint8]
 #: The paper's training, driven at test time by the photo in the place of the text.
 OURS = "Ours"
 BRIDGE, BACKGROUND, GVST, BEST = "Ours w/ memory bridge", "Ours w/ BG", "GVST", "best"
+#: What ``palpate generate`` uses without a model.
+SHIPPED = "palpate/mini"
 #: Text conditions the training, with nothing that bridges to photos.
 BARE: Mapping[str, Any] = {"source": "text", "gap": "none", "noise": 0.0}
 
@@ -108,6 +112,14 @@ class Method:
         return {"condition": self.condition, "background": self.background, "gel": self.gel}
 
 
+def shipped(setting: Setting) -> Images:
+    """Images of the generator that ships, which is not trained in a study."""
+    how: dict[str, Any] = {"seed": setting.seed, "device": setting.device}
+    made = generate(setting.test, model=SHIPPED, progress=setting.progress, **how)
+    side = (setting.size, setting.size)
+    return np.stack([np.asarray(i.resize(side, Image.Resampling.BOX)) for i in made.images])
+
+
 METHODS: Mapping[str, Method] = {
     method.name: method
     for method in (
@@ -134,6 +146,12 @@ METHODS: Mapping[str, Method] = {
             "Preset mini: a token of the text and one of the photo, memory bridge, noise, and an "
             "autoencoder that is given the gel.",
             gel=True,
+        ),
+        Method(
+            SHIPPED,
+            "The generator that ships: as best, trained longer, on other synthetic worlds. Its "
+            "training is not that of the others.",
+            make=shipped,
         ),
     )
 }

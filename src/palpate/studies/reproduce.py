@@ -348,7 +348,7 @@ def _method_nodes(
             trained.add(generator)
             inputs = {"method": method.training, "diffusion": method.preset(preset.diffusion)}
             inputs |= {"steps": preset.steps, "clip": preset.clip, "seed": seed}
-            inputs |= {"autoencoder": autoencoder}
+            inputs |= {"autoencoder": autoencoder, "precision": preset.precision}
             build = partial(making.make_generator, method=method, autoencoder=autoencoder, **how)
             after = ["data", "split", *own]
             nodes.append(Node(generator, build, inputs, after, cost=preset.seconds[2]))
