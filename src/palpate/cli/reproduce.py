@@ -4,12 +4,15 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import tyro
 
 from palpate.cli.terminal import Common, OutPath, Switch, Terminal, require_extra
 from palpate.core import PalpateError
+
+#: Names of ``palpate.studies.study.STUDIES``, without its imports.
+Study = Literal["world-gelsight", "world-digit", "tag", "hct", "clips"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -20,7 +23,7 @@ class Options(Common):
     what is there is kept.
     """
 
-    study: Annotated[str, tyro.conf.Positional]
+    study: Annotated[Study, tyro.conf.Positional]
     """On the world: `world-gelsight` (tables 1, 3 and 4) or `world-digit` (tables 2 and 4); on data
     at --root: `tag` (Touch and Go), `hct`, or `clips` (of Touch and Go)."""
     output: OutPath
@@ -48,12 +51,11 @@ def run(options: Options, terminal: Terminal) -> dict[str, Any]:
     """Run the stages and write what shows them."""
     require_extra("palpate reproduce")
     others = _folders(options.method)
-    from palpate.core import require_choice, write_text
+    from palpate.core import write_text
     from palpate.report import summary_lines
     from palpate.studies.reproduce import plan_of, planned, run_study
     from palpate.studies.study import STUDIES
 
-    require_choice("study", options.study, STUDIES)
     output = options.output
     plan = plan_of(
         STUDIES[options.study],

@@ -7,6 +7,7 @@ Bodies of nodes, as :mod:`palpate.studies.making`; each writes tables, curves an
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -29,6 +30,7 @@ from palpate.studies.appearance import AGAIN, RECORDED, appearance_claims, appea
 from palpate.studies.embedding import embed_generated
 from palpate.studies.forty import companions_on_forty
 from palpate.studies.judging import SIGMA, image_files
+from palpate.studies.lengths import SAMPLING, compute_curves
 from palpate.studies.making import After, Facts, cache_of, data_of, slug
 from palpate.studies.rulers import Generator, ruler_claim, ruler_scores, ruler_tables
 from palpate.studies.study import NOLEAK
@@ -165,6 +167,67 @@ def compare_rulers(
     same = {name: {g: of[g] for g in defined} for name, of in ranked.items()}
     agreement = ruler_scores(same)
     return _write(place, ruler_tables(same, agreement), claims=[ruler_claim(agreement)])
+
+
+def sample_in_steps(
+    place: Path,
+    after: After,
+    progress: Progress,
+    *,
+    generator: str,
+    encoders: str,
+    seed: int,
+    device: str,
+) -> Facts:
+    """Features of one training's images, made with other numbers of sampling steps."""
+    manifest, split = data_of(after, NOLEAK)
+    test = manifest.part(split, "test")
+    test = test.take([test.ids[k] for k in evenly(len(test), MOVED)])
+    judge = EncoderSet.load(after[encoders] / "encoders", device=device)
+    pipeline = TactilePipeline.from_pretrained(after[generator] / "model").to(pick_device(device))
+    cache, gels = cache_of(place), None
+    if pipeline.background or pipeline.gel is not None:
+        gels = gels_of(test, pipeline.size, cache, progress)
+    photos = pipeline.embed(cached_images(test, "vision", pipeline.vision_size, cache))
+    of = embed(test, judge, "tactile", cache=cache, still=True)
+    for done, steps in enumerate(SAMPLING):
+        progress("sampling steps", done, len(SAMPLING), str(steps))
+        sampler = pipeline.sampler_with(steps=steps)
+        images = pipeline.sample(photos, test.ids, seed=seed, sampler=sampler, background=gels)
+        replace(of, features=embed_images(images, judge)).save(place / f"{steps}.npz")
+    return {"samples": len(test)}
+
+
+def measure_compute(
+    place: Path,
+    after: After,
+    progress: Progress,
+    *,
+    encoders: str,
+    trained: Mapping[str, Mapping[int, str]],
+    sampled: Mapping[str, str],
+    device: str,
+) -> Facts:
+    """Quality against training and sampling steps.
+
+    ``trained``: method -> training steps -> node of the images; ``sampled``: method -> node of
+    :func:`sample_in_steps`.
+    """
+    manifest, split = data_of(after, NOLEAK)
+    train, test = (manifest.part(split, part) for part in ("train", "test"))
+    judge, cache = EncoderSet.load(after[encoders] / "encoders", device=device), cache_of(place)
+    of_images = lambda node: embed_generated(after[node] / "images", test, judge, progress)
+    curves = compute_curves(
+        {m: [(n, of_images(of[n])) for n in sorted(of)] for m, of in trained.items()},
+        {
+            m: [(n, FeatureSet.load(after[node] / f"{n}.npz")) for n in SAMPLING]
+            for m, node in sampled.items()
+        },
+        embed(test, judge, "tactile", cache=cache, still=True),
+        embed(train, judge, "tactile", cache=cache),
+        split.digest,
+    )
+    return _write(place, [], curves)
 
 
 def compare_on_forty(

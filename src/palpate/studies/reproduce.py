@@ -36,22 +36,25 @@ from palpate.studies.collecting import collect
 from palpate.studies.demo import require_unseen, stamp
 from palpate.studies.graph import Node, Planned, plan_graph, run_graph
 from palpate.studies.judging import Judging, judge_images, probe_encoders
+from palpate.studies.lengths import SAMPLING, SHARES
 from palpate.studies.making import slug
 from palpate.studies.methods import BACKGROUND, GVST, OURS, Method
 from palpate.studies.questions import (
     MOVED,
     compare_on_forty,
     compare_rulers,
+    measure_compute,
     measure_moves,
     measure_utility,
     move_images,
+    sample_in_steps,
 )
 from palpate.studies.stages import Stage
 from palpate.studies.study import NOLEAK, SPLITS, Preset, Study
 from palpate.studies.utility import Draws
 
 #: Stages whose tables, curves and claims come after those of the paper.
-QUESTIONS = ("utility", "appearance", "forty", "rulers")
+QUESTIONS = ("utility", "compute", "appearance", "forty", "rulers")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -274,6 +277,8 @@ def _question_nodes(plan: Plan) -> list[Node]:
         after = ["data", "split", judge, *made.values()]
         build = partial(build, device=plan.device)
         nodes.append(Node("utility", build, {"draws": draws}, after, cost=120, measures=True))
+    if made:
+        nodes += _compute_nodes(plan, {n: trained[n] for n in made})
     names = [n for n in study.moved if n in trained]
     if study.world is not None and len(names) > 1:
         nodes += _appearance_nodes(plan, {n: trained[n] for n in names})
@@ -292,6 +297,41 @@ def _question_nodes(plan: Plan) -> list[Node]:
         ranking = {"rulers": rulers}
         nodes.append(Node("rulers", build, ranking, after, cost=60, measures=True))
     return nodes
+
+
+def _compute_nodes(plan: Plan, methods: Mapping[str, Method]) -> list[Node]:
+    """Shorter trainings, and other numbers of sampling steps, of the first seed."""
+    preset, seed = plan.preset, plan.seeds[0]
+    judge, nodes = f"encoder-{NOLEAK}-{seed}", list[Node]()
+    trained, sampled = dict[str, dict[int, str]](), dict[str, str]()
+    for name, method in methods.items():
+        trained[name] = {preset.steps: _images(name, NOLEAK, seed)}
+        for share in SHARES:
+            steps = round(share * preset.steps)
+            shorter = dataclasses.replace(method, name=f"{name} {steps} steps")
+            nodes += _method_nodes(_of_one(plan, shorter, steps), shorter, NOLEAK, seed, set())
+            trained[name][steps] = nodes[-1].name
+        sampled[name] = f"sampled-{slug(name)}-{seed}"
+        generator = _generator(plan.study, method, NOLEAK, seed)
+        build = partial(sample_in_steps, generator=generator, encoders=judge, seed=seed)
+        build = partial(build, device=plan.device)
+        inputs = {"samples": MOVED, "steps": SAMPLING, "seed": seed}
+        after = ["data", "split", generator, judge]
+        nodes.append(Node(sampled[name], build, inputs, after, cost=60))
+    build = partial(measure_compute, encoders=judge, trained=trained, sampled=sampled)
+    images = [node for of in trained.values() for node in of.values()]
+    after = ["data", "split", judge, *images, *sampled.values()]
+    build = partial(build, device=plan.device)
+    return [*nodes, Node("compute", build, {"trained": trained}, after, cost=20, measures=True)]
+
+
+def _of_one(plan: Plan, method: Method, steps: int) -> Plan:
+    """The plan of one method alone, trained for other steps."""
+    (encoder, autoencoder, full), share = plan.preset.seconds, steps / plan.preset.steps
+    seconds = encoder, autoencoder, full * share
+    preset = dataclasses.replace(plan.preset, steps=steps, seconds=seconds)
+    study = dataclasses.replace(plan.study, methods=[method])
+    return dataclasses.replace(plan, study=study, preset=preset)
 
 
 def _appearance_nodes(plan: Plan, methods: Mapping[str, Method]) -> list[Node]:

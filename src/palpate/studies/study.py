@@ -108,7 +108,8 @@ class Study:
         on_both: names of methods that are trained on the data set's own split as well.
         controls: name -> what makes their images.
         metrics: further metrics.
-        useful: names of methods whose images train classifiers, where there are materials.
+        useful: names of methods whose images train classifiers, where there are materials, and
+            which are trained shorter and sampled in other numbers of steps as well.
         moved: names of methods whose photos are shown otherwise, on the world; text is said to be a
             filter of the first one, against images in the second one.
         presets: sizes by name.
@@ -181,7 +182,7 @@ PRESETS: Mapping[str, Preset] = {
             autoencoder=replace(
                 _VQ, widths=(16, 32), codes=256, steps_free=60, steps_quantized=20, crop=0
             ),
-            gel="palpate/mini",
+            gel=BackgroundOptions(narrow=16, wide=32, steps=80, crop=0),
             clip="palpate/mini",
             permutations=99,
             cost="for tests: under 8 minutes on two x86-64 cores",
@@ -194,7 +195,7 @@ PRESETS: Mapping[str, Preset] = {
             MINI,
             steps=1500,
             autoencoder=_VQ,
-            gel="palpate/mini",
+            gel=BackgroundOptions(steps=1200),
             clip="palpate/mini",
             precision="bf16",  # 1.4 times as many steps a second, on processors that have it
             cost="about 90 minutes of one x86-64 core a seed",
