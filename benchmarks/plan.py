@@ -1,0 +1,132 @@
+"""What the study costs at the paper's size, counted from the models themselves.
+
+::
+
+    python benchmarks/plan.py [--share 0.3] [--peak 989]
+
+Operations of a forward pass are counted layer by layer (a multiplication and an addition are two),
+a training step is three of them, a guided sample two a sampler step. Seconds are operations over
+``--share`` of ``--peak`` (TFLOP/s; 989 is an H100 in bf16): measure yours with ``python
+benchmarks/training.py --only gpu``, and put its share here. Reading and decoding come on top where
+they cannot keep up. Prints the tables of docs/start/plan.md.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Callable
+from typing import Any
+
+import torch
+from diffusers import VQModel
+from torch.utils.flop_counter import FlopCounterMode
+from transformers import CLIPVisionConfig, CLIPVisionModelWithProjection
+
+from palpate.diffusion.denoiser import build_unet
+from palpate.diffusion.presets import PAPER
+from palpate.encoders.presets import PAPER as ENCODER
+
+#: (train samples, test samples): the paper's counts, four fifths of them train.
+DATA = {
+    "Touch and Go": (11_120, 2_780),
+    "HCT": (31_323, 7_831),
+    "a million frames": (800_000, 200_000),
+}
+EPOCHS = {"generator": 30, "encoder": 200}  # paper, sections 2 and 3
+STEPS = PAPER.sampler.steps
+#: Trainings of the study: seven methods and Ours on the leaking split; an encoder a split.
+METHODS, ENCODERS = 8, 2
+
+
+def operations(forward: Callable[[], Any]) -> float:
+    """Operations of one forward pass, on no device."""
+    with FlopCounterMode(display=False) as counter:
+        forward()
+    return float(counter.get_total_flops())
+
+
+def counted() -> dict[str, float]:
+    """Operations for one image: U-Net, autoencoder, tactile encoder."""
+    assert not isinstance(PAPER.unet, str)
+    assert PAPER.unet is not None
+    size, policy = PAPER.size, PAPER.condition
+    with torch.device("meta"):
+        unet = build_unet(PAPER.unet, policy, channels=3, size=size // 4)
+        token = torch.zeros(1, 1, policy.width)
+        vq = VQModel(
+            down_block_types=("DownEncoderBlock2D",) * 3,
+            up_block_types=("UpDecoderBlock2D",) * 3,
+            block_out_channels=(128, 256, 512),
+            layers_per_block=2,
+            latent_channels=3,
+        )
+        sizes = ENCODER.tactile
+        tower = CLIPVisionModelWithProjection(
+            CLIPVisionConfig(
+                hidden_size=sizes.width,
+                intermediate_size=4 * sizes.width,
+                num_hidden_layers=sizes.layers,
+                num_attention_heads=sizes.heads,
+                patch_size=ENCODER.patch,
+                image_size=ENCODER.image,
+                projection_dim=ENCODER.dim,
+                attn_implementation="eager",
+            )
+        )
+        latents, side = torch.zeros(1, 3, size // 4, size // 4), ENCODER.image
+        return {
+            "U-Net": operations(lambda: unet(latents, torch.zeros(1), encoder_hidden_states=token)),
+            "vq-f4 encoder": operations(lambda: vq.encode(torch.zeros(1, 3, size, size))),
+            "vq-f4 decoder": operations(lambda: vq.decoder(latents)),
+            "tactile encoder": operations(lambda: tower(torch.zeros(1, 3, side, side))),
+        }
+
+
+def duties(of: dict[str, float], train: int, test: int) -> dict[str, float]:
+    """Operations of each duty on a data set."""
+    both = train + test
+    sample = 2 * STEPS * of["U-Net"] + of["vq-f4 decoder"]
+    made = {
+        "latents, once": both * of["vq-f4 encoder"],
+        "one generator": 3 * EPOCHS["generator"] * train * of["U-Net"],
+        f"its test images, {STEPS} steps": test * sample,
+        "one tactile encoder": 3 * EPOCHS["encoder"] * train * of["tactile encoder"],
+        "features of all images": both * of["tactile encoder"],
+    }
+    latents, generator, images, encoder, features = made.values()
+    made["the study, one seed"] = (
+        latents + METHODS * (generator + images) + ENCODERS * (encoder + METHODS * features)
+    )
+    return made
+
+
+def hours(seconds: float) -> str:
+    """``14 min``, ``3.2 h``, ``12 d``."""
+    if seconds < 3600:
+        return f"{seconds / 60:.0f} min" if seconds >= 60 else f"{seconds:.0f} s"
+    return f"{seconds / 3600:.1f} h" if seconds < 48 * 3600 else f"{seconds / 86400:.1f} d"
+
+
+def main() -> None:
+    """Print the tables."""
+    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser.add_argument("--share", type=float, default=0.3, help="of the peak that is reached")
+    parser.add_argument("--peak", type=float, default=989, help="of the device, TFLOP/s")
+    args = parser.parse_args()
+    of, rate = counted(), args.share * args.peak * 1e12
+    print("| for one image, forward | GFLOP |\n|---|---|")
+    for name, count in of.items():
+        print(f"| {name} | {count / 1e9:.0f} |")
+    tables = {name: duties(of, *counts) for name, counts in DATA.items()}
+    print(f"\n| | {' | '.join(f'{n}: PFLOP, one GPU, eight' for n in tables)} |")
+    print("|---" * (len(tables) + 1) + "|")
+    for duty in next(iter(tables.values())):
+        cells = [
+            f"{t[duty] / 1e15:,.0f}, {hours(t[duty] / rate)}, {hours(t[duty] / rate / 8)}"
+            for t in tables.values()
+        ]
+        print(f"| {duty} | {' | '.join(cells)} |")
+
+
+if __name__ == "__main__":
+    main()
