@@ -17,7 +17,7 @@ TINY = replace(
     name="tiny",
     world=replace(WORLDS["tiny"], materials=("Wood", "Brick"), objects_per_material=6, test=0.4),
     steps=4,
-    autoencoder=replace(SMOKE.autoencoder, steps_free=8, steps_quantized=4),
+    autoencoder=replace(SMOKE.autoencoder, steps=12),
     permutations=19,
 )
 STUDY = Study(

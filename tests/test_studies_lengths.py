@@ -49,4 +49,3 @@ def test_without_materials_only_distances_are_left():
         "Quality against training steps",
         "Quality against sampling steps",
     ]
-

@@ -39,11 +39,23 @@ Z = float(special.ndtri(0.975))
 
 @dataclass(frozen=True)
 class Names:
-    """What the methods of the paper's claims are called in the scores."""
+    """What the methods of the paper's claims are called in the scores.
+
+    Attributes:
+        ours: trained on text.
+        images: trained on images.
+        background, plain: with the no-contact image as a condition, and the same without.
+    """
 
     ours: str = "Ours"
     images: Sequence[str] = ("GVST",)
     background: str = "Ours w/ BG"
+    plain: str = "Ours"
+
+    @property
+    def pairs(self) -> list[tuple[str, str]]:
+        """The paper's comparisons, its method first."""
+        return [*((self.ours, other) for other in self.images), (self.plain, self.background)]
 
 
 def differences_over_seeds(runs: Sequence[Iterable[Score]]) -> list[Score]:
@@ -175,13 +187,12 @@ def _preference_claim(
     against = metric in TRADITIONAL
     does = "prefers what people do not" if against else "prefers what people prefer"
     of_metric, of_people, signs = list[Score](), list[Score](), list[int]()
-    for other in (*names.images, names.background):
-        pair = names.ours, other
-        scores = [ahead(d, names.ours) for d in _between(differences, metric, *pair)]
-        people = [ahead(v, names.ours) for v in _between(votes, PEOPLE, *pair)]
+    for pair in names.pairs:
+        scores = [ahead(d, pair[0]) for d in _between(differences, metric, *pair)]
+        people = [ahead(v, pair[0]) for v in _between(votes, PEOPLE, *pair)]
         signs += [side_of(score) * side_of(vote) for score in scores for vote in people]
         of_metric, of_people = of_metric + scores, of_people + people
-    parts = [_puts(of_metric, names.ours), _puts(of_people, names.ours)]
+    parts = [_puts(of_metric), _puts(of_people)]
     if not of_metric:
         parts[0] = f"{metric} was not computed (its weights may be missing)"
     if not of_people:
@@ -191,13 +202,13 @@ def _preference_claim(
     return Claim(f"{metric} {does}", "paper, table 3", verdict, why, evidence)
 
 
-def _puts(scores: Sequence[Score], ours: str) -> str:
+def _puts(scores: Sequence[Score]) -> str:
     """``TMMD puts Ours ahead of GVST by 0.6 [0.3, 0.9], of Ours w/ BG by 1 [0.5, 1.5]``."""
     parts: list[str] = []
-    for label, same in groupby(scores, key=_label):
-        each = [f"of {_other(s, ours)} {_by(s)}" for s in same]
+    for (label, name), same in groupby(scores, key=lambda s: (_label(s), _pair(s)[0])):
+        each = [f"of {_pair(s)[1]} {_by(s)}" for s in same]
         puts = "people put" if label == PEOPLE else f"{label} puts"
-        parts.append(f"{puts} {ours} ahead {', '.join(each)}")
+        parts.append(f"{puts} {name} ahead {', '.join(each)}")
     return "; ".join(parts)
 
 
@@ -205,9 +216,10 @@ def _label(score: Score) -> str:
     return score.metric.removesuffix(", ahead")
 
 
-def _other(score: Score, ours: str) -> str:
-    pair = score.details["a"], score.details["b"]
-    return str(pair[1] if pair[0] == ours else pair[0])
+def _pair(score: Score) -> tuple[str, str]:
+    """The two methods of a score of :func:`ahead`, the one in front first."""
+    front, _, other = score.subject.partition(" against ")
+    return front, other
 
 
 def _by(score: Score) -> str:
@@ -227,29 +239,32 @@ def ranking_claims(
     collapses, are listed as evidence alone.
     """
     names = names or Names()
-    wanted = [(f"Text as a bridge beats images ({other})", other) for other in names.images]
-    wanted.append(("Conditioning on the background hurts", names.background))
-    return [_ranking_claim(claim, other, differences, people, names) for claim, other in wanted]
+    wanted = [f"Text as a bridge beats images ({other})" for other in names.images]
+    wanted.append("Conditioning on the background hurts")
+    return [
+        _ranking_claim(claim, *pair, differences, people)
+        for claim, pair in zip(wanted, names.pairs, strict=True)
+    ]
 
 
 def _ranking_claim(
-    claim: str, other: str, differences: Sequence[Score], people: Sequence[Score], names: Names
+    claim: str, front: str, other: str, differences: Sequence[Score], people: Sequence[Score]
 ) -> Claim:
-    pair = names.ours, other
+    pair = front, other
     votes = [s for s in people if _is_difference(s)]
     compared = _between(differences, "TMMD", *pair) + _between(votes, PEOPLE, *pair)
-    deciding = [ahead(d, names.ours) for d in compared]
+    deciding = [ahead(d, front) for d in compared]
     others = [
-        ahead(d, names.ours) for metric in FAMILY[1:] for d in _between(differences, metric, *pair)
+        ahead(d, front) for metric in FAMILY[1:] for d in _between(differences, metric, *pair)
     ]
     parts = ", ".join(f"in {_label(s)} {_by(s)}" for s in (*deciding, *others))
     why = (
-        f"{names.ours} is ahead of {other} {parts}" + _runs((*deciding, *others)[0])
+        f"{front} is ahead of {other} {parts}" + _runs((*deciding, *others)[0])
         if parts
-        else (f"{other} was not compared with {names.ours}")
+        else (f"{other} was not compared with {front}")
     )
     sides = [side_of(s) for s in deciding]
-    source = "paper, tables 3 and 4" if other in names.images else "paper, table 3"
+    source = "paper, tables 3 and 4" if "images" in claim else "paper, table 3"
     return Claim(claim, source, decide(sides), f"{why}.", [*deciding, *others])
 
 
@@ -301,8 +316,8 @@ def discrimination_claim(differences: Sequence[Score], names: Names | None = Non
     so means that differ by less than ``1.96 sqrt(2)`` are undecided.
     """
     names = names or Names()
-    known = {names.ours, *names.images, names.background}
-    differences = [d for d in differences if {d.details["a"], d.details["b"]} <= known]
+    known = [{*pair} for pair in names.pairs]
+    differences = [d for d in differences if {d.details["a"], d.details["b"]} in known]
     claim, source = "Traditional metrics hardly discriminate between methods", "paper, section 1"
     sizes: dict[str, dict[tuple[str, str], list[float]]] = {"traditional": {}, "family": {}}
     evidence: list[Score] = []

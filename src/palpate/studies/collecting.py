@@ -21,7 +21,7 @@ from palpate.studies.evidence import DIFFERENCE, difference_between, in_words, m
 from palpate.studies.judging import MATERIAL, probing_plan, read_probed, read_scores, stage_of
 from palpate.studies.making import After, Facts
 from palpate.studies.memorization import memorization_table
-from palpate.studies.methods import OURS
+from palpate.studies.methods import BACKGROUND, OURS, VQ
 from palpate.studies.study import NOLEAK, ORIG, SPLITS, Study
 from palpate.studies.study_tables import FAMILY, READING, RETRIEVAL, Scores, same_task, study_tables
 
@@ -71,8 +71,9 @@ def collect(
     tables += [table for answer in answers for table in answer.tables]
     images = [m for m in methods if m.startswith("GVST")]
     tasks = {**_tasks_of_encoders(probed.scores), **_tasks_of_generators(seeds)}
+    named = Names(OURS, images, BACKGROUND, VQ)
     votes = [] if people is None else [*Results.load(people).scores]
-    claims = paper_claims(noleak, tasks=tasks, people=votes, names=Names(OURS, images))
+    claims = paper_claims(noleak, tasks=tasks, people=votes, names=named)
     claims += [claim for answer in answers for claim in answer.claims]
     notes = [*probed.notes, *([Note("synthetic-data")] if manifest.facts.get("synthetic") else [])]
     results = Results(
@@ -94,7 +95,7 @@ def collect(
 def _compares(difference: Score, methods: Sequence[str]) -> bool:
     """Whether a difference is of the paper's two comparisons or of the best method."""
     pair = [difference.details[k] for k in ("a", "b")]
-    return pair[0] == OURS and pair[1] in (*methods, NEAREST)
+    return pair == [VQ, BACKGROUND] or (pair[0] == OURS and pair[1] in (*methods, NEAREST))
 
 
 def _tasks_of_encoders(scores: Sequence[Score]) -> dict[str, Score]:

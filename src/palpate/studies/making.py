@@ -161,17 +161,16 @@ def make_generator(
 ) -> Facts:
     """A method's generator trained from random weights on the train part; in ``model``.
 
-    ``autoencoder``: a shipped name, or the node that trained it.
+    ``autoencoder``: the node that trained it.
     """
     manifest, parts = data_of(after, split)
-    place_of = after[autoencoder] / "autoencoder" if autoencoder in after else autoencoder
     diffusion = method.preset(preset.diffusion)
     encoders = EncoderSet(load_clip(preset.clip, device=device))
     pipeline = train_pipeline(
         manifest,
         parts,
         None if diffusion.condition.source == "resnet" else encoders,
-        load_autoencoder(place_of),
+        load_autoencoder(after[autoencoder] / "autoencoder"),
         diffusion,
         place / "training",
         seed=seed,
@@ -234,7 +233,7 @@ def make_images(
     texts = texts_of(test)[0]
     each = {text: pipeline.embed_text(text) for text in dict.fromkeys(texts)}
     gels = None
-    if pipeline.background:
+    if pipeline.background or pipeline.gel is not None:
         gels = gels_of(test, pipeline.size, cache_of(place), progress)
     words = np.concatenate([np.asarray(each[text]) for text in texts])
     images = pipeline.sample(None, test.ids, texts=words, seed=seed, background=gels)

@@ -26,7 +26,9 @@ from palpate.diffusion.presets import DiffusionPreset
 Images = NDArray[np.uint8]
 #: The paper's training, driven at test time by the photo in the place of the text.
 OURS = "Ours"
-BRIDGE, BACKGROUND, GVST, BEST = "Ours w/ memory bridge", "Ours w/ BG", "GVST", "best"
+BRIDGE, GVST, BEST = "Ours w/ memory bridge", "GVST", "best"
+#: Behind the paper's kind of autoencoder, which is not given the gel; with it and without.
+VQ, BACKGROUND = "Ours, VQ", "Ours w/ BG"
 #: What ``palpate generate`` uses without a model.
 SHIPPED = "palpate/mini"
 #: Text conditions the training, with nothing that bridges to photos.
@@ -89,7 +91,8 @@ class Method:
         condition: fields of :class:`~palpate.diffusion.options.ConditionPolicy` that differ from
             the preset's.
         background: the denoiser sees the no-contact image.
-        gel: the autoencoder is given the no-contact image instead of being the VQ one.
+        vq: behind the paper's kind of autoencoder, which codes the gel with the touch, instead of
+            the one that is given the no-contact image.
         drive: what it is given for a test sample: its photo, or its text.
         make: makes the images in place of a diffusion model, in any way.
     """
@@ -98,7 +101,7 @@ class Method:
     text: str
     condition: Mapping[str, Any] = field(default_factory=dict[str, Any])
     background: bool = False
-    gel: bool = False
+    vq: bool = False
     drive: Literal["photo", "text"] = "photo"
     make: Make | None = None
 
@@ -109,7 +112,7 @@ class Method:
     @property
     def training(self) -> dict[str, Any]:
         """What its training depends on: methods of one training differ in what drives them."""
-        return {"condition": self.condition, "background": self.background, "gel": self.gel}
+        return {"condition": self.condition, "background": self.background, "vq": self.vq}
 
 
 def shipped(setting: Setting) -> Images:
@@ -130,7 +133,6 @@ METHODS: Mapping[str, Method] = {
             "Ours; the photo is replaced by its projection on the training texts.",
             {**BARE, "gap": "memory"},
         ),
-        Method("Ours w/ BG", "Ours, which also sees the no-contact image.", BARE, background=True),
         Method(
             GVST,
             "The same token from photos in training, too: no text.",
@@ -142,10 +144,15 @@ METHODS: Mapping[str, Method] = {
             {**BARE, "source": "resnet"},
         ),
         Method(
-            BEST,
-            "Preset mini: a token of the text and one of the photo, memory bridge, noise, and an "
-            "autoencoder that is given the gel.",
-            gel=True,
+            BEST, "Preset mini: a token of the text and one of the photo, memory bridge, noise."
+        ),
+        Method(VQ, "Ours, with an autoencoder that is not given the gel.", BARE, vq=True),
+        Method(
+            BACKGROUND,
+            "Ours, VQ, whose denoiser also sees the no-contact image.",
+            BARE,
+            background=True,
+            vq=True,
         ),
         Method(
             SHIPPED,

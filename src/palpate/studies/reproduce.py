@@ -38,7 +38,7 @@ from palpate.studies.graph import Node, Planned, plan_graph, run_graph
 from palpate.studies.judging import Judging, judge_images, probe_encoders
 from palpate.studies.lengths import SAMPLING, SHARES
 from palpate.studies.making import slug
-from palpate.studies.methods import BACKGROUND, GVST, OURS, Method
+from palpate.studies.methods import BACKGROUND, GVST, OURS, VQ, Method
 from palpate.studies.questions import (
     MOVED,
     compare_on_forty,
@@ -255,8 +255,8 @@ def _data_nodes(plan: Plan) -> list[Node]:
 def _autoencoder_nodes(plan: Plan, split: str) -> list[Node]:
     preset = plan.preset
     kinds: dict[str, Any] = {f"autoencoder-{split}": preset.autoencoder}
-    if not isinstance(preset.gel, str) and any(m.gel for m in plan.study.trained_on(split)):
-        kinds[f"autoencoder-gel-{split}"] = preset.gel
+    if any(m.vq for m in plan.study.trained_on(split)):
+        kinds[f"autoencoder-vq-{split}"] = preset.vq
     nodes: list[Node] = []
     for name, options in kinds.items():
         how: dict[str, Any] = {"split": split, "options": options, "size": preset.diffusion.size}
@@ -282,7 +282,7 @@ def _question_nodes(plan: Plan) -> list[Node]:
     names = [n for n in study.moved if n in trained]
     if study.world is not None and len(names) > 1:
         nodes += _appearance_nodes(plan, {n: trained[n] for n in names})
-    made = {n: _images(n, NOLEAK, first) for n in (OURS, GVST, BACKGROUND) if n in trained}
+    made = {n: _images(n, NOLEAK, first) for n in (OURS, GVST, VQ, BACKGROUND) if n in trained}
     if len(made) > 1:
         how: dict[str, Any] = {"clip": preset.clip, "size": preset.diffusion.size}
         build = partial(compare_on_forty, images=made, device=plan.device, **how)
@@ -377,20 +377,16 @@ def _method_nodes(
     preset, study = plan.preset, plan.study
     how: dict[str, Any] = {"split": split, "seed": seed, "preset": preset, "device": plan.device}
     nodes, generator = list[Node](), ""
-    autoencoder = f"autoencoder-{split}"
-    if method.gel:
-        gel = preset.gel
-        autoencoder = gel if isinstance(gel, str) else f"autoencoder-gel-{split}"
-    own = [] if "/" in autoencoder else [autoencoder]
+    autoencoder = f"autoencoder-vq-{split}" if method.vq else f"autoencoder-{split}"
     if method.make is None:
         generator = _generator(study, method, split, seed)
         if generator not in trained:
             trained.add(generator)
             inputs = {"method": method.training, "diffusion": method.preset(preset.diffusion)}
             inputs |= {"steps": preset.steps, "clip": preset.clip, "seed": seed}
-            inputs |= {"autoencoder": autoencoder, "precision": preset.precision}
+            inputs |= {"precision": preset.precision}
             build = partial(making.make_generator, method=method, autoencoder=autoencoder, **how)
-            after = ["data", "split", *own]
+            after = ["data", "split", autoencoder]
             nodes.append(Node(generator, build, inputs, after, cost=preset.seconds[2]))
     build = partial(making.make_images, method=method, generator=generator, **how)
     inputs = {"drive": method.drive, "seed": seed}

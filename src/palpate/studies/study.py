@@ -39,8 +39,8 @@ class Preset:
         encoder: the tactile encoder; one is trained for each split and seed.
         diffusion: U-Net, schedule and sampler of all methods; its condition is that of ``best``.
         steps: optimizer steps of each method.
-        autoencoder: of the methods, trained on the train part of each split.
-        gel: the autoencoder that is given the no-contact image: shipped, or trained likewise.
+        autoencoder: of the methods, given the no-contact image; trained on the train part.
+        vq: the paper's kind of autoencoder, for the methods that are not given it.
         clip: frozen vision and text encoders: a shipped name, hub id or folder.
         precision: of the methods' training (:class:`~palpate.training.options.Compute`).
         ruler: another set of encoders that ranks the methods: a shipped name, or none.
@@ -54,8 +54,8 @@ class Preset:
     encoder: EncoderPreset
     diffusion: DiffusionPreset
     steps: int
-    autoencoder: AutoencoderOptions
-    gel: str | BackgroundOptions
+    autoencoder: BackgroundOptions
+    vq: AutoencoderOptions
     clip: str
     precision: Precision = "float32"
     ruler: str | None = "palpate/mini"
@@ -179,10 +179,8 @@ PRESETS: Mapping[str, Preset] = {
                 sampler=replace(MINI.sampler, steps=4),
             ),
             steps=12,
-            autoencoder=replace(
-                _VQ, widths=(16, 32), codes=256, steps_free=60, steps_quantized=20, crop=0
-            ),
-            gel=BackgroundOptions(narrow=16, wide=32, steps=80, crop=0),
+            autoencoder=BackgroundOptions(narrow=16, wide=32, steps=80, crop=0),
+            vq=replace(_VQ, widths=(16, 32), codes=256, steps_free=60, steps_quantized=20, crop=0),
             clip="palpate/mini",
             permutations=99,
             cost="for tests: under 8 minutes on two x86-64 cores",
@@ -194,8 +192,8 @@ PRESETS: Mapping[str, Preset] = {
             ENCODERS["mini"],
             MINI,
             steps=1500,
-            autoencoder=_VQ,
-            gel=BackgroundOptions(steps=1200),
+            autoencoder=BackgroundOptions(steps=1200),
+            vq=_VQ,
             clip="palpate/mini",
             precision="bf16",  # 1.4 times as many steps a second, on processors that have it
             cost="about 90 minutes of one x86-64 core a seed",
