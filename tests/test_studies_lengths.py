@@ -33,12 +33,14 @@ def test_curves_tell_few_steps_from_many_on_the_same_samples():
     sampled = {"Ours": [(2, TRAINED["Ours"][0][1].take(some)), (10, REAL.take(some))]}
     training, material, sampling, _ = compute_curves(TRAINED, sampled, REAL, TRAIN, "split")
     few, many = (score for _, score in training.lines[0].points)
-    assert few.value > many.interval[1] and abs(many.value) < 0.3
+    assert few.value > many.interval[1]
+    assert abs(many.value) < 0.3
     assert {s.split for s in (few, many)} == {"split"}
     ours, real = material.lines
     assert [x for x, _ in ours.points] == [x for x, _ in real.points] == [10, 40]
     assert ours.points[0][1].value < 0.6 < 0.95 < ours.points[1][1].value
-    assert real.label == "real images" and real.points[0][1].value == 1
+    assert real.label == "real images"
+    assert real.points[0][1].value == 1
     assert sampling.lines[0].points[1][1].n == len(some)
 
 
