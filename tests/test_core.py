@@ -3,6 +3,7 @@
 import itertools
 import json
 import pickle
+import shutil
 import warnings
 
 import numpy as np
@@ -281,10 +282,23 @@ def test_a_stage_is_built_once_and_again_for_other_inputs(tmp_path):
 
     first = Run(tmp_path).stage("a", {"k": 1}, build)
     again = Run(tmp_path).stage("a", {"k": 1}, build)
-    assert (first.facts, again.facts, again.reused, len(calls)) == ({"n": 1}, {"n": 1}, True, 1)
+    assert (first.facts, again.facts, len(calls)) == ({"n": 1}, {"n": 1}, 1)
     other = Run(tmp_path).stage("a", {"k": 2}, build)
-    assert (other.facts, other.reused) == ({"n": 2}, False)
+    assert (other.facts, len(calls)) == ({"n": 2}, 2)
     assert other.digest != first.digest
+    Run(tmp_path).stage("a", {"k": 2}, build, read={"b": "0" * 64})
+    assert len(calls) == 3
+
+
+def test_a_stage_killed_after_its_mark_has_the_digest_of_its_files(tmp_path):
+    def build(folder):
+        (folder / "text").write_text("x")
+
+    whole = Run(tmp_path / "whole").stage("a", {}, build)
+    record = tmp_path / "whole" / "a" / "stage.json"
+    shutil.copytree(whole.folder, tmp_path / "run" / "a.partial")  # killed before it was renamed
+    shutil.copy(record, tmp_path / "run" / "a.partial.json")
+    assert Run(tmp_path / "run").stage("a", {}, build).outputs == whole.outputs
 
 
 @pytest.mark.parametrize(("inputs", "resumed"), [({"k": 1}, True), ({"k": 2}, False)])

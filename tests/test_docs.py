@@ -1,5 +1,6 @@
 """The documentation is true: its commands and Python lines run, its links resolve."""
 
+import linecache
 import re
 import shlex
 import shutil
@@ -79,6 +80,8 @@ def test_the_blocks_of_a_page_run(page, examples, tmp_path, monkeypatch):
     names = {}
     for language, text in blocks(page):
         if language == "python":
+            lines = text.splitlines(keepends=True)
+            linecache.cache[page] = (len(text), None, lines, page)  # the source of its functions
             exec(compile(text, page, "exec"), names)
         else:
             for line in text.splitlines():

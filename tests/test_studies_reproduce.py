@@ -1,7 +1,9 @@
 """Studies: their objects and nodes, controls against planted truths, tables from forged scores."""
 
 import json
+import shutil
 from dataclasses import replace
+from functools import partial
 from itertools import combinations
 
 import numpy as np
@@ -10,14 +12,17 @@ import pytest
 
 from palpate.cli import main
 from palpate.core import PalpateError, Score, Split
+from palpate.encoders.models import shipped_folder
 from palpate.report.results import Results
 from palpate.sim import WorldOptions
 from palpate.sim.presets import MINI_SEEDS
-from palpate.studies import controls
+from palpate.studies import controls, reproduce
 from palpate.studies.controls import CONTROLS, FLOOR, NEAREST
+from palpate.studies.graph import in_order
 from palpate.studies.making import slug
 from palpate.studies.methods import METHODS, OURS, Method, Setting
 from palpate.studies.reproduce import nodes_of, plan_of, planned
+from palpate.studies.stages import stage_digest
 from palpate.studies.study import NOLEAK, ORIG, STUDIES, Study
 from palpate.studies.study_tables import Scores, study_tables
 from palpate.studies.verifying import verify
@@ -76,6 +81,72 @@ def test_another_seed_leaves_the_nodes_of_the_first(tmp_path):
     )
     changed = {name for name in one if one[name] != two[name]}
     assert changed == {"results", "appearance", "rulers"}  # what is over all seeds
+
+
+def digests(study, **options):
+    """Name -> digest of what the stage reads."""
+    read = {}
+    for n in in_order(nodes_of(plan_of(study, preset="smoke", **options))):
+        inputs = {**n.inputs, "after": {name: read[name] for name in n.after}}
+        read[n.name] = stage_digest(n.name, inputs, n.version)
+    return read
+
+
+def test_other_weights_under_one_name_build_what_reads_them(tmp_path):
+    clip = tmp_path / "clip"
+    shutil.copytree(shipped_folder("palpate/mini", "clip"), clip)
+    own = Method("mine", "", make=controls.mean_image)
+    smoke = replace(WORLD.presets["smoke"], clip=str(clip))
+    study = replace(WORLD, methods=[*WORLD.methods, own], presets={"smoke": smoke})
+    before = digests(study)
+    weights = clip / "model.safetensors"
+    weights.write_bytes(weights.read_bytes()[:-1] + b"x")
+    after = digests(study)
+    same = {name for name in before if before[name] == after[name]}
+    assert same == {"world", "data", "split", *(n for n in before if n.startswith("autoencoder"))}
+
+
+def test_other_shipped_weights_build_what_reads_them(monkeypatch):
+    before, known = digests(WORLD), reproduce.model_stamp
+    monkeypatch.setattr(
+        reproduce, "model_stamp", lambda p, s: known(p, s) if p == "clip" else f"other {p}"
+    )
+    after = digests(WORLD)
+    trained = [n for n in before if n.startswith(("encoder", "ours", "gvst", "images-ours"))]
+    assert all(before[name] == after[name] for name in trained)
+    for name in ("images-palpate-mini-NoLeak-0", "rulers"):
+        assert before[name] != after[name], name
+
+
+def bright(setting, by=1, **more):
+    raise NotImplementedError
+
+
+def brighter(by):
+    return lambda setting: bright(setting, by)
+
+
+def made_by(make):
+    study = replace(WORLD, methods=[METHODS[OURS], Method("mine", "", make=make)])
+    return digests(study)["images-mine-NoLeak-0"]
+
+
+def test_functions_are_told_apart_by_what_they_are_given():
+    makes = [bright, brighter(1), brighter(2), partial(bright, by=1), partial(bright, by=2)]
+    makes += [partial(bright, darken=bright), partial(bright, darken=controls.mean_image)]
+    assert len({*map(made_by, makes)}) == len(makes)
+    assert made_by(partial(bright, by=2)) == made_by(partial(bright, by=2))
+
+
+class Callable:
+    def __call__(self, setting):
+        raise NotImplementedError
+
+
+@pytest.mark.parametrize("make", [Callable(), len, partial(bright, by=Callable())])
+def test_a_function_without_source_is_refused(make):
+    with pytest.raises(PalpateError, match="must be a function of a file"):
+        made_by(make)
 
 
 def test_a_method_of_your_own_trains_nothing():

@@ -146,7 +146,7 @@ def test_stages_killed_between_their_last_file_and_their_mark_go_on(whole, tmp_p
     run = shutil.copytree(whole, tmp_path / "run")
     for node in NODES:  # as each stage was just before it was marked as finished
         record = json.loads((run / node.name / "stage.json").read_text())
-        inputs = {key: record[key] for key in ("digest", "version", "inputs")}
+        inputs = {key: record[key] for key in ("digest", "version", "inputs", "read")}
         (run / f"{node.name}.partial.json").write_text(json.dumps(inputs))
         (run / node.name / "stage.json").unlink()
         (run / node.name).rename(run / f"{node.name}.partial")

@@ -106,9 +106,12 @@ def digest_file(path: Path) -> str:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 
-def digest_folder(folder: Path, pattern: str = "**/*") -> str:
-    """Return the SHA-256 over names and bytes of the files in ``folder`` that match ``pattern``."""
-    files = sorted(p for p in folder.glob(pattern) if p.is_file())
+def digest_folder(folder: Path, pattern: str = "**/*", *, without: str = "") -> str:
+    """Return the SHA-256 over names and bytes of the files in ``folder`` that match ``pattern``.
+
+    ``without``: name of a file of the folder that is left out.
+    """
+    files = sorted(p for p in folder.glob(pattern) if p.is_file() and p != folder / without)
     return digest_lines(f"{p.relative_to(folder).as_posix()} {digest_file(p)}" for p in files)
 
 

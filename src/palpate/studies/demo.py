@@ -239,12 +239,12 @@ class _Demo:
             inputs = {"options": self.diffusion.autoencoder, "size": self.diffusion.size}
             nodes.append(Node("autoencoder", self.autoencoder, seed | inputs, train))
         inputs = {"preset": self.encoder, "epochs": preset.tactile_epochs}
-        inputs |= {"clip": _stamp_of("clip", clip), "start": _stamp_of("encoders", self.ready)}
+        inputs |= {"clip": model_stamp("clip", clip), "start": model_stamp("encoders", self.ready)}
         after = [*train, *({"clip"} & {*here})]
         nodes.append(Node("encoders", self.encoders, seed | inputs, after))
         inputs = {"preset": self.diffusion, "background": options.background}
-        inputs |= {"autoencoder": _stamp_of("autoencoder", autoencoder)}
-        inputs |= {"start": _stamp_of("generator", self.start)}
+        inputs |= {"autoencoder": model_stamp("autoencoder", autoencoder)}
+        inputs |= {"start": model_stamp("generator", self.start)}
         after = ["data", "split", "encoders", *({"autoencoder"} & {*here})]
         nodes.append(Node("generator", self.generator, seed | inputs, after))
         nodes.append(Node("generated", self.generated, seed, ("data", "split", "generator")))
@@ -433,7 +433,7 @@ def _pretraining(after: After) -> Manifest:
     return Manifest.join(other.prefixed("pretraining/"), manifest.part(split, "train"))
 
 
-def _stamp_of(part: Part, source: str | None) -> str | None:
+def model_stamp(part: Part, source: str | None) -> str | None:
     """What names a given model: the digest of its folder or file, or its hub id."""
     if source is None:
         return None

@@ -2,8 +2,10 @@
 
 A node is built by a function of its folder and of the folders of the nodes it comes after. Its
 digest holds those of the nodes before it (:mod:`palpate.studies.stages`), so that a changed option
-builds again what depends on it and nothing else. Nodes that do not depend on each other may be
-built by several processes; the result does not depend on how many.
+builds again what depends on it and nothing else; its record holds those of their files, so that it
+is built again after a stage that was made again with other files (trained on a GPU, say). Nodes
+that do not depend on each other may be built by several processes; the result does not depend on
+how many.
 """
 
 from __future__ import annotations
@@ -13,14 +15,14 @@ import os
 import signal
 import time
 import traceback
-from collections.abc import Callable, Generator, Mapping, Sequence
+from collections.abc import Callable, Collection, Generator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from functools import partial
 from multiprocessing.connection import wait
 from multiprocessing.process import BaseProcess
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
 from palpate.core import PalpateError, Progress, few, locked, quiet, require
 from palpate.core.processes import exit_with_parent
@@ -62,7 +64,8 @@ class Planned:
 
     Attributes:
         name: of the node.
-        done: whether its stage exists for the same inputs.
+        done: whether its stage exists for the same inputs, and those that it reads exist. After one
+            that does not it may turn out to be done, if that is made again with the same files.
         cost: seconds: what it took, or else is expected to take (0: unknown).
     """
 
@@ -77,8 +80,8 @@ def plan_graph(nodes: Sequence[Node], folder: Path) -> list[Planned]:
     Raises:
         PalpateError: as :func:`run_graph` does for the nodes.
     """
-    ordered = in_order(nodes)
-    done = _finished(ordered, Path(folder))
+    ordered, done = in_order(nodes), dict[str, Stage]()
+    _take_finished(ordered, Path(folder), done)
     return [
         Planned(n.name, n.name in done, done[n.name].seconds if n.name in done else n.cost)
         for n in ordered
@@ -122,14 +125,12 @@ def run_graph(
     require(jobs >= 1, "jobs", "must be at least 1", jobs)
     ordered, folder = in_order(nodes), Path(folder)
     with locked(folder):
-        whole = _Whole(ordered, jobs, print_line, progress)
-        for name, stage in _finished(ordered, folder).items():
-            print_line(f"{name}: already done ({stage.seconds:.0f} s then)")
-            whole.stages[name] = stage
+        whole = _Whole(ordered, folder, jobs, print_line, progress)
+        whole.take_finished()
         if jobs == 1:
-            _run_here(ordered, folder, whole)
+            _run_here(whole)
         else:
-            _run_in_workers(ordered, folder, whole)
+            _run_in_workers(whole)
     return {node.name: whole.stages[node.name] for node in nodes}
 
 
@@ -169,14 +170,20 @@ def _reads(ordered: Sequence[Node]) -> dict[str, dict[str, Any]]:
     return reads
 
 
-def _finished(ordered: Sequence[Node], folder: Path) -> dict[str, Stage]:
-    """The stages that exist for the same inputs."""
-    reads = _reads(ordered)
-    stages = {
-        n.name: finished_stage(folder / n.name, stage_digest(n.name, reads[n.name], n.version))
-        for n in ordered
-    }
-    return {name: stage for name, stage in stages.items() if stage is not None}
+def _take_finished(
+    ordered: Sequence[Node], folder: Path, stages: dict[str, Stage], begun: Collection[str] = ()
+) -> list[Stage]:
+    """Add to ``stages`` those that exist for the same inputs and files of earlier stages."""
+    reads, new = _reads(ordered), list[Stage]()
+    for node in ordered:
+        if node.name in {*stages, *begun} or not stages.keys() >= set(node.after):
+            continue
+        digest = stage_digest(node.name, reads[node.name], node.version)
+        outputs = {name: stages[name].outputs for name in node.after}
+        if (stage := finished_stage(folder / node.name, digest, outputs)) is not None:
+            stages[node.name] = stage
+            new.append(stage)
+    return new
 
 
 @dataclass
@@ -184,16 +191,26 @@ class _Whole:
     """All nodes of a run: what is done, what is running, and the time left."""
 
     ordered: Sequence[Node]
+    folder: Path
     jobs: int
     print_line: PrintLine
     progress: Progress
     stages: dict[str, Stage] = field(default_factory=dict[str, Stage])
     begun: dict[str, float] = field(default_factory=dict[str, float])  # name -> when
 
-    def ready(self) -> Node | None:
+    def take_finished(self) -> None:
+        """Take what needs no work, from now on or once what it reads has been made again."""
+        for stage in _take_finished(self.ordered, self.folder, self.stages, self.begun):
+            self.print_line(f"{stage.folder.name}: already done ({stage.seconds:.0f} s then)")
+
+    def ready(self) -> _Task | None:
         """The first node that may begin."""
         waiting = (n for n in self.ordered if n.name not in {*self.stages, *self.begun})
-        return next((n for n in waiting if self.stages.keys() >= set(n.after)), None)
+        node = next((n for n in waiting if self.stages.keys() >= set(n.after)), None)
+        if node is None:
+            return None
+        outputs = {name: self.stages[name].outputs for name in node.after}
+        return _Task(node, self.folder, _reads(self.ordered)[node.name], outputs)
 
     def begin(self, node: Node) -> None:
         self.begun[node.name] = time.monotonic()
@@ -202,6 +219,7 @@ class _Whole:
     def end(self, stage: Stage) -> None:
         self.begun.pop(stage.folder.name)
         self.stages[stage.folder.name] = stage
+        self.take_finished()
         self.show()
         if len(self.stages) < len(self.ordered):
             self.print_line(f"{len(self.stages)} of {len(self.ordered)} stages{self.remark()}")
@@ -240,10 +258,19 @@ def _words(seconds: float) -> str:
     return f"{seconds / 60:.0f} min" if seconds < 90 * 60 else f"{seconds / 3600:.1f} h"
 
 
-def _build_node(
-    node: Node, read: Mapping[str, Any], folder: Path, print_line: PrintLine, progress: Progress
-) -> Stage:
+@dataclass(frozen=True)
+class _Task:
+    """A node to build: in which run folder, with what it reads, of which files of earlier nodes."""
+
+    node: Node
+    folder: Path
+    inputs: Mapping[str, Any]
+    read: Mapping[str, str]
+
+
+def _build_node(task: _Task, print_line: PrintLine, progress: Progress) -> Stage:
     """Build a node in this process."""
+    node, folder = task.node, task.folder
     before = {name: folder / name for name in node.after}
 
     def report(what: str, done: int, total: int, remark: str = "") -> None:
@@ -253,34 +280,35 @@ def _build_node(
         return node.build(place, before, report)
 
     try:
-        return Run(folder, print_line).stage(node.name, read, build, version=node.version)
+        how: dict[str, Any] = {"version": node.version, "read": task.read}
+        return Run(folder, print_line).stage(node.name, task.inputs, build, **how)
     except Exception:
         print_line(f"{node.name}: stopped by an error")
         raise
 
 
-def _run_here(ordered: Sequence[Node], folder: Path, whole: _Whole) -> None:
-    reads = _reads(ordered)
-
+def _run_here(whole: _Whole) -> None:
     def report(what: str, done: int, total: int, remark: str = "") -> None:
         whole.show()
         whole.progress(what, done, total, remark)
 
-    while (node := whole.ready()) is not None:
-        whole.begin(node)
-        whole.end(_build_node(node, reads[node.name], folder, whole.print_line, report))
+    while (task := whole.ready()) is not None:
+        whole.begin(task.node)
+        whole.end(_build_node(task, whole.print_line, report))
 
 
-def _run_in_workers(ordered: Sequence[Node], folder: Path, whole: _Whole) -> None:
-    reads = _reads(ordered)
+def _run_in_workers(whole: _Whole) -> None:
     workers: dict[Channel, BaseProcess] = {}
     idle: list[Channel] = []
     with _ended_with(workers):
-        while len(whole.stages) < len(ordered):
-            while (idle or len(workers) < whole.jobs) and (node := whole.ready()) is not None:
+        while len(whole.stages) < len(whole.ordered):
+            while (idle or len(workers) < whole.jobs) and (task := whole.ready()) is not None:
                 worker = idle.pop() if idle else _start_worker(workers, whole.jobs)
-                worker.send((node, reads[node.name], folder))
-                whole.begin(node)
+                try:
+                    worker.send(task)
+                except OSError:  # it died while it was idle
+                    _raise_dead(workers[worker])
+                whole.begin(task.node)
             for worker in wait([w for w in workers if w not in idle], timeout=1.0):
                 kind, value = _received(worker, workers[worker])
                 if kind == "stage":
@@ -337,7 +365,11 @@ def _received(worker: Channel, process: BaseProcess) -> tuple[str, Any]:
     try:
         return worker.recv()
     except (EOFError, OSError):
-        process.join()
+        _raise_dead(process)
+
+
+def _raise_dead(process: BaseProcess) -> NoReturn:
+    process.join()
     got = f"one ended with status {process.exitcode}"
     fix = "Free some memory, or use one process; run it again to go on. A script must call this "
     fix += "under: if __name__ == '__main__'"
@@ -356,8 +388,8 @@ def _work(channel: Channel, environment: Mapping[str, str]) -> None:
 
     while True:
         try:
-            node, read, folder = channel.recv()
-            send("stage", _build_node(node, read, folder, partial(send, "line"), report))
+            task = channel.recv()
+            send("stage", _build_node(task, partial(send, "line"), report))
         except Exception as error:
             error.add_note(traceback.format_exc())  # a traceback is not sent along
             send("error", error)

@@ -19,7 +19,6 @@ import inspect
 import os
 import platform
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import suppress
 from functools import partial
 from importlib import metadata
 from itertools import product
@@ -27,18 +26,18 @@ from pathlib import Path
 from typing import Any
 
 from palpate import __version__
-from palpate.core import PalpateError, Progress, digest_file, quiet, read_json, require
+from palpate.core import PalpateError, Progress, digest_file, plain, quiet, read_json, require
 from palpate.evaluation.inputs import read as read_samples
 from palpate.report.results import Results
 from palpate.sim.presets import MINI_SEEDS
 from palpate.studies import making
 from palpate.studies.collecting import collect
-from palpate.studies.demo import require_unseen, stamp
+from palpate.studies.demo import model_stamp, require_unseen, stamp
 from palpate.studies.graph import Node, Planned, plan_graph, run_graph
 from palpate.studies.judging import Judging, judge_images, probe_encoders
 from palpate.studies.lengths import SAMPLING, SHARES
 from palpate.studies.making import slug
-from palpate.studies.methods import BACKGROUND, GVST, OURS, VQ, Method
+from palpate.studies.methods import BACKGROUND, GVST, OURS, SHIPPED, VQ, Method, shipped
 from palpate.studies.questions import (
     MOVED,
     compare_on_forty,
@@ -142,17 +141,16 @@ def nodes_of(plan: Plan) -> list[Node]:
         nodes += _autoencoder_nodes(plan, split)
         after = ["data", "split", f"autoencoder-{split}"]
         make = partial(making.make_controls, split=split, controls=study.controls, preset=preset)
-        inputs = {"controls": {n: _source(f) for n, f in study.controls.items()}}
-        inputs |= {"size": preset.diffusion.size, "clip": preset.clip}
+        inputs: dict[str, Any] = {"controls": {n: _source(f) for n, f in study.controls.items()}}
+        inputs |= {"size": preset.diffusion.size, **_clip(preset)}
         name = f"controls-{split}"
         nodes.append(Node(name, partial(make, device=device), inputs, after, version=2, cost=20))
     for seed, split in product(plan.seeds, SPLITS):
         encoder = f"encoder-{split}-{seed}"
         how: dict[str, Any] = {"preset": preset.encoder, "clip": preset.clip}
         build = partial(making.make_encoders, split=split, seed=seed, device=device, **how)
-        nodes.append(
-            Node(encoder, build, {**how, "seed": seed}, ["data", "split"], cost=preset.seconds[0])
-        )
+        inputs = {"preset": preset.encoder, **_clip(preset), "seed": seed}
+        nodes.append(Node(encoder, build, inputs, ["data", "split"], cost=preset.seconds[0]))
         build = partial(probe_encoders, split=split, encoders=encoder, device=device)
         after = ["data", "split", encoder]
         name = f"probe-{split}-{seed}"
@@ -287,14 +285,15 @@ def _question_nodes(plan: Plan) -> list[Node]:
         how: dict[str, Any] = {"clip": preset.clip, "size": preset.diffusion.size}
         build = partial(compare_on_forty, images=made, device=plan.device, **how)
         after = ["data", "split", *made.values()]
-        nodes.append(Node("forty", build, how, after, cost=15, measures=True))
+        inputs = {**how, **_clip(preset)}
+        nodes.append(Node("forty", build, inputs, after, cost=15, measures=True))
     if len(trained) > 2:
         rulers = {f"trained on {s}": f"encoder-{s}-{first}" for s in SPLITS}
         images = {(n, seed): _images(n, NOLEAK, seed) for n, seed in product(trained, plan.seeds)}
         after = ["data", "split", *rulers.values(), *images.values()]
         rulers |= {} if preset.ruler is None else {preset.ruler: preset.ruler}
         build = partial(compare_rulers, rulers=rulers, images=images, device=plan.device)
-        ranking = {"rulers": rulers}
+        ranking = {"rulers": rulers, "shipped": model_stamp("encoders", preset.ruler)}
         nodes.append(Node("rulers", build, ranking, after, cost=60, measures=True))
     return nodes
 
@@ -383,18 +382,18 @@ def _method_nodes(
         if generator not in trained:
             trained.add(generator)
             inputs = {"method": method.training, "diffusion": method.preset(preset.diffusion)}
-            inputs |= {"steps": preset.steps, "clip": preset.clip, "seed": seed}
+            inputs |= {"steps": preset.steps, **_clip(preset), "seed": seed}
             inputs |= {"precision": preset.precision}
             build = partial(making.make_generator, method=method, autoencoder=autoencoder, **how)
             after = ["data", "split", autoencoder]
             nodes.append(Node(generator, build, inputs, after, cost=preset.seconds[2]))
     build = partial(making.make_images, method=method, generator=generator, **how)
     inputs = {"drive": method.drive, "seed": seed}
-    inputs |= (
-        {}
-        if method.make is None
-        else {"make": _source(method.make), "size": preset.diffusion.size, "steps": preset.steps}
-    )
+    if method.make is not None:
+        inputs |= {"make": _source(method.make), "size": preset.diffusion.size}
+        inputs |= {"steps": preset.steps, **_clip(preset)}
+    if method.make is shipped:
+        inputs |= {"weights": model_stamp("generator", SHIPPED)}
     after = ["data", "split", generator or autoencoder]
     nodes.append(Node(_images(method.name, split, seed), build, inputs, after, cost=60))
     return nodes
@@ -421,19 +420,40 @@ def _score_node(plan: Plan, split: str, judge: str, seed: int) -> Node:
         preset.permutations,
     )
     build = partial(judge_images, judging=judging, device=plan.device)
-    inputs = {**vars(judging), "metrics": [_source(m) for m in study.metrics]}
+    inputs = {**vars(judging), **_clip(preset), "metrics": [_source(m) for m in study.metrics]}
     after = ["data", "split", encoder, f"controls-{split}", *methods.values()]
     name = _scores(split, judge, seed)
     return Node(name, build, inputs, after, version=2, cost=60, measures=True)
 
 
-def _source(function: Callable[..., Any]) -> str:
-    """What names a function: its module, its name, and the digest of its source where known."""
-    text = ""
-    with suppress(OSError, TypeError, SyntaxError):
+def _clip(preset: Preset) -> dict[str, str | None]:
+    """What names the frozen encoders: other weights under the same name make other stages."""
+    return {"clip": model_stamp("clip", preset.clip)}
+
+
+def _source(function: Any) -> Any:
+    """What names a function: its module, its name, and the digest of its source.
+
+    Of a partial one its arguments, too, and of one made within another what it holds of that.
+
+    Raises:
+        PalpateError: if it has no source, or holds what JSON cannot.
+    """
+    if isinstance(function, partial):
+        return [_source(function.func), *map(_source, function.args), _source(function.keywords)]
+    if isinstance(function, Mapping):
+        return {key: _source(value) for key, value in function.items()}
+    try:
+        if not callable(function):
+            return plain(function)
         text = hashlib.sha256(inspect.getsource(function).encode()).hexdigest()
-    name = getattr(function, "__qualname__", type(function).__name__)
-    return f"{function.__module__}.{name} {text}"
+    except (OSError, TypeError, SyntaxError):
+        must = "What a study reads or makes its images with must be a function of a file, or a "
+        must += "functools.partial of one with numbers and words"
+        raise PalpateError(must, f"{function!r}"[:200], "Write it in a module") from None
+    name = f"{function.__module__}.{function.__qualname__} {text}"
+    cells = [_source(cell.cell_contents) for cell in getattr(function, "__closure__", None) or ()]
+    return [name, *cells] if cells else name
 
 
 def _settings(plan: Plan, stages: Mapping[str, Stage]) -> dict[str, Any]:

@@ -1,9 +1,10 @@
 """Run folders: a pipeline as named stages, each kept under the digest of what it read.
 
-``run/NAME/stage.json`` marks a finished stage and holds its inputs, its facts, the digest of its
-files, time, peak memory, date and versions. A stage is built in ``run/NAME.partial``, with its
-inputs in ``run/NAME.partial.json``, and renamed when complete. Running again with the same inputs
-reuses it; with other inputs the stage, and so every stage that read it, is built again. A killed
+``run/NAME/stage.json`` marks a finished stage and holds its inputs, the digests of the files of
+earlier stages that it read, its facts, the digest of its own files, time, peak memory, date and
+versions. A stage is built in ``run/NAME.partial``, with what it reads in ``run/NAME.partial.json``,
+and renamed when complete. Running again with the same inputs and the same files of earlier stages
+reuses it; with others the stage, and so every stage that read it, is built again. A killed
 stage finds its partial folder again if the inputs are the same, and may resume from there. The
 digest holds an integer version of each stage, raised by hand where the stage comes to write other
 bytes, and not the version of palpate: a release does not build everything again.
@@ -40,7 +41,6 @@ class Stage:
         facts: what the builder returned.
         outputs: SHA-256 of its files.
         seconds: how long the last call of the builder took.
-        reused: True if it existed already.
     """
 
     folder: Path
@@ -48,7 +48,6 @@ class Stage:
     facts: Mapping[str, Any]
     outputs: str
     seconds: float
-    reused: bool
 
 
 @dataclass
@@ -72,6 +71,7 @@ class Run:
         build: Callable[[Path], Mapping[str, Any] | None],
         *,
         version: int = 1,
+        read: Mapping[str, str] | None = None,
     ) -> Stage:
         """Return the stage; build it unless it exists for the same inputs.
 
@@ -80,18 +80,19 @@ class Run:
             inputs: everything that the stage reads: options, digests of files and earlier stages.
             build: fills the folder it is given and returns facts (JSON) for ``stage.json``.
             version: of what the stage does; raised by hand when it comes to write other bytes.
+            read: name -> ``outputs`` of the earlier stages that it reads.
 
         Raises:
             PalpateError: if the run folder cannot be used.
         """
-        digest = stage_digest(name, inputs, version)
-        stage = finished_stage(self.folder / name, digest)
+        digest, read = stage_digest(name, inputs, version), read or {}
+        stage = finished_stage(self.folder / name, digest, read)
         if stage is not None:
             self.print_line(f"{name}: already done ({stage.seconds:.0f} s then)")
         else:
             self.print_line(f"{name}: ...")
-            read = {"version": version, "inputs": inputs}
-            stage = _build(self.folder / name, digest, read, build)
+            known = {"digest": digest, "version": version, "inputs": inputs, "read": read}
+            stage = _build(self.folder / name, known, build)
             self.print_line(f"{name}: done in {stage.seconds:.0f} s")
         self.stages[name] = stage
         return stage
@@ -102,28 +103,30 @@ def stage_digest(name: str, inputs: Mapping[str, Any], version: int = 1) -> str:
     return digest_json([FORMAT, version, name, inputs])
 
 
-def finished_stage(folder: Path, digest: str) -> Stage | None:
-    """Return the stage in ``folder`` if it is finished and read what ``digest`` names."""
+def finished_stage(folder: Path, digest: str, read: Mapping[str, str]) -> Stage | None:
+    """Return the stage in ``folder`` if it is finished and read what ``digest`` and ``read`` name.
+
+    The digest does not say which files earlier stages had: one that was made again may have others.
+    """
     record = _record(folder / "stage.json")
-    return _of_record(folder, record, reused=True) if record.get("digest") == digest else None
+    same = record.get("digest") == digest and record.get("read") == read
+    return _of_record(folder, record) if same else None
 
 
 def _build(
-    final: Path,
-    digest: str,
-    read: Mapping[str, Any],
-    build: Callable[[Path], Mapping[str, Any] | None],
+    final: Path, known: Mapping[str, Any], build: Callable[[Path], Mapping[str, Any] | None]
 ) -> Stage:
     partial = final.with_name(f"{final.name}.partial")
     partial_record = final.with_name(f"{final.name}.partial.json")
-    if _record(partial_record).get("digest") != digest:
+    before = _record(partial_record)
+    if any(before.get(key) != known[key] for key in ("digest", "read")):
         shutil.rmtree(partial, ignore_errors=True)
     try:
         partial.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         must = f"The run folder {final.parent} must be writable"
         raise PalpateError(must, str(error), "Choose another folder") from None
-    record = {"digest": digest, **json.loads(canonical_json(read))}
+    record = json.loads(canonical_json(known))
     write_json(partial_record, record)
     per_stage = _reset_peak()
     start = time.monotonic()
@@ -134,7 +137,7 @@ def _build(
             partial.rmdir()
             partial_record.unlink()
         raise
-    record |= {"facts": facts, "outputs": digest_folder(partial)}
+    record |= {"facts": facts, "outputs": stage_outputs(partial)}
     record["seconds"] = round(time.monotonic() - start, 2)
     record |= {"peak_mb": _peak_mb(per_stage)} | _gpu_peak()
     record["date"] = datetime.datetime.now(datetime.UTC).date().isoformat()
@@ -143,12 +146,17 @@ def _build(
     shutil.rmtree(final, ignore_errors=True)
     partial.replace(final)
     partial_record.unlink()
-    return _of_record(final, record, reused=False)
+    return _of_record(final, record)
 
 
-def _of_record(folder: Path, record: Mapping[str, Any], *, reused: bool) -> Stage:
+def stage_outputs(folder: Path) -> str:
+    """Return the digest of a stage's files, without its record."""
+    return digest_folder(folder, without="stage.json")
+
+
+def _of_record(folder: Path, record: Mapping[str, Any]) -> Stage:
     digest, facts, outputs = record["digest"], record["facts"], record["outputs"]
-    return Stage(folder, digest, facts, outputs, record["seconds"], reused)
+    return Stage(folder, digest, facts, outputs, record["seconds"])
 
 
 def _reset_peak() -> bool:

@@ -16,7 +16,6 @@ from pathlib import Path
 from typing import Any
 
 from palpate.core import PalpateError, Progress, Score, plain, quiet, read_json, short
-from palpate.core.digest import digest_file, digest_lines
 from palpate.core.files import reading_entry
 from palpate.report.results import Results
 from palpate.studies.comparing import (
@@ -27,7 +26,7 @@ from palpate.studies.comparing import (
     score_name,
 )
 from palpate.studies.graph import Node, in_order
-from palpate.studies.stages import Run, Stage, stage_digest
+from palpate.studies.stages import Run, Stage, stage_digest, stage_outputs
 
 #: The stage of a study that holds its results.
 LAST = "results"
@@ -109,11 +108,15 @@ def _record_differs(name: str, records: Mapping[str, Mapping[str, Any]]) -> str:
     for other, digest in earlier.items():
         if records.get(other) and digest != records[other].get("digest"):
             return f"it read another {other} than the one that is there"
+    read = record.get("read")
+    for other, outputs in (read if isinstance(read, Mapping) else {}).items():
+        if records.get(other) and outputs != records[other].get("outputs"):
+            return f"it read other files of {other} than those that are there"
     return ""
 
 
 def _files_differ(folder: Path, record: Mapping[str, Any]) -> str:
-    before, now = str(record.get("outputs")), _files_digest(folder)
+    before, now = str(record.get("outputs")), stage_outputs(folder)
     return "" if before == now else f"files SHA-256 {short(before)} in its record, {short(now)} now"
 
 
@@ -124,12 +127,6 @@ def _stated_differs(stated: Any, record: Mapping[str, Any]) -> str:
     facts = record.get("facts")
     known = record if "outputs" in stated else facts if isinstance(facts, Mapping) else {}
     return number_difference(stated, {key: known.get(key) for key in stated}, 0.0)
-
-
-def _files_digest(folder: Path) -> str:
-    """The digest of a stage's files without its record, as when it was made."""
-    files = sorted(p for p in folder.glob("**/*") if p.is_file() and p != folder / "stage.json")
-    return digest_lines(f"{p.relative_to(folder).as_posix()} {digest_file(p)}" for p in files)
 
 
 def _made_again(results: Results, folder: Path, place: Path, progress: Progress) -> Remade:
@@ -209,7 +206,7 @@ def _stage(folder: Path) -> Stage:
     if not (record := _record(folder)):
         raise PalpateError(f"The stage {folder.name} must be there", f"no record at {folder}", "")
     facts, outputs = record["facts"], record["outputs"]
-    return Stage(folder, record["digest"], facts, outputs, record["seconds"], reused=True)
+    return Stage(folder, record["digest"], facts, outputs, record["seconds"])
 
 
 def compare_splits_again(*, work: Path, progress: Progress, **arguments: Any) -> Results:
@@ -238,6 +235,7 @@ class _Again(Run):
         build: Callable[[Path], Mapping[str, Any] | None],
         *,
         version: int = 1,
+        read: Mapping[str, str] | None = None,
     ) -> Stage:
         """The stage of the other folder.
 
