@@ -202,10 +202,8 @@ def test_a_study_on_disk_needs_a_root(small_manifest, tmp_path):
 
 @pytest.fixture
 def setting(small_manifest, tmp_path):
-    """Two contacts of each of six videos of three materials; each video's last contact is test."""
-    rows = [*small_manifest.table.iter_rows(named=True)]
-    parts = {r["id"]: "train" if r["frame"] < 100 else "test" for r in rows}
-    split = Split(parts)
+    """A train and a test video of each of three materials."""
+    split = Split({i: "train" if i < "v3" else "test" for i in small_manifest.ids})
     train, test = (small_manifest.part(split, part) for part in ("train", "test"))
     return Setting(train, test, 32, 0, 1, "palpate/mini", tmp_path / "cache", tmp_path)
 
@@ -225,14 +223,41 @@ def test_the_floor_is_of_other_videos_of_the_material(setting):
     material, wanted = columns_of(setting, rows, "material")
     video, own = columns_of(setting, rows, "video")
     assert (material == wanted).all()
-    assert (video != own).all()
+    assert len({*zip(video, own, strict=True)}) == len({*own}) == 3
 
 
 def test_a_wrong_material_is_never_right(setting):
-    material, wanted = columns_of(
-        setting, rows_of(setting, controls.wrong_material(setting)), "material"
-    )
+    rows = rows_of(setting, controls.wrong_material(setting))
+    material, wanted = columns_of(setting, rows, "material")
     assert (material != wanted).all()
+    video, own = columns_of(setting, rows, "video")
+    assert len({*zip(video, own, strict=True)}) == len({*own}) == 3  # whole videos
+
+
+def with_materials(setting, train, test):
+    """The setting with other materials of its samples."""
+    parts = (setting.train, train), (setting.test, test)
+    train, test = (
+        replace(p, table=p.table.with_columns(pl.Series("material", m, pl.String)))
+        for p, m in parts
+    )
+    return replace(setting, train=train, test=test)
+
+
+def test_controls_use_the_material_of_an_image_and_known_ones_alone(setting):
+    """Train videos of two materials, and unlabeled images; a test video of wood."""
+    known = ["wood", "grass", "grass", "wood", *["grass"] * 4, *["wood", "grass"] * 4, *[None] * 8]
+    mixed = with_materials(setting, known, ["wood"] * 24)
+    for make, material in (
+        ("memorized", "wood"),
+        ("other_videos", "wood"),
+        ("wrong_material", "grass"),
+    ):
+        rows = rows_of(mixed, getattr(controls, make)(mixed))
+        assert {known[k] for k in rows} == {material}, make
+    lacking = with_materials(setting, known, ["sand"] * 24)
+    assert controls.memorized(lacking) is None
+    assert controls.other_videos(lacking) is None
 
 
 def test_without_materials_none_is_wrong(setting):
@@ -241,9 +266,8 @@ def test_without_materials_none_is_wrong(setting):
     train, test = (replace(p, table=p.table.with_columns(none)) for p in parts)
     bare = replace(setting, train=train, test=test)
     assert controls.wrong_material(bare) is None
-    rows = rows_of(bare, controls.other_videos(bare))
-    video, own = columns_of(bare, rows, "video")
-    assert (video != own).all()
+    video, own = columns_of(bare, rows_of(bare, controls.other_videos(bare)), "video")
+    assert len({*zip(video, own, strict=True)}) == len({*own}) == 3
 
 
 def test_a_memorized_video_is_one_a_material(setting):

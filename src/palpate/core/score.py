@@ -46,7 +46,8 @@ class Score:
         interval_method: e.g. ``"leave-one-video-out jackknife, t, 23 df"``.
         null: the range that the score falls into if generated and real images do not differ, or
             None.
-        floor: the same metric on real images of other videos, or None.
+        floor: the same metric on real images, or None: of TMMD, train images of other videos of
+            the same materials; of I-, CI- and D-TMMD, the test part itself.
         estimator: ``"unbiased"``, ``"biased"``, ``"grouped"``, ``"per-image mean"``.
         bandwidth: kernel bandwidth sigma, or None.
         scale: factor that the raw value was multiplied by.

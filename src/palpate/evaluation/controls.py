@@ -3,12 +3,16 @@
 - ``background only``: the no-contact image in place of every tactile image. Scores of pixels reward
   it (paper, section 1); a score of touch must not;
 - ``real, same material``: for each test sample a real train image of its material, what a generator
-  that knows the material but not the place could reach.
+  that knows the material but not the place could reach. Drawn image by image, it has no videos.
+
+The floor of TMMD has them (:func:`matched_rows`): whole train videos in the place of test videos.
 """
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from dataclasses import replace
+from itertools import cycle
 from pathlib import Path
 
 from palpate.core import FeatureSet, Progress, Score, rng_for
@@ -18,6 +22,66 @@ from palpate.metrics.probe import fit_probe, material_accuracy
 
 #: Rows of the tables that are not generators.
 BACKGROUND, SAME_MATERIAL, REAL = "background only", "real, same material", "real"
+
+#: Materials and videos of n rows, '' where unknown.
+Columns = tuple[Collection[str], Collection[str]]
+
+
+def matched_rows(train: Columns, test: Columns, seed: int) -> list[int] | None:
+    """For each test row a row of train: *one* other video of the material stands for a test video.
+
+    Under the names of the test videos these rows have as many frames of every material and video
+    as the test part, so a statistic that leaves out pairs of one video leaves out the same ones.
+    Rows drawn one by one would have no videos. Train videos that are in the test part as well stand
+    for none: they would be compared with themselves.
+
+    Args:
+        train: materials and videos; a row without video is a video of its own.
+        test: the same.
+        seed: of the choice. No video is chosen twice for one material while there are others.
+
+    Returns:
+        A row for each test row; None where train has no other video of a material.
+    """
+    known, wanted = (_by_video(*part) for part in ((*train, "train"), (*test, "test")))
+    tested, rows = {video for of in wanted.values() for video in of}, [0] * len(test[0])
+    for material, videos in wanted.items():
+        key = lambda video, m=material: float(rng_for(seed, "matched", m, video).random())
+        others = sorted({*known.get(material, {})} - tested, key=key)
+        if not others:
+            return None
+        for video, other in zip(sorted(videos), cycle(others), strict=False):
+            at, frames = videos[video], known[material][other]
+            for k, row in enumerate(at):
+                rows[row] = frames[k * len(frames) // len(at)]
+    return rows
+
+
+def _by_video(
+    materials: Collection[str], videos: Collection[str], part: str
+) -> dict[str, dict[str, list[int]]]:
+    """Material -> video -> rows."""
+    rows: dict[str, dict[str, list[int]]] = {}
+    for row, (material, video) in enumerate(zip(materials, videos, strict=True)):
+        rows.setdefault(material, {}).setdefault(video or f"{part} {row}", []).append(row)
+    return rows
+
+
+def matched_features(train: FeatureSet, test: FeatureSet, seed: int) -> FeatureSet | None:
+    """Features of :func:`matched_rows` of train under ids, materials and videos of the test part.
+
+    Materials count where both parts have them.
+    """
+    labeled = train.labels is not None and test.labels is not None
+
+    def columns(part: FeatureSet) -> Columns:
+        unknown = [""] * len(part.ids)
+        return (part.labels if labeled and part.labels else unknown), part.groups or unknown
+
+    rows = matched_rows(columns(train), columns(test), seed)
+    if rows is None:
+        return None
+    return replace(test, features=train.features[rows], encoder=train.encoder)
 
 
 def control_samples(

@@ -49,6 +49,7 @@ from palpate.evaluation.controls import (
     REAL,
     SAME_MATERIAL,
     control_samples,
+    matched_features,
     material_accuracies,
 )
 from palpate.evaluation.inputs import (
@@ -128,12 +129,15 @@ def score_family(
 ) -> Outcome:
     """TMMD, I-, CI- and D-TMMD of every set by preset and bandwidth, with paired differences.
 
-    The TMMD of ``train``, further real features, to the reference is the floor of TMMD.
+    The floor of TMMD is that of features of ``train``, whole videos in the place of the reference's
+    (:func:`palpate.evaluation.controls.matched_rows`): the pairs of one video that are left out on
+    one side are then left out on the other. The floor of the others is of the reference itself.
     """
     sets = {**features.generators, **features.controls}
     grouped = [s.groups is not None for s in (features.reference, *sets.values())]
     floor = features.reference if len(set(grouped)) == 1 else None
     columns = family.columns(grouped=all(grouped), rows=features.rows)
+    further = train and matched_features(train, features.reference, family.common["seed"])
     outcome = Outcome()
     if not family.sigmas and features.rows > MANY:
         outcome.notes.append(Note("wide-sigma-alone", {"rows": MANY}))
@@ -146,9 +150,9 @@ def score_family(
             **({"estimator": family.estimator} if family.estimator else {}),
         }
         least = None
-        if train is not None:
+        if further is not None:
             fast: dict[str, Any] = {**options, "permutations": 0}
-            least = tmmd(train, features.reference, **fast).value
+            least = tmmd(further, features.reference, **fast).value
         for some in features.batches():
             if sigma in (family.sigmas or (SIGMA,)):
                 result = compare(some, features.reference, floor=floor, **options)
@@ -266,8 +270,8 @@ def score(  # noqa: PLR0913
         reference: the real samples, of the same kind. Ids (relative file names) pair samples.
         encoder: name or folder of a set of encoders, or an ``EncoderSet``; its tactile encoder
             gives the features of images. Embeddings need none.
-        split: a split or its file: its test part is scored, its train part gives the floor of TMMD,
-            a material probe and the controls.
+        split: a split or its file: its test part is scored, its train part gives the floor of TMMD
+            (train videos matched by material), a material probe and the controls.
         names: of the generators, in the tables.
         labels: materials, and possibly groups, by id: a CSV or Parquet file or a frame with the
             columns id, material, video; id -> material; or one material per row. ``"cluster:8"``

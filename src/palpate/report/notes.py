@@ -20,8 +20,9 @@ from palpate.core import Note, SampleRef, few
 HOW_TO_READ = (
     "Arrows give the better direction: for TMMD, FID, KID, CMMD and LPIPS lower is better; for "
     "SSIM, PSNR and accuracies higher is; for I-, CI- and D-TMMD (→) closer to the floor is. "
-    "The floor is what real images of other videos score on the same metric: it, and not zero, is "
-    "the target. I- and CI-TMMD far below it mean that the images vary less than real ones "
+    "The floor is what real images score (TMMD: train images of other videos of the materials; I-, "
+    "CI- and D-TMMD: the test images): it, and not zero, is the target. "
+    "I- and CI-TMMD far below it mean that the images vary less than real ones "
     "(collapse), not that they are better. "
     "The null band is where a meaningless difference would fall: a score inside it says nothing, "
     "and two scores whose intervals overlap widely are not distinguished."
@@ -638,7 +639,8 @@ OTHER: dict[str, Sentence] = {
         "(PSNR) prefer it to a wrong tactile image"
     ),
     "no-floor-of-tmmd": (
-        "No floor: that of TMMD is made of further real images, the train part of a split"
+        "No floor: that of TMMD is of train videos of a split, others than those of the test part, "
+        "of each of its materials"
     ),
     "floor-unknown": "No floor: no such value of real images is known",
     "images-outside": (

@@ -3,8 +3,8 @@
 =====================  ===========================================================================
 control                for each test sample
 =====================  ===========================================================================
-real, other videos     a real train image of its material from another video: the floor
-real, wrong material   a real train image of another material
+real, other videos     an image of the train video that stands for its own: the floor of TMMD
+real, wrong material   the same of a train video of another material
 empty background       its no-contact image (paper, section 1: scores of pixels reward it)
 mean image             the mean of all train images
 real, nearest photo    the real image of the train photo most similar to its photo
@@ -13,13 +13,16 @@ one image for all      one real train image: a generator that collapsed
 one video a material   images of one train video of its material: memorized
 =====================  ===========================================================================
 
-Without materials the floor is of other videos, there is no wrong material, and one video stands for
-all. Random choices depend on (seed, sample) alone.
+Each test video and material has *one* train video of this material, with as many frames of it
+(:func:`palpate.evaluation.controls.matched_rows`): such images are of videos, as real ones are, so
+that I-, CI- and D-TMMD have something to find. Without materials any other video will do, there is
+no wrong material, and one video stands for all. A control that the data do not allow is left out,
+as are these two where a split leaks all videos.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -32,6 +35,7 @@ from palpate.diffusion.autoencoder import BackgroundAutoencoder
 from palpate.diffusion.autoencoders import load_autoencoder
 from palpate.encoders.embed import embed
 from palpate.encoders.encoder_set import EncoderSet, load_clip
+from palpate.evaluation.controls import matched_rows
 from palpate.studies.methods import Images, Make, Setting
 
 #: Real images of other videos: the score that no generator needs to beat.
@@ -42,7 +46,6 @@ EMPTY, MEAN, WRONG = "empty background", "mean image", "real, wrong material"
 CEILING, ONE, MEMORIZED = "reconstruction", "one image for all", "one video a material"
 #: One half of a generator's images against the other half.
 HALVES = "halves of Ours"
-Mask = NDArray[np.bool_]
 
 
 def _columns(setting: Setting, name: str) -> tuple[NDArray[Any], NDArray[Any]]:
@@ -52,29 +55,26 @@ def _columns(setting: Setting, name: str) -> tuple[NDArray[Any], NDArray[Any]]:
     return train, test
 
 
-def _drawn(setting: Setting, purpose: str, fits: Callable[[int], Mask]) -> Images:
-    """For each test sample a random train image among those that fit it; else among all."""
-    chosen: list[int] = []
-    for k, i in enumerate(setting.test.ids):
-        rows = np.flatnonzero(fits(k))
-        rows = rows if len(rows) else np.arange(len(setting.train))
-        rng = rng_for(setting.seed, "control", purpose, i)
-        chosen.append(int(rows[rng.integers(len(rows))]))
-    return setting.pixels(setting.train)[chosen]
-
-
-def other_videos(setting: Setting) -> Images:
-    """Real train images of the same material, from other videos."""
+def other_videos(setting: Setting) -> Images | None:
+    """Whole train videos in the place of the test videos; None if train lacks a material."""
     (known, material), (videos, video) = (_columns(setting, c) for c in ("material", "video"))
-    return _drawn(setting, "floor", lambda k: (known == material[k]) & (videos != video[k]))
+    rows = matched_rows((known, videos), (material, video), setting.seed)
+    return None if rows is None else setting.pixels(setting.train)[rows]
 
 
 def wrong_material(setting: Setting) -> Images | None:
-    """Real train images of another material; None without materials."""
-    known, material = _columns(setting, "material")
-    if len({*known}) < 2:
+    """Whole train videos of another material than the test video's; None without two materials."""
+    (known, material), (videos, video) = (_columns(setting, c) for c in ("material", "video"))
+    names = sorted({*known} - {""})
+    if len(names) < 2:
         return None
-    return _drawn(setting, "wrong", lambda k: known != material[k])
+    wrong: list[str] = []
+    for m, v in zip(material, video, strict=True):
+        others = [name for name in names if name != m]
+        rng = rng_for(setting.seed, "control", "wrong", m, v)
+        wrong.append(others[int(rng.integers(len(others)))])
+    rows = matched_rows((known, videos), (wrong, video), setting.seed)
+    return None if rows is None else setting.pixels(setting.train)[rows]
 
 
 def empty_background(setting: Setting) -> Images:
@@ -129,17 +129,23 @@ def one_image(setting: Setting) -> Images:
     return np.broadcast_to(image, (len(setting.test), *image.shape))
 
 
-def memorized(setting: Setting) -> Images:
-    """Images of one train video of the sample's material."""
+def memorized(setting: Setting) -> Images | None:
+    """Images of one train video of the sample's material; None if train lacks a material."""
     (known, material), (videos, video) = (_columns(setting, c) for c in ("material", "video"))
-    one: dict[str, str] = {}
+    frames: dict[str, NDArray[np.intp]] = {}
     for name in sorted({*material}):
-        names = sorted({*videos[known == name]} - {*video}) or sorted({*videos[known == name]})
-        names = names or sorted({*videos})
-        one[name] = names[
-            int(rng_for(setting.seed, "control", "one video", name).integers(len(names)))
-        ]
-    return _drawn(setting, "memorized", lambda k: videos == one[material[k]])
+        of = {*videos[known == name]}
+        if not of:
+            return None
+        names = sorted(of - {*video} or of)
+        rng = rng_for(setting.seed, "control", "one video", name)
+        one = names[int(rng.integers(len(names)))]
+        frames[name] = np.flatnonzero((known == name) & (videos == one))
+    rows: list[int] = []
+    for i, m in zip(setting.test.ids, material, strict=True):
+        rng = rng_for(setting.seed, "control", "memorized", i)
+        rows.append(int(rng.choice(frames[m])))
+    return setting.pixels(setting.train)[rows]
 
 
 CONTROLS: Mapping[str, Make] = {

@@ -144,7 +144,7 @@ def nodes_of(plan: Plan) -> list[Node]:
         inputs: dict[str, Any] = {"controls": {n: _source(f) for n, f in study.controls.items()}}
         inputs |= {"size": preset.diffusion.size, **_clip(preset)}
         name = f"controls-{split}"
-        nodes.append(Node(name, partial(make, device=device), inputs, after, version=2, cost=20))
+        nodes.append(Node(name, partial(make, device=device), inputs, after, version=3, cost=20))
     for seed, split in product(plan.seeds, SPLITS):
         encoder = f"encoder-{split}-{seed}"
         how: dict[str, Any] = {"preset": preset.encoder, "clip": preset.clip}
@@ -423,7 +423,7 @@ def _score_node(plan: Plan, split: str, judge: str, seed: int) -> Node:
     inputs = {**vars(judging), **_clip(preset), "metrics": [_source(m) for m in study.metrics]}
     after = ["data", "split", encoder, f"controls-{split}", *methods.values()]
     name = _scores(split, judge, seed)
-    return Node(name, build, inputs, after, version=2, cost=60, measures=True)
+    return Node(name, build, inputs, after, version=3, cost=60, measures=True)
 
 
 def _clip(preset: Preset) -> dict[str, str | None]:

@@ -160,8 +160,9 @@ def _of_splits(context: _Context, number: int) -> StudyTable:
             controls.append(f"paper, {split}")
     text = (
         "Encoder and generator are trained once for each split; each encoder judges the images of "
-        "both generators. Real images of other videos are the floor. The paper: without leaks "
-        "every column is worse."
+        "both generators. The floor of TMMD is real train images of other videos, matched by "
+        "material (none where a split leaks every video); of I-, CI- and D-TMMD it is the real "
+        "test images themselves. The paper: without leaks every column is worse."
     )
     names = {1: "material and generation", 2: "retrieval and generation"}
     columns = ["images", "judged by encoder of", *heads.values(), *family]
