@@ -144,7 +144,8 @@ def make_autoencoder(
         gels = setting.pixels(setting.test, "background")
     ceiling = measure_reconstruction(model, real, gels)
     shutil.rmtree(place / "training")
-    return {"digest": model.digest, "ceiling": {k: float(v) for k, v in vars(ceiling).items()}}
+    known = {k: float(v) for k, v in vars(ceiling).items() if v is not None}  # no codes: no codebook
+    return {"digest": model.digest, "ceiling": known}
 
 
 def make_generator(
