@@ -55,6 +55,41 @@ def test_seeds_add_their_deviation_to_the_interval_of_videos():
         over_seeds([difference("TMMD", 1.0), difference("SSIM", 1.0)])
 
 
+def test_of_several_seeds_no_p_value_or_verdict_of_one_remains():
+    one = {"p_value": 1e-6, "decided": True, "better": "Ours", "p_better": 1.0, "kind": "same"}
+    one |= {"matrix": [[1.0, 2.0], [2.0, 3.0]], "classes": ["Wood", "Brick"], "unstable": ["Wood"]}
+    a = replace(difference("TMMD", -0.9, 0.1, **one), null=(-0.1, 0.1))
+    b = difference("TMMD", 0.9, 0.1, **one | {"matrix": [[3, 0], [0, 1]], "unstable": []})
+    made = over_seeds([a, b])
+    assert (made.value, made.null) == (0, None)
+    kept = {"a": "Ours", "b": "GVST", "kind": "same", "classes": ["Wood", "Brick"]}
+    assert made.details == {**kept, "matrix": [[2, 1], [1, 2]], "by_seed": [-0.9, 0.9]}
+    assert over_seeds([a]).details["p_value"] == 1e-6
+
+
+def test_leaks_are_measured_by_the_distance_to_the_floor_where_lower_is_not_better():
+    """Orig is on its floor, NoLeak has collapsed to 0: that is no deflation."""
+
+    def scores(value, floor, half):
+        interval = (value - half, value + 2 * half)
+        return [Score("I-TMMD", "Ours", value, interval, floor=floor, higher_is_better=None)]
+
+    made = difference_between(scores(0.4, 0.4, 0.05), scores(0.1, 0.5, 0.03), ("Orig", "NoLeak"))
+    assert made.details["gap"] == pytest.approx(-0.4)
+    # |0.4 - 0.4| has reaches (.05, .1), |0.1 - 0.5| from below (.06, .03).
+    limits = (-0.4 - np.hypot(0.05, 0.03), -0.4 + np.hypot(0.1, 0.06))
+    assert made.details["gap_interval"] == pytest.approx(limits)
+    accuracy = difference("accuracy", 0.2, pair=("Orig", "NoLeak"))
+    tasks = {"I-TMMD": made, "accuracy": replace(accuracy, higher_is_better=True)}
+    claims = verdicts(leak_claims(tasks))
+    assert claims["Leakage inflates I-TMMD"] == "holds"
+    tasks["I-TMMD"] = replace(made, details=made.details | {"gap": 0.4, "gap_interval": [0.3, 0.5]})
+    claims = leak_claims(tasks)
+    assert verdicts(claims)["Leakage inflates I-TMMD"] == "does not hold"
+    assert claims[0].verdict == "holds"
+    assert claims[0].why.startswith("1 of 1 tasks inflated")
+
+
 def test_intervals_of_two_splits_cover_their_difference():
     """In 400 draws of two independent means the interval holds the true difference at its level."""
     rng, hits = np.random.default_rng(0), 0

@@ -16,7 +16,7 @@ from palpate.encoders.models import shipped_folder
 from palpate.report.results import Results
 from palpate.sim import WorldOptions
 from palpate.sim.presets import MINI_SEEDS
-from palpate.studies import controls, reproduce
+from palpate.studies import collecting, controls, judging, reproduce
 from palpate.studies.controls import CONTROLS, FLOOR, NEAREST
 from palpate.studies.graph import in_order
 from palpate.studies.making import slug
@@ -380,6 +380,33 @@ def test_the_papers_numbers_stand_beside_its_own_data_alone():
     assert {
         r[0]: r[1] for r in study_tables(digit, judged, {}, methods=[OURS], controls=[])[1].rows
     }["paper, GVST"] == "2.67"
+
+
+def test_the_papers_numbers_are_of_its_own_metrics_alone():
+    """FID of another network is not the paper's FID."""
+    other = "FID (palpate/mini vision)"
+    scores = [forged(OURS, m, 1.0) for m in ("SSIM", "FID", other)]
+    judged = {
+        (s, j): Scores.over_seeds([scores], "results")
+        for s in (ORIG, NOLEAK)
+        for j in (ORIG, NOLEAK)
+    }
+    study = replace(WORLD, paper=True)
+    three = study_tables(study, judged, {}, methods=[OURS], controls=[])[1]
+    [printed] = [row for row in three.rows if row[0] == "paper, Ours"]
+    cells = dict(zip(three.columns, printed, strict=True))
+    assert (cells["SSIM"], cells["FID"], cells[other]) == ("0.49", "43.9", None)
+
+
+def test_differences_that_are_stored_are_of_a_method_and_not_of_e():
+    score = forged("Ours - x", "I-TMMD difference", 1.0)
+    score = replace(score, details={"a": "x", "b": OURS})
+    assert judging._compares(score, [OURS])
+    assert not judging._compares(score, ["other"])
+    assert not judging._compares(replace(score, metric="I-TMMD E difference"), [OURS])
+    assert judging._compares(forged(FLOOR, "I-TMMD E", 1.0), [OURS])
+    assert collecting._compares(score, [OURS, "x"])  # in either order
+    assert not collecting._compares(score, [OURS])
 
 
 @pytest.mark.slow

@@ -18,7 +18,14 @@ from palpate.studies.claims import Names, differences_over_seeds, effect_table, 
 from palpate.studies.controls import FLOOR, NEAREST
 from palpate.studies.demo_page import gallery as gallery_of
 from palpate.studies.evidence import DIFFERENCE, difference_between, in_words, metric_of
-from palpate.studies.judging import MATERIAL, probing_plan, read_probed, read_scores, stage_of
+from palpate.studies.judging import (
+    MATERIAL,
+    probing_plan,
+    read_probed,
+    read_scores,
+    stage_of,
+    stamped,
+)
 from palpate.studies.making import After, Facts
 from palpate.studies.memorization import memorization_table
 from palpate.studies.methods import BACKGROUND, OURS, VQ
@@ -86,7 +93,7 @@ def collect(
         notes=notes,
         tables=[replace(t, rows=_staged_rows(t.rows, stage)) for t in tables],
         curves=[_staged_curve(c, stage) for a in answers for c in a.curves],
-        claims=[replace(c, evidence=[_staged(s, stage) for s in c.evidence]) for c in claims],
+        claims=[replace(c, evidence=[stamped(s, stage) for s in c.evidence]) for c in claims],
     )
     results.save(place / "results.json")
     return {"tables": len(tables), "claims": len(claims), "scores": len(results.scores)}
@@ -94,8 +101,8 @@ def collect(
 
 def _compares(difference: Score, methods: Sequence[str]) -> bool:
     """Whether a difference is of the paper's two comparisons or of the best method."""
-    pair = [difference.details[k] for k in ("a", "b")]
-    return pair == [VQ, BACKGROUND] or (pair[0] == OURS and pair[1] in (*methods, NEAREST))
+    pair = {difference.details[k] for k in ("a", "b")}
+    return pair == {VQ, BACKGROUND} or (OURS in pair and pair <= {*methods, NEAREST})
 
 
 def _tasks_of_encoders(scores: Sequence[Score]) -> dict[str, Score]:
@@ -128,16 +135,12 @@ def _is(score: Score, metric: str) -> bool:
     return known == (metric, OURS, READING)
 
 
-def _staged(score: Score, stage: str) -> Score:
-    return replace(score, details={**score.details, "stage": stage})
-
-
 def _staged_rows(rows: Sequence[Sequence[Any]], stage: str) -> list[list[Any]]:
-    return [[_staged(c, stage) if isinstance(c, Score) else c for c in row] for row in rows]
+    return [[stamped(c, stage) if isinstance(c, Score) else c for c in row] for row in rows]
 
 
 def _staged_curve(curve: Curve, stage: str) -> Curve:
-    lines = [replace(n, points=[(x, _staged(s, stage)) for x, s in n.points]) for n in curve.lines]
+    lines = [replace(n, points=[(x, stamped(s, stage)) for x, s in n.points]) for n in curve.lines]
     return replace(curve, lines=lines)
 
 

@@ -10,11 +10,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 from scipy import special
 
-from palpate.core import PalpateError, Score
+from palpate.core import PalpateError, Score, plain
 from palpate.report.notes import decimals, number
 
 #: End of the metric of every difference.
@@ -26,7 +27,9 @@ def over_seeds(scores: Sequence[Score]) -> Score:
 
     Returns:
         The mean; ``details["by_seed"]`` has the values. Value or interval is None if one of the
-        seeds has none. A single seed is returned as it is, but for ``by_seed``.
+        seeds has none. Of details remain those that all seeds share and the mean of the matrix;
+        the null, p-values and verdicts of single seeds do not. A single seed is returned as it is,
+        but for ``by_seed``.
 
     Raises:
         PalpateError: without scores, or if metrics or subjects differ.
@@ -36,12 +39,13 @@ def over_seeds(scores: Sequence[Score]) -> Score:
         fix = "Pass one score a seed"
         raise PalpateError("Scores over seeds must be of one metric and subject", got, fix)
     first, values = scores[0], [s.value for s in scores]
-    details = {**first.details, "by_seed": values}
+    if len(values) == 1:
+        return replace(first, details={**first.details, "by_seed": values})
+    details = {**_shared_details(scores), "by_seed": values}
+    first = replace(first, null=None, seed=None)
     known = [v for v in values if v is not None]
     if len(known) < len(values):
         return replace(first, value=None, interval=None, interval_method="", details=details)
-    if len(values) == 1:
-        return replace(first, details=details)
     mean, count = float(np.mean(known)), len(known)
     between = float(special.stdtrit(count - 1, 0.5 + first.level / 2))
     between *= float(np.std(known, ddof=1)) / np.sqrt(count)
@@ -54,14 +58,34 @@ def over_seeds(scores: Sequence[Score]) -> Score:
         value=mean,
         interval=(mean - float(low), mean + float(high)),
         interval_method=f"limits of {count} seeds and their deviation, by recovery of variances",
-        seed=None,
         encoder=first.encoder if len({s.encoder for s in scores}) == 1 else None,
         details=details,
     )
 
 
+#: Details that judge one seed.
+_OF_ONE = ("p_value", "p_better", "p_adjusted", "p_difference", "better", "decided", "units")
+
+
+def _shared_details(scores: Sequence[Score]) -> dict[str, Any]:
+    """Details that are the same for all seeds, and the mean of a matrix of one set of classes."""
+    each: list[Any] = [plain(s.details) for s in scores]
+    shared = {
+        key: value
+        for key, value in scores[0].details.items()
+        if key not in _OF_ONE and all(key in e and e[key] == each[0][key] for e in each)
+    }
+    matrices = [e.get("matrix") for e in each]
+    if all(matrices) and all(e.get("classes") == each[0].get("classes") for e in each):
+        shared["matrix"] = np.mean(np.array(matrices, dtype=float), axis=0).tolist()
+    return shared
+
+
 def difference_between(a: Sequence[Score], b: Sequence[Score], names: tuple[str, str]) -> Score:
     """``a - b`` of one metric on two splits, one score a seed each; limits taken as independent.
+
+    Of metrics of which closer to the floor is better, ``details["gap"]`` is the difference of the
+    distances ``|score - floor|``, each to the floor of its split, which is taken as known.
 
     Test parts of two splits share videos, which makes scores agree: the interval errs on the wide
     side.
@@ -79,10 +103,13 @@ def difference_between(a: Sequence[Score], b: Sequence[Score], names: tuple[str,
         must, fix = "A difference must be of one metric", "Pair scores by their metric"
         raise PalpateError(must, f"{x.metric} and {y.metric}", fix)
     value = None if x.value is None or y.value is None else x.value - y.value
-    interval, of_x, of_y = None, _reach(x), _reach(y)
-    if value is not None and of_x and of_y:
-        (low_a, high_a), (low_b, high_b) = of_x, of_y
-        interval = (value - float(np.hypot(low_a, high_b)), value + float(np.hypot(high_a, low_b)))
+    interval = _limits_of_difference(x, y)
+    gap: dict[str, Any] = {}
+    if x.higher_is_better is None and all(s.floor is not None for s in (*a, *b)):
+        near, far = (over_seeds([_to_floor(s) for s in scores]) for scores in (a, b))
+        if near.value is not None and far.value is not None:
+            limits = _limits_of_difference(near, far)
+            gap = {"gap": near.value - far.value, "gap_interval": limits}
     return replace(
         x,
         metric=x.metric + DIFFERENCE,
@@ -94,8 +121,28 @@ def difference_between(a: Sequence[Score], b: Sequence[Score], names: tuple[str,
         floor=None,
         split=None,
         reference=None,
-        details={"a": names[0], "b": names[1], "values": [x.value, y.value]},
+        details={"a": names[0], "b": names[1], "values": [x.value, y.value], **gap},
     )
+
+
+def _limits_of_difference(x: Score, y: Score) -> tuple[float, float] | None:
+    """Limits of ``x - y``; None if one of the two has none."""
+    of_x, of_y = _reach(x), _reach(y)
+    if x.value is None or y.value is None or of_x is None or of_y is None:
+        return None
+    (low_a, high_a), (low_b, high_b), value = of_x, of_y, x.value - y.value
+    return value - float(np.hypot(low_a, high_b)), value + float(np.hypot(high_a, low_b))
+
+
+def _to_floor(score: Score) -> Score:
+    """The distance to the floor, as a score."""
+    if score.value is None or score.floor is None:
+        return score
+    above, reach = score.value >= score.floor, _reach(score)
+    distance = abs(score.value - score.floor)
+    low, high = (reach if above else reach[::-1]) if reach else (0.0, 0.0)
+    interval = (distance - low, distance + high) if reach else None
+    return replace(score, value=distance, interval=interval)
 
 
 def _reach(score: Score) -> tuple[float, float] | None:

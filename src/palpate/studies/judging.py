@@ -57,7 +57,7 @@ def probe_encoders(
     cache = cache_of(place)
     probed = measure(manifest, parts, loaded, split, plan, cache=cache, progress=progress)
     stage = stage_of(place)
-    write_json(place / "scores.json", [_stamped(m.score, stage).to_json() for m in probed.means])
+    write_json(place / "scores.json", [stamped(m.score, stage).to_json() for m in probed.means])
     arrays = {}
     for k, mean in enumerate(probed.means):
         arrays |= {
@@ -169,7 +169,7 @@ def judge_images(
             one = metric(judged)
             details = {**one.details, "extra": True}  # a column of the tables
             scores.append(replace(one, subject=subject, split=split.digest, details=details))
-    write_json(place / "scores.json", [_stamped(s, stage_of(place)).to_json() for s in scores])
+    write_json(place / "scores.json", [stamped(s, stage_of(place)).to_json() for s in scores])
     return {"scores": len(scores), "judge": judge.digest("tactile")}
 
 
@@ -178,17 +178,20 @@ def stage_of(place: Path) -> str:
     return place.name.removesuffix(".partial")
 
 
-def _stamped(score: Score, stage: str) -> Score:
+def stamped(score: Score, stage: str) -> Score:
+    """The score with the name of the stage that it was made in."""
     return replace(score, details={**score.details, "stage": stage})
 
 
 def _compares(score: Score, methods: Mapping[str, str]) -> bool:
     """Whether a score is of one subject, or the difference of a method from another subject.
 
-    Differences between two controls say nothing of a method.
+    Differences between two controls say nothing of a method, those of E what those of I and CI say.
     """
     pair = [score.details.get(k) for k in ("a", "b")]
-    return pair == [None, None] or any(name in methods for name in pair)
+    if pair == [None, None]:
+        return True
+    return any(name in methods for name in pair) and not score.metric.endswith(" E difference")
 
 
 def image_files(folder: Path, ids: Sequence[str]) -> list[Path]:

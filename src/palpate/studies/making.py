@@ -144,7 +144,9 @@ def make_autoencoder(
         gels = setting.pixels(setting.test, "background")
     ceiling = measure_reconstruction(model, real, gels)
     shutil.rmtree(place / "training")
-    known = {k: float(v) for k, v in vars(ceiling).items() if v is not None}  # no codes: no codebook
+    known = {
+        k: float(v) for k, v in vars(ceiling).items() if v is not None
+    }  # no codes: no codebook
     return {"digest": model.digest, "ceiling": known}
 
 

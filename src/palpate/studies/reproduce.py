@@ -188,7 +188,7 @@ def nodes_of(plan: Plan) -> list[Node]:
     after = ["data", "split", first, *read, *(n.name for n in questions if n.name in QUESTIONS)]
     inputs = {"study": study.name, "title": study.title, "tables": study.tables}
     inputs |= {"people": plan.people and digest_file(plan.people)}
-    nodes.append(Node("results", build, inputs, after, cost=10, measures=True))
+    nodes.append(Node("results", build, inputs, after, version=2, cost=10, measures=True))
     return nodes
 
 

@@ -25,8 +25,6 @@ Cell = Score | str | None
 #: The reading of the TMMD family that tables show; the scores hold the others as well.
 READING = "grouped"
 FAMILY = ("TMMD", "I-TMMD", "CI-TMMD", "D-TMMD")
-#: Metrics on features of networks that know photos, and the stand-in of LPIPS.
-BY_PHOTOS = ("LPIPS", "patch distance", "FID", "CMMD")
 RETRIEVAL = tuple(
     f"top-{k} ({a} by {b})" for a, b in (("text", "tactile"), ("vision", "tactile")) for k in (1, 5)
 )
@@ -201,7 +199,7 @@ def _of_methods(context: _Context, number: int) -> StudyTable:
     if context.study.paper:
         for name in ("GVST", OURS, *(("Ours w/ BG",) if number == 3 else ())):
             printed = PAPER["HCT" if 2 in context.study.tables else 3, name]
-            rows.append([f"paper, {name}", *(printed.get(m.partition(" (")[0]) for m in metrics)])
+            rows.append([f"paper, {name}", *map(printed.get, metrics)])
             controls.append(f"paper, {name}")
     text = (
         "All methods are trained from random weights for the same number of steps. Controls are no "
