@@ -164,7 +164,10 @@ def test_a_score_is_a_number_that_prints_how_it_was_made():
     assert last.strip() == f"9 samples, encoder {'e' * 12}"
     again = Score.from_json(json.loads(json.dumps(score.to_json())))
     assert again == score
-    assert Score("TMMD", "a", float("inf")).to_json()["value"] is None
+    inf, nan = float("inf"), float("nan")
+    lost = Score("TMMD", "a", inf, interval=(0.0, inf), null=(nan, 1.0), floor=-inf)
+    assert (lost.value, lost.interval, lost.null, lost.floor) == (None,) * 4
+    assert Score.from_json(lost.to_json()) == lost
     assert Score.from_json({"metric": "m", "subject": "s", "value": 1, "note": "Old."}).notes == (
         Note("text", {"text": "Old."}),
     )

@@ -4,9 +4,11 @@ import re
 
 import pytest
 
-from palpate.report.first_screen import about, annotated, cards, telling_columns, verdict
+from palpate.core import Note
+from palpate.report.first_screen import about, annotated, cards, caution, telling_columns
 from palpate.report.page import render_page
 from palpate.report.results import Results
+from palpate.report.study_tables import lay
 from palpate.report.tables import score_tables
 from report_fixtures import Tree, clean_audit, full_audit, full_results, gallery, score
 
@@ -22,44 +24,77 @@ def measured():
     return [*scores, score("material accuracy", "real", 0.9, **accuracy)]
 
 
+def verdict(scores, controls=()):
+    """Subject -> its cells, as they are laid out from the most telling columns."""
+    rows = lay(telling_columns(score_tables(scores)), controls).rows
+    return {row.cells[0].value: row.cells[1:] for row in rows}
+
+
+def best(cells):
+    return [cell.best for cell in cells]
+
+
 def test_the_verdict_has_each_metric_once_and_the_best_but_never_the_real_images():
     columns = telling_columns(score_tables(measured()))
     assert [c.metric for c in columns] == ["TMMD", "material accuracy", "D-TMMD"]
-    rows = {row.subject: row.cells for row in verdict(columns)}
+    rows = verdict(measured())
     assert list(rows) == ["ours", "theirs", "background only", "real images (floor)"]
-    best = {subject: [cell.best for cell in cells] for subject, cells in rows.items()}
-    assert best["theirs"] == [True, True, True]
-    assert not any(best["ours"] + best["background only"] + best["real images (floor)"])
-    assert [cell.text for cell in rows["real images (floor)"]] == ["0.042", "0.900", "0.042"]
+    assert best(rows["theirs"]) == [True, True, True]
+    others = ("ours", "background only", "real images (floor)")
+    assert not any(mark for name in others for mark in best(rows[name]))
+    (tmmd, accuracy, d_tmmd) = rows["real images (floor)"]
+    assert (tmmd.value, accuracy.score.value, d_tmmd.value) == ("0.04", 0.9, "0.04")
 
 
 def test_controls_of_a_study_follow_the_methods_and_are_never_the_best():
-    columns = telling_columns(score_tables(measured()))
-    rows = verdict(columns, ["theirs"])
-    assert [(row.subject, row.control) for row in rows] == [
-        ("ours", False),
-        ("background only", False),
-        ("theirs", True),
-        ("real images (floor)", False),
+    rows = lay(telling_columns(score_tables(measured())), ["theirs"]).rows
+    assert [(row.cells[0].value, row.control, row.rule) for row in rows] == [
+        ("ours", False, False),
+        ("background only", False, False),
+        ("theirs", True, True),
+        ("real images (floor)", False, True),
     ]
-    assert [cell.best for cell in rows[0].cells] == [True, True, True]
-    assert not any(cell.best for row in rows[1:] for cell in row.cells)
+    assert best(rows[0].cells[1:]) == [True, True, True]
+    assert not any(mark for row in rows[1:] for mark in best(row.cells))
 
 
 def test_numbers_that_are_written_alike_are_equally_good():
-    scores = [score("SSIM", s, v, higher_is_better=True) for s, v in (("a", 0.50004), ("b", 0.5))]
-    rows = verdict(
-        telling_columns(score_tables([*scores, score("SSIM", "c", 0.4, higher_is_better=True)]))
-    )
-    assert [row.cells[0].best for row in rows[:3]] == [True, True, False]
+    up = {"higher_is_better": True}
+    rows = verdict([score("SSIM", s, v, **up) for s, v in (("a", 0.5004), ("b", 0.5), ("c", 0.4))])
+    assert [rows[name][0].best for name in "abc"] == [True, True, False]
+    near = {"higher_is_better": None, "floor": 0.25, "interval": (0.1, 0.3)}  # two decimals
+    values = (("a", 0.254), ("b", 0.246), ("c", 0.3))  # 0.25, 0.25, 0.30; the floor is 0.25
+    rows = verdict([score("I-TMMD", s, v, **near) for s, v in values])
+    assert [rows[name][0].best for name in "abc"] == [True, True, False]
 
 
 def test_one_method_alone_is_best_of_nothing():
-    (row, floor) = verdict(telling_columns(score_tables([score()])))
-    assert (row.cells, floor.subject) == (
-        [("1.374", False, "[1.010, 1.750]")],
-        "real images (floor)",
-    )
+    rows = verdict([score()])
+    ((cell,), _) = rows.values()
+    assert (cell.score.value, cell.digits, cell.best) == (1.374, 2, False)
+    assert list(rows)[1] == "real images (floor)"
+
+
+def test_a_ratio_that_is_not_known_is_never_the_best_and_has_its_note():
+    note = Note("unstable-denominators", {"known_errors": True, "classes": ["Brick"]})
+    wild = score("D-TMMD", "wild", 0.05, higher_is_better=None, notes=[note])
+    others = [score("D-TMMD", s, v, higher_is_better=None) for s, v in (("a", 1.0), ("b", 2.0))]
+    columns = telling_columns(score_tables([wild, *others]))
+    sheet = lay(columns)
+    ((cell,), (a,), *_) = (row.cells[1:] for row in sheet.rows)
+    assert (cell.best, a.best) == (False, True)
+    assert note in [sheet.notes[k - 1] for k in cell.footnotes]
+
+
+def test_a_metric_that_is_undefined_is_not_filled_from_another_preset():
+    presets = [{"preset": name} for name in ("grouped", "paper")]
+    scores = [score("TMMD", s, 1.0, settings=p) for p in presets for s in ("a", "b")]
+    d = {"higher_is_better": None, "interval": None}
+    scores += [score("D-TMMD", s, None, settings=presets[0], **d) for s in ("a", "b")]
+    scores += [score("D-TMMD", s, 0.5, settings=presets[1], **d) for s in ("a", "b")]
+    column = telling_columns(score_tables(scores))[1]
+    assert (column.metric, [c.defined for c in column.cells]) == ("D-TMMD", [False, False])
+    assert [c.title for c in cards(Results("T", scores=scores), [column])] == []
 
 
 def test_cards_hold_the_leak_the_distance_and_the_material():
@@ -67,10 +102,9 @@ def test_cards_hold_the_leak_the_distance_and_the_material():
     columns = telling_columns(score_tables(results.scores))
     leak, distance, material = cards(results, columns)
     assert [(r.label, r.text) for r in leak.rows] == [("Orig", "99.10 %"), ("NoLeak", "0 %")]
-    assert "median of 304" in leak.foot
-    assert [r.text for r in distance.rows] == ["1.400", "1.100", "7.000"]
+    assert "median of 304 frames" in leak.foot
+    assert [r.text for r in distance.rows] == ["1.40", "1.10", "7.00"]
     assert re.search(r'class="null".*class="floor".*class="interval"', distance.strip)
-    assert distance.foot.endswith("outside the gray band: it differs from real.")
     assert [r.text for r in material.rows] == ["50.0 %", "60.0 %", "20.0 %", "90.0 %"]
     assert "chance, 10.0 %" in material.foot
 
@@ -80,16 +114,50 @@ def test_the_card_of_the_material_always_holds_the_real_images():
     scores = [score("material accuracy", f"m{k}", k / 10, **accuracy) for k in range(6)]
     scores.append(score("material accuracy", "real", 0.9, **accuracy))
     (card,) = cards(Results("T", scores=scores), telling_columns(score_tables(scores)))
-    assert [row.label for row in card.rows] == ["m0", "m1", "m2", "real"]
+    assert [row.label for row in card.rows] == ["m0", "m5", "m1", "real"]
+    assert "Here: 4 of 7." in card.foot
+
+
+def test_a_card_compares_the_first_method_with_the_best_other_and_a_control():
+    subjects = {"ours": 2.0, "variant": 3.0, "GVST": 1.0, "mean": 9.0, "real, nearest photo": 0.5}
+    scores = [score("TMMD", s, v) for s, v in subjects.items()]
+    columns = telling_columns(score_tables(scores))
+    (card,) = cards(Results("T", scores=scores), columns, ["mean", "real, nearest photo"])
+    labels = ["ours", "GVST", "variant", "real, nearest photo (control)"]
+    assert [row.label for row in card.rows] == labels
 
 
 @pytest.mark.parametrize(
-    ("value", "words"), [(0.05, "no difference from real is shown"), (0.07, "it differs from real")]
+    ("values", "words"),
+    [
+        ({"details": {"p_value": 0.3}}, "p = 0.3: not shown to differ from real"),
+        ({"details": {"p_value": 0.00001}}, "p < 0.001: differs from real"),
+        ({}, ""),  # a mean over seeds
+        # A collapsed generator: inside its null, which says nothing of real images.
+        ({"metric": "CI-TMMD"}, "the interval is below the floor: images vary less than real ones"),
+        ({"metric": "CI-TMMD", "floor": 0.001}, "the interval holds the floor"),
+        ({"metric": "D-TMMD", "floor": -1.0}, "the interval is above the floor"),
+    ],
 )
-def test_a_card_says_what_the_null_says(value, words):
-    scores = [score(value=value)]
+def test_a_card_says_what_is_shown_against_real_images(values, words):
+    values = {"metric": "TMMD", "floor": 1.858, **values}
+    if values["metric"] != "TMMD":
+        values["higher_is_better"] = None
+    scores = [score(value=-0.001, interval=(-0.004, 0.002), null=(-0.1, 0.1), **values)]
     (card,) = cards(Results("T", scores=scores), telling_columns(score_tables(scores)))
     assert words in card.foot
+    assert "band" not in card.foot
+    assert ("real" in card.foot.partition("dashed: real images")[2]) == ("real" in words)
+
+
+def test_nothing_leaks_where_nothing_leaks():
+    (card,) = cards(Results("T", audits=[clean_audit()]), [])[:1]
+    assert (card.rows[0].text, card.foot) == ("0 %", "")
+
+
+def test_a_run_that_is_too_small_says_so():
+    assert "can decide nothing" in caution(Results("T", settings={"preset": "smoke"}))
+    assert caution(Results("T", settings={"preset": "mini"})) == ""
 
 
 def test_cards_of_an_audit_alone_say_what_gives_it_away_and_what_it_costs():
@@ -109,6 +177,8 @@ def test_what_a_page_is_about():
     facts = ["Touch and Go", "29,879 test samples of 106 videos", "91,982 train samples"]
     assert about(results, "2026-11-23", "1.0") == [*facts, "2026-11-23", "palpate 1.0"]
     assert about(Results("T", scores=[score()]), "today", "1.0")[0] == "240 samples"
+    made = {"versions": {"palpate": "0.9"}, "stages": {"a": {"date": "2026-01-02"}, "b": {}}}
+    assert about(Results("T", settings=made), "today", "1.0") == ["2026-01-02", "palpate 0.9"]
 
 
 def test_strips_are_explained_on_a_score_with_interval_null_and_floor():

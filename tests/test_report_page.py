@@ -121,10 +121,10 @@ def test_a_page_is_well_formed_and_complete(tmp_path):
         "A title",
         "80.0 % leak.",
         "Synthetic data.",
-        "1.374",
-        "[1.010, 1.750]",
-        "floor 0.042",
-        "null −0.050 to 0.060",
+        "1.37",
+        "[1.01, 1.75]",
+        "real images (floor) 0.04",
+        "null −0.05 to 0.06",
         "undefined",
         "one image for all",
         "A remark.",
@@ -171,8 +171,8 @@ def test_a_page_shows_every_part_of_an_audit(tmp_path):
 def test_a_page_has_paired_differences(tmp_path):
     scores = [score(subject="a"), score(subject="b"), difference("a", "b", better="a")]
     text = Tree(page_of(Results("T", scores=scores), tmp_path)).text
-    assert "TMMD ↓ a b −1.000 [−1.500, −0.500] 97.5 % 0.05" in text
-    assert "[1.010, 1.750] best" in text
+    assert "TMMD ↓ a b −1.00 [−1.50, −0.50] 97.5 % 0.05" in text
+    assert "1.37 best † [1.01, 1.75]" in text.replace("best†", "best †")
 
 
 def test_a_page_refers_to_nothing_outside(tmp_path):
@@ -324,7 +324,7 @@ def test_headline_facts():
         "Orig: 80.0 % of the test samples leak; 80 of 100 come from a video that train has as "
         "well.",
         "NoLeak: no video is shared; none of the 100 test samples leaks.",
-        "TMMD (lower is better): GVST 1.374 [1.010, 1.750]; floor 0.042.",
+        "TMMD (lower is better): GVST 1.37 [1.01, 1.75]; floor 0.04.",
     ]
     assert summary_lines(Results("t")) == []
 

@@ -128,9 +128,19 @@ def test_features_of_several_networks_do_not_split_the_scores_of_one_run():
         ([], None),
     ],
 )
-def test_best_needs_a_decided_difference_against_every_other(differences, best):
+def test_the_dagger_needs_a_decided_difference_against_every_other(differences, best):
     table = score_tables([*(score(subject=s) for s in "abc"), *differences])[0]
-    assert [c.score.subject for c in table.columns[0].cells if c.best] == ([best] if best else [])
+    cells = table.columns[0].cells
+    assert [c.score.subject for c in cells if c.decided] == ([best] if best else [])
+
+
+def test_the_best_by_value_is_among_those_that_are_compared():
+    scores = [score(subject=s, value=v) for s, v in (("a", 2.0), ("b", 3.0), ("photo", 1.0))]
+    best = [
+        [c.score.subject for c in score_tables(all_scores)[0].columns[0].cells if c.best]
+        for all_scores in (scores, [*scores, difference("a", "b")])
+    ]
+    assert best == [["photo"], ["a"]]
 
 
 def test_more_than_two_generators_are_ranked():

@@ -39,7 +39,7 @@ def results():
 def test_every_front_end_has_every_number_and_note(results):
     ascii_minus = str(results)
     for text in (ascii_minus, results.to_markdown(), results.to_latex()):
-        for part in ("1.374", "1.010, 1.750", "2.500", "18.2", "28.6", "0.042", "97.5"):
+        for part in ("1.37", "1.01, 1.75", "2.50", "18.2", "28.6", "0.04", "97.5"):
             assert part in text, part
         assert text.count("Seen") == 1
     assert "undefined" in ascii_minus
@@ -50,8 +50,8 @@ def test_the_terminal_has_a_row_a_score(results):
     lines = str(results).splitlines()
     row = next(line for line in lines if line.startswith("TMMD ↓") and " a " in line)
     assert row.split() == [
-        *("TMMD", "↓", "a", "1.374", "*", "[1.010,", "1.750]", "[-0.050,", "0.060]"),
-        *("0.0312", "0.042", "240", "(1)"),
+        *("TMMD", "↓", "a", "1.37", "*", "†", "[1.01,", "1.75]", "[-0.05,", "0.06]"),
+        *("0.0312", "0.04", "240", "(1)"),
     ]
     assert "(1) Seen" in lines
 
@@ -59,7 +59,7 @@ def test_the_terminal_has_a_row_a_score(results):
 @pytest.mark.parametrize("width", [40, 60, 80, 120])
 def test_a_narrow_terminal_cuts_no_number(results, width):
     text = as_text(results, width)
-    assert "[-0.050, 0.060]" in text
+    assert "[-0.05, 0.06]" in text
     assert "…" not in text
     table = text.split("(1)")[0]
     assert max(map(len, table.splitlines())) <= width
@@ -130,21 +130,27 @@ def test_no_text_is_a_latex_command(text):
     escaped = escape(text)
     commands = set(re.findall(r"\\[a-zA-Z]+|\\.", escaped))
     allowed = r"\textbackslash \textasciitilde \textasciicircum \textless \textgreater \textbar"
-    allowed += r" \char \times \sigma \rightarrow \uparrow \downarrow \{ \} \$ \& \# \% \_ \`"
+    allowed += (
+        r" \char \textdagger \times \sigma \rightarrow \uparrow \downarrow \{ \} \$ \& \# \% \_ \`"
+    )
     assert commands <= set(allowed.split())
     assert not re.search(r"(?<!\\)[%#&]", escaped)
 
 
 def test_latex_tables_have_bold_best_marks_and_floors(results):
     text = results.to_latex()
-    assert r"a & $\mathbf{1.374}$\textsuperscript{a} & --" in text
-    assert r"{\scriptsize $[1.010, 1.750]$}" in text
-    assert r"{\scriptsize $p = 0.0312$}" in text
-    assert "floor (real images) & $0.042$ & -- " in text
-    assert "no-contact image & $28.60$" in text
+    assert r"a & $\mathbf{1.37}$$^\dagger$\textsuperscript{a} & --" in text
+    assert r"{\scriptsize $[1.01, 1.75]$}" in text
+    assert r"{\scriptsize p = 0.0312}" in text
+    assert "real images (floor) & 0.04 & -- " in text
+    assert "no contact & 28.60" in text
     assert r"\textsuperscript{a}~Seen" in text
     assert "-{}-reference b/" in text
-    assert r"TMMD $\downarrow$ & a & b & $-1.000$ & $[-1.500, -0.500]$ & 97.5 \%" in text
+    assert r"TMMD $\downarrow$ & a & b & $-1.00$ & 97.5 \% & 0.05 \\" in text
+    assert r"{\scriptsize $[-1.50, -0.50]$}" in text
+    labels = re.findall(r"\\label\{(tab:[a-z0-9-]+)\}", text)
+    assert len(labels) == len(set(labels)) == 3
+    assert text.count(r"\resizebox") == 3
     for begin, end in (("table", "table"), ("tabular", "tabular")):
         assert text.count(rf"\begin{{{begin}}}") == text.count(rf"\end{{{end}}}") == 3
     for table in re.findall(r"\\begin\{tabular\}\{(.*?)\}(.*?)\\end\{tabular\}", text, re.S):
@@ -154,7 +160,7 @@ def test_latex_tables_have_bold_best_marks_and_floors(results):
 
 @pytest.mark.skipif(shutil.which("pdflatex") is None, reason="no pdflatex")
 def test_latex_compiles(results, tmp_path):
-    preamble = r"\documentclass{article}\usepackage{booktabs}\begin{document}"
+    preamble = r"\documentclass{article}\usepackage{booktabs,graphicx}\begin{document}"
     (tmp_path / "t.tex").write_text(f"{preamble}\n{results.to_latex()}\n\\end{{document}}\n")
     command = ["pdflatex", "-interaction=nonstopmode", "-halt-on-error", "t.tex"]
     subprocess.run(command, cwd=tmp_path, check=True, capture_output=True)

@@ -136,7 +136,7 @@ def test_leaks_inflate_where_orig_is_better_and_the_verdict_flips_with_the_numbe
     claims = leak_claims(tasks)
     assert verdicts(claims)["Leakage inflates every task"] == "undecided"
     assert "1 of 2 tasks inflated" in claims[0].why
-    assert claims[2].why == "In TMMD Orig gains 1.000 [−0.500, 2.500]."
+    assert claims[2].why == "In TMMD Orig gains 1.0 [−0.5, 2.5]."
 
 
 def study(tmmd, ssim):
@@ -172,7 +172,7 @@ def test_metrics_are_held_against_people():
     made = {c.claim: c.why for c in preference_claims(study(1, 0.05), strangers)}
     assert "the human study compared other methods" in made["TMMD prefers what people prefer"]
     assert made["TMMD prefers what people prefer"].startswith(
-        "TMMD puts Ours ahead of GVST by 1.000 [0.900, 1.100], of Ours w/ BG by 2.000 [1.900, "
+        "TMMD puts Ours ahead of GVST by 1.00 [0.90, 1.10], of Ours w/ BG by 2.00 [1.90, "
     )
 
 
@@ -195,7 +195,7 @@ def test_rankings_flip_and_contradictions_are_undecided():
     assert ranking_claims(study(0.05, 0.05))[0].verdict == "undecided"  # holds 0
     assert ranking_claims([])[0].why == "GVST was not compared with Ours."
     why = ranking_claims([*study(1, 0.05), difference("D-TMMD", None, None)])[0].why
-    assert why == "Ours is ahead of GVST in TMMD by 1.000 [0.900, 1.100], in D-TMMD (undefined)."
+    assert why == "Ours is ahead of GVST in TMMD by 1.00 [0.90, 1.10], in D-TMMD (undefined)."
 
 
 def test_effect_sizes_are_differences_over_errors_and_decide_who_discriminates():

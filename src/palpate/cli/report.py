@@ -52,7 +52,7 @@ def run(options: Options, terminal: Terminal) -> dict[str, Any]:
     from palpate.report import write_report
 
     if options.output.suffix == ".html":
-        marks = (options.title.encode(), b"palpate", b"What this page shows")
+        marks = (options.title.encode(), b"palpate")
         guard_output(options.output, options.results, marks)
         guard_output(options.output.with_suffix(".json"), options.results)
         guard_output(options.output.with_suffix(".md"), options.results, marks)

@@ -40,7 +40,7 @@ class Score:
     Attributes:
         metric: e.g. ``"TMMD"``, ``"SSIM"``.
         subject: what was scored: ``"generated"``, ``"real"``, ``"background"``, a generator's name.
-        value: the score, or None where it is undefined (``notes`` say why).
+        value: the score, or None where it is undefined (``notes`` say why); never NaN or infinite.
         interval: (low, high), or None where none can be given.
         level: coverage the interval aims at.
         interval_method: e.g. ``"leave-one-video-out jackknife, t, 23 df"``.
@@ -82,6 +82,14 @@ class Score:
     settings: Mapping[str, Any] = field(default_factory=dict)
     details: Mapping[str, Any] = field(default_factory=dict)
     notes: Sequence[Note] = ()
+
+    def __post_init__(self) -> None:
+        """Drop what is not finite, as JSON does: value and floor become None, pairs as a whole."""
+        for name in ("value", "floor", "interval", "null"):
+            numbers = getattr(self, name)
+            pair = numbers if isinstance(numbers, Sequence) else (numbers,)
+            if not all(v is None or math.isfinite(v) for v in pair):
+                object.__setattr__(self, name, None)
 
     def __float__(self) -> float:
         """Return the value; NaN where it is undefined."""

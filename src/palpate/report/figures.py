@@ -12,7 +12,7 @@ from pathlib import Path
 
 from PIL import Image, ImageDraw, ImageOps
 
-from palpate.core import Score, atomic_path, write_text
+from palpate.core import atomic_path, write_text
 from palpate.report import audits
 from palpate.report.curves import (
     Panel,
@@ -23,11 +23,11 @@ from palpate.report.curves import (
     strips_drawing,
 )
 from palpate.report.drawing import COLORS, Drawing, font_of, in_ascii
-from palpate.report.first_screen import COLUMNS, REAL, TELLING, telling_columns
+from palpate.report.first_screen import COLUMNS, TELLING, telling_columns
 from palpate.report.page import gallery_images, in_turns, material_of, pair_images
 from palpate.report.results import Audit, Results
-from palpate.report.study_tables import controls_of, file_names, sheets
-from palpate.report.tables import heat_tables, score_tables
+from palpate.report.study_tables import controls_of, file_names, scores_of_methods, sheets
+from palpate.report.tables import REAL, heat_tables, score_tables
 from palpate.report.thumbnails import Wanted, read_image
 
 #: Samples and pairs side by side.
@@ -89,7 +89,7 @@ def _drawings(results: Results) -> dict[str, Drawing]:
         panels = [p for p in panels_of(table) if any(s.interval for _, s, _ in p.rows)]
         if panels := sorted(panels, key=_telling)[:COLUMNS]:
             drawings[name] = strips_drawing(table.title, panels)
-    heats = heat_tables(_by_method(results))
+    heats = heat_tables(scores_of_methods(results))
     names = file_names("matrix", [heat.title for heat in heats])
     return drawings | dict(zip(names, map(matrix_drawing, heats), strict=True))
 
@@ -98,16 +98,6 @@ def _telling(panel: Panel) -> int:
     """The place of a panel among those that say most."""
     metric = panel.rows[0][1].metric
     return TELLING.index(metric) if metric in TELLING else len(TELLING)
-
-
-def _by_method(results: Results) -> list[Score]:
-    """The scores of methods: without controls, and of several presets the first."""
-    controls = {REAL, *controls_of(results)}
-    first: dict[tuple[str, str], Score] = {}
-    for score in results.scores:
-        if score.subject not in controls:
-            first.setdefault((score.metric, score.subject), score)
-    return [*first.values()]
 
 
 def _pictures(results: Results) -> dict[str, Picture]:

@@ -1,25 +1,24 @@
-"""The first screen of a page, from data: on what, three cards, samples; and the verdict table."""
+"""The first screen of a page, from data: on what, three cards; and the columns that say most."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import NamedTuple
 
 from markupsafe import Markup
 
 from palpate.core import Score
 from palpate.report import plots
-from palpate.report.notes import number, percent, plural
+from palpate.report.notes import number, p_text, percent, plural
 from palpate.report.results import Audit, Results
 from palpate.report.sentences import share_of
-from palpate.report.tables import Cell, Column, Table, defined
+from palpate.report.tables import REAL, Cell, Column, Table, best_by_value, defined
 
 #: Columns of the verdict table, the most telling first; others follow as they come.
 TELLING = ("TMMD", "material accuracy", "D-TMMD", "CI-TMMD", "SSIM")
 COLUMNS, CARDS, CARD_ROWS = 5, 3, 4
-#: Subjects that are the data themselves: never the best of a column.
-REAL = "real"
+#: Beginnings of metrics whose null is that generated and real images are alike.
+DISTANCES = ("TMMD", "FID", "CMMD", "KID")
 #: Width of the strip in a card, and of the one that explains strips, in pixels.
 STRIP, READING = 296.0, 330.0
 #: What a metric asks, for the title of its card.
@@ -50,26 +49,18 @@ class Card:
     strip: Markup | None = None
 
 
-class VerdictCell(NamedTuple):
-    """A number as text, whether it is the best of its column, and its interval as text."""
-
-    text: str
-    best: bool = False
-    interval: str = ""
-
-
-@dataclass(frozen=True)
-class VerdictRow:
-    """One method or control: a cell for each column."""
-
-    subject: str
-    cells: Sequence[VerdictCell]
-    control: bool = False
-
-
 def about(results: Results, date: str, version: str) -> list[str]:
-    """Return on what the page is: data set, sizes, date, version."""
-    facts = [str(results.settings["dataset"])] if results.settings.get("dataset") else []
+    """Return on what the page is: data set, sizes, when and by what its numbers were made.
+
+    ``date`` and ``version`` are of the page, for results that do not record theirs.
+    """
+    settings = results.settings
+    stages = settings.get("stages")
+    dates = [s.get("date") for s in stages.values()] if isinstance(stages, Mapping) else []
+    date = max((str(d) for d in dates if d), default=date)
+    versions = settings.get("versions")
+    version = versions.get("palpate", version) if isinstance(versions, Mapping) else version
+    facts = [str(settings["dataset"])] if settings.get("dataset") else []
     if audits := [a for a in results.audits if a.against == "train"]:
         last = audits[-1]
         videos = f" of {plural(last.groups_test, last.group)}" if last.group != "none" else ""
@@ -80,70 +71,37 @@ def about(results: Results, date: str, version: str) -> list[str]:
     return [*facts, date, f"palpate {version}"]
 
 
+def caution(results: Results) -> str:
+    """Return what to know before any number: that a run is too small to decide anything; or ''."""
+    if results.settings.get("preset") != "smoke":
+        return ""
+    return "Preset smoke trains for seconds, to show that everything runs; it can decide nothing."
+
+
 def telling_columns(tables: Sequence[Table]) -> list[Column]:
-    """Return at most five columns of different metrics; of several presets the first."""
+    """Return at most five columns of different metrics, each of the first table that has it.
+
+    So a column of another preset never stands in for one that is undefined.
+    """
     first: dict[str, Column] = {}
     for column in (c for table in tables for c in table.columns):
-        if any(cell.defined for cell in column.cells):
-            first.setdefault(column.metric, column)
+        first.setdefault(column.metric, column)
     known = [first.pop(metric) for metric in TELLING if metric in first]
-    return [*known, *first.values()][:COLUMNS]
+    others = [c for c in first.values() if any(cell.defined for cell in c.cells)]
+    return [*known, *others][:COLUMNS]
 
 
-def verdict(columns: Sequence[Column], controls: Collection[str] = ()) -> list[VerdictRow]:
-    """Return methods and controls by ``columns``; last what real images score: the floor.
-
-    ``controls`` are the subjects that a study names so: they come after the methods and are never
-    the best.
-    """
-    subjects = list(dict.fromkeys(cell.score.subject for c in columns for cell in c.cells))
-    subjects.sort(key=lambda subject: (subject == REAL, subject in controls))
-    best = [_best(column, controls) for column in columns]
-    rows = [
-        VerdictRow(
-            s, [_verdict_cell(c, s, b) for c, b in zip(columns, best, strict=True)], s in controls
-        )
-        for s in subjects
-    ]
-    floors = [next((c.score.floor for c in column.cells), None) for column in columns]
-    texts = ["" if f is None else number(f, c.digits) for f, c in zip(floors, columns, strict=True)]
-    if any(texts):
-        known = rows.pop().cells if REAL in subjects else [VerdictCell("")] * len(columns)
-        cells = [VerdictCell(t) if t else cell for t, cell in zip(texts, known, strict=True)]
-        rows.append(VerdictRow("real images (floor)", cells))
-    return rows
-
-
-def _verdict_cell(column: Column, subject: str, best: Collection[str]) -> VerdictCell:
-    cell = next((c for c in column.cells if c.score.subject == subject), None)
-    if cell is None:
-        return VerdictCell("")
-    if not cell.defined:
-        return VerdictCell("undefined")
-    low_high = ", ".join(number(v, column.digits) for v in cell.score.interval or ())
-    interval = f"[{low_high}]" if low_high else ""
-    return VerdictCell(number(cell.score.value, column.digits), subject in best, interval)
-
-
-def _best(column: Column, controls: Collection[str]) -> set[str]:
-    """The subjects with the best value as it is written, no controls; none where one competes."""
-    apart = {REAL, *controls}
-    scores = [c.score for c in column.cells if c.defined and c.score.subject not in apart]
-    if column.higher_is_better is None:
-        scores = [s for s in scores if s.floor is not None]
-    if len(scores) < 2:
-        return set()
-    distance: Callable[[Score], float] = lambda s: abs(float(s) - float(s.floor or 0))
-    keys = {True: lambda s: -float(s), False: float, None: distance}
-    values = {s.subject: round(keys[column.higher_is_better](s), column.digits) for s in scores}
-    return {subject for subject, value in values.items() if value == min(values.values())}
-
-
-def cards(results: Results, columns: Sequence[Column]) -> list[Card]:
+def cards(
+    results: Results, columns: Sequence[Column], controls: Collection[str] = ()
+) -> list[Card]:
     """Return at most three cards: the leak, then the most telling scores, or more of the leak."""
     audits = [audit for audit in results.audits if audit.test_samples]
     found = [_leak_card(audits)] if audits else []
-    found += [_score_card(column) for column in columns]
+    found += [
+        _score_card(column, controls)
+        for column in columns
+        if any(cell.defined for cell in column.cells)
+    ]
     if audits and not columns:
         found += [_signals_card(audits[0])] if audits[0].signals else []
         found += _cost_cards(audits) or _gap_cards(audits[0])
@@ -159,9 +117,11 @@ def _leak_card(audits: Sequence[Audit]) -> Card:
         )
         for a in audits[:CARD_ROWS]
     ]
-    gaps = [a.gap_median for a in audits if a.gap_median is not None]
-    near = f"; the nearest frame is a median of {number(gaps[0], 0)} away" if gaps else ""
-    foot = f"Train has the same video, object or image{near}."
+    foot = ""
+    if any(a.leaked_fraction for a in audits):
+        gaps = [a.gap_median for a in audits if a.leaked_fraction and a.gap_median is not None]
+        near = f"; the nearest is a median of {number(gaps[0], 0)} frames away" if gaps else ""
+        foot = f"A leak: train has the same video, object or image{near}."
     return Card("Test samples that leak from train", rows, foot)
 
 
@@ -197,22 +157,38 @@ def _gap_cards(audit: Audit) -> list[Card]:
     return [Card("Frames to the nearest train frame", rows, "Of the same video.")]
 
 
-def _score_card(column: Column) -> Card:
+def _score_card(column: Column, controls: Collection[str]) -> Card:
     cells = [cell for cell in column.cells if cell.defined]
-    first = cells[0]
+    shown = _compared(column, cells, controls)
+    first = shown[0]
     share = "accuracy" in column.metric
     mark = first.baselines.get("chance") if share else first.score.floor
-    shown = cells[:CARD_ROWS]
-    shown[CARD_ROWS - 1 :] = [c for c in cells[CARD_ROWS - 1 :] if c.score.subject == REAL] or (
-        shown[CARD_ROWS - 1 :]
-    )
-    rows = [_score_row(cell, column, mark) for cell in shown]
+    rows = [_score_row(cell, column, mark, controls) for cell in shown]
+    left = f" Here: {len(shown)} of {len(cells)}." if len(cells) > len(shown) else ""
     title = f"{QUESTIONS.get(column.metric, column.metric)} {column.arrow}"
     if share:
-        return Card(title, rows, f"Share right; dashed: chance, {percent(mark)}." if mark else "")
+        chance = f"Share right; dashed: chance, {percent(mark)}." if mark else ""
+        return Card(title, rows, f"{chance}{left}".strip())
     axis = strip_axis(first.score, STRIP)
     drawing = plots.bar(axis, first.score.value, first.score.interval, first.score.null, mark)
-    return Card(title, rows, _strip_facts(first.score, column), drawing + plots.axis_row(axis))
+    foot = f"{_strip_facts(first.score, column)}{left}".strip()
+    return Card(title, rows, foot, drawing + plots.axis_row(axis))
+
+
+def _compared(column: Column, cells: Sequence[Cell], controls: Collection[str]) -> list[Cell]:
+    """The first method, the best other one, the nearest photo, real images; then as they come."""
+    methods = [c for c in cells if c.score.subject != REAL and c.score.subject not in controls]
+    others = methods[1:]
+    best = best_by_value([c.score for c in others], column.digits) or {0}
+    apart = [c for c in cells if c.score.subject in controls]
+    photo = [c for c in apart if "nearest photo" in c.score.subject] or apart
+    real = [c for c in cells if c.score.subject == REAL]
+    chosen = [*methods[:1], *(others[k] for k in sorted(best)[:1] if others), *photo[:1], *real[:1]]
+    more = [c for c in (*others, *cells) if all(c is not other for other in chosen)]
+    room = CARD_ROWS - len(chosen)
+    place = len(chosen) - len(photo[:1]) - len(real[:1])
+    unique = list({id(c): c for c in more}.values())[:room]
+    return [*chosen[:place], *unique, *chosen[place:]]
 
 
 def strip_axis(score: Score, width: float) -> plots.Axis | None:
@@ -231,22 +207,38 @@ def _strip_facts(score: Score, column: Column) -> str:
         facts.append(f"{100 * score.level:g} % interval [{low}, {high}]")
     if score.floor is not None:
         facts.append(f"dashed: real images {number(score.floor, column.digits)}")
-    if score.null and score.value is not None:
-        inside = score.value <= max(score.null)
-        facts.append(
-            "in the gray band: no difference from real is shown"
-            if inside
-            else "outside the gray band: it differs from real"
-        )
-    return "; ".join(facts) + "." if facts else ""
+    return "; ".join(filter(None, [*facts, _against_real(score)])) + "." * bool(facts)
 
 
-def _score_row(cell: Cell, column: Column, mark: float | None) -> CardRow:
+def _against_real(score: Score) -> str:
+    """What is shown of generated against real images.
+
+    Equality of the two is what the null of a distance to real images means, and its p-value
+    decides; a metric without a better direction has the floor to compare with.
+    """
+    p = score.details.get("p_value")
+    if score.metric.startswith(DISTANCES) and p is not None:
+        shown = "differs from real" if p < 0.05 else "not shown to differ from real"
+        return f"p {'' if p < 0.001 else '= '}{p_text(p)}: {shown}"
+    if score.higher_is_better is not None or score.floor is None or not score.interval:
+        return ""
+    low, high = score.interval
+    if low <= score.floor <= high:
+        return "the interval holds the floor"
+    varied = high < score.floor and score.metric.startswith(("I-TMMD", "CI-TMMD"))
+    lack = ": images vary less than real ones" if varied else ""
+    return f"the interval is {'below' if high < score.floor else 'above'} the floor{lack}"
+
+
+def _score_row(
+    cell: Cell, column: Column, mark: float | None, controls: Collection[str]
+) -> CardRow:
     score = cell.score
+    label = f"{score.subject} (control)" if score.subject in controls else score.subject
     if "accuracy" not in column.metric:
-        return CardRow(score.subject, Markup(""), number(score.value, column.digits))
+        return CardRow(label, Markup(""), number(score.value, column.digits))
     drawing = plots.bar(UNIT, score.value, score.interval, mark=mark)
-    return CardRow(score.subject, drawing, percent(float(score)))
+    return CardRow(label, drawing, percent(float(score)))
 
 
 def annotated(tables: Sequence[Table]) -> tuple[Column, Score] | None:

@@ -1,9 +1,9 @@
 r"""LaTeX tables (``booktabs``): of a study, of its claims, and of scores, one a family of metrics
 and one of its differences.
 
-The interval is below the value, the p-value of a permutation test below that. Bold is better than
-every other generator by a paired difference whose interval excludes 0. Notes have letters below the
-table. Text is escaped: no name can be a command. Letters that pdfLaTeX lacks need LuaLaTeX.
+Below a value are its interval, p-value and null band. Bold is the best of a column by value, a
+dagger what paired differences decide. Notes have letters below the table. Text is escaped: no name
+can be a command. Letters that pdfLaTeX lacks need LuaLaTeX.
 """
 
 from __future__ import annotations
@@ -11,14 +11,14 @@ from __future__ import annotations
 import re
 import unicodedata
 from collections.abc import Callable, Iterable, Sequence
+from itertools import zip_longest
 
 from palpate.core import Note, short
-from palpate.report.notes import sentence
+from palpate.report.notes import number, sentence
 from palpate.report.results import Results
 from palpate.report.study import Claim
-from palpate.report.study_tables import BEST_OF_COLUMN, Entry, Sheet, sheets, tally
-from palpate.report.tables import BASELINES, BEST, Cell, Column, Table, defined, score_tables
-from palpate.report.terminal import NAMES, difference_rows
+from palpate.report.study_tables import Entry, Sheet, file_names, score_sheets, sheets, tally
+from palpate.report.tables import Table, defined, score_tables
 
 #: First line of the file: how the command recognizes its own file.
 MARK = "% palpate: tables of scores"
@@ -40,6 +40,7 @@ _SPECIAL = {
     '"': r"\char34{}",
     "`": r"\`{}",
     "σ": r"$\sigma$",
+    "†": r"\textdagger{}",
     "×": r"$\times$",
     **ARROWS,
     "−": "$-$",
@@ -65,20 +66,21 @@ def latex_tables(results: Results) -> str:
     Raises:
         PalpateError: if two scores that share a column were not made with the same settings.
     """
-    lines = [line for table in sheets(results) for line in _sheet(table)]
-    lines += _claims(results.claims)
+    laid = [(table, [table.text] if table.text else []) for table in sheets(results)]
+    command = [f"Command: {results.commands[0]}"] if results.commands else []
     for table in score_tables(results.scores):
-        caption = [table.title, *_facts(table)]
-        caption += [f"Command: {results.commands[0]}"] if results.commands else []
-        lines += _scores(table, caption) if table.columns else []
-        lines += _differences(table, caption) if table.differences else []
+        laid += [(t, [*_facts(table), *command]) for t in score_sheets(table)]
+    names = file_names("tab", [table.title for table, _ in laid])
+    parts = [_sheet(t, caption, name) for (t, caption), name in zip(laid, names, strict=True)]
+    parts.insert(len(results.tables), _claims(results.claims))
     commands = (re.sub(r"[\x00-\x1f\x7f\u2028\u2029]", " ", c) for c in results.commands)
-    head = [MARK, *(f"% {c}" for c in commands), r"% Needs \usepackage{booktabs}."]
-    return "\n".join([*head, "", *lines]).rstrip() + "\n"
+    needs = r"% Needs \usepackage{booktabs} and \usepackage{graphicx}."
+    head = [MARK, *(f"% {c}" for c in commands), needs]
+    return "\n".join([*head, "", *(line for lines in parts for line in lines)]).rstrip() + "\n"
 
 
-def _sheet(table: Sheet) -> list[str]:
-    """A table of a study: controls in italics between rules, the interval below the value."""
+def _sheet(table: Sheet, caption: Sequence[str], name: str) -> list[str]:
+    """Controls in italics between rules, what is below a value in lines of their own."""
     if not table.rows:
         return []
     heads = (f"{escape(h.label)} {ARROWS[h.arrow] if h.arrow else ''}".strip() for h in table.heads)
@@ -86,13 +88,13 @@ def _sheet(table: Sheet) -> list[str]:
     for row in table.rows:
         rows += [r"\midrule"] * row.rule
         rows.append(_row([_entry(cell, row.control) for cell in row.cells]))
-        below = [_small_interval(cell) for cell in row.cells]
-        rows += [_row(below)] if any(below) else []
-    caption = [table.title, *([table.text] if table.text else [])]
-    caption += [f"Bold: {BEST_OF_COLUMN}"] * table.has_best
+        below = zip_longest(*(_lines_below(cell) for cell in row.cells), fillvalue="")
+        rows += [_row(line) for line in below]
+    caption = [table.title, *caption, *table.marks("Bold:")]
     caption += ["Italics: controls"] * any(row.control for row in table.rows)
     notes = _footnotes(range(1, len(table.notes) + 1), table.notes)
-    return _float(caption, "".join("r" if h.scores else "l" for h in table.heads), rows, notes)
+    columns = "".join("r" if h.scores else "l" for h in table.heads)
+    return _float(caption, columns, rows, notes, name)
 
 
 def _entry(cell: Entry, control: bool) -> str:
@@ -102,14 +104,17 @@ def _entry(cell: Entry, control: bool) -> str:
     marks = _raised(cell.footnotes) if cell.footnotes else ""
     if not defined(cell.score):
         return "--" + marks
-    text = f"{cell.score.value:z.{cell.digits}f}"
-    return (rf"$\mathbf{{{text}}}$" if cell.best else f"${text}$") + marks
+    text = _math(number(cell.score.value, cell.digits))
+    dagger = r"$^\dagger$" * cell.decided
+    return (rf"$\mathbf{{{text}}}$" if cell.best else f"${text}$") + dagger + marks
 
 
-def _small_interval(cell: Entry) -> str:
-    known = cell.score is not None and defined(cell.score)
-    text = _pair(cell.score.interval, cell.digits) if cell.score and known else ""
-    return rf"{{\scriptsize {text}}}" if text else ""
+def _lines_below(cell: Entry) -> list[str]:
+    if cell.score is None or not defined(cell.score):
+        return []
+    pair = ", ".join(_math(number(v, cell.digits)) for v in cell.score.interval or ())
+    lines = [*([f"$[{pair}]$"] if pair else []), *map(escape, cell.below)]
+    return [rf"{{\scriptsize {line}}}" for line in lines]
 
 
 def _claims(claims: Sequence[Claim]) -> list[str]:
@@ -121,58 +126,19 @@ def _claims(claims: Sequence[Claim]) -> list[str]:
         _row([narrow(f"{c.claim} ({c.source})"), escape(c.verdict), narrow(c.why)]) for c in claims
     ]
     columns = r"p{0.38\linewidth}lp{0.4\linewidth}"
-    return _float([f"Claims: {tally(claims)}"], columns, rows, [])
-
-
-def _scores(table: Table, caption: Sequence[str]) -> list[str]:
-    heads = (f"{escape(c.label)} {ARROWS[c.arrow]}" for c in table.columns)
-    rows = [_row(["", *heads]), r"\midrule"]
-    for subject in table.subjects:
-        # Where seeds differ the first is shown.
-        cells = [(c, next(iter(table.cells(subject, c)), None)) for c in table.columns]
-        rows.append(_row([escape(subject), *(_value(c, cell) for c, cell in cells)]))
-        for line in (_interval, _p_value):
-            texts = [line(c, cell) if cell else "" for c, cell in cells]
-            rows += [_row(["", *texts])] if any(texts) else []
-    last = [
-        *_baseline("floor (real images)", table, lambda cell: cell.score.floor),
-        *(
-            row
-            for name in BASELINES
-            for row in _baseline(
-                {"no contact": "no-contact image"}.get(name, name),
-                table,
-                lambda cell, name=name: cell.baselines.get(name),
-            )
-        ),
-    ]
-    rows += [r"\midrule", *last] if last else []
-    if table.differences:
-        caption = [*caption, f"Bold: {BEST}"]
-    below = _below(table, (cell for column in table.columns for cell in column.cells))
-    return _float(caption, "l" + "r" * len(table.columns), rows, below)
-
-
-def _differences(table: Table, caption: Sequence[str]) -> list[str]:
-    rows = difference_rows(table)
-    names = [name for name in rows[0] if name != "notes" and any(row[name] for row in rows)]
-    lines = [_row(["$a - b$" if name == "a - b" else escape(name) for name in names]), r"\midrule"]
-    for row, d in zip(rows, table.differences, strict=True):
-        cells = [escape(row[n]) if n in NAMES or "%" in row[n] else _math(row[n]) for n in names]
-        lines.append(_row([*cells[:-1], cells[-1] + _marks(d.cell)]))
-    columns = "".join("l" if name in NAMES else "r" for name in names)
-    cells = (d.cell for d in table.differences)
-    caption = [f"Paired differences: {caption[0]}", *caption[1:]]
-    return _float(caption, columns, lines, _below(table, cells))
+    return _float([f"Claims: {tally(claims)}"], columns, rows, [], "tab-claims")
 
 
 def _float(
-    caption: Sequence[str], columns: str, rows: Sequence[str], below: Sequence[str]
+    caption: Sequence[str], columns: str, rows: Sequence[str], below: Sequence[str], name: str
 ) -> list[str]:
+    """A table no wider than the text, with a label to refer to."""
     sentences = ". ".join(escape(s).rstrip(".") for s in caption)
     head = [r"\begin{table}", r"\centering", rf"\caption{{{sentences}.}}"]
-    head += [rf"\begin{{tabular}}{{{columns}}}", r"\toprule"]
-    return [*head, *rows, r"\bottomrule", r"\end{tabular}", *below, r"\end{table}", ""]
+    head += [rf"\label{{tab:{name.removeprefix('tab-')}}}"]
+    fit = r"\resizebox{\ifdim\width>\linewidth\linewidth\else\width\fi}{!}{%"
+    head += [fit, rf"\begin{{tabular}}{{{columns}}}", r"\toprule"]
+    return [*head, *rows, r"\bottomrule", r"\end{tabular}}", *below, r"\end{table}", ""]
 
 
 def _facts(table: Table) -> list[str]:
@@ -188,64 +154,18 @@ def _short(text: str) -> str:
     return short(text) if re.fullmatch(r"[0-9a-f]{32,128}", text) else text
 
 
-def _below(table: Table, cells: Iterable[Cell]) -> list[str]:
-    """The footnotes of some cells."""
-    return _footnotes({k for cell in cells for k in cell.footnotes}, table.notes)
-
-
 def _footnotes(numbers: Iterable[int], notes: Sequence[Note]) -> list[str]:
     texts = (f"{_raised([k])}~{escape(sentence(notes[k - 1]))}" for k in sorted(numbers))
     text = ". ".join(note.rstrip(".") for note in texts)
     return [rf"\par\smallskip\parbox{{\linewidth}}{{\footnotesize {text}.}}"] if text else []
 
 
-def _baseline(title: str, table: Table, value_of: Callable[[Cell], float | None]) -> list[str]:
-    """A row with the first known value of each column; none where no column has one."""
-    values = [
-        next((v for cell in c.cells if (v := value_of(cell)) is not None), None)
-        for c in table.columns
-    ]
-    texts = [
-        "--" if v is None else f"${v:z.{c.digits}f}$"
-        for v, c in zip(values, table.columns, strict=True)
-    ]
-    return [_row([title, *texts])] if any(v is not None for v in values) else []
-
-
-def _row(cells: Sequence[str]) -> str:
-    return " & ".join(cells) + r" \\"
-
-
-def _value(column: Column, cell: Cell | None) -> str:
-    if cell is None or not cell.defined:
-        return "--" + (_marks(cell) if cell else "")
-    text = f"{cell.score.value:z.{column.digits}f}"
-    return (rf"$\mathbf{{{text}}}$" if cell.best else f"${text}$") + _marks(cell)
-
-
-def _interval(column: Column, cell: Cell) -> str:
-    text = _pair(cell.score.interval, column.digits)
-    return rf"{{\scriptsize {text}}}" if text else ""
-
-
-def _p_value(column: Column, cell: Cell) -> str:
-    return "" if cell.p_value is None else rf"{{\scriptsize $p {_p(cell.p_value)}$}}"
-
-
-def _pair(pair: tuple[float, float] | None, digits: int) -> str:
-    return "" if pair is None else f"$[{pair[0]:z.{digits}f}, {pair[1]:z.{digits}f}]$"
-
-
-def _p(p: float) -> str:
-    return "< 0.001" if p < 0.001 else f"= {p:.3g}"
-
-
 def _math(text: str) -> str:
-    return f"${text}$" if text else "--"
+    return text.replace("−", "-").replace(",", "{,}")
 
 
-def _marks(cell: Cell) -> str:
-    return _raised(cell.footnotes) if cell.footnotes else ""
+def _row(cells: Iterable[str]) -> str:
+    return " & ".join(cells) + r" \\"
 
 
 def _raised(numbers: Sequence[int]) -> str:

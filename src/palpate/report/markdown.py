@@ -10,20 +10,14 @@ import json
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
+from palpate.core import Note
 from palpate.report.notes import HOW_TO_READ, sentence
 from palpate.report.results import Results
 from palpate.report.sentences import purpose, summary_lines
 from palpate.report.study import Claim
-from palpate.report.study_tables import BEST_OF_COLUMN, Sheet, curve_table, sheet, tally
-from palpate.report.tables import BEST, Table, score_tables, settings_of, table_facts
-from palpate.report.terminal import (
-    NAMES,
-    audit_text,
-    difference_rows,
-    score_rows,
-    sheet_rows,
-    sheet_words,
-)
+from palpate.report.study_tables import Sheet, curve_table, difference_sheet, sheet, tally
+from palpate.report.tables import Table, score_tables, settings_of, table_facts
+from palpate.report.terminal import NAMES, audit_text, marks_of, score_rows, sheet_rows, sheet_words
 
 _SPECIAL = str.maketrans({c: f"\\{c}" for c in "\\`*_[]|<>"})
 
@@ -35,7 +29,7 @@ def render_markdown(results: Results) -> str:
         PalpateError: if scores of different settings would share a column.
     """
     facts = list(results.facts) or summary_lines(results)
-    lines = [f"# {esc(results.title)}", "", esc(purpose(results)), "", *_items(facts)]
+    lines = [f"# {esc(results.title)}", "", f"palpate: {esc(purpose(results))}", "", *_items(facts)]
     if results.notes:
         lines += ["## Read this first", "", *_items(map(sentence, results.notes))]
     tables = [line for table in score_tables(results.scores) for line in _scores(table)]
@@ -97,27 +91,32 @@ def _fenced(text: str, language: str = "text") -> list[str]:
 
 
 def _scores(table: Table) -> list[str]:
-    lines = [f"### {table.title}", "", *([table.question, ""] if table.question else [])]
-    if table.columns:
-        lines += pipe_table(score_rows(table))
-    if any(cell.best for column in table.columns for cell in column.cells):
-        lines += [f"\\* {BEST}", ""]
-    if table.differences:
-        lines += ["Paired differences, a - b:", "", *pipe_table(difference_rows(table))]
-    for title, made in table_facts(table):
-        facts = "; ".join(f"{esc(what)} {esc(how)}" for what, how in made.items())
-        lines.append(f"- {esc(title)}: {facts}")
-    lines += [f"- ({k}) {esc(sentence(note))}" for k, note in enumerate(table.notes, 1)]
-    return [*lines, ""]
+    made = [
+        (title, "; ".join(f"{what} {how}" for what, how in facts.items()))
+        for title, facts in table_facts(table)
+    ]
+    grid = pipe_table(score_rows(table)) if table.columns else []
+    lines = _laid((table.title, table.question), grid, marks_of(table), made, table.notes)
+    return [*lines, *(_sheet(difference_sheet(table)) if table.differences else [])]
 
 
 def _sheet(table: Sheet) -> list[str]:
-    lines = [f"### {esc(table.title)}", "", *([esc(table.text), ""] if table.text else [])]
-    if table.rows:
-        lines += pipe_table(sheet_rows(table), sheet_words(table))
-    lines += [f"\\* {BEST_OF_COLUMN}", ""] if table.has_best else []
-    lines += [f"- {esc(what)}: {esc(how)}" for what, how in table.made]
-    lines += [f"- ({k}) {esc(sentence(note))}" for k, note in enumerate(table.notes, 1)]
+    grid = pipe_table(sheet_rows(table), sheet_words(table)) if table.rows else []
+    return _laid((table.title, table.text), grid, table.marks("*"), table.made, table.notes)
+
+
+def _laid(
+    head: tuple[str, str],
+    grid: Sequence[str],
+    marks: Sequence[str],
+    made: Iterable[tuple[str, str]],
+    notes: Sequence[Note],
+) -> list[str]:
+    title, text = map(esc, head)
+    lines = [f"### {title}", "", *([text, ""] if text else []), *grid]
+    lines += [line for mark in marks for line in (esc(mark), "")]
+    lines += [f"- {esc(what)}: {esc(how)}" for what, how in made]
+    lines += [f"- ({k}) {esc(sentence(note))}" for k, note in enumerate(notes, 1)]
     return [*lines, ""]
 
 

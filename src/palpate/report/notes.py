@@ -14,7 +14,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from palpate.core import Note, SampleRef, few
+from palpate.core import Note, SampleRef, Score, few
 
 #: What every reader of scores needs to know.
 HOW_TO_READ = (
@@ -54,6 +54,30 @@ def decimals(values: Iterable[float]) -> int:
         return 1
     power = math.floor(math.log10(largest))
     return max(0, min(8, 3 - max(0, power) if largest >= 0.1 else 2 - power))
+
+
+def digits_of(scores: Iterable[Score]) -> int:
+    """Return the decimals of scores that are written alike, those of a column or one alone.
+
+    The narrowest interval gets two digits for its half; the largest number has at most five. None
+    of ranks and counts. Every front end rounds by this.
+    """
+    scores = list(scores)
+    values = [abs(float(s)) for s in scores if s.value is not None]
+    bounds = [v for s in scores for v in s.interval or ()]
+    halves = [(s.interval[1] - s.interval[0]) / 2 for s in scores if s.interval]
+    largest = max(values, default=0.0)
+    if not any(half > 0 for half in halves):
+        whole = not bounds and largest > 1 and all(v == round(v) for v in values)
+        return 0 if whole else decimals([*values, *bounds])
+    digits = 1 - math.floor(math.log10(min(half for half in halves if half > 0)))
+    most = 4 - math.floor(math.log10(largest)) if largest else digits
+    return max(0, min(8, digits, most))
+
+
+def p_text(p: float | None) -> str:
+    """Return a p-value in words for every front end; '' for None."""
+    return "" if p is None else "< 0.001" if p < 0.001 else f"{p:.3g}"
 
 
 def number(value: float | None, digits: int | None = None) -> str:

@@ -25,7 +25,7 @@ from markupsafe import Markup, escape
 from palpate import __version__
 from palpate.core import PalpateError, Progress, SampleRef, plain, quiet, write_json, write_text
 from palpate.report import audits, curves, first_screen, plots, sentences, study_tables
-from palpate.report.notes import confidence, count, number, percent, plural, sentence, where
+from palpate.report.notes import count, digits_of, number, percent, plural, sentence, where
 from palpate.report.results import GalleryItem, LeakPair, Results, Strip
 from palpate.report.study_tables import sheets
 from palpate.report.tables import defined, heat_tables, score_tables, settings_of, table_facts
@@ -123,8 +123,8 @@ def render_page(
     rows, essential = image_rows(results)
     tables = score_tables(results.scores)
     columns = first_screen.telling_columns(tables)
-    cards = first_screen.cards(results, columns)
     controls = study_tables.controls_of(results)
+    cards = first_screen.cards(results, columns, controls)
     samples = gallery_images(results.gallery)
     hero_rows: dict[Hashable, list[Wanted]] = {
         id(item): images for item, images in samples[:HERO_ROWS]
@@ -135,17 +135,16 @@ def render_page(
         "results": results,
         "about": first_screen.about(results, date, __version__),
         "purpose": _lede(results),
+        "caution": first_screen.caution(results),
         "facts": list(results.facts) or ([] if cards else sentences.summary_lines(results)),
         "cards": cards,
         "row_labels": [wanted.label for wanted in samples[0][1]] if samples else [],
         "sheets": sheets(results),
         "tables": tables,
-        "columns": columns,
-        "verdict": first_screen.verdict(columns, controls),
-        "controls": controls,
+        "verdict": study_tables.lay(columns, controls),
         "folded": len(tables) > 1,
         "reading": first_screen.annotated(tables),
-        "heats": heat_tables(results.scores),
+        "heats": heat_tables(study_tables.scores_of_methods(results)),
         "settings": settings_of(results),
         "citations": CITATIONS,
         "style": Markup(_template("style.css")),
@@ -334,8 +333,8 @@ def environment() -> Environment:
         "READING": first_screen.READING,
         "like_rows": _like_rows,
         "open_claims": OPEN_CLAIMS,
+        "digits_of": digits_of,
         "verdict_marks": study_tables.MARKS,
-        "best_of_column": study_tables.BEST_OF_COLUMN,
     }
     for module in (audits, curves, first_screen, plots, sentences, study_tables):
         functions |= {k: v for k, v in vars(module).items() if callable(v)}
@@ -349,7 +348,6 @@ def environment() -> Environment:
         plain=plain,
         unbroken=_unbroken,
         sentence=sentence,
-        confidence=confidence,
     )
     return env
 

@@ -179,28 +179,29 @@ def audit_line(audit: Audit) -> str:
 
 
 def purpose(results: Results) -> str:
-    """Return one sentence that says what the page is."""
+    """Return the question that the page answers."""
     parts: list[str] = []
     families = {family_of(score.metric).title for score in results.scores}
     probed = families and not results.gallery and families <= {"Recognition", "Retrieval"}
     if "Captions" in families:
-        parts.append("what captions give away about their labels, and whether they can be used")
+        parts.append("what do captions give away about their labels, and can they be used")
     elif results.strips or probed:
         parts.append(
-            "what an encoder's embeddings know of a sample: its class, its text, its image"
+            "what do an encoder's embeddings know of a sample: its class, its text, its image"
         )
     elif results.gallery or results.scores:
-        parts.append("how close tactile images generated from photos come to real ones")
+        parts.append("how close do tactile images generated from photos come to real ones")
     if results.audits:
-        parts.append("whether the split behind the numbers leaks from train into test")
+        parts.append("does the split leak from train into test")
     if results.claims:
-        parts.append("which claims hold on these data")
+        parts.append("which claims hold")
     if not parts and (results.tables or results.curves):
-        parts.append("what a study measured")
+        parts.append("what did a study measure")
     if not parts:
         return "Results of palpate; nothing has been measured yet."
     *others, last = parts
-    return f"What this page shows: {', '.join(others)}{', and ' * bool(others)}{last}."
+    question = f"{', '.join(others)}{', and ' * bool(others)}{last}?"
+    return question[:1].upper() + question[1:]
 
 
 def score_line(scores: Sequence[Score]) -> str:

@@ -1,28 +1,38 @@
-"""Tables, curves and claims of a study, laid out: what every front end writes of them.
+"""Tables, laid out: what every front end writes of the scores, tables and curves of results.
 
-The best of a column is marked by value alone, among the rows that are no controls; where a score
-has no better direction, the one closest to its floor.
+A :class:`Sheet` comes from a table of a study (:func:`sheet`), from scores (:func:`lay`,
+:func:`score_sheets`) or from a curve. The best of a column is marked by value alone, among the rows
+that are no controls; a dagger marks the one that paired differences decide for.
 """
 
 from __future__ import annotations
 
 import re
 from collections import Counter
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass, replace
 from itertools import count
 
 from palpate.core import Note, Score
 from palpate.core.score import ARROWS, BETTER
-from palpate.report.notes import decimals
+from palpate.report.notes import confidence, digits_of, number, p_text
 from palpate.report.results import Results
 from palpate.report.study import Claim, Curve, StudyTable
-from palpate.report.tables import Footnotes, defined
+from palpate.report.tables import (
+    BASELINES,
+    BEST,
+    DECIDED,
+    REAL,
+    Cell,
+    Column,
+    Footnotes,
+    Table,
+    best_by_value,
+    notes_of,
+)
 
 #: Verdict -> the mark before its word, for those who do not see colors.
 MARKS = {"holds": "✓", "does not hold": "✗", "undecided": "?"}
-#: What the marks of a table mean.
-BEST_OF_COLUMN = "best of its column by value alone, controls aside"
 _ARROW = re.compile("[↑↓→]")
 
 
@@ -30,13 +40,14 @@ _ARROW = re.compile("[↑↓→]")
 class Head:
     """One column: label and better direction ('' where none is shown); whether it holds scores.
 
-    One that is empty is among the scores.
+    One that is empty is among the scores. ``below`` is what all its scores share, say their n.
     """
 
     label: str
     arrow: str
     better: str
     scores: bool
+    below: str = ""
 
 
 @dataclass(frozen=True)
@@ -48,12 +59,16 @@ class Entry:
         digits: decimals of value and interval.
         best: the best of its column.
         footnotes: numbers, from 1, of its notes below the table.
+        decided: paired differences decide for it.
+        below: lines under the interval: p-value, null band, size.
     """
 
     value: Score | str | None
     digits: int = 0
     best: bool = False
     footnotes: Sequence[int] = ()
+    decided: bool = False
+    below: Sequence[str] = ()
 
     @property
     def score(self) -> Score | None:
@@ -72,7 +87,7 @@ class Row:
 
 @dataclass(frozen=True)
 class Sheet:
-    """A table of a study as it is written.
+    """A table as it is written.
 
     Attributes:
         title, text, folded: of the table.
@@ -80,6 +95,7 @@ class Sheet:
         rows: as many entries each as there are heads.
         notes: the footnotes.
         made: (what, how) the scores were made.
+        strips: whether a page draws each score on the axis of its column.
     """
 
     title: str
@@ -88,12 +104,19 @@ class Sheet:
     heads: Sequence[Head]
     rows: Sequence[Row]
     notes: Sequence[Note]
-    made: Sequence[tuple[str, str]]
+    made: Sequence[tuple[str, str]] = ()
+    strips: bool = False
 
-    @property
-    def has_best(self) -> bool:
-        """Whether any cell is marked."""
-        return any(cell.best for row in self.rows for cell in row.cells)
+    def column(self, k: int) -> list[Score]:
+        """The scores of a column."""
+        return [score for row in self.rows if (score := row.cells[k].score) is not None]
+
+    def marks(self, best: str) -> list[str]:
+        """What the marks mean, where there are any; ``best`` is how the best is marked."""
+        cells = [cell for row in self.rows for cell in row.cells]
+        known = {f"{best} {BEST}": any(cell.best for cell in cells)}
+        known[f"† {DECIDED}"] = any(cell.decided for cell in cells)
+        return [text for text, shown in known.items() if shown]
 
 
 def sheets(results: Results) -> list[Sheet]:
@@ -106,6 +129,16 @@ def controls_of(results: Results) -> set[str]:
     return {name for table in results.tables for name in table.controls}
 
 
+def scores_of_methods(results: Results) -> list[Score]:
+    """Return the scores of methods: without controls, and of several presets the first."""
+    controls = {REAL, *controls_of(results)}
+    first: dict[tuple[str, str], Score] = {}
+    for score in results.scores:
+        if score.subject not in controls:
+            first.setdefault((score.metric, score.subject), score)
+    return [*first.values()]
+
+
 def sheet(table: StudyTable) -> Sheet:
     """Return a table with its digits, directions, best marks and footnotes."""
     footnotes = Footnotes()
@@ -115,7 +148,7 @@ def sheet(table: StudyTable) -> Sheet:
     columns = [[row[k] for row in rows] for k in range(width)]
     digits = [_digits(column) for column in columns]
     best = [
-        _best(column, controls, places) if table.best else set()
+        _best(column, controls, places) if table.best else set[int]()
         for column, places in zip(columns, digits, strict=True)
     ]
     laid: list[Row] = []
@@ -128,11 +161,117 @@ def sheet(table: StudyTable) -> Sheet:
         ]
         laid.append(Row(cells, control, r > 0 and control != controls[r - 1]))
     heads = [
-        _head(label, column, table.best)
+        _head(label, column, table.best or bool(table.controls))
         for label, column in zip(_different(table.columns), columns, strict=True)
     ]
     made = _made([value for row in rows for value in row if isinstance(value, Score)])
     return Sheet(table.title, table.text, table.folded, heads, laid, footnotes.notes, made)
+
+
+def lay(columns: Sequence[Column], controls: Collection[str] = ()) -> Sheet:
+    """Return columns of scores as a table with a row a subject; the last is of real images.
+
+    The best of a column is marked among those that compete and are no ``controls``.
+    """
+    footnotes = Footnotes()
+    subjects = list(dict.fromkeys(c.score.subject for column in columns for c in column.cells))
+    subjects.sort(key=lambda subject: (subject == REAL, subject in controls))
+    best: set[int] = set()
+    for column in columns:
+        free = (c.competes and c.score.subject not in controls for c in column.cells)
+        scores = [c.score if f else None for c, f in zip(column.cells, free, strict=True)]
+        best |= {id(column.cells[k]) for k in best_by_value(scores, column.digits)}
+    rows: list[Row] = []
+    for subject in subjects:
+        cells = [[c for c in column.cells if c.score.subject == subject] for column in columns]
+        control = subject in controls
+        for k in range(max(map(len, cells))):  # several where seeds differ
+            entries = [Entry(subject)]
+            for column, several in zip(columns, cells, strict=True):
+                cell = several[k] if k < len(several) else None
+                entries.append(
+                    _entry(cell, column, footnotes, cell is not None and id(cell) in best)
+                )
+            rows.append(Row(entries, control, bool(rows) and control != rows[-1].control))
+    heads = [Head("", "", "", False)]
+    heads += [Head(c.metric, c.arrow, c.better, True) for c in columns]
+    floors = [
+        ""
+        if (floor := next((c.score.floor for c in column.cells), None)) is None
+        else number(floor, column.digits)
+        for column in columns
+    ]
+    if any(floors):
+        known = rows.pop().cells[1:] if REAL in subjects else [Entry(None)] * len(columns)
+        cells = [
+            Entry(text) if entry.score is None and text else entry
+            for text, entry in zip(floors, known, strict=True)
+        ]
+        rule = bool(rows) and rows[-1].control
+        rows.append(Row([Entry("real images (floor)"), *cells], False, rule))
+    return Sheet("The verdict", "", False, heads, rows, footnotes.notes)
+
+
+def _entry(cell: Cell | None, column: Column, footnotes: Footnotes, best: bool) -> Entry:
+    if cell is None:
+        return Entry(None)
+    numbers = footnotes.numbers(notes_of(cell.score))
+    return Entry(cell.score, column.digits, best, numbers, cell.decided)
+
+
+def score_sheets(table: Table) -> list[Sheet]:
+    """Return the scores of one family with all that is known of them, and their differences."""
+    laid = lay(table.columns)
+    below = {id(c.score): _below(c, column) for column in table.columns for c in column.cells}
+    rows = [
+        replace(row, cells=[replace(e, below=below.get(id(e.score), ())) for e in row.cells])
+        for row in laid.rows
+    ]
+    for name in BASELINES:
+        known = [
+            next((v for c in column.cells if (v := c.baselines.get(name)) is not None), None)
+            for column in table.columns
+        ]
+        texts = [
+            None if v is None else number(v, column.digits)
+            for v, column in zip(known, table.columns, strict=True)
+        ]
+        if any(texts):
+            rows.append(Row([Entry(name), *map(Entry, texts)], False, False))
+    heads = [
+        laid.heads[0],
+        *(
+            replace(head, label=column.label, below=column.size)
+            for head, column in zip(laid.heads[1:], table.columns, strict=True)
+        ),
+    ]
+    found = replace(
+        laid, title=table.title, text=table.question, heads=heads, rows=rows, strips=True
+    )
+    return [found] * bool(table.columns) + [difference_sheet(table)] * bool(table.differences)
+
+
+def _below(cell: Cell, column: Column) -> list[str]:
+    p, null = p_text(cell.p_value), cell.score.null or ()
+    lines = [f"p {p}" if p.startswith("<") else f"p = {p}"] if p else []
+    lines += [f"null {' to '.join(number(v, column.digits) for v in null)}"] if null else []
+    return lines + [cell.size] * bool(cell.size)
+
+
+def difference_sheet(table: Table) -> Sheet:
+    """Return the paired differences of a family, a row each."""
+    footnotes = Footnotes()
+    labels = ("metric", "a", "b", "a - b", "a better", "Holm p")
+    heads = [Head(label, "", "", k > 2) for k, label in enumerate(labels)]
+    rows: list[Row] = []
+    for d in table.differences:
+        words = ["" if d.confidence is None else confidence(d.confidence), p_text(d.p)]
+        score = Entry(d.score, d.digits, footnotes=footnotes.numbers(notes_of(d.score)))
+        names = map(Entry, (f"{d.metric} {d.arrow}", d.a, d.b))
+        rows.append(Row([*names, score, *map(Entry, words)], False, False))
+    text = "a - b; where the interval excludes 0 the difference is more than chance."
+    title = f"Paired differences: {table.title}"
+    return Sheet(title, text, False, heads, rows, footnotes.notes)
 
 
 def curve_table(curve: Curve) -> StudyTable:
@@ -189,11 +328,6 @@ def file_names(kind: str, titles: Sequence[str]) -> list[str]:
     return names
 
 
-def evidence_digits(claim: Claim) -> list[int]:
-    """Return the decimals of each score of a claim's evidence: equal ones for equal metrics."""
-    return _digits(claim.evidence)
-
-
 def _different(labels: Sequence[str]) -> list[str]:
     """Labels of which none is another's; a repeated one is numbered."""
     seen: Counter[str] = Counter()
@@ -210,23 +344,15 @@ def _digits(column: Sequence[Score | str | None]) -> list[int]:
     for score in column:
         if isinstance(score, Score):
             by_metric.setdefault(score.metric, []).append(score)
-    digits = {metric: _digits_of(scores) for metric, scores in by_metric.items()}
+    digits = {metric: digits_of(scores) for metric, scores in by_metric.items()}
     return [digits[s.metric] if isinstance(s, Score) else 0 for s in column]
 
 
-def _digits_of(scores: Sequence[Score]) -> int:
-    """Decimals of the scores of one metric; none of ranks and counts."""
-    values = [float(s) for s in scores if defined(s)]
-    bounds = [v for s in scores for v in s.interval or ()]
-    if not bounds and max(values, default=0) > 1 and all(v == round(v) for v in values):
-        return 0
-    return decimals([*values, *bounds])
-
-
-def _head(label: str, column: Sequence[Score | str | None], best: bool) -> Head:
+def _head(label: str, column: Sequence[Score | str | None], compared: bool) -> Head:
     scores = [value for value in column if isinstance(value, Score)]
     directions = {score.higher_is_better for score in scores}
-    shown = best and len(directions) == 1 and not _ARROW.search(label)
+    shown = compared and len(directions) == 1 and not _ARROW.search(label)
+    shown = shown and (None not in directions or any(s.floor is not None for s in scores))
     direction = scores[0].higher_is_better if shown else None
     words = (ARROWS[direction], BETTER[direction]) if shown else ("", "")
     return Head(label, *words, bool(scores) or not any(column))
@@ -235,24 +361,11 @@ def _head(label: str, column: Sequence[Score | str | None], best: bool) -> Head:
 def _best(
     column: Sequence[Score | str | None], controls: Sequence[bool], digits: Sequence[int]
 ) -> set[int]:
-    """The rows with the best score as it is written; none where fewer than two compete."""
-    competing = {
-        k: value
-        for k, (value, control) in enumerate(zip(column, controls, strict=True))
-        if isinstance(value, Score) and not control and defined(value)
-    }
-    directions = {score.higher_is_better for score in competing.values()}
-    floors = [score.floor for score in competing.values()]
-    if len(competing) < 2 or len(directions) > 1 or (None in directions and None in floors):
-        return set()
-    keys: dict[bool | None, Callable[[Score], float]] = {
-        True: lambda s: -float(s),
-        False: float,
-        None: lambda s: abs(float(s) - float(s.floor or 0)),
-    }
-    key = keys[next(iter(directions))]
-    written = {k: round(key(score), digits[k]) for k, score in competing.items()}
-    return {k for k, value in written.items() if value == min(written.values())}
+    competing = [
+        value if isinstance(value, Score) and not control else None
+        for value, control in zip(column, controls, strict=True)
+    ]
+    return best_by_value(competing, max(digits))
 
 
 def _made(scores: Sequence[Score]) -> list[tuple[str, str]]:

@@ -16,7 +16,7 @@ from typing import Any
 
 from palpate.core import Note, Score, columns, plain, short
 from palpate.core.score import ARROWS, BETTER
-from palpate.report.notes import decimals, number
+from palpate.report.notes import decimals, digits_of, number
 from palpate.report.results import Results
 
 #: What the name of a metric ends in where the score is the difference of two generators.
@@ -88,10 +88,13 @@ FAMILIES = (
 )
 #: Column of a baseline -> its key in the details of a score.
 BASELINES = {"no contact": "empty", "chance": "chance", "majority": "majority"}
-BEST = (
+BEST = "best of its column by value alone, controls aside"
+DECIDED = (
     "better than every other one compared (metrics without reference: closer to the floor) by a "
     "paired difference whose interval excludes 0"
 )
+#: Subject of real images.
+REAL = "real"
 #: What the cells of a matrix are.
 DIVERGENCE = (
     "Row against column; the diagonal compares two halves of one class. Stronger color: farther "
@@ -118,13 +121,18 @@ class Cell:
         score: the score.
         footnotes: numbers, from 1, of its notes below the table.
         size: ``"n = 240"``; '' where the whole column shares it.
-        best: better than every other generator by a paired difference that is decided.
+        best: the best of its column, by value (:func:`best_by_value`).
+        decided: better than every other one by a paired difference that is decided.
+        competes: whether it can be the best: where there are differences, whether it has one, else
+            whether it is not of real images.
     """
 
     score: Score
     footnotes: Sequence[int]
     size: str = ""
     best: bool = False
+    decided: bool = False
+    competes: bool = True
 
     @property
     def defined(self) -> bool:
@@ -184,7 +192,7 @@ class Difference:
     """A paired difference of two generators, a - b: one row below the scores.
 
     Attributes:
-        metric: of the two scores.
+        score: the difference; metric: of the two scores.
         arrow: its better direction.
         a, b: the generators.
         confidence: that a is better, in [0, 1], or None.
@@ -192,7 +200,7 @@ class Difference:
         digits: decimals of value and interval.
     """
 
-    cell: Cell
+    score: Score
     metric: str
     arrow: str
     a: str
@@ -241,8 +249,8 @@ class Heat:
 
 
 def defined(score: Score) -> bool:
-    """Return whether a score has a finite value."""
-    return score.value is not None and math.isfinite(score.value)
+    """Return whether a score has a value."""
+    return score.value is not None
 
 
 def family_of(metric: str) -> Family:
@@ -356,39 +364,46 @@ def _table(title: str, question: str, scores: Sequence[Score]) -> Table:
     for metric, column in columns(members).items():
         sizes = [_size(score) for score in column]
         shared = sizes[0] if len(set(sizes)) == 1 else ""
-        best = best_of(column, differences)
+        digits, winner = digits_of(column), best_of(column, differences)
+        names = {name for d in differences for name in (d.details["a"], d.details["b"])}
+        competes = [s.subject in names if names else s.subject != REAL for s in column]
+        best = best_by_value(
+            [s if c else None for s, c in zip(column, competes, strict=True)], digits
+        )
         cells = [
             Cell(
                 score,
                 footnotes.numbers(notes_of(score)),
                 "" if shared else size,
-                score.subject == best,
+                k in best,
+                score.subject == winner,
+                competes[k],
             )
-            for score, size in zip(column, sizes, strict=True)
+            for k, (score, size) in enumerate(zip(column, sizes, strict=True))
         ]
         features = _features(metric)
         label = metric.removesuffix(f" ({features})") if features else metric
-        direction, digits = column[0].higher_is_better, _digits(column)
+        direction = column[0].higher_is_better
         heads.append(Column(metric, label, direction, digits, shared, _made(column), cells))
     columns(differences)
-    rows = [_difference(score, footnotes) for score in differences if defined(score)]
+    rows = [_difference(score) for score in differences if defined(score)]
     shared = [fact for fact in heads[0].made if all(fact in h.made for h in heads)] if heads else []
     heads = [replace(h, made=[fact for fact in h.made if fact not in shared]) for h in heads]
     subjects = list(dict.fromkeys(score.subject for score in members))
     return Table(title, question, heads, subjects, rows, footnotes.notes, shared)
 
 
-def _difference(score: Score, footnotes: Footnotes) -> Difference:
+def _difference(score: Score) -> Difference:
     details = score.details
     return Difference(
-        Cell(score, footnotes.numbers(notes_of(score))),
+        score,
         score.metric.removesuffix(DIFFERENCE),
         ARROWS[score.higher_is_better],
         str(details["a"]),
         str(details["b"]),
         details.get("p_better"),
         details.get("p_adjusted"),
-        _digits([score]),
+        digits_of([score]),
     )
 
 
@@ -419,11 +434,6 @@ def _ranking(differences: Sequence[Difference]) -> str:
     return names[0] + "".join(steps) if known else ""
 
 
-def _digits(scores: Sequence[Score]) -> int:
-    values = (v for s in scores for v in (s.value, s.floor, *(s.interval or ())))
-    return decimals([v for v in values if v is not None])
-
-
 def _size(score: Score) -> str:
     sizes = {"n": score.n or None, "m": score.m}
     return ", ".join(f"{name} = {value:,}" for name, value in sizes.items() if value is not None)
@@ -443,6 +453,33 @@ def best_of(column: Sequence[Score], differences: Sequence[Score]) -> str | None
                 won = bool(d.details.get("decided")) and d.details.get("better") == name
                 wins[name] = wins.get(name, True) and won
     return next((name for name, won in wins.items() if won), None)
+
+
+def best_by_value(column: Sequence[Score | None], digits: int) -> set[int]:
+    """Return the places of the best scores as they are written, by the direction of the metric.
+
+    None where fewer than two compete. A score does not compete that is None, undefined, or a ratio
+    whose denominators are not known (``unstable-denominators``); without a direction, also one
+    without a floor.
+    """
+    competing = {
+        k: score
+        for k, score in enumerate(column)
+        if score is not None
+        and defined(score)
+        and not (score.higher_is_better is None and score.floor is None)
+        and all(note.code != "unstable-denominators" for note in score.notes)
+    }
+    directions = {score.higher_is_better for score in competing.values()}
+    if len(competing) < 2 or len(directions) > 1:
+        return set()
+    worth: dict[int, float] = {}
+    for k, score in competing.items():
+        written = round(float(score), digits)
+        distance = abs(written - round(score.floor or 0.0, digits))
+        worth[k] = {True: -written, False: written, None: distance}[score.higher_is_better]
+    least = min(worth.values()) + 0.5 * 10**-digits
+    return {k for k, value in worth.items() if value < least}
 
 
 def _made(column: Sequence[Score]) -> list[tuple[str, str]]:
@@ -495,10 +532,12 @@ def heat_tables(scores: Sequence[Score]) -> list[Heat]:
         values = [abs(v) for row in matrix for v in row if v is not None]
         digits, top = min(3, decimals(values)), max(values, default=0.0) or 1.0
         parts = [score.metric, score.subject, str(score.settings.get("preset", ""))]
-        parts += [f"reference {short(score.reference)}"] if score.reference else []
+        title = ", ".join(filter(None, parts))
+        if any(title == table.title for table in tables) and score.reference:
+            title += f", reference {short(score.reference)}"
         tables.append(
             Heat(
-                ", ".join(filter(None, parts)),
+                title,
                 CONFUSION if "accuracy" in score.metric else DIVERGENCE,
                 [str(name) for name in names],
                 [[number(v, digits) for v in row] for row in matrix],

@@ -10,8 +10,17 @@ from rich.console import Console
 from rich.table import Table as Grid
 from rich.text import Text
 
-from palpate.core import Score
-from palpate.report.notes import COMMAND_LINE, PYTHON, Style, confidence, count, percent, sentence
+from palpate.core import Note, Score
+from palpate.report.notes import (
+    COMMAND_LINE,
+    PYTHON,
+    Style,
+    count,
+    number,
+    p_text,
+    percent,
+    sentence,
+)
 from palpate.report.results import Audit, Results
 from palpate.report.sentences import (
     audit_line,
@@ -21,8 +30,8 @@ from palpate.report.sentences import (
     threshold_text,
 )
 from palpate.report.study import Claim
-from palpate.report.study_tables import BEST_OF_COLUMN, Entry, Sheet, curve_table, sheet, tally
-from palpate.report.tables import BASELINES, BEST, Cell, Table, defined, rankings, score_tables
+from palpate.report.study_tables import Entry, Sheet, curve_table, difference_sheet, sheet, tally
+from palpate.report.tables import BASELINES, BEST, DECIDED, Table, defined, rankings, score_tables
 
 #: Columns that are text; all others are numbers, flush right.
 NAMES = ("metric", "subject", "a", "b", "notes", "best first")
@@ -53,21 +62,29 @@ def _print_scores(scores: Sequence[Score], console: Console, style: Style) -> No
     for table in score_tables(scores):
         console.print(Text(table.title, "bold"))
         _print_rows(score_rows(table), console)
-        marked = [cell for column in table.columns for cell in column.cells]
+        _print_lines([*marks_of(table), *_notes(table.notes, style)], console)
         if ranked := rankings(table):
             console.print(Text(RANKED, "bold"))
             _print_rows([{"metric": m, "best first": order} for m, order in ranked], console)
         elif table.differences:
-            marked += [d.cell for d in table.differences]
-            console.print(Text("Paired differences, a - b", "bold"))
-            _print_rows(difference_rows(table), console)
-        notes = {k: table.notes[k - 1] for cell in marked for k in cell.footnotes}
-        lines = [f"({k}) {sentence(note, style)}" for k, note in sorted(notes.items())]
-        if any(cell.best for column in table.columns for cell in column.cells):
-            lines.insert(0, f"* {BEST}")
-        for line in lines:
-            console.print(Text(line), soft_wrap=True)
+            _print_sheet(difference_sheet(table), console, style)
         console.print()
+
+
+def marks_of(table: Table) -> list[str]:
+    """What the marks of the rows of scores mean."""
+    cells = [cell for column in table.columns for cell in column.cells]
+    known = {f"* {BEST}": any(c.best for c in cells), f"† {DECIDED}": any(c.decided for c in cells)}
+    return [text for text, shown in known.items() if shown]
+
+
+def _notes(notes: Sequence[Note], style: Style) -> list[str]:
+    return [f"({k}) {sentence(note, style)}" for k, note in enumerate(notes, 1)]
+
+
+def _print_lines(lines: Sequence[str], console: Console) -> None:
+    for line in lines:
+        console.print(Text(line), soft_wrap=True)
 
 
 def as_text(result: Results | Audit, width: int = 140) -> str:
@@ -83,34 +100,19 @@ def score_rows(table: Table) -> list[dict[str, str]]:
         {
             "metric": f"{column.metric} {column.arrow}",
             "subject": cell.score.subject,
-            "value": _number(cell.score.value, column.digits) + (" *" if cell.best else ""),
+            "value": _number(cell.score.value, column.digits)
+            + " *" * cell.best
+            + " †" * cell.decided,
             "95 % interval": _pair(cell.score.interval, column.digits),
             "null": _pair(cell.score.null, column.digits),
-            "p": _p(cell.p_value),
+            "p": p_text(cell.p_value),
             "floor": _number(cell.score.floor, column.digits, ""),
             **{name: _number(cell.baselines.get(name), column.digits, "") for name in BASELINES},
             "n": count(cell.score.n) if cell.score.n else "",
-            "notes": _marks(cell),
+            "notes": " ".join(f"({k})" for k in cell.footnotes),
         }
         for column in table.columns
         for cell in column.cells
-    ]
-
-
-def difference_rows(table: Table) -> list[dict[str, str]]:
-    """Return the paired differences of a table, a row each."""
-    return [
-        {
-            "metric": f"{d.metric} {d.arrow}",
-            "a": d.a,
-            "b": d.b,
-            "a - b": _number(d.cell.score.value, d.digits),
-            "95 % interval": _pair(d.cell.score.interval, d.digits),
-            "a better": "" if d.confidence is None else confidence(d.confidence),
-            "Holm p": _p(d.p),
-            "notes": _marks(d.cell),
-        }
-        for d in table.differences
     ]
 
 
@@ -134,11 +136,9 @@ def sheet_words(table: Sheet) -> list[str]:
 def _entry(cell: Entry) -> str:
     if cell.score is None:
         return cell.value if isinstance(cell.value, str) else ""
-    parts = ["undefined"]
-    if defined(cell.score):
-        interval = _pair(cell.score.interval, cell.digits)
-        parts = [_number(cell.score.value, cell.digits), interval]
-    marks = ["*"] * cell.best + [f"({k})" for k in cell.footnotes]
+    parts = [_number(cell.score.value, cell.digits)]
+    parts += [_pair(cell.score.interval, cell.digits)] * defined(cell.score)
+    marks = ["*"] * cell.best + ["†"] * cell.decided + [f"({k})" for k in cell.footnotes]
     return " ".join(filter(None, [*parts, *marks]))
 
 
@@ -147,10 +147,7 @@ def _print_sheet(table: Sheet, console: Console, style: Style) -> None:
     words = sheet_words(table)
     for rows in _blocks(sheet_rows(table), words, console.width):
         _print_rows(rows, console, words)
-    lines = [f"* {BEST_OF_COLUMN}"] * table.has_best
-    lines += [f"({k}) {sentence(note, style)}" for k, note in enumerate(table.notes, 1)]
-    for line in lines:
-        console.print(Text(line), soft_wrap=True)
+    _print_lines([*table.marks("*"), *_notes(table.notes, style)], console)
     console.print()
 
 
@@ -208,21 +205,13 @@ def _print_rows(
                 console.print(Text(f"  {name}: {row[name]}"), soft_wrap=True)
 
 
-def _marks(cell: Cell) -> str:
-    return " ".join(f"({k})" for k in cell.footnotes)
-
-
 def _number(value: float | None, digits: int, none: str = "undefined") -> str:
     # An ASCII minus: not every terminal has the true one.
-    return none if value is None else f"{value:z.{digits}f}"
+    return none if value is None else number(value, digits).replace("−", "-")
 
 
 def _pair(pair: tuple[float, float] | None, digits: int) -> str:
     return "" if pair is None else f"[{_number(pair[0], digits)}, {_number(pair[1], digits)}]"
-
-
-def _p(p: float | None) -> str:
-    return "" if p is None else "< 1e-15" if p < 1e-15 else f"{p:.3g}"
 
 
 def audit_text(audit: Audit, style: Style = PYTHON) -> str:
@@ -252,7 +241,7 @@ def audit_text(audit: Audit, style: Style = PYTHON) -> str:
 __all__ = [
     "as_text",
     "audit_text",
-    "difference_rows",
+    "marks_of",
     "print_result",
     "score_rows",
     "sheet_rows",

@@ -16,7 +16,7 @@ import numpy as np
 from scipy import special
 
 from palpate.core import PalpateError, Score, plain
-from palpate.report.notes import decimals, number
+from palpate.report.notes import digits_of, number
 
 #: End of the metric of every difference.
 DIFFERENCE = " difference"
@@ -202,6 +202,6 @@ def in_words(score: Score) -> str:
         return "undefined"
     if score.interval is None:
         return f"{number(score.value)} (no interval)"
-    digits = decimals([score.value, *score.interval])
+    digits = digits_of([score])
     value, low, high = (number(v, digits) for v in (score.value, *score.interval))
     return f"{value} [{low}, {high}]"
