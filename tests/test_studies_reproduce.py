@@ -55,7 +55,7 @@ def test_no_shipped_model_has_seen_the_worlds():
                 world = replace(preset.world, **study.world)
                 assert isinstance(world, WorldOptions)
                 assert world.seed not in MINI_SEEDS
-    seen = replace(WORLD, world={**(WORLD.world or {}), "seed": MINI_SEEDS[0]})
+    seen = replace(WORLD, name="seen", world={**(WORLD.world or {}), "seed": MINI_SEEDS[0]})
     with pytest.raises(PalpateError, match="must be one that no shipped model saw"):
         plan_of(seen)
 
@@ -97,7 +97,7 @@ def test_other_weights_under_one_name_build_what_reads_them(tmp_path):
     shutil.copytree(shipped_folder("palpate/mini", "clip"), clip)
     own = Method("mine", "", make=controls.mean_image)
     smoke = replace(WORLD.presets["smoke"], clip=str(clip))
-    study = replace(WORLD, methods=[*WORLD.methods, own], presets={"smoke": smoke})
+    study = replace(WORLD, name="mine", methods=[*WORLD.methods, own], presets={"smoke": smoke})
     before = digests(study)
     weights = clip / "model.safetensors"
     weights.write_bytes(weights.read_bytes()[:-1] + b"x")
@@ -127,7 +127,7 @@ def brighter(by):
 
 
 def made_by(make):
-    study = replace(WORLD, methods=[METHODS[OURS], Method("mine", "", make=make)])
+    study = replace(WORLD, name="mine", methods=[METHODS[OURS], Method("mine", "", make=make)])
     return digests(study)["images-mine-NoLeak-0"]
 
 
@@ -151,7 +151,7 @@ def test_a_function_without_source_is_refused(make):
 
 def test_a_method_of_your_own_trains_nothing():
     mine = Method("mine", "", make=controls.mean_image)
-    study = replace(WORLD, methods=[METHODS[OURS], mine])
+    study = replace(WORLD, name="mine", methods=[METHODS[OURS], mine])
     nodes = {n.name: n for n in nodes_of(plan_of(study, preset="smoke"))}
     assert "images-mine-NoLeak-0" in nodes
     assert "mine-NoLeak-0" not in nodes
@@ -188,6 +188,11 @@ def test_mistakes_are_reported_in_one_line(args, words, capsys, tmp_path, monkey
     lines = capsys.readouterr().err.splitlines()
     assert words in lines[0]
     assert not (tmp_path / "r").exists()
+
+
+def test_another_study_has_another_name():
+    with pytest.raises(PalpateError, match="must have a name of its own"):
+        plan_of(replace(WORLD, methods=WORLD.methods[:1]))
 
 
 def test_a_study_on_disk_needs_a_root(small_manifest, tmp_path):

@@ -10,8 +10,8 @@ import pytest
 from PIL import Image
 
 from palpate.cli import main
-from palpate.core import Score, read_json, write_json
-from palpate.report.results import Results
+from palpate.core import Note, SampleRef, Score, read_json, write_json
+from palpate.report.results import GalleryItem, Results
 from palpate.report.study import Claim, Curve, Line, StudyTable
 from palpate.studies import study as studies
 from palpate.studies.methods import METHODS, OURS
@@ -19,8 +19,11 @@ from palpate.studies.reproduce import plan_of, run_study
 from palpate.studies.stages import Run
 from palpate.studies.study import NOLEAK, STUDIES
 from palpate.studies.verifying import verify
+from palpate.studies.verifying_runs import Remade, _settings_checks
 
-SCORE = Score("TMMD", "Ours", 1.25, n=8, details={"stage": "results"})
+SCORE = Score(
+    "TMMD", "Ours", 1.25, n=8, details={"stage": "results"}, notes=[Note("synthetic-data")]
+)
 
 
 @pytest.fixture
@@ -32,11 +35,16 @@ def forged(tmp_path) -> Path:
         (folder / "a.txt").write_text("an image")
 
     def results(folder):
-        table = StudyTable("Table 9", "", ("", "TMMD"), [("Ours", SCORE)])
+        words = ("paper", "1.37")
+        table = StudyTable(
+            "Table 9", "Of 9 videos", ("", "TMMD"), [("Ours", SCORE), words], controls=["paper"]
+        )
         curve = Curve("Curve", "", "x", "y", [Line("Ours", [(2.0, SCORE)])])
         claim = Claim("Claim", "paper", "holds", "1.25 is low", [SCORE])
         made = Results("Forged", ["Fact: 3 of 4"], scores=[SCORE], tables=[table])
-        replace(made, curves=[curve], claims=[claim]).save(folder / "results.json")
+        sample = SampleRef("s", "v", 1, "Wood", f"{folder.parent}/images/a.txt")
+        more = {"gallery": [GalleryItem(sample, None)], "notes": [Note("synthetic-data")]}
+        replace(made, curves=[curve], claims=[claim], **more).save(folder / "results.json")
 
     made = run.stage("images", {"seed": 0}, images)
     run.stage("results", {"after": {"images": made.digest}, "images": "no stage"}, results)
@@ -73,6 +81,14 @@ def test_an_unknown_study_is_checked_by_its_records_alone(forged):
         "Claim: verdict",
         "Claim: why",
         "fact Fact",
+        "Table 9: words",
+        "Curve: words",
+        "Claim: source",
+        "title",
+        "notes",
+        "gallery, s",
+        "settings: study",
+        "settings: stages",
     }
     assert checked.ok
     assert "The study must be one of" in str(checked)
@@ -88,12 +104,48 @@ def test_an_unknown_study_is_checked_by_its_records_alone(forged):
         (lambda d: d["claims"][0].update(verdict="undecided"), "Claim: verdict"),
         (lambda d: d["claims"][0].update(why="1.2 is low"), "Claim: why"),
         (lambda d: d.update(facts=["Fact: 4 of 4"]), "fact Fact"),
+        (lambda d: d["scores"][0].update(higher_is_better=True), "TMMD of Ours"),
+        (lambda d: d["scores"][0].update(interval_method="by 3 seeds"), "TMMD of Ours"),
+        (lambda d: d["scores"][0]["details"].update(p_value=1e-9), "TMMD of Ours"),
+        (lambda d: d["scores"][0]["details"].update(probe="of all"), "TMMD of Ours"),
+        (lambda d: d["scores"][0].update(notes=[]), "TMMD of Ours"),
+        (lambda d: d["tables"][0]["rows"][0][1].update(subject="mine"), "Table 9: Ours, TMMD"),
+        (lambda d: d["tables"][0].update(text="Of 8 videos"), "Table 9: words"),
+        (lambda d: d["tables"][0].update(controls=[]), "Table 9: words"),
+        (lambda d: d["tables"][0]["rows"][1].__setitem__(1, "1.38"), "Table 9: words"),
+        (lambda d: d["curves"][0].update(text="gains"), "Curve: words"),
+        (lambda d: d["curves"][0].update(log_x=True), "Curve: words"),
+        (lambda d: d["claims"][0].update(source="ours"), "Claim: source"),
+        (lambda d: d.update(notes=[]), "notes"),
+        (lambda d: d.update(title="Real data"), "title"),
+        (lambda d: d["gallery"][0]["sample"].update(vision="images/b.txt"), "gallery, s"),
+        (lambda d: d["gallery"][0]["sample"].update(material="Sand"), "gallery, s"),
+        (lambda d: d.update(gallery=[]), "gallery, s"),
         (lambda d: d["settings"]["stages"]["images"].update(outputs="0" * 64), "stage images"),
     ],
 )
 def test_an_edit_by_hand_is_named(forged, change, name):
     edit(forged, change)
     assert list(differing(forged)) == [name]
+
+
+def test_an_edited_setting_is_named():
+    known = {"digests": {"manifest": "a"}, "options": {"steps of a method": 5}, "machine": "m"}
+    known |= {"stages": {"data": {}}, "versions": {"torch": "2.6"}}
+    made = Remade(Results("", settings=known))
+    assert {c.status for c in _settings_checks(Results("", settings=known), made)} == {"same"}
+    for key, value in {
+        "digests": {"manifest": "b"},
+        "options": {"steps of a method": 6},
+        "machine": "another",
+        "versions": {"torch": "2.7"},
+        "stages": {},
+        "gpu": "H100",
+    }.items():
+        checks = _settings_checks(Results("", settings={**known, key: value}), made)
+        assert [c.name for c in checks if c.status == "differs"] == [f"settings: {key}"]
+    checks = _settings_checks(Results("", settings={}), made)
+    assert {c.status for c in checks} == {"differs"}
 
 
 def test_a_score_of_no_stage_is_untraced(forged):
@@ -163,9 +215,12 @@ def toy(tmp_path_factory):
     small = replace(known.presets["smoke"], steps=2, permutations=9)
     one = replace(known, name="toy", methods=[METHODS[OURS]], presets={"smoke": small})
     folder = tmp_path_factory.mktemp("toy") / "run"
+    people = folder.parent / "people.json"
+    Results("People", scores=[SCORE]).save(people)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(studies, "STUDIES", {"toy": one})
-        run_study(plan_of(one, preset="smoke"), folder)
+        run_study(plan_of(one, preset="smoke", people=people), folder)
+        people.unlink()
         yield folder
 
 
@@ -184,6 +239,7 @@ def test_a_run_that_was_moved_is_made_again_number_by_number(copied):
     names = {c.name for c in checked.checks}
     assert checked.counts["same"] == len(checked.checks) > 400
     assert {"stage scores-NoLeak-by-NoLeak-0, made again", "stage ours-NoLeak-0"} <= names
+    assert {"settings: digests", "settings: options", "settings: machine"} <= names
     assert not (copied / ".verify").exists()
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -96,6 +97,8 @@ def collect(
         claims=[replace(c, evidence=[stamped(s, stage) for s in c.evidence]) for c in claims],
     )
     results.save(place / "results.json")
+    if people is not None:  # ``palpate verify`` reads it again
+        shutil.copyfile(people, place / "people.json")
     return {"tables": len(tables), "claims": len(claims), "scores": len(results.scores)}
 
 

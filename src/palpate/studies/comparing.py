@@ -2,7 +2,7 @@
 
 Numbers agree if ``|a - b| <= tolerance * max(|a|, |b|, scale / 1e6)``: relative, but for values
 near zero, which are differences of sums of the size of the scale. Words, counts and digests agree
-if they are equal. Notes, times and versions are no numbers.
+if they are equal. Times, and the version and stage that a score was made in, are not compared.
 """
 
 from __future__ import annotations
@@ -20,8 +20,6 @@ _DIGEST = re.compile("[0-9a-f]{64}")
 TOLERANCE = 1e-6
 Status = Literal["same", "differs", "cannot check", "untraced"]
 STATUSES: tuple[Status, ...] = ("same", "differs", "cannot check", "untraced")
-#: Fields of a score that say what it is, not how large.
-_WORDS = ("metric", "subject", "notes", "details", "interval_method", "higher_is_better")
 #: Entries of details that no later run repeats.
 _PASSING = ("version", "stage", "seconds")
 #: Fields of an audit that are no numbers, or are compared on their own.
@@ -59,16 +57,10 @@ def score_name(score: Score) -> str:
 def score_difference(before: Score, after: Score, tolerance: float) -> str:
     """The first field in which two scores differ, with both values; '' where none does."""
     a, b, scale = plain(before), plain(after), abs(before.scale)
-    for name in (name for name in a if name not in _WORDS):
-        if difference := _difference(a[name], b[name], tolerance, scale, name):
-            return difference
-    for name, value in a["details"].items():
-        if name in _PASSING or not _holds_numbers(value):
-            continue
-        again = b["details"].get(name)
-        if difference := _difference(value, again, tolerance, scale, name.replace("_", " ")):
-            return difference
-    return ""
+    fields = ((name.replace("_", " "), a[name], b[name]) for name in a if name != "details")
+    details = {**a["details"], **b["details"]}.keys() - {*_PASSING}
+    parts = ((n.replace("_", " "), a["details"].get(n), b["details"].get(n)) for n in details)
+    return _first(fields, tolerance, scale) or _first(parts, tolerance, scale)
 
 
 def audit_numbers(audit: Audit, start: str = "") -> dict[str, Any]:
@@ -101,14 +93,6 @@ def number_difference(before: Any, after: Any, tolerance: float) -> str:
 def _label(row: Mapping[str, Any]) -> str:
     """What a row is of: its first words."""
     return next((str(v) for v in row.values() if isinstance(v, str)), "of no name")
-
-
-def _holds_numbers(value: Any) -> bool:
-    if isinstance(value, Mapping):
-        return any(map(_holds_numbers, value.values()))
-    if isinstance(value, list):
-        return any(map(_holds_numbers, value))
-    return isinstance(value, int | float)
 
 
 def _difference(a: Any, b: Any, tolerance: float, scale: float, name: str) -> str:

@@ -16,16 +16,12 @@ which the next model's card contains.
 from __future__ import annotations
 
 import dataclasses
-import os
-import platform
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import partial
-from importlib import metadata
 from pathlib import Path
 from typing import Any
 
-from palpate import __version__
 from palpate.core import (
     PalpateError,
     Progress,
@@ -119,7 +115,6 @@ class DemoRun:
 
     def settings(self) -> dict[str, Any]:
         """Options, digests, versions and times, for the page."""
-        packages = ("numpy", "torch", "diffusers", "transformers", "polars", "pillow")
         options = dataclasses.asdict(self.options)
         digests = {n: s.facts["digest"] for n, s in self.stages.items() if "digest" in s.facts}
         return {
@@ -133,9 +128,7 @@ class DemoRun:
                 for name, stage in self.stages.items()
             },
             "seconds": {name: round(stage.seconds, 1) for name, stage in self.stages.items()},
-            "versions": {"palpate": __version__, "python": platform.python_version()}
-            | {p: metadata.version(p) for p in packages},
-            "machine": f"{platform.machine()}, {os.cpu_count()} cores",
+            **self.stages["scores"].made_with,
         }
 
 

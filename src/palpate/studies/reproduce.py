@@ -16,16 +16,12 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import inspect
-import os
-import platform
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
-from importlib import metadata
 from itertools import product
 from pathlib import Path
 from typing import Any
 
-from palpate import __version__
 from palpate.core import PalpateError, Progress, digest_file, plain, quiet, read_json, require
 from palpate.evaluation.inputs import read as read_samples
 from palpate.report.results import Results
@@ -49,7 +45,7 @@ from palpate.studies.questions import (
     sample_in_steps,
 )
 from palpate.studies.stages import Stage
-from palpate.studies.study import NOLEAK, SPLITS, Preset, Study
+from palpate.studies.study import NOLEAK, SPLITS, STUDIES, Preset, Study
 from palpate.studies.utility import Draws
 
 #: Stages whose tables, curves and claims come after those of the paper.
@@ -98,9 +94,12 @@ def plan_of(
     """The plan of a run, checked before any work.
 
     Raises:
-        PalpateError: for an unknown preset, no seeds, a root that is missing or not wanted, or a
-            folder that is not there or has the name of a method.
+        PalpateError: for a study of another's name, an unknown preset, no seeds, a root that is
+            missing or not wanted, or a folder that is not there or has the name of a method.
     """
+    if STUDIES.get(study.name, study) != study:
+        must, got = "must have a name of its own", f"another {study.name}"
+        raise PalpateError(must, got, 'Use replace(study, name="mine", ...)', argument="study")
     names = ", ".join(study.presets)
     require(preset in study.presets, "preset", f"must be one of {names}", preset)
     once = 0 < len(seeds) == len({*seeds})
@@ -217,7 +216,7 @@ def run_study(
     folder = Path(folder)
     stages = run_graph(nodes_of(plan), folder, jobs=jobs, print_line=print_line, progress=progress)
     results = Results.load(folder / "results" / "results.json")
-    settings = {**results.settings, **_settings(plan, stages)}
+    settings = {**results.settings, **settings_of(plan, stages, jobs)}
     results = dataclasses.replace(results, settings=settings, commands=[command] if command else [])
     results.save(folder / "results.json")
     return results
@@ -456,9 +455,8 @@ def _source(function: Any) -> Any:
     return [name, *cells] if cells else name
 
 
-def _settings(plan: Plan, stages: Mapping[str, Stage]) -> dict[str, Any]:
+def settings_of(plan: Plan, stages: Mapping[str, Stage], jobs: int) -> dict[str, Any]:
     """The record of a run: what was chosen, digests, versions, machine, and every stage."""
-    packages = ("numpy", "torch", "diffusers", "transformers", "polars", "pillow")
     records = {n: read_json(s.folder / "stage.json", "stage record") for n, s in stages.items()}
     kept = ("digest", "outputs", "seconds", "peak_mb", "date")
     digests: dict[str, Any] = {"manifest": stages["data"].facts["digest"]}
@@ -466,6 +464,8 @@ def _settings(plan: Plan, stages: Mapping[str, Stage]) -> dict[str, Any]:
     for seed, split in product(plan.seeds, SPLITS):
         name = f"encoder-{split}-{seed}"
         digests[f"encoder {split} {seed}"] = stages[name].facts["digest"]
+    if plan.people is not None:
+        digests["people"] = digest_file(plan.people)
     return {
         "study": plan.study.name,
         "dataset": stages["data"].facts["dataset"],
@@ -474,12 +474,13 @@ def _settings(plan: Plan, stages: Mapping[str, Stage]) -> dict[str, Any]:
         "options": {
             "root": str(plan.root) if plan.root else None,
             "methods of others": {name: str(folder) for name, folder in plan.others.items()},
+            "people": str(plan.people) if plan.people else None,
             "steps of a method": plan.preset.steps,
+            "device": plan.device,
+            "jobs": jobs,
         },
         "digests": digests,
         "stages": {n: {k: r[k] for k in kept if k in r} for n, r in records.items()},
         "seconds": {"all stages": round(sum(s.seconds for s in stages.values()))},
-        "versions": {"palpate": __version__, "python": platform.python_version()}
-        | {p: metadata.version(p) for p in packages},
-        "machine": f"{platform.machine()}, {os.cpu_count()} cores",
+        **stages["results"].made_with,
     }

@@ -14,12 +14,15 @@ from __future__ import annotations
 
 import datetime
 import json
+import os
 import platform
 import shutil
 import sys
 import time
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field
+from importlib import metadata
 from pathlib import Path
 from typing import Any
 
@@ -41,6 +44,7 @@ class Stage:
         facts: what the builder returned.
         outputs: SHA-256 of its files.
         seconds: how long the last call of the builder took.
+        made_with: versions of packages, and the machine.
     """
 
     folder: Path
@@ -48,6 +52,7 @@ class Stage:
     facts: Mapping[str, Any]
     outputs: str
     seconds: float
+    made_with: Mapping[str, Any]
 
 
 @dataclass
@@ -110,7 +115,7 @@ def finished_stage(folder: Path, digest: str, read: Mapping[str, str]) -> Stage 
     """
     record = _record(folder / "stage.json")
     same = record.get("digest") == digest and record.get("read") == read
-    return _of_record(folder, record) if same else None
+    return stage_of(folder, record) if same else None
 
 
 def _build(
@@ -141,12 +146,12 @@ def _build(
     record["seconds"] = round(time.monotonic() - start, 2)
     record |= {"peak_mb": _peak_mb(per_stage)} | _gpu_peak()
     record["date"] = datetime.datetime.now(datetime.UTC).date().isoformat()
-    record["versions"] = {"palpate": __version__, "python": platform.python_version()}
+    record |= _made_with()
     write_json(partial / "stage.json", record)
     shutil.rmtree(final, ignore_errors=True)
     partial.replace(final)
     partial_record.unlink()
-    return _of_record(final, record)
+    return stage_of(final, record)
 
 
 def stage_outputs(folder: Path) -> str:
@@ -154,9 +159,20 @@ def stage_outputs(folder: Path) -> str:
     return digest_folder(folder, without="stage.json")
 
 
-def _of_record(folder: Path, record: Mapping[str, Any]) -> Stage:
+def stage_of(folder: Path, record: Mapping[str, Any]) -> Stage:
+    """Return the finished stage in a folder that has this record."""
     digest, facts, outputs = record["digest"], record["facts"], record["outputs"]
-    return Stage(folder, digest, facts, outputs, record["seconds"])
+    made_with = {key: record[key] for key in ("versions", "machine") if key in record}
+    return Stage(folder, digest, facts, outputs, record["seconds"], made_with)
+
+
+def _made_with() -> dict[str, Any]:
+    """Versions of what is installed, and the machine."""
+    versions = {"palpate": __version__, "python": platform.python_version()}
+    for package in ("numpy", "torch", "diffusers", "transformers", "polars", "pillow"):
+        with suppress(metadata.PackageNotFoundError):
+            versions[package] = metadata.version(package)
+    return {"versions": versions, "machine": f"{platform.machine()}, {os.cpu_count()} cores"}
 
 
 def _reset_peak() -> bool:

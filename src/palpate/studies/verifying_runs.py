@@ -12,6 +12,7 @@ import tempfile
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -26,10 +27,12 @@ from palpate.studies.comparing import (
     score_name,
 )
 from palpate.studies.graph import Node, in_order
-from palpate.studies.stages import Run, Stage, stage_digest, stage_outputs
+from palpate.studies.stages import Run, Stage, stage_digest, stage_of, stage_outputs
 
 #: The stage of a study that holds its results.
 LAST = "results"
+#: Options of a study that name places on one machine, or do not change a number.
+OF_PLACE = ("root", "methods of others", "people", "device")
 
 
 @dataclass(frozen=True)
@@ -72,7 +75,7 @@ def verify_run(
             if made.name in records:
                 checks.append(_again_check(made, folder / made.name, tolerance))
     more, others = _number_checks(results, again, tolerance)
-    return [*checks, *more], others
+    return [*checks, *_settings_checks(results, again), *more], others
 
 
 def _record(folder: Path) -> dict[str, Any]:
@@ -136,14 +139,18 @@ def _made_again(results: Results, folder: Path, place: Path, progress: Progress)
         PalpateError: if the study is not known here, or a stage cannot be made.
     """
     if "study" in results.settings:
-        _make_nodes(results.settings, folder, place, progress)
-        return Remade(Results.load(place / LAST / "results.json"))
+        settings = _make_nodes(results.settings, folder, place, progress)
+        made = Results.load(place / LAST / "results.json")
+        return Remade(replace(made, settings={**made.settings, **settings}))
     return Remade(_demo_again(results, folder, place, progress))
 
 
-def _make_nodes(settings: Mapping[str, Any], folder: Path, place: Path, progress: Progress) -> None:
+def _make_nodes(
+    settings: Mapping[str, Any], folder: Path, place: Path, progress: Progress
+) -> dict[str, Any]:
+    """Build what measures; returns the settings that such a run records."""
     from palpate.studies.making import slug
-    from palpate.studies.reproduce import nodes_of, plan_of
+    from palpate.studies.reproduce import nodes_of, plan_of, settings_of
     from palpate.studies.study import NOLEAK, STUDIES
 
     name = str(settings["study"])
@@ -152,14 +159,20 @@ def _make_nodes(settings: Mapping[str, Any], folder: Path, place: Path, progress
         raise PalpateError(must, repr(name), "Verify it where it is defined")
     options = settings["options"]
     images = lambda method: folder / f"images-{slug(method)}-{NOLEAK}" / "images"
-    plan = plan_of(  # data and images of others lie in the run folder, wherever they came from
+    plan = plan_of(  # what was given lies in the run folder, wherever it came from
         STUDIES[name],
         preset=settings["preset"],
         seeds=settings["seeds"],
         root=options["root"] and folder / "data",
         others={method: images(method) for method in options["methods of others"]},
+        people=options["people"] and folder / LAST / "people.json",
     )
-    _measure(nodes_of(plan), folder, place, progress)
+    nodes = nodes_of(plan)
+    _measure(nodes, folder, place, progress)
+    stages = {node.name: _stage(folder / node.name) for node in nodes}
+    made = settings_of(plan, stages, options["jobs"])
+    options = {name: options[name] for name in OF_PLACE}
+    return {**made, "options": {**made["options"], **options}}
 
 
 def _measure(
@@ -205,8 +218,7 @@ def _stage(folder: Path) -> Stage:
     """
     if not (record := _record(folder)):
         raise PalpateError(f"The stage {folder.name} must be there", f"no record at {folder}", "")
-    facts, outputs = record["facts"], record["outputs"]
-    return Stage(folder, record["digest"], facts, outputs, record["seconds"])
+    return stage_of(folder, record)
 
 
 def compare_splits_again(*, work: Path, progress: Progress, **arguments: Any) -> Results:
@@ -266,6 +278,19 @@ def _again_check(made: Path, stored: Path, tolerance: float) -> Check:
     return Check(label, "same", kind="input")
 
 
+def _settings_checks(results: Results, again: Remade) -> Iterator[Check]:
+    """What the run records of itself besides its stages: options, digests, versions, machine."""
+    before: dict[str, Any] = dict(results.settings)
+    after: dict[str, Any] = plain(again.results.settings) if again.results else {}
+    for key in before | ({} if again.reason else after):
+        pair = before.get(key), after.get(key)
+        if key == "stages":  # each is a check of its own
+            pair = sorted(pair[0] or ()), sorted(pair[1] or ())
+        why = again.reason or number_difference(*pair, 0.0)
+        status = "cannot check" if again.reason else "differs" if why else "same"
+        yield Check(f"settings: {key}", status, why, "input")
+
+
 def _number_checks(
     results: Results, again: Remade, tolerance: float
 ) -> tuple[list[Check], list[Score]]:
@@ -301,10 +326,11 @@ def _number_check(name: str, before: Any, after: Any, tolerance: float) -> Check
 
 
 def numbers_by_place(results: Results) -> dict[str, Any]:
-    """Every score, number and sentence with a number, by where it stands."""
+    """Every score, and everything else that a page shows, by where it stands."""
     places: dict[str, Any] = {}
     seen: Counter[str] = Counter()
-    for name, value in (*_of_scores(results), *_of_claims(results), *_of_audits(results)):
+    parts = _of_scores(results), _of_claims(results), _of_audits(results), _of_page(results)
+    for name, value in chain(*parts):
         seen[name] += 1
         places[name if seen[name] == 1 else f"{name} ({seen[name]})"] = value
     return places
@@ -316,29 +342,40 @@ def _of_scores(results: Results) -> Iterator[tuple[str, Any]]:
     for table in results.tables:
         for row in table.rows:
             for column, cell in zip(table.columns, row, strict=False):
-                if isinstance(cell, Score) or _has_digit(cell):
+                if isinstance(cell, Score):
                     yield f"{table.title}: {_label(row)}, {column}", cell
+        rows = [["a score" if isinstance(cell, Score) else cell for cell in r] for r in table.rows]
+        yield f"{table.title}: words", vars(table) | {"rows": rows}
     for curve in results.curves:
+        lines = {line.label: [x for x, _ in line.points] for line in curve.lines}
+        yield f"{curve.title}: words", vars(curve) | {"lines": lines}
         for line in curve.lines:
             yield from ((f"{curve.title}: {line.label} at {x:g}", s) for x, s in line.points)
 
 
 def _of_claims(results: Results) -> Iterator[tuple[str, Any]]:
     for claim in results.claims:
+        yield f"{claim.claim}: source", claim.source
         yield f"{claim.claim}: verdict", claim.verdict
         yield f"{claim.claim}: why", claim.why
         yield from ((f"{claim.claim}: {score_name(score)}", score) for score in claim.evidence)
 
 
 def _of_audits(results: Results) -> Iterator[tuple[str, Any]]:
-    for fact in filter(_has_digit, results.facts):
+    for fact in results.facts:
         yield f"fact {fact.partition(':')[0]}", fact
     for audit in results.audits:
         yield from audit_numbers(audit, f"audit {audit.name}: ").items()
 
 
-def _has_digit(text: object) -> bool:
-    return isinstance(text, str) and any(c.isdigit() for c in text)
+def _of_page(results: Results) -> Iterator[tuple[str, Any]]:
+    yield "title", results.title
+    yield "notes", results.notes
+    for item in results.gallery:
+        sample = item.sample
+        paths = (sample.vision, sample.tactile, item.generated, item.background)
+        shown = [sample.video, sample.frame, sample.material]
+        yield f"gallery, {sample.id}", [*shown, *(path and Path(path).resolve() for path in paths)]
 
 
 def _label(row: Sequence[Any]) -> str:
