@@ -212,7 +212,7 @@ def test_edited_settings_give_a_reason(forged, settings):
 def toy(tmp_path_factory):
     """A study of one method, run at ``smoke``, and its folder."""
     known = STUDIES["world-gelsight"]
-    small = replace(known.presets["smoke"], steps=2, permutations=9)
+    small = replace(known.presets["smoke"], steps=4, permutations=9)
     one = replace(known, name="toy", methods=[METHODS[OURS]], presets={"smoke": small})
     folder = tmp_path_factory.mktemp("toy") / "run"
     people = folder.parent / "people.json"
