@@ -80,7 +80,11 @@ def test_another_seed_leaves_the_nodes_of_the_first(tmp_path):
         for seeds in ((0,), (0, 1))
     )
     changed = {name for name in one if one[name] != two[name]}
-    assert changed == {"results", "appearance", "rulers"}  # what is over all seeds
+    over_seeds = {"results", "appearance", "rulers", "utility", "forty"}
+    assert changed == over_seeds
+    for name in ("utility", "forty"):
+        read = {n.name: n for n in nodes_of(plan_of(WORLD, seeds=(0, 1)))}[name].after
+        assert {"images-ours-NoLeak-0", "images-ours-NoLeak-1"} <= {*read}
 
 
 def digests(study, **options):

@@ -28,6 +28,7 @@ from palpate.sim.options import WorldOptions
 from palpate.sim.photos import with_photos
 from palpate.studies.appearance import AGAIN, RECORDED, appearance_claims, appearance_table, moves
 from palpate.studies.embedding import embed_generated
+from palpate.studies.evidence import over_seeds
 from palpate.studies.forty import companions_on_forty
 from palpate.studies.judging import SIGMA, image_files
 from palpate.studies.lengths import SAMPLING, compute_curves
@@ -46,19 +47,22 @@ def measure_utility(
     after: After,
     progress: Progress,
     *,
-    encoders: str,
-    images: Mapping[str, str],
+    runs: Mapping[str, Mapping[str, str]],
     draws: Draws,
     device: str,
 ) -> Facts:
     """What generated images are worth for a classifier and for retrieval of real touch.
 
-    ``images``: method -> node of its images, made for photos.
+    ``runs``: node of the judge -> method -> node of its images, made for photos; one a seed.
     """
     manifest, split = data_of(after, NOLEAK)
-    judge = EncoderSet.load(after[encoders] / "encoders", device=device)
-    made = {name: after[node] / "images" for name, node in images.items()}
-    tables, curve = utility(manifest, split, judge, made, draws, progress=progress)
+    made = list[tuple[list[StudyTable], Curve]]()
+    for encoders, images in runs.items():
+        judge = EncoderSet.load(after[encoders] / "encoders", device=device)
+        folders = {name: after[node] / "images" for name, node in images.items()}
+        made.append(utility(manifest, split, judge, folders, draws, progress=progress))
+    tables = [table_over_seeds(same) for same in zip(*(t for t, _ in made), strict=True)]
+    curve = curve_over_seeds([curve for _, curve in made])
     return _write(place, tables, [curve], utility_claims(tables[0]))
 
 
@@ -235,23 +239,54 @@ def compare_on_forty(
     after: After,
     progress: Progress,
     *,
-    images: Mapping[str, str],
+    runs: Sequence[Mapping[str, str]],
     clip: str,
     size: int,
     device: str,
 ) -> Facts:
-    """Companions on forty items, as in the paper; ``images``: method -> node of its images."""
+    """Companions on forty items, as in the paper.
+
+    ``runs``: method -> node of its images, one a seed.
+    """
     manifest, split = data_of(after, NOLEAK)
     test = manifest.part(split, "test")
-    made = {
-        n: load_images(image_files(after[of] / "images", test.ids), size)
-        for n, of in images.items()
-    }
     real = load_images(test.paths("tactile"), size)
     groups = [str(v or i) for i, v in zip(test.ids, test.column("video"), strict=True)]
     vision = EncoderSet(load_clip(clip, device=device))
-    table = companions_on_forty(made, real, test.ids, groups, vision, name=clip)
+    tables: list[StudyTable] = []
+    for images in runs:
+        files = {n: image_files(after[of] / "images", test.ids) for n, of in images.items()}
+        made = {name: load_images(paths, size) for name, paths in files.items()}
+        tables.append(companions_on_forty(made, real, test.ids, groups, vision, name=clip))
+    table = table_over_seeds(tables)
+    if len(runs) > 1:
+        text = f"{table.text} Scores are means over {len(runs)} seeds, the sentences of the first."
+        table = replace(table, text=text)
     return _write(place, [table])
+
+
+def table_over_seeds(tables: Sequence[StudyTable]) -> StudyTable:
+    """One table of those of several seeds; words are those of the first."""
+    rows = zip(*(table.rows for table in tables), strict=True)
+    return replace(tables[0], rows=[[*map(_mean, zip(*same, strict=True))] for same in rows])
+
+
+def curve_over_seeds(curves: Sequence[Curve]) -> Curve:
+    """One curve of those of several seeds, over the same numbers."""
+    lines = [
+        replace(same[0], points=[(of[0][0], over_seeds([s for _, s in of])) for of in points])
+        for same in zip(*(curve.lines for curve in curves), strict=True)
+        for points in [zip(*(line.points for line in same), strict=True)]
+    ]
+    return replace(curves[0], lines=lines)
+
+
+def _mean(cells: Sequence[Score | str | None]) -> Score | str | None:
+    """A cell of several seeds; none where one of them has no score."""
+    scores = [cell for cell in cells if isinstance(cell, Score)]
+    if len(scores) < len(cells):
+        return None if scores else cells[0]
+    return over_seeds(scores)
 
 
 def _write(

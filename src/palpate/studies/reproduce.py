@@ -59,7 +59,9 @@ class Plan:
     Attributes:
         study: what is run.
         preset: how large.
-        seeds: one training of everything each.
+        seeds: one training of every encoder and method each. Splits and autoencoders are made once;
+            trainings of other lengths, numbers of sampling steps, and the encoders that rank the
+            generators are of the first.
         root: the data set on disk, for a study that is not of the world.
         others: name -> folder of images of the test part (of the split without leaks) that another
             system made.
@@ -186,6 +188,7 @@ def nodes_of(plan: Plan) -> list[Node]:
     read = [node for of in (judgments, probes) for nodes in of.values() for node in nodes]
     after = ["data", "split", first, *read, *(n.name for n in questions if n.name in QUESTIONS)]
     inputs = {"study": study.name, "title": study.title, "tables": study.tables}
+    inputs |= {"paper": study.paper, "methods": plan.methods, "controls": list(study.controls)}
     inputs |= {"people": plan.people and digest_file(plan.people)}
     nodes.append(Node("results", build, inputs, after, version=2, cost=10, measures=True))
     return nodes
@@ -267,25 +270,32 @@ def _question_nodes(plan: Plan) -> list[Node]:
     study, preset, first = plan.study, plan.preset, plan.seeds[0]
     trained = {m.name: m for m in study.trained_on(NOLEAK) if m.make is None}
     nodes: list[Node] = []
-    made = {n: _images(n, NOLEAK, first) for n in study.useful if n in trained}
-    if 2 not in study.tables and made:
-        judge, draws = f"encoder-{NOLEAK}-{first}", Draws()
-        build = partial(measure_utility, encoders=judge, images=made, draws=draws)
-        after = ["data", "split", judge, *made.values()]
-        build = partial(build, device=plan.device)
-        nodes.append(Node("utility", build, {"draws": draws}, after, cost=120, measures=True))
-    if made:
-        nodes += _compute_nodes(plan, {n: trained[n] for n in made})
+    seeds = len(plan.seeds)
+
+    def made(names: Sequence[str]) -> list[dict[str, str]]:
+        """The images of methods by name, one a seed."""
+        return [{n: _images(n, NOLEAK, s) for n in names} for s in plan.seeds]
+
+    useful = [n for n in study.useful if n in trained]
+    if 2 not in study.tables and useful:
+        judges, draws = [f"encoder-{NOLEAK}-{s}" for s in plan.seeds], Draws()
+        runs = dict(zip(judges, made(useful), strict=True))
+        build = partial(measure_utility, runs=runs, draws=draws, device=plan.device)
+        after = ["data", "split", *judges, *(node for of in runs.values() for node in of.values())]
+        inputs = {"draws": draws, "methods": useful}
+        nodes.append(Node("utility", build, inputs, after, cost=120 * seeds, measures=True))
+    if useful:
+        nodes += _compute_nodes(plan, {n: trained[n] for n in useful})
     names = [n for n in study.moved if n in trained]
     if study.world is not None and len(names) > 1:
         nodes += _appearance_nodes(plan, {n: trained[n] for n in names})
-    made = {n: _images(n, NOLEAK, first) for n in (OURS, GVST, VQ, BACKGROUND) if n in trained}
-    if len(made) > 1:
+    paired = [n for n in (OURS, GVST, VQ, BACKGROUND) if n in trained]
+    if len(paired) > 1:
         how: dict[str, Any] = {"clip": preset.clip, "size": preset.diffusion.size}
-        build = partial(compare_on_forty, images=made, device=plan.device, **how)
-        after = ["data", "split", *made.values()]
+        build = partial(compare_on_forty, runs=made(paired), device=plan.device, **how)
+        after = ["data", "split", *(node for of in made(paired) for node in of.values())]
         inputs = {**how, **_clip(preset)}
-        nodes.append(Node("forty", build, inputs, after, cost=15, measures=True))
+        nodes.append(Node("forty", build, inputs, after, cost=15 * seeds, measures=True))
     if len(trained) > 2:
         rulers = {f"trained on {s}": f"encoder-{s}-{first}" for s in SPLITS}
         images = {(n, seed): _images(n, NOLEAK, seed) for n, seed in product(trained, plan.seeds)}
@@ -347,7 +357,8 @@ def _appearance_nodes(plan: Plan, methods: Mapping[str, Method]) -> list[Node]:
     ours, other = plan.study.moved[:2]
     build = partial(measure_moves, moved=moved, ours=ours, other=other, device=plan.device)
     after = ["data", "split", *dict.fromkeys(read)]
-    return [*nodes, Node("appearance", build, {}, after, cost=10, measures=True)]
+    inputs = {"moved": list(methods)}
+    return [*nodes, Node("appearance", build, inputs, after, cost=10, measures=True)]
 
 
 def _generator(study: Study, method: Method, split: str, seed: int) -> str:
