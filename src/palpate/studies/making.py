@@ -21,7 +21,7 @@ from palpate.core import PalpateError, Progress, Split, write_json
 from palpate.data.manifest import Manifest
 from palpate.diffusion.autoencoder import BackgroundAutoencoder
 from palpate.diffusion.autoencoder_training import measure_reconstruction
-from palpate.diffusion.autoencoders import autoencoder_of, gels_of, load_autoencoder
+from palpate.diffusion.autoencoders import autoencoder_of, load_autoencoder
 from palpate.diffusion.generation import generate
 from palpate.diffusion.options import AutoencoderOptions, BackgroundOptions
 from palpate.diffusion.pipeline import TactilePipeline
@@ -138,7 +138,7 @@ def make_autoencoder(
     common: Facts = {"cache": cache, "device": device, "progress": progress}
     model = autoencoder_of(manifest, parts, options, size, place / "training", **common)
     model.save(fresh(place / "autoencoder"))
-    setting = _setting(manifest, parts, place, size=size, device=device, progress=progress)
+    setting = setting_of(manifest, parts, place, size=size, device=device, progress=progress)
     real, gels = setting.pixels(setting.test), None
     if isinstance(model, BackgroundAutoencoder):
         gels = setting.pixels(setting.test, "background")
@@ -212,7 +212,7 @@ def make_images(
     output = place / "images"
     if method.make is not None:
         autoencoder = after.get(f"autoencoder-{split}")
-        setting = _setting(
+        setting = setting_of(
             manifest,
             parts,
             place,
@@ -237,7 +237,8 @@ def make_images(
     each = {text: pipeline.embed_text(text) for text in dict.fromkeys(texts)}
     gels = None
     if pipeline.background or pipeline.gel is not None:
-        gels = gels_of(test, pipeline.size, cache_of(place), progress)
+        given = setting_of(manifest, parts, place, size=pipeline.size, progress=progress)
+        gels = given.pixels(test, "background")
     words = np.concatenate([np.asarray(each[text]) for text in texts])
     images = pipeline.sample(None, test.ids, texts=words, seed=seed, background=gels)
     write_images(output, test.ids, images)
@@ -256,7 +257,7 @@ def make_controls(
 ) -> Facts:
     """The images of every control that the data allow, a folder each."""
     manifest, parts = data_of(after, split)
-    setting = _setting(
+    setting = setting_of(
         manifest,
         parts,
         place,
@@ -314,7 +315,7 @@ def _checked(name: str, made: Images | None, setting: Setting) -> Images:
     return images
 
 
-def _setting(
+def setting_of(
     manifest: Manifest,
     split: Split,
     place: Path,
@@ -327,6 +328,7 @@ def _setting(
     device: str = "auto",
     autoencoder: Path | None = None,
 ) -> Setting:
+    """What makes images in a stage: the parts of a split, and where its files lie."""
     train, test = (manifest.part(split, part) for part in ("train", "test"))
     folder = place / "work"
     cache = cache_of(place)

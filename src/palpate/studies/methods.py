@@ -130,7 +130,8 @@ METHODS: Mapping[str, Method] = {
         Method("Ours, by text", "Ours, driven by each sample's own text.", BARE, drive="text"),
         Method(
             BRIDGE,
-            "Ours; the photo is replaced by its projection on the training texts.",
+            "Ours, with texts and photos less their training means; the photo is replaced by its "
+            "projection on the training texts.",
             {**BARE, "gap": "memory"},
         ),
         Method(

@@ -14,7 +14,6 @@ from typing import Any
 from palpate.core import FeatureSet, Progress, Score
 from palpate.data.images import cached_images, load_images
 from palpate.data.manifest import Manifest
-from palpate.diffusion.autoencoders import gels_of
 from palpate.diffusion.pipeline import TactilePipeline
 from palpate.encoders.embed import embed, embed_images
 from palpate.encoders.encoder_set import EncoderSet, load_clip
@@ -32,7 +31,7 @@ from palpate.studies.evidence import over_seeds
 from palpate.studies.forty import companions_on_forty
 from palpate.studies.judging import SIGMA, image_files
 from palpate.studies.lengths import SAMPLING, compute_curves
-from palpate.studies.making import After, Facts, cache_of, data_of, slug
+from palpate.studies.making import After, Facts, cache_of, data_of, setting_of, slug
 from palpate.studies.rulers import Generator, ruler_claim, ruler_scores, ruler_tables
 from palpate.studies.study import NOLEAK
 from palpate.studies.study_tables import READING
@@ -85,7 +84,8 @@ def move_images(
     pipeline = TactilePipeline.from_pretrained(after[generator] / "model").to(pick_device(device))
     cache, gels = cache_of(place), None
     if pipeline.background or pipeline.gel is not None:
-        gels = gels_of(test, pipeline.size, cache, progress)
+        given = setting_of(manifest, split, place, size=pipeline.size, progress=progress)
+        gels = given.pixels(test, "background")
     of = embed(test, judge, "tactile", cache=cache, still=True)
     for name in (*APPEARANCES, AGAIN):
         shown = _photographed(test, options, name, place / "photos", progress)
@@ -191,7 +191,8 @@ def sample_in_steps(
     pipeline = TactilePipeline.from_pretrained(after[generator] / "model").to(pick_device(device))
     cache, gels = cache_of(place), None
     if pipeline.background or pipeline.gel is not None:
-        gels = gels_of(test, pipeline.size, cache, progress)
+        given = setting_of(manifest, split, place, size=pipeline.size, progress=progress)
+        gels = given.pixels(test, "background")
     photos = pipeline.embed(cached_images(test, "vision", pipeline.vision_size, cache))
     of = embed(test, judge, "tactile", cache=cache, still=True)
     for done, steps in enumerate(SAMPLING):
