@@ -283,7 +283,9 @@ def _question_nodes(plan: Plan) -> list[Node]:
         build = partial(measure_utility, runs=runs, draws=draws, device=plan.device)
         after = ["data", "split", *judges, *(node for of in runs.values() for node in of.values())]
         inputs = {"draws": draws, "methods": useful}
-        nodes.append(Node("utility", build, inputs, after, cost=120 * seeds, measures=True))
+        nodes.append(
+            Node("utility", build, inputs, after, version=2, cost=120 * seeds, measures=True)
+        )
     if useful:
         nodes += _compute_nodes(plan, {n: trained[n] for n in useful})
     names = [n for n in study.moved if n in trained]

@@ -2,7 +2,8 @@
 
 *Material*: a linear probe on the features of a tactile encoder, tested on real images of new
 videos, is trained on k real videos a class, on these plus all generated images, and on the
-generated images of k videos a class alone; k = 1, 2, 4, 8. *Retrieval*: the same for a linear map W
+generated images of k videos a class alone; k = 1, 2, 4, 8, as far as every tested class has
+k videos. *Retrieval*: the same for a linear map W
 from tactile features x to those y of photos or texts,
 ``min_W,b sum_i ||x_i W + b - y_i||^2 + (n ridge / d) ||W - I||^2``: without data the encoder's own
 space.
@@ -113,14 +114,16 @@ class Draws:
         return float(rng_for(self.seed, "utility", draw, label, video).random())
 
     def fold_of(self, test: FeatureSet, generated: FeatureSet | None) -> NDArray[np.intp]:
-        """The fold (n,) of every test row; all in one where no video was generated for."""
-        _, groups = _columns(test)
+        """The fold (n,) of every test row; all in one where no video was generated for.
+
+        The videos of every class are dealt to the folds in turn.
+        """
+        labels, groups = _columns(test)
         if generated is None or {*_columns(generated)[1]}.isdisjoint(groups):
             return np.zeros(len(groups), np.intp)
-        names = sorted(
-            {*groups}, key=lambda v: float(rng_for(self.seed, "utility folds", v).random())
-        )
-        number = {name: k % self.folds for k, name in enumerate(names)}
+        place = lambda v: float(rng_for(self.seed, "utility folds", v).random())
+        pairs = sorted({*zip(labels, groups, strict=True)}, key=lambda p: (p[0], place(p[1])))
+        number = {v: k % self.folds for k, v in enumerate(dict.fromkeys(v for _, v in pairs))}
         return np.array([number[g] for g in groups])
 
 
@@ -131,12 +134,19 @@ def _columns(features: FeatureSet) -> tuple[list[str], list[str]]:
     return labels, [str(g) for g in features.groups or features.ids]
 
 
-def most_videos(features: FeatureSet) -> int:
-    """The number of videos of the class that has most."""
-    videos: dict[str, set[str]] = {}
-    for label, video in zip(*_columns(features), strict=True):
-        videos.setdefault(label, set()).add(video)
-    return max(map(len, videos.values()))
+def fewest_videos(draws: Draws, features: FeatureSet, test: FeatureSet) -> int:
+    """The largest k: each tested class has as many videos, those of its fold left out.
+
+    Classes that ``features`` has not at all do not count.
+    """
+    fold = draws.fold_of(test, features)
+    rows = [*zip(*_columns(test), fold, strict=True)]
+    pairs = {*zip(*_columns(features), strict=True)}
+    known, left = {label for label, _ in pairs}, list[int]()
+    for label, number in {(label, f) for label, _, f in rows if label in known}:
+        tested = {video for _, video, f in rows if f == number}
+        left.append(sum(of == label and video not in tested for of, video in pairs))
+    return min(left, default=0)
 
 
 def _joined(parts: Sequence[FeatureSet]) -> FeatureSet:
@@ -177,15 +187,19 @@ def _tested(draws: Draws, draw: int, test: FeatureSet, training: Training, fit: 
 
 
 def _trainings(
-    generated: Mapping[str, FeatureSet], real: FeatureSet, shots: int
+    draws: Draws,
+    generated: Mapping[str, FeatureSet],
+    real: FeatureSet,
+    test: FeatureSet,
+    shots: int,
 ) -> dict[str, Training]:
-    """The trainings of one k; without those that no class has k videos for."""
+    """The trainings of one k; without those that a tested class lacks k videos for."""
     trainings: dict[str, Training] = {}
-    if shots <= most_videos(real):
+    if shots <= fewest_videos(draws, real, test):
         trainings[REAL] = Training(real, of_real=shots)
         trainings |= {f"{REAL} + {n}": Training(real, x, shots) for n, x in generated.items()}
     for name, x in generated.items():
-        if shots <= most_videos(x):
+        if shots <= fewest_videos(draws, x, test):
             trainings[f"{name} alone"] = Training(generated=x, of_generated=shots)
     return trainings
 
@@ -242,13 +256,14 @@ def material_utility(
 
     means: dict[tuple[str, int], list[Mean]] = {}
     for done, shots in enumerate(draws.shots):
-        for label, training in _trainings(generated, train, shots).items():
+        for label, training in _trainings(draws, generated, train, test, shots).items():
             means[label, shots] = measured(training, label, shots)
         progress("training on k videos", done + 1, len(draws.shots))
     text = (
         "Accuracy on real images of new videos, of a linear probe trained on k real videos a "
         "class, on these plus generated images, and on generated images of k videos alone. "
-        "Generated images are of photos of other videos than those tested. Gains are paired."
+        "Generated images are of photos of other videos than those tested. A k is left out where a "
+        "tested class has fewer videos. Gains are paired."
     )
     return _table("Material accuracy by training data", text, means, draws.shots, generated), Curve(
         "What generated images add",
@@ -365,7 +380,7 @@ def retrieval_utility(
     means: dict[tuple[str, int], list[Mean]] = {}
     for shots in draws.shots:
         means["the encoder", shots] = [retrieved(test.features, "the encoder", shots)]
-        for label, training in _trainings(made, real, shots).items():
+        for label, training in _trainings(draws, made, real, test, shots).items():
             mapped = (_tested(draws, d, test, training, fitted) for d in range(draws.draws))
             means[label, shots] = [retrieved(queries, label, shots) for queries in mapped]
     text = (
