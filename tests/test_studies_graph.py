@@ -204,7 +204,15 @@ def test_time_left_follows_costs_and_what_finished_nodes_took(tmp_path):
     whole = [args for args in reports if args[0] == "all stages"]
     assert whole[0][1:] == (0, 3, "about 5 min left")  # 300 s of costs
     after = [args[3] for args in whole if args[1] == 1]
-    assert after[0] == "about 0 s left"  # 100 s took 0.2 s
+    assert after[0] == "about 46 s left"  # 200 s of costs, of 130 s that took 30.2 s
+
+
+def test_short_nodes_say_little_of_the_time_left(tmp_path):
+    """A world that takes a tenth of what it should leaves the cost of the trainings as it is."""
+    nodes = [node("a", cost=10.0), node("b", "a", cost=5000.0)]
+    lines = []
+    run_graph(nodes, tmp_path, print_line=lines.append)
+    assert "1 of 2 stages, about 82 min left" in lines  # 83 of costs
 
 
 @pytest.mark.parametrize("jobs", [1, 2])

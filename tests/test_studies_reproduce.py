@@ -1,6 +1,7 @@
 """Studies: their objects and nodes, controls against planted truths, tables from forged scores."""
 
 import json
+import re
 import shutil
 from dataclasses import replace
 from functools import partial
@@ -170,8 +171,18 @@ def test_a_dry_run_writes_nothing(tmp_path, capsys):
     assert [s["name"] for s in stages[:2]] == ["world", "data"]
     assert stages[-1]["name"] == "results"
     assert not any(s["done"] for s in stages)
-    minutes = sum(s["seconds"] for s in stages) / 60 / 2
-    assert minutes < 90, "preset mini must stay under 90 minutes a seed on two cores"
+
+
+def test_costs_are_those_that_the_preset_states(tmp_path):
+    one, two = (
+        sum(s.cost for s in planned(plan_of(WORLD, seeds=seeds), tmp_path)) / 60
+        for seeds in ((0,), (0, 1))
+    )
+    stated = WORLD.presets["mini"].cost
+    once, seed = map(int, re.findall(r"(\d+) minutes", stated))
+    assert two - one == pytest.approx(seed, rel=0.1)
+    assert 2 * one - two == pytest.approx(once, rel=0.1)
+    assert one / 2 < 90, "preset mini must stay under 90 minutes on two cores"
 
 
 @pytest.mark.parametrize(
@@ -367,6 +378,7 @@ def test_tables_hold_methods_controls_and_both_judges():
     assert [row[0] for row in four.rows] == [OURS, "GVST", "other", FLOOR, NEAREST]
     assert three.controls == [FLOOR, NEAREST]
     assert three.columns[:2] == ["images", "SSIM"]
+    assert "All methods but other are trained from random weights" in three.text
     for table in (one, three, four):
         assert all(len(row) == len(table.columns) for row in table.rows)
         assert not any("paper" in str(row[0]) for row in table.rows)

@@ -29,7 +29,8 @@ class Options(Common):
     output: OutPath
     """Run folder: results.json, page.html, tables.tex, tables/ (CSV), and a folder a stage."""
     preset: str = "mini"
-    """`mini` takes about an hour a seed on two cores; `smoke` only shows that everything runs."""
+    """`mini` takes at most 80 minutes of one core a seed, and half an hour once; `smoke` only shows
+    that everything runs."""
     seeds: tuple[int, ...] = (0,)
     """One training of every encoder and generator each; intervals are over these, too."""
     root: Path | None = None

@@ -28,6 +28,8 @@ from palpate.core import PalpateError, Progress, few, locked, quiet, require
 from palpate.core.processes import exit_with_parent
 from palpate.studies.stages import Run, Stage, finished_stage, stage_digest
 
+#: Share of all costs that counts as measured before any node is done.
+PRIOR = 0.1
 Build = Callable[[Path, Mapping[str, Path], Progress], Mapping[str, Any] | None]
 PrintLine = Callable[[str], None]
 Channel = Any  # one end of a pipe, whose type depends on the system
@@ -45,7 +47,7 @@ class Node:
         inputs: what it reads besides earlier stages: options, digests, seeds.
         after: names of earlier nodes; their digests enter its own.
         version: raised by hand when the stage comes to write other bytes.
-        cost: expected seconds on two cores; 0: unknown.
+        cost: expected seconds of one core; 0: unknown.
         measures: it trains nothing: ``palpate verify`` builds it again, to compare.
     """
 
@@ -108,7 +110,8 @@ def run_graph(
             or where that is not set with its share of the cores, when sums may differ from those of
             other ``jobs`` in the last bits. Several GPUs are dealt out in turn.
         print_line: called with one line for each stage begun, reused or done, and with the time
-            left: from the costs, scaled by what finished nodes took.
+            left: from the costs, scaled by what finished nodes took, as if a tenth of the whole had
+            taken what it costs before: the first nodes are short.
         progress: called with what is done within a node, and over the whole.
 
     Returns:
@@ -241,7 +244,8 @@ class _Whole:
         if not known:
             return None
         took = [(n.cost, self.stages[n.name].seconds) for n in known if n.name in self.stages]
-        cost, seconds = (sum(column) for column in zip(*took, strict=True)) if took else (1, 1)
+        prior = PRIOR * sum(n.cost for n in known)
+        cost, seconds = (prior + sum(c[k] for c in took) for k in (0, 1))
         now, left, chain = time.monotonic(), dict[str, float](), dict[str, float]()
         for node in self.ordered:
             expected = node.cost * seconds / cost - (now - self.begun.get(node.name, now))

@@ -240,7 +240,7 @@ def _data_nodes(plan: Plan) -> list[Node]:
     if study.world is not None:
         world = _world(study, plan.preset)
         build = partial(making.make_world, options=world)
-        nodes.append(Node("world", build, {"options": world, "digest": world.digest}, cost=60))
+        nodes.append(Node("world", build, {"options": world, "digest": world.digest}, cost=10))
     build = partial(making.read_data, study=study, root=plan.root)
     inputs: dict[str, Any] = {"read": _source(study.read)}
     if plan.root is not None:
@@ -248,7 +248,7 @@ def _data_nodes(plan: Plan) -> list[Node]:
     nodes.append(Node("data", build, inputs, [node.name for node in nodes], cost=10))
     inputs = {} if study.noleak is None else {"noleak": study.noleak}
     build = partial(making.make_splits, noleak=study.noleak)
-    nodes.append(Node("split", build, inputs, ["data"], cost=60, measures=True))
+    nodes.append(Node("split", build, inputs, ["data"], cost=25, measures=True))
     return nodes
 
 
@@ -407,7 +407,7 @@ def _method_nodes(
     if method.make is shipped:
         inputs |= {"weights": model_stamp("generator", SHIPPED)}
     after = ["data", "split", generator or autoencoder]
-    nodes.append(Node(_images(method.name, split, seed), build, inputs, after, cost=60))
+    nodes.append(Node(_images(method.name, split, seed), build, inputs, after, cost=75))
     return nodes
 
 

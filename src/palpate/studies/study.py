@@ -45,8 +45,8 @@ class Preset:
         precision: of the methods' training (:class:`~palpate.training.options.Compute`).
         ruler: another set of encoders that ranks the methods: a shipped name, or none.
         permutations: of the permutation test of TMMD.
-        cost: what a seed takes, and where that was measured.
-        seconds: expected of one training of an encoder, of the autoencoder, and of a method.
+        cost: what a run takes once and for each seed, and where that was measured.
+        seconds: of one core, for one training of an encoder, of an autoencoder, and of a method.
     """
 
     name: str
@@ -196,8 +196,8 @@ PRESETS: Mapping[str, Preset] = {
             vq=_VQ,
             clip="palpate/mini",
             precision="bf16",  # 1.4 times as many steps a second, on processors that have it
-            cost="about 90 minutes of one x86-64 core a seed",
-            seconds=(180, 450, 370),
+            cost="world-gelsight: 30 minutes of one x86-64 core, and 80 minutes a seed",
+            seconds=(135, 140, 415),
         ),
     )
 }

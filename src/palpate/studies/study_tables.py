@@ -201,9 +201,12 @@ def _of_methods(context: _Context, number: int) -> StudyTable:
             printed = PAPER["HCT" if 2 in context.study.tables else 3, name]
             rows.append([f"paper, {name}", *map(printed.get, metrics)])
             controls.append(f"paper, {name}")
+    alike = {m.name for m in context.study.methods if m.make is None}
+    others = [s for s in subjects if s not in {*alike, *controls}]
     text = (
-        "All methods are trained from random weights for the same number of steps. Controls are no "
-        "generators: a metric that ranks one of them first rewards something else than touch. "
+        f"All methods{' but ' * bool(others)}{' and '.join(others)} are trained from random "
+        "weights for the same number of steps. Controls are no generators: a metric that ranks "
+        "one of them first rewards something else than touch. "
     )
     text += {
         3: "The autoencoder of Ours, VQ and Ours w/ BG is not given the gel, as in the paper. The "
