@@ -18,12 +18,14 @@ from palpate.cli import main
 from palpate.core import SampleRef
 from palpate.report import drawing, write_report
 from palpate.report.curves import (
+    Panel,
     curve_drawing,
     matrix_drawing,
     panels_of,
     score_panels,
     strips_drawing,
 )
+from palpate.report.drawing import Shape, Words
 from palpate.report.first_screen import telling_columns
 from palpate.report.page import OPEN_CLAIMS, render_page
 from palpate.report.results import GalleryItem, Results
@@ -235,6 +237,38 @@ def test_numbers_of_a_reason_are_those_of_its_evidence(tmp_path):
     text = page_text(Results("T", claims=[Claim("C", "s", "holds", why, scores)]), tmp_path)[1]
     for number in ("0.1235 [0.1200, 0.1300]", "0.50 [0.10, 0.90]"):
         assert text.count(number) == 2
+
+
+def test_words_of_a_table_are_no_formulas_of_a_spreadsheet(tmp_path):
+    rows = [["=HYPERLINK(1)", up("a", -0.5)], ["@b", up("=b", -0.25)]]
+    table = StudyTable("T", "", ["", "v"], rows)
+    files = Results("T", tables=[table], scores=[up("=b", -0.25)]).to_csv(tmp_path)
+    texts = {path.stem: path.read_text() for path in files}
+    assert [line.split(",")[:2] for line in texts["table-t"].splitlines()[1:]] == [
+        ["'=HYPERLINK(1)", "-0.5"],
+        ["'@b", "-0.25"],
+    ]
+    assert "'=b" in texts["scores"]
+    assert ",-0.25," in texts["scores"]
+
+
+def test_the_axis_of_strips_is_that_of_the_methods_and_a_control_beyond_it_an_arrow():
+    close = {"null": None, "floor": 0.1, "interval": None}
+    rows = [("a", up("a", 0.1, **close), False), ("b", up("b", 0.2, **close), False)]
+    drawn = strips_drawing("T", [Panel("accuracy", rows)])
+    wide = strips_drawing("T", [Panel("accuracy", [*rows, ("x", up("x", 9.0, **close), True)])])
+    ticks = [{p.text for p in d.parts if isinstance(p, Words)} for d in (drawn, wide)]
+    assert ticks[0] - {"dot: score; dashed: floor"} <= ticks[1]
+    arrows = [p for p in wide.parts if isinstance(p, Shape) and p.fill and len(p.points) == 3]
+    assert len(arrows) == 1
+    assert "9.00" in " ".join(ticks[1])
+
+
+def test_a_table_with_controls_shows_directions_and_one_of_differences_none():
+    rows = [["a", up("a", 0.5)], ["photo", up("photo", 0.6)]]
+    table = StudyTable("T", "", ["", "accuracy"], rows, controls=["photo"])
+    heads = [sheet(t).heads[1].arrow for t in (table, dataclasses.replace(table, controls=[]))]
+    assert heads == ["↑", ""]
 
 
 def test_a_long_reason_is_cut_where_a_clause_ends_and_is_whole_in_the_evidence(tmp_path):
@@ -500,15 +534,17 @@ def test_strips_draw_value_interval_null_and_floor_and_hollow_controls(study):
     table = sheet(results.tables[0])
     panels = panels_of(table)
     assert [p.title for p in panels] == ["TMMD ↓", "material accuracy ↑", "D-TMMD →", "LPIPS ↓"]
-    parts = strips_drawing("T", panels[:1]).parts
+    rows = [(label, s, False) for label, s, _ in panels[0].rows]  # all are on the axis
+    rows.append(("inside", dataclasses.replace(rows[0][1], interval=None), True))
+    parts = strips_drawing("T", [Panel("TMMD", rows)]).parts
     dots = [
         p
         for p in parts
         if isinstance(p, drawing.Shape) and p.ink == "line1" and len(p.points) == 16
     ]
-    assert [p.fill for p in dots] == [True] * 4 + [False] * 3
+    assert [p.fill for p in dots] == [True] * 7 + [False]
     centers = [np.mean(p.points, axis=0)[0] for p in dots]
-    values = [row[1].value for row in results.tables[0].rows]
+    values = [s.value for _, s, _ in rows]
     slope, start = np.polyfit(values, centers, 1)
     assert centers == pytest.approx([start + slope * v for v in values])
     spans = [p for p in parts if isinstance(p, drawing.Shape) and p.width == 1.8]
@@ -518,7 +554,7 @@ def test_strips_draw_value_interval_null_and_floor_and_hollow_controls(study):
     )
     texts = [p.text for p in parts if isinstance(p, drawing.Words)]
     assert texts.count("nearest photo") == 1
-    assert "1.200 [1.080, 1.320]" in texts
+    assert "1.20 [1.08, 1.32]" in texts
     text = next(
         p for p in strips_drawing("T", panels[2:3]).parts if getattr(p, "text", "") == "undefined"
     )

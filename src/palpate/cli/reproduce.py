@@ -27,7 +27,8 @@ class Options(Common):
     """On the world: `world-gelsight` (tables 1, 3 and 4) or `world-digit` (tables 2 and 4); on data
     at --root: `tag` (Touch and Go), `hct`, or `clips` (of Touch and Go)."""
     output: OutPath
-    """Run folder: results.json, page.html, tables.tex, tables/ (CSV), and a folder a stage."""
+    """Run folder: results.json, page.html, tables.tex, tables/ (CSV), figures/, and a folder a
+    stage."""
     preset: str = "mini"
     """`mini` takes at most 80 minutes of one core a seed, and half an hour once; `smoke` only shows
     that everything runs."""
@@ -86,6 +87,7 @@ def run(options: Options, terminal: Terminal) -> dict[str, Any]:
     results.to_html(page)
     write_text(output / "tables.tex", results.to_latex())
     results.to_csv(output / "tables")
+    results.save_figures(output / "figures")
     terminal.print("")
     for line in summary_lines(results):
         terminal.print(line)

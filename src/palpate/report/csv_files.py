@@ -36,7 +36,8 @@ def save_csv(results: Results, folder: Path) -> list[Path]:
         claims = [(c.claim, c.source, c.verdict, c.why) for c in results.claims]
         texts["claims.csv"] = _csv([("claim", "source", "verdict", "why"), *claims])
     if results.scores:
-        texts["scores.csv"] = results.to_frame().write_csv()
+        frame = results.to_frame()
+        texts["scores.csv"] = _csv([frame.columns, *frame.iter_rows()])
     for name, text in texts.items():
         write_text(folder / name, text)
     return [folder / name for name in texts]
@@ -44,8 +45,13 @@ def save_csv(results: Results, folder: Path) -> list[Path]:
 
 def _csv(rows: Iterable[Sequence[Any]]) -> str:
     file = io.StringIO()
-    csv.writer(file, lineterminator="\n").writerows(rows)
+    csv.writer(file, lineterminator="\n").writerows(map(_safe, row) for row in rows)
     return file.getvalue()
+
+
+def _safe(value: Any) -> Any:
+    """Words that a spreadsheet would take for a formula, behind an apostrophe; never numbers."""
+    return f"'{value}" if isinstance(value, str) and value[:1] in tuple("=+-@") else value
 
 
 def _table(table: Sheet) -> Iterable[Sequence[Any]]:

@@ -10,7 +10,7 @@ from itertools import takewhile
 from palpate.core import Score
 from palpate.report.drawing import DASHES, MARKERS, Drawing, Shape, Words, lines_of, marker
 from palpate.report.drawing import text_width as wide
-from palpate.report.notes import decimals, number
+from palpate.report.notes import digits_of, number
 from palpate.report.plots import Axis, axis_of, ticks_of
 from palpate.report.study import Curve, Line
 from palpate.report.study_tables import Row, Sheet
@@ -218,14 +218,15 @@ def _label(row: Row) -> str:
 def strips_drawing(title: str, panels: Sequence[Panel]) -> Drawing:
     """Draw each panel on an axis of its own: value, interval, null and floor of each subject.
 
+    The axis holds the methods and their floor; a control beyond it is an arrow at the edge.
     Controls are hollow. A score without a finite value has no mark, and the word ``undefined``.
     """
     parts: list[Shape | Words] = []
     y = 4.0
     for panel in panels:
-        axis = axis_of(score for _, score, _ in panel.rows)
-        values = [v for _, s, _ in panel.rows for v in (s.value, *(s.interval or ()))]
-        digits = decimals(v for v in values if v is not None)
+        methods = [score for _, score, control in panel.rows if not control]
+        axis = axis_of(methods) or axis_of(score for _, score, _ in panel.rows)
+        digits = digits_of(score for _, score, _ in panel.rows)
         parts.append(
             Words(0, y + 12, lines_of(panel.title, STRIP, most=1)[0], ink="ink", bold=True)
         )
@@ -237,6 +238,7 @@ def strips_drawing(title: str, panels: Sequence[Panel]) -> Drawing:
         y += 34
     kinds = [score for panel in panels for _, score, _ in panel.rows]
     legend = ["dot: score", *["hollow: control"] * any(c for p in panels for *_, c in p.rows)]
+    legend += ["arrow: beyond the axis"] * any(c for p in panels for *_, c in p.rows)
     legend += ["line: interval"] * any(s.interval for s in kinds)
     legend += ["gray: null band"] * any(s.null for s in kinds)
     legend += ["dashed: floor"] * any(s.floor is not None for s in kinds)
@@ -262,8 +264,16 @@ def _strip(
             for end in (low, high):
                 yield Shape([(end, mid - 4), (end, mid + 4)], "line1", width=1.4)
             text += f" [{', '.join(number(v, digits) for v in score.interval)}]"
-        yield from marker(len(MARKERS) if control else 0, _place(axis, float(score)), mid, "line1")
+        yield from _dot(axis, float(score), control, mid)
     yield Words(LABEL + AXIS + 12, mid + 4, text, ink="ink")
+
+
+def _dot(axis: Axis, value: float, control: bool, mid: float) -> Iterable[Shape]:
+    x, way = _place(axis, value), (value > axis.high) - (value < axis.low)
+    if way:
+        yield Shape([(x, mid - 5), (x + 8 * way, mid), (x, mid + 5)], "line1", fill=True)
+    else:
+        yield from marker(len(MARKERS) if control else 0, x, mid, "line1")
 
 
 def _band(score: Score, axis: Axis, mid: float) -> Iterable[Shape]:

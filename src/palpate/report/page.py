@@ -234,21 +234,27 @@ def pair_images(pair: LeakPair, head: str) -> list[Wanted]:
 def gallery_images(gallery: Sequence[GalleryItem]) -> list[tuple[GalleryItem, list[Wanted]]]:
     """Every sample with its images, materials in turn; a column that no sample has is skipped.
 
-    Where a background is known, the contacts follow: without the background, amplified.
+    Where a background is known, the contacts follow: without the background, amplified; or, in
+    their place, other generated images of the same photo, in columns that all rows have.
     """
     rows: list[tuple[GalleryItem, list[Wanted]]] = []
+    others = list(dict.fromkeys(label for item in gallery for label in item.others))
     for item in in_turns(gallery):
         sample, background = item.sample, item.background or item.sample.background
         name = f"{sample.material or 'sample'}, {where(sample)}"
-        tactile = (("Real", sample.tactile), ("Generated", item.generated))
+        tactile = [("Real", sample.tactile), (item.label, item.generated)]
+        tactile += [(label, item.others.get(label)) for label in others]
         images = [Wanted(sample.vision, f"Photo: {name}", "Photo")]
         images += [Wanted(p, f"{kind} tactile image: {name}", kind) for kind, p in tactile]
         images += [
             Wanted(p and background and p, f"{kind} contact: {name}", f"{kind} contact", background)
             for kind, p in tactile
+            if not others
         ]
         rows.append((item, images))
-    known = [any(images[k].path for _, images in rows) for k in range(5)] if rows else []
+    known = [
+        any(image.path for image in column) for column in zip(*(w for _, w in rows), strict=True)
+    ]
     return [(item, list(compress(images, known))) for item, images in rows]
 
 
