@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from palpate.core import PalpateError, Score
+from palpate.core import Note, PalpateError, Score
 from palpate.metrics.intervals import spread_of_values
 from palpate.studies.claims import (
     FAMILY,
@@ -58,10 +58,12 @@ def test_seeds_add_their_deviation_to_the_interval_of_videos():
 def test_of_several_seeds_no_p_value_or_verdict_of_one_remains():
     one = {"p_value": 1e-6, "decided": True, "better": "Ours", "p_better": 1.0, "kind": "same"}
     one |= {"matrix": [[1.0, 2.0], [2.0, 3.0]], "classes": ["Wood", "Brick"], "unstable": ["Wood"]}
-    a = replace(difference("TMMD", -0.9, 0.1, **one), null=(-0.1, 0.1))
+    notes = [Note("no-contact-baseline")]
+    a = replace(difference("TMMD", -0.9, 0.1, **one), null=(-0.1, 0.1), notes=notes)
     b = difference("TMMD", 0.9, 0.1, **one | {"matrix": [[3, 0], [0, 1]], "unstable": []})
     made = over_seeds([a, b])
     assert (made.value, made.null) == (0, None)
+    assert [*over_seeds([a, b, a]).notes] == [*over_seeds([b, a]).notes] == notes
     kept = {"a": "Ours", "b": "GVST", "kind": "same", "classes": ["Wood", "Brick"]}
     assert made.details == {**kept, "matrix": [[2, 1], [1, 2]], "by_seed": [-0.9, 0.9]}
     assert over_seeds([a]).details["p_value"] == 1e-6

@@ -12,7 +12,7 @@ import polars as pl
 import pytest
 
 from palpate.cli import main
-from palpate.core import PalpateError, Score, Split
+from palpate.core import FeatureSet, PalpateError, Score, Split
 from palpate.encoders.models import shipped_folder
 from palpate.report.results import Results
 from palpate.sim import WorldOptions
@@ -358,7 +358,13 @@ def test_tables_hold_methods_controls_and_both_judges():
     metrics = ("SSIM", "TMMD", "I-TMMD", "CI-TMMD", "D-TMMD")
     subjects = (OURS, "GVST", "other", FLOOR, NEAREST)
     judged = {
-        pair: Scores.over_seeds([[forged(n, m, v) for n in subjects for m in metrics]], "results")
+        pair: Scores.over_seeds(
+            [
+                [forged(judging.HALF_PROBES, "material accuracy", 0.5)]
+                + [forged(n, m, v) for n in subjects for m in metrics]
+            ],
+            "results",
+        )
         for pair, v in values.items()
     }
     probed = {
@@ -374,9 +380,11 @@ def test_tables_hold_methods_controls_and_both_judges():
         for judge in (ORIG, NOLEAK):
             for name in (OURS, FLOOR):
                 assert cells[f"{name}, {split}", judge][3].value == values[split, judge]
-    assert [row[0] for row in three.rows] == [OURS, "GVST", "other", FLOOR, NEAREST]
+    listed = [OURS, "GVST", "other", FLOOR, NEAREST, judging.HALF_PROBES]
+    assert [row[0] for row in three.rows] == listed
+    assert not [row for row in one.rows if str(row[0]).startswith(judging.HALF_PROBES)]
     assert [row[0] for row in four.rows] == [OURS, "GVST", "other", FLOOR, NEAREST]
-    assert three.controls == [FLOOR, NEAREST]
+    assert three.controls == [FLOOR, NEAREST, judging.HALF_PROBES]
     assert three.columns[:2] == ["images", "SSIM"]
     assert "All methods but other are trained from random weights" in three.text
     for table in (one, three, four):
@@ -430,6 +438,24 @@ def test_differences_that_are_stored_are_of_a_method_and_not_of_e():
     assert not collecting._compares(score, [OURS])
 
 
+def test_half_probes_name_train_images_beside_the_real_ones_of_labeled_samples():
+    """Videos of two materials; the nearest photo is right for wood, wrong for half of the grass."""
+    rng, materials = np.random.default_rng(0), ["wood", "grass"] * 4
+    x = np.array([[m == "wood", m == "grass"] for m in materials], float)
+    x = (x + 0.05 * rng.normal(size=x.shape)).astype("f4")
+    ids = [f"t{k}" for k in range(8)]
+    train = FeatureSet(ids, x, materials, [f"{m}{k // 2}" for k, m in enumerate(materials)])
+    rows = np.array([0, 2, 1, 4, 3, 5])
+    labels = ["wood", "wood", "grass", "grass", "", ""]
+    videos = [f"v{k}" for k in range(6)]
+    real = FeatureSet(videos, x[[0, 2, 1, 3, 0, 0]], labels, videos)
+    images = replace(real, features=x[rows])
+    split = Split.from_ids(train=ids, test=videos, rule={}, manifest="m" * 64)
+    near, of_real = judging._cross_fitted(train, images, real, rows, split)
+    assert (near.subject, near.value, near.n) == (NEAREST, 0.75, 4)
+    assert (of_real.subject, of_real.value, of_real.n) == (judging.HALF_PROBES, 1, 4)
+
+
 @pytest.mark.slow
 def test_the_study_at_smoke(tmp_path):
     """Every table, method and control; other people's images; running again builds nothing."""
@@ -445,7 +471,7 @@ def test_the_study_at_smoke(tmp_path):
     assert results.curves
     assert {"ours", "paper, section 3.1"} <= {claim.source for claim in results.claims}
     rows = [row[0] for row in results.tables[1].rows]
-    assert {*METHODS, *CONTROLS, controls.HALVES} == {*rows}
+    assert {*METHODS, *CONTROLS, controls.HALVES, judging.HALF_PROBES} == {*rows}
     assert len(results.audits) == 2
     assert results.audits[1].leaked_fraction == 0 < results.audits[0].leaked_fraction
     assert results.claims

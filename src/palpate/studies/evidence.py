@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from scipy import special
 
-from palpate.core import PalpateError, Score, plain
+from palpate.core import Note, PalpateError, Score, plain
 from palpate.report.notes import digits_of, number
 
 #: End of the metric of every difference.
@@ -42,7 +42,10 @@ def over_seeds(scores: Sequence[Score]) -> Score:
     if len(values) == 1:
         return replace(first, details={**first.details, "by_seed": values})
     details = {**_shared_details(scores), "by_seed": values}
-    first = replace(first, null=None, seed=None)
+    notes = list[Note]()
+    for score in scores:
+        notes += [note for note in score.notes if note not in notes]
+    first = replace(first, null=None, seed=None, notes=notes)
     known = [v for v in values if v is not None]
     if len(known) < len(values):
         return replace(first, value=None, interval=None, interval_method="", details=details)

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from palpate.core import FeatureSet, Progress, Score, Split, read_json, write_json
+from palpate.core import FeatureSet, Note, Progress, Score, Split, read_json, write_json
 from palpate.data.images import load_images
 from palpate.data.manifest import Manifest
 from palpate.encoders.embed import embed, embed_images
@@ -35,6 +35,8 @@ OF_TRAIN = (FLOOR, WRONG, NEAREST, ONE, MEMORIZED)
 READINGS = ("grouped", "paper")
 SIGMA = 10.0
 MATERIAL = "material accuracy"
+#: Real test images, named by the probes that name the images of the nearest photos.
+HALF_PROBES = "real, by half probes"
 
 
 def probing_plan(manifest: Manifest, splits: Mapping[str, Split]) -> Plan:
@@ -160,7 +162,9 @@ def judge_images(
     if NEAREST in made and features.labels is not None:
         train = manifest.part(split, "train")
         rows = nearest_rows(train, test, vision, cache=cache)
-        scores += _cross_fitted(embed(train, judge, cache=cache), made[NEAREST], rows, split)
+        scores += _cross_fitted(
+            embed(train, judge, cache=cache), made[NEAREST], features, rows, split
+        )
     if OURS in made:
         scores += _halves(made[OURS], judging.permutations, split)
     for metric in judging.metrics:
@@ -204,33 +208,43 @@ def image_files(folder: Path, ids: Sequence[str]) -> list[Path]:
     return Manifest.load(folder).take(ids).paths("tactile")
 
 
-def _cross_fitted(train: FeatureSet, features: FeatureSet, rows: Any, split: Split) -> list[Score]:
-    """Material accuracy of the images of nearest photos, which are train images.
+def _cross_fitted(
+    train: FeatureSet, images: FeatureSet, real: FeatureSet, rows: Any, split: Split
+) -> list[Score]:
+    """Material accuracy of the images of nearest photos, which are rows of train.
 
     By probes that were not fitted to them: of two halves of the train videos, each names the images
-    of the other. None where a half holds fewer than two materials.
+    of the other. Such a probe knows less than that of the other subjects, so it names the real
+    images of the same samples as well. Samples without material do not count; no score where a half
+    holds fewer than two materials.
     """
     videos = np.array(train.groups or train.ids, dtype=str)
     names = np.unique(videos)
     half = np.isin(videos, names[::2])
-    labels, hits = np.array(train.labels), np.zeros(len(rows))
+    labels, truth = np.array(train.labels), np.array(images.labels)
+    hits, known = np.zeros((2, len(rows))), truth != ""
     if min(len({*labels[side]} - {"", None}) for side in (half, ~half)) < 2:
         return []
     for side in (half, ~half):
         ids = [i for i, inside in zip(train.ids, side, strict=True) if inside]
         probe = fit_probe(train.take(ids))
         other = ~side[rows]
-        named = probe.predict(np.asarray(features.features)[other])
-        hits[other] = np.array(named) == np.array(features.labels)[other]
+        for k, of in enumerate((images, real)):
+            hits[k, other] = np.array(probe.predict(of.features[other])) == truth[other]
     chance = 1 / len({*(train.labels or ())} - {""})
-    details = {"chance": chance, "probe": "fitted to the other half of the train videos"}
+    text = f"By probes of half the train videos: compare with {HALF_PROBES!r}"
     fields: dict[str, Any] = {
-        "subject": NEAREST,
         "split": split.digest,
-        "encoder": features.encoder,
+        "encoder": images.encoder,
+        "details": {"chance": chance},
+        "notes": [Note("text", {"text": text})],
+        "estimator": "mean",
     }
-    groups = list(features.groups or features.ids)
-    return [mean_of(MATERIAL, hits, groups, estimator="mean", details=details, **fields).score]
+    groups = [*np.array(images.groups or images.ids)[known]]
+    return [
+        mean_of(MATERIAL, of[known], groups, subject=name, **fields).score
+        for name, of in zip((NEAREST, HALF_PROBES), hits, strict=True)
+    ]
 
 
 def _halves(features: FeatureSet, permutations: int, split: Split) -> list[Score]:

@@ -190,7 +190,7 @@ def nodes_of(plan: Plan) -> list[Node]:
     inputs = {"study": study.name, "title": study.title, "tables": study.tables}
     inputs |= {"paper": study.paper, "methods": plan.methods, "controls": list(study.controls)}
     inputs |= {"people": plan.people and digest_file(plan.people)}
-    nodes.append(Node("results", build, inputs, after, version=2, cost=10, measures=True))
+    nodes.append(Node("results", build, inputs, after, version=3, cost=10, measures=True))
     return nodes
 
 
@@ -435,7 +435,7 @@ def _score_node(plan: Plan, split: str, judge: str, seed: int) -> Node:
     inputs = {**vars(judging), **_clip(preset), "metrics": [_source(m) for m in study.metrics]}
     after = ["data", "split", encoder, f"controls-{split}", *methods.values()]
     name = _scores(split, judge, seed)
-    return Node(name, build, inputs, after, version=3, cost=60, measures=True)
+    return Node(name, build, inputs, after, version=4, cost=60, measures=True)
 
 
 def _clip(preset: Preset) -> dict[str, str | None]:

@@ -15,7 +15,7 @@ from palpate.core import Score
 from palpate.report.study import StudyTable
 from palpate.studies.controls import FLOOR, HALVES
 from palpate.studies.evidence import DIFFERENCE, over_seeds
-from palpate.studies.judging import MATERIAL
+from palpate.studies.judging import HALF_PROBES, MATERIAL
 from palpate.studies.methods import OURS
 from palpate.studies.study import NOLEAK, ORIG, SPLITS, Study
 
@@ -114,7 +114,7 @@ def study_tables(
         extra: names of further metrics.
     """
     make = {1: _of_splits, 2: _of_splits, 3: _of_methods, 4: _of_methods}
-    context = _Context(study, judged, probed, methods, [*controls, HALVES], extra)
+    context = _Context(study, judged, probed, methods, [*controls, HALF_PROBES, HALVES], extra)
     return [make[number](context, number) for number in study.tables]
 
 
@@ -148,8 +148,10 @@ def _of_splits(context: _Context, number: int) -> StudyTable:
                 label = f"{name}, {split}"
                 knows = judge == split and name == OURS
                 tasked = [_probed(context, t, split) if knows else None for t in tasks]
-                scores = context.judged[split, judge]
-                rows.append([label, judge, *tasked, *(scores.get(m, name) for m in family)])
+                cells = [context.judged[split, judge].get(m, name) for m in family]
+                if not any(cells):  # scored by other metrics alone
+                    continue
+                rows.append([label, judge, *tasked, *cells])
                 if name in context.controls:
                     controls.append(label)
         if context.study.paper:
@@ -194,6 +196,7 @@ def _of_methods(context: _Context, number: int) -> StudyTable:
         metrics = ["SSIM", "PSNR", *of_photos, *FAMILY, MATERIAL, *context.extra]
     subjects = context.present(NOLEAK, [*methods, *context.controls])
     metrics = [m for m in metrics if any(scores.get(m, s) for s in subjects)]
+    subjects = [s for s in subjects if any(scores.get(m, s) for m in metrics)]
     rows: list[list[Cell]] = [[s, *(scores.get(m, s) for m in metrics)] for s in subjects]
     controls = [s for s in subjects if s in context.controls]
     if context.study.paper:
