@@ -7,6 +7,7 @@ import polars as pl
 import pytest
 
 from palpate.core import Split
+from palpate.diffusion.autoencoders import load_autoencoder
 from palpate.studies import making, questions
 from palpate.studies.methods import METHODS
 from palpate.studies.study import PRESETS
@@ -68,3 +69,14 @@ def test_the_stock_gel_is_of_the_train_part(small_manifest, tmp_path, monkeypatc
     stock = np.median(train, axis=0).astype(np.uint8)
     assert (np.asarray(pipeline.given) == stock).all()
     assert len(pipeline.given) == len(manifest.part(split, "test"))
+
+
+def test_a_given_autoencoder_is_taken_and_measured(small_manifest, tmp_path, monkeypatch):
+    split = Split({i: "train" if i[1] in "03" else "test" for i in small_manifest.ids})
+    monkeypatch.setattr(making, "data_of", lambda after, name: (small_manifest, split))
+    where = tmp_path / "stage"
+    how = {"split": "NoLeak", "options": "palpate/mini", "size": 64, "device": "cpu"}
+    facts = making.make_autoencoder(where, {}, lambda *_: None, **how)
+    given = load_autoencoder("palpate/mini")
+    assert facts["digest"] == given.digest == load_autoencoder(where / "autoencoder").digest
+    assert facts["ceiling"]["psnr"] > 10

@@ -13,6 +13,7 @@ import pytest
 
 from palpate.cli import main
 from palpate.core import FeatureSet, PalpateError, Score, Split
+from palpate.core import PalpateError, Score, Split, digest_file
 from palpate.encoders.models import shipped_folder
 from palpate.report.results import Results
 from palpate.sim import WorldOptions
@@ -121,6 +122,23 @@ def test_other_shipped_weights_build_what_reads_them(monkeypatch):
     assert all(before[name] == after[name] for name in trained)
     for name in ("images-palpate-mini-NoLeak-0", "rulers"):
         assert before[name] != after[name], name
+
+
+def test_the_size_of_the_paper_needs_its_autoencoder(tmp_path):
+    tag = STUDIES["tag"]
+    with pytest.raises(PalpateError, match="must be given for preset paper"):
+        plan_of(tag, preset="paper", root=tmp_path)
+    with pytest.raises(PalpateError, match="must be at least 4"):
+        plan_of(tag, preset="mini", root=tmp_path, steps=3)
+    file = tmp_path / "vq-f4.ckpt"
+    file.write_bytes(b"weights")
+    made = {}
+    for preset in ("paper", "mini"):
+        plan = plan_of(tag, preset=preset, root=tmp_path, vq=file, steps=400)
+        made[preset] = {n.name: n for n in nodes_of(plan)}
+        assert made[preset]["autoencoder-vq-NoLeak"].inputs["options"] == digest_file(file)
+        assert made[preset]["ours-vq-NoLeak-0"].inputs["steps"] == 400
+    assert made["paper"].keys() == made["mini"].keys()
 
 
 def bright(setting, by=1, **more):

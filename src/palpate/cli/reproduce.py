@@ -31,7 +31,12 @@ class Options(Common):
     stage."""
     preset: str = "mini"
     """`mini` takes at most 80 minutes of one core a seed, and half an hour once; `smoke` only shows
-    that everything runs."""
+    that everything runs; `paper`, for data at --root, is the paper's size (a GPU)."""
+    steps: int | None = None
+    """Optimizer steps of each compared method, in place of the preset's."""
+    vq: str | None = None
+    """The paper's kind of autoencoder: a folder, hub id or .ckpt of latent diffusion's vq-f4; for
+    preset `paper`, or in place of the one that is trained."""
     seeds: tuple[int, ...] = (0,)
     """One training of every encoder and generator each; intervals are over these, too."""
     root: Path | None = None
@@ -67,6 +72,8 @@ def run(options: Options, terminal: Terminal) -> dict[str, Any]:
         others=others,
         device=options.device,
         people=options.people,
+        steps=options.steps,
+        vq=options.vq,
     )
     if options.dry_run:
         return _print_plan(planned(plan, output), terminal)

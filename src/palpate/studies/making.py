@@ -128,25 +128,27 @@ def make_autoencoder(
     progress: Progress,
     *,
     split: str,
-    options: AutoencoderOptions | BackgroundOptions,
+    options: AutoencoderOptions | BackgroundOptions | str,
     size: int,
     device: str,
 ) -> Facts:
-    """An autoencoder trained on the train part; in ``autoencoder``."""
+    """An autoencoder trained on the train part, or a trained one; in ``autoencoder``."""
     manifest, parts = data_of(after, split)
     cache = cache_of(place)
     common: Facts = {"cache": cache, "device": device, "progress": progress}
-    model = autoencoder_of(manifest, parts, options, size, place / "training", **common)
+    if isinstance(options, str):
+        model = load_autoencoder(options)
+    else:
+        model = autoencoder_of(manifest, parts, options, size, place / "training", **common)
     model.save(fresh(place / "autoencoder"))
     setting = setting_of(manifest, parts, place, size=size, device=device, progress=progress)
     real, gels = setting.pixels(setting.test), None
     if isinstance(model, BackgroundAutoencoder):
         gels = setting.pixels(setting.test, "background")
     ceiling = measure_reconstruction(model, real, gels)
-    shutil.rmtree(place / "training")
-    known = {
-        k: float(v) for k, v in vars(ceiling).items() if v is not None
-    }  # no codes: no codebook
+    shutil.rmtree(place / "training", ignore_errors=True)
+    # Without a codebook nothing is known of it.
+    known = {k: float(v) for k, v in vars(ceiling).items() if v is not None}
     return {"digest": model.digest, "ceiling": known}
 
 

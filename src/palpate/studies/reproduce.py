@@ -92,8 +92,10 @@ def plan_of(
     others: Mapping[str, Path | str] | None = None,
     device: str = "auto",
     people: Path | str | None = None,
+    steps: int | None = None,
+    vq: Path | str | None = None,
 ) -> Plan:
-    """The plan of a run, checked before any work.
+    """The plan of a run, checked before any work; ``steps`` and ``vq`` replace the preset's.
 
     Raises:
         PalpateError: for a study of another's name, an unknown preset, no seeds, a root that is
@@ -113,17 +115,16 @@ def plan_of(
         raise PalpateError(must, "none" if root is None else str(root), fix, argument="root")
     if root is not None and not Path(root).exists():
         raise PalpateError("must exist", f"nothing at {root}", "Check the path", argument="root")
-    folders = {name: Path(folder) for name, folder in (others or {}).items()}
-    for name, folder in folders.items():
-        if slug(name) in {slug(m.name) for m in study.methods} | {slug(c) for c in study.controls}:
-            must, fix = "must have a name of its own", "Choose another name"
-            raise PalpateError(must, name, fix, argument="method")
-        if not folder.is_dir():
-            must, fix = f"{name} must be a folder of images", "Check the path"
-            raise PalpateError(must, f"nothing at {folder}", fix, argument="method")
+    folders = _folders(study, others or {})
     if people is not None:
         Results.load(people)  # raises for a file that holds none
     chosen = study.presets[preset]
+    given = {"steps": steps, "vq": None if vq is None else str(vq)}
+    chosen = dataclasses.replace(chosen, **{k: v for k, v in given.items() if v is not None})
+    require(chosen.steps >= 4, "steps", "must be at least 4", chosen.steps)
+    if chosen.vq is None and any(method.vq for method in study.methods):
+        fix = "Pass the folder, hub id or .ckpt of latent diffusion's vq-f4"
+        raise PalpateError(f"must be given for preset {preset}", "none", fix, argument="vq")
     if study.world is not None and chosen.clip == "palpate/mini":
         seed = _world(study, chosen).seed
         require(seed not in MINI_SEEDS, "world", "must be one that no shipped model saw", seed)
@@ -131,6 +132,19 @@ def plan_of(
         require_unseen(Path(root))
     place, votes = (None if path is None else Path(path) for path in (root, people))
     return Plan(study, chosen, tuple(seeds), place, folders, device, votes)
+
+
+def _folders(study: Study, others: Mapping[str, Path | str]) -> dict[str, Path]:
+    """Folders of images of other systems, under names of their own."""
+    folders = {name: Path(folder) for name, folder in others.items()}
+    for name, folder in folders.items():
+        if slug(name) in {slug(m.name) for m in study.methods} | {slug(c) for c in study.controls}:
+            must, fix = "must have a name of its own", "Choose another name"
+            raise PalpateError(must, name, fix, argument="method")
+        if not folder.is_dir():
+            must, fix = f"{name} must be a folder of images", "Check the path"
+            raise PalpateError(must, f"nothing at {folder}", fix, argument="method")
+    return folders
 
 
 def nodes_of(plan: Plan) -> list[Node]:
@@ -260,8 +274,11 @@ def _autoencoder_nodes(plan: Plan, split: str) -> list[Node]:
     nodes: list[Node] = []
     for name, options in kinds.items():
         how: dict[str, Any] = {"split": split, "options": options, "size": preset.diffusion.size}
+        inputs = how
+        if isinstance(options, str):
+            inputs = {**how, "options": model_stamp("autoencoder", options)}
         build = partial(making.make_autoencoder, device=plan.device, **how)
-        nodes.append(Node(name, build, how, ["data", "split"], cost=preset.seconds[1]))
+        nodes.append(Node(name, build, inputs, ["data", "split"], cost=preset.seconds[1]))
     return nodes
 
 
@@ -489,6 +506,7 @@ def settings_of(plan: Plan, stages: Mapping[str, Stage], jobs: int) -> dict[str,
             "methods of others": {name: str(folder) for name, folder in plan.others.items()},
             "people": str(plan.people) if plan.people else None,
             "steps of a method": plan.preset.steps,
+            "vq": plan.preset.vq if isinstance(plan.preset.vq, str) else None,
             "device": plan.device,
             "jobs": jobs,
         },

@@ -166,6 +166,8 @@ def _make_nodes(
         root=options["root"] and folder / "data",
         others={method: images(method) for method in options["methods of others"]},
         people=options["people"] and folder / LAST / "people.json",
+        steps=options["steps of a method"],
+        vq=options["vq"],
     )
     nodes = nodes_of(plan)
     _measure(nodes, folder, place, progress)
