@@ -12,8 +12,7 @@ import polars as pl
 import pytest
 
 from palpate.cli import main
-from palpate.core import FeatureSet, PalpateError, Score, Split
-from palpate.core import PalpateError, Score, Split, digest_file
+from palpate.core import FeatureSet, PalpateError, Score, Split, digest_file
 from palpate.encoders.models import shipped_folder
 from palpate.report.results import Results
 from palpate.sim import WorldOptions
