@@ -8,6 +8,7 @@ from palpate.core import Note
 from palpate.report.first_screen import about, annotated, cards, caution, telling_columns
 from palpate.report.page import render_page
 from palpate.report.results import Results
+from palpate.report.study import StudyTable
 from palpate.report.study_tables import lay
 from palpate.report.tables import score_tables
 from report_fixtures import Tree, clean_audit, full_audit, full_results, gallery, score
@@ -153,6 +154,14 @@ def test_a_card_says_what_is_shown_against_real_images(values, words):
 def test_nothing_leaks_where_nothing_leaks():
     (card,) = cards(Results("T", audits=[clean_audit()]), [])[:1]
     assert (card.rows[0].text, card.foot) == ("0 %", "")
+
+
+def test_methods_are_explained_once_below_the_verdict(tmp_path):
+    scores = [score("TMMD", "Ours"), score("SSIM", "Ours")]
+    settings = {"methods": {"Ours": "By a photo."}}
+    tables = [StudyTable("T", "", ["", "v"], [["Ours", scores[0]]])]
+    results = Results("T", scores=[*scores, score("FID", "Ours")], tables=tables, settings=settings)
+    assert "By a photo." in Tree(render_page(results, tmp_path, max_bytes=200_000)).text
 
 
 def test_a_run_that_is_too_small_says_so():

@@ -387,6 +387,7 @@ def test_the_histogram_of_gaps_has_a_bar_a_bin_and_the_median():
     assert max(heights) == pytest.approx(70)
     assert "median 304" in svg
     assert gap_histogram(small_audit(gap_counts=[0, 0, 0])) == ""
+    assert gap_histogram(small_audit(gap_counts=[0, 7, 0])) == ""  # one bar
 
 
 def test_the_histograms_of_scores_have_the_threshold_and_join_fine_bins():

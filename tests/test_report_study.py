@@ -17,20 +17,13 @@ from PIL import Image, ImageFont
 from palpate.cli import main
 from palpate.core import SampleRef
 from palpate.report import drawing, write_report
-from palpate.report.curves import (
-    Panel,
-    curve_drawing,
-    matrix_drawing,
-    panels_of,
-    score_panels,
-    strips_drawing,
-)
+from palpate.report.curves import Panel, curve_drawing, matrix_drawing, panels_of, strips_drawing
 from palpate.report.drawing import Shape, Words
 from palpate.report.first_screen import telling_columns
 from palpate.report.page import OPEN_CLAIMS, render_page
 from palpate.report.results import GalleryItem, Results
 from palpate.report.study import Claim, Curve, Line, StudyTable
-from palpate.report.study_tables import brief, curve_table, file_names, sheet, tally
+from palpate.report.study_tables import brief, curve_table, file_names, lay, says_more, sheet, tally
 from palpate.report.tables import heat_tables, score_tables
 from palpate.report.terminal import as_text
 from palpate.studies.evidence import in_words
@@ -262,6 +255,16 @@ def test_the_axis_of_strips_is_that_of_the_methods_and_a_control_beyond_it_an_ar
     arrows = [p for p in wide.parts if isinstance(p, Shape) and p.fill and len(p.points) == 3]
     assert len(arrows) == 1
     assert "9.00" in " ".join(ticks[1])
+
+
+def test_degrees_of_freedom_are_a_range_and_one_score_repeats_no_reason(tmp_path):
+    how = [f"jackknife, t, {n} df" for n in ("11.0", "9", "14.8")]
+    rows = [[h, up(h, 0.5, interval_method=h)] for h in how]
+    made = dict(sheet(StudyTable("T", "", ["", "v"], rows)).made)
+    assert made["interval"] == "95 %, jackknife, t, 9-14.8 df"
+    claims = [Claim("C", "s", "holds", "Why.", [up("a", 0.5)] * n) for n in (1, 2)]
+    assert [says_more(c) for c in claims] == [False, True]
+    assert says_more(dataclasses.replace(claims[0], evidence=[up("a", None)]))
 
 
 def test_a_table_with_controls_shows_directions_and_one_of_differences_none():
@@ -564,7 +567,7 @@ def test_strips_draw_value_interval_null_and_floor_and_hollow_controls(study):
 def test_strips_of_scores_know_the_controls_of_the_study():
     scores = [score("TMMD", name) for name in ("ours", "photo", "real")]
     columns = telling_columns(score_tables(scores))
-    (panel,) = score_panels(columns, {"photo", "real"})
+    (panel,) = panels_of(lay(columns, {"photo", "real"}))
     assert [control for *_, control in panel.rows] == [False, True, True]
     assert panel.title == "TMMD ↓"
 

@@ -7,6 +7,7 @@ import pytest
 from palpate.core import Note, PalpateError
 from palpate.report.notes import decimals, number, percent, plural, score_text
 from palpate.report.results import Results
+from palpate.report.study_tables import score_sheets
 from palpate.report.tables import family_of, heat_tables, rankings, score_tables, settings_of
 from report_fixtures import difference, score, text_note
 
@@ -65,16 +66,16 @@ def test_scores_of_a_family_are_one_table_with_what_they_share():
         score("I-TMMD", "b", n=200),
     ]
     (table,) = score_tables(scores)
-    assert table.subjects == ["a", "b"]
     assert [(c.metric, c.size) for c in table.columns] == [("TMMD", "n = 240"), ("I-TMMD", "")]
-    assert table.cells("b", table.columns[1])[0].size == "n = 200"
+    assert table.columns[1].cells[1].size == "n = 200"
     assert ("bandwidth σ", "10") in table.made
     assert table.columns[0].made == [("seed", "1, 2")]
 
 
 def test_several_seeds_of_a_subject_share_a_cell():
     (table,) = score_tables([score(seed=1), score(seed=2)])
-    assert len(table.cells("a", table.columns[0])) == 2
+    (laid,) = score_sheets(table)
+    assert [row.cells[0].value for row in laid.rows] == ["a", "a", "real images (floor)"]
 
 
 def test_scores_of_different_settings_raise():
@@ -110,7 +111,10 @@ def test_scores_without_reference_go_with_their_subject():
         score("I-TMMD", "b"),
     ]
     first, second = score_tables(scores)
-    assert (first.subjects, second.subjects) == (["a"], ["b"])
+    subjects = [
+        {cell.score.subject for c in t.columns for cell in c.cells} for t in (first, second)
+    ]
+    assert subjects == [{"a"}, {"b"}]
     assert [c.metric for c in second.columns] == ["TMMD", "I-TMMD"]
 
 

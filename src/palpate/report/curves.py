@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Collection, Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from itertools import takewhile
 
@@ -14,7 +14,7 @@ from palpate.report.notes import digits_of, number
 from palpate.report.plots import Axis, axis_of, ticks_of
 from palpate.report.study import Curve, Line
 from palpate.report.study_tables import Row, Sheet
-from palpate.report.tables import Column, Heat
+from palpate.report.tables import Heat
 
 #: Units of a curve: the whole width, the plot's height, and the places of its edges.
 WIDTH, PLOT, TOP, RIGHT = 400.0, 200.0, 26.0, 392.0
@@ -300,18 +300,6 @@ def _strip_axis(axis: Axis | None, y: float) -> Iterable[Shape | Words]:
         x = _place(axis, tick)
         yield Shape([(x, y), (x, y + 4)], "soft")
         yield Words(x, y + 16, number(tick, digits), "middle")
-
-
-def score_panels(columns: Sequence[Column], controls: Collection[str]) -> list[Panel]:
-    """Return a panel for each column of scores that has a defined one."""
-    return [
-        Panel(
-            f"{column.metric} {column.arrow}",
-            [(c.score.subject, c.score, c.score.subject in controls) for c in column.cells],
-        )
-        for column in columns
-        if any(cell.defined for cell in column.cells)
-    ]
 
 
 def matrix_drawing(heat: Heat) -> Drawing:

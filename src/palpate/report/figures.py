@@ -14,19 +14,12 @@ from PIL import Image, ImageDraw, ImageOps
 
 from palpate.core import atomic_path, write_text
 from palpate.report import audits
-from palpate.report.curves import (
-    Panel,
-    curve_drawing,
-    matrix_drawing,
-    panels_of,
-    score_panels,
-    strips_drawing,
-)
+from palpate.report.curves import Panel, curve_drawing, matrix_drawing, panels_of, strips_drawing
 from palpate.report.drawing import COLORS, Drawing, font_of, in_ascii
 from palpate.report.first_screen import COLUMNS, TELLING, telling_columns
 from palpate.report.page import gallery_images, in_turns, material_of, pair_images
 from palpate.report.results import Audit, Results
-from palpate.report.study_tables import controls_of, file_names, scores_of_methods, sheets
+from palpate.report.study_tables import controls_of, file_names, lay, scores_of_methods, sheets
 from palpate.report.tables import REAL, heat_tables, score_tables
 from palpate.report.thumbnails import Wanted, read_image
 
@@ -82,7 +75,7 @@ def _drawings(results: Results) -> dict[str, Drawing]:
     names = file_names("curve", [curve.title for curve in results.curves])
     drawings = dict(zip(names, map(curve_drawing, results.curves), strict=True))
     columns = telling_columns(score_tables(results.scores))
-    if panels := score_panels(columns, {REAL, *controls_of(results)}):
+    if panels := panels_of(lay(columns, {REAL, *controls_of(results)})):
         drawings["strips-scores"] = strips_drawing("Scores", panels)
     tables = sheets(results)
     for name, table in zip(file_names("strips", [t.title for t in tables]), tables, strict=True):

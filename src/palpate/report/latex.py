@@ -18,7 +18,7 @@ from palpate.report.notes import number, sentence
 from palpate.report.results import Results
 from palpate.report.study import Claim
 from palpate.report.study_tables import Entry, Sheet, file_names, score_sheets, sheets, tally
-from palpate.report.tables import Table, defined, score_tables
+from palpate.report.tables import defined, score_tables
 
 #: First line of the file: how the command recognizes its own file.
 MARK = "% palpate: tables of scores"
@@ -69,7 +69,9 @@ def latex_tables(results: Results) -> str:
     laid = [(table, [table.text] if table.text else []) for table in sheets(results)]
     command = [f"Command: {results.commands[0]}"] if results.commands else []
     for table in score_tables(results.scores):
-        laid += [(t, [*_facts(table), *command]) for t in score_sheets(table)]
+        for part in score_sheets(table):
+            facts = "; ".join(f"{what} {_short(how)}" for what, how in part.made)
+            laid.append((part, [*([facts] if facts else []), *command]))
     names = file_names("tab", [table.title for table, _ in laid])
     parts = [_sheet(t, caption, name) for (t, caption), name in zip(laid, names, strict=True)]
     parts.insert(len(results.tables), _claims(results.claims))
@@ -139,14 +141,6 @@ def _float(
     fit = r"\resizebox{\ifdim\width>\linewidth\linewidth\else\width\fi}{!}{%"
     head += [fit, rf"\begin{{tabular}}{{{columns}}}", r"\toprule"]
     return [*head, *rows, r"\bottomrule", r"\end{tabular}}", *below, r"\end{table}", ""]
-
-
-def _facts(table: Table) -> list[str]:
-    """How the numbers were made, in a sentence: what all columns share, then what is of one."""
-    single = [(f"{c.metric} {what}", how) for c in table.columns for what, how in c.made]
-    sizes = [(c.metric, c.size) for c in table.columns if c.size]
-    facts = [*sizes, *table.made, *single]
-    return ["; ".join(f"{what} {_short(how)}" for what, how in facts)] if facts else []
 
 
 def _short(text: str) -> str:

@@ -16,8 +16,8 @@ from palpate.report.results import Results
 from palpate.report.sentences import purpose, summary_lines
 from palpate.report.study import Claim
 from palpate.report.study_tables import Sheet, curve_table, difference_sheet, sheet, tally
-from palpate.report.tables import Table, score_tables, settings_of, table_facts
-from palpate.report.terminal import NAMES, audit_text, marks_of, score_rows, sheet_rows, sheet_words
+from palpate.report.tables import Table, facts_of, marks, score_tables, settings_of
+from palpate.report.terminal import NAMES, audit_text, score_rows, sheet_rows, sheet_words
 
 _SPECIAL = str.maketrans({c: f"\\{c}" for c in "\\`*_[]|<>"})
 
@@ -91,12 +91,9 @@ def _fenced(text: str, language: str = "text") -> list[str]:
 
 
 def _scores(table: Table) -> list[str]:
-    made = [
-        (title, "; ".join(f"{what} {how}" for what, how in facts.items()))
-        for title, facts in table_facts(table)
-    ]
     grid = pipe_table(score_rows(table)) if table.columns else []
-    lines = _laid((table.title, table.question), grid, marks_of(table), made, table.notes)
+    marked = marks((cell for column in table.columns for cell in column.cells), "*")
+    lines = _laid((table.title, table.question), grid, marked, facts_of(table), table.notes)
     return [*lines, *(_sheet(difference_sheet(table)) if table.differences else [])]
 
 
@@ -108,13 +105,13 @@ def _sheet(table: Sheet) -> list[str]:
 def _laid(
     head: tuple[str, str],
     grid: Sequence[str],
-    marks: Sequence[str],
+    marked: Sequence[str],
     made: Iterable[tuple[str, str]],
     notes: Sequence[Note],
 ) -> list[str]:
     title, text = map(esc, head)
     lines = [f"### {title}", "", *([text, ""] if text else []), *grid]
-    lines += [line for mark in marks for line in (esc(mark), "")]
+    lines += [line for mark in marked for line in (esc(mark), "")]
     lines += [f"- {esc(what)}: {esc(how)}" for what, how in made]
     lines += [f"- ({k}) {esc(sentence(note))}" for k, note in enumerate(notes, 1)]
     return [*lines, ""]

@@ -28,7 +28,7 @@ from palpate.report import audits, curves, first_screen, plots, sentences, study
 from palpate.report.notes import count, digits_of, number, percent, plural, sentence, where
 from palpate.report.results import GalleryItem, LeakPair, Results, Strip
 from palpate.report.study_tables import sheets
-from palpate.report.tables import defined, heat_tables, score_tables, settings_of, table_facts
+from palpate.report.tables import defined, heat_tables, score_tables, settings_of
 from palpate.report.thumbnails import Album, Wanted, fit
 
 #: Samples of the first screen; their images take at most a third of the bytes.
@@ -334,7 +334,6 @@ def environment() -> Environment:
     )
     functions: dict[str, Any] = {
         "open_pairs": OPEN_PAIRS,
-        "table_facts": table_facts,
         "long_list": LONG_LIST,
         "READING": first_screen.READING,
         "like_rows": _like_rows,

@@ -218,7 +218,7 @@ def gap_histogram(audit: Audit) -> Markup:
     All bars are equally wide, with the edges (frames) labeled below; the median is a dashed line.
     """
     edges, counts = list(audit.gap_edges), list(audit.gap_counts)
-    if not sum(counts):
+    if sum(map(bool, counts)) < 2:  # one bar says no more than the numbers below it
         return Markup("")
     positions = np.linspace(0, 1, len(edges)).tolist()
     every = max(1, math.ceil(len(counts) / 5))

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import re
 from collections import Counter
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass, replace
 from itertools import count
 
@@ -20,19 +20,20 @@ from palpate.report.results import Results
 from palpate.report.study import Claim, Curve, StudyTable
 from palpate.report.tables import (
     BASELINES,
-    BEST,
-    DECIDED,
     REAL,
     Cell,
     Column,
     Footnotes,
     Table,
     best_by_value,
+    facts_of,
+    marks,
     notes_of,
 )
 
 #: Verdict -> the mark before its word, for those who do not see colors.
 MARKS = {"holds": "✓", "does not hold": "✗", "undecided": "?"}
+_DEGREES = re.compile(r"[\d.]+(?= df)")
 _ARROW = re.compile("[↑↓→]")
 
 
@@ -40,14 +41,13 @@ _ARROW = re.compile("[↑↓→]")
 class Head:
     """One column: label and better direction ('' where none is shown); whether it holds scores.
 
-    One that is empty is among the scores. ``below`` is what all its scores share, say their n.
+    One that is empty is among the scores.
     """
 
     label: str
     arrow: str
     better: str
     scores: bool
-    below: str = ""
 
 
 @dataclass(frozen=True)
@@ -113,10 +113,7 @@ class Sheet:
 
     def marks(self, best: str) -> list[str]:
         """What the marks mean, where there are any; ``best`` is how the best is marked."""
-        cells = [cell for row in self.rows for cell in row.cells]
-        known = {f"{best} {BEST}": any(cell.best for cell in cells)}
-        known[f"† {DECIDED}"] = any(cell.decided for cell in cells)
-        return [text for text, shown in known.items() if shown]
+        return marks((cell for row in self.rows for cell in row.cells), best)
 
 
 def sheets(results: Results) -> list[Sheet]:
@@ -208,7 +205,7 @@ def lay(columns: Sequence[Column], controls: Collection[str] = ()) -> Sheet:
             for text, entry in zip(floors, known, strict=True)
         ]
         rule = bool(rows) and rows[-1].control
-        rows.append(Row([Entry("real images (floor)"), *cells], False, rule))
+        rows.append(Row([Entry("real images (floor)"), *cells], REAL in controls, rule))
     return Sheet("The verdict", "", False, heads, rows, footnotes.notes)
 
 
@@ -241,13 +238,12 @@ def score_sheets(table: Table) -> list[Sheet]:
     heads = [
         laid.heads[0],
         *(
-            replace(head, label=column.label, below=column.size)
+            replace(head, label=column.label)
             for head, column in zip(laid.heads[1:], table.columns, strict=True)
         ),
     ]
-    found = replace(
-        laid, title=table.title, text=table.question, heads=heads, rows=rows, strips=True
-    )
+    words = {"title": table.title, "text": table.question, "made": facts_of(table)}
+    found = replace(laid, **words, heads=heads, rows=rows, strips=True)
     return [found] * bool(table.columns) + [difference_sheet(table)] * bool(table.differences)
 
 
@@ -317,6 +313,13 @@ def brief(text: str, most: int = 220) -> str:
     return f"{text[: next(end for end in ends if end > 0)]} …"
 
 
+def says_more(claim: Claim) -> bool:
+    """Return whether the evidence of a claim says more than its reason."""
+    one = len(claim.evidence) == 1 and claim.evidence[0].value is not None
+    known = one and not claim.evidence[0].notes and brief(claim.why) == claim.why
+    return bool(claim.evidence) and not known
+
+
 def file_names(kind: str, titles: Sequence[str]) -> list[str]:
     """Return a name for each file: its kind and title in a short form, and a number if needed."""
     names: list[str] = []
@@ -371,7 +374,8 @@ def _best(
 def _made(scores: Sequence[Score]) -> list[tuple[str, str]]:
     """How the scores of a table were made, as (what, how)."""
     sizes = sorted({score.n for score in scores if score.n})
-    methods = (f"{100 * s.level:g} %, {s.interval_method}" for s in scores if s.interval)
+    known = [s for s in scores if s.interval]
+    methods = _joined(f"{100 * s.level:g} %, {s.interval_method}" for s in known)
     facts = {
         "n": [" to ".join(dict.fromkeys(f"{n:,}" for n in (*sizes[:1], *sizes[-1:])))],
         "interval": [method.removesuffix(", ") for method in methods],
@@ -381,6 +385,19 @@ def _made(scores: Sequence[Score]) -> list[tuple[str, str]]:
     }
     rows = {what: list(dict.fromkeys(filter(None, how))) for what, how in facts.items()}
     return [(what, _few(what, how)) for what, how in rows.items() if how]
+
+
+def _joined(methods: Iterable[str]) -> list[str]:
+    """Methods that differ in their degrees of freedom alone as one, with the range of these."""
+    degrees: dict[str, list[str]] = {}
+    for method in methods:
+        degrees.setdefault(_DEGREES.sub("{}", method), []).extend(_DEGREES.findall(method))
+    return [
+        method.replace("{}", "-".join(dict.fromkeys((min(n, key=float), max(n, key=float)))))
+        if n
+        else method
+        for method, n in degrees.items()
+    ]
 
 
 def _few(what: str, words: Sequence[str], most: int = 12) -> str:

@@ -9,7 +9,7 @@ another reference are in tables of their own.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Any
@@ -218,7 +218,6 @@ class Table:
         title: family, preset, features, split and reference, as far as they are needed.
         question: what the family answers; '' in its further tables.
         columns: the metrics.
-        subjects: the rows.
         differences: paired differences of these scores.
         notes: the footnotes.
         made: (what, how) all columns were made.
@@ -227,14 +226,9 @@ class Table:
     title: str
     question: str
     columns: Sequence[Column]
-    subjects: Sequence[str]
     differences: Sequence[Difference]
     notes: Sequence[Note]
     made: Sequence[tuple[str, str]]
-
-    def cells(self, subject: str, column: Column) -> list[Cell]:
-        """The scores of a subject in a column; several where seeds differ."""
-        return [cell for cell in column.cells if cell.score.subject == subject]
 
 
 @dataclass(frozen=True)
@@ -389,8 +383,7 @@ def _table(title: str, question: str, scores: Sequence[Score]) -> Table:
     rows = [_difference(score) for score in differences if defined(score)]
     shared = [fact for fact in heads[0].made if all(fact in h.made for h in heads)] if heads else []
     heads = [replace(h, made=[fact for fact in h.made if fact not in shared]) for h in heads]
-    subjects = list(dict.fromkeys(score.subject for score in members))
-    return Table(title, question, heads, subjects, rows, footnotes.notes, shared)
+    return Table(title, question, heads, rows, footnotes.notes, shared)
 
 
 def _difference(score: Score) -> Difference:
@@ -547,7 +540,16 @@ def heat_tables(scores: Sequence[Score]) -> list[Heat]:
     return tables
 
 
-def table_facts(table: Table) -> list[tuple[str, Mapping[str, str]]]:
-    """Return how the scores were made: of all columns together, then what differs by column."""
-    rows = [("All of these", table.made), *((c.metric, c.made) for c in table.columns)]
-    return [(title, dict(made)) for title, made in rows if made]
+def facts_of(table: Table) -> list[tuple[str, str]]:
+    """Return (what, how) the scores were made: what all columns share, then what is of one."""
+    sizes = [(f"{c.metric}, size", c.size) for c in table.columns if c.size]
+    single = [(f"{c.metric}, {what}", how) for c in table.columns for what, how in c.made]
+    return [*sizes, *table.made, *single]
+
+
+def marks(cells: Iterable[Any], best: str) -> list[str]:
+    """Return what the marks of cells mean, where there are any; ``best`` is how it is marked."""
+    cells = list(cells)
+    known = {f"{best} {BEST}": any(cell.best for cell in cells)}
+    known[f"† {DECIDED}"] = any(cell.decided for cell in cells)
+    return [text for text, shown in known.items() if shown]

@@ -31,7 +31,7 @@ from palpate.report.sentences import (
 )
 from palpate.report.study import Claim
 from palpate.report.study_tables import Entry, Sheet, curve_table, difference_sheet, sheet, tally
-from palpate.report.tables import BASELINES, BEST, DECIDED, Table, defined, rankings, score_tables
+from palpate.report.tables import BASELINES, Table, defined, marks, rankings, score_tables
 
 #: Columns that are text; all others are numbers, flush right.
 NAMES = ("metric", "subject", "a", "b", "notes", "best first")
@@ -62,20 +62,14 @@ def _print_scores(scores: Sequence[Score], console: Console, style: Style) -> No
     for table in score_tables(scores):
         console.print(Text(table.title, "bold"))
         _print_rows(score_rows(table), console)
-        _print_lines([*marks_of(table), *_notes(table.notes, style)], console)
+        marked = marks((cell for column in table.columns for cell in column.cells), "*")
+        _print_lines([*marked, *_notes(table.notes, style)], console)
         if ranked := rankings(table):
             console.print(Text(RANKED, "bold"))
             _print_rows([{"metric": m, "best first": order} for m, order in ranked], console)
         elif table.differences:
             _print_sheet(difference_sheet(table), console, style)
         console.print()
-
-
-def marks_of(table: Table) -> list[str]:
-    """What the marks of the rows of scores mean."""
-    cells = [cell for column in table.columns for cell in column.cells]
-    known = {f"* {BEST}": any(c.best for c in cells), f"† {DECIDED}": any(c.decided for c in cells)}
-    return [text for text, shown in known.items() if shown]
 
 
 def _notes(notes: Sequence[Note], style: Style) -> list[str]:
@@ -238,12 +232,4 @@ def audit_text(audit: Audit, style: Style = PYTHON) -> str:
     return "\n".join([*lines, *(audit_text(other, style) for other in audit.others)])
 
 
-__all__ = [
-    "as_text",
-    "audit_text",
-    "marks_of",
-    "print_result",
-    "score_rows",
-    "sheet_rows",
-    "sheet_words",
-]
+__all__ = ["as_text", "audit_text", "print_result", "score_rows", "sheet_rows", "sheet_words"]
