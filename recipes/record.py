@@ -43,8 +43,8 @@ def heading(results: Results, commit: str, notes: list[str]) -> str:
     listed = "".join(f"\n- {note}" for note in notes)
     return f"""# {results.title}: our record
 
-Made by `python recipes/record.py`; do not edit by hand. Synthetic data: it shows what the code does,
-not what real gels do.
+Made by `python recipes/record.py`; do not edit by hand. Synthetic data: it shows what the code
+does, not what real gels do.
 
 | | |
 |---|---|
