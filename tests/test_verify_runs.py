@@ -19,7 +19,7 @@ from palpate.studies.reproduce import plan_of, run_study
 from palpate.studies.stages import Run
 from palpate.studies.study import NOLEAK, STUDIES
 from palpate.studies.verifying import verify
-from palpate.studies.verifying_runs import Remade, _settings_checks
+from palpate.studies.verifying_runs import Remade, _settings_checks, _trained_steps
 
 SCORE = Score(
     "TMMD", "Ours", 1.25, n=8, details={"stage": "results"}, notes=[Note("synthetic-data")]
@@ -148,6 +148,14 @@ def test_an_edited_setting_is_named():
     assert {c.status for c in checks} == {"differs"}
 
 
+def test_the_steps_of_a_study_are_those_of_its_trainings(tmp_path):
+    run = Run(tmp_path)
+    for name, facts in {"data": {}, "ours": {"steps": 8}, "ours-2-steps": {"steps": 2}}.items():
+        run.stage(name, {}, lambda folder, facts=facts: facts)
+    assert _trained_steps(tmp_path, run.stages) == 8
+    assert _trained_steps(tmp_path, ["data", "absent"]) is None
+
+
 def test_a_score_of_no_stage_is_untraced(forged):
     edit(forged, lambda data: data["scores"][0]["details"].pop("stage"))
     checked = verify(forged)
@@ -253,8 +261,11 @@ def test_a_pixel_and_a_number_are_found_in_a_run(copied):
     pixels[3, 3] ^= 128
     Image.fromarray(pixels).save(file)
     edit(copied / "results.json", lambda d: d["audits"][0].update(groups_shared=77))
+    stated = {"steps of a method": 99}
+    edit(copied / "results.json", lambda d: d["settings"]["options"].update(stated))
     changed = differing(copied / "results.json")
     assert changed["audit Orig: groups shared"].startswith("77 in the file")
+    assert "settings: options" in changed
     assert f"stage images-ours-{NOLEAK}-0" in changed
     assert f"stage scores-{NOLEAK}-by-{NOLEAK}-0, made again" in changed
     assert "stage scores-Orig-by-Orig-0, made again" not in changed

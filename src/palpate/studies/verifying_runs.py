@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import tempfile
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import chain
 from pathlib import Path
@@ -166,7 +166,7 @@ def _make_nodes(
         root=options["root"] and folder / "data",
         others={method: images(method) for method in options["methods of others"]},
         people=options["people"] and folder / LAST / "people.json",
-        steps=options["steps of a method"],
+        steps=_trained_steps(folder, settings["stages"]) or options["steps of a method"],
         vq=options["vq"],
     )
     nodes = nodes_of(plan)
@@ -175,6 +175,15 @@ def _make_nodes(
     made = settings_of(plan, stages, options["jobs"])
     options = {name: options[name] for name in OF_PLACE}
     return {**made, "options": {**made["options"], **options}}
+
+
+def _trained_steps(folder: Path, names: Iterable[str]) -> int | None:
+    """Steps of the first method that was trained; those that settings state may have been edited.
+
+    The shorter trainings, whose names depend on it, come after the methods.
+    """
+    facts = (_record(folder / name).get("facts", {}) for name in names)
+    return next((f["steps"] for f in facts if "steps" in f), None)
 
 
 def _measure(
