@@ -1,12 +1,14 @@
 """Rulers agree or reverse as planted, and say when they cannot tell."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from PIL import Image
 from scipy.stats import kendalltau
 
 from mini_fixtures import make_encoders
-from palpate.core import PalpateError, Score, Split
+from palpate.core import Note, PalpateError, Score, Split
 from palpate.data.manifest import Manifest
 from palpate.encoders.embed import embed
 from palpate.metrics import tmmd
@@ -90,6 +92,9 @@ def test_perfect_agreement_has_no_interval_and_mistakes_are_named():
         ruler_scores({"a": same["a"]})
     with pytest.raises(PalpateError, match="the same generators"):
         ruler_scores({"a": same["a"], "b": {("m0", 0): Score("TMMD", "m0", 1.0)}})
+    seen = Note("text", {"text": "has seen them"})
+    noted = {key: replace(s, notes=[seen]) for key, s in same["b"].items()}
+    assert [*ruler_scores({"a": same["a"], "b": noted})[0].notes] == [*score.notes, seen]
     empty = {**same["a"], ("m0", 0): Score("TMMD", "m0", None)}
     with pytest.raises(PalpateError, match="must have a score"):
         ruler_scores({"a": same["a"], "b": empty})

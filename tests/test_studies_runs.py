@@ -6,6 +6,7 @@ import shutil
 import signal
 import subprocess
 import sys
+from collections import Counter
 from pathlib import Path
 
 import numpy as np
@@ -14,11 +15,15 @@ from PIL import Image
 from safetensors.numpy import load_file
 
 import small_study
-from palpate.core import digest_json, short
+from palpate.core import Score, Split, digest_json, short
+from palpate.report.results import Results
+from palpate.report.study import Claim, Curve, Line, StudyTable
 from palpate.studies.graph import in_order
+from palpate.studies.judging import read_scores
 from palpate.studies.reproduce import nodes_of, plan_of
 from palpate.studies.stages import stage_digest
-from palpate.studies.study import STUDIES
+from palpate.studies.study import SPLITS, STUDIES
+from palpate.studies.verifying import numbers_of
 
 GOLDEN = Path(__file__).parent / "golden" / "study_stages.json"
 #: What holds no times.
@@ -107,13 +112,51 @@ def summary(folder) -> dict[str, float]:
     if images:
         numbers["images"] = len(images)
         numbers["mean of images"] = np.mean([np.asarray(Image.open(p)).mean() for p in images])
-    for path in sorted(folder.glob("*.json")):
-        record = json.loads(path.read_text())
-        rows = record.get("scores", []) if isinstance(record, dict) else record
-        values = [r["value"] for r in rows if r.get("value") is not None]
-        numbers[f"{path.name}: scores"] = len(values)
-        numbers[f"{path.name}: mean"] = np.abs(values).mean() if values else 0.0
+    if (folder / "scores.json").is_file():
+        numbers |= means(read_scores(folder))
+    if (folder / "results.json").is_file():
+        results = Results.load(folder / "results.json")
+        numbers |= means(numbers_of(results))
+        verdicts = Counter(claim.verdict for claim in results.claims)
+        numbers |= {f"claims: {verdict}": count for verdict, count in verdicts.items()}
+    for name in SPLITS:
+        if (folder / f"{name}.json").is_file():
+            counts = Split.load(folder / f"{name}.json").counts()
+            numbers |= {f"{name}: {part}": count for part, count in counts.items()}
     return numbers
+
+
+def means(scores) -> dict[str, float]:
+    """The number of scores with a value, their mean, and that of their limits."""
+    values = [float(s) for s in scores if s.value is not None]
+    limits = [s.interval for s in scores if s.interval is not None]
+    numbers = {"scores": len(values), "intervals": len(limits)}
+    return numbers | {
+        f"mean of {name}": np.abs(of).mean()
+        for name, of in (("values", values), ("limits", limits))
+        if of
+    }
+
+
+def test_a_summary_sees_other_numbers_verdicts_and_parts(tmp_path):
+    """In tables, curves and claims as well: those of most questions are nowhere else."""
+
+    def summarized(value, verdict, train):
+        score = Score("TMMD", "Ours", value, (value, value + 1))
+        Results(
+            title="",
+            tables=[StudyTable("", "", ["a"], [[score]])],
+            curves=[Curve("", "", "", "", [Line("", [(1.0, score)])])],
+            claims=[Claim("", "", verdict, "", [score])],
+        ).save(tmp_path / "results.json")
+        Split({"a": "test", "b": train}).save(tmp_path / "Orig.json")
+        return summary(tmp_path)
+
+    first = summarized(1.0, "holds", "train")
+    assert first["scores"] == 3
+    assert summarized(1.0, "holds", "train") == first
+    for other in ((1.1, "holds", "train"), (1.0, "undecided", "train"), (1.0, "holds", "val")):
+        assert summarized(*other) != first
 
 
 @pytest.mark.nightly

@@ -13,14 +13,21 @@ from palpate.encoders.encoder_set import EncoderSet
 from palpate.evaluation.inputs import read
 
 
-def generated_manifest(images: Generated | Path | str, manifest: Manifest) -> Manifest:
-    """The samples of generated images, with these as their tactile images.
+def embed_generated(
+    images: Generated | Path | str,
+    manifest: Manifest,
+    encoders: EncoderSet,
+    progress: Progress = quiet,
+) -> FeatureSet:
+    """Tactile features (n, d) of generated images.
 
     Materials, videos, sensors and no-contact images are those of the manifest's samples.
 
     Args:
         images: a folder of ``palpate generate``, also as it was returned, or one with a manifest.
         manifest: samples of the same ids, and perhaps others.
+        encoders: with a tactile one.
+        progress: progress callback.
 
     Raises:
         PalpateError: if the folder is none of images, or an id is not in the manifest.
@@ -32,15 +39,5 @@ def generated_manifest(images: Generated | Path | str, manifest: Manifest) -> Ma
     assert made is not None  # a folder holds images
     paths = [str(path.resolve()) for path in made.paths("tactile")]
     part = manifest.take(made.ids)
-    return replace(part, table=part.table.with_columns(pl.Series("tactile", paths)))
-
-
-def embed_generated(
-    images: Generated | Path | str,
-    manifest: Manifest,
-    encoders: EncoderSet,
-    progress: Progress = quiet,
-) -> FeatureSet:
-    """Tactile features (n, d) of generated images, with material and video of their samples."""
-    part = generated_manifest(images, manifest)
+    part = replace(part, table=part.table.with_columns(pl.Series("tactile", paths)))
     return embed(part, encoders, "tactile", still=True, progress=progress)

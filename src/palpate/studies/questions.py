@@ -19,7 +19,6 @@ from palpate.encoders.embed import embed, embed_images
 from palpate.encoders.encoder_set import EncoderSet, load_clip
 from palpate.encoders.models import pick_device
 from palpate.encoders.rows import evenly
-from palpate.metrics import tmmd
 from palpate.report.results import Results
 from palpate.report.study import Claim, Curve, StudyTable
 from palpate.sim.appearance import APPEARANCES, Appearance
@@ -29,12 +28,11 @@ from palpate.studies.appearance import AGAIN, RECORDED, appearance_claims, appea
 from palpate.studies.embedding import embed_generated
 from palpate.studies.evidence import over_seeds
 from palpate.studies.forty import companions_on_forty
-from palpate.studies.judging import SIGMA, image_files
+from palpate.studies.judging import image_files
 from palpate.studies.lengths import SAMPLING, compute_curves
 from palpate.studies.making import After, Facts, cache_of, data_of, setting_of, slug
-from palpate.studies.rulers import Generator, ruler_claim, ruler_scores, ruler_tables
+from palpate.studies.rulers import measure_rulers, ruler_claim, ruler_scores, ruler_tables
 from palpate.studies.study import NOLEAK
-from palpate.studies.study_tables import READING
 from palpate.studies.utility import Draws, utility, utility_claims
 
 #: Samples whose photos are shown otherwise.
@@ -159,14 +157,9 @@ def compare_rulers(
         name: EncoderSet.load(after[of] / "encoders" if of in after else of, device=device)
         for name, of in rulers.items()
     }
-    test = manifest.part(split, "test")
-    ranked: dict[str, dict[Generator, Score]] = {name: {} for name in loaded}
-    for name, encoders in loaded.items():
-        real = embed(test, encoders, "tactile", cache=cache_of(place), still=True)
-        for generator, node in images.items():
-            x = embed_generated(after[node] / "images", test, encoders, progress)
-            how: Facts = {"subject": generator[0], "split": split.digest, "permutations": 0}
-            ranked[name][generator] = tmmd(x, real, preset=READING, sigma=SIGMA, **how)
+    folders = {generator: after[node] / "images" for generator, node in images.items()}
+    how: Facts = {"cache": cache_of(place), "progress": progress}
+    ranked = measure_rulers(loaded, folders, manifest, split, **how)
     defined = [g for g in images if all(of[g].value is not None for of in ranked.values())]
     same = {name: {g: of[g] for g in defined} for name, of in ranked.items()}
     agreement = ruler_scores(same)

@@ -322,7 +322,7 @@ def _question_nodes(plan: Plan) -> list[Node]:
         rulers |= {} if preset.ruler is None else {preset.ruler: preset.ruler}
         build = partial(compare_rulers, rulers=rulers, images=images, device=plan.device)
         ranking = {"rulers": rulers, "shipped": model_stamp("encoders", preset.ruler)}
-        nodes.append(Node("rulers", build, ranking, after, cost=60, measures=True))
+        nodes.append(Node("rulers", build, ranking, after, version=2, cost=60, measures=True))
     return nodes
 
 

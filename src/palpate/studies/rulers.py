@@ -44,6 +44,7 @@ def measure_rulers(
     manifest: Manifest,
     split: Split,
     *,
+    cache: Path | None = None,
     progress: Progress = quiet,
 ) -> dict[str, dict[Generator, Score]]:
     """TMMD of every generator's images by every encoder, for :func:`ruler_scores`.
@@ -56,13 +57,14 @@ def measure_rulers(
         images: (method, seed) -> folder of the images of the test part.
         manifest: the samples.
         split: whose test part the images are of.
+        cache: folder for embeddings of real images.
         progress: progress callback.
     """
     test = manifest.part(split, "test")
     made: dict[str, dict[Generator, Score]] = {}
     for name, encoders in rulers.items():
         notes = guard(encoders, "tactile", test, split=split, allow_seen=True, progress=progress)
-        real = embed(test, encoders, "tactile", still=True, progress=progress)
+        real = embed(test, encoders, "tactile", cache=cache, still=True, progress=progress)
         made[name] = {}
         for (method, seed), folder in images.items():
             x = embed_generated(folder, test, encoders, progress)
@@ -85,7 +87,8 @@ def ruler_scores(
 
     Returns:
         A score for each pair, in [-1, 1]; ``details["by_method"]`` is the tau of the methods' mean
-        TMMD, ``"p_value"`` of its test. The interval is None where replicates do not vary.
+        TMMD, ``"p_value"`` of its test. The interval is None where replicates do not vary. Notes
+        of the TMMD, such as on images that an encoder has seen, are taken over.
 
     Raises:
         PalpateError: with fewer than two rulers or three generators, generators that differ, or a
@@ -106,7 +109,14 @@ def ruler_scores(
             raise PalpateError(must, got, "See the score's notes")
     values = {n: np.array([float(of[g]) for g in generators]) for n, of in rulers.items()}
     draws = _draws(generators, replicates, seed)
-    return [_agreement(values, pair, generators, draws, seed) for pair in combinations(rulers, 2)]
+    made: list[Score] = []
+    for pair in combinations(rulers, 2):
+        score = _agreement(values, pair, generators, draws, seed)
+        notes = [*score.notes]
+        for note in (n for name in pair for s in rulers[name].values() for n in s.notes):
+            notes += [] if note in notes else [note]
+        made.append(replace(score, notes=notes))
+    return made
 
 
 def _draws(generators: list[Generator], replicates: int, seed: int) -> Array:
