@@ -217,7 +217,12 @@ def test_the_keyboard_reaches_the_sections_and_the_wide_tables(chromium, page_fi
     tags = [tag for tag, _ in reached]
     assert tags[:6] == [*["A"] * 5, "FIGURE"]
     assert "SUMMARY" in tags
-    assert any(tag == "DIV" and label == "Table: the verdict" for tag, label in reached)
+    assert any(tag == "DIV" and label == "Table: The verdict" for tag, label in reached)
+    ask = """[...document.querySelectorAll('.wide')]
+        .map(e => [e.tabIndex, e.scrollWidth > e.clientWidth])"""
+    for width in (360, 1280):
+        with opened(chromium, page_file, width) as page:
+            assert all((tab == 0) == scrolls for tab, scrolls in page.evaluate(ask))
 
 
 def test_a_printed_page_is_what_is_open_with_its_images(chromium, page_file):
