@@ -309,8 +309,8 @@ class GalleryItem:
         generated: path of the generated image.
         background: that of the image without contact.
         method: what generated it.
-        others: label -> path of images of the same photo that stand beside it in place of contacts;
-            ``label`` is then that of ``generated``, e.g. "Orig" beside {"NoLeak": path}.
+        others: label -> path of images of the same photo that stand next to it in a block of their
+            own, where ``label`` is that of ``generated``, e.g. "NoLeak" next to {"Orig": path}.
     """
 
     sample: SampleRef

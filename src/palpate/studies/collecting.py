@@ -13,7 +13,7 @@ from palpate.data.manifest import Manifest
 from palpate.diffusion.generation import Generated
 from palpate.evaluation.probing import results_of
 from palpate.report.notes import percent
-from palpate.report.results import Audit, Results
+from palpate.report.results import Audit, GalleryItem, Results
 from palpate.report.study import Curve
 from palpate.studies.claims import Names, differences_over_seeds, effect_table, paper_claims
 from palpate.studies.controls import FLOOR, NEAREST
@@ -43,16 +43,16 @@ def collect(
     methods: Sequence[str],
     judgments: Mapping[tuple[str, str], Sequence[str]],
     probes: Mapping[str, Sequence[str]],
-    gallery: str,
+    gallery: Mapping[str, str],
     people: Path | None = None,
     questions: Sequence[str] = (),
 ) -> Facts:
     """Write ``results.json``: everything but the record of the run.
 
     ``judgments``: (split of the images, split of the judge) -> nodes, one a seed; ``probes``: split
-    -> nodes; ``gallery``: node of the images that are shown; ``people``: results of a human study,
-    whose preferences are among the claims; ``questions``: nodes of further
-    tables, curves and claims.
+    -> nodes; ``gallery``: split -> node of the images that are shown; ``people``: results of a
+    human study, whose preferences are among the claims; ``questions``: nodes of further tables,
+    curves and claims.
     """
     manifest = Manifest.load(after["data"])
     splits = {name: Split.load(after["split"] / f"{name}.json") for name in SPLITS}
@@ -89,8 +89,13 @@ def collect(
         facts=[_leak(audits), *_distance(own), *_material(own), *probed.facts[:1]],
         audits=audits,
         scores=[s for (metric, _), s in own.by_name.items() if DIFFERENCE not in metric],
-        gallery=gallery_of(manifest, Generated.load(after[gallery] / "images"), 0),
-        settings={"split rule": {name: dict(s.rule) for name, s in splits.items()}},
+        gallery=_gallery(
+            study.on_both[0], manifest, {s: after[node] / "images" for s, node in gallery.items()}
+        ),
+        settings={
+            "split rule": {name: dict(s.rule) for name, s in splits.items()},
+            "methods": {method.name: method.text for method in study.methods},
+        },
         notes=notes,
         tables=[replace(t, rows=_staged_rows(t.rows, stage)) for t in tables],
         curves=[_staged_curve(c, stage) for a in answers for c in a.curves],
@@ -100,6 +105,23 @@ def collect(
     if people is not None:  # ``palpate verify`` reads it again
         shutil.copyfile(people, place / "people.json")
     return {"tables": len(tables), "claims": len(claims), "scores": len(results.scores)}
+
+
+def _gallery(method: str, manifest: Manifest, folders: Mapping[str, Path]) -> list[GalleryItem]:
+    """Samples of the split without leaks; next to them the images after training on the other."""
+    made = {split: Generated.load(folder) for split, folder in folders.items()}
+    both = {*made[ORIG].ids}
+    return [
+        replace(
+            item,
+            method=method,
+            label=NOLEAK,
+            others={ORIG: str(made[ORIG].path(item.sample.id).resolve())}
+            if item.sample.id in both
+            else {},
+        )
+        for item in gallery_of(manifest, made[NOLEAK], 0)
+    ]
 
 
 def _compares(difference: Score, methods: Sequence[str]) -> bool:

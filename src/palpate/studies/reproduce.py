@@ -188,23 +188,29 @@ def nodes_of(plan: Plan) -> list[Node]:
     nodes += questions
     judgments = {(s, j): [_scores(s, j, n) for n in plan.seeds] for s, j in product(SPLITS, SPLITS)}
     probes = {split: [f"probe-{split}-{seed}" for seed in plan.seeds] for split in SPLITS}
-    first = _images(study.on_both[0], NOLEAK, plan.seeds[0])
+    shown = {split: _images(study.on_both[0], split, plan.seeds[0]) for split in SPLITS}
     build = partial(
         collect,
         study=study,
         methods=plan.methods,
         judgments=judgments,
         probes=probes,
-        gallery=first,
+        gallery=shown,
         people=plan.people,
         questions=[node.name for node in questions if node.name in QUESTIONS],
     )
     read = [node for of in (judgments, probes) for nodes in of.values() for node in nodes]
-    after = ["data", "split", first, *read, *(n.name for n in questions if n.name in QUESTIONS)]
+    after = [
+        "data",
+        "split",
+        *shown.values(),
+        *read,
+        *(n.name for n in questions if n.name in QUESTIONS),
+    ]
     inputs = {"study": study.name, "title": study.title, "tables": study.tables}
     inputs |= {"paper": study.paper, "methods": plan.methods, "controls": list(study.controls)}
     inputs |= {"people": plan.people and digest_file(plan.people)}
-    nodes.append(Node("results", build, inputs, after, version=3, cost=10, measures=True))
+    nodes.append(Node("results", build, inputs, after, version=4, cost=10, measures=True))
     return nodes
 
 
