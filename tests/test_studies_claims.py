@@ -51,6 +51,9 @@ def test_seeds_add_their_deviation_to_the_interval_of_videos():
     assert made.interval == pytest.approx((1.2 - reach, 1.2 + reach))
     assert made.details["by_seed"] == values
     assert over_seeds([difference("TMMD", 1.0, None)] * 2).interval is None
+    for value, reach in ((1.0, 0.5), (1.0, None), (None, None)):
+        by = [replace(difference("TMMD", value, reach), encoder=name) for name in ("e0", "e1")]
+        assert [over_seeds(by).encoder, over_seeds(by[:1] * 2).encoder] == [None, "e0"]
     with pytest.raises(PalpateError, match="one metric and subject"):
         over_seeds([difference("TMMD", 1.0), difference("SSIM", 1.0)])
 

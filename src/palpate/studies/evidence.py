@@ -45,7 +45,8 @@ def over_seeds(scores: Sequence[Score]) -> Score:
     notes = list[Note]()
     for score in scores:
         notes += [note for note in score.notes if note not in notes]
-    first = replace(first, null=None, seed=None, notes=notes)
+    encoder = first.encoder if len({s.encoder for s in scores}) == 1 else None
+    first = replace(first, null=None, seed=None, notes=notes, encoder=encoder)
     known = [v for v in values if v is not None]
     if len(known) < len(values):
         return replace(first, value=None, interval=None, interval_method="", details=details)
@@ -61,7 +62,6 @@ def over_seeds(scores: Sequence[Score]) -> Score:
         value=mean,
         interval=(mean - float(low), mean + float(high)),
         interval_method=f"limits of {count} seeds and their deviation, by recovery of variances",
-        encoder=first.encoder if len({s.encoder for s in scores}) == 1 else None,
         details=details,
     )
 
