@@ -307,7 +307,7 @@ def _question_nodes(plan: Plan) -> list[Node]:
         after = ["data", "split", *judges, *(node for of in runs.values() for node in of.values())]
         inputs = {"draws": draws, "methods": useful}
         nodes.append(
-            Node("utility", build, inputs, after, version=2, cost=120 * seeds, measures=True)
+            Node("utility", build, inputs, after, version=3, cost=120 * seeds, measures=True)
         )
     if useful:
         nodes += _compute_nodes(plan, {n: trained[n] for n in useful})
@@ -320,7 +320,7 @@ def _question_nodes(plan: Plan) -> list[Node]:
         build = partial(compare_on_forty, runs=made(paired), device=plan.device, **how)
         after = ["data", "split", *(node for of in made(paired) for node in of.values())]
         inputs = {**how, **_clip(preset)}
-        nodes.append(Node("forty", build, inputs, after, cost=15 * seeds, measures=True))
+        nodes.append(Node("forty", build, inputs, after, version=2, cost=15 * seeds, measures=True))
     if len(trained) > 2:
         rulers = {f"trained on {s}": f"encoder-{s}-{first}" for s in SPLITS}
         images = {(n, seed): _images(n, NOLEAK, seed) for n, seed in product(trained, plan.seeds)}
@@ -383,7 +383,7 @@ def _appearance_nodes(plan: Plan, methods: Mapping[str, Method]) -> list[Node]:
     build = partial(measure_moves, moved=moved, ours=ours, other=other, device=plan.device)
     after = ["data", "split", *dict.fromkeys(read)]
     inputs = {"moved": list(methods)}
-    return [*nodes, Node("appearance", build, inputs, after, cost=10, measures=True)]
+    return [*nodes, Node("appearance", build, inputs, after, version=2, cost=10, measures=True)]
 
 
 def _generator(study: Study, method: Method, split: str, seed: int) -> str:
