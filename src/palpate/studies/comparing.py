@@ -25,7 +25,7 @@ _PASSING = ("version", "stage", "seconds")
 #: Fields of an audit that are no numbers, or are compared on their own.
 _OF_AUDITS = ("name", "notes", "commands", "call", "others", "impact")
 #: Keys of samples that are places on one machine.
-_PLACES = ("vision", "tactile", "background", "generated")
+_PLACES = ("vision", "tactile", "background", "generated", "others")
 #: Keys of what holds no numbers of a measurement.
 _BESIDES = ("notes", "settings")
 
@@ -111,7 +111,11 @@ def _difference(a: Any, b: Any, tolerance: float, scale: float, name: str) -> st
 
 def _passes(key: str, a: Mapping[str, Any], b: Mapping[str, Any]) -> bool:
     """Whether an entry is no number of a measurement: a time, a note, the path of an image."""
-    path = all(isinstance(value, str | None) for value in (a.get(key), b.get(key)))
+    x, y = a.get(key), b.get(key)
+    if isinstance(x, Mapping) and isinstance(y, Mapping):  # images that stand next to one
+        path = x.keys() == y.keys() and all(isinstance(v, str | None) for v in x.values())
+    else:
+        path = all(isinstance(value, str | None) for value in (x, y))
     return key in (*_PASSING, *_BESIDES) or (key in _PLACES and path)
 
 
