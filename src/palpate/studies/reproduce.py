@@ -355,7 +355,8 @@ def _compute_nodes(plan: Plan, methods: Mapping[str, Method]) -> list[Node]:
     images = [node for of in trained.values() for node in of.values()]
     after = ["data", "split", judge, *images, *sampled.values()]
     build = partial(build, device=plan.device)
-    return [*nodes, Node("compute", build, {"trained": trained}, after, cost=20, measures=True)]
+    inputs = {"trained": {name: [*of.values()] for name, of in trained.items()}}
+    return [*nodes, Node("compute", build, inputs, after, cost=20, measures=True)]
 
 
 def _of_one(plan: Plan, method: Method, steps: int) -> Plan:
