@@ -13,6 +13,7 @@ import pytest
 
 from palpate.cli import main
 from palpate.core import FeatureSet, PalpateError, Score, Split, digest_file
+from palpate.core.digest import canonical_json
 from palpate.encoders.models import shipped_folder
 from palpate.report.results import Results
 from palpate.sim import WorldOptions
@@ -121,6 +122,14 @@ def test_other_shipped_weights_build_what_reads_them(monkeypatch):
     assert all(before[name] == after[name] for name in trained)
     for name in ("images-palpate-mini-NoLeak-0", "rulers"):
         assert before[name] != after[name], name
+
+
+@pytest.mark.parametrize("name", ["world-gelsight", "world-digit"])
+def test_what_a_stage_reads_is_the_same_from_its_record(name):
+    """Keys of JSON are words: a number as a key would come back as another digest."""
+    for node in nodes_of(plan_of(STUDIES[name], seeds=(0, 1))):
+        written = canonical_json(node.inputs)
+        assert canonical_json(json.loads(written)) == written, node.name
 
 
 def test_the_size_of_the_paper_needs_its_autoencoder(tmp_path):
