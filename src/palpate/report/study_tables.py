@@ -127,13 +127,16 @@ def controls_of(results: Results) -> set[str]:
 
 
 def scores_of_methods(results: Results) -> list[Score]:
-    """Return the scores of methods: without controls, and of several presets the first."""
+    """Return the scores of methods: without controls, and of several presets the first.
+
+    Results of real images alone, as a probe's, are returned whole.
+    """
     controls = {REAL, *controls_of(results)}
     first: dict[tuple[str, str], Score] = {}
     for score in results.scores:
         if score.subject not in controls:
             first.setdefault((score.metric, score.subject), score)
-    return [*first.values()]
+    return [*first.values()] or [*results.scores]
 
 
 def sheet(table: StudyTable) -> Sheet:
