@@ -2,8 +2,8 @@
 
 python recipes/record.py RUN -o docs/results/world-gelsight --commit abc1234 [--note "..."]
 
-Writes index.md (claims, tables, curves, settings), results.json (every score, with digests),
-samples.jpg and the curves as SVG. Images of contacts in it are of the synthetic world.
+Writes index.md (claims, tables, curves, settings), tables/ (every score as CSV), settings.json
+(digests, versions, and every stage with its time), samples.jpg and the curves as SVG.
 """
 
 from __future__ import annotations
@@ -78,8 +78,8 @@ def main() -> None:
     text = replace(shown, settings=settings, facts=results.facts).to_markdown()
     body = text.partition("\n")[2]  # the heading is ours
     (output / "index.md").write_text(heading(results, args.commit, args.note) + body)
-    record = json.dumps(results.to_json(), separators=(",", ":"), ensure_ascii=False)
-    (output / "results.json").write_text(record + "\n")
+    results.to_csv(output / "tables")
+    (output / "settings.json").write_text(json.dumps(results.settings, indent=1) + "\n")
 
 
 if __name__ == "__main__":
