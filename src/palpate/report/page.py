@@ -39,7 +39,7 @@ OPEN_ROWS, MAX_ROWS = 8, 160
 COMPARED = 4
 OPEN_PAIRS, MAX_PAIRS = 6, 24
 #: Claims that show at once.
-OPEN_CLAIMS = 8
+OPEN_CLAIMS = 6
 #: A list in the settings is cut here; the JSON keeps it whole.
 LONG_LIST = 24
 _DIGEST = re.compile(r"(?:sha256:)?[0-9a-f]{32,128}")
