@@ -13,7 +13,7 @@ import palpate as pp
 from palpate.core import FeatureSet, PalpateError, Score, Split
 from palpate.data.manifest import Manifest
 from palpate.report.results import Audit, Results
-from palpate.studies.comparing import score_difference
+from palpate.studies.comparing import TOLERANCE, number_difference, score_difference
 from palpate.studies.verifying import verify
 from score_calls import GROUPS, IDS, LABELS, feature_sets, paint
 
@@ -220,6 +220,13 @@ def audited(tmp_path, monkeypatch):
     Path("test.txt").write_text("a/0000000005.jpg,3\nc/0000000001.jpg,4")
     pp.audit("train.txt", "test.txt").save("audit.json")
     return Path("audit.json")
+
+
+def test_thresholds_of_near_duplicates_may_differ_by_what_threads_make_of_them():
+    row = {"threshold": 0.78549515, "rate": 0.78549515}
+    assert not number_difference(row, row | {"threshold": 0.7855167}, TOLERANCE)
+    assert "threshold" in number_difference(row, row | {"threshold": 0.7865}, TOLERANCE)
+    assert "rate" in number_difference(row, row | {"rate": 0.7855167}, TOLERANCE)
 
 
 def test_counts_of_an_audit_are_made_again(audited):

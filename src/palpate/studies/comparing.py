@@ -1,8 +1,9 @@
 """Numbers of two runs side by side: scores and audits, field by field.
 
 Numbers agree if ``|a - b| <= tolerance * max(|a|, |b|, scale / 1e6)``: relative, but for values
-near zero, which are differences of sums of the size of the scale. Words, counts and digests agree
-if they are equal. Times, and the version and stage that a score was made in, are not compared.
+near zero, which are differences of sums of the size of the scale; the thresholds of near-duplicates
+have a tolerance of their own. Words, counts and digests agree if they are equal. Times, and the
+version and stage that a score was made in, are not compared.
 """
 
 from __future__ import annotations
@@ -28,6 +29,9 @@ _OF_AUDITS = ("name", "notes", "commands", "call", "others", "impact")
 _PLACES = ("vision", "tactile", "background", "generated", "others")
 #: Keys of what holds no numbers of a measurement.
 _BESIDES = ("notes", "settings")
+#: The least tolerance of a threshold of near-duplicates: it comes of 16- and 32-bit descriptors, and
+#: two threads in the place of one move it by 3e-5.
+THRESHOLDS = 1e-4
 
 
 @dataclass(frozen=True)
@@ -98,8 +102,17 @@ def _label(row: Mapping[str, Any]) -> str:
 def _difference(a: Any, b: Any, tolerance: float, scale: float, name: str) -> str:
     if isinstance(a, Mapping) and isinstance(b, Mapping):
         keys = [key for key in dict.fromkeys([*a, *b]) if not _passes(key, a, b)]
-        pairs = ((f"{name} {key}".strip(), a.get(key), b.get(key)) for key in keys)
-        return _first(pairs, tolerance, scale)
+        differences = (
+            _difference(
+                a.get(key),
+                b.get(key),
+                max(tolerance, THRESHOLDS) if key == "threshold" else tolerance,
+                scale,
+                f"{name} {key}".strip(),
+            )
+            for key in keys
+        )
+        return next(filter(None, differences), "")
     if isinstance(a, list) and isinstance(b, list) and len(a) == len(b):
         short = len(a) == 2 and all(isinstance(v, int | float) for v in (*a, *b))
         pairs = ((name if short else f"{name} {k + 1}", *v) for k, v in enumerate(zip(a, b)))  # noqa: B905 - of one length
