@@ -29,7 +29,7 @@ _OF_AUDITS = ("name", "notes", "commands", "call", "others", "impact")
 _PLACES = ("vision", "tactile", "background", "generated", "others")
 #: Keys of what holds no numbers of a measurement.
 _BESIDES = ("notes", "settings")
-#: The least tolerance of a threshold of near-duplicates: it comes of 16- and 32-bit descriptors, and
+#: The least tolerance of a threshold of near-duplicates, which comes of 16- and 32-bit descriptors:
 #: two threads in the place of one move it by 3e-5.
 THRESHOLDS = 1e-4
 
