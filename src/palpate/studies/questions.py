@@ -234,25 +234,28 @@ def compare_on_forty(
     progress: Progress,
     *,
     runs: Sequence[Mapping[str, str]],
+    controls: Sequence[str],
     clip: str,
     size: int,
     device: str,
 ) -> Facts:
     """Companions on forty items, as in the paper.
 
-    ``runs``: method -> node of its images, one a seed.
+    ``runs``: method -> node of its images, one a seed; ``controls``: their names.
     """
     manifest, split = data_of(after, NOLEAK)
     test = manifest.part(split, "test")
     real = load_images(test.paths("tactile"), size)
     groups = [str(v or i) for i, v in zip(test.ids, test.column("video"), strict=True)]
     vision = EncoderSet(load_clip(clip, device=device))
+    shown = {name: after[f"controls-{NOLEAK}"] / slug(name) for name in controls}
+    shown = {name: folder for name, folder in shown.items() if folder.is_dir()}
     tables: list[StudyTable] = []
     for images in runs:
-        files = {n: image_files(after[of] / "images", test.ids) for n, of in images.items()}
-        made = {name: load_images(paths, size) for name, paths in files.items()}
+        folders = {name: after[node] / "images" for name, node in images.items()} | shown
+        made = {n: load_images(image_files(of, test.ids), size) for n, of in folders.items()}
         tables.append(companions_on_forty(made, real, test.ids, groups, vision, name=clip))
-    table = table_over_seeds(tables)
+    table = replace(table_over_seeds(tables), controls=[*shown])
     if len(runs) > 1:
         text = f"{table.text} Scores are means over {len(runs)} seeds, the sentences of the first."
         table = replace(table, text=text)

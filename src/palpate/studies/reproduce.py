@@ -317,10 +317,12 @@ def _question_nodes(plan: Plan) -> list[Node]:
     paired = [n for n in (OURS, GVST, VQ, BACKGROUND) if n in trained]
     if len(paired) > 1:
         how: dict[str, Any] = {"clip": preset.clip, "size": preset.diffusion.size}
+        how["controls"] = [*plan.study.controls]
         build = partial(compare_on_forty, runs=made(paired), device=plan.device, **how)
         after = ["data", "split", *(node for of in made(paired) for node in of.values())]
+        after.append(f"controls-{NOLEAK}")
         inputs = {**how, **_clip(preset)}
-        nodes.append(Node("forty", build, inputs, after, version=2, cost=15 * seeds, measures=True))
+        nodes.append(Node("forty", build, inputs, after, version=3, cost=15 * seeds, measures=True))
     if len(trained) > 2:
         rulers = {f"trained on {s}": f"encoder-{s}-{first}" for s in SPLITS}
         images = {(n, seed): _images(n, NOLEAK, seed) for n, seed in product(trained, plan.seeds)}
