@@ -36,10 +36,9 @@ from palpate.metrics import (
     compare_tmmd,
     contact_images,
     mean_score,
-    measure_contacts,
     per_image,
 )
-from palpate.metrics.contact import SETTINGS
+from palpate.metrics.contact import SETTINGS, contacts_of_each
 from palpate.metrics.distributions import prdc_rows
 from palpate.metrics.paired import mean_differences
 
@@ -332,10 +331,7 @@ def _with_differences(
 
 
 def _contact(pairs: Pairs) -> Outcome:
-    contacts = {
-        name: measure_contacts(images, pairs.reference, pairs.background)
-        for name, images in pairs.images.items()
-    }
+    contacts = contacts_of_each(pairs.images, pairs.reference, pairs.background)
     scores = {name: c.scores(subject=name, **pairs.common) for name, c in contacts.items()}
     outcome = Outcome()
     for of_metric in zip(*scores.values(), strict=True):
