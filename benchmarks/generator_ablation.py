@@ -33,7 +33,7 @@ from palpate.data.manifest import Manifest
 from palpate.diffusion.alignment import Alignment
 from palpate.diffusion.autoencoder import BackgroundAutoencoder
 from palpate.diffusion.autoencoders import autoencoder_of, gels_of, load_autoencoder
-from palpate.diffusion.options import AutoencoderOptions, Schedule
+from palpate.diffusion.options import AutoencoderOptions, SamplerOptions, Schedule
 from palpate.diffusion.presets import MINI
 from palpate.diffusion.training import train_pipeline
 from palpate.encoders import train_encoder
@@ -60,7 +60,9 @@ VQ = AutoencoderOptions(
 )
 BFLOAT = Compute(precision="bf16")
 
-BASE = replace(MINI, name="ablation", loop=replace(MINI.loop, steps=2000))
+#: Plain guidance, so that all rows are sampled as the first ones were.
+PLAIN = SamplerOptions("dpm", steps=10, guidance=2.5)
+BASE = replace(MINI, name="ablation", loop=replace(MINI.loop, steps=2000), sampler=PLAIN)
 
 
 def schedule(**changes):

@@ -18,6 +18,7 @@ from palpate.metrics import (
     contact_scores,
     measure_contacts,
 )
+from palpate.metrics.contact import contacts_of_each
 from palpate.sim import Video, World, WorldOptions
 from palpate.sim.plan import first_contact, plan_world
 
@@ -161,6 +162,19 @@ def test_values_by_hand():
     assert contacts.values[IOU][0] == (mask & made_mask).sum() / (mask | made_mask).sum()
     negative = measure_contacts(2 * background - real, real, background)
     assert negative.values[RESIDUAL][0] == pytest.approx(2)
+
+
+def test_stacks_measured_together_score_as_each_alone():
+    rng = np.random.default_rng(0)
+    background, real = gel(3), gel(3)
+    real[:2, 12:36, 12:36] += 0.2  # the third shows no contact
+    stacks = {name: np.clip(real + rng.normal(0, 0.05, real.shape), 0, 1) for name in "ab"}
+    for name, both in contacts_of_each(stacks, real, background).items():
+        alone = measure_contacts(stacks[name], real, background)
+        for metric, values in alone.values.items():
+            assert np.array_equal(both.values[metric], values, equal_nan=True)
+            assert np.array_equal(both.empty[metric], alone.empty[metric], equal_nan=True)
+        assert list(both.area > 0) == [True, True, False]
 
 
 @pytest.mark.parametrize("sigma", [4, 8, 16])
