@@ -152,9 +152,10 @@ def scores_table(target: Path) -> str:
         for row in read_json(target / part / "palpate.json", "card")[key]["scores"]:
             interval = " to ".join(f"{v:.3g}" for v in row.get("interval", ()))
             chance = f"{row['chance']:.3g}" if "chance" in row else ""
+            exact = f"{row['in 32 bits']:.4g}" if "in 32 bits" in row else ""
             lines.append(
                 f"| {part} | {row['score']} | {row['value']:.4g} | {interval} | {chance} "
-                f"| {row['in 32 bits']:.4g} |"
+                f"| {exact} |"
             )
     return "\n".join(lines)
 
