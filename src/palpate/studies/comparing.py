@@ -1,9 +1,9 @@
 """Numbers of two runs side by side: scores and audits, field by field.
 
 Numbers agree if ``|a - b| <= tolerance * max(|a|, |b|, scale / 1e6)``: relative, but for values
-near zero, which are differences of sums of the size of the scale; the thresholds of near-duplicates
-have a tolerance of their own. Words, counts and digests agree if they are equal. Times, and the
-version and stage that a score was made in, are not compared.
+near zero, which are differences of sums of the size of the scale; thresholds and scores of
+near-duplicates have a tolerance of their own. Words, counts and digests agree if they are equal.
+Times, and the version and stage that a score was made in, are not compared.
 """
 
 from __future__ import annotations
@@ -29,9 +29,9 @@ _OF_AUDITS = ("name", "notes", "commands", "call", "others", "impact")
 _PLACES = ("vision", "tactile", "background", "generated", "others")
 #: Keys of what holds no numbers of a measurement.
 _BESIDES = ("notes", "settings")
-#: The least tolerance of a threshold of near-duplicates, which comes of 16- and 32-bit descriptors:
-#: two threads in the place of one move it by 3e-5.
-THRESHOLDS = 1e-4
+#: The least tolerance of near-duplicates, whose descriptors have 16 and 32 bits: two threads in the
+#: place of one move a threshold by 3e-5, and the score of a pair, of four digits, by one of them.
+NEAR, NEAR_TOLERANCE = ("threshold", "score"), 5e-4
 
 
 @dataclass(frozen=True)
@@ -106,7 +106,7 @@ def _difference(a: Any, b: Any, tolerance: float, scale: float, name: str) -> st
             _difference(
                 a.get(key),
                 b.get(key),
-                max(tolerance, THRESHOLDS) if key == "threshold" else tolerance,
+                max(tolerance, NEAR_TOLERANCE) if key in NEAR else tolerance,
                 scale,
                 f"{name} {key}".strip(),
             )
