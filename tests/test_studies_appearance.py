@@ -81,7 +81,7 @@ def rows(scale, seed, shift=0.0, videos=24, frames=4, width=8):
     return FeatureSet(ids, x.astype(np.float32), labels, groups)
 
 
-def study(by_light, seed=0):
+def study(by_light, seed=0, noise=True):
     """A method of which noise moves images by 0.3, and the changes by so much and by nothing."""
     base = rows(0.0, 0)
     renderings = {
@@ -90,7 +90,8 @@ def study(by_light, seed=0):
         "other white balance": base,
         "clutter": rows(0.3, 4 + seed),
     }
-    return moves(renderings, rows(0.3, 5 + seed), base, train=base, subject="m")
+    again = rows(0.3, 5 + seed) if noise else None
+    return moves(renderings, again, base, train=base, subject="m")
 
 
 def test_movement_is_the_mean_distance_and_relative_to_noise():
@@ -115,6 +116,16 @@ def test_movement_is_the_mean_distance_and_relative_to_noise():
     assert float(cells["other white balance"][2]) == 0
     assert float(cells["other light"][2]) > float(cells["clutter"][2])
     assert float(cells["other light"][3]) < 0  # the probe knew the recorded ones by heart
+
+
+def test_what_has_no_noise_moves_by_no_multiple_of_it():
+    runs = {"Ours": [study(0.2)], "GVST": [study(0.8)], "real": [study(0.4, noise=False)]}
+    table = appearance_table(runs)
+    cells = {row[1]: row[2:] for row in table.rows if row[0] == "real"}
+    assert AGAIN not in cells
+    assert cells["other light"][1] is None
+    assert float(cells["other light"][0]) > 0.2
+    assert appearance_claims(runs)[0].verdict == "holds"
 
 
 def test_claims_follow_who_moves_less():

@@ -8,6 +8,7 @@ from palpate.core import Score
 from palpate.report.results import Results
 from palpate.report.study import Curve, Line, StudyTable
 from palpate.studies import questions
+from palpate.studies.controls import NEAREST
 from palpate.studies.questions import curve_over_seeds, table_over_seeds
 from palpate.studies.utility import GAIN, Draws
 
@@ -46,7 +47,9 @@ def test_whether_images_help_is_decided_by_all_seeds(tmp_path, monkeypatch, gain
     """One training may gain where the next loses."""
     left = list(gains)
 
-    def forged(manifest, split, judge, images, draws, *, progress):
+    def forged(manifest, split, judge, images, draws, *, controls, progress):
+        assert controls == [NEAREST]
+        assert images[NEAREST].name == "real-nearest-photo"
         gain = score(left.pop(0), images["Ours"].parent.name)
         assert judge == tmp_path / f"encoder-{gain.subject[-1]}" / "encoders"
         gain = score(gain.value)
@@ -58,8 +61,10 @@ def test_whether_images_help_is_decided_by_all_seeds(tmp_path, monkeypatch, gain
     monkeypatch.setattr(questions, "EncoderSet", load)
     runs = {f"encoder-{k}": {"Ours": f"images-{k}"} for k in range(len(gains))}
     names = [n for encoders, made in runs.items() for n in (encoders, *made.values())]
+    names.append("controls-NoLeak")
     after = {name: tmp_path / name for name in names}
-    how = {"runs": runs, "draws": Draws(), "device": "cpu"}
+    (after["controls-NoLeak"] / "real-nearest-photo").mkdir(parents=True)
+    how = {"runs": runs, "controls": [NEAREST, "mean image"], "draws": Draws(), "device": "cpu"}
     questions.measure_utility(tmp_path, after, lambda *_: None, **how)
     results = Results.load(tmp_path / "results.json")
     assert results.claims[0].verdict == verdict

@@ -15,6 +15,7 @@ from palpate.cli import main
 from palpate.core import FeatureSet, PalpateError, Score, Split, digest_file
 from palpate.core.digest import canonical_json
 from palpate.encoders.models import shipped_folder
+from palpate.preference.scoring import PREFERENCE, STRENGTH
 from palpate.report.results import Results
 from palpate.sim import WorldOptions
 from palpate.sim.presets import MINI_SEEDS
@@ -416,6 +417,24 @@ def test_tables_hold_methods_controls_and_both_judges():
     for table in (one, three, four):
         assert all(len(row) == len(table.columns) for row in table.rows)
         assert not any("paper" in str(row[0]) for row in table.rows)
+
+
+def test_people_are_columns_of_table_three():
+    judged = {
+        (s, j): Scores.over_seeds([[forged(n, "TMMD", 1.0) for n in (OURS, "GVST")]], "results")
+        for s in (ORIG, NOLEAK)
+        for j in (ORIG, NOLEAK)
+    }
+    votes = [forged(n, m, 0.7) for m in (PREFERENCE, STRENGTH) for n in (OURS, "theirs")]
+    votes.append(forged(OURS, "human accuracy of material", 0.4))
+    how = {"methods": [OURS, "GVST"], "controls": [], "people": votes}
+    one, three, four = study_tables(WORLD, judged, {}, **how)
+    assert three.columns == ["images", "TMMD", PREFERENCE, STRENGTH]
+    assert [None if c is None else c.value for c in three.rows[0][1:]] == [1.0, 0.7, 0.7]
+    assert three.rows[1][2:] == [None, None]
+    assert PREFERENCE not in {*one.columns, *four.columns}
+    how["people"] = [forged("theirs", PREFERENCE, 0.7)]
+    assert study_tables(WORLD, judged, {}, **how)[1].columns == ["images", "TMMD"]
 
 
 def test_the_papers_numbers_stand_beside_its_own_data_alone():

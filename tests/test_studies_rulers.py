@@ -70,6 +70,10 @@ def test_tables_and_the_claim_follow():
     assert matrix.rows[1] == ["NoLeak", agreement[0], None]
     assert [[float(c) for c in row[1:]] for row in ranks.rows] == [[k, k] for k in range(1, 9)]
     assert ruler_claim(agreement).verdict == "holds"
+    empty = {n: of | {("empty", 0): Score("TMMD", "empty", 4.5)} for n, of in alike.items()}
+    ranks = ruler_tables(empty, agreement, controls=["empty", "of no data"])[1]
+    assert (ranks.rows[-1][0], ranks.controls) == ("empty", ["empty"])
+    assert sorted(float(row[1]) for row in ranks.rows) == [*range(1, 10)]
     against = {"Orig": ruler(RANKS, 0.3, 0), "NoLeak": ruler(-RANKS, 0.3, 1)}
     assert ruler_claim(ruler_scores(against, replicates=300)).verdict == "does not hold"
     blind = {"Orig": ruler(RANKS, 0.3, 0), "NoLeak": ruler(0 * RANKS, 1.0, 5)}

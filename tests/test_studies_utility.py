@@ -93,6 +93,19 @@ def test_the_claim_follows_the_gain_at_one_video(material):
     assert flipped[1].verdict == "does not hold"
 
 
+def test_controls_are_rows_and_neither_lines_nor_claims():
+    good = {name: like_test(videos(20, "other", 4)) for name in ("made", "retrieved")}
+    draws = Draws(shots=(1,), draws=1)
+    table, curve = material_utility(TRAIN, TEST, good, draws, controls=["retrieved"])
+    aside = ["k real + retrieved", "retrieved alone", "gain by retrieved"]
+    assert sorted(table.controls) == sorted(aside)
+    assert {*aside} < {*cells(table)}
+    assert [line.label for line in curve.lines] == [REAL, "k real + made", "made alone"]
+    assert [c.claim for c in utility_claims(table)] == [
+        "Images of made help a classifier of real touch"
+    ]
+
+
 def test_no_image_trains_what_names_its_video(material):
     """Of the test images themselves a probe would know each video's deviation by heart."""
     rows = cells(material[0])

@@ -52,7 +52,7 @@ class Moves:
 
 def moves(
     renderings: Mapping[str, FeatureSet],
-    again: FeatureSet,
+    again: FeatureSet | None,
     real: FeatureSet,
     *,
     train: FeatureSet | None = None,
@@ -64,7 +64,7 @@ def moves(
     Args:
         renderings: appearance -> features of the images, of one noise seed and the same ids;
             ``as recorded`` among them.
-        again: the same of recorded photos with another noise seed.
+        again: the same of recorded photos with another noise seed; None: there is no noise.
         real: features of the real test images.
         train: real features of the train part with materials, for a probe; None: no accuracy.
         subject: the method, kept in the scores.
@@ -78,7 +78,7 @@ def moves(
         must = f"must hold {RECORDED!r} and a change"
         raise PalpateError(must, got, fix, argument="renderings")
     base, others = renderings[RECORDED], {n: x for n, x in renderings.items() if n != RECORDED}
-    others[AGAIN] = again
+    others |= {} if again is None else {AGAIN: again}
     others = {name: x.take(list(base.ids)) for name, x in others.items()}
     probe = None if train is None or not base.labels else fit_probe(train)
     distances: dict[str, Mean] = {}
@@ -144,7 +144,8 @@ def appearance_table(methods: Mapping[str, Sequence[Moves]]) -> StudyTable:
     rows: list[list[Score | str | None]] = []
     for method, runs in methods.items():
         for name in runs[0].distances:
-            relative = _relative(runs, name) if name != AGAIN else None
+            noisy = name != AGAIN and AGAIN in runs[0].distances
+            relative = _relative(runs, name) if noisy else None
             changes = {
                 parts[0].metric: over_seeds(parts)
                 for parts in zip(*(run.changes[name] for run in runs), strict=True)

@@ -51,7 +51,7 @@ def collect(
 
     ``judgments``: (split of the images, split of the judge) -> nodes, one a seed; ``probes``: split
     -> nodes; ``gallery``: split -> node of the images that are shown; ``people``: results of a
-    human study, whose preferences are among the claims; ``questions``: nodes of further tables,
+    human study, columns of table 3 and evidence of claims; ``questions``: nodes of further tables,
     curves and claims.
     """
     manifest = Manifest.load(after["data"])
@@ -67,8 +67,9 @@ def collect(
     own, noleak = judged[NOLEAK, NOLEAK], seeds[NOLEAK, NOLEAK]
     extra = [m for m in own.metrics if any(s.details.get("extra") for s in own.of(m))]
     names: dict[str, Sequence[str]] = {"methods": methods, "controls": list(study.controls)}
+    votes = [] if people is None else [*Results.load(people).scores]
     tables = [
-        *study_tables(study, judged, known, **names, extra=extra),
+        *study_tables(study, judged, known, **names, extra=extra, people=votes),
         effect_table([d for d in differences_over_seeds(noleak) if _compares(d, methods)]),
         memorization_table(
             {split: [*judged[split, split].by_name.values()] for split in SPLITS},
@@ -80,7 +81,6 @@ def collect(
     images = [m for m in methods if m.startswith("GVST")]
     tasks = {**_tasks_of_encoders(probed.scores), **_tasks_of_generators(seeds)}
     named = Names(OURS, images, BACKGROUND, VQ)
-    votes = [] if people is None else [*Results.load(people).scores]
     claims = paper_claims(noleak, tasks=tasks, people=votes, names=named)
     claims += [claim for answer in answers for claim in answer.claims]
     notes = [*probed.notes, *([Note("synthetic-data")] if manifest.facts.get("synthetic") else [])]

@@ -24,7 +24,7 @@ from palpate.metrics import tmmd
 from palpate.metrics.means import Mean, mean_of
 from palpate.metrics.probe import fit_probe
 from palpate.studies.controls import FLOOR, HALVES, MEMORIZED, NEAREST, ONE, WRONG, nearest_rows
-from palpate.studies.making import After, Facts, cache_of, data_of, slug
+from palpate.studies.making import After, Facts, cache_of, control_folders, data_of
 from palpate.studies.methods import OURS
 from palpate.studies.photo_companions import photo_companions
 from palpate.studies.study import SPLITS, Judged, Metric
@@ -122,8 +122,7 @@ def judge_images(
     manifest, split = data_of(after, name)
     judge = EncoderSet.load(after[judging.encoders] / "encoders", device=device)
     folders = {method: after[node] / "images" for method, node in methods.items()}
-    controls = {c: after[f"controls-{name}"] / slug(c) for c in judging.controls}
-    folders |= {c: folder for c, folder in controls.items() if folder.is_dir()}
+    folders |= control_folders(after, name, judging.controls)
     test = manifest.part(split, "test")
     gels = not test.table["background"].null_count()
     results = score(

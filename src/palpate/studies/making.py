@@ -279,6 +279,12 @@ def make_controls(
     return {"controls": made}
 
 
+def control_folders(after: After, split: str, names: Sequence[str]) -> dict[str, Path]:
+    """Folders of the images of those controls that the data allow, by name."""
+    folders = {name: after[f"controls-{split}"] / slug(name) for name in names}
+    return {name: folder for name, folder in folders.items() if folder.is_dir()}
+
+
 def take_images(
     place: Path, after: After, progress: Progress, *, split: str, folder: Path, size: int
 ) -> Facts:

@@ -25,16 +25,27 @@ from palpate.sim.appearance import APPEARANCES, Appearance
 from palpate.sim.options import WorldOptions
 from palpate.sim.photos import with_photos
 from palpate.studies.appearance import AGAIN, RECORDED, appearance_claims, appearance_table, moves
+from palpate.studies.controls import CEILING, EMPTY, NEAREST, nearest_rows
 from palpate.studies.embedding import embed_generated
 from palpate.studies.evidence import over_seeds
 from palpate.studies.forty import companions_on_forty
 from palpate.studies.judging import image_files
 from palpate.studies.lengths import SAMPLING, compute_curves
-from palpate.studies.making import After, Facts, cache_of, data_of, setting_of, slug
+from palpate.studies.making import (
+    After,
+    Facts,
+    cache_of,
+    control_folders,
+    data_of,
+    setting_of,
+    slug,
+)
 from palpate.studies.rulers import measure_rulers, ruler_claim, ruler_scores, ruler_tables
 from palpate.studies.study import NOLEAK
 from palpate.studies.utility import Draws, utility, utility_claims
 
+#: Controls whose images train a classifier: a perfect generator, retrieval, and no touch at all.
+USEFUL = (CEILING, NEAREST, EMPTY)
 #: Samples whose photos are shown otherwise.
 MOVED = 200
 
@@ -45,19 +56,23 @@ def measure_utility(
     progress: Progress,
     *,
     runs: Mapping[str, Mapping[str, str]],
+    controls: Sequence[str],
     draws: Draws,
     device: str,
 ) -> Facts:
     """What generated images are worth for a classifier and for retrieval of real touch.
 
     ``runs``: node of the judge -> method -> node of its images, made for photos; one a seed.
+    ``controls``: their names.
     """
     manifest, split = data_of(after, NOLEAK)
+    shown = control_folders(after, NOLEAK, controls)
     made = list[tuple[list[StudyTable], Curve]]()
     for encoders, images in runs.items():
         judge = EncoderSet.load(after[encoders] / "encoders", device=device)
-        folders = {name: after[node] / "images" for name, node in images.items()}
-        made.append(utility(manifest, split, judge, folders, draws, progress=progress))
+        folders = {name: after[node] / "images" for name, node in images.items()} | shown
+        how: Facts = {"controls": [*shown], "progress": progress}
+        made.append(utility(manifest, split, judge, folders, draws, **how))
     tables = [table_over_seeds(same) for same in zip(*(t for t, _ in made), strict=True)]
     curve = curve_over_seeds([curve for _, curve in made])
     return _write(place, tables, [curve], utility_claims(tables[0]))
@@ -96,6 +111,31 @@ def move_images(
     return {"samples": len(test)}
 
 
+def retrieve_moved(
+    place: Path,
+    after: After,
+    progress: Progress,
+    *,
+    encoders: str,
+    options: WorldOptions,
+    clip: str,
+    device: str,
+) -> Facts:
+    """The same of the real images of the nearest train photos: the control that has no noise."""
+    manifest, split = data_of(after, NOLEAK)
+    train, test = (manifest.part(split, part) for part in ("train", "test"))
+    test = test.take([test.ids[k] for k in evenly(len(test), MOVED)])
+    judge = EncoderSet.load(after[encoders] / "encoders", device=device)
+    vision, cache = EncoderSet(load_clip(clip, device=device)), cache_of(place)
+    of = embed(test, judge, "tactile", cache=cache, still=True)
+    known = embed(train, judge, "tactile", cache=cache).features
+    for name in APPEARANCES:
+        shown = _photographed(test, options, name, place / "photos", progress)
+        rows = nearest_rows(train, shown, vision, cache=cache)
+        replace(of, features=known[rows]).save(place / f"{slug(name)}.npz")
+    return {"samples": len(test)}
+
+
 def _photographed(
     test: Manifest, options: WorldOptions, name: str, folder: Path, progress: Progress
 ) -> Manifest:
@@ -127,12 +167,15 @@ def measure_moves(
         for node, encoders in nodes:
             judge = EncoderSet.load(after[encoders] / "encoders", device=device)
             sets = {n: FeatureSet.load(after[node] / f"{slug(n)}.npz") for n in APPEARANCES}
-            again = FeatureSet.load(after[node] / f"{slug(AGAIN)}.npz")
-            real = embed(manifest.take(again.ids), judge, "tactile", cache=cache, still=True)
+            noise = after[node] / f"{slug(AGAIN)}.npz"
+            again = FeatureSet.load(noise) if noise.is_file() else None
+            ids = sets[RECORDED].ids
+            real = embed(manifest.take(ids), judge, "tactile", cache=cache, still=True)
             known = embed(train, judge, "tactile", cache=cache) if real.labels else None
             how: dict[str, Any] = {"train": known, "subject": method, "split": split.digest}
             runs.setdefault(method, []).append(moves(sets, again, real, **how))
-    return _write(place, [appearance_table(runs)], claims=appearance_claims(runs, ours, other))
+    table = replace(appearance_table(runs), controls=[n for n in runs if n == NEAREST])
+    return _write(place, [table], claims=appearance_claims(runs, ours, other))
 
 
 def compare_rulers(
@@ -142,6 +185,7 @@ def compare_rulers(
     *,
     rulers: Mapping[str, str],
     images: Mapping[tuple[str, int], str],
+    controls: Sequence[str],
     device: str,
 ) -> Facts:
     """Whether encoders of other training rank the generators alike.
@@ -150,7 +194,8 @@ def compare_rulers(
     ranking is the question.
 
     ``rulers``: name of an encoder -> its node, or the name of a shipped one; ``images``: (method,
-    seed) -> node.
+    seed) -> node; ``controls``: their names. Controls have ranks, but no part in the agreement:
+    encoders of any training put an empty background last.
     """
     manifest, split = data_of(after, NOLEAK)
     loaded = {
@@ -158,12 +203,15 @@ def compare_rulers(
         for name, of in rulers.items()
     }
     folders = {generator: after[node] / "images" for generator, node in images.items()}
+    shown = control_folders(after, NOLEAK, controls)
+    folders |= {(name, 0): folder for name, folder in shown.items()}
     how: Facts = {"cache": cache_of(place), "progress": progress}
     ranked = measure_rulers(loaded, folders, manifest, split, **how)
-    defined = [g for g in images if all(of[g].value is not None for of in ranked.values())]
-    same = {name: {g: of[g] for g in defined} for name, of in ranked.items()}
-    agreement = ruler_scores(same)
-    return _write(place, ruler_tables(same, agreement), claims=[ruler_claim(agreement)])
+    defined = [g for g in folders if all(of[g].value is not None for of in ranked.values())]
+    ranked = {name: {g: of[g] for g in defined} for name, of in ranked.items()}
+    agreement = ruler_scores({n: {g: of[g] for g in images if g in of} for n, of in ranked.items()})
+    tables = ruler_tables(ranked, agreement, controls=[*shown])
+    return _write(place, tables, claims=[ruler_claim(agreement)])
 
 
 def sample_in_steps(
@@ -248,8 +296,7 @@ def compare_on_forty(
     real = load_images(test.paths("tactile"), size)
     groups = [str(v or i) for i, v in zip(test.ids, test.column("video"), strict=True)]
     vision = EncoderSet(load_clip(clip, device=device))
-    shown = {name: after[f"controls-{NOLEAK}"] / slug(name) for name in controls}
-    shown = {name: folder for name, folder in shown.items() if folder.is_dir()}
+    shown = control_folders(after, NOLEAK, controls)
     tables: list[StudyTable] = []
     for images in runs:
         folders = {name: after[node] / "images" for name, node in images.items()} | shown

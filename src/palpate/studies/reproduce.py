@@ -28,6 +28,7 @@ from palpate.report.results import Results
 from palpate.sim.presets import MINI_SEEDS
 from palpate.studies import making
 from palpate.studies.collecting import collect
+from palpate.studies.controls import NEAREST
 from palpate.studies.demo import model_stamp, require_unseen, stamp
 from palpate.studies.graph import Node, Planned, plan_graph, run_graph
 from palpate.studies.judging import Judging, judge_images, probe_encoders
@@ -36,12 +37,14 @@ from palpate.studies.making import slug
 from palpate.studies.methods import BACKGROUND, GVST, OURS, SHIPPED, VQ, Method, shipped
 from palpate.studies.questions import (
     MOVED,
+    USEFUL,
     compare_on_forty,
     compare_rulers,
     measure_compute,
     measure_moves,
     measure_utility,
     move_images,
+    retrieve_moved,
     sample_in_steps,
 )
 from palpate.studies.stages import Stage
@@ -290,10 +293,9 @@ def _autoencoder_nodes(plan: Plan, split: str) -> list[Node]:
 
 def _question_nodes(plan: Plan) -> list[Node]:
     """What generation is for, what moves it, and which ruler: as far as the data allow."""
-    study, preset, first = plan.study, plan.preset, plan.seeds[0]
+    study, preset = plan.study, plan.preset
     trained = {m.name: m for m in study.trained_on(NOLEAK) if m.make is None}
-    nodes: list[Node] = []
-    seeds = len(plan.seeds)
+    nodes, controls, seeds = list[Node](), [*study.controls], len(plan.seeds)
 
     def made(names: Sequence[str]) -> list[dict[str, str]]:
         """The images of methods by name, one a seed."""
@@ -301,14 +303,15 @@ def _question_nodes(plan: Plan) -> list[Node]:
 
     useful = [n for n in study.useful if n in trained]
     if 2 not in study.tables and useful:
-        judges, draws = [f"encoder-{NOLEAK}-{s}" for s in plan.seeds], Draws()
+        judges = [f"encoder-{NOLEAK}-{s}" for s in plan.seeds]
         runs = dict(zip(judges, made(useful), strict=True))
-        build = partial(measure_utility, runs=runs, draws=draws, device=plan.device)
-        after = ["data", "split", *judges, *(node for of in runs.values() for node in of.values())]
-        inputs = {"draws": draws, "methods": useful}
-        nodes.append(
-            Node("utility", build, inputs, after, version=3, cost=120 * seeds, measures=True)
-        )
+        given: dict[str, Any] = {"draws": Draws(), "controls": [c for c in USEFUL if c in controls]}
+        build = partial(measure_utility, runs=runs, device=plan.device, **given)
+        after = ["data", "split", *judges, f"controls-{NOLEAK}"]
+        after += [node for of in runs.values() for node in of.values()]
+        inputs = {**given, "methods": useful}
+        cost = 200 * seeds
+        nodes.append(Node("utility", build, inputs, after, version=4, cost=cost, measures=True))
     if useful:
         nodes += _compute_nodes(plan, {n: trained[n] for n in useful})
     names = [n for n in study.moved if n in trained]
@@ -317,21 +320,29 @@ def _question_nodes(plan: Plan) -> list[Node]:
     paired = [n for n in (OURS, GVST, VQ, BACKGROUND) if n in trained]
     if len(paired) > 1:
         how: dict[str, Any] = {"clip": preset.clip, "size": preset.diffusion.size}
-        how["controls"] = [*plan.study.controls]
+        how |= {"controls": controls}
         build = partial(compare_on_forty, runs=made(paired), device=plan.device, **how)
         after = ["data", "split", *(node for of in made(paired) for node in of.values())]
         after.append(f"controls-{NOLEAK}")
         inputs = {**how, **_clip(preset)}
         nodes.append(Node("forty", build, inputs, after, version=3, cost=15 * seeds, measures=True))
     if len(trained) > 2:
-        rulers = {f"trained on {s}": f"encoder-{s}-{first}" for s in SPLITS}
-        images = {(n, seed): _images(n, NOLEAK, seed) for n, seed in product(trained, plan.seeds)}
-        after = ["data", "split", *rulers.values(), *images.values()]
-        rulers |= {} if preset.ruler is None else {preset.ruler: preset.ruler}
-        build = partial(compare_rulers, rulers=rulers, images=images, device=plan.device)
-        ranking = {"rulers": rulers, "shipped": model_stamp("encoders", preset.ruler)}
-        nodes.append(Node("rulers", build, ranking, after, version=2, cost=60, measures=True))
+        nodes.append(_ruler_node(plan, [*trained]))
     return nodes
+
+
+def _ruler_node(plan: Plan, methods: Sequence[str]) -> Node:
+    """Encoders of the first seed and, if there is one, the shipped one rank all images."""
+    controls, shipped_one = [*plan.study.controls], plan.preset.ruler
+    rulers = {f"trained on {s}": f"encoder-{s}-{plan.seeds[0]}" for s in SPLITS}
+    images = {(n, seed): _images(n, NOLEAK, seed) for n, seed in product(methods, plan.seeds)}
+    after = ["data", "split", f"controls-{NOLEAK}", *rulers.values(), *images.values()]
+    rulers |= {} if shipped_one is None else {shipped_one: shipped_one}
+    build = partial(compare_rulers, rulers=rulers, images=images, controls=controls)
+    build = partial(build, device=plan.device)
+    inputs: dict[str, Any] = {"rulers": rulers, "controls": controls}
+    inputs["shipped"] = model_stamp("encoders", shipped_one)
+    return Node("rulers", build, inputs, after, version=3, cost=75, measures=True)
 
 
 def _compute_nodes(plan: Plan, methods: Mapping[str, Method]) -> list[Node]:
@@ -381,12 +392,19 @@ def _appearance_nodes(plan: Plan, methods: Mapping[str, Method]) -> list[Node]:
         after = ["data", "split", generator, judge]
         nodes.append(Node(node, build, {"samples": MOVED, "seed": seed}, after, cost=90))
         moved.setdefault(name, []).append((node, judge))
+    for seed in plan.seeds if NEAREST in plan.study.controls else ():
+        node, judge = f"moved-{slug(NEAREST)}-{seed}", f"encoder-{NOLEAK}-{seed}"
+        build = partial(retrieve_moved, encoders=judge, options=options, clip=plan.preset.clip)
+        build = partial(build, device=plan.device)
+        inputs = {"samples": MOVED, **_clip(plan.preset)}
+        nodes.append(Node(node, build, inputs, ["data", "split", judge], cost=30))
+        moved.setdefault(NEAREST, []).append((node, judge))
     read = [node for pairs in moved.values() for pair in pairs for node in pair]
     ours, other = plan.study.moved[:2]
     build = partial(measure_moves, moved=moved, ours=ours, other=other, device=plan.device)
     after = ["data", "split", *dict.fromkeys(read)]
-    inputs = {"moved": list(methods)}
-    return [*nodes, Node("appearance", build, inputs, after, version=2, cost=10, measures=True)]
+    inputs = {"moved": list(moved)}
+    return [*nodes, Node("appearance", build, inputs, after, version=3, cost=10, measures=True)]
 
 
 def _generator(study: Study, method: Method, split: str, seed: int) -> str:

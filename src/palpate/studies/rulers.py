@@ -10,7 +10,7 @@ rankings (Kendall 1938) decides.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from itertools import combinations
 from pathlib import Path
@@ -166,13 +166,17 @@ def _agreement(
 
 
 def ruler_tables(
-    rulers: Mapping[str, Mapping[Generator, Score]], agreement: list[Score]
+    rulers: Mapping[str, Mapping[Generator, Score]],
+    agreement: list[Score],
+    *,
+    controls: Sequence[str] = (),
 ) -> list[StudyTable]:
     """How rulers agree, and the rank that each gives to every method by its mean TMMD over seeds.
 
     Args:
-        rulers: see :func:`ruler_scores`.
+        rulers: see :func:`ruler_scores`; here with controls.
         agreement: of :func:`ruler_scores`.
+        controls: methods that are none.
     """
     names, of_pair = list(rulers), {(s.details["a"], s.details["b"]): s for s in agreement}
     matrix = [[a, *(of_pair.get((a, b)) or of_pair.get((b, a)) for b in names)] for a in names]
@@ -191,15 +195,19 @@ def ruler_tables(
         StudyTable(
             "Which ruler",
             "Kendall's tau of the rankings of generators by TMMD, measured by encoders of other "
-            "training: 1 is the same order, 0 an unrelated one.",
+            "training: 1 is the same order, 0 an unrelated one."
+            + " Controls have no part in it."
+            * bool(controls),
             ["encoder", *names],
             matrix,
         ),
         StudyTable(
             "Ranks by ruler",
-            "The rank of each method by its mean TMMD over seeds, by each encoder; 1 is best.",
+            "The rank of each method by its mean TMMD over seeds, by each encoder; 1 is best."
+            + " Controls are ranked with them." * bool(controls),
             ["method", *names],
             ranks,
+            controls=[name for name in controls if name in methods],
         ),
     ]
 

@@ -12,6 +12,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 from palpate.core import Score
+from palpate.preference.scoring import PREFERENCE, STRENGTH
 from palpate.report.study import StudyTable
 from palpate.studies.controls import FLOOR, HALVES
 from palpate.studies.evidence import DIFFERENCE, over_seeds
@@ -102,6 +103,7 @@ def study_tables(
     methods: Sequence[str],
     controls: Sequence[str],
     extra: Sequence[str] = (),
+    people: Sequence[Score] = (),
 ) -> list[StudyTable]:
     """The tables of a study.
 
@@ -112,9 +114,12 @@ def study_tables(
         methods: compared on the split without leaks, in their order.
         controls: that were scored.
         extra: names of further metrics.
+        people: scores of ``palpate preference score``, columns of table 3.
     """
     make = {1: _of_splits, 2: _of_splits, 3: _of_methods, 4: _of_methods}
-    context = _Context(study, judged, probed, methods, [*controls, HALF_PROBES, HALVES], extra)
+    votes = {(s.metric, s.subject): s for s in people if s.metric in (PREFERENCE, STRENGTH)}
+    subjects = [*controls, HALF_PROBES, HALVES]
+    context = _Context(study, judged, probed, methods, subjects, extra, votes)
     return [make[number](context, number) for number in study.tables]
 
 
@@ -126,6 +131,7 @@ class _Context:
     methods: Sequence[str]
     controls: Sequence[str]
     extra: Sequence[str]
+    people: Mapping[tuple[str, str], Score]
 
     def present(self, split: str, names: Iterable[str]) -> list[str]:
         """Those that are scored on a split."""
@@ -197,7 +203,11 @@ def _of_methods(context: _Context, number: int) -> StudyTable:
     subjects = context.present(NOLEAK, [*methods, *context.controls])
     metrics = [m for m in metrics if any(scores.get(m, s) for s in subjects)]
     subjects = [s for s in subjects if any(scores.get(m, s) for m in metrics)]
-    rows: list[list[Cell]] = [[s, *(scores.get(m, s) for m in metrics)] for s in subjects]
+    of = {(m, s): scores.get(m, s) for m in metrics for s in subjects}
+    if number == 3:
+        of |= context.people
+        metrics += dict.fromkeys(m for m, s in context.people if s in subjects)
+    rows: list[list[Cell]] = [[s, *(of.get((m, s)) for m in metrics)] for s in subjects]
     controls = [s for s in subjects if s in context.controls]
     if context.study.paper:
         for name in ("GVST", OURS, *(("Ours w/ BG",) if number == 3 else ())):

@@ -210,6 +210,7 @@ def material_utility(
     generated: Mapping[str, FeatureSet],
     draws: Draws | None = None,
     *,
+    controls: Sequence[str] = (),
     split: str | None = None,
     progress: Progress = quiet,
 ) -> tuple[StudyTable, Curve]:
@@ -221,6 +222,7 @@ def material_utility(
         generated: name -> features of generated images, with the materials and videos of their
             photos; see the head of this module for which photos.
         draws: how videos are drawn.
+        controls: names of ``generated`` that are no generators; the curve leaves them out.
         split: digest of the split, kept in the scores.
         progress: called after every k.
 
@@ -265,12 +267,16 @@ def material_utility(
         "Generated images are of photos of other videos than those tested. A k is left out where a "
         "tested class has fewer videos. Gains are paired."
     )
-    return _table("Material accuracy by training data", text, means, draws.shots, generated), Curve(
+    table = _table(
+        "Material accuracy by training data", text, means, draws.shots, generated, controls=controls
+    )
+    aside = {row for name in controls for row in _rows_of(name)}
+    return table, Curve(
         "What generated images add",
         text,
         "videos a class, k",
         "material accuracy",
-        _lines(means),
+        _lines({(n, k): runs for (n, k), runs in means.items() if n not in aside}),
         log_x=True,
     )
 
@@ -289,6 +295,8 @@ def _table(
     means: Mapping[tuple[str, int], list[Mean]],
     shots: Sequence[int],
     generated: Mapping[str, FeatureSet],
+    *,
+    controls: Sequence[str],
 ) -> StudyTable:
     """Rows of what was trained on, and gains over real videos alone; columns of k."""
     rows: list[list[Score | str | None]] = []
@@ -299,7 +307,15 @@ def _table(
     for gain, name in zip(gains, generated, strict=True):
         pairs = ((means.get((f"{REAL} + {name}", k)), means.get((REAL, k))) for k in shots)
         rows.append([gain, *(_gain(a, b) if a and b else None for a, b in pairs)])
-    return StudyTable(title, text, ["trained on", *(f"k = {k}" for k in shots)], rows)
+    columns = ["trained on", *(f"k = {k}" for k in shots)]
+    beside = {label for name in controls for label in _rows_of(name)}
+    aside = [str(row[0]) for row in rows if row[0] in beside]
+    return StudyTable(title, text, columns, rows, controls=aside)
+
+
+def _rows_of(name: str) -> list[str]:
+    """Labels of the rows that images of one name have part in."""
+    return [f"{REAL} + {name}", f"{name} alone", f"{GAIN}{name}"]
 
 
 def _gain(more: Sequence[Mean], less: Sequence[Mean]) -> Score:
@@ -315,7 +331,7 @@ def utility_claims(table: StudyTable) -> list[Claim]:
     claims: list[Claim] = []
     for label, *cells in table.rows:
         gains = [(k, c) for k, c in zip(table.columns[1:], cells, strict=True) if _is_score(c)]
-        if not str(label).startswith(GAIN) or not gains:
+        if not str(label).startswith(GAIN) or label in table.controls or not gains:
             continue
         scores = [score for _, score in gains]
         each = ", ".join(f"{in_words(score)} at {k}" for k, score in gains)
@@ -339,6 +355,7 @@ def retrieval_utility(
     names: tuple[str, str] = ("tactile", "vision"),
     top: int = 5,
     draws: Draws | None = None,
+    controls: Sequence[str] = (),
     split: str | None = None,
 ) -> StudyTable:
     """How often touch finds its photo or text among the first ``top``, by training data of the map.
@@ -351,6 +368,7 @@ def retrieval_utility(
         names: of queries and keys.
         top: how many keys are looked at.
         draws: how videos are drawn.
+        controls: names of ``generated`` that are no generators.
         split: digest of the split, kept in the scores.
 
     Raises:
@@ -388,7 +406,8 @@ def retrieval_utility(
         "linear map of the tactile features that was fitted to k videos a class; the encoder alone "
         "has none. Generated images are of photos of other videos than those tested."
     )
-    return _table(f"Retrieval of {names[1]} by training data", text, means, draws.shots, generated)
+    title = f"Retrieval of {names[1]} by training data"
+    return _table(title, text, means, draws.shots, generated, controls=controls)
 
 
 def _with_keys(features: FeatureSet, keys: FeatureSet) -> FeatureSet:
@@ -416,6 +435,7 @@ def utility(
     generated: Mapping[str, Generated | Path],
     draws: Draws | None = None,
     *,
+    controls: Sequence[str] = (),
     progress: Progress = quiet,
 ) -> tuple[list[StudyTable], Curve]:
     """Material and retrieval by training data; see the head of this module.
@@ -426,6 +446,7 @@ def utility(
         encoders: tactile, vision and text, of which the tactile one must not have seen test images.
         generated: name -> images that were generated for photos of the test part, or their folder.
         draws: how videos are drawn.
+        controls: names of ``generated`` that are no generators.
         progress: progress callback.
 
     Returns:
@@ -439,7 +460,7 @@ def utility(
     guard(encoders, "tactile", parts["test"], split=split, progress=progress)
     real = {n: embed(part, encoders, "tactile", progress=progress) for n, part in parts.items()}
     made = {n: embed_generated(g, manifest, encoders, progress) for n, g in generated.items()}
-    how: dict[str, Any] = {"split": split.digest}
+    how: dict[str, Any] = {"split": split.digest, "controls": controls}
     table, curve = material_utility(
         real["train"], real["test"], made, draws, progress=progress, **how
     )
