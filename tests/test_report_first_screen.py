@@ -5,10 +5,10 @@ import re
 import pytest
 
 from palpate.core import Note
-from palpate.report.first_screen import about, annotated, cards, caution, telling_columns
+from palpate.report.first_screen import about, annotated, cards, caution, found, telling_columns
 from palpate.report.page import render_page
 from palpate.report.results import Results
-from palpate.report.study import StudyTable
+from palpate.report.study import Claim, StudyTable
 from palpate.report.study_tables import lay
 from palpate.report.tables import score_tables
 from report_fixtures import Tree, clean_audit, full_audit, full_results, gallery, score
@@ -116,7 +116,7 @@ def test_the_card_of_the_material_always_holds_the_real_images():
     scores.append(score("material accuracy", "real", 0.9, **accuracy))
     (card,) = cards(Results("T", scores=scores), telling_columns(score_tables(scores)))
     assert [row.label for row in card.rows] == ["m0", "m5", "m1", "real"]
-    assert "Here: 4 of 7." in card.foot
+    assert "4 of 7 rows." in card.foot
 
 
 def test_a_card_compares_the_first_method_with_the_best_other_and_a_control():
@@ -126,6 +126,38 @@ def test_a_card_compares_the_first_method_with_the_best_other_and_a_control():
     (card,) = cards(Results("T", scores=scores), columns, ["mean", "real, nearest photo"])
     labels = ["ours", "GVST", "variant", "real, nearest photo (control)"]
     assert [row.label for row in card.rows] == labels
+
+
+def test_cards_compare_the_same_subjects():
+    """A method that is first by distance and knows no material must not vanish from the second."""
+    distances = {"ours": 2.0, "near": 0.1, "other": 3.0, "real, nearest photo": 0.5}
+    shares = {"ours": 0.5, "other": 0.7, "near": 0.1, "real, nearest photo": 0.4, "real": 0.8}
+    more = {"higher_is_better": True, "null": None, "floor": None}
+    scores = [score("TMMD", s, v) for s, v in distances.items()]
+    scores += [score("material accuracy", s, v, **more) for s, v in shares.items()]
+    columns = telling_columns(score_tables(scores))
+    made = cards(Results("T", scores=scores), columns, ["real, nearest photo"])
+    photo = "real, nearest photo (control)"
+    assert [row.label for row in made[0].rows] == ["ours", "near", "other", photo]
+    assert [row.label for row in made[1].rows] == ["ours", "near", photo, "real"]
+    assert not made[0].rows[0].drawing  # the strip is of it
+    assert all("interval" in row.drawing for row in made[0].rows[1:])
+
+
+def test_what_was_found_is_said_in_one_sentence():
+    def of(*verdicts):
+        return found(
+            Results("T", claims=[Claim(f"c{k}", "s", v, "") for k, v in enumerate(verdicts)])
+        )
+
+    assert of() == ""
+    assert of("holds") == "Of 1 claim 1 holds (“c0”)."
+    assert of("undecided", "does not hold", "undecided", "undecided") == (
+        "Of 4 claims 1 does not hold (“c1”), 3 are undecided."
+    )
+    assert of("holds", "holds", "undecided") == (
+        "Of 3 claims 1 is undecided (“c2”), 2 hold (“c0”; “c1”)."
+    )
 
 
 @pytest.mark.parametrize(
@@ -186,6 +218,9 @@ def test_what_a_page_is_about():
     facts = ["Touch and Go", "29,879 test samples of 106 videos", "91,982 train samples"]
     assert about(results, "2026-11-23", "1.0") == [*facts, "2026-11-23", "palpate 1.0"]
     assert about(Results("T", scores=[score()]), "today", "1.0")[0] == "240 samples"
+    claims, notes = [Claim("c", "s", "holds", "")], [Note("synthetic-data")]
+    study = Results("T", settings={"dataset": "W", "seeds": [0, 1]}, claims=claims, notes=notes)
+    assert about(study, "today", "1.0")[:2] == ["W, all simulated", "2 seeds"]
     made = {"versions": {"palpate": "0.9"}, "stages": {"a": {"date": "2026-01-02"}, "b": {}}}
     assert about(Results("T", settings=made), "today", "1.0") == ["2026-01-02", "palpate 0.9"]
 

@@ -141,7 +141,7 @@ def test_leaks_inflate_where_orig_is_better_and_the_verdict_flips_with_the_numbe
     claims = leak_claims(tasks)
     assert verdicts(claims)["Leakage inflates every task"] == "undecided"
     assert "1 of 2 tasks inflated" in claims[0].why
-    assert claims[2].why == "In TMMD Orig gains 1.0 [−0.5, 2.5]."
+    assert claims[2].why == "Lead of Orig over NoLeak in TMMD (below 0: behind): 1.0 [−0.5, 2.5]."
 
 
 def study(tmmd, ssim):
@@ -177,7 +177,7 @@ def test_metrics_are_held_against_people():
     made = {c.claim: c.why for c in preference_claims(study(1, 0.05), strangers)}
     assert "the human study compared other methods" in made["TMMD prefers what people prefer"]
     assert made["TMMD prefers what people prefer"].startswith(
-        "TMMD puts Ours ahead of GVST by 1.00 [0.90, 1.10], of Ours w/ BG by 2.00 [1.90, "
+        "Lead by TMMD (below 0: behind): of Ours over GVST 1.00 [0.90, 1.10], over Ours w/ BG 2.00"
     )
 
 
@@ -200,7 +200,10 @@ def test_rankings_flip_and_contradictions_are_undecided():
     assert ranking_claims(study(0.05, 0.05))[0].verdict == "undecided"  # holds 0
     assert ranking_claims([])[0].why == "GVST was not compared with Ours."
     why = ranking_claims([*study(1, 0.05), difference("D-TMMD", None, None)])[0].why
-    assert why == "Ours is ahead of GVST in TMMD by 1.00 [0.90, 1.10], in D-TMMD (undefined)."
+    assert why == (
+        "Lead of Ours over GVST (below 0: behind): TMMD 1.00 [0.90, 1.10], D-TMMD undefined. "
+        "TMMD decides: the others are best where all images are alike."
+    )
 
 
 def test_effect_sizes_are_differences_over_errors_and_decide_who_discriminates():
@@ -251,6 +254,6 @@ def test_the_distance_of_patches_stands_in_for_lpips():
     claim = made["LPIPS prefers what people do not"]
     assert claim.verdict == "holds"
     assert claim.why.startswith(
-        "Patch distance (palpate/mini vision) puts Ours ahead of Ours w/ BG"
+        "Lead by patch distance (palpate/mini vision) (below 0: behind): of Ours over Ours w/ BG −5"
     )
     assert made["FID prefers what people do not"].verdict == "undecided"

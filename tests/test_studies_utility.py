@@ -75,7 +75,7 @@ def test_the_claim_follows_the_gain_at_one_video(material):
     assert made["Images of good help a classifier of real touch"].verdict == "holds"
     noise = made["Images of noise help a classifier of real touch"]
     assert noise.verdict in ("undecided", "does not hold")
-    assert noise.why.startswith("Accuracy on real images of new videos gains −0.")
+    assert noise.why.startswith("Accuracy on real images of new videos changes by −0.")
     assert "at k = 4 real videos a class" in noise.why
     assert len(noise.evidence) == 3
     reversed_rows = [

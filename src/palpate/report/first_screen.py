@@ -17,6 +17,8 @@ from palpate.report.tables import REAL, Cell, Column, Table, best_by_value, defi
 #: Columns of the verdict table, the most telling first; others follow as they come.
 TELLING = ("TMMD", "material accuracy", "D-TMMD", "CI-TMMD", "SSIM")
 COLUMNS, CARDS, CARD_ROWS = 5, 3, 4
+#: Fewer claims of one verdict than this are named on the first screen.
+NAMED = 3
 #: Beginnings of metrics whose null is that generated and real images are alike.
 DISTANCES = ("TMMD", "FID", "CMMD", "KID")
 #: Width of the strip in a card, and of the one that explains strips, in pixels.
@@ -61,6 +63,8 @@ def about(results: Results, date: str, version: str) -> list[str]:
     versions = settings.get("versions")
     version = versions.get("palpate", version) if isinstance(versions, Mapping) else version
     facts = [str(settings["dataset"])] if settings.get("dataset") else []
+    if facts and any(note.code == "synthetic-data" for note in results.notes):
+        facts[0] += ", all simulated"
     if audits := [a for a in results.audits if a.against == "train"]:
         last = audits[-1]
         videos = f" of {plural(last.groups_test, last.group)}" if last.group != "none" else ""
@@ -68,7 +72,24 @@ def about(results: Results, date: str, version: str) -> list[str]:
         facts.append(f"{plural(last.train_samples, 'train sample')}")
     elif results.scores:
         facts.append(plural(max(score.n for score in results.scores), "sample"))
+    seeds = settings.get("seeds")
+    if results.claims and isinstance(seeds, Sequence):
+        facts.append(plural(len(seeds), "seed"))
     return [*facts, date, f"palpate {version}"]
+
+
+def found(results: Results) -> str:
+    """Return what became of the claims, in one sentence; those that are decided by name, if few."""
+    groups: dict[str, list[str]] = {}
+    for claim in results.claims:
+        groups.setdefault(claim.verdict, []).append(claim.claim)
+    words = {"holds": ("holds", "hold"), "does not hold": ("does not hold", "do not hold")}
+    parts: list[str] = []
+    for verdict, same in sorted(groups.items(), key=lambda group: len(group[1])):
+        one, more = words.get(verdict, ("is undecided", "are undecided"))
+        named = f" ({'; '.join(f'“{c}”' for c in same)})" if len(same) < NAMED else ""
+        parts.append(f"{len(same)} {one if len(same) == 1 else more}{named}")
+    return f"Of {plural(len(results.claims), 'claim')} {', '.join(parts)}." if parts else ""
 
 
 def caution(results: Results) -> str:
@@ -96,16 +117,17 @@ def cards(
 ) -> list[Card]:
     """Return at most three cards: the leak, then the most telling scores, or more of the leak."""
     audits = [audit for audit in results.audits if audit.test_samples]
-    found = [_leak_card(audits)] if audits else []
-    found += [
-        _score_card(column, controls)
-        for column in columns
-        if any(cell.defined for cell in column.cells)
-    ]
+    made = [_leak_card(audits)] if audits else []
+    subjects: list[str] = []
+    for column in columns:
+        if cells := [cell for cell in column.cells if cell.defined]:
+            shown = _compared(column, cells, controls, subjects)
+            subjects = subjects or [cell.score.subject for cell in shown]
+            made.append(_score_card(column, shown, len(cells), controls))
     if audits and not columns:
-        found += [_signals_card(audits[0])] if audits[0].signals else []
-        found += _cost_cards(audits) or _gap_cards(audits[0])
-    return found[:CARDS]
+        made += [_signals_card(audits[0])] if audits[0].signals else []
+        made += _cost_cards(audits) or _gap_cards(audits[0])
+    return made[:CARDS]
 
 
 def _leak_card(audits: Sequence[Audit]) -> Card:
@@ -157,32 +179,46 @@ def _gap_cards(audit: Audit) -> list[Card]:
     return [Card("Frames to the nearest train frame", rows, "Of the same video.")]
 
 
-def _score_card(column: Column, controls: Collection[str]) -> Card:
-    cells = [cell for cell in column.cells if cell.defined]
-    shown = _compared(column, cells, controls)
+def _score_card(
+    column: Column, shown: Sequence[Cell], known: int, controls: Collection[str]
+) -> Card:
     first = shown[0]
     share = "accuracy" in column.metric
     mark = first.baselines.get("chance") if share else first.score.floor
-    rows = [_score_row(cell, column, mark, controls) for cell in shown]
-    left = f" Here: {len(shown)} of {len(cells)}." if len(cells) > len(shown) else ""
+    axis = strip_axis([cell.score for cell in shown], STRIP)
+    small = UNIT if share or axis is None else replace(axis, ticks=(), width=UNIT.width)
+    rows = [_score_row(cell, column, small, mark, controls) for cell in shown]
+    left = f" {len(shown)} of {known} rows." if known > len(shown) else ""
     title = f"{QUESTIONS.get(column.metric, column.metric)} {column.arrow}"
     if share:
-        chance = f"Share right; dashed: chance, {percent(mark)}." if mark else ""
+        chance = f"Share named right by a probe; dashed: chance, {percent(mark)}." if mark else ""
         return Card(title, rows, f"{chance}{left}".strip())
-    axis = strip_axis(first.score, STRIP)
+    if axis is None:
+        return Card(title, rows, left.strip())
     drawing = plots.bar(axis, first.score.value, first.score.interval, first.score.null, mark)
+    rows[0] = replace(rows[0], drawing=Markup(""))
     foot = f"{_strip_facts(first.score, column)}{left}".strip()
     return Card(title, rows, foot, drawing + plots.axis_row(axis))
 
 
-def _compared(column: Column, cells: Sequence[Cell], controls: Collection[str]) -> list[Cell]:
-    """The first method, the best other one, the nearest photo, real images; then as they come."""
+def _compared(
+    column: Column, cells: Sequence[Cell], controls: Collection[str], before: Sequence[str]
+) -> list[Cell]:
+    """The first method, the best other one, the nearest photo, real images; then as they come.
+
+    Cards that follow hold the subjects of the first, and the real images in the place of the last
+    method.
+    """
+    real = [c for c in cells if c.score.subject == REAL]
+    if same := [c for name in before for c in cells if c.score.subject == name]:
+        apart = [c for c in same if c.score.subject in controls]
+        methods = [c for c in same if c.score.subject not in {*controls, REAL}]
+        return [*methods[: CARD_ROWS - len(apart) - len(real)], *apart, *real]
     methods = [c for c in cells if c.score.subject != REAL and c.score.subject not in controls]
     others = methods[1:]
     best = best_by_value([c.score for c in others], column.digits) or {0}
     apart = [c for c in cells if c.score.subject in controls]
     photo = [c for c in apart if "nearest photo" in c.score.subject] or apart
-    real = [c for c in cells if c.score.subject == REAL]
     chosen = [*methods[:1], *(others[k] for k in sorted(best)[:1] if others), *photo[:1], *real[:1]]
     more = [c for c in (*others, *cells) if all(c is not other for other in chosen)]
     room = CARD_ROWS - len(chosen)
@@ -191,9 +227,9 @@ def _compared(column: Column, cells: Sequence[Cell], controls: Collection[str]) 
     return [*chosen[:place], *unique, *chosen[place:]]
 
 
-def strip_axis(score: Score, width: float) -> plots.Axis | None:
-    """Return an axis of one score alone, with its interval, null and floor."""
-    axis = plots.axis_of([score])
+def strip_axis(scores: Sequence[Score], width: float) -> plots.Axis | None:
+    """Return an axis of scores, with their intervals, nulls and floors; None without any."""
+    axis = plots.axis_of(scores)
     if axis is None:
         return None
     ticks, digits = plots.ticks_of(axis.low, axis.high, 6)
@@ -231,14 +267,18 @@ def _against_real(score: Score) -> str:
 
 
 def _score_row(
-    cell: Cell, column: Column, mark: float | None, controls: Collection[str]
+    cell: Cell,
+    column: Column,
+    axis: plots.Axis | None,
+    mark: float | None,
+    controls: Collection[str],
 ) -> CardRow:
     score = cell.score
     label = f"{score.subject} (control)" if score.subject in controls else score.subject
-    if "accuracy" not in column.metric:
-        return CardRow(label, Markup(""), number(score.value, column.digits))
-    drawing = plots.bar(UNIT, score.value, score.interval, mark=mark)
-    return CardRow(label, drawing, percent(float(score)))
+    drawing = plots.bar(axis, score.value, score.interval, mark=mark)
+    share = "accuracy" in column.metric
+    text = percent(float(score)) if share else number(score.value, column.digits)
+    return CardRow(label, drawing, text)
 
 
 def annotated(tables: Sequence[Table]) -> tuple[Column, Score] | None:

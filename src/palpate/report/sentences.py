@@ -190,11 +190,12 @@ def purpose(results: Results) -> str:
             "what do an encoder's embeddings know of a sample: its class, its text, its image"
         )
     elif results.gallery or results.scores:
-        parts.append("how close do tactile images generated from photos come to real ones")
+        parts.append("how close do generated tactile images come to real ones")
     if results.audits:
-        parts.append("does the split leak from train into test")
+        parts.append("does the split leak")
     if results.claims:
-        parts.append("which claims hold")
+        paper = any(claim.source.startswith("paper") for claim in results.claims)
+        parts.append(f"which claims{' of Gungor et al. (ICCV 2025)' * paper} hold")
     if not parts and (results.tables or results.curves):
         parts.append("what did a study measure")
     if not parts:

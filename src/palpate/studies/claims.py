@@ -21,6 +21,7 @@ import numpy as np
 from scipy import special
 
 from palpate.core import Score
+from palpate.report.notes import number
 from palpate.report.study import Claim, StudyTable, Verdict
 from palpate.studies.evidence import DIFFERENCE, ahead, in_words, metric_of, over_seeds, side_of
 
@@ -33,6 +34,8 @@ TACTILE = "(tactile)"
 #: What counts for a metric without its weights (:mod:`palpate.studies.photo_companions`).
 STAND_INS = {"LPIPS": "patch distance"}
 PEOPLE = "human preference"
+#: How to read a lead.
+BEHIND = "below 0: behind"
 #: The 97.5 % point of the normal distribution.
 Z = float(special.ndtri(0.975))
 
@@ -129,7 +132,8 @@ def leak_claims(
     gains = {task: ahead(difference, names[0]) for task, difference in tasks.items()}
     source, rows = "paper, tables 1 and 2", list[Claim]()
     for task, gain in gains.items():
-        why = f"In {metric_of(tasks[task])} {names[0]} gains {in_words(gain)}{_runs(gain)}"
+        lead = f"Lead of {names[0]} over {names[1]} in {metric_of(tasks[task])}"
+        why = f"{lead} ({BEHIND}): {in_words(gain)}{_runs(gain)}"
         verdict = decide([side_of(gain)])
         rows.append(Claim(f"Leakage inflates {task}", source, verdict, f"{why}.", [gain]))
     directed = [g for task, g in gains.items() if tasks[task].higher_is_better is not None]
@@ -193,7 +197,7 @@ def _preference_claim(
         people = [ahead(v, pair[0]) for v in _between(votes, PEOPLE, *pair)]
         signs += [side_of(score) * side_of(vote) for score in scores for vote in people]
         of_metric, of_people = of_metric + scores, of_people + people
-    parts = [_puts(of_metric), _puts(of_people)]
+    parts = [_leads(of_metric), _leads(of_people)]
     if not of_metric:
         parts[0] = f"{metric} was not computed (its weights may be missing)"
     if not of_people:
@@ -203,14 +207,15 @@ def _preference_claim(
     return Claim(f"{metric} {does}", "paper, table 3", verdict, why, evidence)
 
 
-def _puts(scores: Sequence[Score]) -> str:
-    """``TMMD puts Ours ahead of GVST by 0.6 [0.3, 0.9], of Ours w/ BG by 1 [0.5, 1.5]``."""
+def _leads(scores: Sequence[Score]) -> str:
+    """``lead by TMMD (below 0: behind): of Ours over GVST 0.6 [0.3, 0.9], over X 1 [0.5, 1.5]``."""
+    if not scores:
+        return ""
     parts: list[str] = []
-    for (label, name), same in groupby(scores, key=lambda s: (_label(s), _pair(s)[0])):
-        each = [f"of {_pair(s)[1]} {_by(s)}" for s in same]
-        puts = "people put" if label == PEOPLE else f"{label} puts"
-        parts.append(f"{puts} {name} ahead {', '.join(each)}")
-    return "; ".join(parts)
+    for front, same in groupby(scores, key=lambda s: _pair(s)[0]):
+        each = [f"over {_pair(s)[1]} {in_words(s)}" for s in same]
+        parts.append(f"of {front} {', '.join(each)}")
+    return f"lead by {_label(scores[0])} ({BEHIND}): {'; '.join(parts)}"
 
 
 def _label(score: Score) -> str:
@@ -221,10 +226,6 @@ def _pair(score: Score) -> tuple[str, str]:
     """The two methods of a score of :func:`ahead`, the one in front first."""
     front, _, other = score.subject.partition(" against ")
     return front, other
-
-
-def _by(score: Score) -> str:
-    return "(undefined)" if score.value is None else f"by {in_words(score)}"
 
 
 def _capital(sentence: str) -> str:
@@ -258,12 +259,13 @@ def _ranking_claim(
     others = [
         ahead(d, front) for metric in FAMILY[1:] for d in _between(differences, metric, *pair)
     ]
-    parts = ", ".join(f"in {_label(s)} {_by(s)}" for s in (*deciding, *others))
-    why = (
-        f"{front} is ahead of {other} {parts}" + _runs((*deciding, *others)[0])
-        if parts
-        else (f"{other} was not compared with {front}")
-    )
+    why = f"{other} was not compared with {front}"
+    if scores := [*deciding, *others]:
+        each = ", ".join(f"{_label(s)} {in_words(s)}" for s in scores)
+        why = f"Lead of {front} over {other} ({BEHIND}): {each}{_runs(scores[0])}"
+        if deciding and others:
+            decide_it = "TMMD and people decide" if votes else "TMMD decides"
+            why += f". {decide_it}: the others are best where all images are alike"
     sides = [side_of(s) for s in deciding]
     source = "paper, tables 3 and 4" if "images" in claim else "paper, table 3"
     return Claim(claim, source, decide(sides), f"{why}.", [*deciding, *others])
@@ -338,8 +340,8 @@ def discrimination_claim(differences: Sequence[Score], names: Names | None = Non
     pairs = f"{len(shared)} pair{'s' * (len(shared) != 1)}"
     why = (
         f"The mean effect size of the TMMD family is {means['family']:.2g}, of traditional metrics "
-        f"{means['traditional']:.2g}, over {pairs} of methods; the difference is {gap:.2g} "
-        f"[{gap - reach:.2g}, {gap + reach:.2g}]."
+        f"{means['traditional']:.2g}, over {pairs} of methods; the difference is {number(gap, 1)} "
+        f"[{number(gap - reach, 1)}, {number(gap + reach, 1)}]."
     )
     return Claim(claim, source, decide([int(gap > reach) - int(gap < -reach)]), why, evidence)
 

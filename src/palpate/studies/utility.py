@@ -335,7 +335,7 @@ def utility_claims(table: StudyTable) -> list[Claim]:
             continue
         scores = [score for _, score in gains]
         each = ", ".join(f"{in_words(score)} at {k}" for k, score in gains)
-        why = f"Accuracy on real images of new videos gains {each} real videos a class."
+        why = f"Accuracy on real images of new videos changes by {each} real videos a class."
         name = str(label).removeprefix(GAIN)
         claim = f"Images of {name} help a classifier of real touch"
         claims.append(Claim(claim, "ours", decide([side_of(scores[0])]), why, scores))
