@@ -173,7 +173,7 @@ def test_wide_tables_are_printed_in_blocks_of_columns_and_cut_no_number(study, w
     results, _ = study
     text = as_text(Results("T", tables=results.tables), width)
     assert max(map(len, text.splitlines())) <= width
-    blocks = {70: 4, 90: 2, 140: 1}[width]
+    blocks = {70: 3, 90: 2, 140: 1}[width]
     assert text.count("real images of other videos") == blocks
     for row in results.tables[0].rows:
         for s in row[1:]:

@@ -514,7 +514,7 @@ def test_the_study_at_smoke(tmp_path):
     further = {"Material accuracy by training data", "Which ruler", "Memorization"}
     assert further <= {table.title for table in results.tables}
     assert results.curves
-    assert {"ours", "paper, section 3.1"} <= {claim.source for claim in results.claims}
+    assert {"beyond the paper", "paper, section 3.1"} <= {claim.source for claim in results.claims}
     rows = [row[0] for row in results.tables[1].rows]
     assert {*METHODS, *CONTROLS, controls.HALVES, judging.HALF_PROBES} == {*rows}
     assert len(results.audits) == 2

@@ -10,6 +10,7 @@ template cannot do (plurals, optional parts), the entry is a function of paramet
 from __future__ import annotations
 
 import math
+import statistics
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -59,18 +60,20 @@ def decimals(values: Iterable[float]) -> int:
 def digits_of(scores: Iterable[Score]) -> int:
     """Return the decimals of scores that are written alike, those of a column or one alone.
 
-    The narrowest interval gets two digits for its half; the largest number has at most five. None
-    of ranks and counts. Every front end rounds by this.
+    The median interval gets two digits for its half, so that one that is narrow does not lengthen
+    all others; the largest number has at most five. None of ranks and counts. Every front end
+    rounds by this.
     """
     scores = list(scores)
     values = [abs(float(s)) for s in scores if s.value is not None]
     bounds = [v for s in scores for v in s.interval or ()]
     halves = [(s.interval[1] - s.interval[0]) / 2 for s in scores if s.interval]
+    halves = [half for half in halves if half > 0]
     largest = max(values, default=0.0)
-    if not any(half > 0 for half in halves):
+    if not halves:
         whole = not bounds and largest > 1 and all(v == round(v) for v in values)
         return 0 if whole else decimals([*values, *bounds])
-    digits = 1 - math.floor(math.log10(min(half for half in halves if half > 0)))
+    digits = 1 - math.floor(math.log10(statistics.median_low(halves)))
     most = 4 - math.floor(math.log10(largest)) if largest else digits
     return max(0, min(8, digits, most))
 

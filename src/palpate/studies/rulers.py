@@ -225,4 +225,4 @@ def ruler_claim(agreement: list[Score]) -> Claim:
     words = [f"tau of {s.subject} is {in_words(s)}" for s in agreement]
     why = f"{'; '.join(words)}; over {agreement[0].n} generators." if agreement else "No rulers."
     claim = "Encoders of other training rank generators alike"
-    return Claim(claim, "ours", verdict, why[:1].upper() + why[1:], agreement)
+    return Claim(claim, "beyond the paper", verdict, why[:1].upper() + why[1:], agreement)
