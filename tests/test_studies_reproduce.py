@@ -459,7 +459,7 @@ def test_the_papers_numbers_stand_beside_its_own_data_alone():
 def test_the_papers_numbers_are_of_its_own_metrics_alone():
     """FID of another network is not the paper's FID."""
     other = "FID (palpate/mini vision)"
-    scores = [forged(OURS, m, 1.0) for m in ("SSIM", "FID", other)]
+    scores = [forged(OURS, m, 1.0) for m in ("SSIM", "FID (Inception)", other)]
     judged = {
         (s, j): Scores.over_seeds([scores], "results")
         for s in (ORIG, NOLEAK)
@@ -469,7 +469,7 @@ def test_the_papers_numbers_are_of_its_own_metrics_alone():
     three = study_tables(study, judged, {}, methods=[OURS], controls=[])[1]
     [printed] = [row for row in three.rows if row[0] == "paper, Ours"]
     cells = dict(zip(three.columns, printed, strict=True))
-    assert (cells["SSIM"], cells["FID"], cells[other]) == ("0.49", "43.9", None)
+    assert (cells["SSIM"], cells["FID (Inception)"], cells[other]) == ("0.49", "43.9", None)
 
 
 def test_differences_that_are_stored_are_of_a_method_and_not_of_e():

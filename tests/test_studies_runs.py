@@ -7,20 +7,24 @@ import signal
 import subprocess
 import sys
 from collections import Counter
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 from PIL import Image
 from safetensors.numpy import load_file
 
 import small_study
-from palpate.core import Score, Split, digest_json, short
+from palpate.core import PalpateError, Score, Split, digest_file, digest_json, short
+from palpate.evaluation.companions import Weights
 from palpate.report.results import Results
 from palpate.report.study import Claim, Curve, Line, StudyTable
 from palpate.studies.graph import in_order
 from palpate.studies.judging import read_scores
-from palpate.studies.reproduce import nodes_of, plan_of
+from palpate.studies.methods import OURS
+from palpate.studies.reproduce import nodes_of, plan_of, run_study
 from palpate.studies.stages import stage_digest
 from palpate.studies.study import SPLITS, STUDIES
 from palpate.studies.verifying import numbers_of
@@ -87,6 +91,38 @@ def test_golden_what_stages_read(study, preset):
         f"What {', '.join(changed)} read has changed: with this release every run builds them "
         f"again. If that is meant, {WRITE}"
     )
+
+
+def inception(path, seed=0):
+    """A file that is called as that of Inception is."""
+    torch.manual_seed(seed)
+
+    class Pooled(torch.nn.Module):
+        def __init__(self):
+            super().__init__()
+            self.conv = torch.nn.Conv2d(3, 4, 3)
+
+        def forward(self, img: torch.Tensor) -> torch.Tensor:
+            return self.conv(img.to(torch.float32) / 127.5 - 1).relu().mean(dim=[2, 3])
+
+    torch.jit.script(Pooled().eval()).save(str(path))
+    return path
+
+
+def test_published_weights_are_read_by_what_judges_alone(tmp_path):
+    def read(**weights):
+        plan = plan_of(small_study.STUDY, preset="tiny", weights=Weights(**weights))
+        return {n.name: stage_digest(n.name, n.inputs, n.version) for n in nodes_of(plan)}
+
+    file, other = inception(tmp_path / "a.pt"), inception(tmp_path / "b.pt", seed=1)
+    none, one, two = read(), read(inception=file), read(inception=other)
+    judges = {name for name in none if name.startswith("scores-")}
+    assert {name for name in none if none[name] != one[name]} == judges
+    assert all(one[name] != two[name] for name in judges)
+    assert read(lpips=(file, other)) != read(lpips=(other, file)) != none
+    assert read(clip="openai/clip") != none
+    with pytest.raises(PalpateError, match="`lpips` must be a file"):
+        read(lpips=(file, tmp_path / "absent.pth"))
 
 
 # --- what stages write: a run each
@@ -225,3 +261,20 @@ def test_a_study_killed_in_each_kind_of_stage_ends_as_one_that_was_not(whole, tm
         killed.append(kind)
     assert killed == KINDS
     assert differing(whole, tmp_path / "run") == []
+
+
+@slow
+def test_published_weights_come_on_top_of_a_run(whole, tmp_path):
+    run, file = tmp_path / "run", inception(tmp_path / "inception.pt")
+    shutil.copytree(whole, run)
+    before = {p.parent.name: p.stat().st_mtime_ns for p in run.glob("*/stage.json")}
+    plan = replace(small_study.plan(), weights=Weights(inception=str(file)))
+    results = run_study(plan, run)
+    after = {p.parent.name: p.stat().st_mtime_ns for p in run.glob("*/stage.json")}
+    changed = {name for name in after if after[name] != before.get(name)}
+    assert changed == {n for n in after if n.startswith("scores-")} | {"results"}
+    table = next(t for t in results.tables if t.title.startswith("Table 3"))
+    at = [*table.columns].index("FID (Inception)")
+    assert all(row[at].value > 0 for row in table.rows if row[0] in (OURS, "GVST"))
+    assert any(name.startswith("FID (") and "vision" in name for name in table.columns)
+    assert results.settings["digests"]["weights of inception"] == digest_file(file)

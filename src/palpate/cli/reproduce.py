@@ -45,7 +45,13 @@ class Options(Common):
     """NAME=FOLDER: images of the test part that another system made, scored like ours. The test
     part is that of FOLDER/split/NoLeak.json of an earlier run."""
     people: Path | None = None
-    """Results of `palpate preference score -o`, for the claims on what people prefer."""
+    """Results of `palpate preference score -o`: columns of table 3, and what claims follow from."""
+    inception: Path | None = None
+    """TorchScript file of Inception: FID as published, beside that of the frozen photo encoder."""
+    clip: str | None = None
+    """Folder or hub id of a CLIP: CMMD as published."""
+    lpips: Annotated[tuple[Path, Path] | None, tyro.conf.arg(metavar="BACKBONE HEADS")] = None
+    """The two files of LPIPS: AlexNet's weights and the heads."""
     jobs: int = 1
     """Processes that run stages at the same time."""
     device: str = "auto"
@@ -59,6 +65,7 @@ def run(options: Options, terminal: Terminal) -> dict[str, Any]:
     require_extra("palpate reproduce")
     others = _folders(options.method)
     from palpate.core import write_text
+    from palpate.evaluation.companions import Weights
     from palpate.report import summary_lines
     from palpate.studies.reproduce import plan_of, planned, run_study
     from palpate.studies.study import STUDIES
@@ -74,6 +81,7 @@ def run(options: Options, terminal: Terminal) -> dict[str, Any]:
         people=options.people,
         steps=options.steps,
         vq=options.vq,
+        weights=Weights(inception=options.inception, clip=options.clip, lpips=options.lpips),
     )
     if options.dry_run:
         return _print_plan(planned(plan, output), terminal)

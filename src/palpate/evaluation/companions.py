@@ -60,6 +60,12 @@ class Weights:
     clip: Path | str | None = None
     lpips: tuple[str | Path, str | Path] | None = None
 
+    @property
+    def companions(self) -> list[Name]:
+        """What is computed as published with these weights, but for KID."""
+        given: dict[Name, object] = {"fid": self.inception, "cmmd": self.clip, "lpips": self.lpips}
+        return [name for name, weights in given.items() if weights is not None]
+
     def for_features(self, name: str) -> tuple[Literal["inception", "clip"], Path | str | None]:
         """The standard encoder of a companion on features, and its weights."""
         return ("clip", self.clip) if name == "cmmd" else ("inception", self.inception)

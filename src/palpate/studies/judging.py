@@ -18,6 +18,7 @@ from palpate.data.images import load_images
 from palpate.data.manifest import Manifest
 from palpate.encoders.embed import embed, embed_images
 from palpate.encoders.encoder_set import EncoderSet, load_clip
+from palpate.evaluation.companions import Weights
 from palpate.evaluation.probing import Plan, Probed, measure, plan_of
 from palpate.evaluation.scoring import score
 from palpate.metrics import tmmd
@@ -101,6 +102,7 @@ class Judging:
         size: side of the images in pixels.
         seed: of the trainings.
         permutations: of the permutation test of TMMD.
+        weights: of FID, CMMD and LPIPS as published, as far as they are given.
     """
 
     split: str
@@ -112,6 +114,7 @@ class Judging:
     size: int
     seed: int
     permutations: int
+    weights: Weights
 
 
 def judge_images(
@@ -134,7 +137,8 @@ def judge_images(
         names=list(folders),
         presets=READINGS,
         sigma=SIGMA,
-        companions=("ssim", "psnr", *(("contact",) if gels else ())),
+        companions=("ssim", "psnr", *(("contact",) if gels else ()), *judging.weights.companions),
+        **vars(judging.weights),
         controls=False,
         permutations=judging.permutations,
         allow_seen=True,  # of the encoder of another split, and by the leak that is measured

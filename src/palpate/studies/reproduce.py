@@ -23,6 +23,7 @@ from pathlib import Path
 from typing import Any
 
 from palpate.core import PalpateError, Progress, digest_file, plain, quiet, read_json, require
+from palpate.evaluation.companions import Weights
 from palpate.evaluation.inputs import read as read_samples
 from palpate.report.results import Results
 from palpate.sim.presets import MINI_SEEDS
@@ -70,6 +71,8 @@ class Plan:
             system made.
         device: ``auto``, ``cpu``, ``cuda`` or ``mps``.
         people: results of ``palpate preference score`` on images of the methods, or None.
+        weights: of FID, CMMD and LPIPS as published; without them stand-ins of the frozen vision
+            encoder are all there is.
     """
 
     study: Study
@@ -79,6 +82,7 @@ class Plan:
     others: Mapping[str, Path] = dataclasses.field(default_factory=dict[str, Path])
     device: str = "auto"
     people: Path | None = None
+    weights: Weights = dataclasses.field(default_factory=Weights)
 
     @property
     def methods(self) -> list[str]:
@@ -97,6 +101,7 @@ def plan_of(
     people: Path | str | None = None,
     steps: int | None = None,
     vq: Path | str | None = None,
+    weights: Weights | None = None,
 ) -> Plan:
     """The plan of a run, checked before any work; ``steps`` and ``vq`` replace the preset's.
 
@@ -134,7 +139,25 @@ def plan_of(
     elif root is not None and chosen.clip == "palpate/mini":
         require_unseen(Path(root))
     place, votes = (None if path is None else Path(path) for path in (root, people))
-    return Plan(study, chosen, tuple(seeds), place, folders, device, votes)
+    weights = _whole(weights or Weights())
+    return Plan(study, chosen, tuple(seeds), place, folders, device, votes, weights)
+
+
+def _whole(weights: Weights) -> Weights:
+    """The weights by whole paths; a CLIP may be a hub id."""
+
+    def whole(path: Path | str, name: str) -> str:
+        if not Path(path).is_file():
+            got, fix = f"nothing at {path}", "Check the path"
+            raise PalpateError("must be a file", got, fix, argument=name)
+        return str(Path(path).resolve())
+
+    inception, clip, lpips = weights.inception, weights.clip, weights.lpips
+    return Weights(
+        inception=None if inception is None else whole(inception, "inception"),
+        clip=str(Path(clip).resolve()) if clip and Path(clip).exists() else clip,
+        lpips=None if lpips is None else (whole(lpips[0], "lpips"), whole(lpips[1], "lpips")),
+    )
 
 
 def _folders(study: Study, others: Mapping[str, Path | str]) -> dict[str, Path]:
@@ -474,9 +497,13 @@ def _score_node(plan: Plan, split: str, judge: str, seed: int) -> Node:
         preset.diffusion.size,
         seed,
         preset.permutations,
+        plan.weights,
     )
     build = partial(judge_images, judging=judging, device=plan.device)
     inputs = {**vars(judging), **_clip(preset), "metrics": [_source(m) for m in study.metrics]}
+    del inputs["weights"]
+    if plan.weights.companions:
+        inputs["weights"] = _stamps(plan.weights)
     after = ["data", "split", encoder, f"controls-{split}", *methods.values()]
     name = _scores(split, judge, seed)
     return Node(name, build, inputs, after, version=4, cost=60, measures=True)
@@ -485,6 +512,14 @@ def _score_node(plan: Plan, split: str, judge: str, seed: int) -> Node:
 def _clip(preset: Preset) -> dict[str, str | None]:
     """What names the frozen encoders: other weights under the same name make other stages."""
     return {"clip": model_stamp("clip", preset.clip)}
+
+
+def _stamps(weights: Weights) -> dict[str, Any]:
+    """What names the weights of published metrics."""
+    made: dict[str, Any] = {"clip": model_stamp("clip", weights.clip and str(weights.clip))}
+    made["inception"] = weights.inception and digest_file(Path(weights.inception))
+    made["lpips"] = weights.lpips and [digest_file(Path(path)) for path in weights.lpips]
+    return {name: stamp for name, stamp in made.items() if stamp}
 
 
 def _source(function: Any) -> Any:
@@ -521,6 +556,7 @@ def settings_of(plan: Plan, stages: Mapping[str, Stage], jobs: int) -> dict[str,
     for seed, split in product(plan.seeds, SPLITS):
         name = f"encoder-{split}-{seed}"
         digests[f"encoder {split} {seed}"] = stages[name].facts["digest"]
+    digests |= {f"weights of {name}": of for name, of in _stamps(plan.weights).items()}
     if plan.people is not None:
         digests["people"] = digest_file(plan.people)
     return {
@@ -534,6 +570,7 @@ def settings_of(plan: Plan, stages: Mapping[str, Stage], jobs: int) -> dict[str,
             "people": str(plan.people) if plan.people else None,
             "steps of a method": plan.preset.steps,
             "vq": plan.preset.vq if isinstance(plan.preset.vq, str) else None,
+            "weights": {name: of for name, of in vars(plan.weights).items() if of},
             "device": plan.device,
             "jobs": jobs,
         },

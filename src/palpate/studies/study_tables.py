@@ -37,7 +37,7 @@ def _printed(columns: Sequence[str], numbers: str) -> Mapping[str, str]:
 
 
 _SPLIT_1, _SPLIT_2 = (MATERIAL, *FAMILY), (*RETRIEVAL, *FAMILY[:2])
-_METHOD = ("SSIM", "PSNR", "LPIPS", "FID", "CMMD", *FAMILY)
+_METHOD = ("SSIM", "PSNR", "LPIPS", "FID (Inception)", "CMMD (CLIP)", *FAMILY)
 #: What the paper prints: (table, row) -> column -> number. Table 4 of DIGIT is "HCT".
 PAPER: Mapping[tuple[int | str, str], Mapping[str, str]] = {
     (1, ORIG): _printed(_SPLIT_1, "54.7%  0.33  0.04  0.21  0.06"),

@@ -149,6 +149,7 @@ def _make_nodes(
     settings: Mapping[str, Any], folder: Path, place: Path, progress: Progress
 ) -> dict[str, Any]:
     """Build what measures; returns the settings that such a run records."""
+    from palpate.evaluation.companions import Weights
     from palpate.studies.making import slug
     from palpate.studies.reproduce import nodes_of, plan_of, settings_of
     from palpate.studies.study import NOLEAK, STUDIES
@@ -168,6 +169,7 @@ def _make_nodes(
         people=options["people"] and folder / LAST / "people.json",
         steps=_trained_steps(folder, settings["stages"]) or options["steps of a method"],
         vq=options["vq"],
+        weights=Weights(**options.get("weights", {})),
     )
     nodes = nodes_of(plan)
     _measure(nodes, folder, place, progress)
