@@ -145,19 +145,35 @@ def test_cards_compare_the_same_subjects():
 
 
 def test_what_was_found_is_said_in_one_sentence():
-    def of(*verdicts):
-        return found(
-            Results("T", claims=[Claim(f"c{k}", "s", v, "") for k, v in enumerate(verdicts)])
-        )
+    def of(*verdicts, source="paper, table 3"):
+        return [Claim(f"c{k}", source, v, "") for k, v in enumerate(verdicts)]
 
-    assert of() == ""
-    assert of("holds") == "Of 1 claim 1 holds (“c0”)."
-    assert of("undecided", "does not hold", "undecided", "undecided") == (
-        "Of 4 claims 1 does not hold (“c1”), 3 are undecided."
+    def said(*claims):
+        return found(Results("T", claims=claims))
+
+    assert said() == ""
+    assert said(*of("holds")) == "1 claim: 1 holds (“c0”)."
+    assert said(*of("undecided", "does not hold", "undecided", "undecided")) == (
+        "4 claims: 1 does not hold (“c1”), 3 undecided."
     )
-    assert of("holds", "holds", "undecided") == (
-        "Of 3 claims 1 is undecided (“c2”), 2 hold (“c0”; “c1”)."
+    assert said(*of("holds", "holds", "undecided")) == (
+        "3 claims: 1 undecided, 2 hold (“c0”; “c1”)."
     )
+    beyond = of("does not hold", source="beyond the paper")
+    assert said(*of("undecided"), *beyond) == (
+        "1 claim of the paper: 1 undecided; 1 beyond it: 1 does not hold (“c0”)."
+    )
+
+
+def test_a_card_never_loses_its_method_to_controls():
+    more = {"higher_is_better": True, "null": None, "floor": None}
+    names = ["ours", "a", "b", "c", "real"]
+    scores = [score("TMMD", s, 1.0) for s in names[:4]]
+    scores += [score("material accuracy", s, 0.5, **more) for s in names]
+    columns = telling_columns(score_tables(scores))
+    made = cards(Results("T", scores=scores), columns, names[1:4])[1]
+    labels = [row.label for row in made.rows]
+    assert (labels[0], labels[-1], len(labels)) == ("ours", "real", 4)
 
 
 @pytest.mark.parametrize(

@@ -70,3 +70,30 @@ def test_whether_images_help_is_decided_by_all_seeds(tmp_path, monkeypatch, gain
     assert results.claims[0].verdict == verdict
     assert results.tables[0].rows[0][1].details["by_seed"] == list(gains)
     assert results.curves[0].lines[0].points[0][1].value == pytest.approx(sum(gains) / len(gains))
+
+
+def test_controls_are_ranked_and_have_no_part_in_the_agreement(tmp_path, monkeypatch):
+    places = {"a": 0.1, "b": 0.2, "c": 0.3, NEAREST: 0.05, "mean image": 9.0}
+
+    def forged(rulers, folders, manifest, split, **options):
+        assert {name for name, _ in folders} == {*places}
+        return {ruler: {g: Score("TMMD", g[0], places[g[0]]) for g in folders} for ruler in rulers}
+
+    monkeypatch.setattr(questions, "measure_rulers", forged)
+    monkeypatch.setattr(questions, "data_of", lambda after, name: (None, None))
+    monkeypatch.setattr(questions, "cache_of", lambda place: None)
+    load = SimpleNamespace(load=lambda folder, device: folder)
+    monkeypatch.setattr(questions, "EncoderSet", load)
+    after = {name: tmp_path / name for name in ("controls-NoLeak", "x", "y", "i")}
+    for name in ("real-nearest-photo", "mean-image"):
+        (after["controls-NoLeak"] / name).mkdir(parents=True)
+    images = {(name, seed): "i" for name in "abc" for seed in (3, 5)}
+    how = {"rulers": {"one": "x", "two": "y"}, "images": images, "device": "cpu"}
+    questions.compare_rulers(
+        tmp_path, after, lambda *_: None, controls=[NEAREST, "mean image", "absent"], **how
+    )
+    results = Results.load(tmp_path / "results.json")
+    assert results.claims[0].evidence[0].n == 6
+    ranks = {row[0]: float(row[1]) for row in results.tables[1].rows}
+    assert ranks == {"a": 1, "b": 2, "c": 3, NEAREST: 1, "mean image": 4}
+    assert results.tables[1].controls == [NEAREST, "mean image"]

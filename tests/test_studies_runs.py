@@ -144,6 +144,10 @@ def summary(folder) -> dict[str, float]:
         weights = load_file(path).values()
         values = np.concatenate([np.ravel(w).astype(float) for w in weights])
         numbers[path.relative_to(folder).as_posix()] = np.abs(values).mean()
+    for path in sorted(folder.rglob("*.npz")):
+        with np.load(path) as arrays:
+            values = [np.ravel(a) for a in arrays.values() if a.dtype.kind == "f"]
+        numbers[path.relative_to(folder).as_posix()] = np.abs(np.concatenate(values)).mean()
     images = [*folder.rglob("*.png"), *folder.rglob("*.jpg")]
     if images:
         numbers["images"] = len(images)

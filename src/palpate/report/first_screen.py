@@ -9,9 +9,11 @@ from markupsafe import Markup
 
 from palpate.core import Score
 from palpate.report import plots
-from palpate.report.notes import number, p_text, percent, plural
+from palpate.report.notes import number, p_text, percent, plural, sentence
 from palpate.report.results import Audit, Results
 from palpate.report.sentences import share_of
+from palpate.report.study import Claim
+from palpate.report.study_tables import verdict_word
 from palpate.report.tables import REAL, Cell, Column, Table, best_by_value, defined
 
 #: Columns of the verdict table, the most telling first; others follow as they come.
@@ -79,17 +81,31 @@ def about(results: Results, date: str, version: str) -> list[str]:
 
 
 def found(results: Results) -> str:
-    """Return what became of the claims, in one sentence; those that are decided by name, if few."""
-    groups: dict[str, list[str]] = {}
+    """Return what became of the claims, of the paper and beyond it; few decided ones by name."""
+    sides: dict[str, list[Claim]] = {}
     for claim in results.claims:
+        place = "of the paper" if claim.source.startswith("paper") else "beyond it"
+        sides.setdefault(place, []).append(claim)
+    if len(sides) == 1:
+        sides = {"": [*results.claims]}
+    parts = [
+        f"{plural(len(claims), 'claim') if not k else len(claims)} {place}".strip()
+        + f": {_verdicts(claims)}"
+        for k, (place, claims) in enumerate(sides.items())
+    ]
+    return f"{'; '.join(parts)}." if parts else ""
+
+
+def _verdicts(claims: Sequence[Claim]) -> str:
+    groups: dict[str, list[str]] = {}
+    for claim in claims:
         groups.setdefault(claim.verdict, []).append(claim.claim)
-    words = {"holds": ("holds", "hold"), "does not hold": ("does not hold", "do not hold")}
     parts: list[str] = []
     for verdict, same in sorted(groups.items(), key=lambda group: len(group[1])):
-        one, more = words.get(verdict, ("is undecided", "are undecided"))
-        named = f" ({'; '.join(f'“{c}”' for c in same)})" if len(same) < NAMED else ""
-        parts.append(f"{len(same)} {one if len(same) == 1 else more}{named}")
-    return f"Of {plural(len(results.claims), 'claim')} {', '.join(parts)}." if parts else ""
+        few = verdict != "undecided" and len(same) < NAMED
+        named = f" ({'; '.join(f'“{c}”' for c in same)})" if few else ""
+        parts.append(f"{len(same)} {verdict_word(verdict, len(same))}{named}")
+    return ", ".join(parts)
 
 
 def caution(results: Results) -> str:
@@ -189,6 +205,8 @@ def _score_card(
     small = UNIT if share or axis is None else replace(axis, ticks=(), width=UNIT.width)
     rows = [_score_row(cell, column, small, mark, controls) for cell in shown]
     left = f" {len(shown)} of {known} rows." if known > len(shown) else ""
+    told = [n for cell in shown for n in cell.score.notes if n.code == "text"]
+    left += f" * {sentence(told[0])}" if told else ""
     title = f"{QUESTIONS.get(column.metric, column.metric)} {column.arrow}"
     if share:
         chance = f"Share named right by a probe; dashed: chance, {percent(mark)}." if mark else ""
@@ -213,7 +231,9 @@ def _compared(
     if same := [c for name in before for c in cells if c.score.subject == name]:
         apart = [c for c in same if c.score.subject in controls]
         methods = [c for c in same if c.score.subject not in {*controls, REAL}]
-        return [*methods[: CARD_ROWS - len(apart) - len(real)], *apart, *real]
+        room = CARD_ROWS - len(real)
+        methods = methods[: max(1, room - len(apart))]
+        return [*methods, *apart[: room - len(methods)], *real]
     methods = [c for c in cells if c.score.subject != REAL and c.score.subject not in controls]
     others = methods[1:]
     best = best_by_value([c.score for c in others], column.digits) or {0}
@@ -275,6 +295,7 @@ def _score_row(
 ) -> CardRow:
     score = cell.score
     label = f"{score.subject} (control)" if score.subject in controls else score.subject
+    label += "*" * any(note.code == "text" for note in score.notes)
     drawing = plots.bar(axis, score.value, score.interval, mark=mark)
     share = "accuracy" in column.metric
     text = percent(float(score)) if share else number(score.value, column.digits)

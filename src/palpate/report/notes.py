@@ -57,25 +57,30 @@ def decimals(values: Iterable[float]) -> int:
     return max(0, min(8, 3 - max(0, power) if largest >= 0.1 else 2 - power))
 
 
-def digits_of(scores: Iterable[Score]) -> int:
+def digits_of(scores: Iterable[Score], *, finest: bool = False) -> int:
     """Return the decimals of scores that are written alike, those of a column or one alone.
 
     The median interval gets two digits for its half, so that one that is narrow does not lengthen
-    all others; the largest number has at most five. None of ranks and counts. Every front end
-    rounds by this.
+    all others, and no limit is written as the 0 that it excludes; with ``finest`` the narrowest
+    one. The largest number has at most five. None of ranks and counts. Every front end rounds by
+    this.
     """
     scores = list(scores)
     values = [abs(float(s)) for s in scores if s.value is not None]
-    bounds = [v for s in scores for v in s.interval or ()]
-    halves = [(s.interval[1] - s.interval[0]) / 2 for s in scores if s.interval]
-    halves = [half for half in halves if half > 0]
+    intervals = [s.interval for s in scores if s.interval]
+    halves = [half for low, high in intervals if (half := (high - low) / 2) > 0]
     largest = max(values, default=0.0)
     if not halves:
-        whole = not bounds and largest > 1 and all(v == round(v) for v in values)
-        return 0 if whole else decimals([*values, *bounds])
-    digits = 1 - math.floor(math.log10(statistics.median_low(halves)))
-    most = 4 - math.floor(math.log10(largest)) if largest else digits
-    return max(0, min(8, digits, most))
+        whole = not intervals and largest > 1 and all(v == round(v) for v in values)
+        return 0 if whole else decimals([*values, *(v for pair in intervals for v in pair)])
+    digits, most = (
+        1 - math.floor(math.log10(half)) for half in (statistics.median_low(halves), min(halves))
+    )
+    limits = [min(map(abs, pair)) for pair in intervals if pair[0] * pair[1] > 0]
+    while digits < most and any(round(limit, digits) == 0 for limit in limits):
+        digits += 1
+    room = 4 - math.floor(math.log10(largest)) if largest else most
+    return max(0, min(8, most if finest else digits, room))
 
 
 def p_text(p: float | None) -> str:

@@ -285,12 +285,17 @@ def curve_table(curve: Curve) -> StudyTable:
 def tally(claims: Sequence[Claim]) -> str:
     """Return how many claims have which verdict: ``4 hold, 1 does not hold, 2 undecided``."""
     counts = Counter(claim.verdict for claim in claims)
-    words = {"holds": "hold", "does not hold": "do not hold"}
     return ", ".join(
-        f"{counts[verdict]} {verdict if counts[verdict] == 1 else words.get(verdict, verdict)}"
+        f"{counts[verdict]} {verdict_word(verdict, counts[verdict])}"
         for verdict in MARKS
         if counts[verdict]
     )
+
+
+def verdict_word(verdict: str, n: int) -> str:
+    """Return the verdict of ``n`` claims: ``hold`` for ``holds``."""
+    words = {"holds": "hold", "does not hold": "do not hold"}
+    return verdict if n == 1 else words.get(verdict, verdict)
 
 
 def in_turns_by_source(claims: Sequence[Claim], most: int) -> tuple[list[Claim], list[Claim]]:

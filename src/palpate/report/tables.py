@@ -449,11 +449,12 @@ def best_of(column: Sequence[Score], differences: Sequence[Score]) -> str | None
 
 
 def best_by_value(column: Sequence[Score | None], digits: int) -> set[int]:
-    """Return the places of the best scores as they are written, by the direction of the metric.
+    """Return the places of the best scores, by the direction of the metric.
 
-    None where fewer than two compete. A score does not compete that is None, undefined, or a ratio
-    whose denominators are not known (``unstable-denominators``); without a direction, also one
-    without a floor.
+    They are compared as written with ``digits``, or with those of the narrowest interval if these
+    are more. None where fewer than two compete. A score does not compete that is None, undefined,
+    or a ratio whose denominators are not known (``unstable-denominators``); without a direction,
+    also one without a floor.
     """
     competing = {
         k: score
@@ -466,6 +467,7 @@ def best_by_value(column: Sequence[Score | None], digits: int) -> set[int]:
     directions = {score.higher_is_better for score in competing.values()}
     if len(competing) < 2 or len(directions) > 1:
         return set()
+    digits = max(digits, digits_of(competing.values(), finest=True))
     worth: dict[int, float] = {}
     for k, score in competing.items():
         written = round(float(score), digits)

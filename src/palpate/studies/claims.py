@@ -237,8 +237,8 @@ def ranking_claims(
 ) -> list[Claim]:
     """Text as a bridge beats images; conditioning on the background hurts.
 
-    TMMD and, if given, people decide; I-, CI- and D-TMMD, which look perfect when a generator
-    collapses, are listed as evidence alone.
+    TMMD and, if given, people decide; I-, CI- and D-TMMD, which say how images vary and not how
+    close they are, are listed as evidence alone.
     """
     names = names or Names()
     wanted = [f"Text as a bridge beats images ({other})" for other in names.images]
@@ -264,8 +264,8 @@ def _ranking_claim(
         each = ", ".join(f"{_label(s)} {in_words(s)}" for s in scores)
         why = f"Lead of {front} over {other} ({BEHIND}): {each}{_runs(scores[0])}"
         if deciding and others:
-            decide_it = "TMMD and people decide" if votes else "TMMD decides"
-            why += f". {decide_it}: the others are best where all images are alike"
+            people_too = any(metric_of(d) == PEOPLE for d in compared)
+            why += f". {'TMMD and people decide' if people_too else 'TMMD decides'}"
     sides = [side_of(s) for s in deciding]
     source = "paper, tables 3 and 4" if "images" in claim else "paper, table 3"
     return Claim(claim, source, decide(sides), f"{why}.", [*deciding, *others])

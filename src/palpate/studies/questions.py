@@ -128,7 +128,7 @@ def retrieve_moved(
     judge = EncoderSet.load(after[encoders] / "encoders", device=device)
     vision, cache = EncoderSet(load_clip(clip, device=device)), cache_of(place)
     of = embed(test, judge, "tactile", cache=cache, still=True)
-    known = embed(train, judge, "tactile", cache=cache).features
+    known = embed(train, judge, "tactile", cache=cache, still=True).features
     for name in APPEARANCES:
         shown = _photographed(test, options, name, place / "photos", progress)
         rows = nearest_rows(train, shown, vision, cache=cache)
@@ -171,7 +171,8 @@ def measure_moves(
             again = FeatureSet.load(noise) if noise.is_file() else None
             ids = sets[RECORDED].ids
             real = embed(manifest.take(ids), judge, "tactile", cache=cache, still=True)
-            known = embed(train, judge, "tactile", cache=cache) if real.labels else None
+            probed = real.labels and method != NEAREST  # a probe has seen these very images
+            known = embed(train, judge, "tactile", cache=cache) if probed else None
             how: dict[str, Any] = {"train": known, "subject": method, "split": split.digest}
             runs.setdefault(method, []).append(moves(sets, again, real, **how))
     table = replace(appearance_table(runs), controls=[n for n in runs if n == NEAREST])
@@ -194,8 +195,8 @@ def compare_rulers(
     ranking is the question.
 
     ``rulers``: name of an encoder -> its node, or the name of a shipped one; ``images``: (method,
-    seed) -> node; ``controls``: their names. Controls have ranks, but no part in the agreement:
-    encoders of any training put an empty background last.
+    seed) -> node; ``controls``: their names. They are placed in the ranking of the generators, and
+    have no part in the agreement.
     """
     manifest, split = data_of(after, NOLEAK)
     loaded = {

@@ -420,7 +420,8 @@ def _appearance_nodes(plan: Plan, methods: Mapping[str, Method]) -> list[Node]:
         build = partial(retrieve_moved, encoders=judge, options=options, clip=plan.preset.clip)
         build = partial(build, device=plan.device)
         inputs = {"samples": MOVED, **_clip(plan.preset)}
-        nodes.append(Node(node, build, inputs, ["data", "split", judge], cost=30))
+        after = ["data", "split", judge]
+        nodes.append(Node(node, build, inputs, after, cost=30, measures=True))
         moved.setdefault(NEAREST, []).append((node, judge))
     read = [node for pairs in moved.values() for pair in pairs for node in pair]
     ours, other = plan.study.moved[:2]

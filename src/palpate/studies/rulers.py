@@ -187,9 +187,9 @@ def ruler_tables(
             m: float(np.mean([float(s) for (method, _), s in scores.items() if method == m]))
             for m in methods
         }
-        order = sorted(methods, key=lambda m, of=means: of[m])
         for row, method in zip(ranks, methods, strict=True):
-            rank = float(order.index(method) + 1)
+            others = (means[m] for m in methods if m != method and m not in controls)
+            rank = 1.0 + sum(mean < means[method] for mean in others)
             row.append(Score("rank", method, rank, details={"mean TMMD": means[method]}))
     return [
         StudyTable(
@@ -204,7 +204,7 @@ def ruler_tables(
         StudyTable(
             "Ranks by ruler",
             "The rank of each method by its mean TMMD over seeds, by each encoder; 1 is best."
-            + " Controls are ranked with them." * bool(controls),
+            + " Of a control: the rank that it would have among them." * bool(controls),
             ["method", *names],
             ranks,
             controls=[name for name in controls if name in methods],

@@ -308,6 +308,9 @@ def _table(
         pairs = ((means.get((f"{REAL} + {name}", k)), means.get((REAL, k))) for k in shots)
         rows.append([gain, *(_gain(a, b) if a and b else None for a, b in pairs)])
     columns = ["trained on", *(f"k = {k}" for k in shots)]
+    if controls:
+        text += " Controls: what retrieval or a perfect generator would add is real touch, and of "
+        text += "more videos than k."
     beside = {label for name in controls for label in _rows_of(name)}
     aside = [str(row[0]) for row in rows if row[0] in beside]
     return StudyTable(title, text, columns, rows, controls=aside)
