@@ -159,6 +159,7 @@ def test_what_was_found_is_said_in_one_sentence():
     assert said(*of("holds", "holds", "undecided")) == (
         "3 claims: 1 undecided, 2 hold (“c0”; “c1”)."
     )
+    assert said(*of("undecided", "undecided")) == "2 claims: all undecided."
     beyond = of("does not hold", source="beyond the paper")
     assert said(*of("undecided"), *beyond) == (
         "1 claim of the paper: 1 undecided; 1 beyond it: 1 does not hold (“c0”)."

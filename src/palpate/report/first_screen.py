@@ -104,7 +104,8 @@ def _verdicts(claims: Sequence[Claim]) -> str:
     for verdict, same in sorted(groups.items(), key=lambda group: len(group[1])):
         few = verdict != "undecided" and len(same) < NAMED
         named = f" ({'; '.join(f'“{c}”' for c in same)})" if few else ""
-        parts.append(f"{len(same)} {verdict_word(verdict, len(same))}{named}")
+        number_of = "all" if 1 < len(same) == len(claims) else str(len(same))
+        parts.append(f"{number_of} {verdict_word(verdict, len(same))}{named}")
     return ", ".join(parts)
 
 
@@ -158,7 +159,8 @@ def _leak_card(audits: Sequence[Audit]) -> Card:
     foot = ""
     if any(a.leaked_fraction for a in audits):
         gaps = [a.gap_median for a in audits if a.leaked_fraction and a.gap_median is not None]
-        near = f"; the nearest is a median of {number(gaps[0], 0)} frames away" if gaps else ""
+        frames = f"{number(gaps[0], 0)} frame{'s' * (gaps[0] != 1)}" if gaps else ""
+        near = f"; the nearest is a median of {frames} away" if frames else ""
         foot = f"A leak: train has the same video, object or image{near}."
     return Card("Test samples that leak from train", rows, foot)
 
