@@ -1,14 +1,18 @@
 """What generated images are worth: noise nothing, real images of other videos much."""
 
+from collections import Counter
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from palpate.core import FeatureSet, PalpateError
+from palpate.studies.controls import CEILING
 from palpate.studies.utility import (
     REAL,
     Draws,
+    Training,
+    _tested,
     fewest_videos,
     linear_map,
     material_utility,
@@ -115,6 +119,35 @@ def test_no_image_trains_what_names_its_video(material):
     assert float(cells(by_heart)[f"{REAL} + x"][0]) > leak + 0.15
 
 
+def test_every_fold_leaves_out_as_many_videos_of_a_class():
+    """Else a class is rarer in training where it is tested, and no knowledge is below chance."""
+    uneven = [
+        i for i, g in zip(TEST.ids, TEST.groups, strict=True) if g not in ("test0-1", "test2-3")
+    ]
+    test, seen = TEST.take(uneven), []
+
+    def fit(features):
+        pairs = {*zip(features.labels, features.groups, strict=True)}
+        seen.append(Counter(label for label, _ in pairs))
+        return lambda rows: np.zeros(len(rows.ids))
+
+    _tested(Draws(folds=3), 0, test, Training(generated=test), fit)
+    assert seen == 3 * [{"class 0": 12, "class 1": 13, "class 2": 12, "class 3": 13}]
+    other = Training(generated=replace(test, groups=[f"other {g}" for g in test.groups]))
+    seen.clear()
+    _tested(Draws(folds=3), 0, test, other, fit)
+    assert seen == [{"class 0": 19, "class 1": 20, "class 2": 19, "class 3": 20}]
+
+
+def test_a_claim_names_what_a_perfect_generator_would_add():
+    good = {name: like_test(videos(20, "other", 4)) for name in ("made", CEILING)}
+    draws = Draws(shots=(1,), draws=1)
+    table = material_utility(TRAIN, TEST, good, draws, controls=[CEILING])[0]
+    [claim] = utility_claims(table)
+    assert "Images of a perfect generator would change it by 0." in claim.why
+    assert claim.why.endswith("] at k = 1.")
+
+
 def _renamed(features):
     """The same rows under other videos, which no fold can keep apart."""
     return replace(features, groups=[f"renamed {g}" for g in features.groups])
@@ -142,7 +175,10 @@ def test_the_drawn_videos_are_nested_and_the_same_for_all_sets():
     assert len(one) == CLASSES * FRAMES
     assert FEW.rows(TRAIN, 1, 1) != one
     assert len({TRAIN.groups[k] for k in two}) == 2 * CLASSES
-    assert FEW.rows(TRAIN, None, 0) == [*range(len(TRAIN.ids))]
+    each = {f"class {c}": c for c in range(CLASSES)}
+    assert Counter(TRAIN.labels[k] for k in FEW.rows(TRAIN, each, 0)) == {
+        f"class {c}": c * FRAMES for c in range(1, CLASSES)
+    }
     fold = FEW.fold_of(TEST, TEST)
     assert len(set(fold)) == FEW.folds
     assert all(

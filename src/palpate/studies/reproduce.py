@@ -334,7 +334,7 @@ def _question_nodes(plan: Plan) -> list[Node]:
         after += [node for of in runs.values() for node in of.values()]
         inputs = {**given, "methods": useful}
         cost = 200 * seeds
-        nodes.append(Node("utility", build, inputs, after, version=4, cost=cost, measures=True))
+        nodes.append(Node("utility", build, inputs, after, version=5, cost=cost, measures=True))
     if useful:
         nodes += _compute_nodes(plan, {n: trained[n] for n in useful})
     names = [n for n in study.moved if n in trained]

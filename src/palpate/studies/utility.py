@@ -14,8 +14,10 @@ video it is tested on. Generated images are those of the *test part's other vide
 are dealt into folds, and what names the videos of one fold is trained on generated images of the
 others. Images of train photos would be the wrong choice: the generator was trained on the real
 touch of these very videos, so they may be recitations of it, and add real videos to the k by
-another name. (Sets whose videos are not in the test part need no folds; they are taken whole.) What
-is left is to be read with it: the generator itself was trained on the whole train part. The
+another name. (Sets whose videos are not in the test part need no folds; they are taken whole.)
+Every fold leaves out as many videos of a class: else the class of a tested video would be a rarer
+one in training than in the test, and whoever is unsure would be wrong more often than by chance.
+What is left is to be read with it: the generator itself was trained on the whole train part. The
 question is what it adds for new photos of known material, not whether real touch was saved.
 
 The k videos are drawn several times, nested in k. A mean over draws has the interval over test
@@ -45,6 +47,7 @@ from palpate.metrics.probe import fit_probe
 from palpate.metrics.retrieval import retrieval
 from palpate.report.study import Claim, Curve, Line, StudyTable
 from palpate.studies.claims import decide
+from palpate.studies.controls import CEILING
 from palpate.studies.embedding import embed_generated
 from palpate.studies.evidence import in_words, side_of
 
@@ -59,12 +62,15 @@ Fit = Callable[[FeatureSet], Callable[[FeatureSet], Any]]
 
 @dataclass(frozen=True)
 class Training:
-    """What is trained on: features or None, and videos a class of each (None: all)."""
+    """What is trained on: features or None, and videos a class of each.
+
+    ``of_generated`` 0: as many videos of a class as every fold can leave.
+    """
 
     real: FeatureSet | None = None
     generated: FeatureSet | None = None
-    of_real: int | None = None
-    of_generated: int | None = None
+    of_real: int = 0
+    of_generated: int = 0
 
 
 @dataclass(frozen=True)
@@ -94,18 +100,17 @@ class Draws:
         require(self.draws >= 1, "draws", "must be at least 1", self.draws, 5)
         require(self.folds >= 2, "folds", "must be at least 2", self.folds, 4)
 
-    def rows(self, features: FeatureSet, shots: int | None, draw: int) -> list[int]:
-        """Rows of k videos of every class (None: all), the same videos in every set.
+    def rows(self, features: FeatureSet, shots: int | Mapping[str, int], draw: int) -> list[int]:
+        """Rows of k videos of every class, or of so many of each, the same videos in every set.
 
         The first k of an order by (seed, draw, class, video): nested in k.
         """
-        videos: dict[str, set[str]] = {}
-        for label, video in zip(*_columns(features), strict=True):
-            videos.setdefault(label, set()).add(video)
+        count = lambda label: shots if isinstance(shots, int) else shots[label]
+        videos = _videos(features)
         kept = {
             (label, video)
             for label, of in videos.items()
-            for video in sorted(of, key=lambda v: self._place(draw, label, v))[:shots]
+            for video in sorted(of, key=lambda v: self._place(draw, label, v))[: count(label)]
         }
         pairs = zip(*_columns(features), strict=True)
         return [k for k, pair in enumerate(pairs) if pair in kept]
@@ -132,6 +137,22 @@ def _columns(features: FeatureSet) -> tuple[list[str], list[str]]:
     n = len(features.ids)
     labels = [str(v) for v in features.labels or [""] * n]
     return labels, [str(g) for g in features.groups or features.ids]
+
+
+def _videos(features: FeatureSet) -> dict[str, set[str]]:
+    """Class -> its videos."""
+    videos: dict[str, set[str]] = {}
+    for label, video in zip(*_columns(features), strict=True):
+        videos.setdefault(label, set()).add(video)
+    return videos
+
+
+def _left(made: FeatureSet, tested: Sequence[set[str]]) -> dict[str, int]:
+    """Class -> its videos that are left by the fold, of these sets of videos, that tests most."""
+    return {
+        label: len(of) - max(len(of & fold) for fold in tested)
+        for label, of in _videos(made).items()
+    }
 
 
 def fewest_videos(draws: Draws, features: FeatureSet, test: FeatureSet) -> int:
@@ -169,16 +190,17 @@ def _tested(draws: Draws, draw: int, test: FeatureSet, training: Training, fit: 
     """What a training gives for every test row; generated images are those of other folds."""
     real, made = training.real, training.generated
     fold, videos = draws.fold_of(test, made), _columns(test)[1]
+    places = [np.flatnonzero(fold == number) for number in np.unique(fold)]
+    tested = [{videos[k] for k in at} for at in places]
     parts: list[tuple[NDArray[np.intp], Any]] = []
-    for number in np.unique(fold):
-        at = np.flatnonzero(fold == number)
-        tested, sets = {videos[k] for k in at}, list[FeatureSet]()
+    for at, names in zip(places, tested, strict=True):
+        sets: list[FeatureSet] = []
         if real is not None:
             sets.append(_picked(real, draws.rows(real, training.of_real, draw)))
         if made is not None:
-            others = [k for k, v in enumerate(_columns(made)[1]) if v not in tested]
-            free = _picked(made, others)
-            sets.append(_picked(free, draws.rows(free, training.of_generated, draw)))
+            others = [k for k, v in enumerate(_columns(made)[1]) if v not in names]
+            free, shots = _picked(made, others), training.of_generated or _left(made, tested)
+            sets.append(_picked(free, draws.rows(free, shots, draw)))
         parts.append((at, fit(_joined(sets))(_picked(test, at.tolist()))))
     values = np.empty((len(fold), *np.shape(parts[0][1])[1:]))
     for at, part in parts:
@@ -331,7 +353,7 @@ def utility_claims(table: StudyTable) -> list[Claim]:
     The gain at the fewest real videos a class decides, where help is needed most; the others are
     listed.
     """
-    claims: list[Claim] = []
+    claims, first = list[Claim](), table.columns[1]
     for label, *cells in table.rows:
         gains = [(k, c) for k, c in zip(table.columns[1:], cells, strict=True) if _is_score(c)]
         if not str(label).startswith(GAIN) or label in table.controls or not gains:
@@ -339,10 +361,20 @@ def utility_claims(table: StudyTable) -> list[Claim]:
         scores = [score for _, score in gains]
         each = ", ".join(f"{in_words(score)} at {k}" for k, score in gains)
         why = f"Accuracy on real images of new videos changes by {each} real videos a class."
+        if perfect := _gain_of(table, CEILING):
+            why += (
+                f" Images of a perfect generator would change it by {in_words(perfect)} at {first}."
+            )
         name = str(label).removeprefix(GAIN)
         claim = f"Images of {name} help a classifier of real touch"
         claims.append(Claim(claim, "beyond the paper", decide([side_of(scores[0])]), why, scores))
     return claims
+
+
+def _gain_of(table: StudyTable, name: str) -> Score | None:
+    """The gain by images of one name at the fewest videos, if there are such."""
+    cell = next((row[1] for row in table.rows if row[0] == f"{GAIN}{name}"), None)
+    return cell if _is_score(cell) else None
 
 
 def _is_score(cell: Any) -> TypeGuard[Score]:
