@@ -144,26 +144,52 @@ def test_cards_compare_the_same_subjects():
     assert all("interval" in row.drawing for row in made[0].rows[1:])
 
 
-def test_what_was_found_is_said_in_one_sentence():
-    def of(*verdicts, source="paper, table 3"):
-        return [Claim(f"c{k}", source, v, "") for k, v in enumerate(verdicts)]
+def test_what_was_found_is_said_question_by_question():
+    def of(*verdicts, source="paper, table 3", measured=True):
+        return [Claim(f"c{k}", source, v, "", (), measured) for k, v in enumerate(verdicts)]
 
-    def said(*claims):
-        return found(Results("T", claims=claims))
+    def said(*claims, **more):
+        return found(Results("T", claims=claims, **more)).removesuffix(
+            " Intervals are over videos."
+        )
 
-    assert said() == ""
-    assert said(*of("holds")) == "1 claim: 1 holds (“c0”)."
+    assert found(Results("T")) == ""
+    assert said(*of("holds")) == "1 claim of the paper: 1 holds (“c0”)."
     assert said(*of("undecided", "does not hold", "undecided", "undecided")) == (
-        "4 claims: 1 does not hold (“c1”), 3 undecided."
+        "4 claims of the paper: 1 does not hold (“c1”), 3 undecided."
     )
     assert said(*of("holds", "holds", "undecided")) == (
-        "3 claims: 1 undecided, 2 hold (“c0”; “c1”)."
+        "3 claims of the paper: 2 hold (“c0”; “c1”), 1 undecided."
     )
-    assert said(*of("undecided", "undecided")) == "2 claims: all undecided."
+    assert said(*of("undecided", "undecided")) == "2 claims of the paper: all undecided."
     beyond = of("does not hold", source="beyond the paper")
-    assert said(*of("undecided"), *beyond) == (
-        "1 claim of the paper: 1 undecided; 1 beyond it: 1 does not hold (“c0”)."
+    assert said(*of("undecided"), *of("undecided", measured=False), *beyond) == (
+        "2 claims of the paper: 1 undecided, 1 not measured; 1 beyond it: 1 does not hold (“c0”)."
     )
+    leaks = said(*of("holds"), audits=[full_audit(), clean_audit()])
+    assert leaks.startswith(
+        "99.10 % of the test samples of Orig and 0 % of the test samples of NoLeak leak. "
+    )
+    seeds = found(Results("T", claims=of("holds"), settings={"seeds": [0, 1]}))
+    assert seeds.endswith("Intervals are over videos and seeds.")
+
+
+@pytest.mark.parametrize(
+    ("interval", "words"),
+    [
+        ((0.2, 0.4), "farther from real images than those"),
+        ((0.05, 0.4), "not told apart from real images"),
+    ],
+)
+def test_a_method_is_told_apart_by_its_interval_and_that_of_the_floor(interval, words):
+    real = score("TMMD", "real, other videos", 0.0, interval=(-0.1, 0.1))
+    scores = [score("TMMD", "Ours", 0.3, interval=interval), real]
+    columns = telling_columns(score_tables(scores))
+    results = Results("T", scores=scores, claims=[Claim("c", "s", "holds", "")])
+    assert f"By TMMD, Ours is {words} of other videos." in found(
+        results, columns, ["real, other videos"]
+    )
+    assert "By TMMD" not in found(results, telling_columns(score_tables(scores[:1])))  # no floor
 
 
 def test_a_card_never_loses_its_method_to_controls():

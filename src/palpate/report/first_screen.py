@@ -13,7 +13,7 @@ from palpate.report.notes import number, p_text, percent, plural, sentence
 from palpate.report.results import Audit, Results
 from palpate.report.sentences import share_of
 from palpate.report.study import Claim
-from palpate.report.study_tables import verdict_word
+from palpate.report.study_tables import MARKS, verdict_word
 from palpate.report.tables import REAL, Cell, Column, Table, best_by_value, defined
 
 #: Columns of the verdict table, the most telling first; others follow as they come.
@@ -21,6 +21,8 @@ TELLING = ("TMMD", "material accuracy", "D-TMMD", "CI-TMMD", "SSIM")
 COLUMNS, CARDS, CARD_ROWS = 5, 3, 4
 #: Fewer claims of one verdict than this are named on the first screen.
 NAMED = 3
+#: The control that is the floor of TMMD.
+FLOOR = "real, other videos"
 #: Beginnings of metrics whose null is that generated and real images are alike.
 DISTANCES = ("TMMD", "FID", "CMMD", "KID")
 #: Width of the strip in a card, and of the one that explains strips, in pixels.
@@ -80,32 +82,50 @@ def about(results: Results, date: str, version: str) -> list[str]:
     return [*facts, date, f"palpate {version}"]
 
 
-def found(results: Results) -> str:
-    """Return what became of the claims, of the paper and beyond it; few decided ones by name."""
-    sides: dict[str, list[Claim]] = {}
-    for claim in results.claims:
-        place = "of the paper" if claim.source.startswith("paper") else "beyond it"
-        sides.setdefault(place, []).append(claim)
-    if len(sides) == 1:
-        sides = {"": [*results.claims]}
-    parts = [
-        f"{plural(len(claims), 'claim') if not k else len(claims)} {place}".strip()
-        + f": {_verdicts(claims)}"
-        for k, (place, claims) in enumerate(sides.items())
-    ]
-    return f"{'; '.join(parts)}." if parts else ""
+def found(results: Results, columns: Sequence[Column] = (), controls: Collection[str] = ()) -> str:
+    """Return what a study found, question by question, in a few words, and what intervals cover."""
+    if not results.claims:
+        return ""
+    audits = [a for a in results.audits if a.against == "train" and a.test_samples]
+    leaks = " and ".join(f"{share_of(a)} of the test samples of {a.name}" for a in audits)
+    own = [c for c in results.claims if not c.source.startswith("paper")]
+    papers = [c for c in results.claims if c.source.startswith("paper")]
+    told = [f"{plural(len(papers), 'claim')} of the paper: {_verdicts(papers)}"] if papers else []
+    beyond = "beyond it" if papers else "claims"
+    told += [f"{len(own)} {beyond}: {_verdicts(own)}"] if own else []
+    seeds = results.settings.get("seeds")
+    covered = (
+        f"Intervals are over videos{' and seeds' * (isinstance(seeds, list) and len(seeds) > 1)}"
+    )
+    parts = [leaks and f"{leaks} leak", _apart(columns, controls), "; ".join(told), covered]
+    return " ".join(f"{part}." for part in parts if part)
+
+
+def _apart(columns: Sequence[Column], controls: Collection[str]) -> str:
+    """Whether the first method is told apart from real images of other videos, by TMMD."""
+    cells = [c for column in columns if column.metric == "TMMD" for c in column.cells if c.defined]
+    method = next((c.score for c in cells if c.score.subject not in {*controls, REAL}), None)
+    floor = next((c.score for c in cells if c.score.subject == FLOOR), None)
+    if method is None or floor is None or not method.interval or not floor.interval:
+        return ""
+    apart = method.interval[0] > floor.interval[1]
+    word = "farther from real images than those" if apart else "not told apart from real images"
+    return f"By TMMD, {method.subject} is {word} of other videos"
 
 
 def _verdicts(claims: Sequence[Claim]) -> str:
+    """``1 does not hold (“...”), 8 undecided, 12 not measured``; decided ones by name, if few."""
     groups: dict[str, list[str]] = {}
     for claim in claims:
-        groups.setdefault(claim.verdict, []).append(claim.claim)
+        verdict = claim.verdict if claim.measured else "not measured"
+        groups.setdefault(verdict, []).append(claim.claim)
     parts: list[str] = []
-    for verdict, same in sorted(groups.items(), key=lambda group: len(group[1])):
-        few = verdict != "undecided" and len(same) < NAMED
-        named = f" ({'; '.join(f'“{c}”' for c in same)})" if few else ""
+    for verdict in (*MARKS, "not measured"):
+        same = groups.get(verdict, [])
+        named = verdict in ("holds", "does not hold") and len(same) < NAMED
+        names = f" ({'; '.join(f'“{c}”' for c in same)})" * named
         number_of = "all" if 1 < len(same) == len(claims) else str(len(same))
-        parts.append(f"{number_of} {verdict_word(verdict, len(same))}{named}")
+        parts += [f"{number_of} {verdict_word(verdict, len(same))}{names}"] if same else []
     return ", ".join(parts)
 
 
@@ -160,8 +180,8 @@ def _leak_card(audits: Sequence[Audit]) -> Card:
     if any(a.leaked_fraction for a in audits):
         gaps = [a.gap_median for a in audits if a.leaked_fraction and a.gap_median is not None]
         frames = f"{number(gaps[0], 0)} frame{'s' * (gaps[0] != 1)}" if gaps else ""
-        near = f"; the nearest is a median of {frames} away" if frames else ""
-        foot = f"A leak: train has the same video, object or image{near}."
+        near = f", a median of {frames} away" if frames else ""
+        foot = f"Train has the same video, object or image{near}."
     return Card("Test samples that leak from train", rows, foot)
 
 
@@ -208,7 +228,7 @@ def _score_card(
     rows = [_score_row(cell, column, small, mark, controls) for cell in shown]
     left = f" {len(shown)} of {known} rows." if known > len(shown) else ""
     told = [n for cell in shown for n in cell.score.notes if n.code == "text"]
-    left += f" * {sentence(told[0])}" if told else ""
+    left += f" * {sentence(told[0]).partition(':')[0]}." if told else ""
     title = f"{QUESTIONS.get(column.metric, column.metric)} {column.arrow}"
     if share:
         chance = f"Share named right by a probe; dashed: chance, {percent(mark)}." if mark else ""

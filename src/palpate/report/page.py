@@ -138,7 +138,7 @@ def render_page(
         "about": first_screen.about(results, date, __version__),
         "purpose": _lede(results),
         "caution": first_screen.caution(results),
-        "found": first_screen.found(results),
+        "found": first_screen.found(results, columns, controls),
         "facts": list(results.facts) or ([] if cards else sentences.summary_lines(results)),
         "cards": cards,
         "row_labels": _labels(samples),

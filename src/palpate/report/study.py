@@ -77,6 +77,7 @@ class Claim:
         verdict: what the evidence says.
         why: one sentence: the numbers that decide, or what is missing.
         evidence: the scores (or paired differences) that the verdict follows from.
+        measured: whether what decides was measured at all; else it is undecided for want of data.
     """
 
     claim: str
@@ -84,3 +85,4 @@ class Claim:
     verdict: Verdict
     why: str
     evidence: Sequence[Score] = ()
+    measured: bool = True

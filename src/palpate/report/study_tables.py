@@ -283,13 +283,15 @@ def curve_table(curve: Curve) -> StudyTable:
 
 
 def tally(claims: Sequence[Claim]) -> str:
-    """Return how many claims have which verdict: ``4 hold, 1 does not hold, 2 undecided``."""
+    """Return how many claims have which verdict: ``4 hold, 2 undecided (1 not measured)``."""
     counts = Counter(claim.verdict for claim in claims)
-    return ", ".join(
+    missing = sum(not claim.measured for claim in claims)
+    tallied = [
         f"{counts[verdict]} {verdict_word(verdict, counts[verdict])}"
         for verdict in MARKS
         if counts[verdict]
-    )
+    ]
+    return ", ".join(tallied) + f" ({missing} not measured)" * bool(missing)
 
 
 def verdict_word(verdict: str, n: int) -> str:

@@ -183,7 +183,7 @@ def appearance_claims(
         claim = f"Text drops {dropped}"
         if len(pair) < 2 or any(change not in run.distances for runs in pair for run in runs):
             why = f"{ours} and {other} were not both given photos with {change}."
-            claims.append(Claim(claim, source, "undecided", why))
+            claims.append(Claim(claim, source, "undecided", why, measured=False))
             continue
         terms = [[run.distances[n] for run in runs] for runs in pair for n in (change, AGAIN)]
         spread = spread_of(terms, lambda m: m[..., 2] / m[..., 3] - m[..., 0] / m[..., 1])

@@ -135,12 +135,14 @@ def leak_claims(
         lead = f"Lead of {names[0]} over {names[1]} in {metric_of(tasks[task])}"
         why = f"{lead} ({BEHIND}): {in_words(gain)}{_runs(gain)}"
         verdict = decide([side_of(gain)])
-        rows.append(Claim(f"Leakage inflates {task}", source, verdict, f"{why}.", [gain]))
+        claim, known = f"Leakage inflates {task}", gain.interval is not None
+        rows.append(Claim(claim, source, verdict, f"{why}.", [gain], known))
     directed = [g for task, g in gains.items() if tasks[task].higher_is_better is not None]
     sides = [side_of(gain) for gain in directed]
     counts = f"{sides.count(1)} of {len(sides)} tasks inflated, {sides.count(-1)} deflated"
     why = f"{counts}, {sides.count(0)} with an interval that holds 0 or is missing."
-    overall = Claim("Leakage inflates every task", source, decide(sides, every=True), why, directed)
+    verdict, known = decide(sides, every=True), any(gain.interval for gain in directed)
+    overall = Claim("Leakage inflates every task", source, verdict, why, directed, known)
     return [overall, *rows]
 
 
@@ -204,7 +206,7 @@ def _preference_claim(
         parts[1] = "the human study compared other methods" if votes else "no human study was given"
     verdict = decide([-sign if against else sign for sign in signs])
     why, evidence = f"{_capital('; '.join(parts))}.", [*of_metric, *of_people]
-    return Claim(f"{metric} {does}", "paper, table 3", verdict, why, evidence)
+    return Claim(f"{metric} {does}", "paper, table 3", verdict, why, evidence, bool(signs))
 
 
 def _leads(scores: Sequence[Score]) -> str:
@@ -268,7 +270,8 @@ def _ranking_claim(
             why += f". {'TMMD and people decide' if people_too else 'TMMD decides'}"
     sides = [side_of(s) for s in deciding]
     source = "paper, tables 3 and 4" if "images" in claim else "paper, table 3"
-    return Claim(claim, source, decide(sides), f"{why}.", [*deciding, *others])
+    known = any(score.interval for score in deciding)
+    return Claim(claim, source, decide(sides), f"{why}.", [*deciding, *others], known)
 
 
 def effect_size(difference: Score) -> Score | None:
@@ -334,7 +337,7 @@ def discrimination_claim(differences: Sequence[Score], names: Names | None = Non
     shared = [pair for pair in sizes["traditional"] if pair in sizes["family"]]
     if not shared:
         why = "No two methods were compared by both kinds of metrics with intervals."
-        return Claim(claim, source, "undecided", why, evidence)
+        return Claim(claim, source, "undecided", why, evidence, measured=False)
     means = {kind: fmean(fmean(of[pair]) for pair in shared) for kind, of in sizes.items()}
     gap, reach = means["family"] - means["traditional"], Z * np.sqrt(2)
     pairs = f"{len(shared)} pair{'s' * (len(shared) != 1)}"

@@ -236,7 +236,7 @@ def nodes_of(plan: Plan) -> list[Node]:
     inputs = {"study": study.name, "title": study.title, "tables": study.tables}
     inputs |= {"paper": study.paper, "methods": plan.methods, "controls": list(study.controls)}
     inputs |= {"people": plan.people and digest_file(plan.people)}
-    nodes.append(Node("results", build, inputs, after, version=6, cost=10, measures=True))
+    nodes.append(Node("results", build, inputs, after, version=7, cost=10, measures=True))
     return nodes
 
 
