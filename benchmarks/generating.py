@@ -55,7 +55,7 @@ from palpate.encoders.encoder_set import EncoderSet, seeded
 from palpate.metrics import tmmd
 from palpate.metrics.probe import fit_probe, material_accuracy
 from palpate.sim import PRESETS, write_world
-from palpate.training.engine import Task, fit
+from palpate.training.engine import Task, fit, has_bf16
 from palpate.training.options import Compute, LoopOptions
 
 SHAPE = {"contacts_per_video": 3, "frames_per_contact": 1, "sensors": 3, "materials": 10}
@@ -335,9 +335,7 @@ class Bench:
 
     def bf16(self):
         """Sampling and training steps."""
-        flags = Path("/proc/cpuinfo")
-        has = flags.exists() and "bf16" in flags.read_text()
-        if not has:
+        if not has_bf16():
             return {"skipped": "this CPU has no bfloat16"}
         other = TactilePipeline.from_pretrained("palpate/mini", device="cpu").to(torch.bfloat16)
         batch = self.pipeline.sampler.batch

@@ -5,6 +5,7 @@ import math
 import os
 import signal
 import time
+import warnings
 
 import numpy as np
 import pytest
@@ -14,7 +15,7 @@ from safetensors import safe_open
 from tensorboardX.proto.event_pb2 import Event
 from torch import nn
 
-from palpate.core import PalpateError, quiet
+from palpate.core import PalpateError, PalpateWarning, quiet
 from palpate.training import engine
 from palpate.training.engine import Losses, Task
 from palpate.training.options import Compute, LoopOptions, RowOrder, learning_rate
@@ -551,6 +552,23 @@ def test_half_precision_learns(tmp_path, whole, precision, lines):
     log = fit(Net(), loss, N, options(), tmp_path, compute)
     for row, plain in list(zip(log, whole[1], strict=True))[:lines]:
         assert row["loss"] == pytest.approx(plain["loss"], rel=0.01)
+
+
+@pytest.mark.parametrize("has", [True, False])
+def test_a_processor_without_bf16_computes_in_float32_and_says_so(tmp_path, whole, has):
+    known = {"architecture": "x86_64", "avx512_bf16": has, "amx_bf16": False}
+    seen = []
+
+    def watched(module, batch):
+        seen.append(torch.is_autocast_enabled("cpu"))
+        return loss(module, batch)
+
+    with pytest.MonkeyPatch.context() as patch, warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always", PalpateWarning)
+        patch.setattr(torch.cpu, "get_capabilities", lambda: known)
+        fit(Net(), watched, N, options(), tmp_path, Compute(precision="bf16"))
+    assert set(seen) == {has}
+    assert len([w for w in caught if "no bf16" in str(w.message)]) == (not has)
 
 
 def overflowing(steps):

@@ -115,7 +115,7 @@ class Machine:
     device: str = "auto"
     """auto, cpu, cuda, mps."""
     precision: Literal["float32", "bf16", "fp16"] = "float32"
-    """Of matrix products; the weights stay float32."""
+    """Of matrix products; the weights stay float32. bf16 is float32 on an x86 CPU without bf16."""
     tf32: bool = True
     """Let float32 products on CUDA round their factors to 10 bits."""
     compile: Switch = False

@@ -14,6 +14,7 @@ from __future__ import annotations
 import json
 import math
 import time
+import warnings
 from collections.abc import Callable, Generator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
@@ -29,7 +30,16 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import load_file, save_file
 from torch import Tensor, nn
 
-from palpate.core import PalpateError, Progress, atomic_path, digest_json, quiet, rng_for, short
+from palpate.core import (
+    PalpateError,
+    PalpateWarning,
+    Progress,
+    atomic_path,
+    digest_json,
+    quiet,
+    rng_for,
+    short,
+)
 from palpate.training.options import Compute, LoopOptions, RowOrder, Tracker, learning_rate
 from palpate.training.processes import average, barrier, merged, place, shared
 from palpate.training.steps import Step
@@ -158,6 +168,11 @@ class _Run:
             fix = "Do not freeze the whole model"
             raise PalpateError(f"{task.what} needs parameters that require gradients", "none", fix)
         self.device = next(iter(self.parameters.values())).device
+        self.dtype = DTYPES.get(compute.precision)
+        if compute.precision == "bf16" and self.device.type == "cpu" and not has_bf16():
+            self.dtype = None
+            text = "This processor has no bf16 and would emulate it: training in float32"
+            warnings.warn(text, PalpateWarning, stacklevel=3)
         matrices = [p for p in self.parameters.values() if p.ndim >= 2]
         vectors = [p for p in self.parameters.values() if p.ndim < 2]
         groups = [{"params": matrices, "weight_decay": options.weight_decay}]
@@ -240,8 +255,7 @@ class _Run:
     def forward(self, batch: Batch) -> Losses:
         """The loss of a batch, in the requested precision."""
         batch = {k: v.to(self.device, non_blocking=True) for k, v in batch.items()}
-        dtype = DTYPES.get(self.compute.precision)
-        with torch.autocast(self.device.type, dtype, enabled=dtype is not None):
+        with torch.autocast(self.device.type, self.dtype, enabled=self.dtype is not None):
             return self.loss(self.module, batch)
 
     def update(self, batch: Batch) -> None:
@@ -557,6 +571,14 @@ def _checkpoint_blocks(module: nn.Module) -> None:
             if hasattr(part, name):
                 getattr(part, name)()
                 break
+
+
+def has_bf16() -> bool:
+    """Whether the processor multiplies in bf16; an x86 one that emulates it takes ten times as long
+    as in float32.
+    """
+    known = torch.cpu.get_capabilities()
+    return known["architecture"] != "x86_64" or known["avx512_bf16"] or known["amx_bf16"]
 
 
 @contextmanager
