@@ -26,8 +26,8 @@ class Options(Common):
     run folder of `palpate demo` or `palpate reproduce`. It may have been moved with what it was
     made of."""
     tolerance: float = 1e-6
-    """Relative difference up to which two numbers are the same: another machine adds in another
-    order. Counts and digests must be equal."""
+    """Relative difference up to which two numbers are the same, if not to the sixth decimal:
+    another machine adds in another order. Counts and digests must be equal."""
     output: OptionalOutPath = None
     """Write every check as JSON."""
 

@@ -33,7 +33,7 @@ QUESTIONS = {
     "material accuracy": "Material read from the image",
 }
 #: Axis of shares.
-UNIT = plots.Axis(-0.02, 1.02, (), 1, width=112)
+UNIT = plots.Axis(-0.02, 1.02, (), 1, width=92)
 
 
 @dataclass(frozen=True)

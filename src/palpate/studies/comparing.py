@@ -1,15 +1,16 @@
 """Numbers of two runs side by side: scores and audits, field by field.
 
-Numbers agree if ``|a - b| <= tolerance * max(|a|, |b|, scale / 1e6)``: relative, but for values
-near zero, which are differences of sums of the size of the scale; thresholds and scores of
-near-duplicates have a tolerance of their own. Words, counts and digests agree if they are equal.
-Times, and the version and stage that a score was made in, are not compared.
+Numbers agree if ``|a - b| <= tolerance * max(|a|, |b|)``, or to the sixth decimal: scores near zero
+are differences of sums over embeddings of 32 bits, whose last ones depend on processor and threads.
+p-values and effect sizes, which divide two such differences, and what is said of near-duplicates
+have a tolerance of their own. Words, counts and digests agree if they are equal. Times, and the
+version and stage that a score was made in, are not compared.
 """
 
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -19,6 +20,8 @@ from palpate.report.results import Audit
 _DIGEST = re.compile("[0-9a-f]{64}")
 #: Relative, for sums whose order may change from run to run.
 TOLERANCE = 1e-6
+#: Absolute, where the relative one is not 0.
+DECIMAL = 1e-6
 Status = Literal["same", "differs", "cannot check", "untraced"]
 STATUSES: tuple[Status, ...] = ("same", "differs", "cannot check", "untraced")
 #: Entries of details that no later run repeats.
@@ -29,9 +32,13 @@ _OF_AUDITS = ("name", "notes", "commands", "call", "others", "impact")
 _PLACES = ("vision", "tactile", "background", "generated", "others")
 #: Keys of what holds no numbers of a measurement.
 _BESIDES = ("notes", "settings")
-#: The least tolerance of near-duplicates, whose descriptors have 16 and 32 bits: two threads in the
-#: place of one move a threshold by 3e-5, and the score of a pair, of four digits, by one of them.
-NEAR, NEAR_TOLERANCE = ("threshold", "score"), 5e-4
+#: The least tolerance of some numbers. Descriptors of near-duplicates have 16 and 32 bits: two
+#: threads in the place of one move a threshold by 3e-5, and the score of a pair, of four digits, by
+#: one of them. p-values and effect sizes of untrained models, 1e-5 apart, are moved by 2e-3.
+LEAST = {
+    **dict.fromkeys(("threshold", "score"), 5e-4),
+    **dict.fromkeys(("p_value", "p_better", "p_adjusted", "effect size"), 5e-3),
+}
 
 
 @dataclass(frozen=True)
@@ -60,11 +67,17 @@ def score_name(score: Score) -> str:
 
 def score_difference(before: Score, after: Score, tolerance: float) -> str:
     """The first field in which two scores differ, with both values; '' where none does."""
-    a, b, scale = plain(before), plain(after), abs(before.scale)
-    fields = ((name.replace("_", " "), a[name], b[name]) for name in a if name != "details")
+    a, b = plain(before), plain(after)
+    if before.metric.startswith("effect size"):
+        tolerance = max(tolerance, LEAST["effect size"])
+    names = [name for name in a if name != "details"]
     details = {**a["details"], **b["details"]}.keys() - {*_PASSING}
-    parts = ((n.replace("_", " "), a["details"].get(n), b["details"].get(n)) for n in details)
-    return _first(fields, tolerance, scale) or _first(parts, tolerance, scale)
+    pairs = [(name, a[name], b[name]) for name in names]
+    pairs += [(name, a["details"].get(name), b["details"].get(name)) for name in details]
+    return _first(
+        _difference(x, y, max(tolerance, LEAST.get(name, 0.0)), name.replace("_", " "))
+        for name, x, y in pairs
+    )
 
 
 def audit_numbers(audit: Audit, start: str = "") -> dict[str, Any]:
@@ -91,7 +104,7 @@ def audit_numbers(audit: Audit, start: str = "") -> dict[str, Any]:
 
 def number_difference(before: Any, after: Any, tolerance: float) -> str:
     """Where two numbers, or rows of numbers, differ, with both values; '' where they do not."""
-    return _difference(before, after, tolerance, 1.0, "")
+    return _difference(before, after, tolerance, "")
 
 
 def _label(row: Mapping[str, Any]) -> str:
@@ -99,25 +112,24 @@ def _label(row: Mapping[str, Any]) -> str:
     return next((str(v) for v in row.values() if isinstance(v, str)), "of no name")
 
 
-def _difference(a: Any, b: Any, tolerance: float, scale: float, name: str) -> str:
+def _difference(a: Any, b: Any, tolerance: float, name: str) -> str:
     if isinstance(a, Mapping) and isinstance(b, Mapping):
+        if str(a.get("metric")).startswith("effect size"):
+            tolerance = max(tolerance, LEAST["effect size"])
         keys = [key for key in dict.fromkeys([*a, *b]) if not _passes(key, a, b)]
-        differences = (
+        return _first(
             _difference(
-                a.get(key),
-                b.get(key),
-                max(tolerance, NEAR_TOLERANCE) if key in NEAR else tolerance,
-                scale,
-                f"{name} {key}".strip(),
+                a.get(key), b.get(key), max(tolerance, LEAST.get(key, 0.0)), f"{name} {key}".strip()
             )
             for key in keys
         )
-        return next(filter(None, differences), "")
     if isinstance(a, list) and isinstance(b, list) and len(a) == len(b):
         short = len(a) == 2 and all(isinstance(v, int | float) for v in (*a, *b))
-        pairs = ((name if short else f"{name} {k + 1}", *v) for k, v in enumerate(zip(a, b)))  # noqa: B905 - of one length
-        return _first(pairs, tolerance, scale)
-    if _close(a, b, tolerance, scale):
+        return _first(
+            _difference(x, y, tolerance, name if short else f"{name} {k}")
+            for k, (x, y) in enumerate(zip(a, b, strict=True), 1)
+        )
+    if _close(a, b, tolerance):
         return ""
     return f"{name} {_text(a)} in the file, {_text(b)} now".strip()
 
@@ -132,16 +144,15 @@ def _passes(key: str, a: Mapping[str, Any], b: Mapping[str, Any]) -> bool:
     return key in (*_PASSING, *_BESIDES) or (key in _PLACES and path)
 
 
-def _first(pairs: Iterator[tuple[str, Any, Any]], tolerance: float, scale: float) -> str:
-    differences = (_difference(a, b, tolerance, scale, name) for name, a, b in pairs)
+def _first(differences: Iterable[str]) -> str:
     return next(filter(None, differences), "")
 
 
-def _close(a: Any, b: Any, tolerance: float, scale: float) -> bool:
+def _close(a: Any, b: Any, tolerance: float) -> bool:
     numbers = [v for v in (a, b) if isinstance(v, int | float) and not isinstance(v, bool)]
     if len(numbers) < 2 or all(isinstance(v, int) for v in numbers):
         return type(a) is type(b) and a == b
-    return abs(a - b) <= tolerance * max(abs(a), abs(b), scale / 1e6)
+    return abs(a - b) <= max(tolerance * max(abs(a), abs(b)), DECIMAL * (tolerance > 0))
 
 
 def _text(value: Any) -> str:
