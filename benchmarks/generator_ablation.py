@@ -58,7 +58,7 @@ JUDGE = LoopOptions(2500, 32, 2e-3, warmup=100, weight_decay=1e-3, ema=0.99)
 VQ = AutoencoderOptions(
     patch=2, widths=(32, 64), channels=4, codes=8192, steps_free=3000, steps_quantized=400
 )
-BFLOAT = Compute(precision="bf16")
+BFLOAT = Compute(precision="bf16")  # float32 on x86 processors without it
 
 #: Plain guidance, so that all rows are sampled as the first ones were.
 PLAIN = SamplerOptions("dpm", steps=10, guidance=2.5)

@@ -258,6 +258,7 @@ def run_until(folder, kinds):
 
 
 @pytest.mark.nightly
+@pytest.mark.timeout(3600)  # a process for each kind of stage
 @slow
 def test_a_study_killed_in_each_kind_of_stage_ends_as_one_that_was_not(whole, tmp_path):
     killed = []
