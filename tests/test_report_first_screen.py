@@ -103,7 +103,7 @@ def test_cards_hold_the_leak_the_distance_and_the_material():
     columns = telling_columns(score_tables(results.scores))
     leak, distance, material = cards(results, columns)
     assert [(r.label, r.text) for r in leak.rows] == [("Orig", "99.10 %"), ("NoLeak", "0 %")]
-    assert "median of 304 frames" in leak.foot
+    assert "image; median of Orig: 304 frames away." in leak.foot
     assert [r.text for r in distance.rows] == ["1.40", "1.10", "7.00"]
     assert re.search(r'class="null".*class="floor".*class="interval"', distance.strip)
     assert [r.text for r in material.rows] == ["50.0 %", "60.0 %", "20.0 %", "90.0 %"]
@@ -190,6 +190,12 @@ def test_a_method_is_told_apart_by_its_interval_and_that_of_the_floor(interval, 
         results, columns, ["real, other videos"]
     )
     assert "By TMMD" not in found(results, telling_columns(score_tables(scores[:1])))  # no floor
+    # A metric that takes the empty background for real images cannot praise a method.
+    for near, neither in (((-0.2, 0.05), interval[0] < 0.1), ((0.5, 0.6), False)):
+        more = [*scores, score("TMMD", "empty background", 0.0, interval=near)]
+        said = found(results, telling_columns(score_tables(more)), [s.subject for s in more[1:]])
+        assert ("neither Ours nor the empty background" in said) == neither
+        assert (f"Ours is {words}" in said) != neither
 
 
 def test_a_card_never_loses_its_method_to_controls():

@@ -94,6 +94,12 @@ def test_pairs_without_photos_show_the_contact_and_no_empty_boxes(tmp_path):
     for image, clear in ((tactile, False), (contact, True), (alone, True)):
         inside, around = image[disc].mean(), image[~disc & (np.hypot(y - 40, x - 20) < 13)].mean()
         assert (inside - around > 30) == clear
+    # A generated contact is amplified as the real one is: half of it shows as half.
+    Image.fromarray(gel + 6 * disc[..., None].astype(np.uint8)).save(tmp_path / "real.png")
+    sample = SampleRef("s", tactile="real.png", background="gel.png")
+    html = page_of(Results("T", gallery=[GalleryItem(sample, "a.png")]), tmp_path)
+    real, made = (im.astype(float)[disc].mean() - 128 for im in shown_images(html)[2:4])
+    assert made == pytest.approx(real / 2, rel=0.2)
     photos = page_of(Results("T", audits=[small_audit([pair(vision="gel.png")])]), tmp_path)
     assert [a["alt"].split(":")[0] for a in Tree(photos).all("img")][::2] == [
         "Test photo",
@@ -274,7 +280,7 @@ def test_a_page_keeps_within_its_size(tmp_path):
     rows = len(tree.all("img")) // 3
     assert len(cut.encode()) <= 60_000
     assert 0 < rows < 50
-    assert f"{rows} of 50 chosen samples, every material in turn." in tree.text
+    assert re.search(rf"{rows} of 50 chosen samples(, \d of them above)?, every material in turn", tree.text)
     assert f"{50 - rows} rows of images were skipped" in tree.text
     assert len(json.loads((tmp_path / "page.json").read_text())["gallery"]) == 50
     with pytest.raises(PalpateError, match="`max_bytes` must hold at least the text"):

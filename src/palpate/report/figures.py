@@ -169,7 +169,7 @@ def _field(wanted: Wanted, base: Path, crop: bool) -> Image.Image:
     try:
         if wanted.path is None:
             raise FileNotFoundError
-        image, tiny = read_image(base, wanted.path, 4 * SIDE, wanted.less)
+        image, tiny = read_image(base, wanted.path, 4 * SIDE, less=wanted.less, like=wanted.like)
     except Exception:  # as for thumbnails
         field = Image.new("RGB", (SIDE, SIDE), COLORS["paper"])
         ImageDraw.Draw(field).rectangle((0, 0, SIDE - 1, SIDE - 1), outline=COLORS["line"], width=3)

@@ -13,7 +13,7 @@ from palpate.report.notes import number, p_text, percent, plural, sentence
 from palpate.report.results import Audit, Results
 from palpate.report.sentences import share_of
 from palpate.report.study import Claim
-from palpate.report.study_tables import MARKS, verdict_word
+from palpate.report.study_tables import by_verdict, verdict_word
 from palpate.report.tables import REAL, Cell, Column, Table, best_by_value, defined
 
 #: Columns of the verdict table, the most telling first; others follow as they come.
@@ -23,6 +23,8 @@ COLUMNS, CARDS, CARD_ROWS = 5, 3, 4
 NAMED = 3
 #: The control that is the floor of TMMD.
 FLOOR = "real, other videos"
+#: The control that no distance to real images may take for one.
+EMPTY = "empty background"
 #: Beginnings of metrics whose null is that generated and real images are alike.
 DISTANCES = ("TMMD", "FID", "CMMD", "KID")
 #: Width of the strip in a card, and of the one that explains strips, in pixels.
@@ -102,30 +104,34 @@ def found(results: Results, columns: Sequence[Column] = (), controls: Collection
 
 
 def _apart(columns: Sequence[Column], controls: Collection[str]) -> str:
-    """Whether the first method is told apart from real images of other videos, by TMMD."""
+    """Whether the first method is told apart from real images of other videos, by TMMD.
+
+    If the empty background is not, then that says nothing.
+    """
     cells = [c for column in columns if column.metric == "TMMD" for c in column.cells if c.defined]
     method = next((c.score for c in cells if c.score.subject not in {*controls, REAL}), None)
-    floor = next((c.score for c in cells if c.score.subject == FLOOR), None)
-    if method is None or floor is None or not method.interval or not floor.interval:
+    known = {c.score.subject: c.score.interval for c in cells}
+    floor, empty = known.get(FLOOR), known.get(EMPTY)
+    if method is None or floor is None or not method.interval:
         return ""
-    apart = method.interval[0] > floor.interval[1]
-    word = "farther from real images than those" if apart else "not told apart from real images"
-    return f"By TMMD, {method.subject} is {word} of other videos"
+    if method.interval[0] > floor[1]:
+        return f"By TMMD, {method.subject} is farther from real images than those of other videos"
+    if empty and empty[0] <= floor[1]:
+        return (
+            f"By TMMD, neither {method.subject} nor the {EMPTY} is told apart from real images of "
+            "other videos, so it says nothing here"
+        )
+    return f"By TMMD, {method.subject} is not told apart from real images of other videos"
 
 
 def _verdicts(claims: Sequence[Claim]) -> str:
     """``1 does not hold (“...”), 8 undecided, 12 not measured``; decided ones by name, if few."""
-    groups: dict[str, list[str]] = {}
-    for claim in claims:
-        verdict = claim.verdict if claim.measured else "not measured"
-        groups.setdefault(verdict, []).append(claim.claim)
     parts: list[str] = []
-    for verdict in (*MARKS, "not measured"):
-        same = groups.get(verdict, [])
+    for verdict, same in by_verdict(claims).items():
         named = verdict in ("holds", "does not hold") and len(same) < NAMED
-        names = f" ({'; '.join(f'“{c}”' for c in same)})" * named
+        names = f" ({'; '.join(f'“{c.claim}”' for c in same)})" * named
         number_of = "all" if 1 < len(same) == len(claims) else str(len(same))
-        parts += [f"{number_of} {verdict_word(verdict, len(same))}{names}"] if same else []
+        parts.append(f"{number_of} {verdict_word(verdict, len(same))}{names}")
     return ", ".join(parts)
 
 
@@ -178,9 +184,11 @@ def _leak_card(audits: Sequence[Audit]) -> Card:
     ]
     foot = ""
     if any(a.leaked_fraction for a in audits):
-        gaps = [a.gap_median for a in audits if a.leaked_fraction and a.gap_median is not None]
-        frames = f"{number(gaps[0], 0)} frame{'s' * (gaps[0] != 1)}" if gaps else ""
-        near = f", a median of {frames} away" if frames else ""
+        gaps = {a.name: a.gap_median for a in audits if a.leaked_fraction}
+        name, gap = next(((n, g) for n, g in gaps.items() if g is not None), ("", None))
+        of = f" of {name}" if len(audits) > 1 else ""
+        frames = "" if gap is None else f"{number(gap, 0)} frame{'s' * (gap != 1)} away"
+        near = f"; median{of}: {frames}" if frames else ""
         foot = f"Train has the same video, object or image{near}."
     return Card("Test samples that leak from train", rows, foot)
 
@@ -232,6 +240,11 @@ def _score_card(
     title = f"{QUESTIONS.get(column.metric, column.metric)} {column.arrow}"
     if share:
         chance = f"Share named right by a probe; dashed: chance, {percent(mark)}." if mark else ""
+        real = next((c.score for c in shown if c.score.subject == REAL), None)
+        if mark and real and real.interval and real.interval[0] <= mark:
+            chance = (
+                f"A probe: on real images not above chance ({percent(mark)}), so it says nothing."
+            )
         return Card(title, rows, f"{chance}{left}".strip())
     if axis is None:
         return Card(title, rows, left.strip())
@@ -282,7 +295,7 @@ def _strip_facts(score: Score, column: Column) -> str:
     facts: list[str] = []
     if score.interval:
         low, high = (number(v, column.digits) for v in score.interval)
-        facts.append(f"{100 * score.level:g} % interval [{low}, {high}]")
+        facts.append(f"{score.subject}: {100 * score.level:g} % interval [{low}, {high}]")
     if score.floor is not None:
         facts.append(f"dashed: real images {number(score.floor, column.digits)}")
     return "; ".join(filter(None, [*facts, _against_real(score)])) + "." * bool(facts)

@@ -249,7 +249,7 @@ def pair_images(pair: LeakPair, head: str) -> list[Wanted]:
 def gallery_images(gallery: Sequence[GalleryItem]) -> list[tuple[GalleryItem, list[Wanted]]]:
     """Every sample with its images, materials in turn; a column that no sample has is skipped.
 
-    Where a background is known, the contacts follow: without the background, amplified.
+    Where a background is known, the contacts follow: without the background, both amplified alike.
     """
     rows: list[tuple[GalleryItem, list[Wanted]]] = []
     for item in in_turns(gallery):
@@ -259,7 +259,13 @@ def gallery_images(gallery: Sequence[GalleryItem]) -> list[tuple[GalleryItem, li
         images = [Wanted(sample.vision, f"Photo: {name}", "Photo")]
         images += [Wanted(p, f"{kind} tactile image: {name}", kind) for kind, p in tactile]
         images += [
-            Wanted(p and background and p, f"{kind} contact: {name}", f"{kind} contact", background)
+            Wanted(
+                p and background and p,
+                f"{kind} contact: {name}",
+                f"{kind} contact",
+                background,
+                sample.tactile,
+            )
             for kind, p in tactile
         ]
         rows.append((item, images))

@@ -283,15 +283,17 @@ def curve_table(curve: Curve) -> StudyTable:
 
 
 def tally(claims: Sequence[Claim]) -> str:
-    """Return how many claims have which verdict: ``4 hold, 2 undecided (1 not measured)``."""
-    counts = Counter(claim.verdict for claim in claims)
-    missing = sum(not claim.measured for claim in claims)
-    tallied = [
-        f"{counts[verdict]} {verdict_word(verdict, counts[verdict])}"
-        for verdict in MARKS
-        if counts[verdict]
-    ]
-    return ", ".join(tallied) + f" ({missing} not measured)" * bool(missing)
+    """Return how many claims have which verdict: ``4 hold, 1 undecided, 1 not measured``."""
+    groups = by_verdict(claims).items()
+    return ", ".join(f"{len(same)} {verdict_word(verdict, len(same))}" for verdict, same in groups)
+
+
+def by_verdict(claims: Sequence[Claim]) -> dict[str, list[Claim]]:
+    """Return the claims of each verdict that any has; what was not measured is the last."""
+    groups: dict[str, list[Claim]] = {verdict: [] for verdict in (*MARKS, "not measured")}
+    for claim in claims:
+        groups[claim.verdict if claim.measured else "not measured"].append(claim)
+    return {verdict: same for verdict, same in groups.items() if same}
 
 
 def verdict_word(verdict: str, n: int) -> str:
@@ -320,7 +322,8 @@ def brief(text: str, most: int = 220) -> str:
     if len(text) <= most:
         return text
     ends = (text.rfind("; ", 0, most), text.rfind(" ", 0, most), most)
-    return f"{text[: next(end for end in ends if end > 0)]} …"
+    cut = text[: next(end for end in ends if end > 0)]
+    return f"{cut.rpartition(' [')[0] if cut.count('[') > cut.count(']') else cut} …"
 
 
 def says_more(claim: Claim) -> bool:

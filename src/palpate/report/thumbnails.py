@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 from PIL import Image, ImageFilter, ImageOps
 
 from palpate.core import Progress, quiet, track
@@ -40,12 +41,14 @@ class Wanted(NamedTuple):
         alt: what it is in words.
         label: its column's name.
         less: image to subtract, amplified; '' for what varies slowly over the image itself.
+        like: image that says how much to amplify, in the place of this one.
     """
 
     path: str | None
     alt: str
     label: str
     less: str | None = None
+    like: str | None = None
 
 
 class Thumbnail(NamedTuple):
@@ -96,7 +99,10 @@ def fit(
     for side, quality in SIZES:
         fitting, used = {}, 0
         for key, wanted in track(list(rows.items()), f"images of {side} px", progress):
-            images = [(w, thumbnail(base, w.path, side, quality, w.less)) for w in wanted]
+            images = [
+                (w, thumbnail(base, w.path, side, quality, less=w.less, like=w.like))
+                for w in wanted
+            ]
             used += ROW_MARKUP + sum(len(image.uri) for _, image in images)
             if used > budget:
                 break
@@ -108,13 +114,19 @@ def fit(
 
 @lru_cache(maxsize=4096)
 def thumbnail(
-    base: Path, name: str | None, side: int, quality: int, less: str | None = None
+    base: Path,
+    name: str | None,
+    side: int,
+    quality: int,
+    *,
+    less: str | None = None,
+    like: str | None = None,
 ) -> Thumbnail:
-    """Return one image with at most ``side`` pixels a side; ``less`` as in :class:`Wanted`."""
+    """Return one image with at most ``side`` pixels a side; the rest as in :class:`Wanted`."""
     if name is None:
         return Thumbnail(problem="not recorded")
     try:
-        image, tiny = read_image(base, name, side, less)
+        image, tiny = read_image(base, name, side, less=less, like=like)
         data = io.BytesIO()
         exact = tiny and side == SIZES[0][0] and less is None
         kind = "webp" if exact else "jpeg"
@@ -130,7 +142,7 @@ def thumbnail(
 
 
 def read_image(
-    base: Path, name: str, side: int, less: str | None = None
+    base: Path, name: str, side: int, *, less: str | None = None, like: str | None = None
 ) -> tuple[Image.Image, bool]:
     """Return an image with at most ``side`` pixels a side, and whether its file has at most 96.
 
@@ -139,6 +151,7 @@ def read_image(
         name: path of the file.
         side: in pixels.
         less: as in :class:`Wanted`.
+        like: as in :class:`Wanted`.
 
     Raises:
         OSError: if the file is missing, a pipe, or of too many pixels; PIL raises almost anything
@@ -153,24 +166,32 @@ def read_image(
         file.draft("RGB", (2 * side, 2 * side))
         image = to_rgb(file)
     image.thumbnail((side, side), Image.Resampling.LANCZOS)
-    return (image if less is None else amplified(image, base / less if less else None)), tiny
+    if less is None:
+        return image, tiny
+    pattern = read_image(base, like, side)[0].resize(image.size) if like else image
+    return amplified(image, base / less if less else None, pattern), tiny
 
 
-def amplified(image: Image.Image, background: Path | None) -> Image.Image:
-    """Return what differs from the background, its strongest hundredth 110 gray levels from 128.
+def amplified(image: Image.Image, background: Path | None, pattern: Image.Image) -> Image.Image:
+    """Return what differs from the background, amplified as ``pattern`` needs it.
 
-    Without a background what varies slowly over the image takes its place. Differences of less than
-    two gray levels are amplified like those of two.
+    The strongest hundredth of the pattern's differences is then 110 gray levels from 128; those of
+    less than two gray levels are amplified like those of two. Without a background what varies
+    slowly over each image takes its place.
     """
-    if background is None:
-        ground = image.filter(ImageFilter.GaussianBlur(max(image.size) / 12))
-    else:
-        with Image.open(background) as file:
-            ground = to_rgb(file).resize(image.size)
-    contact = np.asarray(image, np.float32) - np.asarray(ground, np.float32)
-    contact -= np.median(contact, axis=(0, 1))
-    gain = 110 / max(float(np.quantile(np.abs(contact), 0.99)), 2.0)
-    return Image.fromarray(np.clip(128 + gain * contact, 0, 255).round().astype(np.uint8))
+
+    def contact_of(image: Image.Image) -> NDArray[np.float32]:
+        if background is None:
+            ground = image.filter(ImageFilter.GaussianBlur(max(image.size) / 12))
+        else:
+            with Image.open(background) as file:
+                ground = to_rgb(file).resize(image.size)
+        contact = np.asarray(image, np.float32) - np.asarray(ground, np.float32)
+        return contact - np.median(contact, axis=(0, 1))
+
+    gain = 110 / max(float(np.quantile(np.abs(contact_of(pattern)), 0.99)), 2.0)
+    shown = np.clip(128 + gain * contact_of(image), 0, 255)
+    return Image.fromarray(shown.round().astype(np.uint8))
 
 
 def to_rgb(image: Image.Image) -> Image.Image:
