@@ -62,7 +62,13 @@ BFLOAT = Compute(precision="bf16")  # float32 on x86 processors without it
 
 #: Plain guidance, so that all rows are sampled as the first ones were.
 PLAIN = SamplerOptions("dpm", steps=10, guidance=2.5)
-BASE = replace(MINI, name="ablation", loop=replace(MINI.loop, steps=2000), sampler=PLAIN)
+BASE = replace(
+    MINI,
+    name="ablation",
+    condition=replace(MINI.condition, gap="memory"),
+    loop=replace(MINI.loop, steps=2000),
+    sampler=PLAIN,
+)
 
 
 def schedule(**changes):
@@ -92,6 +98,7 @@ ROWS = {
     "condition: photo, noise": condition(source="vision", gap="mean-shift"),
     "condition: mixed": condition(source="mixed", gap="mean-shift"),
     "condition: both, no noise": condition(noise=0.0),
+    "condition: both, pairs": condition(gap="pairs"),
     "tokens: 4 learned": condition(tokens=4, learned=True),
     "tokens: words of the text": condition(words=32),
     "tokens: patches of the photo": condition(patches=64),

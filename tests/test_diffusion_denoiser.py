@@ -276,7 +276,7 @@ def test_a_photo_in_the_place_of_a_text_is_projected_on_the_training_texts():
     policy = replace(POLICY, gap="memory", tau=0.05)
     torch.manual_seed(0)
     net = build_unet(UNET, policy, channels=3, size=8)
-    model = Denoiser(net, policy, means, texts).eval()
+    model = Denoiser(net, policy, means, (texts, None)).eval()
     unit = torch.nn.functional.normalize
     memory = unit(texts - means["text"], dim=1)
     photos = torch.randn(5, 12)
@@ -289,16 +289,53 @@ def test_a_photo_in_the_place_of_a_text_is_projected_on_the_training_texts():
     assert torch.allclose(own, memory[:5] * 12**0.5, atol=1e-5)
 
 
-@pytest.mark.parametrize("gap", ["mean-shift", "memory"])
+def test_pairs_find_texts_by_their_photos():
+    means = {s: 0.1 * torch.randn(12) for s in ("text", "vision")}
+    texts, keys, photos = torch.randn(30, 12), torch.randn(30, 12), torch.randn(5, 12)
+    unit = lambda rows, source: torch.nn.functional.normalize(rows - means[source], dim=1)
+    weights = torch.softmax(unit(photos, "vision") @ unit(keys, "vision").T / 0.05, 1)
+    of_text, of_photo = (
+        torch.nn.functional.normalize(weights @ unit(rows, s), dim=1) * 12**0.5
+        for rows, s in ((texts, "text"), (keys, "vision"))
+    )
+    for source in ("both", "mixed"):
+        policy = replace(POLICY, gap="pairs", tau=0.05, source=source)
+        net = build_unet(UNET, policy, channels=3, size=8)
+        model = Denoiser(net, policy, means, (texts, keys)).eval()
+        made = model.condition(photos)
+        assert torch.allclose(made[:, 0], of_text, atol=1e-5)
+        assert source == "mixed" or torch.allclose(made[:, 1], of_photo, atol=1e-5)
+        # In training a photo in its own place is itself.
+        own = unit(photos, "vision") * 12**0.5
+        seen = model.tokens(photos, "vision")[:, 0]
+        assert torch.allclose(seen, own if source == "both" else of_text, atol=1e-5)
+
+
+def test_training_remembers_each_text_once_with_the_mean_of_its_photos(tmp_path):
+    _, conditions = data()
+    conditions["text"][1] = conditions["text"][0]
+    policy = replace(POLICY, gap="pairs", source="both", tau=1e-3)
+    model = train(tmp_path, policy=policy, conditions=conditions)
+    assert model.memory.shape == model.keys.shape == (23, 12)
+    unit, (text, vision) = torch.nn.functional.normalize, model.means
+    mean = conditions["vision"][:2].mean(0)
+    found = model.recall(unit(mean[None] - vision, dim=1))
+    wanted = conditions["text"][0] - text, mean - vision
+    for one, other in zip(found, wanted, strict=True):
+        assert torch.allclose(one[0], unit(other, dim=0), atol=1e-4)
+
+
+@pytest.mark.parametrize("gap", ["mean-shift", "memory", "pairs"])
 def test_with_two_places_what_is_not_given_is_null_or_projected(gap):
     policy = replace(POLICY, gap=gap, source="both")
     means = {s: torch.zeros(12) for s in ("text", "vision")}
     net = build_unet(UNET, policy, channels=3, size=8)
-    model = Denoiser(net, policy, means, torch.randn(9, 12)).eval()
+    memory = torch.randn(9, 12), torch.randn(9, 12)
+    model = Denoiser(net, policy, means, memory).eval()
     c = torch.randn(4, 12)
     photo, text, both = model.condition(c), model.condition(None, c), model.condition(c, c)
     assert photo.shape == text.shape == both.shape == (4, 2, 12)
-    assert bool(photo[:, 0].any()) == (gap == "memory")
+    assert bool(photo[:, 0].any()) == (gap != "mean-shift")
     assert not text[:, 1].any()
     assert torch.equal(both[:, 1], photo[:, 1])
 
@@ -329,7 +366,8 @@ def train(folder, **changes):
         "loop": LOOP,
         "folder": folder,
     }
-    return train_denoiser(z, conditions, **settings | changes)
+    changes.setdefault("conditions", conditions)
+    return train_denoiser(z, **settings | changes)
 
 
 def test_training_does_not_touch_global_randomness(tmp_path):
@@ -349,7 +387,7 @@ def test_training_does_not_touch_global_randomness(tmp_path):
     assert torch.equal(torch.get_rng_state(), before)
 
 
-@pytest.mark.parametrize("gap", ["mean-shift", "memory"])
+@pytest.mark.parametrize("gap", ["mean-shift", "memory", "pairs"])
 def test_saved_denoiser_is_the_same(tmp_path, gap):
     policy = replace(POLICY, gap=gap, null="learned", source="vision", tokens=2, learned=True)
     model = train(tmp_path / "run", policy=policy)
@@ -379,10 +417,10 @@ def test_the_token_reaches_the_output_through_the_time_embedding_alone():
 
 @pytest.mark.filterwarnings("ignore:It is deprecated:FutureWarning")
 @pytest.mark.parametrize(
-    "harm", ["cut", "no means", "no null", "more", "shape", "config", "weights"]
+    "harm", ["cut", "no means", "no null", "no keys", "more", "shape", "config", "weights"]
 )
 def test_a_broken_folder_is_rejected(tmp_path, harm):
-    policy, folder = replace(POLICY, null="learned"), tmp_path / "unet"
+    policy, folder = replace(POLICY, null="learned", gap="pairs"), tmp_path / "unet"
     denoiser(policy).save(folder)
     extra = folder / "condition.safetensors"
     tensors = load_file(extra)

@@ -8,8 +8,8 @@ fit into the same slot (paper section 2; section 9, "token type"):
 with m_source = 0 (``gap="none"``, the paper's reading) or the mean of that modality on the train
 part (``"mean-shift"``, which closes the constant part of the gap between text and vision
 embeddings). ``"memory"`` also keeps the training texts, and projects a photo that takes the place
-of a text on them. The unconditional token of classifier-free guidance is all zeros, or learned.
-All of this is part of the checkpoint.
+of a text on them; ``"pairs"`` finds them by the photos that they were given for. The unconditional
+token of classifier-free guidance is all zeros, or learned. All of this is part of the checkpoint.
 
 The words of a text and the patches of a photo may follow as tokens, through a trained matrix. The
 baseline GVST (``source="resnet"``) has no embedding: its tokens are the map that a residual
@@ -46,6 +46,8 @@ from palpate.encoders.models import (
     save_model,
 )
 
+#: What a memory consists of: training texts, and the mean photo of each.
+MEMORY = ("memory", "keys")
 FIX_UNET = "Pass a folder or hub id, e.g. of Stable Diffusion 1.5"
 
 
@@ -199,13 +201,14 @@ class Denoiser(nn.Module):
 
     means: Tensor
     memory: Tensor
+    keys: Tensor
 
     def __init__(
         self,
         unet: UNet2DConditionModel,
         policy: ConditionPolicy,
         means: Mapping[Source, Tensor] | None = None,
-        memory: Tensor | None = None,
+        memory: tuple[Tensor, Tensor | None] | None = None,
         widths: Mapping[str, int] | None = None,
     ) -> None:
         """Take what the policy's ``gap`` needs.
@@ -214,7 +217,8 @@ class Denoiser(nn.Module):
             unet: the network.
             policy: how embeddings become tokens.
             means: the training mean (d,) of each source.
-            memory: embeddings (m, d) of the training texts.
+            memory: embeddings (m, d) of the different training texts, and of ``gap="pairs"`` the
+                mean of the photos of each (m, d).
             widths: of the states of words and patches; default: that of the embeddings.
         """
         super().__init__()
@@ -239,10 +243,12 @@ class Denoiser(nn.Module):
             width = (widths or {}).get(name, policy.width)
             photos = name == "photos"
             self.maps[name] = PhotoMap(policy) if photos else _state_map(name, width, policy.width)
-        if policy.gap == "memory":
-            kept = torch.zeros(1, policy.width)  # until load() fills it
-            kept = kept if memory is None else self._unit(memory, "text")
-            self.register_buffer("memory", kept)
+        self.recalls = policy.gap in ("memory", "pairs")
+        kept = memory or (None, None)
+        for name, source, rows in zip(MEMORY, ("text", "vision"), kept, strict=True):
+            if self.recalls and (name == "memory" or policy.gap == "pairs"):
+                empty = torch.zeros(1, policy.width)  # until load() fills it
+                self.register_buffer(name, empty if rows is None else self._unit(rows, source))
 
     @property
     def channels(self) -> int:
@@ -266,8 +272,8 @@ class Denoiser(nn.Module):
             PalpateError: for another width, or a source whose training mean is unknown.
         """
         unit = self._unit(conditions.to(self.device), source)
-        if source == "vision" and self.policy.gap == "memory" and self.slots == 1:
-            unit = self.project(unit)
+        if source == "vision" and self.recalls and self.slots == 1:
+            unit, _ = self.recall(unit)
         return self._repeated(unit)
 
     def condition(
@@ -290,8 +296,8 @@ class Denoiser(nn.Module):
         photo, of_photo = self._split(photos, "vision")
         text, of_text = self._split(texts, "text")
         place = photo if self.slots == 1 else None  # of two slots the photo has its own
-        if photo is not None and self.policy.gap == "memory":
-            place = self.project(photo)
+        if photo is not None and self.recalls:
+            place, photo = self.recall(photo)
         if text is not None:
             mixed = text if place is None else weight * place + (1 - weight) * text
             place = nn.functional.normalize(mixed, dim=1)
@@ -325,13 +331,22 @@ class Denoiser(nn.Module):
             raise PalpateError(must, got, "Use the pipeline's embed", argument="conditions")
         return photos.to(self.device)
 
-    def project(self, photos: Tensor) -> Tensor:
-        """Unit embeddings of photos (n, d) -> unit means of the training texts nearest to them."""
-        parts = [
-            torch.softmax(rows @ self.memory.T / self.policy.tau, dim=1) @ self.memory
-            for rows in photos.split(1024)
-        ]
-        return nn.functional.normalize(torch.cat(parts), dim=1)
+    def recall(self, photos: Tensor) -> tuple[Tensor, Tensor]:
+        """What the memory knows of photos, as unit embeddings (n, d).
+
+        Of ``memory``: the mean of the training texts nearest to each photo, and the photo itself.
+        Of ``pairs``: the means of the texts, and of the photos, of the training photos nearest to
+        it.
+        """
+        paired = self.policy.gap == "pairs"
+        keys = self.keys if paired else self.memory
+        texts, near = [], []
+        for rows in photos.split(1024):
+            weights = torch.softmax(rows @ keys.T / self.policy.tau, dim=1)
+            texts.append(weights @ self.memory)
+            near.append(weights @ keys if paired else rows)
+        unit = nn.functional.normalize
+        return unit(torch.cat(texts), dim=1), unit(torch.cat(near), dim=1)
 
     def _unit(self, conditions: Tensor, source: Source) -> Tensor:
         width = self.policy.width
@@ -383,23 +398,23 @@ class Denoiser(nn.Module):
         return cast("Tensor", self.unet(x.to(kind), t, return_dict=False, **options)[0]).float()
 
     def halve(self) -> float:
-        """Round the U-Net's weights and the training texts to 16 bits in place."""
-        if self.policy.gap == "memory":
-            self.memory.copy_(self.memory.half())
+        """Round the U-Net's weights and the memory to 16 bits in place."""
+        for kept in (b for name, b in self.named_buffers(recurse=False) if name in MEMORY):
+            kept.copy_(kept.half())
         return round_to_half({"unet": self.unet})
 
     def save(self, folder: Path, *, half: bool = False) -> None:
-        """Write the U-Net and ``condition.safetensors`` (means, texts, learned parts).
+        """Write the U-Net and ``condition.safetensors`` (means, memory, learned parts).
 
-        With ``half``, :meth:`halve` first (this object too), and the U-Net's weights and the texts
+        With ``half``, :meth:`halve` first (this object too), and the U-Net's weights and the memory
         are 16-bit; the few others stay float32.
         """
         if half:
             self.halve()
         save_model(self.unet, folder, half=half)
         extra = {k: v for k, v in self.state_dict().items() if not k.startswith("unet.")}
-        if half and "memory" in extra:
-            extra["memory"] = extra["memory"].half()
+        if half:
+            extra |= {name: extra[name].half() for name in MEMORY if name in extra}
         with atomic_path(Path(folder) / "condition.safetensors") as part:
             save_file({k: v.detach().cpu().contiguous() for k, v in extra.items()}, part)
 
@@ -419,11 +434,11 @@ class Denoiser(nn.Module):
             states = [name for name in inputs_of(policy) if name != "photos"]
             widths = {name: extra[f"maps.{name}.1.weight"].shape[1] for name in states}
             model = cls(unet, policy, widths=widths)
-            if "memory" in extra:
-                model.memory = extra.pop("memory").float()
-            wanted = {k for k in model.state_dict() if not k.startswith("unet.")} - {"memory"}
+            wanted = {k for k in model.state_dict() if not k.startswith("unet.")}
             if wanted != set(extra):
                 raise KeyError(f"other entries than {', '.join(sorted(wanted))}")
+            for name in wanted & {*MEMORY}:
+                setattr(model, name, extra[name].float())
             model.load_state_dict(extra, strict=False)
         except UNREADABLE as error:
             raise PalpateError(must, first_line(error), fix) from None

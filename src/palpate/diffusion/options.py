@@ -117,7 +117,8 @@ class ConditionPolicy:
         gap: ``none``; ``mean-shift``: subtract the mean of the source's training embeddings;
             ``memory``: so, and give a photo in the place of a text by its projection on the
             training texts, the mean of these weighted by softmax(cosine / ``tau``) (DeCap, Li et
-            al., ICLR 2023).
+            al., ICLR 2023); ``pairs``: as ``memory``, with the cosine to the photos of each text in
+            place of the text, and a photo in its own place by the same mean of training photos.
         noise: standard deviation, in units of the token's typical entry, of Gaussian noise added in
             training.
         dropout: probability that training replaces the condition by the unconditional token; with
@@ -126,7 +127,7 @@ class ConditionPolicy:
             without text), ``mixed`` (one of them for each row), ``both`` (two tokens: text, then
             photo), ``resnet`` (that baseline as published, GVST: 8 x 8 tokens that a residual
             network makes of the photo; it is trained with the denoiser, and no encoder is needed).
-        tau: temperature of ``memory``.
+        tau: temperature of ``memory`` and ``pairs``.
         photo_share: with ``mixed``, the share of the rows that are conditioned on the photo.
         learned: make the k tokens from the embedding by a trained matrix.
         photo_size: of ``resnet``: side of the photos in pixels, a power of 2 from 16 on.
@@ -143,7 +144,7 @@ class ConditionPolicy:
     width: int
     tokens: int = 1
     null: Literal["zeros", "learned"] = "zeros"
-    gap: Literal["none", "mean-shift", "memory"] = "none"
+    gap: Literal["none", "mean-shift", "memory", "pairs"] = "none"
     noise: float = 0.0
     dropout: float = 0.1
     source: Sources = "text"

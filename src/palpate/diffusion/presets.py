@@ -14,7 +14,7 @@ schedule        beta, T = 1000        flow, time mean .5            beta, T = 10
 prediction      eps                   velocity                      eps (Eq. 1)
 condition       one token             text and photo, a token each  one token
 source          text                  both                          text
-gap, noise      none, 0               memory, 0.3                   none, 0
+gap, noise      none, 0               pairs, 0.3                    none, 0
 optimizer       AdamW 1e-3, EMA 0.99  AdamW 1e-3, cosine, EMA 0.99  AdamW 6.4e-5, EMA 0.9999
 length          20 steps of 8         400 steps of 16               30 epochs of batch 32
 sampler         DPM-Solver++ 4        DPM-Solver++ 10               DDIM 200, eta 0
@@ -144,7 +144,7 @@ MINI = DiffusionPreset(
         widths=(64, 96), attention=(False, True), layers=1, head_width=32, groups=16, modulate=True
     ),
     # Gap and noise go beyond the paper: the text-image gap is wide in small encoders.
-    condition=ConditionPolicy(width=128, gap="memory", noise=0.3, source="both"),
+    condition=ConditionPolicy(width=128, gap="pairs", noise=0.3, source="both"),
     loop=LoopOptions(steps=400, batch=16, lr=1e-3, warmup=50, ema=0.99),
     schedule=Schedule(prediction="flow"),
     # Guidance at the noisiest times, and the contrast that it adds, are what costs TMMD.

@@ -476,7 +476,7 @@ def _policy(
     width = preset.condition.width if encoders is None else encoders.dim
     policy = preset.condition_for(width)
     chosen, gap = source or policy.source, policy.gap
-    if chosen == "vision" != policy.source and gap == "memory":
+    if chosen == "vision" != policy.source and gap in ("memory", "pairs"):
         gap = "mean-shift"
     return replace(policy, source=chosen, gap="none" if chosen == "resnet" else gap)
 
@@ -485,7 +485,8 @@ def _modalities(policy: ConditionPolicy) -> tuple[Source, ...]:
     """The encoders that training needs: vision for the samples that it draws, at least."""
     if not policy.sources:
         return ()
-    return SOURCES if "text" in policy.sources or policy.gap == "memory" else ("vision",)
+    recalled = policy.gap in ("memory", "pairs")
+    return SOURCES if "text" in policy.sources or recalled else ("vision",)
 
 
 def _encoded(  # noqa: PLR0913 - one row per part
@@ -626,7 +627,7 @@ def train_denoiser(  # noqa: PLR0913 - one row per part of the model
         for s in SOURCES
         if s in conditions
     }
-    needed = (*policy.sources, *inputs_of(policy))
+    needed = (*policy.sources, *inputs_of(policy), *(SOURCES if policy.gap == "pairs" else ()))
     if missing := [name for name in needed if name not in conditions]:
         must, fix = f"source={policy.source!r} needs conditions of {', '.join(needed)}", ""
         raise PalpateError(must, f"none of {missing[0]}", fix)
@@ -642,9 +643,9 @@ def train_denoiser(  # noqa: PLR0913 - one row per part of the model
             if isinstance(unet, str)
             else build_unet(unet, policy, size=size, **how)
         )
-        texts = tables["text"].unique(dim=0) if policy.gap == "memory" else None
+        memory = _memory(tables) if policy.gap in ("memory", "pairs") else None
         widths = {name: conditions[name].shape[2] for name in inputs_of(policy)}
-        model = Denoiser(net, policy, means, texts, widths)
+        model = Denoiser(net, policy, means, memory, widths)
         inputs = [*inputs_of(policy), *(["guide"] if "guide" in conditions else [])]
         if "guide" in conditions:
             model.guide = Guide(net, conditions["guide"].shape[2])
@@ -684,6 +685,15 @@ def train_denoiser(  # noqa: PLR0913 - one row per part of the model
         model.guide.hook.remove()
         model.guide = None
     return model.eval().requires_grad_(False)
+
+
+def _memory(tables: Mapping[Source, Tensor]) -> tuple[Tensor, Tensor | None]:
+    """The different training texts (m, d), and the mean of the photos of each if there are any."""
+    texts, which, counts = tables["text"].unique(dim=0, return_inverse=True, return_counts=True)
+    if "vision" not in tables:
+        return texts, None
+    photos = torch.zeros_like(texts).index_add_(0, which, tables["vision"])
+    return texts, photos / counts[:, None]
 
 
 def _copy_weights(source: Denoiser, target: Denoiser) -> None:

@@ -145,7 +145,8 @@ METHODS: Mapping[str, Method] = {
             {**BARE, "source": "resnet"},
         ),
         Method(
-            BEST, "Preset mini: a token of the text and one of the photo, memory bridge, noise."
+            BEST,
+            "Preset mini: tokens of text and photo, both from the nearest training pairs; noise.",
         ),
         Method(VQ, "Ours, with an autoencoder that is not given the gel.", BARE, vq=True),
         Method(
