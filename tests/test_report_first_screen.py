@@ -167,9 +167,7 @@ def test_what_was_found_is_said_question_by_question():
         "2 claims of the paper: 1 undecided, 1 not measured; 1 beyond it: 1 does not hold (“c0”)."
     )
     leaks = said(*of("holds"), audits=[full_audit(), clean_audit()])
-    assert leaks.startswith(
-        "99.10 % of the test samples of Orig and 0 % of the test samples of NoLeak leak. "
-    )
+    assert leaks.startswith("Test samples that leak: Orig 99.10 %, NoLeak 0 %. ")
     seeds = found(Results("T", claims=of("holds"), settings={"seeds": [0, 1]}))
     assert seeds.endswith("Intervals are over videos and seeds.")
 
@@ -194,7 +192,7 @@ def test_a_method_is_told_apart_by_its_interval_and_that_of_the_floor(interval, 
     for near, neither in (((-0.2, 0.05), interval[0] < 0.1), ((0.5, 0.6), False)):
         more = [*scores, score("TMMD", "empty background", 0.0, interval=near)]
         said = found(results, telling_columns(score_tables(more)), [s.subject for s in more[1:]])
-        assert ("neither Ours nor the empty background" in said) == neither
+        assert ("neither Ours nor the empty background from real" in said) == neither
         assert (f"Ours is {words}" in said) != neither
 
 
@@ -207,6 +205,16 @@ def test_a_card_never_loses_its_method_to_controls():
     made = cards(Results("T", scores=scores), columns, names[1:4])[1]
     labels = [row.label for row in made.rows]
     assert (labels[0], labels[-1], len(labels)) == ("ours", "real", 4)
+
+
+@pytest.mark.parametrize("low", [0.2, 0.3])
+def test_a_probe_that_does_not_read_real_images_says_so(low):
+    more = {"higher_is_better": True, "null": None, "floor": None, "details": {"chance": 0.25}}
+    scores = [
+        score("material accuracy", s, 0.5, interval=(low, 0.6), **more) for s in ("a", "real")
+    ]
+    made = cards(Results("T", scores=scores), telling_columns(score_tables(scores)))[0]
+    assert ("at chance (25.0 %) on real images" in made.foot) == (low < 0.25)
 
 
 @pytest.mark.parametrize(

@@ -89,7 +89,7 @@ def found(results: Results, columns: Sequence[Column] = (), controls: Collection
     if not results.claims:
         return ""
     audits = [a for a in results.audits if a.against == "train" and a.test_samples]
-    leaks = " and ".join(f"{share_of(a)} of the test samples of {a.name}" for a in audits)
+    leaks = ", ".join(f"{a.name} {share_of(a)}" for a in audits)
     own = [c for c in results.claims if not c.source.startswith("paper")]
     papers = [c for c in results.claims if c.source.startswith("paper")]
     told = [f"{plural(len(papers), 'claim')} of the paper: {_verdicts(papers)}"] if papers else []
@@ -99,7 +99,12 @@ def found(results: Results, columns: Sequence[Column] = (), controls: Collection
     covered = (
         f"Intervals are over videos{' and seeds' * (isinstance(seeds, list) and len(seeds) > 1)}"
     )
-    parts = [leaks and f"{leaks} leak", _apart(columns, controls), "; ".join(told), covered]
+    parts = [
+        leaks and f"Test samples that leak: {leaks}",
+        _apart(columns, controls),
+        "; ".join(told),
+        covered,
+    ]
     return " ".join(f"{part}." for part in parts if part)
 
 
@@ -118,8 +123,8 @@ def _apart(columns: Sequence[Column], controls: Collection[str]) -> str:
         return f"By TMMD, {method.subject} is farther from real images than those of other videos"
     if empty and empty[0] <= floor[1]:
         return (
-            f"By TMMD, neither {method.subject} nor the {EMPTY} is told apart from real images of "
-            "other videos, so it says nothing here"
+            f"TMMD tells neither {method.subject} nor the {EMPTY} from real images, so it says "
+            "nothing here"
         )
     return f"By TMMD, {method.subject} is not told apart from real images of other videos"
 
@@ -242,9 +247,7 @@ def _score_card(
         chance = f"Share named right by a probe; dashed: chance, {percent(mark)}." if mark else ""
         real = next((c.score for c in shown if c.score.subject == REAL), None)
         if mark and real and real.interval and real.interval[0] <= mark:
-            chance = (
-                f"A probe: on real images not above chance ({percent(mark)}), so it says nothing."
-            )
+            chance = f"By a probe that is at chance ({percent(mark)}) on real images, too."
         return Card(title, rows, f"{chance}{left}".strip())
     if axis is None:
         return Card(title, rows, left.strip())
