@@ -5,10 +5,11 @@
     python benchmarks/generator_sheet.py --blind runs/blind --answers answers.json
 
 New objects, videos and gel units of a world that no shipped model has seen. ``--blind`` writes
-``examples.png``, a strip of real images for each material by name, and ``sort-me.png``, five
+``examples-*.png``, a strip of real images for each material by name, and ``sort-*.png``, five
 generated images of new videos of each material, numbered in random order; whoever sorts them writes
 ``{"1": "Wood", ...}`` and sees nothing else. With the answers the number of materials above chance
-is printed: at least two of five right, which guessing reaches for one material in forty.
+is printed: at least two of five right, which guessing reaches for one material in forty. With
+``--real`` the images to be sorted are the real ones of the same samples: what an eye can tell.
 """
 
 import argparse
@@ -36,6 +37,8 @@ WORLD = replace(
 )
 EACH = 5  # images of a material, of as many videos
 SIDE = 96
+LARGE = 144  # side of an image that is to be sorted
+PER_PAGE = 50  # images of one page
 AMPLIFIED = 3.0
 
 
@@ -55,29 +58,29 @@ def picked(world):
     return {m: table[m][:EACH] for m in sorted(table)}, others
 
 
-def sheet(rows, names):
+def sheet(rows, names, side=SIDE):
     """Rows of images of one size, each with its name at the left."""
     font = ImageFont.load_default(14)
     width = max(len(images) for images in rows)
-    page = Image.new("RGB", (150 + SIDE * width, SIDE * len(rows)), "white")
+    page = Image.new("RGB", (150 + side * width, side * len(rows)), "white")
     draw = ImageDraw.Draw(page)
     for k, (name, images) in enumerate(zip(names, rows, strict=True)):
-        draw.text((6, SIDE * k + SIDE // 2 - 8), str(name), "black", font=font)
+        draw.text((6, side * k + side // 2 - 8), str(name), "black", font=font)
         for j, image in enumerate(images):
-            page.paste(Image.fromarray(image).resize((SIDE, SIDE)), (150 + SIDE * j, SIDE * k))
+            page.paste(Image.fromarray(image).resize((side, side)), (150 + side * j, side * k))
     return page
 
 
-def numbered(images, columns=10):
-    """All images with their numbers, from 1."""
+def numbered(images, first, columns=10):
+    """All images with their numbers, from ``first`` on."""
     font = ImageFont.load_default(14)
     lines = -(-len(images) // columns)
-    page = Image.new("RGB", (columns * (SIDE + 8), lines * (SIDE + 24)), "white")
+    page = Image.new("RGB", (columns * (LARGE + 8), lines * (LARGE + 24)), "white")
     draw = ImageDraw.Draw(page)
     for k, image in enumerate(images):
-        left, top = (k % columns) * (SIDE + 8), (k // columns) * (SIDE + 24)
-        draw.text((left + 4, top + 2), str(k + 1), "black", font=font)
-        page.paste(Image.fromarray(image).resize((SIDE, SIDE)), (left, top + 20))
+        left, top = (k % columns) * (LARGE + 8), (k // columns) * (LARGE + 24)
+        draw.text((left + 4, top + 2), str(first + k), "black", font=font)
+        page.paste(Image.fromarray(image).resize((LARGE, LARGE)), (left, top + 20))
     return page
 
 
@@ -86,6 +89,7 @@ def main():
     parser.add_argument("--model", default="palpate/mini")
     parser.add_argument("--write", type=Path, help="image of real and generated rows")
     parser.add_argument("--blind", type=Path, help="folder for the sheets to be sorted")
+    parser.add_argument("--real", action="store_true", help="sort real images, as a control")
     parser.add_argument("--answers", type=Path, help="JSON: number -> material")
     chosen = parser.parse_args()
     with tempfile.TemporaryDirectory() as folder:
@@ -113,8 +117,13 @@ def main():
         order = rng_for(0, "blind").permutation(len(made))
         key = {str(k + 1): labels[i] for k, i in enumerate(order)}
         chosen.blind.mkdir(parents=True, exist_ok=True)
-        sheet([shown[m][:8] for m in ids], ids).save(chosen.blind / "examples.png")
-        numbered(made[order]).save(chosen.blind / "sort-me.png")
+        sorted_ones, names, half = (real if chosen.real else made)[order], list(ids), len(ids) // 2
+        for page, part in enumerate((names[:half], names[half:]), 1):
+            strips = sheet([shown[m][:8] for m in part], part, LARGE)
+            strips.save(chosen.blind / f"examples-{page}.png")
+        for page, at in enumerate(range(0, len(made), PER_PAGE), 1):
+            numbers = numbered(sorted_ones[at : at + PER_PAGE], at + 1)
+            numbers.save(chosen.blind / f"sort-{page}.png")
         if chosen.answers:
             answers = json.loads(chosen.answers.read_text())
             right = {m: sum(answers.get(k) == m == v for k, v in key.items()) for m in ids}
