@@ -33,6 +33,11 @@ EAGER = """Promise.all([...document.images]
     .filter(image => !image.closest('details:not([open])'))
     .map(image => { image.loading = 'eager'; return image.decode(); }))"""
 SIDEWAYS = "document.documentElement.scrollWidth > innerWidth"
+#: CSS pixels between the margins of A4, and by how many the widest table is wider.
+PAPER = 718
+CUT = """(dispatchEvent(new Event('beforeprint')),
+    [...document.querySelectorAll('table')].reduce((most, table) =>
+        Math.max(most, Math.round(table.getBoundingClientRect().right - innerWidth)), 0))"""
 
 
 def measure(browser: Any, page: Path, viewport: tuple[int, int], pictures: Path | None) -> dict:
@@ -62,6 +67,9 @@ def measure(browser: Any, page: Path, viewport: tuple[int, int], pictures: Path 
     tab = browser.new_page()
     tab.goto(page.resolve().as_uri())
     pdf = tab.pdf(path=pictures / "print.pdf" if pictures else None, format="A4")
+    tab.emulate_media(media="print")
+    tab.set_viewport_size({"width": PAPER, "height": viewport[1]})
+    facts["cut in print"] = tab.evaluate(CUT)
     tab.close()
     return facts | {"print pages": len(re.findall(rb"/Type\s*/Page\b", pdf))}
 
@@ -69,6 +77,8 @@ def measure(browser: Any, page: Path, viewport: tuple[int, int], pictures: Path 
 def problems(facts: dict, viewport: tuple[int, int]) -> list[str]:
     """Return what is over a limit, in words; nothing if the page keeps to all."""
     found = [f"{facts['bytes']:,} bytes, over {BYTES:,}"] if facts["bytes"] > BYTES else []
+    if facts["cut in print"]:
+        found.append(f"a table is {facts['cut in print']} px wider than the paper")
     for name, seen in facts.items():
         if not isinstance(seen, dict):
             continue

@@ -6,6 +6,7 @@ import numpy as np
 import polars as pl
 import pytest
 from PIL import Image
+from threadpoolctl import threadpool_limits
 
 from leakage_fixtures import MATERIALS, NoiseVideo, crop, make_leaky, save
 from palpate.core import PalpateError
@@ -54,6 +55,14 @@ def test_planted_copies_are_found_and_others_are_not(leaky, modality, known):
     assert set(flags.cause) <= {"", "content", "nothing touched"}
     assert sum(flags.matches) == np.isfinite(flags.score).sum() == len(test)
     assert len(flags.edges) == len(flags.unrelated) + 1
+
+
+def test_scores_do_not_depend_on_the_number_of_threads(leaky):
+    def scores(threads):
+        with threadpool_limits(threads, user_api="blas"):
+            return near_duplicates(leaky.train, leaky.test, "vision").score
+
+    assert np.array_equal(scores(1), scores(2))
 
 
 def test_groups_join_copies_and_nothing_else(leaky):

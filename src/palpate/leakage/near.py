@@ -29,6 +29,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
+from threadpoolctl import threadpool_limits
 
 from palpate.core import Note, PalpateError, Progress, quiet
 from palpate.data.manifest import Manifest
@@ -61,6 +62,12 @@ RATE = 0.001
 SAME = 0.9995
 
 
+#: One thread, so that scores do not depend on how many a machine has; the products are small, and
+#: more threads make them slower.
+one_blas_thread = threadpool_limits.wrap(limits=1, user_api="blas")
+
+
+@one_blas_thread
 def near_duplicates(
     train: Manifest,
     test: Manifest,
@@ -97,6 +104,7 @@ def near_duplicates(
     return _flags(modality, images, (base, queries), matches, cut=cut, rate=false_positives)
 
 
+@one_blas_thread
 def near_groups(
     manifest: Manifest, modality: str, *, cache: Path | None = None, progress: Progress = quiet
 ) -> Ints:

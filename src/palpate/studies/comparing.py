@@ -32,9 +32,9 @@ _OF_AUDITS = ("name", "notes", "commands", "call", "others", "impact")
 _PLACES = ("vision", "tactile", "background", "generated", "others")
 #: Keys of what holds no numbers of a measurement.
 _BESIDES = ("notes", "settings")
-#: The least tolerance of some numbers. Descriptors of near-duplicates have 16 and 32 bits: two
-#: threads in the place of one move a threshold by 3e-5, and the score of a pair, of four digits, by
-#: one of them. p-values and effect sizes of untrained models, 1e-5 apart, are moved by 2e-3.
+#: The least tolerance of some numbers. Descriptors of near-duplicates have 16 and 32 bits: another
+#: order of their sums moves a threshold by 3e-5, and the score of a pair, of four digits, by one of
+#: them. p-values and effect sizes of untrained models, 1e-5 apart, are moved by 2e-3.
 LEAST = {
     **dict.fromkeys(("threshold", "score"), 5e-4),
     **dict.fromkeys(("p_value", "p_better", "p_adjusted", "effect size"), 5e-3),
