@@ -5,7 +5,8 @@
     python benchmarks/plan.py [--share 0.3] [--peak 989]
 
 Operations of a forward pass are counted layer by layer (a multiplication and an addition are two),
-a training step is three of them, a guided sample two a sampler step. Seconds are operations over
+a training step is three of them, a guided sample two a sampler step. How many trainings, images and
+features the study makes is counted from its own stages. Seconds are operations over
 ``--share`` of ``--peak`` (TFLOP/s; 989 is an H100 in bf16): measure yours with ``python
 benchmarks/training.py --only gpu``, and put its share here. Reading and decoding come on top where
 they cannot keep up. Prints the tables of docs/start/plan.md.
@@ -14,6 +15,7 @@ they cannot keep up. Prints the tables of docs/start/plan.md.
 from __future__ import annotations
 
 import argparse
+import tempfile
 from collections.abc import Callable
 from typing import Any
 
@@ -22,9 +24,12 @@ from diffusers import VQModel
 from torch.utils.flop_counter import FlopCounterMode
 from transformers import CLIPVisionConfig, CLIPVisionModelWithProjection
 
+from palpate.diffusion.autoencoder import BackgroundAutoencoder
 from palpate.diffusion.denoiser import build_unet
 from palpate.diffusion.presets import PAPER
 from palpate.encoders.presets import PAPER as ENCODER
+from palpate.studies.reproduce import nodes_of, plan_of
+from palpate.studies.study import ON_DISK, STUDIES
 
 #: (train samples, test samples): the paper's counts, four fifths of them train.
 DATA = {
@@ -34,8 +39,8 @@ DATA = {
 }
 EPOCHS = {"generator": 30, "encoder": 200}  # paper, sections 2 and 3
 STEPS = PAPER.sampler.steps
-#: Trainings of the study: seven methods and Ours on the leaking split; an encoder a split.
-METHODS, ENCODERS = 8, 2
+AUTOENCODER = ON_DISK["paper"].autoencoder
+VQ = "palpate/mini"  # stands for a trained one in the plan; only stages are counted
 
 
 def operations(forward: Callable[[], Any]) -> float:
@@ -74,15 +79,44 @@ def counted() -> dict[str, float]:
             )
         )
         latents, side = torch.zeros(1, 3, size // 4, size // 4), ENCODER.image
+        ours = BackgroundAutoencoder(AUTOENCODER.channels, AUTOENCODER.narrow, AUTOENCODER.wide)
+        crop = torch.zeros(1, 3, AUTOENCODER.crop, AUTOENCODER.crop)
         return {
             "U-Net": operations(lambda: unet(latents, torch.zeros(1), encoder_hidden_states=token)),
             "vq-f4 encoder": operations(lambda: vq.encode(torch.zeros(1, 3, size, size))),
             "vq-f4 decoder": operations(lambda: vq.decoder(latents)),
             "tactile encoder": operations(lambda: tower(torch.zeros(1, 3, side, side))),
+            "background autoencoder, a crop": operations(
+                lambda: ours.residual(ours.latents(crop, crop), crop)
+            ),
         }
 
 
-def duties(of: dict[str, float], train: int, test: int) -> dict[str, float]:
+def stages() -> dict[str, float]:
+    """How often the study of one seed does each duty; a training that is shorter is a part of one.
+
+    Images are in sets of the test part, those of the sampling curve single ones a sampler step.
+    """
+    with tempfile.TemporaryDirectory() as empty:
+        plan = plan_of(STUDIES["tag"], preset="paper", root=empty, vq=VQ)
+        nodes = nodes_of(plan)
+    named = lambda start: [n for n in nodes if n.name.startswith(start)]
+    judged = [len(n.inputs["methods"]) + len(n.inputs["controls"]) for n in named("scores-")]
+    curves = [n.inputs["samples"] * sum(n.inputs["steps"]) for n in named("sampled-")]
+    return {
+        "generators": sum(n.inputs["steps"] for n in nodes if "diffusion" in n.inputs)
+        / plan.preset.steps,
+        "sets of images": sum("make" not in n.inputs for n in named("images-")),
+        "steps for the curves": sum(curves),
+        "encoders": len(named("encoder-")),
+        "background autoencoders": sum("-vq-" not in n.name for n in named("autoencoder-")),
+        "sets of features": sum(judged),
+    }
+
+
+def duties(
+    of: dict[str, float], times: dict[str, float], train: int, test: int
+) -> dict[str, float]:
     """Operations of each duty on a data set."""
     both = train + test
     sample = 2 * STEPS * of["U-Net"] + of["vq-f4 decoder"]
@@ -91,11 +125,21 @@ def duties(of: dict[str, float], train: int, test: int) -> dict[str, float]:
         "one generator": 3 * EPOCHS["generator"] * train * of["U-Net"],
         f"its test images, {STEPS} steps": test * sample,
         "one tactile encoder": 3 * EPOCHS["encoder"] * train * of["tactile encoder"],
+        "one background autoencoder": 3
+        * AUTOENCODER.steps
+        * AUTOENCODER.batch
+        * of["background autoencoder, a crop"],
         "features of all images": both * of["tactile encoder"],
     }
-    latents, generator, images, encoder, features = made.values()
+    latents, generator, images, encoder, autoencoder, features = made.values()
     made["the study, one seed"] = (
-        latents + METHODS * (generator + images) + ENCODERS * (encoder + METHODS * features)
+        latents
+        + times["generators"] * generator
+        + times["sets of images"] * images
+        + times["steps for the curves"] * 2 * of["U-Net"]
+        + times["background autoencoders"] * autoencoder
+        + times["encoders"] * (encoder + features)
+        + times["sets of features"] * test * of["tactile encoder"]
     )
     return made
 
@@ -117,7 +161,9 @@ def main() -> None:
     print("| for one image, forward | GFLOP |\n|---|---|")
     for name, count in of.items():
         print(f"| {name} | {count / 1e9:.0f} |")
-    tables = {name: duties(of, *counts) for name, counts in DATA.items()}
+    times = stages()
+    print("\nThe study, one seed:", ", ".join(f"{what} {n:g}" for what, n in times.items()))
+    tables = {name: duties(of, times, *counts) for name, counts in DATA.items()}
     print(f"\n| | {' | '.join(f'{n}: PFLOP, one GPU, eight' for n in tables)} |")
     print("|---" * (len(tables) + 1) + "|")
     for duty in next(iter(tables.values())):

@@ -30,7 +30,7 @@ class Options(Common):
     """Run folder: results.json, page.html, tables.tex, tables/ (CSV), figures/, and a folder a
     stage."""
     preset: str = "mini"
-    """`mini` takes at most 80 minutes of one core a seed, and half an hour once; `smoke` only shows
+    """`mini` takes 82 to 137 minutes a seed, and 36 once, on two cores; `smoke` only shows
     that everything runs; `paper`, for data at --root, is the paper's size (a GPU)."""
     steps: int | None = None
     """Optimizer steps of each compared method, in place of the preset's."""

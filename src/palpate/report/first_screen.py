@@ -192,7 +192,7 @@ def _leak_card(audits: Sequence[Audit]) -> Card:
         gaps = {a.name: a.gap_median for a in audits if a.leaked_fraction}
         name, gap = next(((n, g) for n, g in gaps.items() if g is not None), ("", None))
         of = f" of {name}" if len(audits) > 1 else ""
-        frames = "" if gap is None else f"{number(gap, 0)} frame{'s' * (gap != 1)} away"
+        frames = "" if gap is None else f"{gap:g} frame{'s' * (gap != 1)} away"
         near = f"; median{of}: {frames}" if frames else ""
         foot = f"Train has the same video, object or image{near}."
     return Card("Test samples that leak from train", rows, foot)

@@ -25,6 +25,7 @@ from typing import Any
 from palpate.core import PalpateError, Progress, digest_file, plain, quiet, read_json, require
 from palpate.evaluation.companions import Weights
 from palpate.evaluation.inputs import read as read_samples
+from palpate.preference.scoring import PREFERENCE
 from palpate.report.results import Results
 from palpate.sim.presets import MINI_SEEDS
 from palpate.studies import making
@@ -124,8 +125,10 @@ def plan_of(
     if root is not None and not Path(root).exists():
         raise PalpateError("must exist", f"nothing at {root}", "Check the path", argument="root")
     folders = _folders(study, others or {})
-    if people is not None:
-        Results.load(people)  # raises for a file that holds none
+    votes = [] if people is None else [s.metric for s in Results.load(people).scores]
+    if people is not None and PREFERENCE not in votes:
+        must, fix = "must hold scores of palpate preference score", "Pass what its -o wrote"
+        raise PalpateError(must, str(people), fix, argument="people")
     chosen = study.presets[preset]
     given = {"steps": steps, "vq": None if vq is None else str(vq)}
     chosen = dataclasses.replace(chosen, **{k: v for k, v in given.items() if v is not None})
@@ -237,7 +240,14 @@ def nodes_of(plan: Plan) -> list[Node]:
     inputs |= {"paper": study.paper, "methods": plan.methods, "controls": list(study.controls)}
     inputs |= {"people": plan.people and digest_file(plan.people)}
     nodes.append(Node("results", build, inputs, after, version=7, cost=10, measures=True))
-    return nodes
+    return [_priced(node, preset.rest) for node in nodes]
+
+
+def _priced(node: Node, rest: float) -> Node:
+    """The node with the cost of its preset: a training has its own."""
+    trains = (making.make_encoders, making.make_autoencoder, making.make_generator)
+    trained = getattr(node.build, "func", node.build) in trains
+    return node if trained else dataclasses.replace(node, cost=rest * node.cost)
 
 
 def run_study(
