@@ -5,11 +5,12 @@
     python benchmarks/generator_sheet.py --blind runs/blind --answers answers.json
 
 New objects, videos and gel units of a world that no shipped model has seen. ``--blind`` writes
-``examples-*.png``, a strip of real images for each material by name, and ``sort-*.png``, five
-generated images of new videos of each material, numbered in random order; whoever sorts them writes
-``{"1": "Wood", ...}`` and sees nothing else. With the answers the number of materials above chance
-is printed: at least two of five right, which guessing reaches for one material in forty. With
-``--real`` the images to be sorted are the real ones of the same samples: what an eye can tell.
+``examples-*.png``, a strip of real images for each material by name, of other objects, and
+``sort-*.png``, five generated images of each material, numbered in random order; whoever sorts
+them writes ``{"1": "Wood", ...}`` and sees nothing else. With the answers the number of materials
+above chance is printed: at least two of five right, which guessing reaches for one material in
+forty. With ``--real`` the images to be sorted are the real ones of the same samples: what an eye
+can tell.
 """
 
 import argparse
@@ -30,7 +31,7 @@ from palpate.sim import PRESETS, write_world
 WORLD = replace(
     PRESETS["pretrain"],
     seed=63,
-    objects_per_material=5,
+    objects_per_material=10,
     contacts_per_video=2,
     frames_per_contact=1,
     sensors=1,
@@ -49,13 +50,13 @@ def amplified(images, gels):
 
 
 def picked(world):
-    """Material -> ids of its samples, one a video, and as many other ones for the examples."""
+    """Material -> ids of its first videos, one each, and of the other videos, for the examples."""
     first = world.table.group_by("material", "video", maintain_order=True).agg("id")
-    table, others = {}, {}
+    table = {}
     for material, _, ids in first.iter_rows():
         table.setdefault(material, []).append(ids[0])
-        others.setdefault(material, []).append(ids[-1])
-    return {m: table[m][:EACH] for m in sorted(table)}, others
+    names = sorted(table)
+    return {m: table[m][:EACH] for m in names}, {m: table[m][EACH:] for m in names}
 
 
 def sheet(rows, names, side=SIDE):
