@@ -383,7 +383,8 @@ Made by a committed command; do not edit by hand. Synthetic: the tables show a m
     python benchmarks/generator_ablation.py --materials 10 20 --seeds 0 1 2
 
 The rows that are there, of {len(ROWS)}: the command goes on where it was stopped. A row is `base`
-(the preset `mini`, trained shorter) with one change. The judges, a small CNN and the linear probe
+(the preset `mini` with a memory that is asked by text, trained shorter, under plain guidance) with
+one change. The judges, a small CNN and the linear probe
 of `palpate/mini`, saw real images only and are never fitted again; they judge new objects, videos
 and gel units. Intervals: 95 % over videos, of one training; TMMD (grouped) is to the real images
 of the same samples. {platform.machine()}, CPU, bf16; {datetime.date.today().isoformat()}.

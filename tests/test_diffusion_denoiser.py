@@ -311,6 +311,21 @@ def test_pairs_find_texts_by_their_photos():
         assert torch.allclose(seen, own if source == "both" else of_text, atol=1e-5)
 
 
+@pytest.mark.parametrize(
+    ("changes", "without", "words"),
+    [
+        ({"source": "mixed"}, "", "must be text or both with gap='pairs'"),
+        ({"source": "text"}, "vision", "gap='pairs' need conditions of text, vision"),
+        ({"source": "vision", "gap": "memory"}, "text", "need conditions of vision, text"),
+    ],
+)
+def test_a_memory_needs_what_it_remembers(tmp_path, changes, without, words):
+    conditions = {k: v for k, v in data()[1].items() if k != without}
+    policy = replace(POLICY, **{"gap": "pairs", **changes})
+    with pytest.raises(PalpateError, match=words):
+        train(tmp_path, policy=policy, conditions=conditions)
+
+
 def test_training_remembers_each_text_once_with_the_mean_of_its_photos(tmp_path):
     _, conditions = data()
     conditions["text"][1] = conditions["text"][0]
@@ -389,7 +404,8 @@ def test_training_does_not_touch_global_randomness(tmp_path):
 
 @pytest.mark.parametrize("gap", ["mean-shift", "memory", "pairs"])
 def test_saved_denoiser_is_the_same(tmp_path, gap):
-    policy = replace(POLICY, gap=gap, null="learned", source="vision", tokens=2, learned=True)
+    source = "both" if gap == "pairs" else "vision"
+    policy = replace(POLICY, gap=gap, null="learned", source=source, tokens=2, learned=True)
     model = train(tmp_path / "run", policy=policy)
     model.save(tmp_path / "unet")
     again = Denoiser.load(tmp_path / "unet", policy)
@@ -417,7 +433,8 @@ def test_the_token_reaches_the_output_through_the_time_embedding_alone():
 
 @pytest.mark.filterwarnings("ignore:It is deprecated:FutureWarning")
 @pytest.mark.parametrize(
-    "harm", ["cut", "no means", "no null", "no keys", "more", "shape", "config", "weights"]
+    "harm",
+    ["cut", "no means", "no null", "no keys", "few keys", "more", "shape", "config", "weights"],
 )
 def test_a_broken_folder_is_rejected(tmp_path, harm):
     policy, folder = replace(POLICY, null="learned", gap="pairs"), tmp_path / "unet"
@@ -430,6 +447,8 @@ def test_a_broken_folder_is_rejected(tmp_path, harm):
         save_file({**tensors, "other": torch.zeros(1)}, extra)
     elif harm == "shape":
         save_file({**tensors, "means": torch.zeros(1, 12)}, extra)
+    elif harm == "few keys":
+        save_file({**tensors, "keys": torch.zeros(0, 12)}, extra)
     elif harm == "config":
         (folder / "config.json").write_text("[]")
     elif harm == "weights":

@@ -95,7 +95,7 @@ def test_photos_drive_it_without_encoders_and_it_comes_back_from_its_folder(tmp_
             r"tokens of shape \(n, 64, 8\)",
         ),
         (lambda: pipeline.denoiser.condition(None, torch.randn(1, 8)), "knows photos alone"),
-        (lambda: learned(tmp_path / "n", ConditionPolicy(width=8)), "needs conditions of text"),
+        (lambda: learned(tmp_path / "n", ConditionPolicy(width=8)), "need conditions of text"),
     ):
         with pytest.raises(PalpateError, match=message):
             call()

@@ -329,8 +329,7 @@ def size(folder: Path) -> int:
 def test_what_ships_is_small_enough_complete_and_16_bit():
     assert set(SHIPPED) == {"palpate/mini"}
     assert all((MINI / place / "palpate.json").is_file() for place in PARTS.values())
-    assert size(MINI / "encoders") + size(MINI / "autoencoder") < 12e6
-    assert size(MINI / "generator") < 10e6
+    assert size(MINI) < 15e6
     files = [p for p in MINI.rglob("*") if p.is_file()]
     assert {p.suffix for p in files} <= {".json", ".md", ".png", ".safetensors"}
     for place in ("encoders/clip", "encoders/tactile", "autoencoder", "generator/unet"):

@@ -214,7 +214,7 @@ def test_a_probe_that_does_not_read_real_images_says_so(low):
         score("material accuracy", s, 0.5, interval=(low, 0.6), **more) for s in ("a", "real")
     ]
     made = cards(Results("T", scores=scores), telling_columns(score_tables(scores)))[0]
-    assert ("at chance (25.0 %) on real images" in made.foot) == (low < 0.25)
+    assert ("tell real images from chance, 25.0 % (dashed)" in made.foot) == (low < 0.25)
 
 
 @pytest.mark.parametrize(

@@ -212,6 +212,25 @@ def test_costs_are_those_that_the_preset_states(tmp_path):
     assert one / 2 < 90, "preset mini must stay under 90 minutes on two cores"
 
 
+def test_a_training_costs_what_its_preset_says_and_the_rest_a_share(tmp_path):
+    smoke, mini = (
+        {s.name: s.cost for s in planned(plan_of(WORLD, preset=p), tmp_path)} for p in WORLD.presets
+    )
+    encoder, autoencoder, method = WORLD.presets["smoke"].seconds
+    trained = [
+        smoke[f"{name}-NoLeak{end}"]
+        for name, end in (("encoder", "-0"), ("autoencoder", ""), ("ours", "-0"))
+    ]
+    assert trained == [encoder, autoencoder, method]
+    assert smoke["utility"] == pytest.approx(WORLD.presets["smoke"].rest * mini["utility"])
+
+
+def test_a_human_study_must_be_one(tmp_path):
+    Results("t", scores=[Score("TMMD", "Ours", 0.1)]).save(tmp_path / "scores.json")
+    with pytest.raises(PalpateError, match="must hold scores of palpate preference score"):
+        plan_of(WORLD, people=tmp_path / "scores.json")
+
+
 @pytest.mark.parametrize(
     ("args", "words"),
     [

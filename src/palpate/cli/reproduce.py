@@ -30,7 +30,7 @@ class Options(Common):
     """Run folder: results.json, page.html, tables.tex, tables/ (CSV), figures/, and a folder a
     stage."""
     preset: str = "mini"
-    """`mini` takes 82 to 137 minutes a seed, and 36 once, on two cores; `smoke` only shows
+    """`mini`: stages of 82 to 137 minutes a seed, and 36 once; `smoke` only shows
     that everything runs; `paper`, for data at --root, is the paper's size (a GPU)."""
     steps: int | None = None
     """Optimizer steps of each compared method, in place of the preset's."""

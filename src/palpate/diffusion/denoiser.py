@@ -243,10 +243,9 @@ class Denoiser(nn.Module):
             width = (widths or {}).get(name, policy.width)
             photos = name == "photos"
             self.maps[name] = PhotoMap(policy) if photos else _state_map(name, width, policy.width)
-        self.recalls = policy.gap in ("memory", "pairs")
         kept = memory or (None, None)
         for name, source, rows in zip(MEMORY, ("text", "vision"), kept, strict=True):
-            if self.recalls and (name == "memory" or policy.gap == "pairs"):
+            if policy.recalls and (name == "memory" or policy.gap == "pairs"):
                 empty = torch.zeros(1, policy.width)  # until load() fills it
                 self.register_buffer(name, empty if rows is None else self._unit(rows, source))
 
@@ -272,7 +271,7 @@ class Denoiser(nn.Module):
             PalpateError: for another width, or a source whose training mean is unknown.
         """
         unit = self._unit(conditions.to(self.device), source)
-        if source == "vision" and self.recalls and self.slots == 1:
+        if source == "vision" and self.policy.recalls and self.slots == 1:
             unit, _ = self.recall(unit)
         return self._repeated(unit)
 
@@ -296,7 +295,7 @@ class Denoiser(nn.Module):
         photo, of_photo = self._split(photos, "vision")
         text, of_text = self._split(texts, "text")
         place = photo if self.slots == 1 else None  # of two slots the photo has its own
-        if photo is not None and self.recalls:
+        if photo is not None and self.policy.recalls:
             place, photo = self.recall(photo)
         if text is not None:
             mixed = text if place is None else weight * place + (1 - weight) * text
@@ -437,8 +436,12 @@ class Denoiser(nn.Module):
             wanted = {k for k in model.state_dict() if not k.startswith("unet.")}
             if wanted != set(extra):
                 raise KeyError(f"other entries than {', '.join(sorted(wanted))}")
-            for name in wanted & {*MEMORY}:
-                setattr(model, name, extra[name].float())
+            kept = {name: extra[name].float() for name in MEMORY if name in wanted}
+            shapes = {rows.shape for rows in kept.values()}
+            if len(shapes) > 1 or any(shape[1:] != (policy.width,) for shape in shapes):
+                raise KeyError("a memory of another shape")
+            for name, rows in kept.items():
+                setattr(model, name, rows)
             model.load_state_dict(extra, strict=False)
         except UNREADABLE as error:
             raise PalpateError(must, first_line(error), fix) from None

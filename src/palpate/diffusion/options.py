@@ -164,6 +164,11 @@ class ConditionPolicy:
             return ()
         return SOURCES if self.source in ("mixed", "both") else (self.source,)
 
+    @property
+    def recalls(self) -> bool:
+        """Whether a photo asks the memory of training texts."""
+        return self.gap in ("memory", "pairs")
+
 
 @dataclass(frozen=True)
 class Schedule:

@@ -472,12 +472,17 @@ def _digests(encoders: EncoderSet | None) -> dict[str, str | None]:
 def _policy(
     preset: DiffusionPreset, encoders: EncoderSet | None, source: Sources | None
 ) -> ConditionPolicy:
-    """The preset's policy with another source; photos alone need no memory of texts."""
+    """The preset's policy with another source; photos alone need no memory of texts.
+
+    Photos that stand for their text in training would find it by themselves among the pairs.
+    """
     width = preset.condition.width if encoders is None else encoders.dim
     policy = preset.condition_for(width)
     chosen, gap = source or policy.source, policy.gap
-    if chosen == "vision" != policy.source and gap in ("memory", "pairs"):
+    if chosen == "vision" != policy.source and policy.recalls:
         gap = "mean-shift"
+    if chosen == "mixed" != policy.source and gap == "pairs":
+        gap = "memory"
     return replace(policy, source=chosen, gap="none" if chosen == "resnet" else gap)
 
 
@@ -485,8 +490,7 @@ def _modalities(policy: ConditionPolicy) -> tuple[Source, ...]:
     """The encoders that training needs: vision for the samples that it draws, at least."""
     if not policy.sources:
         return ()
-    recalled = policy.gap in ("memory", "pairs")
-    return SOURCES if "text" in policy.sources or recalled else ("vision",)
+    return SOURCES if "text" in policy.sources or policy.recalls else ("vision",)
 
 
 def _encoded(  # noqa: PLR0913 - one row per part
@@ -627,10 +631,7 @@ def train_denoiser(  # noqa: PLR0913 - one row per part of the model
         for s in SOURCES
         if s in conditions
     }
-    needed = (*policy.sources, *inputs_of(policy), *(SOURCES if policy.gap == "pairs" else ()))
-    if missing := [name for name in needed if name not in conditions]:
-        must, fix = f"source={policy.source!r} needs conditions of {', '.join(needed)}", ""
-        raise PalpateError(must, f"none of {missing[0]}", fix)
+    _require_conditions(policy, conditions)
     channels, size = latents.shape[1], latents.shape[2]
     means: dict[Source, Tensor] = {
         s: tables[s].double().mean(0).float() for s in SOURCES if s in tables
@@ -643,7 +644,7 @@ def train_denoiser(  # noqa: PLR0913 - one row per part of the model
             if isinstance(unet, str)
             else build_unet(unet, policy, size=size, **how)
         )
-        memory = _memory(tables) if policy.gap in ("memory", "pairs") else None
+        memory = _memory(tables) if policy.recalls else None
         widths = {name: conditions[name].shape[2] for name in inputs_of(policy)}
         model = Denoiser(net, policy, means, memory, widths)
         inputs = [*inputs_of(policy), *(["guide"] if "guide" in conditions else [])]
@@ -685,6 +686,18 @@ def train_denoiser(  # noqa: PLR0913 - one row per part of the model
         model.guide.hook.remove()
         model.guide = None
     return model.eval().requires_grad_(False)
+
+
+def _require_conditions(policy: ConditionPolicy, conditions: Mapping[str, Any]) -> None:
+    if policy.gap == "pairs" and policy.source not in ("text", "both"):
+        must = "must be text or both with gap='pairs': other photos would find their own text"
+        raise PalpateError(must, policy.source, "Take gap='memory'", argument="source")
+    remembered = {"memory": ("text",), "pairs": SOURCES}.get(policy.gap, ())
+    needed = dict.fromkeys((*policy.sources, *inputs_of(policy), *remembered))
+    if missing := [name for name in needed if name not in conditions]:
+        chosen = f"source={policy.source!r} and gap={policy.gap!r}"
+        must, fix = f"{chosen} need conditions of {', '.join(needed)}", ""
+        raise PalpateError(must, f"none of {missing[0]}", fix)
 
 
 def _memory(tables: Mapping[Source, Tensor]) -> tuple[Tensor, Tensor | None]:

@@ -247,7 +247,7 @@ def _score_card(
         chance = f"Share named right by a probe; dashed: chance, {percent(mark)}." if mark else ""
         real = next((c.score for c in shown if c.score.subject == REAL), None)
         if mark and real and real.interval and real.interval[0] <= mark:
-            chance = f"By a probe that is at chance ({percent(mark)}) on real images, too."
+            chance = f"The probe does not tell real images from chance, {percent(mark)} (dashed)."
         return Card(title, rows, f"{chance}{left}".strip())
     if axis is None:
         return Card(title, rows, left.strip())

@@ -168,7 +168,9 @@ def read_image(
     image.thumbnail((side, side), Image.Resampling.LANCZOS)
     if less is None:
         return image, tiny
-    pattern = read_image(base, like, side)[0].resize(image.size) if like else image
+    pattern = image
+    if like and (base / like).is_file():
+        pattern = read_image(base, like, side)[0].resize(image.size)
     return amplified(image, base / less if less else None, pattern), tiny
 
 
@@ -187,7 +189,7 @@ def amplified(image: Image.Image, background: Path | None, pattern: Image.Image)
             with Image.open(background) as file:
                 ground = to_rgb(file).resize(image.size)
         contact = np.asarray(image, np.float32) - np.asarray(ground, np.float32)
-        return contact - np.median(contact, axis=(0, 1))
+        return contact - np.median(contact, axis=(0, 1)).astype(np.float32)
 
     gain = 110 / max(float(np.quantile(np.abs(contact_of(pattern)), 0.99)), 2.0)
     shown = np.clip(128 + gain * contact_of(image), 0, 255)

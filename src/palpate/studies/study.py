@@ -200,7 +200,8 @@ PRESETS: Mapping[str, Preset] = {
             vq=_VQ,
             clip="palpate/mini",
             precision="bf16",  # 1.4 times as many steps a second, on processors that have it
-            cost="world-gelsight: 36 minutes once, 82 to 137 a seed, two stages at a time",
+            cost="world-gelsight: 30 minutes of one idle x86-64 core, and 80 minutes a seed; the "
+            "record, on busy ones: 36, and 82 to 137",
             seconds=(135, 140, 415),
         ),
     )
