@@ -1,4 +1,4 @@
-"""Studies of data sets on disk, at ``smoke``: forged trees of the true layouts, and real clips."""
+"""Studies at ``smoke`` to their page: forged trees of true layouts, real clips, the DIGIT world."""
 
 import pytest
 
@@ -11,7 +11,8 @@ from study_trees import forge_clips, forge_hct, forge_touch_and_go
 
 def reproduced(study, root, run):
     """The results of a study, with its page."""
-    command = ["reproduce", study, "--root", str(root), "--preset", "smoke", "-o", str(run), "-q"]
+    command = ["reproduce", study, "--preset", "smoke", "-o", str(run), "-q"]
+    command += [] if root is None else ["--root", str(root)]
     assert main(command) == 0
     assert (run / "page.html").stat().st_size > 0
     return Results.load(run / "results.json")
@@ -45,3 +46,12 @@ def test_clips_reach_the_page(tmp_path):
     assert results.settings["split rule"][NOLEAK]["group"] == "video"
     assert results.audits[1].leaked_fraction == 0 < results.audits[0].leaked_fraction
     assert not any(str(row[0]).startswith("paper") for row in results.tables[0].rows)
+
+
+@pytest.mark.nightly
+@pytest.mark.slow
+def test_the_digit_world_reaches_the_page(tmp_path):
+    results = reproduced("world-digit", None, tmp_path / "run")
+    assert results.audits[1].leaked_fraction == 0 < results.audits[0].leaked_fraction
+    titles = [table.title.partition(":")[0] for table in results.tables]
+    assert [title for title in titles if title.startswith("Table")] == ["Table 2", "Table 4"]
