@@ -243,9 +243,10 @@ class Denoiser(nn.Module):
             width = (widths or {}).get(name, policy.width)
             photos = name == "photos"
             self.maps[name] = PhotoMap(policy) if photos else _state_map(name, width, policy.width)
+        self.recalls = {"memory": MEMORY[:1], "pairs": MEMORY}.get(policy.gap, ())
         kept = memory or (None, None)
         for name, source, rows in zip(MEMORY, ("text", "vision"), kept, strict=True):
-            if policy.recalls and (name == "memory" or policy.gap == "pairs"):
+            if name in self.recalls:
                 empty = torch.zeros(1, policy.width)  # until load() fills it
                 self.register_buffer(name, empty if rows is None else self._unit(rows, source))
 
@@ -271,7 +272,7 @@ class Denoiser(nn.Module):
             PalpateError: for another width, or a source whose training mean is unknown.
         """
         unit = self._unit(conditions.to(self.device), source)
-        if source == "vision" and self.policy.recalls and self.slots == 1:
+        if source == "vision" and self.recalls and self.slots == 1:
             unit, _ = self.recall(unit)
         return self._repeated(unit)
 
@@ -295,7 +296,7 @@ class Denoiser(nn.Module):
         photo, of_photo = self._split(photos, "vision")
         text, of_text = self._split(texts, "text")
         place = photo if self.slots == 1 else None  # of two slots the photo has its own
-        if photo is not None and self.policy.recalls:
+        if photo is not None and self.recalls:
             place, photo = self.recall(photo)
         if text is not None:
             mixed = text if place is None else weight * place + (1 - weight) * text
