@@ -242,13 +242,14 @@ class Study:
             return autoencoder.decode(autoencoder.encode(self.real, self.gels), self.gels)
         return autoencoder.decode(autoencoder.encode(np.asarray(self.real)))
 
-    def nearest(self):
-        """The real images of the training photos that are most like the test photos."""
-        known, asked = (
-            embed(m, self.encoders, "vision", cache=self.cache).features
-            for m in (self.train, self.test)
+    def nearest(self, known, cache):
+        """The real images of the photos of ``known`` that are most like the test photos."""
+        keys, asked = (
+            embed(part, self.encoders, "vision", cache=of).features
+            for part, of in ((known, cache), (self.test, self.cache))
         )
-        return self.images[(asked @ known.T).argmax(1)]
+        images = cached_images(known, "tactile", MINI.size, cache)
+        return images[(asked @ keys.T).argmax(1)]
 
     def guide(self):
         """Encoders of another seed than those that judge."""
@@ -294,22 +295,27 @@ class Study:
             result[drive] = self.judged(made)
             np.save(folder / f"{drive}.npy", made)
         if gels is not None:  # what a gel costs that training has not seen
-            made = pipeline.sample(photos, self.test.ids, seed=seed, background=self.known_gels())
+            made = pipeline.sample(
+                photos, self.test.ids, seed=seed, background=self.gels_like(self.train, self.cache)
+            )
             result["known gels"] = self.judged(made)
             hits = [self.judge.names(np.load(folder / "photo.npy")), self.judge.names(made)]
             loss = np.subtract(*((names == self.answers).astype(float) for names in hits[::-1]))
             result["loss by new gels"] = by_video(loss, self.videos)
         return result
 
-    def known_gels(self):
-        """A gel of the training world for each judged sample."""
-        gels = gels_of(self.train, MINI.size, self.cache)
+    def gels_like(self, known, cache):
+        """A gel of ``known`` for each judged sample."""
+        gels = gels_of(known, MINI.size, cache)
         rows = rng_for(0, "known gels").integers(len(gels), size=len(self.test))
         return np.stack([gels[row] for row in rows])
 
     def ceilings(self):
         """What is not generated, judged alike."""
-        shown = {"real": self.real, "real, of the nearest training photo": self.nearest()}
+        shown = {
+            "real": self.real,
+            "real, of the nearest training photo": self.nearest(self.train, self.cache),
+        }
         shown["through the autoencoder of palpate/mini"] = self.reconstructed(self.autoencoder())
         return {name: self.judged(images) for name, images in shown.items()}
 

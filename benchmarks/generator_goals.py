@@ -25,9 +25,8 @@ from generator_ablation import Study, by_video, line, percents
 from palpate.core import rng_for, write_json
 from palpate.data.images import cached_images
 from palpate.data.manifest import Manifest
-from palpate.diffusion.autoencoders import gels_of
 from palpate.diffusion.pipeline import TactilePipeline
-from palpate.encoders.embed import embed, texts_of
+from palpate.encoders.embed import texts_of
 
 NAME = "palpate/mini"
 #: Row -> what drives the generator.
@@ -49,8 +48,9 @@ class Goals:
         self.pipeline = TactilePipeline.from_pretrained(NAME)
         self.path = work / str(materials) / f"goals-{self.pipeline.digest[:12]}.json"
         self.record = json.loads(self.path.read_text()) if self.path.is_file() else {}
-        known = Manifest.load(trained_on / "world gelsight" / "tree")
-        self.known, self.cache = known, trained_on / "cache"
+        known = Manifest.load(trained_on / "world gelsight" / "tree"), trained_on / "cache"
+        self.known_gels = self.study.gels_like(*known)
+        self.nearest = partial(self.study.nearest, *known)
         photos = cached_images(
             self.study.test, "vision", self.pipeline.vision_size, self.study.cache
         )
@@ -60,24 +60,6 @@ class Goals:
         texts = texts_of(self.study.test)[0]
         each = {text: self.pipeline.embed_text(text) for text in set(texts)}
         return torch.cat([each[text] for text in texts])
-
-    def nearest(self):
-        """Real images of the generator's training whose photos are nearest to those of the test."""
-        study = self.study
-        known, asked = (
-            embed(part, study.encoders, "vision", cache=cache).features
-            for part, cache in ((self.known, self.cache), (study.test, study.cache))
-        )
-        images = cached_images(self.known, "tactile", self.pipeline.size, self.cache)
-        return images[(asked @ known.T).argmax(1)]
-
-    def gels(self, which):
-        """A gel for each sample: its own, which training never saw, or one of the training."""
-        if which != "known":
-            return self.study.gels
-        gels = gels_of(self.known, self.pipeline.size, self.cache)
-        rows = rng_for(0, "known gels").integers(len(gels), size=len(self.study.test))
-        return np.stack([gels[row] for row in rows])
 
     def generated(self, seed, *, gap=None, gels="own", photo=True, text=False, permuted=False):
         pipeline = self.pipeline
@@ -93,7 +75,7 @@ class Goals:
                 self.study.test.ids,
                 texts=self.texts() if text else None,
                 seed=seed,
-                background=self.gels(gels),
+                background=self.known_gels if gels == "known" else self.study.gels,
             )
         finally:
             if gap:
