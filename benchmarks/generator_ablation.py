@@ -49,6 +49,7 @@ from palpate.training.options import Compute, LoopOptions
 WORLDS = {
     "train": {"seed": 61, "objects_per_material": 75, "sensors": 4},
     "new": {"seed": 62, "objects_per_material": 10, "sensors": 2},
+    "tuned": {"seed": 64, "objects_per_material": 150, "sensors": 4},  # of generator_tuned.py
 }
 SHAPE = {"contacts_per_video": 3, "frames_per_contact": 2}
 VERSION = 1  # raised when a row's name comes to mean something else: it is then trained again
@@ -173,12 +174,10 @@ class Study:
         self.work, self.materials = work, materials
         self.cache = work / "cache"
         self.progress = progress or Line()
-        self.train, self.new = (self.world(name) for name in WORLDS)
+        self.train, self.new = (self.world(name) for name in ("train", "new"))
         self.test = self.new.take(self.new.ids[:: max(1, len(self.new) // JUDGED)][:JUDGED])
         self.encoders = EncoderSet.load("palpate/mini")
-        self.everything = Split.from_ids(
-            train=self.train.ids, rule={"name": "everything"}, manifest=self.train.digest
-        )
+        self.everything = self.everything_of(self.train)
         self.names = sorted(set(self.train.column("material")))
         pixels = partial(cached_images, size=MINI.size, cache=self.cache)
         self.images, self.real = (pixels(m, "tactile") for m in (self.train, self.test))
@@ -190,6 +189,11 @@ class Study:
             embed(m, self.encoders, "tactile", cache=self.cache) for m in (self.train, self.test)
         ]
         self.probe = fit_probe(self.tactile[0])
+
+    @staticmethod
+    def everything_of(world):
+        """A split without a test part: what is judged is of another world."""
+        return Split.from_ids(train=world.ids, rule={"name": "everything"}, manifest=world.digest)
 
     def world(self, name):
         folder = self.work / f"world {name}"

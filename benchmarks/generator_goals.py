@@ -43,18 +43,17 @@ DRIVES = {
 class Goals:
     """One world: its study, the generator, and what drives it."""
 
-    def __init__(self, work, materials, trained_on):
-        self.study = Study(work / str(materials), materials)
-        self.pipeline = TactilePipeline.from_pretrained(NAME)
-        self.path = work / str(materials) / f"goals-{self.pipeline.digest[:12]}.json"
+    def __init__(self, study, known, name):
+        self.study = study
+        self.path = study.work / f"{name}.json"
         self.record = json.loads(self.path.read_text()) if self.path.is_file() else {}
-        known = Manifest.load(trained_on / "world gelsight" / "tree"), trained_on / "cache"
-        self.known_gels = self.study.gels_like(*known)
-        self.nearest = partial(self.study.nearest, *known)
-        photos = cached_images(
-            self.study.test, "vision", self.pipeline.vision_size, self.study.cache
-        )
-        self.photos = self.pipeline.embed(photos)
+        self.known_gels = study.gels_like(*known)
+        self.nearest = partial(study.nearest, *known)
+
+    def take(self, pipeline):
+        self.pipeline = pipeline
+        photos = cached_images(self.study.test, "vision", pipeline.vision_size, self.study.cache)
+        self.photos = pipeline.embed(photos)
 
     def texts(self):
         texts = texts_of(self.study.test)[0]
@@ -92,6 +91,17 @@ class Goals:
             seeds[str(seed)] = {**judged, "day": day}
             write_json(self.path, self.record)
             print(name, seed, percents(seeds[str(seed)]["cnn"]), flush=True)
+
+    def day(self):
+        """Of the newest measurement."""
+        return max(r["day"] for seeds in self.record.values() for r in seeds.values())
+
+    def section(self):
+        """Markdown of this world."""
+        materials, videos = self.study.materials, self.study.videos
+        head = f"## {materials} materials (chance {100 / materials:.0f} %)"
+        size = f"{len(self.study.test)} samples of {len(set(videos))} videos."
+        return f"{head}\n\n{size}\n\n{table(self.record, videos)}\n"
 
 
 def table(record, videos):
@@ -145,20 +155,21 @@ def main():
         help="Markdown file to write",
     )
     chosen, parts, days = parser.parse_args(), [], []
+    pipeline, trained_on = TactilePipeline.from_pretrained(NAME), chosen.trained_on
+    known = Manifest.load(trained_on / "world gelsight" / "tree"), trained_on / "cache"
     for materials in sorted(chosen.materials):
-        goals = Goals(chosen.work, materials, chosen.trained_on)
-        study, autoencoder = goals.study, goals.pipeline.autoencoder
+        study = Study(chosen.work / str(materials), materials)
+        goals = Goals(study, known, f"goals-{pipeline.digest[:12]}")
+        goals.take(pipeline)
         goals.measure("real", 0, lambda s=study: s.real)
         goals.measure("real, of the nearest photo of its training", 0, goals.nearest)
-        through = partial(study.reconstructed, autoencoder)
+        through = partial(study.reconstructed, pipeline.autoencoder)
         goals.measure("through its autoencoder", 0, through)
         for seed in chosen.seeds:
             for name, drive in DRIVES.items():
                 goals.measure(name, seed, partial(goals.generated, seed, **drive))
-        days += [r["day"] for s in goals.record.values() for r in s.values()]
-        head = f"## {materials} materials (chance {100 / materials:.0f} %)"
-        size = f"{len(study.test)} samples of {len(set(study.videos))} videos."
-        parts.append(f"{head}\n\n{size}\n\n{table(goals.record, study.videos)}\n")
+        days.append(goals.day())
+        parts.append(goals.section())
     chosen.page.write_text(page(parts, max(days)))
     print(chosen.page.read_text())
 

@@ -62,6 +62,16 @@ def test_encoders_and_a_generator_from_the_command_line(data, tmp_path, capsys, 
     photo = data[0].paths("vision")[0]
     assert main(["generate", str(photo), "--model", "model", "-o", "t.png"]) == 0
     assert not [p.name for p in tmp_path.iterdir() if p.name.endswith(".work")]
+    # From the command's own model: its encoders and autoencoder, and its record goes with it.
+    assert (
+        main(["train", "generator", *common, "--start", "model", "--steps", "1", "-o", "on"]) == 0
+    )
+    tuned = TactilePipeline.from_pretrained(tmp_path / "on")
+    assert tuned.autoencoder.digest == pipeline.autoencoder.digest
+    assert tuned.encoders.digest("text") == encoders.digest("text")
+    assert tuned.training["start"] == pipeline.digest != tuned.digest
+    assert tuned.training["start_record"]["loop"]["steps"] == 2
+    capsys.readouterr()
     # The same again does not overwrite.
     assert main(["train", "encoder", *common, "-o", "encoders"]) == 2
     assert "must be absent or an empty folder" in capsys.readouterr().err
@@ -131,6 +141,14 @@ def test_a_set_of_encoders_or_a_clip_conditions_a_generator(data, tmp_path):
         (
             lambda m, s: train_generator(m, s, "palpate/mini", preset="paper"),
             "`autoencoder` must be given for the preset paper",
+        ),
+        (
+            lambda m, s: train_generator(m, s, preset="tiny", start="palpate/mini"),
+            "`start` must share autoencoder, vision encoder, schedule",
+        ),
+        (
+            lambda m, s: train_generator(m, s, preset="sd15", unet="u", start="palpate/mini"),
+            "`unet` must be left out with start",
         ),
     ],
 )

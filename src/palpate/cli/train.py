@@ -29,6 +29,9 @@ class Options(Training):
     unet: str | None = None
     """Trained U-Net of diffusers to go on from: folder or hub id of it or of its generator, whose
     autoencoder is the default. Default: random weights; the preset `sd15` needs one."""
+    start: str | None = None
+    """Generator of palpate to go on from: its folder, or palpate/mini. Its encoders and autoencoder
+    stand for those that are not given. Default: random weights."""
     preset: Literal["mini", "tiny", "small", "paper", "sd15"] = "mini"
     """Geometry, schedule and length: `small` for one small GPU, `paper` is the paper's, `sd15` goes
     on from Stable Diffusion 1.5."""
@@ -69,6 +72,7 @@ def run(options: Options, terminal: Terminal) -> dict[str, Any]:
             preset=preset,
             autoencoder=options.autoencoder,
             unet=options.unet,
+            start=options.start,
             output=options.output,
             source=options.source,
             background=options.background,

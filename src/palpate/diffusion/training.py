@@ -125,6 +125,7 @@ def train_generator(  # noqa: PLR0913 - a public verb
     preset: str | DiffusionPreset = "mini",
     autoencoder: AnyAutoencoder | str | Path | None = None,
     unet: str | Path | None = None,
+    start: TactilePipeline | str | Path | None = None,
     output: Path | str | None = None,
     source: Sources | None = None,
     background: bool = False,
@@ -150,6 +151,9 @@ def train_generator(  # noqa: PLR0913 - a public verb
             first on the train part, or that of ``unet``; the preset ``paper`` needs one.
         unet: go on from this one of diffusers instead of random weights: a folder or hub id of it
             or of its generator; the preset ``sd15`` needs one.
+        start: go on from this generator of palpate, its folder, or ``palpate/mini``: its encoders
+            and autoencoder stand for those that are not given, its record goes into the new one,
+            and the memory is made of the new data alone.
         output: folder for the pipeline, new or empty; None keeps it in memory.
         source: what training conditions on; default: the preset's. ``resnet`` is GVST, the baseline
             without text; ``vision`` has the preset's encoder in its place.
@@ -171,7 +175,12 @@ def train_generator(  # noqa: PLR0913 - a public verb
     if steps is not None and steps < 1:
         fix = "Leave it out for the preset's length"
         raise PalpateError("must be at least 1", str(steps), fix, argument="steps")
+    if start is not None and unet is not None:
+        raise PalpateError("must be left out with start", str(unet), "", argument="unet")
     chosen = _chosen(preset, unet)
+    if start is not None:
+        start = TactilePipeline.from_pretrained(start) if isinstance(start, str | Path) else start
+        clip, autoencoder = clip or start.encoders, autoencoder or start.autoencoder
     if autoencoder is None and chosen.autoencoder is None:
         if not isinstance(chosen.unet, str):
             raise _not_given("autoencoder", chosen)
@@ -215,6 +224,7 @@ def train_generator(  # noqa: PLR0913 - a public verb
             source=source,
             background=background,
             align=None if align is None else Alignment.of(align, align_weight, device),
+            start=start,
             cache=cache,
             device=device,
             compute=compute,
