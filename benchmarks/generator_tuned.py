@@ -35,17 +35,18 @@ def tuned(study, world, seed, steps):
     return TactilePipeline.from_pretrained(folder)
 
 
-def page(parts, day, steps):
+def page(parts, day, chosen):
+    materials, seeds = (" ".join(map(str, rows)) for rows in (chosen.materials, chosen.seeds))
     return f"""# The shipped generator, fine-tuned
 
 Made by a committed command; do not edit by hand. Synthetic: the tables show a mechanism.
 
-    python benchmarks/generator_tuned.py --materials 10 --seeds 0 1 2
+    python benchmarks/generator_tuned.py --materials {materials} --seeds {seeds}
 
-`{NAME}` goes on for {steps:,} steps of {PRESET.loop.batch} on a world of the named materials alone
-(seed 64), in the way of `palpate train generator --start {NAME}`; a seed is of one training and of
-its noise. Judged on new objects, videos and gel units of another world (seed 62) by a small CNN
-that saw real images of a third (seed 61), and by the linear probe of `{NAME}`; neither knows an
+`{NAME}` goes on for {chosen.steps:,} steps of {PRESET.loop.batch} on a world of the named materials
+alone (seed 64), in the way of `palpate train generator --start {NAME}`; a seed is of one training
+and of its noise. Judged on new objects, videos and gel units of another world (seed 62) by a small
+CNN that saw real images of a third (seed 61), and by the linear probe of `{NAME}`; neither knows an
 image that is compared. Nothing was chosen on these numbers: preset, steps and seeds were set
 before. Intervals: 95 % over videos. What one is ahead of another is paired by image, in points of
 the CNN. TMMD (grouped) is to the real images of the same samples. {platform.machine()}, CPU,
@@ -80,7 +81,7 @@ def main():
                     goals.measure(name, seed, partial(goals.generated, seed, **drive))
         days.append(goals.day())
         parts.append(goals.section())
-    chosen.page.write_text(page(parts, max(days), chosen.steps))
+    chosen.page.write_text(page(parts, max(days), chosen))
     print(chosen.page.read_text())
 
 
