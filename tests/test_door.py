@@ -47,8 +47,8 @@ SIGNATURES = {
     ),
     "train_autoencoder": "data split * preset start output seed device compute progress",
     "train_generator": (
-        "data split clip * preset autoencoder unet start output source background align align_weight"
-        " steps seed device compute progress"
+        "data split clip * preset autoencoder unet start output source background align"
+        " align_weight steps seed device compute progress"
     ),
     "validate": "source * format check progress **options",
     "Encoder.from_pretrained": "source * modality device",

@@ -519,6 +519,29 @@ def test_fresh_clip_learns(world, tmp_path):
     assert not any(p.requires_grad for p in clip.model.parameters())
 
 
+def test_vision_goes_on_against_the_text_encoder_as_it_is(world, clip, tmp_path):
+    before = {m: clip.digest(m) for m in ("vision", "text")}
+    where, how = tmp_path / "on", {"device": "cpu", "start": clip}
+    on = train_clip(world, by_video(world), TINY, where, seed=1, **how)
+    assert {m: clip.digest(m) for m in before} == before  # the first one is not touched
+    assert on.digest("text") == before["text"]
+    assert on.digest("vision") != before["vision"]
+    assert on.preprocess == clip.preprocess
+    assert on.card["start_card"] == clip.card
+    assert on.card["start"] == before["vision"]
+    assert not any(p.requires_grad for p in on.model.parameters())
+    assert set(clip.seen) <= set(on.seen)
+    assert not on.card["seen_in_part"]
+    again = train_clip(world, by_video(world), TINY, tmp_path / "again", seed=1, **how)
+    assert again.digest("vision") == on.digest("vision")
+    unknown = replace(clip, seen=None)
+    short = train_clip(
+        world, by_video(world), TINY, tmp_path / "part", epochs=0.1, device="cpu", start=unknown
+    )
+    assert short.card["seen_in_part"]
+    assert short.seen is not None
+
+
 def test_mistakes_are_explained(world, clip, tmp_path):
     def train(rows=None, split=None, **options):
         manifest = world if rows is None else Manifest.from_rows(rows, world.root)

@@ -29,7 +29,7 @@ from transformers import CLIPModel, CLIPVisionModelWithProjection
 
 from palpate import __version__
 from palpate.core import PalpateError, Progress, Split, digest_json, digest_lines, quiet, rng_for
-from palpate.data.images import cached_images, image_stamp
+from palpate.data.images import image_stamp
 from palpate.data.manifest import Manifest
 from palpate.data.reading import load
 from palpate.encoders.embed import embed, texts_of
@@ -516,6 +516,7 @@ def train_clip(  # noqa: PLR0913 - as train_tactile
     seed: int = 0,
     targets: Targets | None = None,
     held_out: float = 0.0,
+    start: ClipEncoders | None = None,
     cache: Path | None = None,
     device: str = "auto",
     compute: Compute | None = None,
@@ -527,6 +528,9 @@ def train_clip(  # noqa: PLR0913 - as train_tactile
     encoder is trained on the tactile images, as the text encoder needs a partner; the card says so.
     Run again to resume.
 
+    With ``start`` its vision encoder goes on, against its text encoder as it is (LiT, Zhai et al.
+    2022): what was trained in the space of its texts stays valid. Its size is its own.
+
     Returns:
         The CLIP, frozen, with a card.
 
@@ -535,21 +539,20 @@ def train_clip(  # noqa: PLR0913 - as train_tactile
             CLIP, or has this course keep the best weights or stop early.
     """
     where, compute = pick_device(connect(device)), compute or Compute()
-    train = _parts(manifest, split, held_out, seed)[0]
-    side, course = _sides(train)[0], _clip_course(preset)
-    missing = train.column(side).count(None)
-    has = zip(train.ids, train.column(side), strict=True)
-    train = train.take([i for i, image in has if image is not None])
+    train, side, missing = _pictured(_parts(manifest, split, held_out, seed)[0])
+    course, words = _clip_course(preset), "photos" if side == "vision" else "samples"
     options = course.options(len(train), seed, epochs)
-    words = "photos" if side == "vision" else "samples"
     _require_rows(train, options, words, "clip_batch_size")
     texts, source = texts_of(train)
+    how = Preprocess(preset.image, preset.image) if start is None else start.preprocess
     with first_alone():
-        images = cached_images(train, side, preset.image, cache, progress)
-    plain = Preprocess(preset.image, preset.image)
-    clip = new_clip(preset, texts, seed, _preprocess(preset, images, plain))
+        images = prepared_images(train, side, how, cache, progress)
+    if start is None:
+        clip = new_clip(preset, texts, seed, _preprocess(preset, images, how))
+        clip.model.requires_grad_(True)
+    else:
+        clip = _copy_that_sees(start)
     move(clip.model, where)
-    clip.model.requires_grad_(True)
     mode, words, distinct = targets or preset.targets, numbers(texts), sorted(set(texts))
 
     def load(step: Step) -> Batch:
@@ -568,7 +571,8 @@ def train_clip(  # noqa: PLR0913 - as train_tactile
         total, _ = three_way(vision, text, None, scale, labels, **how)
         return Losses(total, {"scale": scale.detach()}, encoded.sum(dim=1))
 
-    facts = _facts(preset, train, split, (texts, source), options) | {"targets": mode}
+    known = {"start": start.digest("vision"), "text": start.digest("text")} if start else {}
+    facts = _facts(preset, train, split, (texts, source), options) | {"targets": mode} | known
     facts |= {} if side == "vision" else {"trained_on": "tactile images, not photos"}
     facts |= {"without_photo": missing} if missing else {}
     key = digest_json([facts, image_stamp(train, side)])
@@ -576,8 +580,18 @@ def train_clip(  # noqa: PLR0913 - as train_tactile
     log = fit(clip.model, task, options, folder, compute=compute, progress=progress)
     clip.model.eval().requires_grad_(False)
     clip.card = _card(facts, options, log, where)
-    clip.seen = union(digest_images(images))
+    clip.card |= {"start_card": start.card, "seen_in_part": start.seen is None} if start else {}
+    clip.seen = union(digest_images(images), start.seen if start else None)
     return clip
+
+
+def _copy_that_sees(clip: ClipEncoders) -> ClipEncoders:
+    """A copy whose text encoder stays as it is."""
+    copied = replace(clip, model=copy.deepcopy(clip.model))
+    copied.model.requires_grad_(True)
+    for part in (copied.model.text_model, copied.model.text_projection):
+        part.requires_grad_(False)
+    return copied
 
 
 def _clip_course(preset: EncoderPreset) -> Course:
@@ -598,6 +612,14 @@ def train_part(manifest: Manifest, split: Split) -> Manifest:
         must = "The train part of the split must hold samples of this manifest"
         raise PalpateError(must, "none", "Make a split with: palpate split")
     return train
+
+
+def _pictured(train: Manifest) -> tuple[Manifest, str, int]:
+    """The rows with a photo, or of data without photos a tactile image; which; how many lack it."""
+    side = _sides(train)[0]
+    has = zip(train.ids, train.column(side), strict=True)
+    some = train.take([i for i, image in has if image is not None])
+    return some, side, len(train) - len(some)
 
 
 def _sides(train: Manifest) -> list[str]:
