@@ -33,7 +33,7 @@ from palpate.data.manifest import Manifest
 from palpate.diffusion.alignment import Alignment
 from palpate.diffusion.autoencoder import BackgroundAutoencoder
 from palpate.diffusion.autoencoders import autoencoder_of, gels_of, load_autoencoder
-from palpate.diffusion.options import AutoencoderOptions, SamplerOptions, Schedule
+from palpate.diffusion.options import AutoencoderOptions, Schedule
 from palpate.diffusion.presets import MINI
 from palpate.diffusion.training import train_pipeline
 from palpate.encoders import train_encoder
@@ -42,6 +42,7 @@ from palpate.encoders.encoder_set import EncoderSet, seeded
 from palpate.metrics import tmmd
 from palpate.metrics.probe import fit_probe, material_accuracy
 from palpate.sim import PRESETS, write_world
+from palpate.studies.making import fresh
 from palpate.training.engine import Losses, Task, fit
 from palpate.training.options import Compute, LoopOptions
 
@@ -50,10 +51,14 @@ WORLDS = {
     "train": {"seed": 61, "objects_per_material": 75, "sensors": 4},
     "new": {"seed": 62, "objects_per_material": 10, "sensors": 2},
     "tuned": {"seed": 64, "objects_per_material": 150, "sensors": 4},  # of generator_tuned.py
+    # Of generator_goals.py: as many videos as there are objects, one image of each.
+    "many": {"seed": 65, "sensors": 8, "contacts_per_video": 1, "frames_per_contact": 1},
 }
 SHAPE = {"contacts_per_video": 3, "frames_per_contact": 2}
-VERSION = 1  # raised when a row's name comes to mean something else: it is then trained again
-JUDGED = 400  # images a row is judged by
+MANY = 1600
+VERSION = 2  # raised when rows come to mean something else: all are then trained again
+JUDGED = 400  # images of the world new
+ROW_JUDGED = 800  # images that a row is judged by, of as many videos
 JUDGE = LoopOptions(2500, 32, 2e-3, warmup=100, weight_decay=1e-3, ema=0.99)
 #: What palpate shipped before: patches of 2 x 2 pixels, one halving, 8,192 codes.
 VQ = AutoencoderOptions(
@@ -61,15 +66,7 @@ VQ = AutoencoderOptions(
 )
 BFLOAT = Compute(precision="bf16")  # float32 on x86 processors without it
 
-#: Plain guidance, so that all rows are sampled as the first ones were.
-PLAIN = SamplerOptions("dpm", steps=10, guidance=2.5)
-BASE = replace(
-    MINI,
-    name="ablation",
-    condition=replace(MINI.condition, gap="memory"),
-    loop=replace(MINI.loop, steps=2000),
-    sampler=PLAIN,
-)
+BASE = replace(MINI, name="ablation")
 
 
 def schedule(**changes):
@@ -93,13 +90,14 @@ ROWS = {
     "time mean: 0": schedule(prediction="flow", time_mean=0.0),
     "time mean: 1": schedule(prediction="flow", time_mean=1.0),
     "condition: text (Ours)": condition(source="text", gap="none", noise=0.0),
-    "condition: text, memory": condition(source="text"),
+    "condition: text, memory": condition(source="text", gap="memory"),
     "condition: photo": condition(source="vision", gap="mean-shift", noise=0.0),
     "condition: photo, trained map (GVST)": condition(source="resnet", gap="none", noise=0.0),
     "condition: photo, noise": condition(source="vision", gap="mean-shift"),
     "condition: mixed": condition(source="mixed", gap="mean-shift"),
     "condition: both, no noise": condition(noise=0.0),
-    "condition: both, pairs": condition(gap="pairs"),
+    "condition: both, memory asked by text": condition(gap="memory"),
+    "condition: both, photo as it is": condition(gap="mean-shift"),
     "tokens: 4 learned": condition(tokens=4, learned=True),
     "tokens: words of the text": condition(words=32),
     "tokens: patches of the photo": condition(patches=64),
@@ -170,12 +168,12 @@ def by_video(hits, videos):
 class Study:
     """The worlds, the judges, the autoencoders, and the rows."""
 
-    def __init__(self, work, materials, progress=None):
+    def __init__(self, work, materials, new="new", judged=JUDGED):
         self.work, self.materials = work, materials
         self.cache = work / "cache"
-        self.progress = progress or Line()
-        self.train, self.new = (self.world(name) for name in ("train", "new"))
-        self.test = self.new.take(self.new.ids[:: max(1, len(self.new) // JUDGED)][:JUDGED])
+        self.progress = Line()
+        self.train, self.new = (self.world(name) for name in ("train", new))
+        self.test = self.new.take(self.new.ids[:: max(1, len(self.new) // judged)][:judged])
         self.encoders = EncoderSet.load("palpate/mini")
         self.everything = self.everything_of(self.train)
         self.names = sorted(set(self.train.column("material")))
@@ -197,8 +195,8 @@ class Study:
 
     def world(self, name):
         folder = self.work / f"world {name}"
-        options = replace(PRESETS["pretrain"], **SHAPE, **WORLDS[name])
-        options = replace(options, materials=self.materials)
+        shape = {"objects_per_material": MANY // self.materials, **SHAPE, **WORLDS[name]}
+        options = replace(PRESETS["pretrain"], **shape, materials=self.materials)
         if not (folder / "done").is_file():
             write_world(folder / "tree", options, workers=2, progress=self.progress)
             (folder / "done").write_text(options.digest)
@@ -266,7 +264,7 @@ class Study:
     def row(self, name, seed, steps):
         """Train one row; return what the judges say of its images."""
         autoencoder = self.autoencoder("VQ" if name == "autoencoder: VQ" else "background")
-        folder = self.work / "rows" / digest_json([name, seed, steps])[:16]
+        folder = self.work / "rows" / digest_json([name, seed, steps, VERSION])[:16]
         began = time.process_time()
         pipeline = train_pipeline(
             self.train,
@@ -284,7 +282,7 @@ class Study:
             progress=self.progress,
         )
         result = {"seconds": round(time.process_time() - began)}
-        pipeline.save(folder / "model")  # for a look at its images later
+        pipeline.save(fresh(folder / "model"))  # for a look at its images later
         gels = self.gels if pipeline.background else None
         pixels = cached_images(self.test, "vision", pipeline.vision_size, self.cache)
         photos = pipeline.embed(pixels)
@@ -393,8 +391,7 @@ Made by a committed command; do not edit by hand. Synthetic: the tables show a m
     python benchmarks/generator_ablation.py --materials 10 20 --seeds 0 1 2
 
 The rows that are there, of {len(ROWS)}: the command goes on where it was stopped. A row is `base`
-(the preset `mini` with a memory that is asked by text, trained shorter, under plain guidance) with
-one change. The judges, a small CNN and the linear probe
+(the preset `mini`, trained shorter) with one change. The judges, a small CNN and the linear probe
 of `palpate/mini`, saw real images only and are never fitted again; they judge new objects, videos
 and gel units. Intervals: 95 % over videos, of one training; TMMD (grouped) is to the real images
 of the same samples. {platform.machine()}, CPU, bf16; {datetime.date.today().isoformat()}.
@@ -418,18 +415,18 @@ def main():
     chosen = parser.parse_args()
     file = chosen.page.with_suffix(".json")
     records = json.loads(file.read_text()) if file.is_file() else {}
+    records = {k: r for k, r in records.items() if r["version"] == VERSION}
     for seed, materials, name in itertools.product(chosen.seeds, chosen.materials, chosen.rows):
-        key = {"row": name, "seed": seed, "steps": chosen.steps, "version": VERSION}
+        key = {"row": name, "seed": seed, "steps": chosen.steps}
         record = records.get(str(materials), {})
         if any(key.items() <= r.items() for r in record.get("rows", ())):
             continue
-        study = Study(chosen.work / str(materials), materials)
+        study = Study(chosen.work / str(materials), materials, "many", ROW_JUDGED)
         if not record:
             counts = {"train": len(study.train), "test": len(study.test)}
-            counts["videos"] = len(set(study.videos))
+            counts |= {"videos": len(set(study.videos)), "version": VERSION}
             record = {**counts, "ceilings": study.ceilings(), "rows": []}
         row = {**key, **study.row(name, seed, chosen.steps)}
-        records = json.loads(file.read_text()) if file.is_file() else {}  # others may have written
         record = records.setdefault(str(materials), record)
         record["rows"].append(row)
         write_json(file, records)

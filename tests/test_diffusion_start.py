@@ -55,17 +55,18 @@ def test_it_begins_with_the_given_weights_and_leaves_those_alone(tmp_path):
     assert same(train(tmp_path / "d", 2, start), moved)
 
 
-def test_another_geometry_is_rejected(tmp_path):
+def test_its_geometry_is_its_own_and_what_it_learned_beside_the_unet_tells_runs_apart(tmp_path):
     start = make_pipeline().denoiser
-    with pytest.raises(PalpateError, match="geometry of the preset"):
-        train(
-            tmp_path,
-            1,
-            start,
-            unet=UNetOptions(
-                widths=(16, 16), attention=(False, True), layers=1, head_width=16, groups=8
-            ),
-        )
+    wide = UNetOptions(widths=(16, 16), attention=(False, True), layers=1, head_width=16, groups=8)
+    assert same(train(tmp_path / "a", 0, start, unet=wide), start)
+    policy = ConditionPolicy(width=6, tokens=2, learned=True)
+    how = {"policy": policy, "unet": None}
+    start = make_pipeline(policy=policy).denoiser
+    first = train(tmp_path / "b", 2, start, **how)
+    start.expand.weight.data.add_(1)
+    second = train(tmp_path / "b", 2, start, **how)
+    assert not torch.equal(first.expand.weight, second.expand.weight)
+    assert torch.equal(second.expand.weight, train(tmp_path / "c", 2, start, **how).expand.weight)
 
 
 def test_a_learned_unconditional_token_goes_along(tmp_path):
@@ -117,3 +118,14 @@ def test_other_encoders_autoencoders_and_schedules_are_rejected(small_manifest, 
         set(manifest.part(split, "train").column("material"))
     )
     assert all(name in made.notice for name in made.training["materials"])
+    # What it goes on from was trained on another split of these data, further back on real ones.
+    first = {"manifest": manifest.digest, "split": "a", "materials": ["Felt"], "synthetic": True}
+    first |= {"align": {"encoder": "guide"}}
+    between = {**first, "split": "b", "materials": [], "align": None, "start_record": first}
+    start.training = between
+    on = run()
+    assert on.earlier_splits == ["a", "b"]
+    assert on.guides == ["guide"]
+    assert "Felt" in on.notice
+    start.training = {**between, "start_record": {**first, "synthetic": False}}
+    assert not run().notice

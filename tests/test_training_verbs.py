@@ -7,6 +7,7 @@ import pytest
 import torch
 from PIL import Image
 
+from mini_fixtures import make_encoders
 from palpate.cli import main
 from palpate.core import PalpateError, Split
 from palpate.data.manifest import Manifest
@@ -67,6 +68,11 @@ def test_encoders_and_a_generator_from_the_command_line(data, tmp_path, capsys, 
         main(["train", "generator", *common, "--start", "model", "--steps", "1", "-o", "on"]) == 0
     )
     tuned = TactilePipeline.from_pretrained(tmp_path / "on")
+    assert tuned.denoiser.policy == pipeline.denoiser.policy
+    page = (tmp_path / "on" / "README.md").read_text()
+    both = page[page.index("## Data") : page.index("## Digests")]
+    assert "## Data of the models that it went on from" in both
+    assert both.count(str(len(data[1].ids("train")))) >= 2
     assert tuned.autoencoder.digest == pipeline.autoencoder.digest
     assert tuned.encoders.digest("text") == encoders.digest("text")
     assert tuned.training["start"] == pipeline.digest != tuned.digest
@@ -143,8 +149,16 @@ def test_a_set_of_encoders_or_a_clip_conditions_a_generator(data, tmp_path):
             "`autoencoder` must be given for the preset paper",
         ),
         (
-            lambda m, s: train_generator(m, s, preset="tiny", start="palpate/mini"),
-            "`start` must share autoencoder, vision encoder, schedule",
+            lambda m, s: train_generator(m, s, make_encoders(), start="palpate/mini"),
+            "`start` must share autoencoder, vision encoder, schedule, condition",
+        ),
+        (
+            lambda m, s: train_generator(m, s, start="palpate/mini", source="text"),
+            "`source` must be left out with start, which is conditioned on both",
+        ),
+        (
+            lambda m, s: train_generator(m, s, start="palpate/mini", background=True),
+            "`background` must be left out with start, which sees no background",
         ),
         (
             lambda m, s: train_generator(m, s, preset="sd15", unet="u", start="palpate/mini"),

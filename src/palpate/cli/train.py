@@ -62,7 +62,7 @@ def run(options: Options, terminal: Terminal) -> dict[str, Any]:
     data, machine = (options.data, options.split), options.machine
     if options.dry_run:
         how: dict[str, Any] = {"background": options.background, "device": machine.device}
-        how |= {"unet": options.unet, "source": options.source}
+        how |= {"unet": options.unet, "source": options.source, "start": options.start}
         plan = plan_generator(*data, preset=preset, steps=options.steps, **how)
         return print_plan(terminal, f"Plan of {options.output}", plan)
     with terminal.progress() as progress:

@@ -706,6 +706,7 @@ def _settings(pipeline: TactilePipeline, sampler: SamplerOptions, seed: int) -> 
     usual = {"scheduler": None, "dtype": "torch.float32"}
     return {k: v for k, v in other.items() if v != usual[k]} | {
         **({"guides": pipeline.guides} if pipeline.guides else {}),
+        **({"earlier_splits": pipeline.earlier_splits} if pipeline.earlier_splits else {}),
         "pipeline": pipeline.digest,
         "split": pipeline.training.get("split"),
         "preset": pipeline.preset,

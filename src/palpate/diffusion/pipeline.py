@@ -331,8 +331,23 @@ class TactilePipeline(DiffusionPipeline):
     @property
     def guides(self) -> list[str]:
         """Digests of encoders that it was aligned with in training, which may not score it."""
-        records = (self.training, self.training.get("start_record") or {})
-        return [record["align"]["encoder"] for record in records if record.get("align")]
+        return [record["align"]["encoder"] for record in self.records if record.get("align")]
+
+    @property
+    def records(self) -> list[Mapping[str, Any]]:
+        """How it was trained, then that of the generator which it went on from, and so on."""
+        records: list[Mapping[str, Any]] = [self.training]
+        while before := records[-1].get("start_record"):
+            records.append(before)
+        return records
+
+    @property
+    def earlier_splits(self) -> list[str]:
+        """Digests of other splits of the same data that a generator it went on from trained on."""
+        own, *before = self.records
+        data = own.get("manifest")
+        same = {str(r["split"]) for r in before if r.get("split") and r.get("manifest") == data}
+        return sorted(same - {own.get("split")})
 
     @property
     def background(self) -> bool:
@@ -534,10 +549,10 @@ class TactilePipeline(DiffusionPipeline):
     @property
     def notice(self) -> str:
         """What every viewer of its images must know; empty for a pipeline trained on real data."""
-        if not self.training.get("synthetic"):
+        real = any(record.get("synthetic") is False for record in self.records)
+        if real or not self.training.get("synthetic"):
             return ""
-        records = (self.training, self.training.get("start_record") or {})
-        known = sorted({str(name) for record in records for name in record.get("materials", ())})
+        known = sorted({str(n) for record in self.records for n in record.get("materials", ())})
         only = f" It knows only these materials: {', '.join(known)}." if known else ""
         return SYNTHETIC + only
 

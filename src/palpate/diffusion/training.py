@@ -145,15 +145,17 @@ def train_generator(  # noqa: PLR0913 - a public verb
             the data.
         clip: vision and text encoders that condition the generator: a set of encoders, its folder,
             the folder or hub id of a CLIP, or ``palpate/mini``; ``source="resnet"`` needs none.
-        preset: geometry, schedule and length, or its name (:data:`palpate.diffusion.PRESETS`).
+        preset: geometry, schedule and length, or its name (:data:`palpate.diffusion.PRESETS`); with
+            ``start`` its length and rate alone.
         autoencoder: any :class:`~palpate.diffusion.autoencoder.Autoencoder` or what its ``load``
             takes: folder, hub id, ``.ckpt`` or ``palpate/mini``. Default: a small one, trained
             first on the train part, or that of ``unet``; the preset ``paper`` needs one.
         unet: go on from this one of diffusers instead of random weights: a folder or hub id of it
             or of its generator; the preset ``sd15`` needs one.
-        start: go on from this generator of palpate, its folder, or ``palpate/mini``: its encoders
-            and autoencoder stand for those that are not given, its record goes into the new one,
-            and the memory is made of the new data alone.
+        start: go on from this generator of palpate, its folder, or ``palpate/mini``. Geometry,
+            condition, schedule and sampler stay as they are, its encoders and autoencoder stand for
+            those that are not given, its record goes into the new one, and the memory is made of
+            the new data alone.
         output: folder for the pipeline, new or empty; None keeps it in memory.
         source: what training conditions on; default: the preset's. ``resnet`` is GVST, the baseline
             without text; ``vision`` has the preset's encoder in its place.
@@ -175,12 +177,12 @@ def train_generator(  # noqa: PLR0913 - a public verb
     if steps is not None and steps < 1:
         fix = "Leave it out for the preset's length"
         raise PalpateError("must be at least 1", str(steps), fix, argument="steps")
-    if start is not None and unet is not None:
-        raise PalpateError("must be left out with start", str(unet), "", argument="unet")
-    chosen = _chosen(preset, unet)
+    start = TactilePipeline.from_pretrained(start) if isinstance(start, str | Path) else start
+    chosen = _chosen(preset, unet, start)
     if start is not None:
-        start = TactilePipeline.from_pretrained(start) if isinstance(start, str | Path) else start
+        _require_left_out(start, source=source, background=background)
         clip, autoencoder = clip or start.encoders, autoencoder or start.autoencoder
+        background = start.denoiser.background
     if autoencoder is None and chosen.autoencoder is None:
         if not isinstance(chosen.unet, str):
             raise _not_given("autoencoder", chosen)
@@ -236,15 +238,34 @@ def train_generator(  # noqa: PLR0913 - a public verb
     return pipeline
 
 
-def _chosen(preset: str | DiffusionPreset, unet: str | Path | None) -> DiffusionPreset:
-    """The preset, with a trained U-Net where one is given."""
+def _chosen(
+    preset: str | DiffusionPreset, unet: str | Path | None, start: TactilePipeline | None = None
+) -> DiffusionPreset:
+    """The preset, with a trained U-Net where one is given; after ``start`` only its length."""
     chosen = preset if isinstance(preset, DiffusionPreset) else preset_named(preset)
+    if start is not None:
+        if unet is not None:
+            raise PalpateError("must be left out with start", str(unet), "", argument="unet")
+        same = {"name": start.preset, "size": start.size, "schedule": start.schedule}
+        same |= {"condition": start.denoiser.policy, "sampler": start.sampler}
+        return replace(chosen, **same)
     chosen = chosen if unet is None else replace(chosen, unet=str(unet))
     if chosen.unet is None:
         raise _not_given("unet", chosen)
     if isinstance(chosen.unet, str):
         find_unet(chosen.unet)
     return chosen
+
+
+def _require_left_out(start: TactilePipeline, *, source: Sources | None, background: bool) -> None:
+    """What the denoiser sees stays as it is."""
+    known = start.denoiser.policy.source
+    if source not in (None, known):
+        must = f"must be left out with start, which is conditioned on {known}"
+        raise PalpateError(must, str(source), "", argument="source")
+    if background and not start.denoiser.background:
+        must = "must be left out with start, which sees no background"
+        raise PalpateError(must, "given", "", argument="background")
 
 
 def _not_given(argument: str, preset: DiffusionPreset) -> PalpateError:
@@ -258,6 +279,7 @@ def plan_generator(
     *,
     preset: str | DiffusionPreset = "mini",
     unet: str | Path | None = None,
+    start: TactilePipeline | str | Path | None = None,
     source: Sources | None = None,
     steps: int | None = None,
     background: bool = False,
@@ -271,7 +293,8 @@ def plan_generator(
     Returns:
         see :func:`palpate.training.estimate.estimate`.
     """
-    chosen = _chosen(preset, unet)
+    start = TactilePipeline.from_pretrained(start) if isinstance(start, str | Path) else start
+    chosen = _chosen(preset, unet, start)
     train = train_part(load(data), load_split(data, split))
     loop = chosen.loop_for(len(train))
     loop = loop if steps is None else replace(loop, steps=steps)
@@ -282,8 +305,14 @@ def plan_generator(
     channels = options.channels if options else 4 if trained else 3
     side = chosen.size // factor
     wide = 0 if not background else 48 if isinstance(options, BackgroundOptions) else channels
+    if start is not None:
+        known = start.unet.config
+        policy, side, channels = start.denoiser.policy, known["sample_size"], known["out_channels"]
+        wide = known["in_channels"] - channels
 
     def build() -> nn.Module:
+        if start is not None:
+            return start.unet
         if isinstance(chosen.unet, UNetOptions):
             return build_unet(chosen.unet, policy, channels=channels, size=side, background=wide)
         file = find_unet(str(chosen.unet))[1] / "config.json"
@@ -352,10 +381,10 @@ def train_pipeline(  # noqa: PLR0913, PLR0917 - one row per choice of the traini
         must = f"must reduce images of {preset.size} pixels, the preset's, by a divisor of it"
         fix = "Choose another, or another size"
         raise PalpateError(must, str(autoencoder.factor), fix, argument="autoencoder")
-    if start is not None:
-        _require_same(start, encoders, autoencoder, preset)
-    where = pick_device(connect(device))
     policy = _policy(preset, encoders, source)
+    if start is not None:
+        _require_same(start, encoders, autoencoder, preset.schedule, policy)
+    where = pick_device(connect(device))
     encoders = encoders.to(where) if encoders is not None and policy.sources else None
     nn.Module.to(autoencoder, where)
     modalities = _modalities(policy)
@@ -421,7 +450,7 @@ def train_pipeline(  # noqa: PLR0913, PLR0917 - one row per choice of the traini
         rows.latents,
         rows.conditions,
         stats=stats,
-        unet=cast("UNetOptions | str", preset.unet),
+        unet=preset.unet,
         policy=policy,
         schedule=preset.schedule,
         loop=loop,
@@ -444,14 +473,14 @@ def train_pipeline(  # noqa: PLR0913, PLR0917 - one row per choice of the traini
         "train_samples": len(train),
         "text_source": text_source,
         "autoencoder": autoencoder.digest,
-        "ceiling": autoencoder.card.get("held_out"),
+        "ceiling": autoencoder.card.get("held_out") or autoencoder.card.get("scores"),
         **_digests(encoders),
         "source": policy.source,
         "background": background,
         "align": align.about if align else None,
         "gel": ("manifest" if gels else "median") if given_gel else None,
         "loop": asdict(loop),
-        "unet": _geometry(preset.unet),
+        "unet": start.training.get("unet") if start else _geometry(preset.unet),
         "seed": seed,
         "processes": place()[1],
         "palpate": __version__,
@@ -570,14 +599,17 @@ def _require_same(
     start: TactilePipeline,
     encoders: EncoderSet | None,
     autoencoder: AnyAutoencoder,
-    preset: DiffusionPreset,
+    schedule: Schedule,
+    policy: ConditionPolicy,
 ) -> None:
     """A denoiser goes on only in the space that it knows."""
     vision = start.encoders.digest("vision") if start.encoders else None
+    seen = [(p.source, *lengths_of(p), p.learned) for p in (start.denoiser.policy, policy)]
     pairs = {
         "autoencoder": (start.autoencoder.digest, autoencoder.digest),
         "vision encoder": (vision, _digests(encoders)["vision"]),
-        "schedule": (start.schedule, preset.schedule),
+        "schedule": (start.schedule, schedule),
+        "condition": tuple(seen),
     }
     if different := [name for name, (a, b) in pairs.items() if a != b]:
         must, got = f"must share {', '.join(pairs)}", f"another {', another '.join(different)}"
@@ -589,7 +621,7 @@ def train_denoiser(  # noqa: PLR0913 - one row per part of the model
     conditions: Mapping[str, Tensor | NDArray[Any]],
     *,
     stats: LatentStats,
-    unet: UNetOptions | str,
+    unet: UNetOptions | str | None,
     policy: ConditionPolicy,
     schedule: Schedule,
     loop: LoopOptions,
@@ -613,15 +645,16 @@ def train_denoiser(  # noqa: PLR0913 - one row per part of the model
             their mean. By name ``inputs_of(policy)``, arrays or memory maps; as ``guide`` states
             (n, k, w) of an encoder that the middle block is aligned with.
         stats: normalize the latents of tactile and background images.
-        unet: geometry of the network, or a trained one, see :func:`load_unet`.
+        unet: geometry of the network, or a trained one, see :func:`load_unet`; ``start`` has its
+            own.
         policy: how embeddings become tokens, and which train.
         schedule: the forward process and the target.
         loop: length, rate, averaging; its seed also seeds the weights.
         folder: for checkpoints and the log.
         background: rows -> (n, g, h, w), see :meth:`Encoded.backgrounds`, for the variant w/ BG.
         held_out: conditions, latents and background of rows whose loss is measured in training.
-        start: go on from these weights instead of random ones, in the same geometry. The modality
-            means are those of ``conditions`` all the same.
+        start: go on from these weights instead of random ones. The modality means are those of
+            ``conditions`` all the same.
         align_weight: of the alignment in the loss.
         key: digest of latents, conditions and background, which are not read for it.
         names: of the rows, for errors.
@@ -634,7 +667,7 @@ def train_denoiser(  # noqa: PLR0913 - one row per part of the model
         The denoiser with averaged weights, frozen.
 
     Raises:
-        PalpateError: if a source is missing, or ``start`` has another geometry.
+        PalpateError: if a source is missing.
     """
     tables: dict[Source, Tensor] = {
         s: torch.as_tensor(np.asarray(conditions[s]), dtype=torch.float32)
@@ -649,11 +682,13 @@ def train_denoiser(  # noqa: PLR0913 - one row per part of the model
     with seeded(loop.seed, "denoiser"):
         wide = 0 if background is None else background(np.arange(1)).shape[1]
         how: dict[str, Any] = {"channels": channels, "background": wide}
-        net = (
-            load_unet(unet, policy, **how)
-            if isinstance(unet, str)
-            else build_unet(unet, policy, size=size, **how)
-        )
+        if start is not None:
+            net = cast("Any", UNet2DConditionModel.from_config(start.unet.config))
+        elif isinstance(unet, str):
+            net = load_unet(unet, policy, **how)
+        else:
+            assert unet is not None
+            net = build_unet(unet, policy, size=size, **how)
         memory = _memory(tables) if policy.recalls else None
         widths = {name: conditions[name].shape[2] for name in inputs_of(policy)}
         model = Denoiser(net, policy, means, memory, widths)
@@ -686,9 +721,9 @@ def train_denoiser(  # noqa: PLR0913 - one row per part of the model
         if held_out is not None:
             others = (len(held_out[1]), loss_of(*held_out).load)
     records = (stats, unet, policy, schedule)
-    settings = [facts(r) for r in records if not isinstance(r, str)]
-    begin = [] if start is None else [digest_tensors(start.unet.state_dict())]
-    begin += [digest_tensors(net.state_dict())] if isinstance(unet, str) else []
+    settings = [facts(r) for r in records if r is not None and not isinstance(r, str)]
+    trained = start is not None or isinstance(unet, str)
+    begin = [digest_tensors(model.state_dict())] if trained else []
     key = digest_json([key, background is not None, *settings, *begin])
     task = Task("generator", len(latents), loss.load, loss, key, names, others, None, samples)
     fit(model, task, loop, folder, compute=compute, progress=progress)
@@ -721,14 +756,10 @@ def _memory(tables: Mapping[Source, Tensor]) -> tuple[Tensor, Tensor | None]:
 
 def _copy_weights(source: Denoiser, target: Denoiser) -> None:
     """Copy the U-Net, and what else both have learned."""
-    weights, own = (dict(d.named_parameters()) for d in (source, target))
-    shared = [k for k in weights | own if k.startswith("unet.") or (k in weights and k in own)]
-    shapes = [[d[k].shape if k in d else None for k in shared] for d in (weights, own)]
-    if shapes[0] != shapes[1]:
-        must, got = "must have the geometry of the preset", "another geometry"
-        raise PalpateError(must, got, "Leave it out", argument="start")
-    for name in shared:
-        own[name].data.copy_(weights[name].data)
+    weights = dict(source.named_parameters())
+    for name, own in target.named_parameters():
+        if name in weights:
+            own.data.copy_(weights[name].data)
 
 
 class DiffusionLoss:

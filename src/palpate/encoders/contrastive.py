@@ -51,7 +51,7 @@ from palpate.encoders.losses import (
     require_weights,
     three_way,
 )
-from palpate.encoders.models import move, pick_device
+from palpate.encoders.models import digest_tensors, move, pick_device
 from palpate.encoders.preprocess import CLIP_MEAN, CLIP_STD, digest_images, prepared_images, union
 from palpate.encoders.presets import Course, EncoderPreset, Targets, preset
 from palpate.encoders.rows import Rows, augmented, draw, numbers, unit
@@ -365,7 +365,7 @@ def train_tactile(  # noqa: PLR0913 - one row per choice of the training
     card = _card(facts, options, log, where) | {"clip": clip.name, "clip_card": clip.card}
     card["start_card"] = start.card if start else None
     card["synthetic"] = train.synthetic if not start or start.card.get("synthetic") else False
-    card["seen_in_part"] = start is not None and start.seen is None
+    card["seen_in_part"] = start is not None and not start.knows_seen("tactile")
     images = rows.images
     if preset.subtract:  # another background makes no new image
         plain = replace(preset.preprocess, subtract=())
@@ -562,7 +562,7 @@ def train_clip(  # noqa: PLR0913 - as train_tactile
         return {**batch, "texts": every}
 
     def loss(module: nn.Module, batch: Batch) -> Losses:
-        pixels = clip.preprocess.normalize(augmented(unit(batch["images"]), batch))
+        pixels = clip.preprocess(augmented(unit(batch["images"]), batch))
         encoded = in_chunks(clip.encode_vision, pixels, compute.chunk)
         text = gather_rows(_encode_phrases(clip, distinct, batch["phrase"]))
         scale = clamped_scale(clip.model.logit_scale)
@@ -571,7 +571,8 @@ def train_clip(  # noqa: PLR0913 - as train_tactile
         total, _ = three_way(vision, text, None, scale, labels, **how)
         return Losses(total, {"scale": scale.detach()}, encoded.sum(dim=1))
 
-    known = {"start": start.digest("vision"), "text": start.digest("text")} if start else {}
+    known = {m: start.digest(m) for m in ("vision", "text")} if start else {}
+    known |= {"start": digest_tensors(start.model.state_dict())} if start else {}
     facts = _facts(preset, train, split, (texts, source), options) | {"targets": mode} | known
     facts |= {} if side == "vision" else {"trained_on": "tactile images, not photos"}
     facts |= {"without_photo": missing} if missing else {}
@@ -579,15 +580,19 @@ def train_clip(  # noqa: PLR0913 - as train_tactile
     task = Task("training vision and text", len(train), load, loss, key, train.ids)
     log = fit(clip.model, task, options, folder, compute=compute, progress=progress)
     clip.model.eval().requires_grad_(False)
-    clip.card = _card(facts, options, log, where)
-    clip.card |= {"start_card": start.card, "seen_in_part": start.seen is None} if start else {}
+    clip.card = _card(facts, options, log, where) | clip.card
     clip.seen = union(digest_images(images), start.seen if start else None)
     return clip
 
 
 def _copy_that_sees(clip: ClipEncoders) -> ClipEncoders:
-    """A copy whose text encoder stays as it is."""
-    copied = replace(clip, model=copy.deepcopy(clip.model))
+    """A copy whose text encoder stays as it is; its card says what it was."""
+    if clip.family != "clip":
+        must, got = "must be a CLIP, whose vision encoder goes on", f"a {clip.family}"
+        raise PalpateError(must, got, "Pass another, or leave it out", argument="start")
+    card = {"start_card": clip.card, "seen_in_part": not EncoderSet(clip).knows_seen("vision")}
+    card |= {"license": clip.card["license"]} if "license" in clip.card else {}
+    copied = replace(clip, model=copy.deepcopy(clip.model), card=card)
     copied.model.requires_grad_(True)
     for part in (copied.model.text_model, copied.model.text_projection):
         part.requires_grad_(False)

@@ -819,7 +819,7 @@ def with_warnings(
         for name, s in inputs.generators.items()
         if split is not None
         and s.generator is not None
-        and s.generator.get("split") != split.digest
+        and {s.generator.get("split"), *s.generator.get("earlier_splits", ())} != {split.digest}
     }
     return [
         replace(

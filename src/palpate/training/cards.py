@@ -21,7 +21,7 @@ Every other key is part of the training record, which is printed as JSON.
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -111,11 +111,14 @@ def model_card(about: Mapping[str, Any]) -> str:
     record = {
         k: _cut(v) for k, v in card.items() if k not in PLACED and v not in (None, {}, [], "")
     }
+    before = list(_before(card))
+    limits = [text for model in (card, *before) for text in model.get("limits", ())]
     sections = {
         "Scores": _table(card.get("scores")),
         "Ceiling: what survives the autoencoder": _table(card.get("ceiling")),
-        "Data": _table(card.get("data") or _trained_on(card)),
-        "Limits": "\n".join(f"- {text}" for text in card.get("limits", ())),
+        "Data": _table(_data(card)),
+        "Data of the models that it went on from": "\n\n".join(_table(_data(b)) for b in before),
+        "Limits": "\n".join(f"- {text}" for text in dict.fromkeys(limits)),
         "Made by": _code("sh", str(card.get("recipe", ""))),
         "Digests": "\n".join(f"- {part}: `{digest}`" for part, digest in digests.items()),
         "Record": record
@@ -173,8 +176,17 @@ def _card(about: Mapping[str, Any]) -> Mapping[str, Any]:
     return about.get("card", about.get("training")) or {}
 
 
-def _trained_on(card: Mapping[str, Any]) -> dict[str, Any]:
-    """The data of a pipeline that palpate trained, as one row."""
+def _before(card: Mapping[str, Any]) -> Iterator[Mapping[str, Any]]:
+    """The cards of the models that a training went on from."""
+    while before := card.get("start_record") or card.get("start_card"):
+        yield before
+        card = before
+
+
+def _data(card: Mapping[str, Any]) -> Sequence[Mapping[str, Any]] | Mapping[str, Any]:
+    """What it was trained on; of a pipeline that palpate trained, as one row."""
+    if card.get("data"):
+        return card["data"]
     names = {"split_rule": "split", "train_samples": "training samples", "materials": "materials"}
     row = {shown: card[name] for name, shown in names.items() if card.get(name)}
     return {k: json.dumps(v) if isinstance(v, Mapping) else v for k, v in row.items()}
