@@ -14,6 +14,7 @@ world          seed      read by
 =============  ========  =========================================================================
 gelsight       900000    every part
 digit          900001    the autoencoder alone: the other look of the sensor
+photos         900002    the vision encoder alone: 16,000 more objects, one photo of each
 new gelsight   900050    scores: new objects, videos and gel units
 new digit      900051    scores of the autoencoder
 =============  ========  =========================================================================
@@ -63,12 +64,17 @@ _BASE = replace(PRESETS["pretrain"], contacts_per_video=3, frames_per_contact=2)
 WORLDS: dict[str, WorldOptions] = {
     "gelsight": replace(_BASE, seed=900_000, objects_per_material=150, sensors=8),
     "digit": replace(_BASE, seed=900_001, objects_per_material=30, sensors=4, look="digit"),
+    "photos": replace(
+        _BASE, seed=900_002, objects_per_material=800, contacts_per_video=1, frames_per_contact=1
+    ),
     "new gelsight": replace(_BASE, seed=900_050, objects_per_material=10),
     "new digit": replace(_BASE, seed=900_051, objects_per_material=4, look="digit"),
 }
 ENCODER = preset("mini")
+#: Of the vision encoder when it goes on: more rows to tell apart.
+VISION = replace(ENCODER, clip_course=replace(ENCODER.clip_course, batch=256, lr=2e-3))
 #: Passes over the data. One core sees about 400 images a second in training.
-CLIP_EPOCHS, TACTILE_EPOCHS = 14.0, 8.0
+CLIP_EPOCHS, TACTILE_EPOCHS, VISION_EPOCHS = 14.0, 8.0, 20.0
 AUTOENCODER = BackgroundOptions(steps=6_000)
 GENERATOR = replace(DIFFUSION, loop=replace(DIFFUSION.loop, batch=32, warmup=100))
 GENERATOR_STEPS = 8_000
@@ -107,8 +113,14 @@ def main() -> int:
         default=1.0,
         help="share of all training lengths, to try the recipe out (not for shipping)",
     )
+    parser.add_argument(
+        "--before",
+        type=Path,
+        help="folder of formerly shipped models whose text and tactile encoder and autoencoder "
+        "stay, and whose vision encoder goes on, instead of training these",
+    )
     options = parser.parse_args()
-    recipe = Recipe(options.work, options.share)
+    recipe = Recipe(options.work, options.share, options.before)
     try:
         if options.verify:
             return recipe.verify()
@@ -133,8 +145,8 @@ def print_line(line: str) -> None:
 class Recipe:
     """The parts, each a stage of a run folder; a finished stage is read, not made again."""
 
-    def __init__(self, work: Path, share: float) -> None:
-        self.run, self.share = Run(work, print_line), share
+    def __init__(self, work: Path, share: float, before: Path | None = None) -> None:
+        self.run, self.share, self.before = Run(work, print_line), share, before
         self.cache = work / "cache"
         self.shown = 0.0
 
@@ -213,8 +225,10 @@ class Recipe:
         )
         return stage.folder / "clip"
 
-    def encoders(self) -> EncoderSet:
-        """The pair and a tactile encoder that learns from it, rounded to 16 bits."""
+    def tactile(self) -> EncoderSet:
+        """The pair and a tactile encoder that learns from it."""
+        if self.before:
+            return EncoderSet.load(self.before / "encoders")
         clip, train = self.clip(), self.world("gelsight")
         epochs = TACTILE_EPOCHS * self.share
 
@@ -231,10 +245,10 @@ class Recipe:
                 progress=self.progress,
             )
             encoders.save(fresh(folder / "encoders"))
-            return {"tactile": encoders.digest("tactile")}
+            return {"tactile": encoders.digest("tactile"), "text": encoders.digest("text")}
 
         stage = self.run.stage(
-            "encoders",
+            "tactile",
             {
                 "preset": ENCODER,
                 "epochs": epochs,
@@ -245,8 +259,40 @@ class Recipe:
         )
         return EncoderSet.load(stage.folder / "encoders")
 
+    def encoders(self) -> EncoderSet:
+        """The three encoders; vision goes on with one photo of each of many more objects.
+
+        Text and tactile encoder stay: so do all scores that are made with these.
+        """
+        encoders = self.tactile()
+        parts = [self.world(name).prefixed(f"{name}/") for name in ("gelsight", "photos")]
+        train, epochs = Manifest.join(*parts), VISION_EPOCHS * self.share
+
+        def build(folder: Path) -> Mapping[str, Any]:
+            clip = train_clip(
+                train,
+                self._everything(train),
+                VISION,
+                folder / "training",
+                epochs=epochs,
+                seed=SEED,
+                start=encoders.clip,
+                cache=self.cache,
+                compute=COMPUTE,
+                progress=self.progress,
+            )
+            replace(encoders, clip=clip).save(fresh(folder / "encoders"))
+            return {"vision": clip.digest("vision")}
+
+        inputs = {"preset": VISION, "epochs": epochs, "seed": SEED, "train": train.digest}
+        inputs |= {m: encoders.digest(m) for m in encoders.modalities}
+        stage = self.run.stage("encoders", inputs, build)
+        return EncoderSet.load(stage.folder / "encoders")
+
     def autoencoder(self) -> AnyAutoencoder:
         """The background autoencoder, of tactile images of both looks."""
+        if self.before:
+            return load_autoencoder(self.before / "autoencoder")
         parts = [self.world(name) for name in ("gelsight", "digit")]
         options = replace(AUTOENCODER, steps=max(1, round(AUTOENCODER.steps * self.share)))
 

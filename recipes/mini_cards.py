@@ -25,8 +25,9 @@ SUMMARIES = {
         "Three small encoders with one space of 128 dimensions: a CLIP (vision and text, with"
         " its tokenizer) trained on photos and captions of the procedural world, which say "
         "what is felt and name no material, and a "
-        "tactile encoder trained against it with the three-way InfoNCE. They replace the "
-        "frozen CLIP of the paper where no hub is in reach.",
+        "tactile encoder trained against it with the three-way InfoNCE; then vision went on "
+        "against the text encoder as it is, with many more photos. They replace the frozen CLIP "
+        "of the paper where no hub is in reach.",
     ),
     "autoencoder": (
         "Background autoencoder of tactile images of palpate's world",
@@ -46,12 +47,13 @@ PAIR = (
     "Vision and text encoders of palpate's world",
     "A small CLIP with its tokenizer, trained on photos and captions of the procedural world,"
     " which say what is felt and name no material;"
-    " its space has 128 dimensions. The tactile encoder next to it was trained against it.",
+    " its space has 128 dimensions. The tactile encoder next to it was trained against it;"
+    " then the vision encoder went on, with many more photos, against the text encoder as it is.",
 )
 READ = {
-    "encoders": ("gelsight", "new gelsight"),
+    "encoders": ("gelsight", "photos", "new gelsight"),
     "autoencoder": ("gelsight", "digit", "new gelsight", "new digit"),
-    "generator": ("gelsight", "new gelsight"),
+    "generator": ("gelsight", "photos", "new gelsight"),
 }
 
 

@@ -31,7 +31,8 @@ class Options(Training):
     autoencoder is the default. Default: random weights; the preset `sd15` needs one."""
     start: str | None = None
     """Generator of palpate to go on from: its folder, or palpate/mini. Its encoders and autoencoder
-    stand for those that are not given. Default: random weights."""
+    stand for those that are not given, and the preset gives length and rate alone. Default: random
+    weights."""
     preset: Literal["mini", "tiny", "small", "paper", "sd15"] = "mini"
     """Geometry, schedule and length: `small` for one small GPU, `paper` is the paper's, `sd15` goes
     on from Stable Diffusion 1.5."""

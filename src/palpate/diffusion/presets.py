@@ -148,7 +148,7 @@ MINI = DiffusionPreset(
     loop=LoopOptions(steps=400, batch=16, lr=1e-3, warmup=50, ema=0.99),
     schedule=Schedule(prediction="flow"),
     # Guidance at the noisiest times, and the contrast that it adds, are what costs TMMD.
-    sampler=SamplerOptions("dpm", steps=10, guidance=4.0, rescale=0.7, high=0.8),
+    sampler=SamplerOptions("dpm", steps=10, guidance=3.0, rescale=0.7, high=0.8),
 )
 
 #: The paper's model as far as it is known; reference/paper.md section 9 gives the reason for each
