@@ -196,7 +196,8 @@ class Bench:
             with seeded(0, "denoiser"):
                 shape = {"channels": latents.shape[1], "size": latents.shape[2]}
                 unet = build_unet(MINI.unet, policy, **shape)
-                return Denoiser(unet, policy, means, torch.from_numpy(tables["text"]))
+                memory = tuple(torch.from_numpy(tables[s]) for s in ("text", "vision"))
+                return Denoiser(unet, policy, means, memory)
 
         tokens = model().tokens
 

@@ -58,7 +58,7 @@ SHAPE = {"contacts_per_video": 3, "frames_per_contact": 2}
 MANY = 1600
 VERSION = 2  # raised when rows come to mean something else: all are then trained again
 JUDGED = 400  # images of the world new
-ROW_JUDGED = 800  # images that a row is judged by, of as many videos
+ROW_JUDGED = 400  # images that a row is judged by, of as many videos
 JUDGE = LoopOptions(2500, 32, 2e-3, warmup=100, weight_decay=1e-3, ema=0.99)
 #: What palpate shipped before: patches of 2 x 2 pixels, one halving, 8,192 codes.
 VQ = AutoencoderOptions(
@@ -403,7 +403,7 @@ def main():
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--rows", nargs="+", default=list(ROWS), choices=tuple(ROWS), metavar="ROW")
     parser.add_argument("--seeds", type=int, nargs="+", default=[0])
-    parser.add_argument("--steps", type=int, default=2000)
+    parser.add_argument("--steps", type=int, default=1000)
     parser.add_argument("--materials", type=int, nargs="+", default=[10])
     parser.add_argument("--work", type=Path, default=Path("runs/generator_ablation"))
     parser.add_argument(
@@ -415,7 +415,7 @@ def main():
     chosen = parser.parse_args()
     file = chosen.page.with_suffix(".json")
     records = json.loads(file.read_text()) if file.is_file() else {}
-    records = {k: r for k, r in records.items() if r["version"] == VERSION}
+    records = {k: r for k, r in records.items() if r.get("version") == VERSION}
     for seed, materials, name in itertools.product(chosen.seeds, chosen.materials, chosen.rows):
         key = {"row": name, "seed": seed, "steps": chosen.steps}
         record = records.get(str(materials), {})
