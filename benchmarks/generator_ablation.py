@@ -57,8 +57,7 @@ WORLDS = {
 SHAPE = {"contacts_per_video": 3, "frames_per_contact": 2}
 MANY = 1600
 VERSION = 2  # raised when rows come to mean something else: all are then trained again
-JUDGED = 400  # images of the world new
-ROW_JUDGED = 400  # images that a row is judged by, of as many videos
+JUDGED = 400  # images a row is judged by
 JUDGE = LoopOptions(2500, 32, 2e-3, warmup=100, weight_decay=1e-3, ema=0.99)
 #: What palpate shipped before: patches of 2 x 2 pixels, one halving, 8,192 codes.
 VQ = AutoencoderOptions(
@@ -421,7 +420,7 @@ def main():
         record = records.get(str(materials), {})
         if any(key.items() <= r.items() for r in record.get("rows", ())):
             continue
-        study = Study(chosen.work / str(materials), materials, "many", ROW_JUDGED)
+        study = Study(chosen.work / str(materials), materials, "many")
         if not record:
             counts = {"train": len(study.train), "test": len(study.test)}
             counts |= {"videos": len(set(study.videos)), "version": VERSION}

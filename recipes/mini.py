@@ -48,9 +48,9 @@ from palpate.diffusion.pipeline import TactilePipeline
 from palpate.diffusion.presets import MINI as DIFFUSION
 from palpate.diffusion.training import train_pipeline
 from palpate.encoders.contrastive import train_clip, train_tactile
-from palpate.encoders.encoder_set import EncoderSet, load_clip
+from palpate.encoders.encoder_set import ClipEncoders, EncoderSet, load_clip
 from palpate.encoders.models import SHIPPED, shipped_root
-from palpate.encoders.presets import preset
+from palpate.encoders.presets import EncoderPreset, preset
 from palpate.sim import PRESETS, VERSION, WorldOptions, write_world
 from palpate.studies.making import fresh
 from palpate.studies.stages import Run
@@ -205,16 +205,7 @@ class Recipe:
         epochs = CLIP_EPOCHS * self.share
 
         def build(folder: Path) -> Mapping[str, Any]:
-            clip = train_clip(
-                train,
-                self._everything(train),
-                ENCODER,
-                folder / "training",
-                epochs=epochs,
-                seed=SEED,
-                cache=self.cache,
-                progress=self.progress,
-            )
+            clip = self._pair(train, ENCODER, folder, epochs)
             clip.save(fresh(folder / "clip"))
             return {"vision": clip.digest("vision"), "text": clip.digest("text")}
 
@@ -224,6 +215,13 @@ class Recipe:
             build,
         )
         return stage.folder / "clip"
+
+    def _pair(
+        self, train: Manifest, preset: EncoderPreset, folder: Path, epochs: float, **how: Any
+    ) -> ClipEncoders:
+        how |= {"seed": SEED, "cache": self.cache, "progress": self.progress}
+        part = self._everything(train)
+        return train_clip(train, part, preset, folder / "training", epochs=epochs, **how)
 
     def tactile(self) -> EncoderSet:
         """The pair and a tactile encoder that learns from it."""
@@ -269,18 +267,8 @@ class Recipe:
         train, epochs = Manifest.join(*parts), VISION_EPOCHS * self.share
 
         def build(folder: Path) -> Mapping[str, Any]:
-            clip = train_clip(
-                train,
-                self._everything(train),
-                VISION,
-                folder / "training",
-                epochs=epochs,
-                seed=SEED,
-                start=encoders.clip,
-                cache=self.cache,
-                compute=COMPUTE,
-                progress=self.progress,
-            )
+            how = {"start": encoders.clip, "compute": COMPUTE}
+            clip = self._pair(train, VISION, folder, epochs, **how)
             replace(encoders, clip=clip).save(fresh(folder / "encoders"))
             return {"vision": clip.digest("vision")}
 

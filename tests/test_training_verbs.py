@@ -64,6 +64,10 @@ def test_encoders_and_a_generator_from_the_command_line(data, tmp_path, capsys, 
     assert main(["generate", str(photo), "--model", "model", "-o", "t.png"]) == 0
     assert not [p.name for p in tmp_path.iterdir() if p.name.endswith(".work")]
     # From the command's own model: its encoders and autoencoder, and its record goes with it.
+    capsys.readouterr()
+    started = ["train", "generator", *common, "--start", "model", "--dry-run", "-o", "on"]
+    assert main(started) == 0
+    assert json.loads(capsys.readouterr().out)["parameters"] == facts["parameters"]
     assert (
         main(["train", "generator", *common, "--start", "model", "--steps", "1", "-o", "on"]) == 0
     )
@@ -150,15 +154,15 @@ def test_a_set_of_encoders_or_a_clip_conditions_a_generator(data, tmp_path):
         ),
         (
             lambda m, s: train_generator(m, s, make_encoders(), start="palpate/mini"),
-            "`start` must share autoencoder, vision encoder, schedule, condition",
+            "`start` must share autoencoder, vision encoder.*another vision encoder",
         ),
         (
             lambda m, s: train_generator(m, s, start="palpate/mini", source="text"),
-            "`source` must be left out with start, which is conditioned on both",
+            "another source and tokens",
         ),
         (
             lambda m, s: train_generator(m, s, start="palpate/mini", background=True),
-            "`background` must be left out with start, which sees no background",
+            "another background",
         ),
         (
             lambda m, s: train_generator(m, s, preset="sd15", unet="u", start="palpate/mini"),

@@ -696,7 +696,8 @@ def _require_readable(paths: Sequence[Path], argument: str = "photos") -> None:
     if bad := [Problem(str(path), "bad-image", reason) for path, reason in reasons if reason]:
         if len(paths) == 1:
             must, got = "must be an image that can be read", f"{paths[0]}: {bad[0].text}"
-            raise PalpateError(must, got, "Check the path", argument=argument)
+            fix = "Save it anew, or pass another" if paths[0].is_file() else "Check the path"
+            raise PalpateError(must, got, fix, argument=argument)
         raise ProblemsError(bad, FIX_PHOTOS, example={"skip_bad": True})
 
 

@@ -171,8 +171,8 @@ def train_generator(  # noqa: PLR0913 - a public verb
         progress: called while the work goes on.
 
     Raises:
-        PalpateError: if the train part is empty, a sample of it lacks an image or words, or models
-            are missing.
+        PalpateError: if the train part is empty, a sample of it lacks an image or words, models
+            are missing, or ``start`` does not fit what is given beside it.
     """
     if steps is not None and steps < 1:
         fix = "Leave it out for the preset's length"
@@ -180,9 +180,8 @@ def train_generator(  # noqa: PLR0913 - a public verb
     start = TactilePipeline.from_pretrained(start) if isinstance(start, str | Path) else start
     chosen = _chosen(preset, unet, start)
     if start is not None:
-        _require_left_out(start, source=source, background=background)
         clip, autoencoder = clip or start.encoders, autoencoder or start.autoencoder
-        background = start.denoiser.background
+        background = background or start.denoiser.background
     if autoencoder is None and chosen.autoencoder is None:
         if not isinstance(chosen.unet, str):
             raise _not_given("autoencoder", chosen)
@@ -257,17 +256,6 @@ def _chosen(
     return chosen
 
 
-def _require_left_out(start: TactilePipeline, *, source: Sources | None, background: bool) -> None:
-    """What the denoiser sees stays as it is."""
-    known = start.denoiser.policy.source
-    if source not in (None, known):
-        must = f"must be left out with start, which is conditioned on {known}"
-        raise PalpateError(must, str(source), "", argument="source")
-    if background and not start.denoiser.background:
-        must = "must be left out with start, which sees no background"
-        raise PalpateError(must, "given", "", argument="background")
-
-
 def _not_given(argument: str, preset: DiffusionPreset) -> PalpateError:
     must, fix = f"must be given for the preset {preset.name}", "Pass a folder, a hub id or a file"
     return PalpateError(must, "none", fix, argument=argument)
@@ -285,7 +273,7 @@ def plan_generator(
     background: bool = False,
     device: str = "auto",
 ) -> dict[str, Any]:
-    """What training the denoiser would take; only the manifest is read.
+    """What training the denoiser would take; only the manifest and ``start`` are read.
 
     Latents are taken as those of the preset's autoencoder, or of an f4 of three channels; with a
     trained U-Net of an f8 of four.
@@ -312,7 +300,7 @@ def plan_generator(
 
     def build() -> nn.Module:
         if start is not None:
-            return start.unet
+            return cast("nn.Module", UNet2DConditionModel.from_config(start.unet.config))
         if isinstance(chosen.unet, UNetOptions):
             return build_unet(chosen.unet, policy, channels=channels, size=side, background=wide)
         file = find_unet(str(chosen.unet))[1] / "config.json"
@@ -383,7 +371,7 @@ def train_pipeline(  # noqa: PLR0913, PLR0917 - one row per choice of the traini
         raise PalpateError(must, str(autoencoder.factor), fix, argument="autoencoder")
     policy = _policy(preset, encoders, source)
     if start is not None:
-        _require_same(start, encoders, autoencoder, preset.schedule, policy)
+        _require_same(start, encoders, autoencoder, preset.schedule, policy, background=background)
     where = pick_device(connect(device))
     encoders = encoders.to(where) if encoders is not None and policy.sources else None
     nn.Module.to(autoencoder, where)
@@ -601,6 +589,8 @@ def _require_same(
     autoencoder: AnyAutoencoder,
     schedule: Schedule,
     policy: ConditionPolicy,
+    *,
+    background: bool,
 ) -> None:
     """A denoiser goes on only in the space that it knows."""
     vision = start.encoders.digest("vision") if start.encoders else None
@@ -609,7 +599,8 @@ def _require_same(
         "autoencoder": (start.autoencoder.digest, autoencoder.digest),
         "vision encoder": (vision, _digests(encoders)["vision"]),
         "schedule": (start.schedule, schedule),
-        "condition": tuple(seen),
+        "source and tokens": tuple(seen),
+        "background": (start.denoiser.background, background),
     }
     if different := [name for name, (a, b) in pairs.items() if a != b]:
         must, got = f"must share {', '.join(pairs)}", f"another {', another '.join(different)}"

@@ -535,8 +535,8 @@ def train_clip(  # noqa: PLR0913 - as train_tactile
         The CLIP, frozen, with a card.
 
     Raises:
-        PalpateError: if the train part is empty or has one photo, or the preset takes a pretrained
-            CLIP, or has this course keep the best weights or stop early.
+        PalpateError: if the train part is empty or has one photo, ``start`` is no CLIP, or the
+            preset takes a pretrained CLIP, or has this course keep the best weights or stop early.
     """
     where, compute = pick_device(connect(device)), compute or Compute()
     train, side, missing = _pictured(_parts(manifest, split, held_out, seed)[0])

@@ -111,7 +111,7 @@ def model_card(about: Mapping[str, Any]) -> str:
     record = {
         k: _cut(v) for k, v in card.items() if k not in PLACED and v not in (None, {}, [], "")
     }
-    before = list(_before(card))
+    before = list(earlier(card))
     limits = [text for model in (card, *before) for text in model.get("limits", ())]
     sections = {
         "Scores": _table(card.get("scores")),
@@ -130,6 +130,13 @@ def model_card(about: Mapping[str, Any]) -> str:
     parts += [_code("python", form.usage.format(name=name))]
     parts += [f"## {title}\n\n{text}" for title, text in sections.items() if text]
     return "\n\n".join(parts) + "\n"
+
+
+def earlier(card: Mapping[str, Any]) -> Iterator[Mapping[str, Any]]:
+    """The cards, or records, of the models that a training went on from, the latest first."""
+    while before := card.get("start_record") or card.get("start_card"):
+        yield before
+        card = before
 
 
 def write_model_cards(folder: Path) -> list[Path]:
@@ -174,13 +181,6 @@ def _contents(folder: Path, models: Mapping[Path, Mapping[str, Any]]) -> str:
 
 def _card(about: Mapping[str, Any]) -> Mapping[str, Any]:
     return about.get("card", about.get("training")) or {}
-
-
-def _before(card: Mapping[str, Any]) -> Iterator[Mapping[str, Any]]:
-    """The cards of the models that a training went on from."""
-    while before := card.get("start_record") or card.get("start_card"):
-        yield before
-        card = before
 
 
 def _data(card: Mapping[str, Any]) -> Sequence[Mapping[str, Any]] | Mapping[str, Any]:
