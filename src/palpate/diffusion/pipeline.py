@@ -86,7 +86,7 @@ from palpate.encoders.models import (
     pick_device,
 )
 from palpate.encoders.preprocess import Preprocess, to_unit
-from palpate.training.cards import earlier, write_model_cards
+from palpate.training.cards import write_model_cards
 
 FORMAT = "palpate-pipeline/2"
 #: Format 1 called the encoders ``towers``; it is still read, and the digest still covers its name.
@@ -336,7 +336,10 @@ class TactilePipeline(DiffusionPipeline):
     @property
     def records(self) -> list[Mapping[str, Any]]:
         """How it was trained, then that of the generator which it went on from, and so on."""
-        return [self.training, *earlier(self.training)]
+        records: list[Mapping[str, Any]] = [self.training]
+        while before := records[-1].get("start_record"):
+            records.append(before)
+        return records
 
     @property
     def earlier_splits(self) -> list[str]:

@@ -111,7 +111,7 @@ def model_card(about: Mapping[str, Any]) -> str:
     record = {
         k: _cut(v) for k, v in card.items() if k not in PLACED and v not in (None, {}, [], "")
     }
-    before = list(earlier(card))
+    before = list(_earlier(card))
     limits = [text for model in (card, *before) for text in model.get("limits", ())]
     sections = {
         "Scores": _table(card.get("scores")),
@@ -132,7 +132,7 @@ def model_card(about: Mapping[str, Any]) -> str:
     return "\n\n".join(parts) + "\n"
 
 
-def earlier(card: Mapping[str, Any]) -> Iterator[Mapping[str, Any]]:
+def _earlier(card: Mapping[str, Any]) -> Iterator[Mapping[str, Any]]:
     """The cards, or records, of the models that a training went on from, the latest first."""
     while before := card.get("start_record") or card.get("start_card"):
         yield before
