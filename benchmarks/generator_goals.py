@@ -1,32 +1,42 @@
 """How near the generator that ships comes to real touches, on worlds that its training never saw.
 
     python recipes/mini.py --work runs/mini --only worlds      # what it was trained on
-    python benchmarks/generator_goals.py --materials 10 20 --seeds 0 1 2
+    python benchmarks/generator_goals.py --materials 10 20 --seeds 0 1 2 --trainings 0 1 2
 
 Worlds and judges are those of ``generator_ablation.py``, whose work folder is used: a small CNN
 that saw real images of another world alone, and the linear probe of ``palpate/mini``. Beside the
 generator stands the real image of the nearest photo of its own training: a judge knows none of
-these, as it knows none of the generated ones. Seeds are of the noise; there is one training. A
-measurement that is on record is not made again.
+these, as it knows none of the generated ones. Seeds are of the noise. Training 0 is the one that
+ships; others are trained as it was, with another seed, and kept in the work folder. A measurement
+that is on record is not made again.
 """
 
 import argparse
 import datetime
 import json
 import platform
+import sys
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
 import numpy as np
 import torch
-from generator_ablation import MANY, Study, by_video, line, percents
+from generator_ablation import MANY, Line, Study, by_video, line, percents
 
 from palpate.core import digest_json, rng_for, short, write_json
 from palpate.core.digest import facts
 from palpate.data.images import cached_images
 from palpate.data.manifest import Manifest
+from palpate.diffusion.autoencoders import load_autoencoder
 from palpate.diffusion.pipeline import TactilePipeline
+from palpate.diffusion.training import train_pipeline
 from palpate.encoders.embed import texts_of
+from palpate.encoders.encoder_set import EncoderSet
+from palpate.studies.making import fresh
+
+sys.path.append(str(Path(__file__).parents[1] / "recipes"))
+from mini import COMPUTE, GENERATOR, GENERATOR_STEPS
 
 NAME = "palpate/mini"
 #: Row -> what drives the generator.
@@ -37,6 +47,33 @@ DRIVES = {
     "by photo and caption": {"text": True},
     "by another sample's photo (control)": {"permuted": True},
 }
+
+
+#: What is measured of the other trainings.
+OF_TRAININGS = ("by photo", "by photo, on gels of its training")
+
+
+def trained(seed, world, work):
+    """The generator of a training as the recipe's, on the shipped encoders and autoencoder."""
+    if seed == 0:
+        return TactilePipeline.from_pretrained(NAME)
+    folder = work / f"training {seed}"
+    if not (folder / "model").is_dir():
+        pipeline = train_pipeline(
+            world,
+            Study.everything_of(world),
+            EncoderSet.load(NAME),
+            load_autoencoder(NAME),
+            GENERATOR,
+            folder / "training",
+            seed=seed,
+            steps=GENERATOR_STEPS,
+            cache=folder / "cache",
+            compute=COMPUTE,
+            progress=Line(),
+        )
+        pipeline.save(fresh(folder / "model"), half=True, shared=NAME)
+    return replace(TactilePipeline.from_pretrained(folder / "model"), sampler=GENERATOR.sampler)
 
 
 class Goals:

@@ -2,7 +2,7 @@
 
 ::
 
-    python benchmarks/training.py [--only encoded-once overhead processes embedding memory gpu]
+    python benchmarks/training.py [--only encoded-once overhead processes embedding memory]
 
 - ``encoded-once``: steps a second with frozen partners embedded once, over embedding them in each
   step (preset mini; wanted: 1.4).
@@ -15,14 +15,11 @@
 - ``memory``: peak memory of the process in a step of batch 256 of a ViT-Small in chunks of 8
   (wanted: below 6 GB), and how far loss and gradient are from the plain batch's at batch 16
   (wanted: 1e-4).
-- ``gpu``: where there is one: encoder and U-Net of the preset paper in steps of the engine, in
-  float32, with TF32, in bf16, and in bf16 with ``torch.compile``: images a second, share of the
-  device's peak at that precision (H200, H100 and A100; operations as done, with those that cached
-  gradients repeat), memory.
 
-Pairs are measured in turns, and the median ratio is printed: other work on the machine then
-disturbs both. ``ratio`` is of processor seconds (one thread), which other work hardly changes; for
-``processes`` it is by the clock, since waiting for the other process takes no processor time.
+What steps cost on a GPU: ``benchmarks/gpu.py``. Pairs are measured in turns, and the median ratio
+is printed: other work on the machine then disturbs both. ``ratio`` is of processor seconds (one
+thread), which other work hardly changes; for ``processes`` it is by the clock, since waiting for
+the other process takes no processor time.
 """
 
 from __future__ import annotations
@@ -38,45 +35,26 @@ import sys
 import tempfile
 import time
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import numpy as np
 import torch
-from torch.utils.flop_counter import FlopCounterMode
 
 from palpate.core import quiet, rng_for
-from palpate.diffusion.autoencoder import LatentStats
-from palpate.diffusion.denoiser import Denoiser, build_unet
-from palpate.diffusion.presets import preset_named
-from palpate.diffusion.training import DiffusionLoss
 from palpate.encoders.contrastive import TactileLoss, TactileModel, new_clip
 from palpate.encoders.embed import embed_images
-from palpate.encoders.encoder_set import EncoderSet, Preprocess, encode_tactile, new_tactile
+from palpate.encoders.encoder_set import EncoderSet, Preprocess, new_tactile
 from palpate.encoders.losses import ALL_PAIRS, Labels, in_chunks, three_way
 from palpate.encoders.preprocess import to_unit
 from palpate.encoders.presets import preset
 from palpate.encoders.rows import Rows, augmented, draw, numbers, unit
-from palpate.training.engine import Losses, Task, fit
-from palpate.training.options import Compute, LoopOptions, RowOrder
+from palpate.training.engine import Task, fit
+from palpate.training.options import Compute, RowOrder
 from palpate.training.steps import Step
 
 MINI = preset("mini")
-#: TFLOP/s of dense products by the data sheets (SXM), by the precision of the factors.
-PEAKS = {
-    "H200": {"float32": 67, "tf32": 495, "bf16": 989},
-    "H100 80GB HBM3": {"float32": 67, "tf32": 495, "bf16": 989},
-    "A100": {"float32": 19.5, "tf32": 156, "bf16": 312},
-}
-#: Of the part gpu: the precision of the products, and how the engine is run.
-MODES = {
-    "float32": ("float32", Compute(tf32=False, checkpoint_minutes=1e9)),
-    "tf32": ("tf32", Compute(checkpoint_minutes=1e9)),
-    "bf16": ("bf16", Compute(precision="bf16", checkpoint_minutes=1e9)),
-    "bf16 + compile": ("bf16", Compute(precision="bf16", compile=True, checkpoint_minutes=1e9)),
-}
 WORDS = ["rough", "smooth", "soft", "hard", "grained", "ribbed", "woven", "sharp", "flat", "warm"]
 
 
@@ -339,93 +317,12 @@ def memory(batch=256, chunk=8):
     }
 
 
-def paper_encoder(chosen, batch, chunk):
-    """The tactile encoder, its loss against fixed partners, and the data of a batch."""
-    model = new_tactile(chosen.tactile_config(chosen.dim), 0)
-    data = {"pixels": torch.randn(batch, 3, chosen.image, chosen.image)}
-    data |= {name: torch.randn(batch, chosen.dim) for name in ("text", "vision")}
-
-    def loss(module, batch):
-        embedded = in_chunks(partial(encode_tactile, module), batch["pixels"], chunk)
-        labels = Labels(torch.arange(len(embedded), device=embedded.device))
-        return Losses(three_way(embedded, batch["text"], batch["vision"], 10.0, labels)[0])
-
-    return model, loss, lambda step: {name: rows[step.rows] for name, rows in data.items()}
-
-
-def paper_unet(chosen, batch, _):
-    """The denoiser, its loss, and the data of a batch of latents of an f4 of three channels."""
-    side, policy = chosen.size // 4, chosen.condition
-    model = Denoiser(build_unet(chosen.unet, policy, channels=3, size=side), policy)
-    latents = torch.randn(batch, 3, side, side)
-    tokens = {source: model.null_tokens(batch).clone() for source in policy.sources}
-    how = {"stats": LatentStats.of(latents), "schedule": chosen.schedule, "policy": policy}
-    loss = DiffusionLoss(latents, tokens, None, **how)
-    return model, loss, loss.load
-
-
-def gpu_steps(built, batch, compute, device, steps=8):
-    """Seconds of a step of the engine, operations of a row with all repetitions, peak memory."""
-    model, loss, load = built
-    model.to(device)
-    few = {name: rows.to(device) for name, rows in load(Step(0, np.arange(2), 0)).items()}
-    with FlopCounterMode(display=False) as counter:
-        loss(model, few).total.backward()
-    at, cuda = [], device == "cuda"
-
-    def progress(what, done, total, remark=""):
-        if cuda:
-            torch.cuda.synchronize()
-        at.append(time.perf_counter())
-
-    if cuda:
-        torch.cuda.reset_peak_memory_stats()
-    options = LoopOptions(steps, batch, 1e-6, warmup=0, ema=0.9999)
-    with tempfile.TemporaryDirectory() as folder:
-        task = Task("benchmark", batch, load, loss)
-        fit(model, task, options, Path(folder), compute=compute, progress=progress)
-    peak = torch.cuda.max_memory_allocated() / 1e9 if cuda else None
-    return float(np.median(np.diff(at)[2:])), counter.get_total_flops() / 2, peak
-
-
-def gpu(device="cuda", encoder="paper", denoiser="paper", batches=(256, 32), chunk=32):
-    """The encoder and the U-Net of the preset paper, plain and as fast as they go.
-
-    The device, the presets and the batches are for tries without a GPU.
-    """
-    if device == "cuda" and not torch.cuda.is_available():
-        return {"skipped": "no CUDA device here"}
-    name = torch.cuda.get_device_name() if device == "cuda" else device
-    peaks = next((p for known, p in PEAKS.items() if known in name), {})
-    models = {
-        "encoder": (paper_encoder, preset(encoder), batches[0]),
-        "unet": (paper_unet, preset_named(denoiser), batches[1]),
-    }
-    result: dict = {"device": name}
-    for what, (build, chosen, batch) in models.items():
-        for mode, (peak_of, compute) in MODES.items():
-            rows = min(chunk, batch // 2)  # chunks in both counts of operations
-            built = build(chosen, batch, rows if batch > rows else None)
-            seconds, operations, memory = gpu_steps(built, batch, compute, device)
-            rate = operations * batch / seconds / 1e12
-            share = rate / peaks[peak_of] if peaks else None
-            result[f"{what}, {mode}"] = {
-                "images_a_second": batch / seconds,
-                "TFLOP_a_second": rate,
-                "share_of_peak": share,
-                "peak_GB": memory,
-                "batch": batch,
-            }
-    return result
-
-
 PARTS = {
     "encoded-once": encoded_once,
     "overhead": overhead,
     "processes": processes,
     "embedding": embedding,
     "memory": memory,
-    "gpu": gpu,
 }
 
 

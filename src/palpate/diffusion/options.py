@@ -214,7 +214,7 @@ class SamplerOptions:
         steps: network evaluations per sample (two each under guidance).
         guidance: s; 1 means none.
         batch: samples at once; results do not depend on it (up to rounding).
-        low, high: guide only at times t / T in (low, high] (Kynkaanniemi et al. 2024).
+        low, high: guide only at times t / T in [low, high] (Kynkaanniemi et al. 2024).
         rescale: share phi of the guidance rescaling of Lin et al. (2024), which pulls the spread of
             the guided prediction back to that of the conditional one; 0 is the plain formula.
     """

@@ -823,7 +823,7 @@ def sample(  # noqa: PLR0913 - one row per part
         z = z.to(tokens.device) * getattr(scheduler, "init_noise_sigma", 1.0)
         for k, t in enumerate(scheduler.timesteps):
             times, empty = t.expand(len(z)), null.expand(given.shape)
-            inside = options.low < float(t) / schedule.steps <= options.high
+            inside = options.low <= float(t) / schedule.steps <= options.high
             here = options if inside else replace(options, guidance=1.0)
             scaled = scheduler.scale_model_input(z, t) if scales else z
             prediction = guided(predict, scaled, times, given, empty, ground, here)

@@ -1,0 +1,373 @@
+"""What the presets made for GPUs cost on one: training steps and sampling, plain and fast.
+
+    python benchmarks/gpu.py --write docs/studies/gpu.md
+    python benchmarks/gpu.py --device cpu --small      # a try of the code without a GPU
+
+- ``train``: the tactile encoder of ``paper``, and the U-Nets of ``paper`` and ``sd15``, in steps of
+  the training engine: in float32, with TF32, in bf16, and in bf16 with ``torch.compile``.
+- ``sample``: ``paper`` (DDIM, 200 steps) and ``sd15`` (DPM-Solver++, 25), guided, with their
+  autoencoders: by a plain float32 loop of diffusers' parts, and by the pipeline in the same modes.
+
+Weights are random, in the published sizes: what a step costs does not depend on them. Operations
+are counted by PyTorch (with those that cached gradients repeat); the share is that of the device's
+peak by its data sheet, at the precision of the factors. Rows end in the records beside the page: of
+the same device and the same torch they are not measured again.
+"""
+
+import argparse
+import datetime
+import gc
+import json
+import os
+import platform
+import tempfile
+import time
+from contextlib import suppress
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import torch
+from diffusers import AutoencoderKL, UNet2DConditionModel, VQModel
+from torch.utils.flop_counter import FlopCounterMode
+
+from palpate.core import write_json
+from palpate.diffusion.autoencoder import Autoencoder, LatentStats
+from palpate.diffusion.denoiser import Denoiser, build_unet
+from palpate.diffusion.pipeline import TactilePipeline, build_scheduler, starting_noise
+from palpate.diffusion.presets import preset_named
+from palpate.diffusion.training import DiffusionLoss
+from palpate.encoders.encoder_set import encode_tactile, new_tactile
+from palpate.encoders.losses import Labels, in_chunks, three_way
+from palpate.encoders.presets import preset as encoder_preset
+from palpate.training.engine import Losses, Task, fit
+from palpate.training.options import Compute, LoopOptions
+from palpate.training.steps import Step
+
+#: TFLOP/s of dense products by the data sheets (SXM), by the precision of the factors.
+PEAKS = {
+    "H200": {"float32": 67, "tf32": 495, "bf16": 989},
+    "H100 80GB HBM3": {"float32": 67, "tf32": 495, "bf16": 989},
+    "A100": {"float32": 19.5, "tf32": 156, "bf16": 312},
+}
+#: The precision of the products, and whether the network is compiled.
+MODES = {
+    "float32": ("float32", False),
+    "tf32": ("tf32", False),
+    "bf16": ("bf16", False),
+    "bf16 + compile": ("bf16", True),
+}
+PLAIN = "float32, plain loop of diffusers"
+#: The latents that Stable Diffusion's U-Net and autoencoder, and latent diffusion's f4, agree on.
+LEVELS = {"paper": (128, 256, 512), "sd15": (128, 256, 512, 512)}
+
+
+class EnoughError(Exception):
+    """As many steps as are timed; a checkpoint of gigabytes is not written."""
+
+
+def synchronized():
+    """The clock, once the device has done all it was given."""
+    if torch.cuda.is_available():
+        torch.cuda.synchronize()
+    return time.perf_counter()
+
+
+def denoiser(name, chosen):
+    """The untrained denoiser of a preset; of ``sd15`` in the geometry of Stable Diffusion 1.5."""
+    policy, side = chosen.condition, chosen.size // 2 ** (len(LEVELS[name]) - 1)
+    if chosen.unet is not None:
+        return Denoiser(build_unet(chosen.unet, policy, channels=3, size=side), policy), side
+    unet = UNet2DConditionModel(cross_attention_dim=policy.width, sample_size=side)
+    return Denoiser(unet, policy), side
+
+
+def encoder_steps(chosen, batch, chunk):
+    """The tactile encoder, its loss against fixed partners, and the data of a batch."""
+    model = new_tactile(chosen.tactile_config(chosen.dim), 0)
+    data = {"pixels": torch.randn(batch, 3, chosen.image, chosen.image)}
+    data |= {name: torch.randn(batch, chosen.dim) for name in ("text", "vision")}
+
+    def loss(module, batch):
+        embedded = in_chunks(partial(encode_tactile, module), batch["pixels"], chunk)
+        labels = Labels(torch.arange(len(embedded), device=embedded.device))
+        return Losses(three_way(embedded, batch["text"], batch["vision"], 10.0, labels)[0])
+
+    return model, loss, lambda step: {name: rows[step.rows] for name, rows in data.items()}
+
+
+def denoiser_steps(name, chosen, batch):
+    """The denoiser, its loss, and the data of a batch of latents."""
+    model, side = denoiser(name, chosen)
+    policy = model.policy
+    latents = torch.randn(batch, model.channels, side, side)
+    tokens = {source: torch.randn(batch, 1, policy.width) for source in policy.sources}
+    states = {"words": torch.randn(batch, policy.words, policy.width)} if policy.words else {}
+    how = {"stats": LatentStats.of(latents), "schedule": chosen.schedule, "policy": policy}
+    loss = DiffusionLoss(latents, tokens, None, inputs=states, **how)
+    return model, loss, loss.load
+
+
+def steps(built, batch, device, mode, count):
+    """Seconds of a step of the engine, operations of a row with all repetitions, peak memory."""
+    model, loss, load = built
+    model.to(device)
+    few = {name: rows.to(device) for name, rows in load(Step(0, np.arange(2), 0)).items()}
+    with FlopCounterMode(display=False) as counter:
+        loss(model, few).total.backward()
+    at = []
+
+    def progress(what, done, total, remark=""):
+        at.append(synchronized())
+        if done == count:
+            raise EnoughError
+
+    precision, compiled = MODES[mode]
+    compute = Compute(
+        precision="bf16" if precision == "bf16" else "float32",
+        tf32=precision != "float32",
+        compile=compiled,
+        checkpoint_minutes=1e9,
+    )
+    if device == "cuda":
+        torch.cuda.reset_peak_memory_stats()
+    options = LoopOptions(count + 1, batch, 1e-6, warmup=0, ema=0.9999)
+    with tempfile.TemporaryDirectory() as folder:
+        task = Task("benchmark", batch, load, loss)
+        with suppress(EnoughError):
+            fit(model, task, options, Path(folder), compute=compute, progress=progress)
+    return float(np.median(np.diff(at)[2:])), counter.get_total_flops() / 2
+
+
+def generator(name, chosen, device):
+    """The pipeline of a preset, with random weights."""
+    model, _ = denoiser(name, chosen)
+    levels = LEVELS[name]
+    sizes = {
+        "down_block_types": ("DownEncoderBlock2D",) * len(levels),
+        "up_block_types": ("UpDecoderBlock2D",) * len(levels),
+        "block_out_channels": levels,
+        "layers_per_block": 2,
+        "latent_channels": model.channels,
+    }
+    net = AutoencoderKL(**sizes) if name == "sd15" else VQModel(**sizes)
+    ones = (1.0,) * model.channels
+    return TactilePipeline(
+        autoencoder=Autoencoder(net.eval().requires_grad_(False)),
+        denoiser=model.eval().requires_grad_(False),
+        stats=LatentStats((0.0,) * model.channels, ones, "one"),
+        schedule=chosen.schedule,
+        sampler=chosen.sampler,
+        size=chosen.size,
+    ).to(device)
+
+
+@torch.no_grad()
+def plain_loop(pipeline, rows, ids, count, at):
+    """The shortest loop of diffusers' parts that makes the same images."""
+    tokens = pipeline.denoiser.condition(rows)
+    both = torch.cat([pipeline.denoiser.null_tokens(1).expand(tokens.shape), tokens])
+    scheduler = build_scheduler(pipeline.schedule, pipeline.sampler.method)
+    scheduler.set_timesteps(count, device=tokens.device)
+    z = starting_noise(ids, pipeline._latent, 0).to(tokens.device)
+    for t in scheduler.timesteps:
+        out = pipeline.unet(torch.cat([z, z]), t, both, return_dict=False)[0]
+        without, given = out.chunk(2)
+        prediction = without + pipeline.sampler.guidance * (given - without)
+        z = scheduler.step(prediction, t, z, return_dict=False)[0]
+        at.append(synchronized())
+    return pipeline.autoencoder.decode(z)
+
+
+def sampling(name, chosen, device, mode, batch, count):
+    """Seconds of a sampler step and of decoding a batch, and operations of an image's step."""
+    precision = MODES.get(mode, ("float32", False))[0]
+    torch.backends.cuda.matmul.allow_tf32 = precision != "float32"
+    torch.backends.cudnn.allow_tf32 = precision != "float32"
+    pipeline = generator(name, chosen, device)
+    rows, ids = torch.randn(batch, pipeline.denoiser.policy.width), [*map(str, range(batch))]
+    with FlopCounterMode(display=False) as counter:
+        pipeline.sample(rows[:1], ids[:1], seed=0, sampler=pipeline.sampler_with(steps=1, batch=1))
+    decoding = FlopCounterMode(display=False)
+    with decoding:
+        pipeline.autoencoder.decode(torch.randn(1, *pipeline._latent))
+    operations = counter.get_total_flops() - decoding.get_total_flops()
+    if precision == "bf16":
+        pipeline.to(torch.bfloat16)
+    if MODES.get(mode, ("", False))[1]:
+        pipeline.unet = torch.compile(pipeline.unet)
+
+    def run(count):
+        at = [synchronized()]
+        if mode == PLAIN:
+            plain_loop(pipeline, rows, ids, count, at)
+        else:
+            sampler = pipeline.sampler_with(steps=count, batch=batch)
+            pipeline.sample(
+                rows,
+                ids,
+                seed=0,
+                sampler=sampler,
+                on_step=lambda k, t, z: (at.append(synchronized()), z)[1],
+            )
+        return np.array(at), synchronized()
+
+    run(2)
+    if device == "cuda":
+        torch.cuda.reset_peak_memory_stats()
+    at, end = run(count)
+    return float(np.median(np.diff(at)[1:])), float(end - at[-1]), operations
+
+
+class Bench:
+    """All that is measured, in rows that are printed and kept as they come."""
+
+    def __init__(self, device, small, output, modes=MODES):
+        self.device, self.small, self.output, self.modes = device, small, output, modes
+        self.record = {
+            "device": torch.cuda.get_device_name() if device == "cuda" else platform.machine(),
+            "cores": os.cpu_count(),
+            "torch": torch.__version__,
+            "python": platform.python_version(),
+            "rows": [],
+        }
+        file = output and output.with_suffix(".json")
+        if file and file.is_file():
+            known = json.loads(file.read_text())
+            if all(known[key] == self.record[key] for key in ("device", "torch")):
+                self.record = known
+        name = self.record["device"]
+        self.peaks = next((p for known, p in PEAKS.items() if known in name), {})
+
+    def row(self, what, mode, batch, measure):
+        """Images a second of one row, or that it does not fit."""
+        row = {"what": what, "mode": mode, "batch": batch}
+        if any(row.items() <= known.items() for known in self.record["rows"]):
+            return
+        began = time.perf_counter()
+        gc.collect()
+        torch._dynamo.reset()
+        if self.device == "cuda":
+            torch.cuda.empty_cache()
+        try:
+            seconds, operations, more = measure()
+        except torch.OutOfMemoryError:
+            row["note"] = "out of memory"
+        else:
+            rate = operations * batch / seconds / 1e12
+            row |= {"seconds": seconds, "images": batch / more.pop("whole", seconds)}
+            row |= {"TFLOP/s": rate, **more}
+            if peak := self.peaks.get(MODES.get(mode, ("float32",))[0]):
+                row["share"] = rate / peak
+            if self.device == "cuda":
+                row["GB"] = torch.cuda.max_memory_allocated() / 1e9
+        row["all"] = time.perf_counter() - began
+        self.record["rows"].append(row)
+        self.record["date"] = datetime.date.today().isoformat()
+        print(json.dumps(row), flush=True)
+        if self.output:
+            write_json(self.output.with_suffix(".json"), self.record)
+            self.output.write_text(page(self.record), encoding="utf-8")
+
+    def train(self, what):
+        """One model in the requested modes."""
+        for mode in self.modes:
+            if what == "encoder of paper":
+                batch, chosen = (4, "mini") if self.small else (256, "paper")
+                chunk = 2 if self.small else 32
+                make = partial(encoder_steps, encoder_preset(chosen), batch, chunk)
+            else:
+                batch, name = 4 if self.small else 32, what.split()[-1]
+                make = partial(denoiser_steps, name, self.preset(name), batch)
+
+            def measure(make=make, batch=batch, mode=mode):
+                return *steps(make(), batch, self.device, mode, 8), {}
+
+            self.row(f"training, {what}", mode, batch, measure)
+
+    def preset(self, name):
+        """The preset, or in a try a tiny one in its place."""
+        chosen = preset_named("tiny" if self.small else name)
+        return replace(chosen, schedule=replace(chosen.schedule, prediction="epsilon"))
+
+    def sample(self, name):
+        """One generator in the requested modes, and by the plain loop."""
+        chosen, batch, count = self.preset(name), 2 if self.small else 16, 4 if self.small else 10
+        for mode in (PLAIN, *self.modes):
+
+            def measure(mode=mode):
+                one = sampling(name, chosen, self.device, mode, batch, count)
+                step, decode, operations = one
+                whole = chosen.sampler.steps * step + decode
+                return step, operations, {"whole": whole, "decode": decode}
+
+            self.row(f"sampling, {name}", mode, batch, measure)
+
+
+PARTS = {
+    "train paper": lambda bench: bench.train("U-Net of paper"),
+    "train sd15": lambda bench: bench.train("U-Net of sd15"),
+    "sample paper": lambda bench: bench.sample("paper"),
+    "sample sd15": lambda bench: bench.sample("sd15"),
+    "train encoder": lambda bench: bench.train("encoder of paper"),
+}
+
+
+def page(record):
+    """The whole Markdown file."""
+    lines, first = [], {}
+    modes = [PLAIN, *MODES]
+    for row in sorted(record["rows"], key=lambda r: (r["what"], modes.index(r["mode"]))):
+        cells = [row["what"], row["mode"], row["batch"]]
+        if "note" in row:
+            cells += [row["note"]]
+        else:
+            base = first.setdefault(row["what"], row["images"])
+            ratio = f"{row['images'] / base:.2f}"
+            share = f"{100 * row['share']:.0f} %" if "share" in row else ""
+            memory = f"{row['GB']:.1f}" if "GB" in row else ""
+            cells += [f"{1000 * row['seconds']:.0f}", f"{row['images']:.3g}", ratio]
+            cells += [f"{row['TFLOP/s']:.0f}", share, memory, f"{row['all']:.0f}"]
+        lines.append(f"| {' | '.join(map(str, cells))} |")
+    return f"""# On one GPU: speed
+
+Made by a committed command; do not edit by hand. **{record["device"]}**,
+{record["cores"]} processor cores, torch {record["torch"]}, Python {record["python"]};
+{record["date"]}.
+
+    python benchmarks/gpu.py --write docs/studies/gpu.md
+
+Random weights in the published sizes: `paper` (406 M parameters; its `vq-f4`; 256 px), `sd15` (the
+geometry of Stable Diffusion 1.5, 860 M; its `kl-f8`; 256 px), and the tactile encoder of `paper`
+(ViT-Large) in chunks of 32. A training step has optimizer and moving average. A sampled image takes
+the preset's steps (`paper` 200, `sd15` 25), each of two passes; ten are timed, their median stands
+for all, and decoding comes on top. Compiling comes before what is timed, and is in the seconds in
+all. The ratio is to the first row of the same work, the share that of the device's peak by its data
+sheet, at that precision. Rows that are not there have not been measured.
+
+| what | mode | batch | ms a step | images a second | ratio | TFLOP/s | of peak | GB | s in all |
+|---|---|---|---|---|---|---|---|---|---|
+{chr(10).join(lines)}
+"""
+
+
+def main():
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--only", nargs="+", choices=[*PARTS], default=[*PARTS], metavar="PART")
+    parser.add_argument("--modes", nargs="+", choices=[*MODES], default=[*MODES], metavar="MODE")
+    parser.add_argument("--device", default="cuda")
+    parser.add_argument("--small", action="store_true", help="tiny models: a try of the code")
+    parser.add_argument("--write", type=Path, help="the page, kept up to date row by row")
+    chosen = parser.parse_args()
+    if chosen.device == "cuda" and not torch.cuda.is_available():
+        parser.exit(2, "There is no CUDA device here; --device cpu --small tries the code.\n")
+    bench = Bench(chosen.device, chosen.small, chosen.write, chosen.modes)
+    for name in chosen.only:
+        PARTS[name](bench)
+    if chosen.write:
+        chosen.write.write_text(page(bench.record), encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()
