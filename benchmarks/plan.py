@@ -8,8 +8,8 @@ Operations of a forward pass are counted layer by layer (a multiplication and an
 a training step is three of them, a guided sample two a sampler step. How many trainings, images and
 features the study makes is counted from its own stages. Seconds are operations over
 ``--share`` of ``--peak`` (TFLOP/s; 989 is an H100 in bf16, of which the U-Net's training reached
-17 %): measure yours with ``python benchmarks/gpu.py``, and put its share here. Reading and decoding come on top where
-they cannot keep up. Prints the tables of docs/start/plan.md.
+17 %): measure yours with ``python benchmarks/gpu.py``, and put its share here. Reading and decoding
+come on top where they cannot keep up. Prints the tables of docs/start/plan.md.
 """
 
 from __future__ import annotations

@@ -37,15 +37,18 @@ class Counted:
 
 
 @pytest.mark.parametrize("change", [{}, {"guidance": 1.0}, {"low": 0.2, "high": 0.8}])
-def test_evaluations_are_those_of_the_call(files, change):
+@pytest.mark.parametrize("method", ["dpm", "ddim"])
+def test_evaluations_are_those_of_the_call(files, change, method):
     pipeline = make_pipeline()
-    chosen = {"steps": 6, "guidance": 2.0, "batch": 10} | change
+    chosen = {"method": method, "steps": 6, "guidance": 2.0, "batch": 10} | change
     pipeline.sampler = replace(pipeline.sampler, **chosen)
     needed = estimate(files, model=pipeline)
     counted = Counted(pipeline)
     generate(files, model=pipeline)
     assert (needed.images, needed.missing, needed.steps) == (20, 20, 6)
     assert needed.evaluations == counted.count
+    if not change:  # two passes in every step: the last one of dpm, at t = 0, too
+        assert counted.count == 20 * 6 * 2
     assert needed.seconds > 0
 
 

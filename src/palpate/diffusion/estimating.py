@@ -134,5 +134,5 @@ def _work(run: Run, steps: int) -> tuple[int, int]:
     scheduler.set_timesteps(steps)
     times = [float(t) / model.schedule.steps for t in scheduler.timesteps]
     guided = sampler.guidance not in (0.0, 1.0)
-    twice = sum(sampler.low < t <= sampler.high for t in times) if guided else 0
+    twice = sum(sampler.low <= t <= sampler.high for t in times) if guided else 0
     return len(times), len(times) + twice
