@@ -49,6 +49,7 @@ DRIVES = {
 }
 
 
+NEAREST = "real, of the nearest photo of its training"
 #: What is measured of the other trainings.
 OF_TRAININGS = ("by photo", "by photo, on gels of its training")
 
@@ -124,12 +125,15 @@ class Goals:
         """Of the newest measurement."""
         return max(r["day"] for seeds in self.record.values() for r in seeds.values())
 
-    def section(self):
-        """Markdown of this world."""
+    def section(self, trainings):
+        """Markdown of this world; ``trainings``: seed -> the record of another training."""
         materials, videos = self.study.materials, self.study.videos
         head = f"## {materials} materials (chance {100 / materials:.0f} %)"
         size = f"{len(self.study.test)} samples of {len(set(videos))} videos."
-        return f"{head}\n\n{size}\n\n{table(self.record, videos)}\n"
+        parts = [head, size, table(self.record, videos)]
+        if trainings:
+            parts.append(of_trainings({0: self.record, **trainings}, videos))
+        return "\n\n".join(parts) + "\n"
 
 
 def table(record, videos):
@@ -149,6 +153,26 @@ def table(record, videos):
         lead = "" if name == "by photo" else percents(ahead)
         far = f"{far[0]:.3f} [{far[1]:.3f}, {far[2]:.3f}]"
         lines.append(line(name, len(seeds), *shares, lead, percents(probe), far))
+    return "\n".join(lines)
+
+
+def of_trainings(records, videos):
+    """Markdown of several trainings, the noise of each of one seed, and of their mean."""
+    shipped = records[0]
+    real, near = (np.array(shipped[name]["0"]["hits"]) for name in ("real", NEAREST))
+
+    def rows(name):
+        return np.array([r[name][str(seed)]["hits"] for seed, r in records.items()], float)
+
+    own, known = map(rows, OF_TRAININGS)
+    heads = "by photo, training", "CNN, %", "of real", "ahead of the nearest", "lost by new gels"
+    lines = [line(*heads), "|---" * len(heads) + "|"]
+    each = zip([*records, "mean"], [*own, own.mean(0)], [*known, known.mean(0)], strict=True)
+    for name, hits, on_known in each:
+        cnn = by_video(hits, videos)
+        cells = percents(cnn), f"{cnn[0] / real.mean():.2f}"
+        others = (by_video(d, videos) for d in (hits - near, on_known - hits))
+        lines.append(line(name, *cells, *map(percents, others)))
     return "\n".join(lines)
 
 
@@ -175,6 +199,7 @@ def main():
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--materials", type=int, nargs="+", default=[10, 20])
     parser.add_argument("--seeds", type=int, nargs="+", default=[0])
+    parser.add_argument("--trainings", type=int, nargs="+", default=[0])
     parser.add_argument("--work", type=Path, default=Path("runs/generator_ablation"))
     parser.add_argument("--trained-on", type=Path, default=Path("runs/mini"))
     parser.add_argument(
@@ -191,14 +216,22 @@ def main():
         goals = Goals(study, known, pipeline.digest, facts(pipeline.sampler))
         goals.take(pipeline)
         goals.measure("real", 0, lambda s=study: s.real)
-        goals.measure("real, of the nearest photo of its training", 0, goals.nearest)
+        goals.measure(NEAREST, 0, goals.nearest)
         through = partial(study.reconstructed, pipeline.autoencoder)
         goals.measure("through its autoencoder", 0, through)
         for seed in chosen.seeds:
             for name, drive in DRIVES.items():
                 goals.measure(name, seed, partial(goals.generated, seed, **drive))
+        others = {}
+        for seed in sorted(set(chosen.trainings) - {0}):
+            other = trained(seed, known[0], chosen.work)
+            of = Goals(study, known, other.digest, facts(other.sampler))
+            of.take(other)
+            for name in OF_TRAININGS:
+                of.measure(name, seed, partial(of.generated, seed, **DRIVES[name]))
+            others[seed] = of.record
         days.append(goals.day())
-        parts.append(goals.section())
+        parts.append(goals.section(others))
     chosen.page.write_text(page(parts, max(days)))
     print(chosen.page.read_text())
 
