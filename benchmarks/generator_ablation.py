@@ -9,9 +9,9 @@ The autoencoder is that of palpate/mini where a row names no other. Judges see r
 training and nothing else, and are never fitted again: a small CNN, and the linear probe of the
 tactile encoder of palpate/mini. Driven by the photo, by the sample's own caption, and by photos in
 permuted order (a control). The oracle is told the material itself, one-hot, in training and in
-place of the photo: what it misses, no better condition would mend. Every row ends in the records
-beside the page, which grow run by run: a row that is there is not trained again, and a training
-that was stopped goes on. Losers stay.
+place of the photo: what it misses is not for want of knowing the material. Every row ends in the
+records beside the page, which grow run by run: a row that is there is not trained again, and a
+training that was stopped goes on. Losers stay.
 """
 
 import argparse

@@ -125,7 +125,7 @@ class Goals:
         """Of the newest measurement."""
         return max(r["day"] for seeds in self.record.values() for r in seeds.values())
 
-    def section(self, trainings):
+    def section(self, trainings=()):
         """Markdown of this world; ``trainings``: seed -> the record of another training."""
         materials, videos = self.study.materials, self.study.videos
         head = f"## {materials} materials (chance {100 / materials:.0f} %)"

@@ -9,9 +9,9 @@
   autoencoders: by a plain float32 loop of diffusers' parts, and by the pipeline in the same modes.
 
 Weights are random, in the published sizes: what a step costs does not depend on them. Operations
-are counted by PyTorch (with those that cached gradients repeat); the share is that of the device's
-peak by its data sheet, at the precision of the factors. Rows end in the records beside the page: of
-the same device and the same torch they are not measured again.
+are counted by PyTorch (without those that cached gradients repeat); the share is that of the
+device's peak by its data sheet, at the precision of the factors. Rows end in the records beside the
+page: of the same device and the same torch they are not measured again.
 """
 
 import argparse
@@ -109,7 +109,7 @@ def denoiser_steps(name, chosen, batch):
 
 
 def steps(built, batch, device, mode, count):
-    """Seconds of a step of the engine, operations of a row with all repetitions, peak memory."""
+    """Seconds of a step of the engine, and operations of a row."""
     model, loss, load = built
     model.to(device)
     few = {name: rows.to(device) for name, rows in load(Step(0, np.arange(2), 0)).items()}
@@ -336,9 +336,10 @@ Made by a committed command; do not edit by hand. **{record["device"]}**,
 
     python benchmarks/gpu.py --write docs/studies/gpu.md
 
-Random weights in the published sizes: `paper` (406 M parameters; its `vq-f4`; 256 px), `sd15` (the
-geometry of Stable Diffusion 1.5, 860 M; its `kl-f8`; 256 px), and the tactile encoder of `paper`
-(ViT-Large) in chunks of 32. A training step has optimizer and moving average. A sampled image takes
+Random weights in the published sizes: `paper` (406 M parameters; a `vq-f4`, with 256 codes;
+256 px), `sd15` (the geometry of Stable Diffusion 1.5, 860 M; its `kl-f8`; 256 px), and the encoder
+of tactile images of `paper` (ViT-Large) in chunks of 32. A training step has optimizer and moving
+average. A sampled image takes
 the preset's steps (`paper` 200, `sd15` 25), each of two passes; ten are timed, their median stands
 for all, and decoding comes on top. Compiling comes before what is timed, and is in the seconds in
 all. The ratio is to the first row of the same work, the share that of the device's peak by its data

@@ -221,7 +221,7 @@ ON_DISK: Mapping[str, Preset] = {
         clip="openai/clip-vit-large-patch14",
         precision="bf16",
         ruler=None,
-        cost="counted: 6.8 hours of an H100 a seed on Touch and Go",
+        cost="counted: at least 12 hours of an H100 a seed on Touch and Go",
         seconds=(3600, 1800, 700),
     ),
 }
