@@ -336,14 +336,14 @@ Made by a committed command; do not edit by hand. **{record["device"]}**,
 
     python benchmarks/gpu.py --write docs/studies/gpu.md
 
-Random weights in the published sizes: `paper` (406 M parameters; a `vq-f4`, with 256 codes;
-256 px), `sd15` (the geometry of Stable Diffusion 1.5, 860 M; its `kl-f8`; 256 px), and the encoder
-of tactile images of `paper` (ViT-Large) in chunks of 32. A training step has optimizer and moving
-average. A sampled image takes
-the preset's steps (`paper` 200, `sd15` 25), each of two passes; ten are timed, their median stands
-for all, and decoding comes on top. Compiling comes before what is timed, and is in the seconds in
-all. The ratio is to the first row of the same work, the share that of the device's peak by its data
-sheet, at that precision. Rows that are not there have not been measured.
+Random weights in the published sizes: `paper` (406 M parameters; a `vq-f4`, with 256 codes; 256
+px), `sd15` (the geometry of Stable Diffusion 1.5, 860 M; its `kl-f8`; 256 px), and the encoder of
+tactile images of `paper` (ViT-Large) in chunks of 32. A training step has optimizer and moving
+average. A sampled image takes the preset's steps (`paper` 200, `sd15` 25), each of two passes; ten
+are timed, their median stands for all, and decoding comes on top. Compiling comes before what is
+timed, and is in the seconds in all. The ratio is to the first row of the same work, the share that
+of the device's peak by its data sheet, at that precision. Rows that are not there have not been
+measured.
 
 | what | mode | batch | ms a step | images a second | ratio | TFLOP/s | of peak | GB | s in all |
 |---|---|---|---|---|---|---|---|---|---|

@@ -68,6 +68,8 @@ def test_encoders_and_a_generator_from_the_command_line(data, tmp_path, capsys, 
     started = ["train", "generator", *common, "--start", "model", "--dry-run", "-o", "on"]
     assert main(started) == 0
     assert json.loads(capsys.readouterr().out)["parameters"] == facts["parameters"]
+    assert main([*started, "--source", "vision"]) == 2  # refused as the training would
+    assert "another source and tokens" in " ".join(capsys.readouterr().err.split())
     assert (
         main(["train", "generator", *common, "--start", "model", "--steps", "1", "-o", "on"]) == 0
     )

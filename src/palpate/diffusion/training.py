@@ -280,6 +280,9 @@ def plan_generator(
 
     Returns:
         see :func:`palpate.training.estimate.estimate`.
+
+    Raises:
+        PalpateError: if the train part is empty, or ``start`` does not fit what is given beside it.
     """
     start = TactilePipeline.from_pretrained(start) if isinstance(start, str | Path) else start
     chosen = _chosen(preset, unet, start)
@@ -294,6 +297,9 @@ def plan_generator(
     side = chosen.size // factor
     wide = 0 if not background else 48 if isinstance(options, BackgroundOptions) else channels
     if start is not None:
+        background = background or start.denoiser.background
+        same = start.encoders, start.autoencoder, chosen.schedule, policy
+        _require_same(start, *same, background=background)
         known = start.unet.config
         policy, side, channels = start.denoiser.policy, known["sample_size"], known["out_channels"]
         wide = known["in_channels"] - channels
@@ -604,7 +610,8 @@ def _require_same(
     }
     if different := [name for name, (a, b) in pairs.items() if a != b]:
         must, got = f"must share {', '.join(pairs)}", f"another {', another '.join(different)}"
-        raise PalpateError(must, got, "Leave it out", argument="start")
+        fix = "Leave out what differs, or start"
+        raise PalpateError(must, got, fix, argument="start")
 
 
 def train_denoiser(  # noqa: PLR0913 - one row per part of the model
