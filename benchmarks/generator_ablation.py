@@ -384,9 +384,18 @@ def line(*values):
     return f"| {' | '.join(map(str, values))} |"
 
 
+def row_line(r, real):
+    """One row and seed, and what it is of ``real``, the share that the CNN names right."""
+    main = r["photo"] if "photo" in r else r["told"]
+    cnn, probe, far = cells(main)
+    others = [percents(r[d]["cnn"]) if d in r else "" for d in ("caption", "permuted")]
+    others.append(percents(r["loss by new gels"]) if "loss by new gels" in r else "")
+    ratio = f"{main['cnn'][0] / real:.2f}"
+    return line(r["row"], r["seed"], r["steps"], r["seconds"], cnn, ratio, probe, far, *others)
+
+
 def tables(record):
     """Markdown of one world: what is not generated, then one line a row and seed."""
-    real = record["ceilings"]["real"]
     lines = [line("not generated", "CNN, %", "probe, %", "TMMD"), "|---|---|---|---|"]
     lines += [line(name, *cells(c)) for name, c in record["ceilings"].items()]
     heads = ["by photo: CNN, %", "of real", "probe, %", "TMMD", "by caption: CNN, %"]
@@ -395,14 +404,7 @@ def tables(record):
     lines += ["", line(*heads), "|---" * len(heads) + "|"]
     order = list(ROWS)
     for r in sorted(record["rows"], key=lambda r: (order.index(r["row"]), r["steps"], r["seed"])):
-        main = r["photo"] if "photo" in r else r["told"]
-        cnn, probe, far = cells(main)
-        others = [percents(r[d]["cnn"]) if d in r else "" for d in ("caption", "permuted")]
-        others.append(percents(r["loss by new gels"]) if "loss by new gels" in r else "")
-        ratio = f"{main['cnn'][0] / real['cnn'][0]:.2f}"
-        lines.append(
-            line(r["row"], r["seed"], r["steps"], r["seconds"], cnn, ratio, probe, far, *others)
-        )
+        lines.append(row_line(r, record["ceilings"]["real"]["cnn"][0]))
     return "\n".join(lines)
 
 
@@ -471,7 +473,7 @@ def main():
         record["rows"].append(row)
         write_json(file, records)
         chosen.page.write_text(page(records))
-        print(tables(record).splitlines()[-1], flush=True)
+        print(row_line(row, record["ceilings"]["real"]["cnn"][0]), flush=True)
 
 
 if __name__ == "__main__":

@@ -58,13 +58,16 @@ def trained(seed, world, work):
     """The generator of a training as the recipe's, on the shipped encoders and autoencoder."""
     if seed == 0:
         return TactilePipeline.from_pretrained(NAME)
-    folder = work / f"training {seed}"
+    encoders, autoencoder = EncoderSet.load(NAME), load_autoencoder(NAME)
+    encoded_by = encoders.digest("text"), encoders.digest("vision"), autoencoder.digest
+    made_by = world.digest, *encoded_by, facts(GENERATOR), GENERATOR_STEPS, seed
+    folder = work / f"training-{short(digest_json(made_by))}"
     if not (folder / "model").is_dir():
         pipeline = train_pipeline(
             world,
             Study.everything_of(world),
-            EncoderSet.load(NAME),
-            load_autoencoder(NAME),
+            encoders,
+            autoencoder,
             GENERATOR,
             folder / "training",
             seed=seed,

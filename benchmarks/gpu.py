@@ -11,7 +11,7 @@
 Weights are random, in the published sizes: what a step costs does not depend on them. Operations
 are counted by PyTorch (without those that cached gradients repeat); the share is that of the
 device's peak by its data sheet, at the precision of the factors. Rows end in the records beside the
-page: of the same device and the same torch they are not measured again.
+page, of one device and one torch each, and are not measured again.
 """
 
 import argparse
@@ -20,6 +20,7 @@ import gc
 import json
 import os
 import platform
+import sys
 import tempfile
 import time
 from contextlib import suppress
@@ -234,8 +235,10 @@ class Bench:
         file = output and output.with_suffix(".json")
         if file and file.is_file():
             known = json.loads(file.read_text())
-            if all(known[key] == self.record[key] for key in ("device", "torch")):
-                self.record = known
+            for key in ("device", "torch"):
+                if known[key] != self.record[key]:
+                    sys.exit(f"{file} has rows of {known[key]}; here is {self.record[key]}")
+            self.record = known
         name = self.record["device"]
         self.peaks = next((p for known, p in PEAKS.items() if known in name), {})
 
@@ -361,6 +364,8 @@ def main():
     chosen = parser.parse_args()
     if chosen.device == "cuda" and not torch.cuda.is_available():
         parser.exit(2, "There is no CUDA device here; --device cpu --small tries the code.\n")
+    if chosen.small and chosen.write:
+        parser.error("--small measures other models, which are not written")
     bench = Bench(chosen.device, chosen.small, chosen.write, chosen.modes)
     for name in chosen.only:
         PARTS[name](bench)
