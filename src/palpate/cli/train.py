@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from typing import Any, Literal
 
 from palpate.cli.presets import Training, preset_flags, print_plan, with_flags
 from palpate.cli.terminal import Switch, Terminal, require_extra
+from palpate.core import PalpateError
 from palpate.diffusion.options import Sources
 from palpate.diffusion.presets import PRESETS, DiffusionPreset
 
@@ -60,6 +61,8 @@ def run(options: Options, terminal: Terminal) -> dict[str, Any]:
     from palpate.diffusion.training import plan_generator, train_generator
 
     preset = with_flags(PRESETS[options.preset], options.fields, *_FLAGS)
+    if options.start is not None:
+        _require_length_alone(preset, PRESETS[options.preset])
     data, machine = (options.data, options.split), options.machine
     if options.dry_run:
         how: dict[str, Any] = {"background": options.background, "device": machine.device}
@@ -101,3 +104,11 @@ def run(options: Options, terminal: Terminal) -> dict[str, Any]:
     }
     terminal.facts(f"Generator {options.output}", facts)
     return facts
+
+
+def _require_length_alone(preset: DiffusionPreset, named: DiffusionPreset) -> None:
+    """A generator that goes on keeps all but how long and how fast it is trained."""
+    other = [f.name for f in fields(preset) if f.name not in ("loop", "epochs")]
+    if given := [name for name in other if getattr(preset, name) != getattr(named, name)]:
+        must = "Options of the preset other than length and rate must be left out with --start"
+        raise PalpateError(must, f"options of {', '.join(given)}", "Leave them out, or --start")
