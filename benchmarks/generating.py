@@ -326,8 +326,9 @@ class Bench:
         gels = np.broadcast_to(pipeline.gel, (batch, *pipeline.gel.shape))
         tokens = pipeline.denoiser.condition(rows)
         both = torch.cat([pipeline.denoiser.null_tokens(1).expand(tokens.shape), tokens])
-        s = pipeline.sampler.guidance
-        images = {}
+        s, images = pipeline.sampler.guidance, {}
+        # The loop guides at every step by the plain formula; so must the pipeline here.
+        plainly = replace(pipeline.sampler, low=0.0, high=1.0, rescale=0.0)
 
         @torch.no_grad()
         def plain(_):
@@ -342,7 +343,7 @@ class Bench:
             images["plain"] = pipeline.autoencoder.decode(pipeline.stats.restore(z), gels)
 
         def ours(_):
-            images["ours"] = pipeline.sample(rows, ids, seed=0)
+            images["ours"] = pipeline.sample(rows, ids, seed=0, sampler=plainly)
 
         plain(0)
         result = in_turns(plain, ours, 2 * self.sizes.turns + 1)

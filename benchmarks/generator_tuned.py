@@ -87,7 +87,7 @@ def main():
             for name in ROWS:
                 goals.measure(name, seed, partial(goals.generated, seed, **DRIVES[name]))
         days.append(goals.day())
-        parts.append(goals.section())
+        parts.append(goals.section(chosen.seeds))
     chosen.page.write_text(page(parts, max(days), chosen))
     print(chosen.page.read_text())
 

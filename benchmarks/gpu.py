@@ -237,7 +237,8 @@ class Bench:
             known = json.loads(file.read_text())
             for key in ("device", "torch"):
                 if known[key] != self.record[key]:
-                    sys.exit(f"{file} has rows of {known[key]}; here is {self.record[key]}")
+                    here = f"here is {self.record[key]}: write another page"
+                    sys.exit(f"{file} has rows of {known[key]}; {here}")
             self.record = known
         name = self.record["device"]
         self.peaks = next((p for known, p in PEAKS.items() if known in name), {})

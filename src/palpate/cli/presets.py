@@ -86,25 +86,30 @@ def preset_flags(title: str, preset: type[Any], main: str, skip: tuple[str, ...]
     return make_dataclass(title, rows, frozen=True, kw_only=True)
 
 
+def fields_given(preset: type[Any], given: Any, main: str, skip: tuple[str, ...]) -> list[_Field]:
+    """The fields of a preset class that were given on the command line."""
+    return [f for f in _fields(preset, main, skip) if getattr(given, f.flag) is not None]
+
+
 def with_flags(preset: Any, given: Any, main: str, skip: tuple[str, ...]) -> Any:
     """The preset with the fields that were given on the command line.
 
     Raises:
         PalpateError: for a field of a part that the preset does not have.
     """
-    for each in _fields(type(preset), main, skip):
-        if (value := getattr(given, each.flag)) is not None:
-            *parts, name = each.path.split(".")
-            records = [preset]
-            for part in parts:
-                records.append(getattr(records[-1], part))
-            if not hasattr(records[-1], name):
-                must, got = "must belong to a part of the preset", f"a preset without {each.path}"
-                raise PalpateError(must, got, "Leave it out", argument=each.flag)
-            value = None if value == "none" and type(None) in get_args(each.kind) else value
-            for record, inner in zip(reversed(records), [name, *reversed(parts)], strict=True):
-                value = dataclasses.replace(record, **{inner: value})
-            preset = value
+    for each in fields_given(type(preset), given, main, skip):
+        value = getattr(given, each.flag)
+        *parts, name = each.path.split(".")
+        records = [preset]
+        for part in parts:
+            records.append(getattr(records[-1], part))
+        if not hasattr(records[-1], name):
+            must, got = "must belong to a part of the preset", f"a preset without {each.path}"
+            raise PalpateError(must, got, "Leave it out", argument=each.flag)
+        value = None if value == "none" and type(None) in get_args(each.kind) else value
+        for record, inner in zip(reversed(records), [name, *reversed(parts)], strict=True):
+            value = dataclasses.replace(record, **{inner: value})
+        preset = value
     return preset
 
 

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field
 from typing import Any, Literal
 
-from palpate.cli.presets import Training, preset_flags, print_plan, with_flags
+from palpate.cli.presets import Training, fields_given, preset_flags, print_plan, with_flags
 from palpate.cli.terminal import Switch, Terminal, require_extra
 from palpate.core import PalpateError
 from palpate.diffusion.options import Sources
@@ -32,8 +32,8 @@ class Options(Training):
     autoencoder is the default. Default: random weights; the preset `sd15` needs one."""
     start: str | None = None
     """Generator of palpate to go on from: its folder, or palpate/mini. Its encoders and autoencoder
-    stand for those that are not given, and the preset gives length and rate alone. Default: random
-    weights."""
+    stand for those that are not given, and the preset gives the training loop alone. Default:
+    random weights."""
     preset: Literal["mini", "tiny", "small", "paper", "sd15"] = "mini"
     """Geometry, schedule and length: `small` for one small GPU, `paper` is the paper's, `sd15` goes
     on from Stable Diffusion 1.5."""
@@ -60,9 +60,12 @@ def run(options: Options, terminal: Terminal) -> dict[str, Any]:
     require_extra("palpate train generator")
     from palpate.diffusion.training import plan_generator, train_generator
 
+    for each in fields_given(DiffusionPreset, options.fields, *_FLAGS) if options.start else ():
+        if each.path.split(".")[0] not in ("loop", "epochs"):
+            must = "must be left out beside a generator to go on from, which keeps its own"
+            got = f"--start {options.start}"
+            raise PalpateError(must, got, "Leave one out", argument=each.flag)
     preset = with_flags(PRESETS[options.preset], options.fields, *_FLAGS)
-    if options.start is not None:
-        _require_length_alone(preset, PRESETS[options.preset])
     data, machine = (options.data, options.split), options.machine
     if options.dry_run:
         how: dict[str, Any] = {"background": options.background, "device": machine.device}
@@ -104,11 +107,3 @@ def run(options: Options, terminal: Terminal) -> dict[str, Any]:
     }
     terminal.facts(f"Generator {options.output}", facts)
     return facts
-
-
-def _require_length_alone(preset: DiffusionPreset, named: DiffusionPreset) -> None:
-    """A generator that goes on keeps all but how long and how fast it is trained."""
-    other = [f.name for f in fields(preset) if f.name not in ("loop", "epochs")]
-    if given := [name for name in other if getattr(preset, name) != getattr(named, name)]:
-        must = "Options of the preset other than length and rate must be left out with --start"
-        raise PalpateError(must, f"options of {', '.join(given)}", "Leave them out, or --start")

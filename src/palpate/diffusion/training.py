@@ -146,7 +146,7 @@ def train_generator(  # noqa: PLR0913 - a public verb
         clip: vision and text encoders that condition the generator: a set of encoders, its folder,
             the folder or hub id of a CLIP, or ``palpate/mini``; ``source="resnet"`` needs none.
         preset: geometry, schedule and length, or its name (:data:`palpate.diffusion.PRESETS`); with
-            ``start`` its length and rate alone.
+            ``start`` its training loop alone.
         autoencoder: any :class:`~palpate.diffusion.autoencoder.Autoencoder` or what its ``load``
             takes: folder, hub id, ``.ckpt`` or ``palpate/mini``. Default: a small one, trained
             first on the train part, or that of ``unet``; the preset ``paper`` needs one.
