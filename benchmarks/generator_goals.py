@@ -61,8 +61,8 @@ def trained(seed, world, work):
         return TactilePipeline.from_pretrained(NAME)
     encoders, autoencoder = EncoderSet.load(NAME), load_autoencoder(NAME)
     encoded_by = encoders.digest("text"), encoders.digest("vision"), autoencoder.digest
-    drawn_later = replace(GENERATOR, sampler=SamplerOptions())  # no part of the training
-    made_by = world.digest, *encoded_by, facts(drawn_later), GENERATOR_STEPS, facts(COMPUTE), seed
+    undrawn = replace(GENERATOR, sampler=SamplerOptions())  # no part of the training
+    made_by = world.digest, *encoded_by, facts(undrawn), GENERATOR_STEPS, facts(COMPUTE), seed
     folder = work / f"training-{short(digest_json(made_by))}"
     if not (folder / "model").is_dir():
         pipeline = train_pipeline(

@@ -75,7 +75,7 @@ def test_encoders_and_a_generator_from_the_command_line(data, tmp_path, capsys, 
     for idle in (["--sampler-guidance", "2"], ["--unet-layers", "3"]):  # one is as in the preset
         assert main([*started, *idle]) == 2
         error = " ".join(capsys.readouterr().err.split())
-        assert f"{idle[0]} must be left out beside a generator to go on from" in error
+        assert f"{idle[0]} must be left out with a generator to go on from" in error
     assert (
         main(["train", "generator", *common, "--start", "model", "--steps", "1", "-o", "on"]) == 0
     )

@@ -30,6 +30,7 @@ class Options(Training):
 def run(options: Options, terminal: Terminal) -> dict[str, Any]:
     """Train, and print how well images outside of train are reconstructed."""
     require_extra("palpate train autoencoder")
+    options.require_data()
     from palpate.diffusion.autoencoders import train_autoencoder
 
     machine = options.machine

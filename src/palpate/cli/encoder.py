@@ -47,6 +47,7 @@ class Options(Training):
 def run(options: Options, terminal: Terminal) -> dict[str, Any]:
     """Train, and print the accuracy of a linear material probe on the test part."""
     require_extra("palpate train encoder")
+    options.require_data()
     from palpate.encoders.contrastive import plan_encoder, train_encoder
 
     preset = with_flags(PRESETS[options.preset], options.fields, *_FLAGS)

@@ -158,6 +158,12 @@ class Training(Common):
     machine: Machine = field(default_factory=Machine)
     """How to run it on the machine at hand."""
 
+    def require_data(self) -> None:
+        """Raise ``PalpateError`` if the data are not there, before torch is imported (seconds)."""
+        from palpate.data.importing import require_source
+
+        require_source(self.data)
+
 
 def print_plan(terminal: Terminal, title: str, plan: dict[str, Any]) -> dict[str, Any]:
     """Print what a training would take, and return it."""

@@ -58,14 +58,15 @@ class Options(Training):
 def run(options: Options, terminal: Terminal) -> dict[str, Any]:
     """Train the autoencoder, if none is given, then the denoiser, and save the pipeline."""
     require_extra("palpate train generator")
-    from palpate.diffusion.training import plan_generator, train_generator
-
     for each in fields_given(DiffusionPreset, options.fields, *_FLAGS) if options.start else ():
         if each.path.split(".")[0] not in ("loop", "epochs"):
-            must = "must be left out beside a generator to go on from, which keeps its own"
+            must = "must be left out with a generator to go on from, which keeps its own"
             got = f"--start {options.start}"
             raise PalpateError(must, got, "Leave one out", argument=each.flag)
     preset = with_flags(PRESETS[options.preset], options.fields, *_FLAGS)
+    options.require_data()
+    from palpate.diffusion.training import plan_generator, train_generator
+
     data, machine = (options.data, options.split), options.machine
     if options.dry_run:
         how: dict[str, Any] = {"background": options.background, "device": machine.device}

@@ -201,15 +201,21 @@ def write_summed_lists(manifest: Manifest, split: Split, output: Path) -> list[s
     return [*names, "SHA256SUMS"]
 
 
+def require_source(source: Path) -> None:
+    """Raise ``PalpateError`` if there is nothing at the path of a data set."""
+    if not source.exists():
+        fix = "Check the path; a data set on the hub needs the format hf"
+        raise PalpateError("must exist", f"nothing at {source}", fix, argument="source")
+
+
 def recognized(
     source: Path, name: str = "auto", options: Mapping[str, Any] | None = None
 ) -> tuple[str, Format]:
     """The named format, or the first that the source looks like; templates give pairs or videos."""
     require_choice("format", name, ("auto", *FORMATS))
     require_regular(source)
-    if not source.exists() and (name == "auto" or not FORMATS[name].remote):
-        fix = "Check the path; a data set on the hub needs the format hf"
-        raise PalpateError("must exist", f"nothing at {source}", fix, argument="source")
+    if name == "auto" or not FORMATS[name].remote:
+        require_source(source)
     if name == "auto":
         given = {c: text for c in IMAGE_COLUMNS if (text := (options or {}).get(c))}
         looks = (n for n, form in FORMATS.items() if form.detect(source))
