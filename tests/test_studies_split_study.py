@@ -111,7 +111,7 @@ def test_a_killed_study_ends_as_one_that_was_not(data, tmp_path):
     assert [s["value"] for s in scores] == [s.value for s in whole]
 
 
-def test_a_field_of_a_preset_is_switched_off_or_refused(capsys, monkeypatch):
+def test_a_field_of_a_preset_is_switched_off_or_refused(capsys, monkeypatch, tmp_path):
     presets = []
 
     def stop(*_, preset, **options):
@@ -119,7 +119,7 @@ def test_a_field_of_a_preset_is_switched_off_or_refused(capsys, monkeypatch):
         raise PalpateError("Nothing must be trained", "a test", "")
 
     monkeypatch.setattr("palpate.encoders.contrastive.train_encoder", stop)
-    train = ["train", "encoder", "x", "-o", "none", "--preset", "tiny"]
+    train = ["train", "encoder", str(tmp_path), "-o", "none", "--preset", "tiny"]
     assert main([*train, "--clip-norm", "none", "--lr", "0.5"]) == 2
     course = presets[0].tactile_course
     assert (course.clip_norm, course.lr, course.patience) == (None, 0.5, None)
