@@ -99,10 +99,18 @@ def test_the_optimum_is_that_of_brute_force_and_every_seed_reaches_it(rows, targ
         assert problem.deviations(drawn).max() <= limit + EXACT
 
 
-def test_a_program_that_highs_cannot_presolve_is_solved():
-    counts = np.array([[0, 3, 9, 12], [3, 9, 0, 12], [1, 5, 3, 9], [5, 9, 20, 34]])
-    best = optimize(Problem(counts, np.array([0.6, 0.2, 0.2])))
-    assert best.deviation == pytest.approx(brute(counts, (0.6, 0.2, 0.2))[1], abs=EXACT)
+@pytest.mark.parametrize(
+    ("rows", "target"),
+    [
+        ([[0, 3, 9], [3, 9, 0], [1, 5, 3], [5, 9, 20]], (0.6, 0.2, 0.2)),  # "Solve error"
+        ([[5, 9, 1], [1, 9, 9], [9, 2, 2], [9, 9, 0]], (0.7, 0.3)),  # a wrong optimum, "proven"
+    ],
+)
+def test_a_program_that_highs_fails_at_is_solved(rows, target):
+    counts = np.array([[*row, sum(row)] for row in rows])
+    best = optimize(Problem(counts, np.array(target)))
+    expected = pytest.approx(brute(counts, target)[1], abs=EXACT)
+    assert (best.deviation, best.bound) == (expected, expected)
 
 
 @pytest.mark.parametrize(("groups", "worst"), [(600, 0.004), (3000, 0.002)])
