@@ -31,13 +31,12 @@ from palpate.data.manifest import Manifest
 from palpate.diffusion.autoencoders import load_autoencoder
 from palpate.diffusion.options import SamplerOptions
 from palpate.diffusion.pipeline import TactilePipeline
-from palpate.diffusion.training import train_pipeline
 from palpate.encoders.embed import texts_of
 from palpate.encoders.encoder_set import EncoderSet
 from palpate.studies.making import fresh
 
 sys.path.append(str(Path(__file__).parents[1] / "recipes"))
-from mini import COMPUTE, GENERATOR, GENERATOR_STEPS
+from mini import COMPUTE, GENERATOR, GENERATOR_ROUNDS, GENERATOR_STEPS, train_round
 
 NAME = "palpate/mini"
 #: Row -> what drives the generator.
@@ -62,24 +61,19 @@ def trained(seed, world, work):
     encoders, autoencoder = EncoderSet.load(NAME), load_autoencoder(NAME)
     encoded_by = encoders.digest("text"), encoders.digest("vision"), autoencoder.digest
     undrawn = replace(GENERATOR, sampler=SamplerOptions())  # no part of the training
-    made_by = world.digest, *encoded_by, facts(undrawn), GENERATOR_STEPS, facts(COMPUTE), seed
-    folder = work / f"training-{short(digest_json(made_by))}"
-    if not (folder / "model").is_dir():
-        pipeline = train_pipeline(
-            world,
-            Study.everything_of(world),
-            encoders,
-            autoencoder,
-            GENERATOR,
-            folder / "training",
-            seed=seed,
-            steps=GENERATOR_STEPS,
-            cache=folder / "cache",
-            compute=COMPUTE,
-            progress=Line(),
-        )
-        pipeline.save(fresh(folder / "model"), half=True, shared=NAME)
-    return replace(TactilePipeline.from_pretrained(folder / "model"), sampler=GENERATOR.sampler)
+    pipeline = None
+    for number in range(GENERATOR_ROUNDS):
+        drawn = (seed + number,) if pipeline is None else (seed + number, pipeline.digest)
+        made_by = world.digest, *encoded_by, facts(undrawn), GENERATOR_STEPS, facts(COMPUTE), *drawn
+        folder = work / f"training-{short(digest_json(made_by))}"
+        if not (folder / "model").is_dir():
+            print(f"training {seed}, round {number + 1}, in {folder}", flush=True)
+            parts = world, encoders, autoencoder, folder / "training"
+            how = {"cache": work / "training cache", "progress": Line()}
+            made = train_round(*parts, seed + number, pipeline, **how)
+            made.save(fresh(folder / "model"), half=True, shared=NAME)
+        pipeline = TactilePipeline.from_pretrained(folder / "model")
+    return replace(pipeline, sampler=GENERATOR.sampler)
 
 
 class Goals:

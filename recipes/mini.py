@@ -77,7 +77,8 @@ VISION = replace(ENCODER, clip_course=replace(ENCODER.clip_course, batch=256, lr
 CLIP_EPOCHS, TACTILE_EPOCHS, VISION_EPOCHS = 14.0, 8.0, 20.0
 AUTOENCODER = BackgroundOptions(steps=6_000)
 GENERATOR = replace(DIFFUSION, loop=replace(DIFFUSION.loop, batch=32, warmup=100))
-GENERATOR_STEPS = 8_000
+#: Of a round of the generator's training, and how many rounds: each goes on from the last.
+GENERATOR_STEPS, GENERATOR_ROUNDS = 8_000, 2
 #: Half the time, on CPUs that have it; the weights then depend on the kind of CPU.
 COMPUTE = Compute(precision="bf16")
 PARTS = ("worlds", "clip", "encoders", "autoencoder", "generator", "scores")
@@ -142,6 +143,35 @@ def print_line(line: str) -> None:
     sys.stdout.flush()
 
 
+def everything(manifest: Manifest) -> Split:
+    """All samples, to train on."""
+    rule = {"name": "everything, for the shipped models"}
+    return Split.from_ids(train=manifest.ids, rule=rule, manifest=manifest.digest)
+
+
+def rounded(pipeline: TactilePipeline) -> TactilePipeline:
+    """The pipeline with the generator's weights rounded to 16 bits, in place."""
+    pipeline.denoiser.halve()
+    vars(pipeline).pop("digest", None)  # cached before the weights changed
+    return pipeline
+
+
+def train_round(
+    train: Manifest,
+    encoders: EncoderSet,
+    autoencoder: AnyAutoencoder,
+    folder: Path,
+    seed: int,
+    start: TactilePipeline | None,
+    steps: int = GENERATOR_STEPS,
+    **how: Any,
+) -> TactilePipeline:
+    """The generator after a round of training, from random weights or from those of ``start``."""
+    parts = train, everything(train), encoders, autoencoder, GENERATOR, folder
+    how |= {"seed": seed, "steps": steps, "start": start, "compute": COMPUTE}
+    return train_pipeline(*parts, **how)
+
+
 class Recipe:
     """The parts, each a stage of a run folder; a finished stage is read, not made again."""
 
@@ -192,13 +222,6 @@ class Recipe:
         stage = self.run.stage(f"world {name}", {"options": options.digest}, build)
         return Manifest.load(stage.folder / "tree")
 
-    def _everything(self, manifest: Manifest) -> Split:
-        return Split.from_ids(
-            train=manifest.ids,
-            rule={"name": "everything, for the shipped models"},
-            manifest=manifest.digest,
-        )
-
     def clip(self) -> Path:
         """Vision and text, by contrast of photos and captions."""
         train = self.world("gelsight")
@@ -220,7 +243,7 @@ class Recipe:
         self, train: Manifest, preset: EncoderPreset, folder: Path, epochs: float, **how: Any
     ) -> ClipEncoders:
         how |= {"seed": SEED, "cache": self.cache, "progress": self.progress}
-        part = self._everything(train)
+        part = everything(train)
         return train_clip(train, part, preset, folder / "training", epochs=epochs, **how)
 
     def tactile(self) -> EncoderSet:
@@ -233,7 +256,7 @@ class Recipe:
         def build(folder: Path) -> Mapping[str, Any]:
             encoders = train_tactile(
                 train,
-                self._everything(train),
+                everything(train),
                 load_clip(clip),
                 ENCODER,
                 folder / "training",
@@ -313,41 +336,48 @@ class Recipe:
 
     def generator(self) -> TactilePipeline:
         """From a photo to a tactile image, in the space of the rounded encoders and autoencoder."""
-        encoders, autoencoder, train = self.encoders(), self.autoencoder(), self.world("gelsight")
-        encoders.halve()
-        autoencoder.halve()
-        steps = max(1, math.ceil(GENERATOR_STEPS * self.share))
+        parts = self.encoders(), self.autoencoder(), self.world("gelsight")
+        parts[0].halve()
+        parts[1].halve()
+        pipeline = None
+        for number in range(GENERATOR_ROUNDS):
+            pipeline = self._round(number, pipeline, *parts)
+        assert pipeline is not None
+        return replace(pipeline, sampler=GENERATOR.sampler)
 
-        def build(folder: Path) -> Mapping[str, Any]:
-            pipeline = train_pipeline(
-                train,
-                self._everything(train),
-                encoders,
-                autoencoder,
-                GENERATOR,
-                folder / "training",
-                seed=SEED,
-                steps=steps,
-                cache=self.cache,
-                compute=COMPUTE,
-                progress=self.progress,
-            )
-            pipeline.save(fresh(folder / "model"))
-            return {"digest": pipeline.digest, "train": len(train)}
-
+    def _round(
+        self,
+        number: int,
+        start: TactilePipeline | None,
+        encoders: EncoderSet,
+        autoencoder: AnyAutoencoder,
+        train: Manifest,
+    ) -> TactilePipeline:
+        """A round of the generator's training; it goes on from the rounded weights of the last."""
+        steps, seed = max(1, math.ceil(GENERATOR_STEPS * self.share)), SEED + number
         inputs = {
             "preset": replace(GENERATOR, sampler=SamplerOptions()),  # no part of the training
             "steps": steps,
-            "seed": SEED,
+            "seed": seed,
             "vision": encoders.digest("vision"),
             "text": encoders.digest("text"),
             "autoencoder": autoencoder.digest,
             "train": train.digest,
         }
-        pipeline = TactilePipeline.from_pretrained(
-            self.run.stage("generator", inputs, build).folder / "model"
-        )
-        return replace(pipeline, sampler=GENERATOR.sampler)
+        if start is not None:
+            start = rounded(start)
+            inputs["start"] = start.digest
+
+        def build(folder: Path) -> Mapping[str, Any]:
+            how = {"cache": self.cache, "progress": self.progress}
+            parts = train, encoders, autoencoder
+            pipeline = train_round(*parts, folder / "training", seed, start, steps, **how)
+            pipeline.save(fresh(folder / "model"))
+            return {"digest": pipeline.digest, "train": len(train)}
+
+        name = f"generator {number + 1}" if number else "generator"
+        folder = self.run.stage(name, inputs, build).folder
+        return TactilePipeline.from_pretrained(folder / "model")
 
     def scores(self) -> dict[str, Any]:
         """Scores of the full and of the rounded models on the new worlds, as rows for the cards."""
