@@ -50,6 +50,10 @@ DRIVES = {
 
 
 NEAREST = "real, of the nearest photo of its training"
+#: Of the page, where there are several trainings.
+SEVERAL = """Of several trainings, 0 ships, and training k is drawn with noise seed k alone; round r
+of its training has seed k + r. How trainings differ is not in the interval of their mean.
+"""
 #: What is measured of the other trainings.
 OF_TRAININGS = ("by photo", "by photo, on gels of its training")
 
@@ -70,7 +74,7 @@ def trained(seed, world, work):
             print(f"training {seed}, round {number + 1}, in {folder}", flush=True)
             parts = world, encoders, autoencoder, folder / "training"
             how = {"cache": work / "training cache", "progress": Line()}
-            made = train_round(*parts, seed + number, pipeline, **how)
+            made = train_round(*parts, seed + number, pipeline, GENERATOR_STEPS, **how)
             made.save(fresh(folder / "model"), half=True, shared=NAME)
         pipeline = TactilePipeline.from_pretrained(folder / "model")
     return replace(pipeline, sampler=GENERATOR.sampler)
@@ -195,10 +199,8 @@ world (seed 61) alone, and the linear probe of `{NAME}`, fitted on that third wo
 material. Intervals: 95 % over videos; seeds are of the noise, and are averaged image by image. What
 one is ahead of another is paired by image, in points of the CNN. TMMD (grouped) is to the real
 images of the same samples, with the mean of the seeds' limits. Nothing was chosen on these
-worlds: guidance and the memory's temperature are those that were chosen before, on others. Of
-several trainings, 0 ships, and training k is drawn with noise seed k alone; how trainings differ is
-not in the interval of their mean.
-{platform.machine()}, CPU; {day}.
+worlds: guidance, the memory's temperature and the second round of training were chosen on others.
+{SEVERAL if len(chosen.trainings) > 1 else ""}{platform.machine()}, CPU; {day}.
 
 {chr(10).join(parts)}"""
 

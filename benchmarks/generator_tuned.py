@@ -38,7 +38,7 @@ def tuned(study, world, start, seed, steps):
     return TactilePipeline.from_pretrained(folder)
 
 
-def page(parts, day, chosen):
+def page(parts, day, chosen, start):
     materials, seeds = (" ".join(map(str, rows)) for rows in (chosen.materials, chosen.seeds))
     command = f"generator_tuned.py --materials {materials} --seeds {seeds} --steps {chosen.steps}"
     return f"""# The shipped generator, fine-tuned
@@ -47,9 +47,10 @@ Made by a committed command; do not edit by hand. Synthetic: the tables show a m
 
     python benchmarks/{command}
 
-`{NAME}` goes on for {chosen.steps:,} steps of {PRESET.loop.batch} on a world of the named materials
-alone (seed 64), as `palpate train generator --start {NAME} --steps {chosen.steps} --batch-size
-{PRESET.loop.batch} --warmup {PRESET.loop.warmup} --precision bf16` does; a seed is of one training
+`{NAME}` (digest {short(start)}) goes on for {chosen.steps:,} steps of {PRESET.loop.batch}
+on a world of the named materials alone (seed 64), as
+`palpate train generator --start {NAME} --steps {chosen.steps} --batch-size {PRESET.loop.batch}
+--warmup {PRESET.loop.warmup} --precision bf16` does; a seed is of one training
 and of its noise. Judged on new objects, videos and gel units of another world (seed 65), one image
 of each video, by a small CNN that saw real images of a third (seed 61), and by the linear probe of
 `{NAME}`, fitted on that third. Nothing was chosen on these numbers: preset, steps and seeds were
@@ -74,10 +75,10 @@ def main():
         help="Markdown file to write",
     )
     chosen, parts, days = parser.parse_args(), [], []
+    start = TactilePipeline.from_pretrained(NAME)
     for materials in sorted(chosen.materials):
         study = Study(chosen.work / str(materials), materials, "many", MANY)
         world = study.world("tuned")
-        start = TactilePipeline.from_pretrained(NAME)
         made_by = start.digest, facts(start.sampler), world.digest, facts(PRESET), chosen.steps
         goals = Goals(study, (world, study.work / "tuned cache"), *made_by)
         goals.measure("real", 0, lambda s=study: s.real)
@@ -88,7 +89,7 @@ def main():
                 goals.measure(name, seed, partial(goals.generated, seed, **DRIVES[name]))
         days.append(goals.day())
         parts.append(goals.section(chosen.seeds))
-    chosen.page.write_text(page(parts, max(days), chosen))
+    chosen.page.write_text(page(parts, max(days), chosen, start.digest))
     print(chosen.page.read_text())
 
 

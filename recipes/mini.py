@@ -149,13 +149,6 @@ def everything(manifest: Manifest) -> Split:
     return Split.from_ids(train=manifest.ids, rule=rule, manifest=manifest.digest)
 
 
-def rounded(pipeline: TactilePipeline) -> TactilePipeline:
-    """The pipeline with the generator's weights rounded to 16 bits, in place."""
-    pipeline.denoiser.halve()
-    vars(pipeline).pop("digest", None)  # cached before the weights changed
-    return pipeline
-
-
 def train_round(
     train: Manifest,
     encoders: EncoderSet,
@@ -163,7 +156,7 @@ def train_round(
     folder: Path,
     seed: int,
     start: TactilePipeline | None,
-    steps: int = GENERATOR_STEPS,
+    steps: int,
     **how: Any,
 ) -> TactilePipeline:
     """The generator after a round of training, from random weights or from those of ``start``."""
@@ -365,7 +358,7 @@ class Recipe:
             "train": train.digest,
         }
         if start is not None:
-            start = rounded(start)
+            self._halve(encoders, autoencoder, start)
             inputs["start"] = start.digest
 
         def build(folder: Path) -> Mapping[str, Any]:

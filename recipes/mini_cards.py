@@ -39,8 +39,9 @@ SUMMARIES = {
         "From a photo to a tactile image of palpate's world",
         "A latent diffusion model (flow matching), conditioned on captions and photos, and driven "
         "by photos, captions or both, in the space of the encoders and the autoencoder next to "
-        "it. It knows the world's twenty materials and nothing else. The image is made on a gel "
-        "that is given as a picture without contact, or on a stock gel.",
+        "it. Trained in two rounds, the second from the rounded weights of the first, on the same "
+        "images. It knows the world's twenty materials and nothing else. The image is made on a "
+        "gel that is given as a picture without contact, or on a stock gel.",
     ),
 }
 PAIR = (

@@ -87,6 +87,11 @@ def test_every_part_is_made_shipped_and_verified(small, tmp_path, capsys):
     assert any(
         row["score"] == "TMMD, generated" for row in scores["generator"]["training"]["scores"]
     )
+    second = scores["generator"]["training"]
+    assert (second["seed"], second["start_record"]["seed"]) == (1, 0)
+    assert second["start_record"]["start"] is None
+    exact = recipe.run.stages["generator"].facts["digest"]
+    assert second["start"] != exact  # the rounded weights went on
     assert "900050" in (target / "encoders" / "README.md").read_text()
     assert not any(
         "tactile" in row["score"]
@@ -103,9 +108,9 @@ def test_every_part_is_made_shipped_and_verified(small, tmp_path, capsys):
         for part, about in scores.items()
     }
     assert trained == {
-        "encoders": {900_000},
+        "encoders": {900_000, 900_002},
         "autoencoder": {900_000, 900_001},
-        "generator": {900_000},
+        "generator": {900_000, 900_002},
     }
     page = (tmp_path / "mini.md").read_text()
     assert page.startswith("before\n")

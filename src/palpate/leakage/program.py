@@ -49,7 +49,8 @@ DRAW_GAP = 0.15
 #: Weight of the random cost relative to the mean deviation; of a material that a part lacks.
 RANDOM, MISSING = 0.1, 10.0
 #: The optimum's objective is multiplied by this: with weights near 1 HiGHS 1.12 proves a wrong
-#: optimum of a rare small program (tests/test_leakage_splits.py has one).
+#: optimum of a rare small program (tests/test_leakage_splits.py has one). A draw is checked against
+#: the optimum and needs to be good, not best.
 SCALE = 1000.0
 #: Weight of a deviation above the limit, where the whole program is not solved.
 ABOVE = 1000.0
