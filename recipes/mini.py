@@ -335,7 +335,6 @@ class Recipe:
         pipeline = None
         for number in range(GENERATOR_ROUNDS):
             pipeline = self._round(number, pipeline, *parts)
-        assert pipeline is not None
         return replace(pipeline, sampler=GENERATOR.sampler)
 
     def _round(

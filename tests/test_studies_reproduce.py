@@ -19,7 +19,7 @@ from palpate.preference.scoring import PREFERENCE, STRENGTH
 from palpate.report.results import Results
 from palpate.sim import WorldOptions
 from palpate.sim.presets import MINI_SEEDS
-from palpate.studies import collecting, controls, judging, reproduce
+from palpate.studies import collecting, controls, demo, judging, reproduce
 from palpate.studies.controls import CONTROLS, FLOOR, NEAREST
 from palpate.studies.graph import in_order
 from palpate.studies.making import slug
@@ -123,6 +123,23 @@ def test_other_shipped_weights_build_what_reads_them(monkeypatch):
     assert all(before[name] == after[name] for name in trained)
     for name in ("images-palpate-mini-NoLeak-0", "rulers"):
         assert before[name] != after[name], name
+
+
+@pytest.mark.parametrize("part", ["clip", "encoders", "autoencoder", "generator"])
+def test_the_words_of_a_card_build_nothing_again(monkeypatch, tmp_path, part):
+    before = reproduce.model_stamp(part, "palpate/mini")
+    record = json.loads((shipped_folder("palpate/mini", part) / "palpate.json").read_text())
+    monkeypatch.setattr(demo, "shipped_folder", lambda *_: tmp_path)
+
+    def stamp(record):
+        (tmp_path / "palpate.json").write_text(json.dumps(record))
+        return reproduce.model_stamp(part, "palpate/mini")
+
+    [words] = {"card", "training"} & set(record)
+    record[words]["summary"] = "Other words."
+    assert stamp(record) == before
+    digest = "digest" if "digest" in record else "digests"
+    assert stamp(record | {digest: "other weights"}) != before
 
 
 @pytest.mark.parametrize("name", ["world-gelsight", "world-digit"])

@@ -29,6 +29,7 @@ from palpate.core import (
     Split,
     digest_file,
     digest_folder,
+    digest_json,
     digest_lines,
     quiet,
     read_json,
@@ -431,7 +432,9 @@ def model_stamp(part: Part, source: str | None) -> str | None:
     if source is None:
         return None
     if (shipped := shipped_folder(source, part)) is not None:
-        return digest_folder(shipped, "**/*.json")  # they hold the digests of the weights
+        record = read_json(shipped / "palpate.json", "model record")  # with digests of weights
+        prose = ("card", "training", "palpate")
+        return digest_json({key: value for key, value in record.items() if key not in prose})
     if Path(source).is_file():
         return digest_file(Path(source))
     return digest_folder(Path(source)) if Path(source).is_dir() else source

@@ -28,7 +28,8 @@ from typing import Any, NamedTuple
 from palpate.core import PalpateError, read_json, write_text
 
 PLACED = ("title", "summary", "license", "tags", "data", "ceiling", "recipe", "scores", "limits")
-#: Longer entries of the record (loss curves, nested cards) are cut on the page.
+PLACED += ("start_record", "start_card")
+#: Longer entries of the record (loss curves) are cut on the page.
 MAX_CHARACTERS = 240
 
 
