@@ -78,6 +78,7 @@ class Person:
 def opened(chromium, *, quiet=True, **options):
     """A browser context; what it requests is one file or one server, and it prints nothing."""
     context = chromium.new_context(**{"viewport": {"width": 1280, "height": 800}} | options)
+    context.set_default_timeout(120_000)  # a busy machine was seen to stand still for 40 s
     messages, urls = [], []
     context.on("console", lambda message: messages.append(message.text))
     context.on("weberror", lambda error: messages.append(str(error.error)))
