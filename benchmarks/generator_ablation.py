@@ -34,7 +34,8 @@ from palpate.data.images import cached_images
 from palpate.data.manifest import Manifest
 from palpate.diffusion.alignment import Alignment
 from palpate.diffusion.autoencoder import BackgroundAutoencoder, LatentStats
-from palpate.diffusion.autoencoders import autoencoder_of, gels_of, load_autoencoder
+from palpate.diffusion.autoencoders import autoencoder_of, load_autoencoder
+from palpate.diffusion.no_contact import gels_of
 from palpate.diffusion.options import AutoencoderOptions, Schedule
 from palpate.diffusion.pipeline import TactilePipeline
 from palpate.diffusion.presets import MINI

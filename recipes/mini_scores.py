@@ -23,8 +23,9 @@ from palpate.data.images import cached_images
 from palpate.data.manifest import Manifest
 from palpate.diffusion.autoencoder import BackgroundAutoencoder
 from palpate.diffusion.autoencoder_training import measure_reconstruction
-from palpate.diffusion.autoencoders import AnyAutoencoder, gels_of
+from palpate.diffusion.autoencoders import AnyAutoencoder
 from palpate.diffusion.generation import generate
+from palpate.diffusion.no_contact import gels_of
 from palpate.diffusion.pipeline import TactilePipeline
 from palpate.encoders.embed import embed, embed_images, embed_texts, texts_of
 from palpate.encoders.encoder_set import EncoderSet

@@ -92,6 +92,18 @@ def test_saved_and_loaded_it_is_the_same(trained, tmp_path):
         load_autoencoder(tmp_path / "a")
 
 
+def test_it_goes_on_from_a_folder_in_its_own_shape(trained, tmp_path):
+    trained.save(tmp_path / "a")
+    start, ground = load_autoencoder(tmp_path / "a"), gels(8)
+    other = replace(SMALL, channels=2, narrow=4, wide=8, steps=4)
+    model = train_background_autoencoder(
+        pressed(ground), ground, other, tmp_path / "b", start=start
+    )
+    assert (model.channels, model.card["options"]["wide"]) == (4, 16)
+    assert model.card["start"] == start.digest != model.digest
+    assert error(model, pressed(ground), ground) < 1.5 * error(start, pressed(ground), ground)
+
+
 def test_training_again_gives_the_same_weights(tmp_path):
     ground, options = gels(8), replace(SMALL, steps=4)
     a, b = (

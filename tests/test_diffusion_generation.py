@@ -200,6 +200,7 @@ def test_wrong_inputs_and_outputs_are_explained(pipeline, tmp_path):
         (tmp_path / "model", "out", "`photos` must be images. Got .*, a saved model"),
         (two, "out", r"`photos` must differ in name in a list\. Got 'x.png' twice"),
         (photo, "in", "must be empty or hold generated"),
+        ([Image.open(photo), photo], "out", "must be all files, or all images in memory"),
         (photo, "out.jpg", "must be a .png or a folder"),
         (tmp_path / "in", "in/0.png", "must not replace an input"),
     ):

@@ -152,6 +152,8 @@ def test_the_background_variant_uses_its_background():
         (lambda p: p(photos(1) / 255), "`images` must be uint8"),
         (lambda p: p(7), "`images` must be files, PIL images"),
         (lambda p: p("nowhere.jpg"), "nowhere.jpg: no such file"),
+        (lambda p: p([]), "at least one photo"),
+        (lambda p: p(text=["rough", "smooth"]), "`text` must be one string, for all images"),
         (lambda p: without_encoders(p)(photos(1)), "vision encoder"),
     ],
 )

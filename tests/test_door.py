@@ -45,10 +45,10 @@ SIGNATURES = {
         "data split * preset clip output epochs targets weights partners held_out seed device"
         " compute progress"
     ),
-    "train_autoencoder": "data split * preset start output seed device compute progress",
+    "train_autoencoder": "data split * preset start judge output seed device compute progress",
     "train_generator": (
         "data split clip * preset autoencoder unet start output source background align"
-        " align_weight steps seed device compute progress"
+        " align_weight judge steps seed device compute progress"
     ),
     "validate": "source * format check progress **options",
     "Encoder.from_pretrained": "source * modality device",

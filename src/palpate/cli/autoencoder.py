@@ -23,6 +23,9 @@ class Options(Training):
     background); `tiny` is a VQ model."""
     start: str | None = None
     """Fine-tune this one: a folder, a hub id, or palpate/mini. Default: random weights."""
+    judge: str = "palpate/mini"
+    """Encoders whose tactile encoder judges, by TMMD and by material, what survives of images
+    outside of train: a folder, a public tactile encoder, or palpate/mini."""
     fields: _Preset = field(default_factory=_Preset)  # pyright: ignore[reportInvalidTypeForm]
     """Fields of the preset."""
 
@@ -40,6 +43,7 @@ def run(options: Options, terminal: Terminal) -> dict[str, Any]:
             options.split,
             preset=with_flags(PRESETS[options.preset], options.fields, *_FLAGS),
             start=options.start,
+            judge=options.judge,
             output=options.output,
             seed=options.seed,
             device=machine.device,

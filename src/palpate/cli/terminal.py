@@ -125,7 +125,7 @@ class Common:
     as_json: Annotated[Switch, tyro.conf.arg(name="json")] = False
     """Print one JSON object on standard output instead of text."""
     quiet: Annotated[Switch, tyro.conf.arg(aliases=["-q"])] = False
-    """No progress."""
+    """No progress and no notes."""
 
 
 class Terminal:

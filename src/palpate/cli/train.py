@@ -47,6 +47,9 @@ class Options(Training):
     transformers, a hub id, a public tactile encoder. It may not score this generator."""
     align_weight: float = 0.5
     """Of that term in the loss."""
+    judge: str = "palpate/mini"
+    """Encoders whose tactile encoder judges, by TMMD and by material, what of images outside of
+    train survives the autoencoder."""
     steps: int | None = None
     """Optimizer steps. Default: the preset's."""
     dry_run: Switch = False
@@ -86,6 +89,7 @@ def run(options: Options, terminal: Terminal) -> dict[str, Any]:
             background=options.background,
             align=options.align,
             align_weight=options.align_weight,
+            judge=options.judge,
             steps=options.steps,
             seed=options.seed,
             device=machine.device,
@@ -106,5 +110,6 @@ def run(options: Options, terminal: Terminal) -> dict[str, Any]:
         "source": record["source"],
         "background": record["background"],
     }
+    facts |= {f"ceiling_{name}": value for name, value in (record["ceiling"] or {}).items()}
     terminal.facts(f"Generator {options.output}", facts)
     return facts

@@ -62,7 +62,10 @@ def opened(source: Path | BinaryIO) -> Image.Image:
     """
     if isinstance(source, Path) and source.is_fifo():
         raise OSError("a pipe, which is no file")
-    image = Image.open(source)
+    try:
+        image = Image.open(source)
+    except Image.DecompressionBombError:  # in Pillow's words
+        raise Image.DecompressionBombError(f"more than {LARGEST:,} pixels") from None
     if image.width * image.height > LARGEST:
         size = f"{image.width} x {image.height} pixels"
         raise Image.DecompressionBombError(f"{size}, more than {LARGEST:,}")

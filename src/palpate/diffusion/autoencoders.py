@@ -6,9 +6,6 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
-
 from palpate.core import PalpateError, Progress, Split, digest_json, quiet
 from palpate.data.images import cached_images, image_stamp
 from palpate.data.manifest import Manifest
@@ -22,15 +19,15 @@ from palpate.diffusion.autoencoder import (
 from palpate.diffusion.autoencoder_training import measure_reconstruction
 from palpate.diffusion.autoencoder_training import train_autoencoder as train_vq
 from palpate.diffusion.background_training import train_background_autoencoder
+from palpate.diffusion.ceiling import measure_ceiling
+from palpate.diffusion.no_contact import gels_of, has_gels
 from palpate.diffusion.options import AutoencoderOptions, BackgroundOptions
 from palpate.diffusion.presets import DiffusionPreset, preset_named
 from palpate.encoders.contrastive import load_split, train_part
+from palpate.encoders.encoder_set import EncoderSet
 from palpate.encoders.models import pick_device
-from palpate.encoders.rows import evenly
 from palpate.training.options import Compute
 from palpate.training.processes import connect, first_alone, keep_logs, place, work_folder
-
-MEDIAN = 500  # images that a stock gel is the median of, at most
 
 
 def train_autoencoder(
@@ -39,6 +36,7 @@ def train_autoencoder(
     *,
     preset: str | DiffusionPreset = "mini",
     start: AnyAutoencoder | str | Path | None = None,
+    judge: EncoderSet | str | Path | None = "palpate/mini",
     output: Path | str | None = None,
     seed: int = 0,
     device: str = "auto",
@@ -54,6 +52,8 @@ def train_autoencoder(
         split: a split or its file. None: the one that lies with the data.
         preset: gives kind, shape and length.
         start: fine-tune a copy of this one instead of starting from random weights.
+        judge: whose tactile encoder says what of the images outside of train survives
+            (:mod:`palpate.diffusion.ceiling`); None: PSNR and SSIM alone.
         output: folder for the autoencoder, new or empty; None keeps it in memory.
         seed: of weights, order, crops and noise.
         device: ``auto``, ``cpu``, ``cuda`` or ``mps``.
@@ -92,6 +92,10 @@ def train_autoencoder(
             progress=progress,
         )
         model.card |= {"manifest": manifest.digest, "split": split.digest}
+        judge = EncoderSet.load(judge) if isinstance(judge, str | Path) else judge
+        how: dict[str, Any] = {"judge": judge, "cache": work / "cache", "progress": progress}
+        if measured := measure_ceiling(model, manifest, split, chosen.size, **how):
+            model.card["held_out"] = measured
         if output is not None and place()[0] == 0:
             model.save(output)
             keep_logs(work, output)
@@ -142,32 +146,3 @@ def autoencoder_of(  # noqa: PLR0913 - one row per choice of the training
 
 def _other_kind(kind: str) -> PalpateError:
     return PalpateError(f"must be {kind}, as the preset's", "another kind", "", argument="start")
-
-
-def has_gels(part: Manifest) -> bool:
-    """Whether the samples name no-contact images."""
-    return any(part.column("background"))
-
-
-def gels_of(
-    part: Manifest,
-    size: int,
-    cache: Path | None = None,
-    progress: Progress = quiet,
-    like: NDArray[np.uint8] | None = None,
-) -> NDArray[np.uint8]:
-    """The no-contact image of each sample, bytes (n, size, size, 3).
-
-    Where no sample has one, all get one stock gel: the first of ``like``, or the median of up to
-    500 of the tactile images.
-
-    Raises:
-        PalpateError: if some samples have one and others have not.
-    """
-    if has_gels(part):
-        return cached_images(part, "background", size, cache, progress)
-    if like is not None:
-        return np.broadcast_to(like[0], (len(part), size, size, 3))
-    images = cached_images(part, "tactile", size, cache, progress)
-    stock = np.median(images[evenly(len(images), MEDIAN)], axis=0).astype(np.uint8)
-    return np.broadcast_to(stock, images.shape)

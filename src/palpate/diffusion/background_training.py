@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict
+import copy
+from dataclasses import asdict, replace
 from pathlib import Path
 
 import numpy as np
@@ -40,7 +41,7 @@ def train_background_autoencoder(
         background: the no-contact image of each one's gel, of the same shape.
         options: see :class:`BackgroundOptions`.
         folder: for checkpoints.
-        start: go on from a copy of this one, of the same widths, instead of random weights.
+        start: go on from a copy of this one, in its own shape, instead of random weights.
         seed: of weights, order, crops, colors and noise.
         key: digest of both.
         device: where to train.
@@ -54,15 +55,14 @@ def train_background_autoencoder(
     if side % 4 or side > min(images.shape[1:3]):
         must = "must be a multiple of 4 that fits into the images"
         raise PalpateError(must, f"{side}", "Choose another", argument="crop")
-    with seeded(seed, "background autoencoder"):
-        model = BackgroundAutoencoder(options.channels, options.narrow, options.wide)
     if start is None:
+        with seeded(seed, "background autoencoder"):
+            model = BackgroundAutoencoder(options.channels, options.narrow, options.wide)
         model.measure(images, background)
-    elif model.config != start.config:
-        must, fix = "must have the channels of the options", "Choose its channels"
-        raise PalpateError(must, f"{start.channels} channels", fix, argument="start")
     else:
-        model.load_state_dict(start.state_dict())
+        model = copy.deepcopy(start).requires_grad_(True)
+        shape = {name: start.config[name] for name in ("channels", "narrow", "wide")}
+        options = replace(options, **shape)
     begin = None if start is None else start.digest
     loop = LoopOptions(
         options.steps,

@@ -18,9 +18,16 @@ from typing import Any
 
 from palpate.core import Progress, plain, quiet
 from palpate.core.digest import fact_lines
-from palpate.diffusion.generation import Run, as_files, in_memory, loaded, prepare, video_of
+from palpate.diffusion.generation import (
+    Run,
+    as_files,
+    frames_of,
+    in_memory,
+    loaded,
+    prepare,
+    video_of,
+)
 from palpate.diffusion.pipeline import TactilePipeline
-from palpate.diffusion.video import save_frames
 
 #: Steps of the two batches that are timed; the first one is sampled twice, to warm up.
 FEW, MORE = 2, 4
@@ -89,7 +96,7 @@ def estimate(
             photos = as_files(photos, folder)
         elif (video := video_of(photos)) is not None:
             model = loaded(model, device, progress)
-            photos = save_frames(video, folder, model.vision_size, progress)[0]
+            photos = frames_of(video, folder, model, options)[0]
         options |= {"output": None if output is None else Path(output), "device": device}
         run = prepare(photos, model=model, progress=progress, **options)
         return _estimated(run, folder / "sampled")

@@ -452,18 +452,32 @@ def _require_condition(photos: object, text: str | None, weight: float) -> None:
         raise PalpateError("must lie in [0, 1]", f"{weight:g}", "1 is the photo", argument="weight")
 
 
+def frames_of(
+    video: Path, folder: Path, model: TactilePipeline, options: dict[str, Any]
+) -> tuple[dict[str, Path], float]:
+    """The frames of a video, by id, and their rate; ``options`` come to give all of them one noise.
+
+    So the touch stays where it is.
+    """
+    from palpate.diffusion.video import save_frames
+
+    if (copies := options.get("best_of", 1)) > 1:
+        must, fix = "must be 1 for a video, whose frames share their noise", "Pass its frames"
+        raise PalpateError(must, str(copies), fix, argument="best_of")
+    progress = options.get("progress", quiet)
+    frames, rate = save_frames(video, folder, model.vision_size, progress)
+    options["noise"] = video.name
+    return frames, rate
+
+
 def _of_video(
     video: Path, output: Path | None, model: TactilePipeline, **options: Any
 ) -> Generated:
-    """An image a frame, all of one noise, so the touch stays where it is; and their video."""
-    from palpate.diffusion.video import save_frames, write_video
+    """An image a frame, and their video."""
+    from palpate.diffusion.video import write_video
 
-    if options["best_of"] > 1:
-        must, got = "must be 1 for a video, whose frames share their noise", str(options["best_of"])
-        raise PalpateError(must, got, "Generate from its frames", argument="best_of")
     with tempfile.TemporaryDirectory() as folder:
-        frames, rate = save_frames(video, Path(folder), model.vision_size, options["progress"])
-        options["noise"] = video.name
+        frames, rate = frames_of(video, Path(folder), model, options)
         made = generate(frames, output=output, model=model, **options)
     if made.folder is not None:
         write_video(made.folder / "tactile.mp4", made.images, rate)
@@ -480,7 +494,7 @@ def _photos(
     table = {} if manifest is not None else photo_ids(cast("Photos", photos))
     if not (manifest.ids if manifest is not None else table):
         must, fix = "There must be at least one photo", "Check the folder, the split or the names"
-        raise PalpateError(must, "none", fix)
+        raise PalpateError(must, "none", f"{fix}; a video is passed by itself")
     return manifest, table
 
 
@@ -608,6 +622,9 @@ def photo_ids(photos: Photos) -> dict[str, Path]:
         files = sorted(p for p in folder.rglob("*") if p.suffix.lower() in SUFFIXES and p.is_file())
         return {p.relative_to(folder).as_posix(): p for p in files}
     paths = [Path(p) for p in ([photos] if isinstance(photos, str | Path) else photos)]
+    if videos := [path.name for path in paths if path.suffix.lower() in VIDEOS]:
+        must, fix = "must be photos, or one video by itself", "Pass each video by itself"
+        raise PalpateError(must, ", ".join(videos), fix, argument="photos")
     if len(paths) == 1 and paths[0].is_dir():
         return photo_ids(paths[0])
     table = {path.name: path for path in paths}
@@ -637,8 +654,11 @@ def as_files(photos: Any, folder: Path) -> dict[str, Path]:
 
     files: dict[str, Path] = {}
     for k, image in enumerate(list_images(photos)):
+        if not isinstance(image, Image.Image):
+            must, fix = "must be all files, or all images in memory", "Open the files"
+            raise PalpateError(must, str(image), fix, argument="photos")
         files[str(k)] = folder / f"{k}.png"
-        cast("Image.Image", image).save(files[str(k)])
+        image.save(files[str(k)])
     return files
 
 
@@ -696,7 +716,11 @@ def _require_readable(paths: Sequence[Path], argument: str = "photos") -> None:
     if bad := [Problem(str(path), "bad-image", reason) for path, reason in reasons if reason]:
         if len(paths) == 1:
             must, got = "must be an image that can be read", f"{paths[0]}: {bad[0].text}"
-            fix = "Save it anew, or pass another" if paths[0].is_file() else "Check the path"
+            fix = (
+                "Save it anew, smaller if it is large, or pass another"
+                if paths[0].is_file()
+                else "Check the path"
+            )
             raise PalpateError(must, got, fix, argument=argument)
         raise ProblemsError(bad, FIX_PHOTOS, example={"skip_bad": True})
 

@@ -243,10 +243,10 @@ class TactilePipeline(DiffusionPipeline):
         Raises:
             PalpateError: if a photo is unreadable, a gel is missing, or settings do not fit.
         """
-        if photos is None and text is None:
+        images = [] if photos is None else list_images(photos)
+        if not images and (photos is not None or text is None):
             must, fix = "There must be at least one photo, or a text", "Pass one of them"
             raise PalpateError(must, "none", fix)
-        images = [] if photos is None else list_images(photos)
         if ids is None:
             ids = [i.name if isinstance(i, Path) else str(k) for k, i in enumerate(images)]
             ids = ids if images else [str(text)]
@@ -430,8 +430,11 @@ class TactilePipeline(DiffusionPipeline):
         With the tokens of its words, for a denoiser that knows them: (1, 1 + w, d).
 
         Raises:
-            PalpateError: if the pipeline has no text encoder, or the text is empty.
+            PalpateError: if the pipeline has no text encoder, or the text is empty or no string.
         """
+        if not isinstance(text, str):
+            must, fix = "must be one string, for all images", "Call it once for each text"
+            raise PalpateError(must, type(text).__name__, fix, argument="text")
         if self.encoders is None or "text" not in self.encoders.modalities:
             must, fix = "must be left out for a generator without text encoder", "Pass a photo"
             raise PalpateError(must, repr(text), fix, argument="text")

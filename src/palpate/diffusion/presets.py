@@ -18,7 +18,7 @@ gap, noise      none, 0               pairs, 0.3                    none, 0
 optimizer       AdamW 1e-3, EMA 0.99  AdamW 1e-3, cosine, EMA 0.99  AdamW 6.4e-5, EMA 0.9999
 length          20 steps of 8         400 steps of 16               30 epochs of batch 32
 sampler         DPM-Solver++ 4        DPM-Solver++ 10               DDIM 200, eta 0
-guidance        2                     4 up to t = .8, rescaled .7   7.5
+guidance        2                     3 up to t = .8, rescaled .7   7.5
 ==============  ====================  ============================  ================================
 
 beta: linear in its square root, 0.0015 -> 0.0195. Dropout 0.1 and null zeros in all presets.

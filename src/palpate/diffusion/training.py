@@ -52,7 +52,8 @@ from palpate.diffusion.autoencoder import (
     load_autoencoder,
 )
 from palpate.diffusion.autoencoder_training import SHOWN, sheet
-from palpate.diffusion.autoencoders import autoencoder_of, gels_of, has_gels
+from palpate.diffusion.autoencoders import autoencoder_of
+from palpate.diffusion.ceiling import measure_ceiling
 from palpate.diffusion.denoiser import (
     Denoiser,
     build_unet,
@@ -64,6 +65,7 @@ from palpate.diffusion.denoiser import (
     slots_of,
 )
 from palpate.diffusion.encoding import encode_latents, encode_states
+from palpate.diffusion.no_contact import gels_of, has_gels
 from palpate.diffusion.options import (
     SOURCES,
     AutoencoderOptions,
@@ -131,6 +133,7 @@ def train_generator(  # noqa: PLR0913 - a public verb
     background: bool = False,
     align: EncoderSet | str | Path | None = None,
     align_weight: float = 0.5,
+    judge: EncoderSet | str | Path | None = "palpate/mini",
     steps: int | None = None,
     seed: int = 0,
     device: str = "auto",
@@ -164,6 +167,8 @@ def train_generator(  # noqa: PLR0913 - a public verb
             tactile images (REPA); its tactile encoder, or else its vision encoder. Scores by the
             same encoder are rejected: use another one.
         align_weight: of that term in the loss.
+        judge: whose tactile encoder says what of the images outside of train survives the
+            autoencoder (:mod:`palpate.diffusion.ceiling`); None: PSNR and SSIM alone.
         steps: optimizer steps; default: the preset's.
         seed: of weights, order, noise and condition dropout.
         device: ``auto``, ``cpu``, ``cuda`` or ``mps``.
@@ -226,6 +231,7 @@ def train_generator(  # noqa: PLR0913 - a public verb
             background=background,
             align=None if align is None else Alignment.of(align, align_weight, device),
             start=start,
+            judge=EncoderSet.load(judge) if isinstance(judge, str | Path) else judge,
             cache=cache,
             device=device,
             compute=compute,
@@ -338,6 +344,7 @@ def train_pipeline(  # noqa: PLR0913, PLR0917 - one row per choice of the traini
     background: bool = False,
     align: Alignment | None = None,
     start: TactilePipeline | None = None,
+    judge: EncoderSet | None = None,
     cache: Path | None = None,
     device: str = "auto",
     compute: Compute | None = None,
@@ -361,6 +368,7 @@ def train_pipeline(  # noqa: PLR0913, PLR0917 - one row per choice of the traini
         start: go on from this pipeline's denoiser instead of random weights. It must use the same
             autoencoder, vision encoder and schedule, gives its latent statistics, and its record
             goes into the new one, so that the data it was trained on stays declared.
+        judge: of the ceiling, beside PSNR and SSIM.
         cache: folder for decoded pixels and embeddings.
         device: see :func:`palpate.encoders.models.pick_device`.
         compute: how to run it on the machine at hand.
@@ -460,6 +468,9 @@ def train_pipeline(  # noqa: PLR0913, PLR0917 - one row per choice of the traini
         compute=compute,
         progress=progress,
     )
+    measured = measure_ceiling(
+        autoencoder, manifest, split, preset.size, judge=judge, cache=cache, progress=progress
+    )
     record = {
         "manifest": manifest.digest,
         "split": split.digest,
@@ -467,7 +478,7 @@ def train_pipeline(  # noqa: PLR0913, PLR0917 - one row per choice of the traini
         "train_samples": len(train),
         "text_source": text_source,
         "autoencoder": autoencoder.digest,
-        "ceiling": autoencoder.card.get("held_out") or autoencoder.card.get("scores"),
+        "ceiling": measured,
         **_digests(encoders),
         "source": policy.source,
         "background": background,

@@ -41,8 +41,9 @@ from palpate.data.importing import import_dataset
 from palpate.data.manifest import Manifest
 from palpate.diffusion.autoencoder import BackgroundAutoencoder
 from palpate.diffusion.autoencoder_training import measure_reconstruction
-from palpate.diffusion.autoencoders import autoencoder_of, gels_of, load_autoencoder
+from palpate.diffusion.autoencoders import autoencoder_of, load_autoencoder
 from palpate.diffusion.generation import Generated, generate
+from palpate.diffusion.no_contact import gels_of
 from palpate.diffusion.pipeline import TactilePipeline
 from palpate.diffusion.presets import preset_named as diffusion_preset
 from palpate.diffusion.training import train_pipeline

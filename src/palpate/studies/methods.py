@@ -19,8 +19,8 @@ from PIL import Image
 from palpate.core import Progress, quiet
 from palpate.data.images import cached_images
 from palpate.data.manifest import Manifest
-from palpate.diffusion.autoencoders import gels_of
 from palpate.diffusion.generation import generate
+from palpate.diffusion.no_contact import gels_of
 from palpate.diffusion.presets import DiffusionPreset
 
 Images = NDArray[np.uint8]

@@ -1,0 +1,103 @@
+"""The ceiling of an autoencoder: what two judges lose, on images of a world and planted losses."""
+
+import json
+
+import numpy as np
+import pytest
+import torch
+
+from palpate.cli import main
+from palpate.core import Split
+from palpate.data.manifest import Manifest
+from palpate.diffusion.autoencoder import load_autoencoder
+from palpate.diffusion.ceiling import measure_ceiling
+from palpate.encoders.encoder_set import EncoderSet
+from palpate.sim import WorldOptions, write_world
+
+SIZE = 64
+
+
+class Through:
+    """Stands in for an autoencoder: what ``change`` makes of the images."""
+
+    def __init__(self, change):
+        self.change = change
+
+    def encode(self, images, batch=64):
+        return torch.from_numpy(np.array(images))
+
+    def decode(self, latents, batch=64):
+        return self.change(latents.numpy())
+
+
+@pytest.fixture(scope="module")
+def world(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("world")
+    shape = {"objects_per_material": 16, "contacts_per_video": 1, "frames_per_contact": 3}
+    write_world(folder / "tree", WorldOptions(seed=5, materials=3, **shape))
+    return Manifest.load(folder / "tree")
+
+
+@pytest.fixture(scope="module")
+def split(world):
+    videos = sorted(set(world.column("video")))
+    train = [i for i, v in zip(world.ids, world.column("video"), strict=True) if v in videos[::2]]
+    rest = [i for i in world.ids if i not in train]
+    return Split.from_ids(train=train, test=rest, manifest=world.digest)
+
+
+def measured(world, split, change):
+    return measure_ceiling(
+        Through(change), world, split, SIZE, judge=EncoderSet.load("palpate/mini")
+    )
+
+
+def test_what_loses_nothing_scores_as_real_images_do(world, split):
+    found = measured(world, split, lambda x: x)
+    assert found["n"] == len(split.ids("test"))
+    assert found["psnr"] > 90
+    assert found["tmmd"] == pytest.approx(0, abs=1e-3)
+    assert found["accuracy_frozen"] == found["accuracy_refitted"] == found["accuracy_real"] > 0.5
+
+
+def test_a_refitted_probe_tells_what_is_gone_from_what_looks_otherwise(world, split):
+    real = measured(world, split, lambda x: x)["accuracy_real"]
+    other = measured(world, split, lambda x: 255 - x)  # all is there, in other colors
+    assert other["accuracy_frozen"] < real - 0.1
+    assert other["accuracy_refitted"] > other["accuracy_frozen"] + 0.1
+    gone = measured(world, split, lambda x: np.full_like(x, 128))
+    assert gone["accuracy_refitted"] < 0.5
+    assert gone["tmmd"] > other["tmmd"] > 1
+
+
+def test_what_the_data_cannot_give_is_left_out(world, split):
+    whole = Split.from_ids(train=world.ids, manifest=world.digest)
+    assert measure_ceiling(Through(lambda x: x), world, whole, SIZE) is None
+    material = world.column("material")[0]
+    same = world.take(
+        [i for i, m in zip(world.ids, world.column("material"), strict=True) if m == material]
+    )
+    parts = Split.from_ids(train=same.ids[:9], test=same.ids[9:], manifest=same.digest)
+    found = measured(same, parts, lambda x: x)
+    assert {"psnr", "judge"} <= set(found)
+    assert not {"accuracy_real", "accuracy_frozen", "accuracy_refitted"} & set(found)
+
+
+@pytest.mark.slow
+def test_trainings_print_the_ceiling_of_the_data_that_they_are_given(
+    world, split, tmp_path, capsys
+):
+    split.save(tmp_path / "split.json")
+    common = ["--split", str(tmp_path / "split.json"), "--steps", "2", "--json"]
+    start = ["--start", "palpate/mini"]
+    folder = str(world.root)
+    assert main(["train", "autoencoder", folder, *common, *start, "-o", str(tmp_path / "a")]) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert found["held_out_n"] == len(split.ids("test"))
+    assert 0 < found["held_out_accuracy_frozen"] <= 1
+    assert load_autoencoder(tmp_path / "a").card["held_out"]["tmmd"] == found["held_out_tmmd"]
+    given = ["--autoencoder", str(tmp_path / "a"), "--clip", "palpate/mini"]
+    assert main(["train", "generator", folder, *common, *given, "-o", str(tmp_path / "g")]) == 0
+    again = json.loads(capsys.readouterr().out)
+    assert again["ceiling_psnr"] == pytest.approx(found["held_out_psnr"], abs=0.01)
+    assert "accuracy_refitted" in (tmp_path / "g" / "README.md").read_text()
