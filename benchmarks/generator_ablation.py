@@ -84,7 +84,7 @@ def unet(**changes):
     return replace(BASE, unet=replace(BASE.unet, **changes))
 
 
-ORACLE = "oracle: told the material"
+ORACLE, LENGTH = "oracle: told the material", "length: twice"
 #: Row -> preset; a name before the colon is the choice that changes.
 ROWS = {
     "base": BASE,
@@ -111,6 +111,7 @@ ROWS = {
     "autoencoder: VQ": BASE,
     "width: 96, 128": unet(widths=(96, 128)),
     "no modulation": unet(modulate=False),
+    LENGTH: BASE,
     "batch: 32": replace(BASE, loop=replace(BASE.loop, batch=32)),
     ORACLE: condition(source="text", gap="none", noise=0.0),
 }
@@ -459,7 +460,8 @@ def main():
     chosen = parser.parse_args()
     file = chosen.page.with_suffix(".json")
     for seed, materials, name in itertools.product(chosen.seeds, chosen.materials, chosen.rows):
-        key = {"row": name, "seed": seed, "steps": chosen.steps}
+        steps = chosen.steps * (2 if name == LENGTH else 1)
+        key = {"row": name, "seed": seed, "steps": steps}
         record = saved(file).get(str(materials), {})
         if any(key.items() <= r.items() for r in record.get("rows", ())):
             continue
@@ -468,7 +470,7 @@ def main():
             counts = {"train": len(study.train), "test": len(study.test)}
             counts |= {"videos": len(set(study.videos)), "version": VERSION}
             record = {**counts, "ceilings": study.ceilings(), "rows": []}
-        row = {**key, **study.row(name, seed, chosen.steps)}
+        row = {**key, **study.row(name, seed, steps)}
         records = saved(file)  # again: another process may have added rows of another world
         record = records.setdefault(str(materials), record)
         record["rows"].append(row)

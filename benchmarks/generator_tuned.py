@@ -6,13 +6,16 @@ What a user does with ``palpate train generator --start palpate/mini``: the U-Ne
 memory holds the captions and photos of the new data alone. Trained on one world, judged on new
 objects, videos and gel units of another, by a CNN that saw real images of a third (those of
 ``generator_goals.py``, whose work folder is used). A seed is of one training and of its noise.
-A training that was stopped goes on, and a measurement that is on record is not made again.
+Captions are of what is felt, as the world writes them, or coded from the material, as palpate does
+for data without texts. A training that was stopped goes on, and a measurement that is on record is
+not made again.
 """
 
 import argparse
 import platform
 from dataclasses import replace
 from functools import partial
+from itertools import product
 from pathlib import Path
 
 from generator_ablation import BFLOAT, MANY, Line, Study
@@ -26,6 +29,14 @@ from palpate.diffusion.training import train_generator
 
 ROWS = "by photo", "by photo, on gels of its training", "by photo and caption"
 PRESET = replace(MINI, loop=replace(MINI.loop, batch=32, warmup=100))
+
+
+CAPTIONS = {"felt": "Captions of what is felt", "label": "Captions coded from the material"}
+
+
+def without_texts(manifest):
+    """The same samples; their captions are then made from the material."""
+    return replace(manifest, table=manifest.table.with_columns(text=None))
 
 
 def tuned(study, world, start, seed, steps):
@@ -66,6 +77,7 @@ def main():
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--materials", type=int, nargs="+", default=[10])
     parser.add_argument("--seeds", type=int, nargs="+", default=[0])
+    parser.add_argument("--captions", nargs="+", choices=[*CAPTIONS], default=[*CAPTIONS])
     parser.add_argument("--steps", type=int, default=500, help="of 32 images")
     parser.add_argument("--work", type=Path, default=Path("runs/generator_ablation"))
     parser.add_argument(
@@ -76,9 +88,11 @@ def main():
     )
     chosen, parts, days = parser.parse_args(), [], []
     start = TactilePipeline.from_pretrained(NAME)
-    for materials in sorted(chosen.materials):
+    for materials, captions in product(sorted(chosen.materials), chosen.captions):
         study = Study(chosen.work / str(materials), materials, "many", MANY)
         world = study.world("tuned")
+        if captions == "label":
+            study.test, world = without_texts(study.test), without_texts(world)
         made_by = start.digest, facts(start.sampler), world.digest, facts(PRESET), chosen.steps
         goals = Goals(study, (world, study.work / "tuned cache"), *made_by)
         goals.measure("real", 0, lambda s=study: s.real)
@@ -88,7 +102,8 @@ def main():
             for name in ROWS:
                 goals.measure(name, seed, partial(goals.generated, seed, **DRIVES[name]))
         days.append(goals.day())
-        parts.append(goals.section(chosen.seeds))
+        title = f"## {CAPTIONS[captions]}, "
+        parts.append(goals.section(chosen.seeds).replace("## ", title, 1))
     chosen.page.write_text(page(parts, max(days), chosen, start.digest))
     print(chosen.page.read_text())
 

@@ -203,6 +203,7 @@ def read_record(
     forms = [form] if isinstance(form, str) else form
     if forms is not None and record.get("format") not in forms:
         got = repr(record.get("format"))
+        fix = "Name another folder, or install the release of palpate that wrote it"
         raise PalpateError(f"The {what} {path} must have the format {forms[0]}", got, fix)
     if missing := [name for name in keys if name not in record]:
         must = f"The {what} {path} must have the keys {', '.join(keys)}"
