@@ -7,9 +7,10 @@ import pytest
 import torch
 
 from palpate.cli import main
-from palpate.core import Split
+from palpate.core import PalpateError, Split
 from palpate.data.manifest import Manifest
 from palpate.diffusion.autoencoder import load_autoencoder
+from palpate.diffusion.autoencoders import train_autoencoder
 from palpate.diffusion.ceiling import measure_ceiling
 from palpate.encoders.encoder_set import EncoderSet
 from palpate.sim import WorldOptions, write_world
@@ -81,6 +82,12 @@ def test_what_the_data_cannot_give_is_left_out(world, split):
     found = measured(same, parts, lambda x: x)
     assert {"psnr", "judge"} <= set(found)
     assert not {"accuracy_real", "accuracy_frozen", "accuracy_refitted"} & set(found)
+
+
+def test_a_judge_without_touch_is_rejected_before_the_training(world, split):
+    clip = EncoderSet(EncoderSet.load("palpate/mini").clip)
+    with pytest.raises(PalpateError, match="`judge` must have a tactile encoder"):
+        train_autoencoder(world, split, judge=clip)
 
 
 @pytest.mark.slow

@@ -19,7 +19,7 @@ from palpate.diffusion.autoencoder import (
 from palpate.diffusion.autoencoder_training import measure_reconstruction
 from palpate.diffusion.autoencoder_training import train_autoencoder as train_vq
 from palpate.diffusion.background_training import train_background_autoencoder
-from palpate.diffusion.ceiling import measure_ceiling
+from palpate.diffusion.ceiling import judge_of, measure_ceiling
 from palpate.diffusion.no_contact import gels_of, has_gels
 from palpate.diffusion.options import AutoencoderOptions, BackgroundOptions
 from palpate.diffusion.presets import DiffusionPreset, preset_named
@@ -65,14 +65,15 @@ def train_autoencoder(
         of train.
 
     Raises:
-        PalpateError: if the train part is empty, the preset has no autoencoder of its own, or
-            ``start`` is of another kind or shape.
+        PalpateError: if the train part is empty, the preset has no autoencoder of its own,
+            ``start`` is of another kind, or the judge has no tactile encoder.
     """
     chosen = preset if isinstance(preset, DiffusionPreset) else preset_named(preset)
     if chosen.autoencoder is None:
         must, fix = "must be one with an autoencoder of its own", "Choose mini, small or tiny"
         raise PalpateError(must, chosen.name, fix, argument="preset")
     device = connect(device)
+    judges = judge_of(judge, device)
     manifest, split = load(data), load_split(data, split)
     if start is not None and not isinstance(start, AnyAutoencoder):
         start = load_autoencoder(start)
@@ -92,8 +93,7 @@ def train_autoencoder(
             progress=progress,
         )
         model.card |= {"manifest": manifest.digest, "split": split.digest}
-        judge = EncoderSet.load(judge) if isinstance(judge, str | Path) else judge
-        how: dict[str, Any] = {"judge": judge, "cache": work / "cache", "progress": progress}
+        how: dict[str, Any] = {"judge": judges, "cache": work / "cache", "progress": progress}
         if measured := measure_ceiling(model, manifest, split, chosen.size, **how):
             model.card["held_out"] = measured
         if output is not None and place()[0] == 0:

@@ -25,12 +25,28 @@ from palpate.diffusion.autoencoder_training import measure_reconstruction
 from palpate.diffusion.no_contact import gels_of
 from palpate.encoders.embed import embed_images
 from palpate.encoders.encoder_set import EncoderSet
+from palpate.encoders.models import pick_device
 from palpate.encoders.rows import evenly
 from palpate.metrics.probe import fit_probe, material_accuracy
 from palpate.metrics.tactile import tmmd
 
 #: Samples that are scored, and samples of train that a probe is fitted to, at most.
 SCORED, FITTED = 1000, 4000
+
+
+def judge_of(judge: EncoderSet | str | Path | None, device: str = "cpu") -> EncoderSet | None:
+    """Load the encoders that judge, if they are named: before a training, so that it is not lost.
+
+    Raises:
+        PalpateError: if there are none of that name, or none of them is tactile.
+    """
+    if judge is None:
+        return None
+    judge = judge if isinstance(judge, EncoderSet) else EncoderSet.load(judge)
+    if "tactile" not in judge.modalities:
+        fix = "Choose others, or palpate/mini"
+        raise PalpateError("must have a tactile encoder", "none", fix, argument="judge")
+    return judge.to(pick_device(device))
 
 
 def measure_ceiling(

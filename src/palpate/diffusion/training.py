@@ -53,7 +53,7 @@ from palpate.diffusion.autoencoder import (
 )
 from palpate.diffusion.autoencoder_training import SHOWN, sheet
 from palpate.diffusion.autoencoders import autoencoder_of
-from palpate.diffusion.ceiling import measure_ceiling
+from palpate.diffusion.ceiling import judge_of, measure_ceiling
 from palpate.diffusion.denoiser import (
     Denoiser,
     build_unet,
@@ -192,6 +192,7 @@ def train_generator(  # noqa: PLR0913 - a public verb
             raise _not_given("autoencoder", chosen)
         autoencoder = chosen.unet
     device = connect(device)
+    judges = judge_of(judge, device)
     manifest, split = load(data), load_split(data, split)
     encoders = EncoderSet(load_clip(clip)) if isinstance(clip, str | Path) else clip
     needed = _modalities(_policy(chosen, encoders, source))
@@ -231,7 +232,7 @@ def train_generator(  # noqa: PLR0913 - a public verb
             background=background,
             align=None if align is None else Alignment.of(align, align_weight, device),
             start=start,
-            judge=EncoderSet.load(judge) if isinstance(judge, str | Path) else judge,
+            judge=judges,
             cache=cache,
             device=device,
             compute=compute,
