@@ -57,6 +57,7 @@ def test_what_speaks_against_a_gel_is_noted(tmp_path):
     digit = samples(look="digit")[1]
     worst = contacts[int(np.argmax([unevenness(image) for image in contacts]))]
     files = {"contact": worst, "gel": gels[5], "digit": digit[0], "small": gels[5][::4, ::4]}
+    files["exchanged"] = gels[5][..., ::-1]
     codes = {}
     for name, image in files.items():
         Image.fromarray(image).save(tmp_path / f"{name}.png")
@@ -65,6 +66,7 @@ def test_what_speaks_against_a_gel_is_noted(tmp_path):
         "contact": ["gel-contact"],
         "gel": [],
         "digit": ["gel-sensor"],
+        "exchanged": ["gel-exchanged"],
         "small": ["gel-small"],
     }
     photo = np.random.default_rng(0).integers(0, 256, (90, 120, 3), dtype=np.uint8)

@@ -9,6 +9,9 @@
 - *It is of another sensor.* The lights of another one come from other sides: the relative opponent
   colors of 4 x 4 cells, their mean left out, differ from those of the stock gel. GelSights of the
   world differ by up to 3, the real ones by up to 7.4 from the world's, DIGITs by more than 12.
+- *Its red and blue are exchanged*, as of an image that OpenCV read and another library wrote: it
+  is much nearer to the stock gel with them exchanged again (real gels: half as far; as they are,
+  at least 1.5 times as far).
 """
 
 from __future__ import annotations
@@ -28,6 +31,8 @@ from palpate.metrics.contact import marker_mask
 SMOOTH = 4.0
 #: Difference of the light, on the scale of 0 to 128, from which it is another sensor.
 OTHER_LIGHT = 10.0
+#: Share of that difference that is left once red and blue are exchanged, below which they were.
+EXCHANGED = 0.75
 _SIZE, _CELLS, _DEGREE = 64, 4, 4
 
 
@@ -43,8 +48,12 @@ def gel_notes(file: Path, size: int, stock: NDArray[np.uint8] | None) -> list[No
     pixels = square(image, _SIZE)
     if (left := unevenness(pixels)) > SMOOTH:
         notes.append(Note("gel-contact", {"gel": name, "left": left}))
-    if stock is not None and light_difference(pixels, stock) > OTHER_LIGHT:
-        notes.append(Note("gel-sensor", {"gel": name}))
+    if stock is not None:
+        light = light_difference(pixels, stock)
+        if light_difference(pixels[..., ::-1].copy(), stock) < EXCHANGED * light:
+            notes.append(Note("gel-exchanged", {"gel": name}))
+        elif light > OTHER_LIGHT:
+            notes.append(Note("gel-sensor", {"gel": name}))
     if (side := min(image.size)) < size:
         notes.append(Note("gel-small", {"gel": name, "side": side, "size": size}))
     return notes

@@ -552,6 +552,10 @@ EVALUATION: dict[str, Sentence] = {
         "{gel} is lit from other sides than the gels that the generator knows: a sensor of another "
         "kind, on which its contacts are implausible"
     ),
+    "gel-exchanged": (
+        "{gel} looks like a gel whose red and blue are exchanged, as OpenCV reads images: its light "
+        "comes from the wrong sides for the contacts that are made on it"
+    ),
     "gel-small": "{gel} is {side} px wide and was enlarged to {size}",
     "encoder-license": lambda p, _: (
         f"The {p['modality']} encoder is {p['name']}, whose license is "
