@@ -553,8 +553,8 @@ EVALUATION: dict[str, Sentence] = {
         "kind, on which its contacts are implausible"
     ),
     "gel-exchanged": (
-        "{gel} looks like a gel whose red and blue are exchanged, as OpenCV reads images: its light "
-        "comes from the wrong sides for the contacts that are made on it"
+        "{gel} looks like a gel whose red and blue are exchanged, as OpenCV reads images: its "
+        "light comes from the wrong sides for the contacts that are made on it"
     ),
     "gel-small": "{gel} is {side} px wide and was enlarged to {size}",
     "encoder-license": lambda p, _: (
