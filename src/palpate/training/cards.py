@@ -27,8 +27,10 @@ from typing import Any, NamedTuple
 
 from palpate.core import PalpateError, read_json, write_text
 
-PLACED = ("title", "summary", "license", "tags", "data", "ceiling", "recipe", "scores", "limits")
-PLACED += ("start_record", "start_card")
+PLACED = (
+    *("title", "summary", "license", "tags", "data", "ceiling", "recipe", "scores", "limits"),
+    *("start_record", "start_card"),
+)
 #: Longer entries of the record (loss curves) are cut on the page.
 MAX_CHARACTERS = 240
 
