@@ -52,6 +52,7 @@ def tuned(study, world, start, seed, steps):
 def page(parts, day, chosen, start):
     materials, seeds = (" ".join(map(str, rows)) for rows in (chosen.materials, chosen.seeds))
     command = f"generator_tuned.py --materials {materials} --seeds {seeds} --steps {chosen.steps}"
+    command += f" --captions {' '.join(chosen.captions)}"
     return f"""# The shipped generator, fine-tuned
 
 Made by a committed command; do not edit by hand. Synthetic: the tables show a mechanism.
@@ -67,7 +68,8 @@ of each video, by a small CNN that saw real images of a third (seed 61), and by 
 `{NAME}`, fitted on that third. Nothing was chosen on these numbers: preset, steps and seeds were
 set before. Intervals: 95 % over videos, of the seeds' mean image by image: how trainings differ is
 not in them. What one is ahead of another is paired by image, in points of the CNN. TMMD (grouped)
-is to the real images of the same samples, with the mean of the seeds' limits.
+is to the real images of the same samples, with the mean of the seeds' limits. Captions, of training
+and test, are those that the world writes of what is felt, or coded from the material.
 {platform.machine()}, CPU, bf16; {day}.
 
 {chr(10).join(parts)}"""

@@ -162,7 +162,9 @@ def train_round(
     """The generator after a round of training, from random weights or from those of ``start``."""
     parts = train, everything(train), encoders, autoencoder, GENERATOR, folder
     how |= {"seed": seed, "steps": steps, "start": start, "compute": COMPUTE}
-    return train_pipeline(*parts, **how)
+    made = train_pipeline(*parts, **how)
+    # Nothing is left out of the training: the ceiling is that of the autoencoder's own card.
+    return replace(made, training={**made.training, "ceiling": autoencoder.card.get("scores")})
 
 
 class Recipe:

@@ -1,8 +1,10 @@
 """The ceiling of an autoencoder: what two judges lose, on images of a world and planted losses."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
+import polars as pl
 import pytest
 import torch
 
@@ -82,6 +84,30 @@ def test_what_the_data_cannot_give_is_left_out(world, split):
     found = measured(same, parts, lambda x: x)
     assert {"psnr", "judge"} <= set(found)
     assert not {"accuracy_real", "accuracy_frozen", "accuracy_refitted"} & set(found)
+
+
+def test_a_training_is_not_lost_for_a_file_outside_of_it(world, split, tmp_path):
+    code, test = load_autoencoder("palpate/mini"), split.ids("test")
+    gel = pl.when(pl.col("id") == test[0]).then(None).otherwise(pl.col("background"))
+    lacking = replace(world, table=world.table.with_columns(background=gel))
+    known = Split.from_ids(train=split.ids("train"), test=test, manifest=lacking.digest)
+    assert measure_ceiling(code, lacking, known, SIZE)["n"] == len(test) - 1
+    (tmp_path / "cut.png").write_bytes(b"no image")
+    path = pl.when(pl.col("id") == test[0]).then(pl.lit(str(tmp_path / "cut.png")))
+    broken = replace(
+        world, table=world.table.with_columns(tactile=path.otherwise(pl.col("tactile")))
+    )
+    known = Split.from_ids(train=split.ids("train"), test=test, manifest=broken.digest)
+    assert "cut.png" in measure_ceiling(code, broken, known, SIZE)["not_measured"]
+
+
+def test_a_background_autoencoder_is_given_gels_or_the_stock_gel(world, split):
+    code, judge = load_autoencoder("palpate/mini"), EncoderSet.load("palpate/mini")
+    given = measure_ceiling(code, world, split, SIZE, judge=judge)
+    assert abs(given["accuracy_frozen"] - given["accuracy_real"]) < 0.1
+    without = replace(world, table=world.table.with_columns(background=None))
+    known = Split.from_ids(**{p: split.ids(p) for p in ("train", "test")}, manifest=without.digest)
+    assert given["psnr"] > measure_ceiling(code, without, known, SIZE)["psnr"] > 15
 
 
 def test_a_judge_without_touch_is_rejected_before_the_training(world, split):

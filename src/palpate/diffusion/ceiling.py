@@ -9,6 +9,7 @@ or only looks otherwise.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import asdict
 from pathlib import Path
@@ -22,13 +23,14 @@ from palpate.data.images import cached_images
 from palpate.data.manifest import Manifest
 from palpate.diffusion.autoencoder import AnyAutoencoder, BackgroundAutoencoder
 from palpate.diffusion.autoencoder_training import measure_reconstruction
-from palpate.diffusion.no_contact import gels_of
+from palpate.diffusion.no_contact import gels_of, has_gels
 from palpate.encoders.embed import embed_images
 from palpate.encoders.encoder_set import EncoderSet
 from palpate.encoders.models import pick_device
 from palpate.encoders.rows import evenly
 from palpate.metrics.probe import fit_probe, material_accuracy
 from palpate.metrics.tactile import tmmd
+from palpate.training.processes import place
 
 #: Samples that are scored, and samples of train that a probe is fitted to, at most.
 SCORED, FITTED = 1000, 4000
@@ -75,15 +77,36 @@ def measure_ceiling(
         The fields of :class:`~palpate.diffusion.autoencoder_training.Reconstruction` that are not
         None; with a judge its digest, ``tmmd`` with its 95 % interval, and ``accuracy_real``,
         ``accuracy_frozen`` and ``accuracy_refitted`` of the material. What the data cannot give,
-        for want of materials or of samples, is left out.
+        for want of materials or of samples, is left out. ``not_measured`` says what was wrong with
+        a file. None also on all processes but the first.
     """
-    others = _some(manifest.part(split, "val", "test"), SCORED)
-    if not len(others):
+    given = isinstance(autoencoder, BackgroundAutoencoder)
+    train = manifest.part(split, "train")
+    needed = ["tactile", "background"] if given and has_gels(train) else ["tactile"]
+    others = manifest.part(split, "val", "test")
+    there = np.all([[v is not None for v in others.column(name)] for name in needed], axis=0)
+    others = others.take([i for i, all_there in zip(others.ids, there, strict=True) if all_there])
+    others = others.take([others.ids[k] for k in evenly(len(others), SCORED)])
+    if not len(others) or place()[0]:
         return None
-    train = _some(manifest.part(split, "train"), FITTED)
-    gels = held = None
+    try:
+        return _measured(autoencoder, train, others, size, judge, cache, progress)
+    except PalpateError as error:  # of a file: no reason to lose the training
+        return {"not_measured": str(error)}
+
+
+def _measured(  # noqa: PLR0917 - the arguments of measure_ceiling
+    autoencoder: AnyAutoencoder,
+    train: Manifest,
+    others: Manifest,
+    size: int,
+    judge: EncoderSet | None,
+    cache: Path | None,
+    progress: Progress,
+) -> dict[str, Any]:
+    some, gels, held = evenly(len(train), FITTED), None, None
     if isinstance(autoencoder, BackgroundAutoencoder):
-        gels = gels_of(train, size, cache, progress)
+        gels = gels_of(train, size, cache, progress)  # the stock gel is that of the training
         held = gels_of(others, size, cache, progress, like=gels)
     images = np.asarray(cached_images(others, "tactile", size, cache, progress))
     pixels = asdict(measure_reconstruction(autoencoder, images, held))
@@ -92,8 +115,7 @@ def measure_ceiling(
         return found
 
     def features(part: Manifest, pixels: NDArray[np.uint8]) -> FeatureSet:
-        columns = (part.column(name) for name in ("material", "video"))
-        labels, groups = ([*map(str, c)] if all(c) else None for c in columns)
+        labels, groups = _words(part.column("material")), _words(part.column("video"))
         rows = embed_images(pixels, judge, progress=progress)
         return FeatureSet(part.ids, rows, labels, groups, found["judge"])
 
@@ -103,18 +125,21 @@ def measure_ceiling(
 
     found["judge"] = judge.digest("tactile")
     real, ours = features(others, images), features(others, through(images, held))
-    with suppress(PalpateError):  # too few videos
+    with suppress(PalpateError):  # too few samples or videos
         score = tmmd(ours, real)
         found |= {"tmmd": score.value, "tmmd_interval": score.interval}
-    with suppress(PalpateError):  # no materials, or one
-        known = np.asarray(cached_images(train, "tactile", size, cache, progress))
-        frozen, refitted = features(train, known), features(train, through(known, gels))
-        probe = fit_probe(frozen)
-        found["accuracy_real"] = material_accuracy(frozen, real, probe=probe).value
-        found["accuracy_frozen"] = material_accuracy(frozen, ours, probe=probe).value
-        found["accuracy_refitted"] = material_accuracy(refitted, ours).value
+    if len({*train.column("material")} - {None}) > 1:
+        known = np.asarray(cached_images(train, "tactile", size, cache, progress)[some])
+        fitted = train.take([train.ids[k] for k in some])
+        frozen = features(fitted, known)
+        refitted = features(fitted, through(known, None if gels is None else gels[some]))
+        with suppress(PalpateError):  # no material outside of train
+            probe = fit_probe(frozen)
+            found["accuracy_real"] = material_accuracy(frozen, real, probe=probe).value
+            found["accuracy_frozen"] = material_accuracy(frozen, ours, probe=probe).value
+            found["accuracy_refitted"] = material_accuracy(refitted, ours).value
     return {name: value for name, value in found.items() if value is not None}
 
 
-def _some(part: Manifest, most: int) -> Manifest:
-    return part.take([part.ids[k] for k in evenly(len(part), most)])
+def _words(column: Sequence[Any]) -> list[str] | None:
+    return None if all(v is None for v in column) else ["" if v is None else str(v) for v in column]

@@ -96,7 +96,7 @@ def estimate(
             photos = as_files(photos, folder)
         elif (video := video_of(photos)) is not None:
             model = loaded(model, device, progress)
-            photos = frames_of(video, folder, model, options)[0]
+            photos = frames_of(video, folder, model, options, progress)[0]
         options |= {"output": None if output is None else Path(output), "device": device}
         run = prepare(photos, model=model, progress=progress, **options)
         return _estimated(run, folder / "sampled")

@@ -453,7 +453,7 @@ def _require_condition(photos: object, text: str | None, weight: float) -> None:
 
 
 def frames_of(
-    video: Path, folder: Path, model: TactilePipeline, options: dict[str, Any]
+    video: Path, folder: Path, model: TactilePipeline, options: dict[str, Any], progress: Progress
 ) -> tuple[dict[str, Path], float]:
     """The frames of a video, by id, and their rate; ``options`` come to give all of them one noise.
 
@@ -464,7 +464,6 @@ def frames_of(
     if (copies := options.get("best_of", 1)) > 1:
         must, fix = "must be 1 for a video, whose frames share their noise", "Pass its frames"
         raise PalpateError(must, str(copies), fix, argument="best_of")
-    progress = options.get("progress", quiet)
     frames, rate = save_frames(video, folder, model.vision_size, progress)
     options["noise"] = video.name
     return frames, rate
@@ -477,7 +476,7 @@ def _of_video(
     from palpate.diffusion.video import write_video
 
     with tempfile.TemporaryDirectory() as folder:
-        frames, rate = frames_of(video, Path(folder), model, options)
+        frames, rate = frames_of(video, Path(folder), model, options, options["progress"])
         made = generate(frames, output=output, model=model, **options)
     if made.folder is not None:
         write_video(made.folder / "tactile.mp4", made.images, rate)

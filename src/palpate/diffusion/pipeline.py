@@ -245,8 +245,8 @@ class TactilePipeline(DiffusionPipeline):
         """
         images = [] if photos is None else list_images(photos)
         if not images and (photos is not None or text is None):
-            must, fix = "There must be at least one photo, or a text", "Pass one of them"
-            raise PalpateError(must, "none", fix)
+            must, fix = "There must be at least one photo, or a text alone", "Pass one of them"
+            raise PalpateError(must, "no photo", fix)
         if ids is None:
             ids = [i.name if isinstance(i, Path) else str(k) for k, i in enumerate(images)]
             ids = ids if images else [str(text)]
