@@ -434,8 +434,9 @@ def model_stamp(part: Part, source: str | None) -> str | None:
         return None
     if (shipped := shipped_folder(source, part)) is not None:
         record = read_json(shipped / "palpate.json", "model record")  # with digests of weights
-        prose = ("card", "training", "palpate")
-        return digest_json({key: value for key, value in record.items() if key not in prose})
+        for card in {"card", "training"} & {*record}:  # what is trained from it carries the rest
+            record[card] = {k: v for k, v in record[card].items() if k not in ("title", "summary")}
+        return digest_json(record)
     if Path(source).is_file():
         return digest_file(Path(source))
     return digest_folder(Path(source)) if Path(source).is_dir() else source
