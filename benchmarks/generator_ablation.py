@@ -3,8 +3,9 @@
     python benchmarks/generator_ablation.py --materials 10 20 --seeds 0 1 2
     python benchmarks/generator_ablation.py --rows base "condition: mixed" --steps 200    # a look
 
-Every row is the base with one change, trained on one procedural world for equal steps (the
-processor seconds are in the table) and judged on another world: new objects, videos and gel units.
+Every row is the base with one change, trained on one procedural world for equal steps, but for
+``length`` (the processor seconds of the process that ended the row are in the table), and judged on
+another world: new objects, videos and gel units.
 The autoencoder is that of palpate/mini where a row names no other. Judges see real images in
 training and nothing else, and are never fitted again: a small CNN, and the linear probe of the
 tactile encoder of palpate/mini. Driven by the photo, by the sample's own caption, and by photos in
