@@ -175,6 +175,8 @@ def by_video(hits, videos):
 class Study:
     """The worlds, the judges, the autoencoders, and the rows."""
 
+    look = "gelsight"
+
     def __init__(self, work, materials, new="new", judged=JUDGED):
         self.work, self.materials = work, materials
         self.cache = work / "cache"
@@ -203,7 +205,7 @@ class Study:
     def world(self, name):
         folder = self.work / f"world {name}"
         shape = {"objects_per_material": MANY // self.materials, **SHAPE, **WORLDS[name]}
-        options = replace(PRESETS["pretrain"], **shape, materials=self.materials)
+        options = replace(PRESETS["pretrain"], **shape, materials=self.materials, look=self.look)
         if not (folder / "done").is_file():
             write_world(folder / "tree", options, workers=2, progress=self.progress)
             (folder / "done").write_text(options.digest)

@@ -11,21 +11,18 @@ the latents (shares of their spread), and decoded on the gel of another sample. 
 
 import argparse
 import platform
-from dataclasses import replace
 from datetime import date
 from pathlib import Path
 
 import numpy as np
 import torch
-from generator_ablation import BASE, MANY, SHAPE, WORLDS, Study, by_video, cells, line, percents
+from generator_ablation import BASE, MANY, Study, by_video, cells, line, percents
 
 from palpate.core import FeatureSet, rng_for, short
-from palpate.data.manifest import Manifest
 from palpate.diffusion.no_contact import gels_of
 from palpate.encoders.embed import embed_images
 from palpate.metrics.images import per_image
 from palpate.metrics.probe import material_accuracy
-from palpate.sim import PRESETS, write_world
 
 NOISES = 0.0, 0.2, 0.5
 
@@ -36,17 +33,6 @@ class Look(Study):
     def __init__(self, work, materials, look):
         self.look = look
         super().__init__(work, materials, "many", MANY)
-
-    def world(self, name):
-        if self.look == "gelsight":
-            return super().world(name)
-        folder = self.work / f"world {name}"
-        shape = {"objects_per_material": MANY // self.materials, **SHAPE, **WORLDS[name]}
-        options = replace(PRESETS["pretrain"], **shape, materials=self.materials, look=self.look)
-        if not (folder / "done").is_file():
-            write_world(folder / "tree", options, workers=2, progress=self.progress)
-            (folder / "done").write_text(options.digest)
-        return Manifest.load(folder / "tree")
 
     def rows(self):
         """Markdown rows of the table."""
