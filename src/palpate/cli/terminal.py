@@ -338,8 +338,8 @@ def join_help_lines(options: type[Any]) -> None:
         group: Any = field.default_factory
         if dataclasses.is_dataclass(field.default):
             group = type(field.default)
-        # The groups of `palpate world` are made by the verb and have no source.
-        if dataclasses.is_dataclass(group) and group.__module__ != "types":
+        # Groups made by `make_dataclass` have no source; they write their own help.
+        if dataclasses.is_dataclass(group) and group.__name__ in vars(inspect.getmodule(group)):
             join_help_lines(group)  # type: ignore[arg-type]
 
 
