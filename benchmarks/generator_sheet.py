@@ -26,6 +26,7 @@ from palpate.core import rng_for
 from palpate.data.images import load_images
 from palpate.data.manifest import Manifest
 from palpate.diffusion.generation import generate
+from palpate.diffusion.pipeline import TactilePipeline
 from palpate.sim import PRESETS, write_world
 
 WORLD = replace(
@@ -94,11 +95,11 @@ def main():
     parser.add_argument("--answers", type=Path, help="JSON: number -> material")
     chosen = parser.parse_args()
     with tempfile.TemporaryDirectory() as folder:
-        write_world(Path(folder) / "tree", WORLD, workers=2)
+        size = TactilePipeline.from_pretrained(chosen.model).size
+        write_world(Path(folder) / "tree", replace(WORLD, size=size, tile=4 * size), workers=2)
         world = Manifest.load(Path(folder) / "tree")
         ids, others = picked(world)
         flat = [i for row in ids.values() for i in row]
-        size = generate(world.take(flat[:1]), model=chosen.model).images[0].size[0]
         pixels = lambda names, column: load_images(world.take(names).paths(column), size)
         made = np.stack(
             [np.asarray(i) for i in generate(world.take(flat), model=chosen.model).images]

@@ -5,6 +5,9 @@
 
 - ``train``: the tactile encoder of ``paper``, and the U-Nets of ``paper`` and ``sd15``, in steps of
   the training engine: in float32, with TF32, in bf16, and in bf16 with ``torch.compile``.
+- ``cached``: the same of both U-Nets where each step also encodes its images and texts, as a loop
+  without caches does; they lie in memory, so reading them is not in it (wanted: at least 1.4 times
+  the seconds of the cached step).
 - ``sample``: ``paper`` (DDIM, 200 steps) and ``sd15`` (DPM-Solver++, 25), guided, with their
   autoencoders: by a plain float32 loop of diffusers' parts, and by the pipeline in the same modes.
 
@@ -23,7 +26,7 @@ import platform
 import sys
 import tempfile
 import time
-from contextlib import suppress
+from contextlib import nullcontext, suppress
 from functools import partial
 from pathlib import Path
 
@@ -31,6 +34,7 @@ import numpy as np
 import torch
 from diffusers import AutoencoderKL, UNet2DConditionModel, VQModel
 from torch.utils.flop_counter import FlopCounterMode
+from transformers import CLIPTextConfig, CLIPTextModelWithProjection
 
 from palpate.core import write_json
 from palpate.diffusion.autoencoder import Autoencoder, LatentStats
@@ -51,16 +55,20 @@ PEAKS = {
     "H100 80GB HBM3": {"float32": 67, "tf32": 495, "bf16": 989},
     "A100": {"float32": 19.5, "tf32": 156, "bf16": 312},
 }
-#: The precision of the products, and whether the network is compiled.
+#: The precision of the products, and how else the training or pipeline is run.
 MODES = {
-    "float32": ("float32", False),
-    "tf32": ("tf32", False),
-    "bf16": ("bf16", False),
-    "bf16 + compile": ("bf16", True),
+    "float32": ("float32", {}),
+    "tf32": ("tf32", {}),
+    "bf16": ("bf16", {}),
+    "bf16 + channels-last": ("bf16", {"channels_last": True}),
+    "bf16 + compile": ("bf16", {"compile": True}),
 }
 PLAIN = "float32, plain loop of diffusers"
 #: Channels of the autoencoders' levels: of latent diffusion's vq-f4, of Stable Diffusion's kl-f8.
 LEVELS = {"paper": (128, 256, 512), "sd15": (128, 256, 512, 512)}
+#: The text encoder of CLIP ViT-L/14, which both presets are conditioned on.
+TEXT = {"hidden_size": 768, "intermediate_size": 3072, "num_attention_heads": 12}
+ENCODED = ", encoded in each step"
 
 
 class EnoughError(Exception):
@@ -97,6 +105,53 @@ def encoder_steps(chosen, batch, chunk):
     return model, loss, lambda step: {name: rows[step.rows] for name, rows in data.items()}
 
 
+def autoencoder(name, channels):
+    """The untrained autoencoder of a preset."""
+    levels = LEVELS[name]
+    sizes = {
+        "down_block_types": ("DownEncoderBlock2D",) * len(levels),
+        "up_block_types": ("UpDecoderBlock2D",) * len(levels),
+        "block_out_channels": levels,
+        "layers_per_block": 2,
+        "latent_channels": channels,
+    }
+    net = AutoencoderKL(**sizes) if name == "sd15" else VQModel(**sizes)
+    return Autoencoder(net.eval().requires_grad_(False))
+
+
+class Live:
+    """A table whose rows are computed when they are read, in the precision of the training."""
+
+    def __init__(self, rows, device, mode, function):
+        self.rows, self.device, self.function = rows, device, function
+        self.bf16 = MODES[mode][0] == "bf16"
+
+    @torch.no_grad()
+    def __getitem__(self, index):
+        rows = self.rows[index].to(self.device)
+        with torch.autocast(self.device, torch.bfloat16) if self.bf16 else nullcontext():
+            return self.function(rows).float().cpu()
+
+
+def encoded_steps(name, chosen, batch, device, mode):
+    """`denoiser_steps` where latents, and what a text becomes, are made anew in each step."""
+    model, loss, load = denoiser_steps(name, chosen, batch)
+    code = autoencoder(name, model.channels).to(device)
+    config = CLIPTextConfig(**TEXT, projection_dim=model.policy.width)
+    text = CLIPTextModelWithProjection(config).to(device).eval()
+    pixels = torch.randint(256, (batch, 3, chosen.size, chosen.size), dtype=torch.uint8)
+    words = torch.randint(config.vocab_size, (batch, 77))
+
+    def states(rows):
+        found = text(rows)
+        return found.last_hidden_state if model.policy.words else found.text_embeds[:, None]
+
+    loss.latents = Live(pixels, device, mode, lambda rows: code.latents(rows / 127.5 - 1))
+    table = loss.inputs if model.policy.words else loss.tokens
+    table["words" if model.policy.words else "text"] = Live(words, device, mode, states)
+    return model, loss, load
+
+
 def denoiser_steps(name, chosen, batch):
     """The denoiser, its loss, and the data of a batch of latents."""
     model, side = denoiser(name, chosen)
@@ -113,8 +168,8 @@ def steps(built, batch, device, mode, count):
     """Seconds of a step of the engine, and operations of a row."""
     model, loss, load = built
     model.to(device)
-    few = {name: rows.to(device) for name, rows in load(Step(0, np.arange(2), 0)).items()}
     with FlopCounterMode(display=False) as counter:
+        few = {name: rows.to(device) for name, rows in load(Step(0, np.arange(2), 0)).items()}
         loss(model, few).total.backward()
     at = []
 
@@ -123,12 +178,12 @@ def steps(built, batch, device, mode, count):
         if done == count:
             raise EnoughError
 
-    precision, compiled = MODES[mode]
+    precision, more = MODES[mode]
     compute = Compute(
         precision="bf16" if precision == "bf16" else "float32",
         tf32=precision != "float32",
-        compile=compiled,
         checkpoint_minutes=1e9,
+        **more,
     )
     if device == "cuda":
         torch.cuda.reset_peak_memory_stats()
@@ -143,18 +198,9 @@ def steps(built, batch, device, mode, count):
 def generator(name, chosen, device):
     """The pipeline of a preset, with random weights."""
     model, _ = denoiser(name, chosen)
-    levels = LEVELS[name]
-    sizes = {
-        "down_block_types": ("DownEncoderBlock2D",) * len(levels),
-        "up_block_types": ("UpDecoderBlock2D",) * len(levels),
-        "block_out_channels": levels,
-        "layers_per_block": 2,
-        "latent_channels": model.channels,
-    }
-    net = AutoencoderKL(**sizes) if name == "sd15" else VQModel(**sizes)
     ones = (1.0,) * model.channels
     return TactilePipeline(
-        autoencoder=Autoencoder(net.eval().requires_grad_(False)),
+        autoencoder=autoencoder(name, model.channels),
         denoiser=model.eval().requires_grad_(False),
         stats=LatentStats((0.0,) * model.channels, ones, "one"),
         schedule=chosen.schedule,
@@ -182,7 +228,7 @@ def plain_loop(pipeline, rows, ids, count, at):
 
 def sampling(name, chosen, device, mode, batch, count):
     """Seconds of a sampler step and of decoding a batch, and operations of an image's step."""
-    precision = MODES.get(mode, ("float32", False))[0]
+    precision, how = MODES.get(mode, ("float32", {}))
     torch.backends.cuda.matmul.allow_tf32 = precision != "float32"
     torch.backends.cudnn.allow_tf32 = precision != "float32"
     pipeline = generator(name, chosen, device)
@@ -195,7 +241,9 @@ def sampling(name, chosen, device, mode, batch, count):
     operations = counter.get_total_flops() - decoding.get_total_flops()
     if precision == "bf16":
         pipeline.to(torch.bfloat16)
-    if MODES.get(mode, ("", False))[1]:
+    if how.get("channels_last"):
+        pipeline.unet.to(memory_format=torch.channels_last)
+    if how.get("compile"):
         pipeline.unet = torch.compile(pipeline.unet)
 
     def run(count):
@@ -277,12 +325,17 @@ class Bench:
         """One model in the requested modes."""
         for mode in self.modes:
             if what == "encoder of paper":
+                if "channels_last" in MODES[mode][1]:
+                    continue  # it has one convolution
                 batch, chosen = (4, "mini") if self.small else (256, "paper")
                 chunk = 2 if self.small else 32
                 make = partial(encoder_steps, encoder_preset(chosen), batch, chunk)
             else:
-                batch, name = 4 if self.small else 32, what.split()[-1]
-                make = partial(denoiser_steps, name, self.preset(name), batch)
+                batch, name = 4 if self.small else 32, what.removesuffix(ENCODED).split()[-1]
+                how = (name, self.preset(name), batch)
+                make = partial(denoiser_steps, *how)
+                if what.endswith(ENCODED):
+                    make = partial(encoded_steps, *how, self.device, mode)
 
             def measure(make=make, batch=batch, mode=mode):
                 return *steps(make(), batch, self.device, mode, 8), {}
@@ -310,10 +363,24 @@ class Bench:
 PARTS = {
     "train paper": lambda bench: bench.train("U-Net of paper"),
     "train sd15": lambda bench: bench.train("U-Net of sd15"),
+    "cached paper": lambda bench: bench.train(f"U-Net of paper{ENCODED}"),
+    "cached sd15": lambda bench: bench.train(f"U-Net of sd15{ENCODED}"),
     "sample paper": lambda bench: bench.sample("paper"),
     "sample sd15": lambda bench: bench.sample("sd15"),
     "train encoder": lambda bench: bench.train("encoder of paper"),
 }
+
+
+def cached(record):
+    """How much faster a step is with latents and conditions cached, by model and mode."""
+    seconds = {(r["what"], r["mode"]): r["seconds"] for r in record["rows"] if "seconds" in r}
+    told = []
+    for (what, mode), encoded in seconds.items():
+        plain = what.removesuffix(ENCODED)
+        if what != plain and (plain, mode) in seconds:
+            name, ratio = plain.split()[-1], encoded / seconds[plain, mode]
+            told.append(f"`{name}`, {mode}: **{ratio:.2f}**")
+    return "; ".join(told) or "not measured"
 
 
 def page(record):
@@ -352,6 +419,14 @@ measured.
 | what | mode | batch | ms a step | images a second | ratio | TFLOP/s | of peak | GB | s in all |
 |---|---|---|---|---|---|---|---|---|---|
 {chr(10).join(lines)}
+
+## Cached latents and conditions
+
+Seconds of a step that also encodes its images and texts (by the autoencoder, and by the text
+encoder of CLIP ViT-L/14; uint8 images in memory, so nothing is read), over those of a step with
+both cached, as `palpate train generator` has them (wanted: at least 1.4).
+
+{cached(record)}.
 """
 
 

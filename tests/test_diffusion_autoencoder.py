@@ -194,9 +194,8 @@ def test_k_means_finds_separate_heaps_and_leaves_no_center_unused():
 
 def test_training_learns_and_uses_its_codes(tmp_path):
     train, test = make_images(64), make_images(16, seed=1)
-    model = train_autoencoder(train, SMALL, tmp_path / "a", held_out=test)
+    model = train_autoencoder(train, SMALL, tmp_path / "a", shown=test[:8])
     result = measure_reconstruction(model, test)
-    assert model.card["held_out"]["psnr"] == pytest.approx(result.psnr)
     untrained = measure_reconstruction(random_model(), test)
     assert result.psnr > untrained.psnr + 4
     assert result.perplexity > 8 > untrained.perplexity

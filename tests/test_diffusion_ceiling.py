@@ -13,8 +13,9 @@ from palpate.core import PalpateError, Split
 from palpate.data.manifest import Manifest
 from palpate.diffusion.autoencoder import load_autoencoder
 from palpate.diffusion.autoencoders import train_autoencoder
-from palpate.diffusion.ceiling import measure_ceiling
+from palpate.diffusion.ceiling import judge_of, measure_ceiling
 from palpate.encoders.encoder_set import EncoderSet
+from palpate.encoders.preprocess import digest_images, load_frames
 from palpate.sim import WorldOptions, write_world
 
 SIZE = 64
@@ -114,6 +115,22 @@ def test_a_judge_without_touch_is_rejected_before_the_training(world, split):
     clip = EncoderSet(EncoderSet.load("palpate/mini").clip)
     with pytest.raises(PalpateError, match="`judge` must have a tactile encoder"):
         train_autoencoder(world, split, judge=clip)
+
+
+def test_a_judge_that_was_trained_on_the_images_does_not_judge_them(world, split):
+    judge, test = EncoderSet.load("palpate/mini"), world.part(split, "test")
+    preprocess = judge.preprocess("tactile")
+    judge.seen = digest_images(
+        load_frames(preprocess.frames(test, "tactile").files[:3], preprocess)
+    )
+    found = measure_ceiling(Through(lambda x: x), world, split, SIZE, judge=judge)
+    assert found["psnr"] > 90
+    assert f"3 of the {len(test)} images" in found["not_judged"]
+    assert not {"tmmd", "accuracy_frozen"} & set(found)
+
+
+def test_none_is_no_judge():
+    assert judge_of("none") is None
 
 
 @pytest.mark.slow

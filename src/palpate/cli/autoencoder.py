@@ -25,7 +25,7 @@ class Options(Training):
     """Fine-tune this one: a folder, a hub id, or palpate/mini. Default: random weights."""
     judge: str = "palpate/mini"
     """Encoders whose tactile encoder judges, by TMMD and by material, what survives of images
-    outside of train: a folder, a public tactile encoder, or palpate/mini."""
+    outside of train: a folder, a public tactile encoder, palpate/mini, or none."""
     fields: _Preset = field(default_factory=_Preset)  # pyright: ignore[reportInvalidTypeForm]
     """Fields of the preset."""
 

@@ -7,6 +7,7 @@ training have no prefix.
 from __future__ import annotations
 
 import dataclasses
+import inspect
 import re
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, make_dataclass
@@ -59,9 +60,10 @@ def _walk(record: type[Any], main: str, path: tuple[str, ...]) -> Iterator[_Fiel
 @cache
 def attributes(record: type[Any]) -> Mapping[str, str]:
     """The texts of a record's docstring about its attributes."""
-    block = (record.__doc__ or "").partition("Attributes:")[2].partition("\n\n")[0]
+    # From Python 3.13 on a docstring has lost its indentation already.
+    block = inspect.cleandoc(record.__doc__ or "").partition("Attributes:")[2].partition("\n\n")[0]
     texts: dict[str, str] = {}
-    for names, text in re.findall(r"^ {8}([\w, ]+): ((?:.|\n {9,})+)", block, re.MULTILINE):
+    for names, text in re.findall(r"^ {4}([\w, ]+): ((?:.|\n {5,})+)", block, re.MULTILINE):
         plain = re.sub(r":\w+:`([^`]*)`|``([^`]*)``", r"\1\2", " ".join(text.split()))
         texts |= dict.fromkeys(names.split(", "), plain[:1].upper() + plain[1:].rstrip(".") + ".")
     return texts

@@ -49,7 +49,7 @@ class Options(Training):
     """Of that term in the loss."""
     judge: str = "palpate/mini"
     """Encoders whose tactile encoder judges, by TMMD and by material, what of images outside of
-    train survives the autoencoder."""
+    train survives the autoencoder; or none."""
     steps: int | None = None
     """Optimizer steps. Default: the preset's."""
     dry_run: Switch = False

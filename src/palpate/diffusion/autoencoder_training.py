@@ -34,7 +34,6 @@ from palpate.diffusion.autoencoder import Autoencoder, BackgroundAutoencoder, to
 from palpate.diffusion.options import AutoencoderOptions
 from palpate.encoders.encoder_set import seeded
 from palpate.encoders.preprocess import to_unit
-from palpate.encoders.rows import evenly
 from palpate.metrics.images import per_image
 from palpate.training.engine import Batch, Losses, Task, fit
 from palpate.training.options import Compute, LoopOptions
@@ -68,7 +67,7 @@ def train_autoencoder(
     folder: Path,
     *,
     start: Autoencoder | None = None,
-    held_out: NDArray[np.uint8] | None = None,
+    shown: NDArray[np.uint8] | None = None,
     seed: int = 0,
     key: str = "",
     device: str | torch.device = "cpu",
@@ -82,8 +81,7 @@ def train_autoencoder(
         options: see :class:`AutoencoderOptions`.
         folder: for checkpoints.
         start: fine-tune a copy of this one, in its own shape: the last stage alone.
-        held_out: bytes (m, h, w, 3) of other videos; the card then says how well they are
-            reconstructed, and some are drawn with each checkpoint.
+        shown: bytes (m, h, w, 3) of other videos, drawn with each checkpoint.
         seed: of weights, order, crops and noise.
         key: digest of the images.
         device: where to train.
@@ -105,16 +103,15 @@ def train_autoencoder(
     free = LoopOptions(options.steps_free, options.batch, options.lr, weight_decay=1e-4, seed=seed)
     last = replace(free, steps=options.steps_quantized, lr=options.lr / 2)
 
-    shown = images[:0] if held_out is None else held_out[evenly(len(held_out), SHOWN)]
-
     def run(what: str, course: LoopOptions, stage: str, *, quantize: bool) -> None:
         def samples(module: nn.Module) -> NDArray[np.uint8]:
             assert isinstance(module, Autoencoder)
+            assert shown is not None
             latents = module.latents(to_unit(shown, device, signed=True))
             return sheet(shown, to_bytes(module.image(latents, quantize=quantize)[0]))
 
         loss = _Loss(images, options, quantize=quantize)
-        draw = samples if len(shown) else None
+        draw = None if shown is None else samples
         task = Task(what, len(images), loss.load, loss, key, samples=draw)
         fit(model, task, course, folder / stage, compute=compute, progress=progress)
 
@@ -124,8 +121,6 @@ def train_autoencoder(
     run("codebook", last, "quantized", quantize=True)
     model.card = {"options": asdict(options), "seed": seed, "images": len(images), "key": key}
     model.card |= {} if start is None else {"start": start.digest}
-    if held_out is not None and len(held_out):
-        model.card["held_out"] = asdict(measure_reconstruction(model, held_out))
     return model.eval().requires_grad_(False)
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +16,7 @@ from palpate.diffusion.autoencoder import (
     BackgroundAutoencoder,
     load_autoencoder,
 )
-from palpate.diffusion.autoencoder_training import measure_reconstruction
+from palpate.diffusion.autoencoder_training import SHOWN
 from palpate.diffusion.autoencoder_training import train_autoencoder as train_vq
 from palpate.diffusion.background_training import train_background_autoencoder
 from palpate.diffusion.ceiling import judge_of, measure_ceiling
@@ -26,6 +26,7 @@ from palpate.diffusion.presets import DiffusionPreset, preset_named
 from palpate.encoders.contrastive import load_split, train_part
 from palpate.encoders.encoder_set import EncoderSet
 from palpate.encoders.models import pick_device
+from palpate.encoders.rows import evenly
 from palpate.training.options import Compute
 from palpate.training.processes import connect, first_alone, keep_logs, place, work_folder
 
@@ -117,31 +118,27 @@ def autoencoder_of(  # noqa: PLR0913 - one row per choice of the training
     progress: Progress = quiet,
 ) -> AnyAutoencoder:
     """Train one on images of the train part, ``size`` pixels square; ``folder`` for checkpoints."""
-    train, others = train_part(manifest, split), manifest.part(split, "val", "test")
+    train = train_part(manifest, split)
     with first_alone():
-        images, held_out = (
-            cached_images(p, "tactile", size, cache, progress) if len(p) else None
-            for p in (train, others)
-        )
-    assert images is not None
+        images = cached_images(train, "tactile", size, cache, progress)
     how: dict[str, Any] = {"seed": seed, "device": pick_device(device)}
     how |= {"compute": compute, "progress": progress}
     key = image_stamp(train, "tactile")
     if isinstance(options, AutoencoderOptions):
         if isinstance(start, BackgroundAutoencoder):
             raise _other_kind("a VQ autoencoder")
-        return train_vq(images, options, folder, start=start, held_out=held_out, key=key, **how)
+        shown = manifest.part(split, "val", "test")
+        shown = shown.take([shown.ids[k] for k in evenly(len(shown), SHOWN)])
+        with first_alone(), suppress(PalpateError):  # a file: no reason to lose the training
+            how["shown"] = cached_images(shown, "tactile", size, cache) if len(shown) else None
+        return train_vq(images, options, folder, start=start, key=key, **how)
     if isinstance(start, Autoencoder):
         raise _other_kind("one that is given the gel")
     with first_alone():
         gels = gels_of(train, size, cache, progress)
-        held_gels = None if held_out is None else gels_of(others, size, cache, progress, like=gels)
     columns = ("tactile", "background") if has_gels(train) else ("tactile",)
     how["key"] = digest_json([image_stamp(train, c) for c in columns])
-    model = train_background_autoencoder(images, gels, options, folder, start=start, **how)
-    if held_out is not None:
-        model.card["held_out"] = asdict(measure_reconstruction(model, held_out, held_gels))
-    return model
+    return train_background_autoencoder(images, gels, options, folder, start=start, **how)
 
 
 def _other_kind(kind: str) -> PalpateError:

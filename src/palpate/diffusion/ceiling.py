@@ -37,12 +37,12 @@ SCORED, FITTED = 1000, 4000
 
 
 def judge_of(judge: EncoderSet | str | Path | None, device: str = "cpu") -> EncoderSet | None:
-    """Load the encoders that judge, if they are named: before a training, so that it is not lost.
+    """Load the encoders that judge, unless None or ``"none"``: before a training, not to lose it.
 
     Raises:
         PalpateError: if there are none of that name, or none of them is tactile.
     """
-    if judge is None:
+    if judge is None or judge == "none":
         return None
     judge = judge if isinstance(judge, EncoderSet) else EncoderSet.load(judge)
     if "tactile" not in judge.modalities:
@@ -77,8 +77,9 @@ def measure_ceiling(
         The fields of :class:`~palpate.diffusion.autoencoder_training.Reconstruction` that are not
         None; with a judge its digest, ``tmmd`` with its 95 % interval, and ``accuracy_real``,
         ``accuracy_frozen`` and ``accuracy_refitted`` of the material. What the data cannot give,
-        for want of materials or of samples, is left out. ``not_measured`` says what was wrong with
-        a file. None also on all processes but the first.
+        for want of materials or of samples, is left out. ``not_judged`` says that the judge was
+        trained on some of the images, and ``not_measured`` what was wrong with a file. None also on
+        all processes but the first.
     """
     given = isinstance(autoencoder, BackgroundAutoencoder)
     train = manifest.part(split, "train")
@@ -113,6 +114,9 @@ def _measured(  # noqa: PLR0917 - the arguments of measure_ceiling
     found = {name: value for name, value in pixels.items() if value is not None}
     if judge is None:
         return found
+    if seen := int(judge.saw("tactile", others, progress=progress).sum()):
+        saw = f"the judge was trained on {seen:,} of the {len(others):,} images; choose another"
+        return found | {"not_judged": saw}
 
     def features(part: Manifest, pixels: NDArray[np.uint8]) -> FeatureSet:
         labels, groups = _words(part.column("material")), _words(part.column("video"))

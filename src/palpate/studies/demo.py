@@ -42,6 +42,7 @@ from palpate.data.manifest import Manifest
 from palpate.diffusion.autoencoder import BackgroundAutoencoder
 from palpate.diffusion.autoencoder_training import measure_reconstruction
 from palpate.diffusion.autoencoders import autoencoder_of, load_autoencoder
+from palpate.diffusion.ceiling import measure_ceiling
 from palpate.diffusion.generation import Generated, generate
 from palpate.diffusion.no_contact import gels_of
 from palpate.diffusion.pipeline import TactilePipeline
@@ -325,8 +326,8 @@ class _Demo:
         )
         size, how = self.diffusion.size, self.how(place, progress)
         model = autoencoder_of(both, parts, options, size, place / "training", **how)
+        ceiling = measure_ceiling(model, both, parts, size, cache=how["cache"], progress=progress)
         model.save(fresh(place / "autoencoder"))
-        ceiling = model.card["held_out"]
         return {"digest": model.digest, "images": len(everything), "ceiling on test": ceiling}
 
     def encoders(self, place: Path, after: After, progress: Progress) -> dict[str, Any]:
