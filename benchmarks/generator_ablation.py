@@ -64,6 +64,7 @@ MANY = 1600
 VERSION = 2  # raised when rows come to mean something else: all are then trained again
 JUDGED = 400  # images a row is judged by
 JUDGE = LoopOptions(2500, 32, 2e-3, warmup=100, weight_decay=1e-3, ema=0.99)
+VQ_ROW = "autoencoder: VQ"
 #: What palpate shipped before: patches of 2 x 2 pixels, one halving, 8,192 codes.
 VQ = AutoencoderOptions(
     patch=2, widths=(32, 64), channels=4, codes=8192, steps_free=3000, steps_quantized=400
@@ -109,7 +110,7 @@ ROWS = {
     "tokens: words and patches": condition(words=32, patches=64),
     "gel as input": BASE,
     "aligned with another encoder": BASE,
-    "autoencoder: VQ": BASE,
+    VQ_ROW: BASE,
     "width: 96, 128": unet(widths=(96, 128)),
     "no modulation": unet(modulate=False),
     LENGTH: BASE,
@@ -275,7 +276,7 @@ class Study:
         folder = self.work / "rows" / digest_json([name, seed, steps, VERSION])[:16]
         if name == ORACLE:
             return self.oracle(folder, seed, steps)
-        autoencoder = self.autoencoder("VQ" if name == "autoencoder: VQ" else "background")
+        autoencoder = self.autoencoder("VQ" if name == VQ_ROW else "background")
         began = time.process_time()
         pipeline = train_pipeline(
             self.train,
@@ -357,6 +358,9 @@ class Study:
         }
         shown["through the autoencoder of palpate/mini"] = self.reconstructed(self.autoencoder())
         return {name: self.judged(images) for name, images in shown.items()}
+
+    def vq_ceiling(self):
+        return self.judged(self.reconstructed(self.autoencoder("VQ")))
 
 
 class Line:
@@ -477,6 +481,8 @@ def main():
         records = saved(file)  # again: another process may have added rows of another world
         record = records.setdefault(str(materials), record)
         record["rows"].append(row)
+        if name == VQ_ROW:
+            record["ceilings"]["through the VQ autoencoder of its row"] = study.vq_ceiling()
         write_json(file, records)
         chosen.page.write_text(page(records))
         print(row_line(row, record["ceilings"]["real"]["cnn"][0]), flush=True)

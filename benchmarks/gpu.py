@@ -69,6 +69,9 @@ LEVELS = {"paper": (128, 256, 512), "sd15": (128, 256, 512, 512)}
 #: The text encoder of CLIP ViT-L/14, which both presets are conditioned on.
 TEXT = {"hidden_size": 768, "intermediate_size": 3072, "num_attention_heads": 12}
 ENCODED = ", encoded in each step"
+#: Of the page's table.
+COLUMNS = ["what", "mode", "batch", "ms a step", "images a second", "ratio"]
+COLUMNS += ["TFLOP/s", "of peak", "GB", "s in all", "day"]
 
 
 class EnoughError(Exception):
@@ -314,8 +317,8 @@ class Bench:
             if self.device == "cuda":
                 row["GB"] = torch.cuda.max_memory_allocated() / 1e9
         row["all"] = time.perf_counter() - began
+        row["day"] = datetime.date.today().isoformat()
         self.record["rows"].append(row)
-        self.record["date"] = datetime.date.today().isoformat()
         print(json.dumps(row), flush=True)
         if self.output:
             write_json(self.output.with_suffix(".json"), self.record)
@@ -397,13 +400,12 @@ def page(record):
             share = f"{100 * row['share']:.0f} %" if "share" in row else ""
             memory = f"{row['GB']:.1f}" if "GB" in row else ""
             cells += [f"{1000 * row['seconds']:.0f}", f"{row['images']:.3g}", ratio]
-            cells += [f"{row['TFLOP/s']:.0f}", share, memory, f"{row['all']:.0f}"]
+            cells += [f"{row['TFLOP/s']:.0f}", share, memory, f"{row['all']:.0f}", row["day"]]
         lines.append(f"| {' | '.join(map(str, cells))} |")
     return f"""# On one GPU: speed
 
 Made by a committed command; do not edit by hand. **{record["device"]}**,
-{record["cores"]} processor cores, torch {record["torch"]}, Python {record["python"]};
-{record["date"]}.
+{record["cores"]} processor cores, torch {record["torch"]}, Python {record["python"]}.
 
     python benchmarks/gpu.py --write docs/studies/gpu.md
 
@@ -413,11 +415,12 @@ tactile images of `paper` (ViT-Large) in chunks of 32. A training step has optim
 average. A sampled image takes the preset's steps (`paper` 200, `sd15` 25), each of two passes; ten
 are timed, their median stands for all, and decoding comes on top. Compiling comes before what is
 timed, and is in the seconds in all. The ratio is to the first row of the same work, the share that
-of the device's peak by its data sheet, at that precision. Rows that are not there have not been
-measured.
+of the device's peak by its data sheet, at that precision. Rows of different days are of different
+hosts with this card: where the host's Python, not the card, sets the pace (bf16 without compiling),
+they compare only within a day. Rows that are not there have not been measured.
 
-| what | mode | batch | ms a step | images a second | ratio | TFLOP/s | of peak | GB | s in all |
-|---|---|---|---|---|---|---|---|---|---|
+| {" | ".join(COLUMNS)} |
+{"|---" * len(COLUMNS)}|
 {chr(10).join(lines)}
 
 ## Cached latents and conditions
