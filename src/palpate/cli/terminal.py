@@ -339,7 +339,8 @@ def join_help_lines(options: type[Any]) -> None:
         if dataclasses.is_dataclass(field.default):
             group = type(field.default)
         # Groups made by `make_dataclass` have no source; they write their own help.
-        if dataclasses.is_dataclass(group) and group.__name__ in vars(inspect.getmodule(group)):
+        written = hasattr(inspect.getmodule(group), getattr(group, "__name__", ""))
+        if written and dataclasses.is_dataclass(group):
             join_help_lines(group)  # type: ignore[arg-type]
 
 
