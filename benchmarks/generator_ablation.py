@@ -4,8 +4,8 @@
     python benchmarks/generator_ablation.py --rows base "condition: mixed" --steps 200    # a look
 
 Every row is the base with one change, trained on one procedural world for equal steps, but for
-``length`` (the processor seconds of the process that ended the row are in the table), and judged on
-another world: new objects, videos and gel units.
+``length`` (its processor seconds are in the table, unless it was stopped and went on), and judged
+on another world: new objects, videos and gel units.
 The autoencoder is that of palpate/mini where a row names no other. Judges see real images in
 training and nothing else, and are never fitted again: a small CNN, and the linear probe of the
 tactile encoder of palpate/mini. Driven by the photo, by the sample's own caption, and by photos in
@@ -277,7 +277,7 @@ class Study:
         if name == ORACLE:
             return self.oracle(folder, seed, steps)
         autoencoder = self.autoencoder("VQ" if name == VQ_ROW else "background")
-        began = time.process_time()
+        began, resumed = time.process_time(), folder.is_dir()
         pipeline = train_pipeline(
             self.train,
             self.everything,
@@ -293,7 +293,7 @@ class Study:
             compute=BFLOAT,
             progress=self.progress,
         )
-        result = {"seconds": round(time.process_time() - began)}
+        result = {"seconds": None if resumed else round(time.process_time() - began)}
         pipeline.save(fresh(folder / "model"))  # for a look at its images later
         gels = self.gels if pipeline.background else None
         pixels = cached_images(self.test, "vision", pipeline.vision_size, self.cache)
@@ -320,7 +320,8 @@ class Study:
 
     def oracle(self, folder, seed, steps):
         """The row of a generator whose condition is the one-hot code of the material."""
-        began, chosen, code = time.process_time(), ROWS[ORACLE], self.autoencoder()
+        began, resumed = time.process_time(), folder.is_dir()
+        chosen, code = ROWS[ORACLE], self.autoencoder()
         latents = code.encode(self.images, gels_of(self.train, MINI.size, self.cache))
         stats, codes = LatentStats.of(latents), np.eye(chosen.condition.width, dtype=np.float32)
         known = [self.names.index(m) for m in self.train.column("material")]
@@ -337,7 +338,7 @@ class Study:
             compute=BFLOAT,
             progress=self.progress,
         )
-        seconds = round(time.process_time() - began)
+        seconds = None if resumed else round(time.process_time() - began)
         parts = code, denoiser, stats, chosen.schedule, chosen.sampler, MINI.size
         pipeline = TactilePipeline(*parts, gel=self.gels[0])
         how = {"seed": seed, "background": self.gels}
@@ -400,7 +401,8 @@ def row_line(r, real):
     others = [percents(r[d]["cnn"]) if d in r else "" for d in ("caption", "permuted")]
     others.append(percents(r["loss by new gels"]) if "loss by new gels" in r else "")
     ratio = f"{main['cnn'][0] / real:.2f}"
-    return line(r["row"], r["seed"], r["steps"], r["seconds"], cnn, ratio, probe, far, *others)
+    seconds = r["seconds"] or ""
+    return line(r["row"], r["seed"], r["steps"], seconds, cnn, ratio, probe, far, *others)
 
 
 def tables(record):
@@ -439,8 +441,9 @@ The rows that are there, of {len(ROWS)}: the command goes on where it was stoppe
 training and in place of the photo. The judges, a small CNN and the linear probe of `palpate/mini`,
 saw real images only and are never fitted again; they judge new objects, videos and gel units. The
 real images of the nearest training photos are among those that they saw. Intervals: 95 % over
-videos, of one training; TMMD (grouped) is to the real images of the same samples.
-{platform.machine()}, CPU, bf16; {datetime.date.today().isoformat()}.
+videos, of one training; TMMD (grouped) is to the real images of the same samples. Trainings that
+were stopped and went on have no seconds. {platform.machine()}, CPU, bf16; last row of
+{datetime.date.today().isoformat()}.
 
 {chr(10).join(parts)}"""
 
@@ -481,7 +484,7 @@ def main():
         records = saved(file)  # again: another process may have added rows of another world
         record = records.setdefault(str(materials), record)
         record["rows"].append(row)
-        if name == VQ_ROW:
+        if name == VQ_ROW:  # its autoencoder is trained by now
             record["ceilings"]["through the VQ autoencoder of its row"] = study.vq_ceiling()
         write_json(file, records)
         chosen.page.write_text(page(records))

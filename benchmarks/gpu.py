@@ -376,12 +376,13 @@ PARTS = {
 
 def cached(record):
     """How much faster a step is with latents and conditions cached, by model and mode."""
-    seconds = {(r["what"], r["mode"]): r["seconds"] for r in record["rows"] if "seconds" in r}
+    keys = ("what", "mode", "day")
+    seconds = {tuple(r[k] for k in keys): r["seconds"] for r in record["rows"] if "seconds" in r}
     told = []
-    for (what, mode), encoded in seconds.items():
+    for (what, mode, day), encoded in seconds.items():
         plain = what.removesuffix(ENCODED)
-        if what != plain and (plain, mode) in seconds:
-            name, ratio = plain.split()[-1], encoded / seconds[plain, mode]
+        if what != plain and (plain, mode, day) in seconds:
+            name, ratio = plain.split()[-1], encoded / seconds[plain, mode, day]
             told.append(f"`{name}`, {mode}: **{ratio:.2f}**")
     return "; ".join(told) or "not measured"
 
@@ -390,12 +391,13 @@ def page(record):
     """The whole Markdown file."""
     lines, first = [], {}
     modes = [PLAIN, *MODES]
-    for row in sorted(record["rows"], key=lambda r: (r["what"], modes.index(r["mode"]))):
+    order = lambda r: (r["what"], r["day"], modes.index(r["mode"]))
+    for row in sorted(record["rows"], key=order):
         cells = [row["what"], row["mode"], row["batch"]]
         if "note" in row:
             cells += [row["note"]]
         else:
-            base = first.setdefault(row["what"], row["images"])
+            base = first.setdefault((row["what"], row["day"]), row["images"])
             ratio = f"{row['images'] / base:.2f}"
             share = f"{100 * row['share']:.0f} %" if "share" in row else ""
             memory = f"{row['GB']:.1f}" if "GB" in row else ""
@@ -414,10 +416,10 @@ px), `sd15` (the geometry of Stable Diffusion 1.5, 860 M; its `kl-f8`; 256 px), 
 tactile images of `paper` (ViT-Large) in chunks of 32. A training step has optimizer and moving
 average. A sampled image takes the preset's steps (`paper` 200, `sd15` 25), each of two passes; ten
 are timed, their median stands for all, and decoding comes on top. Compiling comes before what is
-timed, and is in the seconds in all. The ratio is to the first row of the same work, the share that
-of the device's peak by its data sheet, at that precision. Rows of different days are of different
-hosts with this card: where the host's Python, not the card, sets the pace (bf16 without compiling),
-they compare only within a day. Rows that are not there have not been measured.
+timed, and is in the seconds in all. The ratio is to the first row of the same work and day, the
+share that of the device's peak by its data sheet, at that precision. Days may be of different hosts
+with this card: where the host's Python, not the card, sets the pace, they do not compare. Rows that
+are not there have not been measured.
 
 | {" | ".join(COLUMNS)} |
 {"|---" * len(COLUMNS)}|
@@ -427,7 +429,8 @@ they compare only within a day. Rows that are not there have not been measured.
 
 Seconds of a step that also encodes its images and texts (by the autoencoder, and by the text
 encoder of CLIP ViT-L/14; uint8 images in memory, so nothing is read), over those of a step with
-both cached, as `palpate train generator` has them (wanted: at least 1.4).
+both cached, as `palpate train generator` has them (wanted: at least 1.4). What is encoded goes
+through the host's memory, as what is cached does; a loop of one's own could leave it on the device.
 
 {cached(record)}.
 """

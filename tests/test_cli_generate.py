@@ -83,6 +83,7 @@ def test_an_earlier_image_is_replaced_and_may_be_the_photo_of_another(place, cap
 
 def test_mistakes_are_one_line_and_write_nothing(place, capsys):
     (place / "cut.jpg").write_bytes((place / "photo.jpg").read_bytes()[:300])
+    Image.new("1", (20_000, 15_000)).save("huge.png")
     (place / "full").mkdir()
     (place / "full" / "mine.png").write_bytes((place / "photos" / "b.png").read_bytes())
     (place / "folder.png").mkdir()
@@ -92,6 +93,7 @@ def test_mistakes_are_one_line_and_write_nothing(place, capsys):
         (["gone.jpg", "-o", "t.png"], "gone.jpg: no such file"),
         (["photo.jpg", "gone.jpg", "lost.jpg", "-o", "t"], "2 problems"),
         (["cut.jpg", "-o", "t.png"], "cut.jpg"),
+        (["huge.png", "-o", "t.png"], "huge.png: more than 50,000,000 pixels"),
         (["photo.jpg", "photos/../photo.jpg", "-o", "t"], "PATH must differ in name"),
         ([model, "-o", "t"], "a saved model"),
         (["photo.jpg", "-o", "t.jpg"], "--output must be a .png or a folder"),

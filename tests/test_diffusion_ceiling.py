@@ -7,6 +7,7 @@ import numpy as np
 import polars as pl
 import pytest
 import torch
+from PIL import Image
 
 from palpate.cli import main
 from palpate.core import PalpateError, Split
@@ -115,6 +116,8 @@ def test_a_judge_without_touch_is_rejected_before_the_training(world, split):
     clip = EncoderSet(EncoderSet.load("palpate/mini").clip)
     with pytest.raises(PalpateError, match="`judge` must have a tactile encoder"):
         train_autoencoder(world, split, judge=clip)
+    with pytest.raises(PalpateError, match=r"`judge` must be encoders that judge.*or none"):
+        train_autoencoder(world, split, judge="nowhere")
 
 
 def test_a_judge_that_was_trained_on_the_images_does_not_judge_them(world, split):
@@ -124,8 +127,16 @@ def test_a_judge_that_was_trained_on_the_images_does_not_judge_them(world, split
         load_frames(preprocess.frames(test, "tactile").files[:3], preprocess)
     )
     found = measure_ceiling(Through(lambda x: x), world, split, SIZE, judge=judge)
+    assert (found["n"], found["not_judged"]) == (len(test), 3)
+    rest = Split.from_ids(train=split.ids("train"), test=test.ids[3:], manifest=world.digest)
+    alone = measure_ceiling(Through(lambda x: x), world, rest, SIZE, judge=judge)
+    assert "not_judged" not in alone
+    for name in ("tmmd", "accuracy_real", "accuracy_frozen"):
+        assert found[name] == pytest.approx(alone[name], abs=1e-9)
+    judge.seen = digest_images(load_frames(preprocess.frames(test, "tactile").files, preprocess))
+    found = measure_ceiling(Through(lambda x: x), world, split, SIZE, judge=judge)
+    assert found["not_judged"] == len(test)
     assert found["psnr"] > 90
-    assert f"3 of the {len(test)} images" in found["not_judged"]
     assert not {"tmmd", "accuracy_frozen"} & set(found)
 
 
@@ -143,11 +154,16 @@ def test_trainings_print_the_ceiling_of_the_data_that_they_are_given(
     folder = str(world.root)
     assert main(["train", "autoencoder", folder, *common, *start, "-o", str(tmp_path / "a")]) == 0
     found = json.loads(capsys.readouterr().out)
-    assert found["held_out_n"] == len(split.ids("test"))
-    assert 0 < found["held_out_accuracy_frozen"] <= 1
-    assert load_autoencoder(tmp_path / "a").card["held_out"]["tmmd"] == found["held_out_tmmd"]
+    assert found["ceiling_n"] == len(split.ids("test"))
+    assert 0 < found["ceiling_accuracy_frozen"] <= 1
+    assert load_autoencoder(tmp_path / "a").card["ceiling"]["tmmd"] == found["ceiling_tmmd"]
+    assert "| psnr |" in (tmp_path / "a" / "README.md").read_text()
+    (drawn,) = (tmp_path / "a" / "samples" / "autoencoder").iterdir()  # images, reconstructions
+    images, made = np.split(np.asarray(Image.open(drawn), float), 2)
+    assert images.shape == (64, 8 * 64, 3)
+    assert 0 < np.abs(images - made).mean() < 0.3 * images.std()
     given = ["--autoencoder", str(tmp_path / "a"), "--clip", "palpate/mini"]
     assert main(["train", "generator", folder, *common, *given, "-o", str(tmp_path / "g")]) == 0
     again = json.loads(capsys.readouterr().out)
-    assert again["ceiling_psnr"] == pytest.approx(found["held_out_psnr"], abs=0.01)
+    assert again["ceiling_psnr"] == pytest.approx(found["ceiling_psnr"], abs=0.01)
     assert "accuracy_refitted" in (tmp_path / "g" / "README.md").read_text()

@@ -198,6 +198,7 @@ def test_files_that_are_no_plain_weights_are_rejected(tmp_path, monkeypatch):
         ("cut.ckpt", good[: len(good) // 2], "cut.ckpt must hold weights"),
         ("cut.safetensors", good[:100], "cut.safetensors must hold weights"),
         ("empty.ckpt", b"", "empty.ckpt must hold weights"),
+        ("photo.jpg", b"\xff\xd8\xff\xe0 photo", "nothing else. Got a file of another kind"),
         ("pointer.ckpt", pointer, r"pointer of Git LFS .* git lfs pull"),
         ("pointer.safetensors", pointer, r"pointer of Git LFS .* git lfs pull"),
     ):

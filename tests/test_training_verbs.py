@@ -55,7 +55,7 @@ def test_encoders_and_a_generator_from_the_command_line(data, tmp_path, capsys, 
     pipeline = TactilePipeline.from_pretrained(tmp_path / "model")
     assert (facts["digest"], facts["steps"], facts["source"]) == (pipeline.digest, 2, "text")
     assert pipeline.encoders.digest("vision") == encoders.digest("vision")
-    assert pipeline.autoencoder.card["held_out"]["n"] == len(data[1].ids("test"))
+    assert pipeline.training["ceiling"]["n"] == len(data[1].ids("test"))
     # Of eight test samples: photo, real and generated; image and reconstruction.
     for stage, rows in (("denoiser", 3), ("free", 2), ("quantized", 2)):
         (drawn,) = (tmp_path / "model" / "samples" / stage).iterdir()

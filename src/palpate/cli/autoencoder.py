@@ -52,7 +52,6 @@ def run(options: Options, terminal: Terminal) -> dict[str, Any]:
         )
     facts: dict[str, Any] = {"folder": str(options.output), "digest": model.digest}
     facts |= {"images": model.card["images"], "split": model.card["split"]}
-    ceiling = {k: v for k, v in model.card.get("held_out", {}).items() if v is not None}
-    facts |= {f"held_out_{name}": value for name, value in ceiling.items()}
+    facts |= {f"ceiling_{name}": value for name, value in model.card.get("ceiling", {}).items()}
     terminal.facts(f"Autoencoder {options.output}", facts)
     return facts

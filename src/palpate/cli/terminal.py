@@ -339,7 +339,8 @@ def join_help_lines(options: type[Any]) -> None:
         if dataclasses.is_dataclass(field.default):
             group = type(field.default)
         # Groups made by `make_dataclass` have no source; they write their own help.
-        written = hasattr(inspect.getmodule(group), getattr(group, "__name__", ""))
+        name = getattr(group, "__name__", "")
+        written = getattr(inspect.getmodule(group), name, None) is group
         if written and dataclasses.is_dataclass(group):
             join_help_lines(group)  # type: ignore[arg-type]
 

@@ -18,6 +18,7 @@ image: trained on crops alone, whole images come out too dark.
 from __future__ import annotations
 
 import copy
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import cast
@@ -29,11 +30,13 @@ from numpy.typing import NDArray
 from scipy.spatial import KDTree
 from torch import Tensor, nn
 
-from palpate.core import PalpateError, Progress, digest_json, quiet, rng_for
+from palpate.core import PalpateError, Progress, Split, digest_json, quiet, rng_for
+from palpate.data.manifest import Manifest
 from palpate.diffusion.autoencoder import Autoencoder, BackgroundAutoencoder, to_bytes
 from palpate.diffusion.options import AutoencoderOptions
 from palpate.encoders.encoder_set import seeded
 from palpate.encoders.preprocess import to_unit
+from palpate.encoders.rows import evenly
 from palpate.metrics.images import per_image
 from palpate.training.engine import Batch, Losses, Task, fit
 from palpate.training.options import Compute, LoopOptions
@@ -122,6 +125,19 @@ def train_autoencoder(
     model.card = {"options": asdict(options), "seed": seed, "images": len(images), "key": key}
     model.card |= {} if start is None else {"start": start.digest}
     return model.eval().requires_grad_(False)
+
+
+def some_whole(part: Manifest, columns: Sequence[str], n: int) -> Manifest:
+    """Up to ``n`` samples, evenly, of those that have an image in each of these columns."""
+    cells = zip(part.ids, *(part.column(name) for name in columns), strict=True)
+    whole = [name for name, *images in cells if all(images)]
+    return part.take([whole[k] for k in evenly(len(whole), n)])
+
+
+def shown_of(manifest: Manifest, split: Split, columns: Sequence[str]) -> Manifest:
+    """The samples that a training draws: of val, or of test where there is no val."""
+    held = manifest.part(split, "val")
+    return some_whole(held if len(held) else manifest.part(split, "test"), columns, SHOWN)
 
 
 def sheet(*rows: NDArray[np.uint8]) -> NDArray[np.uint8]:

@@ -16,7 +16,7 @@ from palpate.diffusion.autoencoder import (
     BackgroundAutoencoder,
     load_autoencoder,
 )
-from palpate.diffusion.autoencoder_training import SHOWN
+from palpate.diffusion.autoencoder_training import shown_of
 from palpate.diffusion.autoencoder_training import train_autoencoder as train_vq
 from palpate.diffusion.background_training import train_background_autoencoder
 from palpate.diffusion.ceiling import judge_of, measure_ceiling
@@ -26,7 +26,6 @@ from palpate.diffusion.presets import DiffusionPreset, preset_named
 from palpate.encoders.contrastive import load_split, train_part
 from palpate.encoders.encoder_set import EncoderSet
 from palpate.encoders.models import pick_device
-from palpate.encoders.rows import evenly
 from palpate.training.options import Compute
 from palpate.training.processes import connect, first_alone, keep_logs, place, work_folder
 
@@ -62,7 +61,7 @@ def train_autoencoder(
         progress: called while the work goes on.
 
     Returns:
-        The autoencoder, frozen; ``card["held_out"]`` says how well it reconstructs images outside
+        The autoencoder, frozen; ``card["ceiling"]`` says how well it reconstructs images outside
         of train.
 
     Raises:
@@ -96,7 +95,7 @@ def train_autoencoder(
         model.card |= {"manifest": manifest.digest, "split": split.digest}
         how: dict[str, Any] = {"judge": judges, "cache": work / "cache", "progress": progress}
         if measured := measure_ceiling(model, manifest, split, chosen.size, **how):
-            model.card["held_out"] = measured
+            model.card["ceiling"] = measured
         if output is not None and place()[0] == 0:
             model.save(output)
             keep_logs(work, output)
@@ -127,8 +126,7 @@ def autoencoder_of(  # noqa: PLR0913 - one row per choice of the training
     if isinstance(options, AutoencoderOptions):
         if isinstance(start, BackgroundAutoencoder):
             raise _other_kind("a VQ autoencoder")
-        shown = manifest.part(split, "val", "test")
-        shown = shown.take([shown.ids[k] for k in evenly(len(shown), SHOWN)])
+        shown = shown_of(manifest, split, ["tactile"])
         with first_alone(), suppress(PalpateError):  # a file: no reason to lose the training
             how["shown"] = cached_images(shown, "tactile", size, cache) if len(shown) else None
         return train_vq(images, options, folder, start=start, key=key, **how)
@@ -138,6 +136,13 @@ def autoencoder_of(  # noqa: PLR0913 - one row per choice of the training
         gels = gels_of(train, size, cache, progress)
     columns = ("tactile", "background") if has_gels(train) else ("tactile",)
     how["key"] = digest_json([image_stamp(train, c) for c in columns])
+    shown = shown_of(manifest, split, columns)
+    with first_alone(), suppress(PalpateError):
+        drawn = [
+            cached_images(shown, "tactile", size, cache),
+            gels_of(shown, size, cache, like=gels),
+        ]
+        how["shown"] = drawn if len(shown) else None
     return train_background_autoencoder(images, gels, options, folder, start=start, **how)
 
 

@@ -14,6 +14,7 @@ from torch.nn.functional import avg_pool2d, interpolate
 
 from palpate.core import PalpateError, Progress, digest_json, quiet
 from palpate.diffusion.autoencoder import BackgroundAutoencoder
+from palpate.diffusion.autoencoder_training import sheet
 from palpate.diffusion.options import BackgroundOptions
 from palpate.encoders.encoder_set import seeded
 from palpate.training.engine import Batch, Losses, Task, fit
@@ -21,13 +22,14 @@ from palpate.training.options import Compute, LoopOptions
 from palpate.training.steps import Step
 
 
-def train_background_autoencoder(
+def train_background_autoencoder(  # noqa: PLR0913 - one row per choice of the training
     images: NDArray[np.uint8],
     background: NDArray[np.uint8],
     options: BackgroundOptions,
     folder: Path,
     *,
     start: BackgroundAutoencoder | None = None,
+    shown: tuple[NDArray[np.uint8], NDArray[np.uint8]] | None = None,
     seed: int = 0,
     key: str = "",
     device: str | torch.device = "cpu",
@@ -42,6 +44,7 @@ def train_background_autoencoder(
         options: see :class:`BackgroundOptions`.
         folder: for checkpoints.
         start: go on from a copy of this one, in its own shape, instead of random weights.
+        shown: images of other videos and their gels, drawn with each checkpoint.
         seed: of weights, order, crops, colors and noise.
         key: digest of both.
         device: where to train.
@@ -75,9 +78,16 @@ def train_background_autoencoder(
         seed=seed,
     )
     loss = _Loss(images, background, options)
-    task = Task(
-        "autoencoder", len(images), loss.load, loss, digest_json([key, asdict(options), begin])
-    )
+    key = digest_json([key, asdict(options), begin])
+
+    def samples(module: nn.Module) -> NDArray[np.uint8]:
+        assert isinstance(module, BackgroundAutoencoder)
+        assert shown is not None
+        drawn, gels = shown
+        return sheet(drawn, module.decode(module.encode(drawn, gels), gels))
+
+    draw = None if shown is None else samples
+    task = Task("autoencoder", len(images), loss.load, loss, key, samples=draw)
     nn.Module.to(model, device)
     fit(model, task, loop, folder, compute=compute, progress=progress)
     model.card = {"options": asdict(options), "seed": seed, "images": len(images), "start": begin}

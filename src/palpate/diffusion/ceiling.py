@@ -22,7 +22,7 @@ from palpate.core import FeatureSet, PalpateError, Progress, Split, quiet
 from palpate.data.images import cached_images
 from palpate.data.manifest import Manifest
 from palpate.diffusion.autoencoder import AnyAutoencoder, BackgroundAutoencoder
-from palpate.diffusion.autoencoder_training import measure_reconstruction
+from palpate.diffusion.autoencoder_training import measure_reconstruction, some_whole
 from palpate.diffusion.no_contact import gels_of, has_gels
 from palpate.encoders.embed import embed_images
 from palpate.encoders.encoder_set import EncoderSet
@@ -44,9 +44,13 @@ def judge_of(judge: EncoderSet | str | Path | None, device: str = "cpu") -> Enco
     """
     if judge is None or judge == "none":
         return None
-    judge = judge if isinstance(judge, EncoderSet) else EncoderSet.load(judge)
+    fix = "Choose others, palpate/mini, or none"
+    try:
+        judge = judge if isinstance(judge, EncoderSet) else EncoderSet.load(judge)
+    except PalpateError as error:
+        must = "must be encoders that judge"
+        raise PalpateError(must, str(error), fix, argument="judge") from None
     if "tactile" not in judge.modalities:
-        fix = "Choose others, or palpate/mini"
         raise PalpateError("must have a tactile encoder", "none", fix, argument="judge")
     return judge.to(pick_device(device))
 
@@ -77,17 +81,14 @@ def measure_ceiling(
         The fields of :class:`~palpate.diffusion.autoencoder_training.Reconstruction` that are not
         None; with a judge its digest, ``tmmd`` with its 95 % interval, and ``accuracy_real``,
         ``accuracy_frozen`` and ``accuracy_refitted`` of the material. What the data cannot give,
-        for want of materials or of samples, is left out. ``not_judged`` says that the judge was
-        trained on some of the images, and ``not_measured`` what was wrong with a file. None also on
-        all processes but the first.
+        for want of materials or of samples, is left out. ``not_judged`` counts the images that the
+        judge was trained on, which it leaves out, and ``not_measured`` says what was wrong with
+        a file. None also on all processes but the first.
     """
     given = isinstance(autoencoder, BackgroundAutoencoder)
     train = manifest.part(split, "train")
     needed = ["tactile", "background"] if given and has_gels(train) else ["tactile"]
-    others = manifest.part(split, "val", "test")
-    there = np.all([[v is not None for v in others.column(name)] for name in needed], axis=0)
-    others = others.take([i for i, all_there in zip(others.ids, there, strict=True) if all_there])
-    others = others.take([others.ids[k] for k in evenly(len(others), SCORED)])
+    others = some_whole(manifest.part(split, "val", "test"), needed, SCORED)
     if not len(others) or place()[0]:
         return None
     try:
@@ -114,9 +115,14 @@ def _measured(  # noqa: PLR0917 - the arguments of measure_ceiling
     found = {name: value for name, value in pixels.items() if value is not None}
     if judge is None:
         return found
-    if seen := int(judge.saw("tactile", others, progress=progress).sum()):
-        saw = f"the judge was trained on {seen:,} of the {len(others):,} images; choose another"
-        return found | {"not_judged": saw}
+    seen = judge.saw("tactile", others, progress=progress)
+    if seen.any():
+        found["not_judged"] = int(seen.sum())
+        if seen.all():
+            return found
+        rest = [name for name, known in zip(others.ids, seen, strict=True) if not known]
+        others, images = others.take(rest), images[~seen]
+        held = None if held is None else held[~seen]
 
     def features(part: Manifest, pixels: NDArray[np.uint8]) -> FeatureSet:
         labels, groups = _words(part.column("material")), _words(part.column("video"))

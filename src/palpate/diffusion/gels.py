@@ -12,6 +12,8 @@
 - *Its red and blue are exchanged*, as of an image that OpenCV read and another library wrote: it
   is much nearer to the stock gel with them exchanged again (real gels: half as far; as they are,
   at least 1.5 times as far).
+- *It has no lights*: one color all over, black or white. The relative opponent colors of a gel
+  differ over its cells by at least 4.2 (root mean square), those of the real clips by 5.5.
 """
 
 from __future__ import annotations
@@ -31,6 +33,8 @@ from palpate.metrics.contact import marker_mask
 SMOOTH = 4.0
 #: Difference of the light, on the scale of 0 to 128, from which it is another sensor.
 OTHER_LIGHT = 10.0
+#: Differences of the light over an image, on that scale, below which it has none.
+UNLIT = 2.0
 #: Share of that difference that is left once red and blue are exchanged, below which they were.
 EXCHANGED = 0.75
 _SIZE, _CELLS, _DEGREE = 64, 4, 4
@@ -46,9 +50,13 @@ def gel_notes(file: Path, size: int, stock: NDArray[np.uint8] | None) -> list[No
     """
     image, name, notes = read_image(file), file.name, list[Note]()
     pixels = square(image, _SIZE)
-    if (left := unevenness(pixels)) > SMOOTH:
+    if (left := unevenness(pixels)) == float("inf"):
+        notes.append(Note("gel-dark", {"gel": name}))
+    elif left > SMOOTH:
         notes.append(Note("gel-contact", {"gel": name, "left": left}))
-    if stock is not None:
+    if np.sqrt((_light(pixels) ** 2).mean()) < UNLIT:
+        notes.append(Note("gel-unlit", {"gel": name}))
+    elif stock is not None:
         light = light_difference(pixels, stock)
         if light_difference(pixels[..., ::-1].copy(), stock) < EXCHANGED * light:
             notes.append(Note("gel-exchanged", {"gel": name}))

@@ -51,7 +51,7 @@ from palpate.diffusion.autoencoder import (
     LatentStats,
     load_autoencoder,
 )
-from palpate.diffusion.autoencoder_training import SHOWN, sheet
+from palpate.diffusion.autoencoder_training import sheet, shown_of
 from palpate.diffusion.autoencoders import autoencoder_of
 from palpate.diffusion.ceiling import judge_of, measure_ceiling
 from palpate.diffusion.denoiser import (
@@ -82,7 +82,6 @@ from palpate.encoders.contrastive import load_split, train_part
 from palpate.encoders.embed import embed, texts_of
 from palpate.encoders.encoder_set import EncoderSet, Modality, load_clip, seeded
 from palpate.encoders.models import digest_tensors, is_hub_id, pick_device, stated
-from palpate.encoders.rows import evenly
 from palpate.training.engine import Batch, Losses, Task, fit
 from palpate.training.estimate import estimate
 from palpate.training.options import Compute, LoopOptions
@@ -590,13 +589,9 @@ def _shown(
     manifest: Manifest, split: Split, size: int
 ) -> tuple[Manifest, NDArray[np.uint8], NDArray[np.uint8]] | None:
     """Some samples outside of train, their photos and tactile images."""
-    held = manifest.part(split, "val")
-    held = held if len(held) else manifest.part(split, "test")
-    cells = zip(held.ids, held.column("vision"), held.column("tactile"), strict=True)
-    whole = [name for name, *images in cells if all(images)]
-    if not whole:
+    some = shown_of(manifest, split, ("vision", "tactile"))
+    if not len(some):
         return None
-    some = held.take([whole[k] for k in evenly(len(whole), SHOWN)])
     photos, tactile = (cached_images(some, column, size) for column in ("vision", "tactile"))
     return some, photos, tactile
 

@@ -267,6 +267,10 @@ def read_weights(path: Path, fix: str) -> dict[str, Tensor]:
     try:
         if path.suffix == ".safetensors":
             return load_file(path)
+        with path.open("rb") as file:
+            head = file.read(2)
+        if head != b"PK" and not head.startswith(b"\x80"):  # neither torch's archive nor a pickle
+            raise ValueError("a file of another kind")
         with torch.serialization.safe_globals(safe):
             content = torch.load(path, map_location="cpu", weights_only=True, mmap=is_zipfile(path))
     except Exception as error:  # of a damaged file torch raises many kinds

@@ -548,6 +548,11 @@ EVALUATION: dict[str, Sentence] = {
         "gray levels of its colors, and under 4 of a gel that nothing touches. The images are made "
         "on it all the same"
     ),
+    "gel-dark": "{gel} looks like no image of a gel: most of it is as dark as markers are",
+    "gel-unlit": (
+        "{gel} looks like no image of a gel: the colored lights that fall on one from its sides "
+        "are missing"
+    ),
     "gel-sensor": (
         "{gel} is lit from other sides than the gels that the generator knows: a sensor of another "
         "kind, on which its contacts are implausible"

@@ -327,6 +327,7 @@ class _Demo:
         size, how = self.diffusion.size, self.how(place, progress)
         model = autoencoder_of(both, parts, options, size, place / "training", **how)
         ceiling = measure_ceiling(model, both, parts, size, cache=how["cache"], progress=progress)
+        model.card["ceiling"] = ceiling
         model.save(fresh(place / "autoencoder"))
         return {"digest": model.digest, "images": len(everything), "ceiling on test": ceiling}
 

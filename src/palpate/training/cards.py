@@ -9,7 +9,7 @@ The ``card`` in that JSON may have these keys, each with its own place on the pa
 ``tags``     in addition to those of the format
 ``data``     rows (list of objects): world, seeds, version, digest, frames ...; of a pipeline
              without: its manifest, split and training samples
-``ceiling``  of a pipeline: scores (an object) of what survives the autoencoder
+``ceiling``  scores (an object) of what survives the autoencoder
 ``recipe``   the command that makes it again
 ``scores``   rows (list of objects): score, value, interval, chance, on, n ...
 ``limits``   sentences
