@@ -4,7 +4,8 @@
 
 Worlds of both looks, with and without markers, 20 materials, new gel units; and, where the clips of
 Touch and Go are, every fifth frame of them: those listed as in contact, those at least 15 frames
-away from one, and the least and largest unevenness of the others' quiet half. The lists leave out
+away from one, and the least and largest unevenness of the others' quiet half; and how much the
+light differs over a gel. The lists leave out
 light contacts, which the eye sees in the frames between; so the last share holds true ones.
 """
 
@@ -17,7 +18,7 @@ from PIL import Image
 
 from palpate.data.images import square
 from palpate.data.video import VideoReader
-from palpate.diffusion.gels import SMOOTH, light_difference, unevenness
+from palpate.diffusion.gels import SMOOTH, light_difference, light_spread, unevenness
 from palpate.sim import World, WorldOptions
 
 SHARED = Path(__file__).resolve().parents[2] / "shared" / "data"
@@ -53,7 +54,9 @@ def worlds():
         shares(name, *([unevenness(i) for i in images] for images in small.values()))
         stock = small["background"][0] if stock is None else stock
         light = [light_difference(gel, stock) for gel in small["background"]]
+        spread = min(light_spread(gel) for gel in small["background"])
         print(f"  light against a gelsight: {min(light):.1f} to {max(light):.1f}")
+        print(f"  light over a gel: {spread:.1f} at least")
 
 
 def clips(folder):
@@ -62,14 +65,16 @@ def clips(folder):
         video, frame = line.split(",")[0].split("/")
         listed.setdefault(video, set()).add(int(Path(frame).stem))
     for video, frames in listed.items():
-        contacts, gels = [], []
+        contacts, gels, spread = [], [], []
         with VideoReader(folder / "dataset" / video / "gelsight.mp4") as reader:
             for k in range(0, len(reader), 5):
                 far = min(abs(k - f) for f in frames) >= 15
                 if k in frames or far:
-                    value = unevenness(square(Image.fromarray(reader[k]), 64))
-                    (contacts if k in frames else gels).append(value)
+                    small = square(Image.fromarray(reader[k]), 64)
+                    (contacts if k in frames else gels).append(unevenness(small))
+                    spread.append(light_spread(small))
         shares(video, contacts, gels)
+        print(f"  light over it: {min(spread):.1f} at least")
 
 
 def main():

@@ -503,8 +503,8 @@ One photo with `palpate generate photo.jpg -o t.png`, start-up included:
 {start["processor seconds"]} processor seconds (median of {start["runs"]}; wanted: below 8). The
 pipeline makes {loop["images a processor second"]} images a processor second; its images and those
 of the plain loop differ by {loop["largest difference of a pixel"]} of 255 at most.{rounding}
-bf16 is faster on processors with AMX: on one the last two rows were 1.577 and 1.346 (27 November
-2026). This one {amx}.
+bf16 is faster on processors with AMX: on one it sampled 1.577 and trained 1.346 times as fast (27
+November 2026). This one {amx}.
 
 ## Few steps against many
 

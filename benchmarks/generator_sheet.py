@@ -2,15 +2,16 @@
 
     python benchmarks/generator_sheet.py --write docs/images/generated.jpg
     python benchmarks/generator_sheet.py --blind runs/blind       # to be sorted by somebody
-    python benchmarks/generator_sheet.py --blind runs/blind --answers answers.json
+    python benchmarks/generator_sheet.py --blind runs/blind \\
+        --answers docs/studies/generator_blind.json
 
 New objects, videos and gel units of a world that no shipped model has seen. ``--blind`` writes
 ``examples-*.png``, a strip of real images for each material by name, of other objects, and
 ``sort-*.png``, five generated images of each material, numbered in random order; whoever sorts
-them writes ``{"1": "Wood", ...}`` and sees nothing else. With the answers the number of materials
-above chance is printed: at least two of five right, which guessing reaches for one material in
-forty. With ``--real`` the images to be sorted are the real ones of the same samples: what an eye
-can tell.
+them writes ``{"1": "Wood", ...}`` and sees nothing else. With the answers, ``{"who": {"1": ...}}``,
+the number of materials above chance is printed: at least two of five right, which guessing reaches
+for one material in forty. With ``--real`` the images to be sorted are the real ones of the same
+samples: what an eye can tell.
 """
 
 import argparse
@@ -92,7 +93,7 @@ def main():
     parser.add_argument("--write", type=Path, help="image of real and generated rows")
     parser.add_argument("--blind", type=Path, help="folder for the sheets to be sorted")
     parser.add_argument("--real", action="store_true", help="sort real images, as a control")
-    parser.add_argument("--answers", type=Path, help="JSON: number -> material")
+    parser.add_argument("--answers", type=Path, help="JSON: sorting -> number -> material")
     chosen = parser.parse_args()
     with tempfile.TemporaryDirectory() as folder:
         size = TactilePipeline.from_pretrained(chosen.model).size
@@ -126,12 +127,12 @@ def main():
         for page, at in enumerate(range(0, len(made), PER_PAGE), 1):
             numbers = numbered(sorted_ones[at : at + PER_PAGE], at + 1)
             numbers.save(chosen.blind / f"sort-{page}.png")
-        if chosen.answers:
-            answers = json.loads(chosen.answers.read_text())
+        sortings = json.loads(chosen.answers.read_text()) if chosen.answers else {}
+        for name, answers in sortings.items():
             right = {m: sum(answers.get(k) == m == v for k, v in key.items()) for m in ids}
             above = sum(n >= 2 for n in right.values())
-            print(f"{sum(right.values())} of {len(key)} right; {above} materials above chance")
-            print(right)
+            total = f"{sum(right.values())} of {len(key)} right"
+            print(f"{name}: {total}; {above} materials above chance; {right}")
 
 
 if __name__ == "__main__":

@@ -15,6 +15,7 @@ from palpate.data.manifest import Manifest
 from palpate.diffusion.autoencoder import load_autoencoder
 from palpate.diffusion.autoencoders import train_autoencoder
 from palpate.diffusion.ceiling import judge_of, measure_ceiling
+from palpate.diffusion.training import train_generator
 from palpate.encoders.encoder_set import EncoderSet
 from palpate.encoders.preprocess import digest_images, load_frames
 from palpate.sim import WorldOptions, write_world
@@ -112,6 +113,19 @@ def test_a_background_autoencoder_is_given_gels_or_the_stock_gel(world, split):
     assert given["psnr"] > measure_ceiling(code, without, known, SIZE)["psnr"] > 15
 
 
+def test_a_training_without_gels_gives_the_stock_gel_to_all(world, split):
+    """Also where others have their own, or some of them."""
+    code = load_autoencoder("palpate/mini")
+    test, known = split.ids("test"), None
+    for have in (set(), set(test), set(test[::2])):
+        own = pl.when(pl.col("id").is_in(list(have))).then("background")
+        mixed = replace(world, table=world.table.with_columns(background=own))
+        parts = Split.from_ids(train=split.ids("train"), test=test, manifest=mixed.digest)
+        found = measure_ceiling(code, mixed, parts, SIZE)
+        known = known or found
+        assert found == known
+
+
 def test_a_judge_without_touch_is_rejected_before_the_training(world, split):
     clip = EncoderSet(EncoderSet.load("palpate/mini").clip)
     with pytest.raises(PalpateError, match="`judge` must have a tactile encoder"):
@@ -142,6 +156,28 @@ def test_a_judge_that_was_trained_on_the_images_does_not_judge_them(world, split
 
 def test_none_is_no_judge():
     assert judge_of("none") is None
+
+
+@pytest.mark.slow
+def test_samples_that_are_drawn_have_a_gel_and_whole_files(world, split, tmp_path):
+    """What is only drawn and scored costs no training: without gels, or with a broken file."""
+    test = split.ids("test")
+    own = pl.when(~pl.col("id").is_in(list(test[:-5]))).then("background")
+    few = replace(world, table=world.table.with_columns(background=own))
+    (tmp_path / "cut.png").write_bytes(world.paths("tactile")[0].read_bytes()[:60])
+    cut = pl.when(pl.col("id").is_in([test[-1]])).then(pl.lit(str(tmp_path / "cut.png")))
+    broken = replace(world, table=world.table.with_columns(tactile=cut.otherwise("tactile")))
+    how = {"clip": "palpate/mini", "autoencoder": "palpate/mini", "steps": 1, "device": "cpu"}
+    for name, data in (("few", few), ("broken", broken)):
+        parts = Split.from_ids(train=split.ids("train"), test=test, manifest=data.digest)
+        made = train_generator(data, parts, output=tmp_path / name, **how)
+        drawn = [*(tmp_path / name).glob("samples/*/*.png")]
+        if name == "few":
+            assert made.training["ceiling"]["n"] == 5
+            assert [Image.open(file).size for file in drawn] == [(5 * 64, 3 * 64)]
+        else:
+            assert "cut.png" in made.training["ceiling"]["not_measured"]
+            assert not drawn
 
 
 @pytest.mark.slow

@@ -140,7 +140,7 @@ def autoencoder_of(  # noqa: PLR0913 - one row per choice of the training
     with first_alone(), suppress(PalpateError):
         drawn = [
             cached_images(shown, "tactile", size, cache),
-            gels_of(shown, size, cache, like=gels),
+            gels_of(shown, size, cache, like=gels, own=has_gels(train)),
         ]
         how["shown"] = drawn if len(shown) else None
     return train_background_autoencoder(images, gels, options, folder, start=start, **how)

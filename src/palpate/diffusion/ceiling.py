@@ -109,12 +109,13 @@ def _measured(  # noqa: PLR0917 - the arguments of measure_ceiling
     some, gels, held = evenly(len(train), FITTED), None, None
     if isinstance(autoencoder, BackgroundAutoencoder):
         gels = gels_of(train, size, cache, progress)  # the stock gel is that of the training
-        held = gels_of(others, size, cache, progress, like=gels)
+        held = gels_of(others, size, cache, progress, gels, own=has_gels(train))
     images = np.asarray(cached_images(others, "tactile", size, cache, progress))
     pixels = asdict(measure_reconstruction(autoencoder, images, held))
     found = {name: value for name, value in pixels.items() if value is not None}
     if judge is None:
         return found
+    found["judge"] = judge.digest("tactile")
     seen = judge.saw("tactile", others, progress=progress)
     if seen.any():
         found["not_judged"] = int(seen.sum())
@@ -133,7 +134,6 @@ def _measured(  # noqa: PLR0917 - the arguments of measure_ceiling
         given: tuple[Any, ...] = () if gels is None else (gels,)
         return autoencoder.decode(autoencoder.encode(pixels, *given), *given)
 
-    found["judge"] = judge.digest("tactile")
     real, ours = features(others, images), features(others, through(images, held))
     with suppress(PalpateError):  # too few samples or videos
         score = tmmd(ours, real)

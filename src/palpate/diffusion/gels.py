@@ -12,8 +12,9 @@
 - *Its red and blue are exchanged*, as of an image that OpenCV read and another library wrote: it
   is much nearer to the stock gel with them exchanged again (real gels: half as far; as they are,
   at least 1.5 times as far).
-- *It has no lights*: one color all over, black or white. The relative opponent colors of a gel
-  differ over its cells by at least 4.2 (root mean square), those of the real clips by 5.5.
+- *It has no lights*: one color all over, or gray. The light of a gel differs over its cells by at
+  least 4.2 (root mean square), that of the real clips by 5.5.
+- *Dark spots are all over it*, where markers leave most of a gel free.
 """
 
 from __future__ import annotations
@@ -51,10 +52,10 @@ def gel_notes(file: Path, size: int, stock: NDArray[np.uint8] | None) -> list[No
     image, name, notes = read_image(file), file.name, list[Note]()
     pixels = square(image, _SIZE)
     if (left := unevenness(pixels)) == float("inf"):
-        notes.append(Note("gel-dark", {"gel": name}))
+        notes.append(Note("gel-spotted", {"gel": name}))
     elif left > SMOOTH:
         notes.append(Note("gel-contact", {"gel": name, "left": left}))
-    if np.sqrt((_light(pixels) ** 2).mean()) < UNLIT:
+    if light_spread(pixels) < UNLIT:
         notes.append(Note("gel-unlit", {"gel": name}))
     elif stock is not None:
         light = light_difference(pixels, stock)
@@ -84,6 +85,11 @@ def unevenness(gel: NDArray[np.uint8]) -> float:
 def light_difference(gel: NDArray[np.uint8], other: NDArray[np.uint8]) -> float:
     """How differently two gels are lit: 0 for the same lights, of whatever brightness."""
     return float(np.sqrt(((_light(gel) - _light(other)) ** 2).mean()))
+
+
+def light_spread(gel: NDArray[np.uint8]) -> float:
+    """How much the light differs over a gel: 0 for a picture of one color."""
+    return float(np.sqrt((_light(gel) ** 2).mean()))
 
 
 def _light(gel: NDArray[np.uint8]) -> NDArray[np.float64]:

@@ -410,7 +410,7 @@ def train_pipeline(  # noqa: PLR0913, PLR0917 - one row per choice of the traini
     with first_alone():
         rows, held = code(train), manifest.part(split, "val")
         others = code(held, like=rows.gels) if len(held) else None
-        shown = _shown(manifest, split, preset.size)
+        shown = _shown(manifest, split, preset.size, columns, rows.gels)
     key = [digest_lines(texts), *(image_stamp(train, c) for c in columns)]
     key += [
         *(train.digest, held.digest if len(held) else "", autoencoder.digest),
@@ -427,10 +427,9 @@ def train_pipeline(  # noqa: PLR0913, PLR0917 - one row per choice of the traini
     def samples(module: nn.Module) -> NDArray[np.uint8]:
         assert isinstance(module, Denoiser)
         assert shown is not None
-        part, photos, tactile = shown
-        gels = None if rows.gels is None else gels_of(part, preset.size, like=rows.gels)
+        names, photos, tactile, given = shown
         drawn = pipeline(module)
-        made = drawn.sample(drawn.embed(photos), part.ids, seed=seed, background=gels)
+        made = drawn.sample(drawn.embed(photos), names, seed=seed, background=given)
         return sheet(photos, tactile, made)
 
     def pipeline(denoiser: Denoiser, record: dict[str, Any] | None = None) -> TactilePipeline:
@@ -555,7 +554,7 @@ def _encoded(  # noqa: PLR0913 - one row per part
     given = isinstance(autoencoder, BackgroundAutoencoder)
     gels = None
     if given:
-        gels = gels_of(part, size, cache, progress, like)
+        gels = gels_of(part, size, cache, progress, like, own="background" in columns)
     elif "background" in columns:
         gels = cached_images(part, "background", size, cache, progress)
     images = cached_images(part, "tactile", size, cache, progress)
@@ -586,14 +585,23 @@ def _encoded(  # noqa: PLR0913 - one row per part
 
 
 def _shown(
-    manifest: Manifest, split: Split, size: int
-) -> tuple[Manifest, NDArray[np.uint8], NDArray[np.uint8]] | None:
-    """Some samples outside of train, their photos and tactile images."""
-    some = shown_of(manifest, split, ("vision", "tactile"))
+    manifest: Manifest,
+    split: Split,
+    size: int,
+    columns: Sequence[str],
+    like: NDArray[np.uint8] | None,
+) -> tuple[Sequence[str], NDArray[np.uint8], NDArray[np.uint8], NDArray[np.uint8] | None] | None:
+    """Ids of some samples outside of train, their photos, tactile images and gels."""
+    some = shown_of(manifest, split, columns)
     if not len(some):
         return None
-    photos, tactile = (cached_images(some, column, size) for column in ("vision", "tactile"))
-    return some, photos, tactile
+    try:
+        photos, tactile = (cached_images(some, column, size) for column in ("vision", "tactile"))
+        own = "background" in columns
+        gels = None if like is None else gels_of(some, size, like=like, own=own)
+    except PalpateError:  # of a file: no reason to lose the training
+        return None
+    return some.ids, photos, tactile, gels
 
 
 def _require_same(

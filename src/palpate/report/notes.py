@@ -548,7 +548,7 @@ EVALUATION: dict[str, Sentence] = {
         "gray levels of its colors, and under 4 of a gel that nothing touches. The images are made "
         "on it all the same"
     ),
-    "gel-dark": "{gel} looks like no image of a gel: most of it is as dark as markers are",
+    "gel-spotted": "{gel} looks like no image of a gel: dark spots, as of markers, are all over it",
     "gel-unlit": (
         "{gel} looks like no image of a gel: the colored lights that fall on one from its sides "
         "are missing"
