@@ -13,7 +13,7 @@
   is much nearer to the stock gel with them exchanged again (real gels: half as far; as they are,
   at least 1.5 times as far).
 - *It has no lights*: one color all over, or gray. The light of a gel differs over its cells by at
-  least 4.2 (root mean square), that of the real clips by 5.5.
+  least 4.3 (root mean square), that of the real clips by 5.6 (``benchmarks/gel_contacts.py``).
 - *Dark spots are all over it*, where markers leave most of a gel free.
 """
 
