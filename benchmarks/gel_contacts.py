@@ -4,9 +4,9 @@
 
 Worlds of both looks, with and without markers, 20 materials, new gel units; and, where the clips of
 Touch and Go are, every fifth frame of them: those listed as in contact, those at least 15 frames
-away from one, and the least and largest unevenness of the others' quiet half; and how much the
-light differs over a gel. The lists leave out
-light contacts, which the eye sees in the frames between; so the last share holds true ones.
+away from one, and the least and largest unevenness of the others' quiet half. The lists leave out
+light contacts, which the eye sees in the frames between; so the last share holds true ones. Of each
+also the least difference of the light over a gel.
 """
 
 import argparse

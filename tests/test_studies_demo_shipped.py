@@ -54,7 +54,7 @@ def test_shipped_models_replace_three_stages(mini, tmp_path):
     assert model.training["start_record"]["data"] == WORLD
     assert "Brick" in model.notice
     assert {s.encoder for s in demo.scores if s.metric == "TMMD"} == {encoders.digest("tactile")}
-    ceiling = demo.stages["generator"].facts["ceiling on test"]
+    ceiling = demo.stages["generator"].facts["ceiling"]
     assert (ceiling["n"], ceiling["codes"]) == (len(demo.split.ids("test")), 64)
     results = results_of(demo, "palpate demo")
     notes = {note.code: note.params for note in results.notes}

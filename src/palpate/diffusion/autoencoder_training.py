@@ -33,6 +33,7 @@ from torch import Tensor, nn
 from palpate.core import PalpateError, Progress, Split, digest_json, quiet, rng_for
 from palpate.data.manifest import Manifest
 from palpate.diffusion.autoencoder import Autoencoder, BackgroundAutoencoder, to_bytes
+from palpate.diffusion.no_contact import has_gels
 from palpate.diffusion.options import AutoencoderOptions
 from palpate.encoders.encoder_set import seeded
 from palpate.encoders.preprocess import to_unit
@@ -134,10 +135,14 @@ def some_whole(part: Manifest, columns: Sequence[str], n: int) -> Manifest:
     return part.take([whole[k] for k in evenly(len(whole), n)])
 
 
-def shown_of(manifest: Manifest, split: Split, columns: Sequence[str]) -> Manifest:
-    """The samples that a training draws: of val, or of test where there is no val."""
+def shown_of(manifest: Manifest, split: Split, *columns: str, gels: bool) -> Manifest:
+    """The samples that a training draws: of val, or of test where there is no val.
+
+    With ``gels`` those that have one, if any has.
+    """
     held = manifest.part(split, "val")
-    return some_whole(held if len(held) else manifest.part(split, "test"), columns, SHOWN)
+    held = held if len(held) else manifest.part(split, "test")
+    return some_whole(held, [*columns, *(["background"] * (gels and has_gels(held)))], SHOWN)
 
 
 def sheet(*rows: NDArray[np.uint8]) -> NDArray[np.uint8]:

@@ -126,7 +126,7 @@ def autoencoder_of(  # noqa: PLR0913 - one row per choice of the training
     if isinstance(options, AutoencoderOptions):
         if isinstance(start, BackgroundAutoencoder):
             raise _other_kind("a VQ autoencoder")
-        shown = shown_of(manifest, split, ["tactile"])
+        shown = shown_of(manifest, split, "tactile", gels=False)
         with first_alone(), suppress(PalpateError):  # a file: no reason to lose the training
             how["shown"] = cached_images(shown, "tactile", size, cache) if len(shown) else None
         return train_vq(images, options, folder, start=start, key=key, **how)
@@ -136,11 +136,11 @@ def autoencoder_of(  # noqa: PLR0913 - one row per choice of the training
         gels = gels_of(train, size, cache, progress)
     columns = ("tactile", "background") if has_gels(train) else ("tactile",)
     how["key"] = digest_json([image_stamp(train, c) for c in columns])
-    shown = shown_of(manifest, split, columns)
+    shown = shown_of(manifest, split, "tactile", gels=True)
     with first_alone(), suppress(PalpateError):
         drawn = [
             cached_images(shown, "tactile", size, cache),
-            gels_of(shown, size, cache, like=gels, own=has_gels(train)),
+            gels_of(shown, size, cache, like=gels),
         ]
         how["shown"] = drawn if len(shown) else None
     return train_background_autoencoder(images, gels, options, folder, start=start, **how)

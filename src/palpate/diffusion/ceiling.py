@@ -87,8 +87,9 @@ def measure_ceiling(
     """
     given = isinstance(autoencoder, BackgroundAutoencoder)
     train = manifest.part(split, "train")
-    needed = ["tactile", "background"] if given and has_gels(train) else ["tactile"]
-    others = some_whole(manifest.part(split, "val", "test"), needed, SCORED)
+    others = manifest.part(split, "val", "test")
+    needed = ["tactile", "background"] if given and has_gels(others) else ["tactile"]
+    others = some_whole(others, needed, SCORED)
     if not len(others) or place()[0]:
         return None
     try:
@@ -109,7 +110,7 @@ def _measured(  # noqa: PLR0917 - the arguments of measure_ceiling
     some, gels, held = evenly(len(train), FITTED), None, None
     if isinstance(autoencoder, BackgroundAutoencoder):
         gels = gels_of(train, size, cache, progress)  # the stock gel is that of the training
-        held = gels_of(others, size, cache, progress, gels, own=has_gels(train))
+        held = gels_of(others, size, cache, progress, like=gels)
     images = np.asarray(cached_images(others, "tactile", size, cache, progress))
     pixels = asdict(measure_reconstruction(autoencoder, images, held))
     found = {name: value for name, value in pixels.items() if value is not None}

@@ -26,26 +26,16 @@ def gels_of(
     cache: Path | None = None,
     progress: Progress = quiet,
     like: NDArray[np.uint8] | None = None,
-    *,
-    own: bool = True,
 ) -> NDArray[np.uint8]:
     """The no-contact image of each sample, bytes (n, size, size, 3).
 
     Where no sample has one, all get one stock gel: the first of ``like``, or the median of up to
     500 of the tactile images.
 
-    Args:
-        part: the samples.
-        size: side of the images in pixels.
-        cache: folder for decoded pixels.
-        progress: called while files are read.
-        like: gels of the samples that a model was trained on.
-        own: False for the stock gel all the same, as where those samples had none of their own.
-
     Raises:
         PalpateError: if some samples have one and others have not.
     """
-    if own and has_gels(part):
+    if has_gels(part):
         return cached_images(part, "background", size, cache, progress)
     if like is not None:
         return np.broadcast_to(like[0], (len(part), size, size, 3))

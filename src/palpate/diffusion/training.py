@@ -410,7 +410,7 @@ def train_pipeline(  # noqa: PLR0913, PLR0917 - one row per choice of the traini
     with first_alone():
         rows, held = code(train), manifest.part(split, "val")
         others = code(held, like=rows.gels) if len(held) else None
-        shown = _shown(manifest, split, preset.size, columns, rows.gels)
+        shown = _shown(manifest, split, preset.size, rows.gels)
     key = [digest_lines(texts), *(image_stamp(train, c) for c in columns)]
     key += [
         *(train.digest, held.digest if len(held) else "", autoencoder.digest),
@@ -554,11 +554,14 @@ def _encoded(  # noqa: PLR0913 - one row per part
     given = isinstance(autoencoder, BackgroundAutoencoder)
     gels = None
     if given:
-        gels = gels_of(part, size, cache, progress, like, own="background" in columns)
+        gels = gels_of(part, size, cache, progress, like)
     elif "background" in columns:
         gels = cached_images(part, "background", size, cache, progress)
     images = cached_images(part, "tactile", size, cache, progress)
-    key = digest_json([part.digest, *(image_stamp(part, c) for c in columns), size])
+    stamps = [image_stamp(part, column) for column in columns]
+    if given and gels is not None and len(gels):  # the stock gel is that of train
+        stamps.append(digest_tensors({"gel": torch.from_numpy(np.array(gels[0]))}))
+    key = digest_json([part.digest, *stamps, size])
     place = (cache or folder) / f"latents-{short(digest_json([key, autoencoder.digest]))}"
     code = partial(encode_latents, autoencoder, ids=part.ids, key=key, progress=progress)
     conditions: dict[str, NDArray[Any]] = {}
@@ -585,20 +588,15 @@ def _encoded(  # noqa: PLR0913 - one row per part
 
 
 def _shown(
-    manifest: Manifest,
-    split: Split,
-    size: int,
-    columns: Sequence[str],
-    like: NDArray[np.uint8] | None,
+    manifest: Manifest, split: Split, size: int, like: NDArray[np.uint8] | None
 ) -> tuple[Sequence[str], NDArray[np.uint8], NDArray[np.uint8], NDArray[np.uint8] | None] | None:
     """Ids of some samples outside of train, their photos, tactile images and gels."""
-    some = shown_of(manifest, split, columns)
+    some = shown_of(manifest, split, "vision", "tactile", gels=like is not None)
     if not len(some):
         return None
     try:
         photos, tactile = (cached_images(some, column, size) for column in ("vision", "tactile"))
-        own = "background" in columns
-        gels = None if like is None else gels_of(some, size, like=like, own=own)
+        gels = None if like is None else gels_of(some, size, like=like)
     except PalpateError:  # of a file: no reason to lose the training
         return None
     return some.ids, photos, tactile, gels

@@ -20,7 +20,7 @@ from palpate.core import Progress, quiet
 from palpate.data.images import cached_images
 from palpate.data.manifest import Manifest
 from palpate.diffusion.generation import generate
-from palpate.diffusion.no_contact import gels_of, has_gels
+from palpate.diffusion.no_contact import gels_of
 from palpate.diffusion.presets import DiffusionPreset
 
 Images = NDArray[np.uint8]
@@ -72,8 +72,7 @@ class Setting:
         """
         if column == "background":
             like = gels_of(self.train, self.size, self.cache, self.progress)
-            own = has_gels(self.train)
-            return gels_of(part, self.size, self.cache, self.progress, like, own=own)
+            return gels_of(part, self.size, self.cache, self.progress, like=like)
         return cached_images(part, column, self.size, self.cache, self.progress)
 
 
