@@ -10,7 +10,7 @@ DEV    := $(VENV)/.dev-$(KEY)
 OUT    ?= runs/demo
 # Processes that run tests; each uses one thread.
 WORKERS ?= auto
-PYTEST = OMP_NUM_THREADS=1 HF_HUB_OFFLINE=1 $(BIN)/python -m pytest -q -n $(WORKERS)
+PYTEST = OMP_NUM_THREADS=1 HF_HUB_OFFLINE=1 $(BIN)/python -m pytest -q -n $(WORKERS) --dist worksteal
 PIP    = $(BIN)/python -m pip install --quiet --disable-pip-version-check
 # Spinning threads make two busy cores several times slower than one.
 export OMP_WAIT_POLICY := passive

@@ -199,7 +199,7 @@ PRESETS: Mapping[str, Preset] = {
             autoencoder=BackgroundOptions(steps=1200),
             vq=_VQ,
             clip="palpate/mini",
-            precision="bf16",  # 1.4 times as many steps a second, on processors that have it
+            precision="bf16",  # 1.35 times as many steps a second with AMX, .65 without
             cost="world-gelsight: 30 minutes of one idle x86-64 core, and 80 minutes a seed; the "
             "record, on busy ones: 36, and 82 to 137",
             seconds=(135, 140, 415),

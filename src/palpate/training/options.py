@@ -95,7 +95,9 @@ class Compute:
 
     Attributes:
         precision: of matrix products: ``bf16`` and ``fp16`` by autocast, weights stay float32. An
-            x86 processor without bf16 computes in float32 in its place, many times faster.
+            x86 processor without bf16 computes in float32 in its place, many times faster; with
+            bf16 but without AMX, Intel's was slower in it than in float32
+            (docs/studies/generating.md).
         tf32: let float32 products on CUDA round their factors to 10 bits.
         compile: compile the loss with ``torch.compile``: minutes at the start, faster steps.
         channels_last: memory layout of convolutions.
