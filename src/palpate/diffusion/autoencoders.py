@@ -138,11 +138,8 @@ def autoencoder_of(  # noqa: PLR0913 - one row per choice of the training
     how["key"] = digest_json([image_stamp(train, c) for c in columns])
     shown = shown_of(manifest, split, "tactile", gels=True)
     with first_alone(), suppress(PalpateError):
-        drawn = [
-            cached_images(shown, "tactile", size, cache),
-            gels_of(shown, size, cache, like=gels),
-        ]
-        how["shown"] = drawn if len(shown) else None
+        drawn = cached_images(shown, "tactile", size, cache)
+        how["shown"] = (drawn, gels_of(shown, size, cache, like=gels)) if len(shown) else None
     return train_background_autoencoder(images, gels, options, folder, start=start, **how)
 
 

@@ -44,7 +44,8 @@ def train_background_autoencoder(  # noqa: PLR0913 - one row per choice of the t
         options: see :class:`BackgroundOptions`.
         folder: for checkpoints.
         start: go on from a copy of this one, in its own shape, instead of random weights.
-        shown: images of other videos and their gels, drawn with each checkpoint.
+        shown: images of other videos and their gels, bytes (m, h, w, 3) both, drawn with each
+            checkpoint.
         seed: of weights, order, crops, colors and noise.
         key: digest of both.
         device: where to train.

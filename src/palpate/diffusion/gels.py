@@ -88,7 +88,7 @@ def light_difference(gel: NDArray[np.uint8], other: NDArray[np.uint8]) -> float:
 
 
 def light_spread(gel: NDArray[np.uint8]) -> float:
-    """How much the light differs over a gel: 0 for a picture of one color."""
+    """How much the light differs over a gel (h, w, 3), 0 to 128: 0 for one color."""
     return float(np.sqrt((_light(gel) ** 2).mean()))
 
 

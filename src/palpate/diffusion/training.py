@@ -559,7 +559,7 @@ def _encoded(  # noqa: PLR0913 - one row per part
         gels = cached_images(part, "background", size, cache, progress)
     images = cached_images(part, "tactile", size, cache, progress)
     stamps = [image_stamp(part, column) for column in columns]
-    if given and gels is not None and len(gels):  # the stock gel is that of train
+    if given and gels is not None:  # the stock gel is that of train
         stamps.append(digest_tensors({"gel": torch.from_numpy(np.array(gels[0]))}))
     key = digest_json([part.digest, *stamps, size])
     place = (cache or folder) / f"latents-{short(digest_json([key, autoencoder.digest]))}"
