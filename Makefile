@@ -31,8 +31,9 @@ test-fast: $(DEV)  ## tests of under about five seconds each
 test-slow: $(DEV)  ## the slow ones, and the page in a browser
 	$(PYTEST) -m "(slow or browser) and not nightly"
 
-nightly: $(DEV)  ## what takes longer: tests of minutes, the metrics at full size, the shipped models scored again, the study of splits, small, 50 raters in browsers
+nightly: $(DEV)  ## what takes longer: tests of minutes, what must not change, the metrics at full size, the shipped models scored again, the study of splits, small, 50 raters in browsers
 	$(PYTEST) -m nightly
+	$(BIN)/python benchmarks/frozen.py --compare
 	$(BIN)/python benchmarks/metrics.py
 	$(BIN)/python recipes/mini.py --work runs/mini --verify
 	$(BIN)/python benchmarks/split_drop.py --small
