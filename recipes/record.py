@@ -2,7 +2,7 @@
 
 python recipes/record.py RUN -o docs/results/world-gelsight --commit abc1234 [--note "..."]
 
-Writes index.md (claims, tables, curves, settings), tables/ (every score as CSV), settings.json
+Writes index.md (claims, tables, curves, settings), settings.json
 (digests, versions, and every stage with its time), samples.jpg and the curves as SVG.
 """
 
@@ -78,7 +78,6 @@ def main() -> None:
     text = replace(shown, settings=settings, facts=results.facts).to_markdown()
     body = text.partition("\n")[2]  # the heading is ours
     (output / "index.md").write_text(heading(results, args.commit, args.note) + body)
-    results.to_csv(output / "tables")
     (output / "settings.json").write_text(json.dumps(results.settings, indent=1) + "\n")
 
 

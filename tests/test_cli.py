@@ -1,16 +1,15 @@
-"""The command line: statuses, JSON, one-line errors, old spellings, help, and how verbs connect."""
+"""The command line: statuses, JSON, one-line errors, help, and how verbs connect."""
 
 import dataclasses
 import json
 import re
-import subprocess
 from importlib import import_module
 from pathlib import Path
 
 import pytest
 
 from palpate.cli import VERBS, main, terminal
-from palpate.cli.terminal import RENAMED, error_line, join_help_lines
+from palpate.cli.terminal import error_line, join_help_lines
 from palpate.core import PalpateError, Split
 
 
@@ -57,11 +56,8 @@ def test_fail_over_is_a_limit(capsys, lists, limit, status):
     ("args", "words"),
     [
         (["audti"], "Did you mean: palpate audit"),
-        (["encoder", "tag/"], "Write: palpate train encoder"),
-        (["train", "tag/"], "Write: palpate train generator"),
         (["validate", "--formats"], "Did you mean: --format."),
         (["validate", "--listt"], "Did you mean: --list."),
-        (["audit", "a", "b", "--towers=x"], "--towers of palpate audit is now --encoder"),
         (["audit", "no.txt", "such.txt"], "no.txt"),
         (["audit", "--color", "red"], "Got --color"),
         (["split", "nowhere", "-o", "s.json"], "nowhere"),
@@ -105,24 +101,6 @@ def test_a_mistake_is_one_line_and_status_2(capsys, tmp_path, monkeypatch, args,
 )
 def test_errors_name_options(verb, error, line):
     assert error_line(verb, error) == line
-
-
-def test_every_new_spelling_exists(capsys):
-    for (verb, option), new in RENAMED.items():
-        if option and verb and new.startswith("-"):
-            with pytest.raises(SystemExit):
-                main([*verb.split(), "--help"])
-            assert re.search(rf"{new.split()[0]}\b", capsys.readouterr().out), (verb, option, new)
-
-
-@pytest.mark.parametrize("shell", ["bash", "zsh", "fish"])
-def test_completion_knows_every_verb(capsys, shell):
-    status, script, _ = call(capsys, "completion", shell)
-    assert status == 0
-    for verb in VERBS:
-        assert all(word in script for word in verb.split())
-    if shell == "bash":
-        subprocess.run(["bash", "-n"], input=script, text=True, check=True)
 
 
 def test_help_is_wrapped_by_the_terminal_and_not_by_the_source(capsys):

@@ -554,7 +554,6 @@ def test_the_published_split_by_command(capsys, tmp_path, real_data):
         (["LISTS", "--noleak", "touch-and-go", "-o", "x"], "8 of 8 that are not"),
         (["--noleak", "hct", "-o", "x"], "no path"),
         (["LISTS", "--noleak", "touch-and-go", "-o", "x", "--by", "video"], "has its rule"),
-        (["LISTS", "-o", "x", "--group", "contact"], "is now --by"),
         (["--noleak", "touch-and-go", "-o", "x", "--lists", "l"], "--lists must go with"),
         (["-o", "x"], "no path"),
         (["LISTS", "-o", "TRAIN"], "must not replace"),

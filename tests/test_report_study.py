@@ -1,6 +1,5 @@
-"""Tables, curves and claims of a study: on the page, in text, in LaTeX, as CSV and as figures."""
+"""Tables, curves and claims of a study: on the page, in text, in LaTeX and as figures."""
 
-import csv
 import dataclasses
 import io
 import itertools
@@ -232,19 +231,6 @@ def test_numbers_of_a_reason_are_those_of_its_evidence(tmp_path):
         assert text.count(number) == 2
 
 
-def test_words_of_a_table_are_no_formulas_of_a_spreadsheet(tmp_path):
-    rows = [["=HYPERLINK(1)", up("a", -0.5)], ["@b", up("=b", -0.25)]]
-    table = StudyTable("T", "", ["", "v"], rows)
-    files = Results("T", tables=[table], scores=[up("=b", -0.25)]).to_csv(tmp_path)
-    texts = {path.stem: path.read_text() for path in files}
-    assert [line.split(",")[:2] for line in texts["table-t"].splitlines()[1:]] == [
-        ["'=HYPERLINK(1)", "-0.5"],
-        ["'@b", "-0.25"],
-    ]
-    assert "'=b" in texts["scores"]
-    assert ",-0.25," in texts["scores"]
-
-
 def test_the_axis_of_strips_is_that_of_the_methods_and_a_control_beyond_it_an_arrow():
     close = {"null": None, "floor": 0.1, "interval": None}
     rows = [("a", up("a", 0.1, **close), False), ("b", up("b", 0.2, **close), False)]
@@ -344,35 +330,7 @@ def test_many_rows_long_words_and_empty_things_are_drawn(tmp_path):
             )
             > 20
         )
-    assert len(results.to_csv(tmp_path / "csv")) == 5
     assert len(results.save_figures(tmp_path / "figures")) == 4
-
-
-# --- CSV ------------------------------------------------------------------------------------
-
-
-def test_csv_files_hold_the_scores_in_full_precision(study, tmp_path):
-    results, _ = study
-    files = {path.name: path for path in results.to_csv(tmp_path / "tables")}
-    table = next(path for name, path in files.items() if name == "table-4-generators.csv")
-    head, *rows = list(csv.reader(table.open(encoding="utf-8")))
-    assert head[:4] == ["method", "TMMD", "TMMD low", "TMMD high"]
-    assert [row[-1] for row in rows] == ["false"] * 4 + ["true"] * 3
-    for row, cells in zip(rows, results.tables[0].rows, strict=True):
-        assert float(row[1]) == cells[1].value
-        assert (float(row[2]), float(row[3])) == cells[1].interval
-    assert rows[1][head.index("D-TMMD")] == ""
-    curve = next(path for name, path in files.items() if name.startswith("curve-what-"))
-    rows = list(csv.DictReader(curve.open(encoding="utf-8")))
-    points = [
-        (li.label, x, s.value, *s.interval) for li in results.curves[0].lines for x, s in li.points
-    ]
-    assert points == [
-        (r["line"], *(float(r[k]) for k in ("x", "value", "low", "high"))) for r in rows
-    ]
-    claims = list(csv.DictReader(files["claims.csv"].open(encoding="utf-8")))
-    assert [row["verdict"] for row in claims] == ["holds", "does not hold", "undecided"]
-    assert len(list(csv.DictReader(files["scores.csv"].open(encoding="utf-8")))) == len(results)
 
 
 # --- curves ---------------------------------------------------------------------------------
@@ -621,21 +579,20 @@ def test_figures_hold_samples_pairs_and_the_background(tmp_path, monkeypatch):
 # --- the command ----------------------------------------------------------------------------
 
 
-def test_the_command_writes_figures_and_tables_and_replaces_no_other_file(tmp_path, capsys):
+def test_the_command_writes_figures_and_replaces_no_other_file(tmp_path, capsys):
     results = study_results(tmp_path, 2)
     results = dataclasses.replace(results, curves=results.curves[:1], audits=results.audits[1:])
     page = write_report(results, tmp_path / "first.html", base=tmp_path).page
     given = [str(page.with_suffix(".json")), "-o", str(tmp_path / "page.html"), "-q"]
-    folders = ["--figures", str(tmp_path / "figures"), "--csv", str(tmp_path / "tables")]
+    folder = tmp_path / "figures"
     for _ in range(2):  # its own files are replaced
-        assert main(["report", *given, *folders]) == 0
+        assert main(["report", *given, "--figures", str(folder)]) == 0
     again = Results.load(tmp_path / "page.json")
     assert [len(getattr(again, n)) for n in ("tables", "curves", "claims")] == [2, 1, 3]
-    assert {p.suffix for p in (tmp_path / "figures").iterdir()} == {".svg", ".png"}
-    assert {p.suffix for p in (tmp_path / "tables").iterdir()} == {".csv"}
-    (tmp_path / "tables" / "thesis.csv").touch()
+    assert {p.suffix for p in folder.iterdir()} == {".svg", ".png"}
+    (folder / "thesis.csv").touch()
     capsys.readouterr()
-    assert main(["report", *given, *folders]) == 2
-    assert "--csv must be a new folder" in capsys.readouterr().err
+    assert main(["report", *given, "--figures", str(folder)]) == 2
+    assert "--figures must be a new folder" in capsys.readouterr().err
     assert main(["report", *given, "--figures", str(page)]) == 2
     assert "--figures must be a folder" in capsys.readouterr().err

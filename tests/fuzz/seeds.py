@@ -103,7 +103,6 @@ COMMANDS: dict[str, int] = {
     "--raters 1 --size 32 -o OUT/study": 3,
     "preference score IN/study IN/study/votes --replicates 100 -o OUT/s.json --latex OUT/t.tex": 4,
     "demo --data IN/vectors --preset tiny -o OUT/d": 1,
-    "completion bash": 1,
 }
 
 

@@ -17,17 +17,15 @@ from palpate.core import Note, PalpateError, inside, read_record, short
 from palpate.report.results import AUDIT_FORMATS, RESULTS_FORMATS, Audit, Results
 
 TITLE = "palpate report"
-#: Names of the files that folders of figures and of tables hold.
-WRITTEN = re.compile(
-    r"(background|claims|curve|matrix|pairs|samples|scores|strips|table)\b.*\.(csv|png|svg)"
-)
+#: Names of the files that a folder of figures holds.
+WRITTEN = re.compile(r"(background|curve|matrix|pairs|samples|strips)\b.*\.(png|svg)")
 
 
 @dataclass(frozen=True, kw_only=True)
 class Options(Common):
     """Write one self-contained page, with JSON and Markdown of the same results next to it.
 
-    Figures and tables for a paper can be written as files, too.
+    Figures for a paper can be written as files, too.
     """
 
     results: Annotated[tuple[Path, ...], tyro.conf.Positional]
@@ -40,8 +38,6 @@ class Options(Common):
     """Folders whose images the page may show, next to those of the results."""
     figures: Path | None = None
     """Folder for figures: curves and scores (.svg and .png), samples and pairs (.png)."""
-    csv: Path | None = None
-    """Folder for the tables, curves and claims of a study, and scores, as .csv."""
 
 
 def run(options: Options, terminal: Terminal) -> dict[str, Any]:
@@ -56,8 +52,7 @@ def run(options: Options, terminal: Terminal) -> dict[str, Any]:
         guard_output(options.output, options.results, marks)
         guard_output(options.output.with_suffix(".json"), options.results)
         guard_output(options.output.with_suffix(".md"), options.results, marks)
-    for argument, folder in (("figures", options.figures), ("csv", options.csv)):
-        _guard_folder(argument, folder)
+    _guard_folder(options.figures)
     results = [read(path, options.images) for path in options.results]
     merged = reduce(join, results, Results(title=options.title))
     for note in merged.notes:
@@ -70,15 +65,12 @@ def run(options: Options, terminal: Terminal) -> dict[str, Any]:
     if options.figures:
         merged.save_figures(options.figures)
         paths["figures"] = str(options.figures)
-    if options.csv:
-        merged.to_csv(options.csv)
-        paths["csv"] = str(options.csv)
     terminal.facts("Report", paths)
     return paths
 
 
-def _guard_folder(argument: str, folder: Path | None) -> None:
-    """Check that a folder of files holds no other ones, which might be replaced.
+def _guard_folder(folder: Path | None) -> None:
+    """Check that a folder of figures holds no other files, which might be replaced.
 
     Raises:
         PalpateError: if it holds one, or is a file.
@@ -86,12 +78,12 @@ def _guard_folder(argument: str, folder: Path | None) -> None:
     if folder is None or not folder.exists():
         return
     if not folder.is_dir():
-        raise PalpateError("must be a folder", str(folder), "Name another", argument=argument)
+        raise PalpateError("must be a folder", str(folder), "Name another", argument="figures")
     foreign = sorted(path.name for path in folder.iterdir() if not WRITTEN.fullmatch(path.name))
     if foreign:
         must = "must be a new folder, or hold nothing but files of this command"
         got = f"{folder} with {foreign[0]}"
-        raise PalpateError(must, got, "Choose another folder", argument=argument)
+        raise PalpateError(must, got, "Choose another folder", argument="figures")
 
 
 def read(path: Path, folders: Sequence[Path] = ()) -> Results:

@@ -27,7 +27,7 @@ class Options(Common):
     """On the world: `world-gelsight` (tables 1, 3 and 4) or `world-digit` (tables 2 and 4); on data
     at --root: `tag` (Touch and Go), `hct`, or `clips` (of Touch and Go)."""
     output: OutPath
-    """Run folder: results.json, page.html, tables.tex, tables/ (CSV), figures/, and a folder a
+    """Run folder: results.json, page.html, tables.tex, figures/, and a folder a
     stage."""
     preset: str = "mini"
     """`mini`: stages of 82 to 137 minutes a seed, and 36 once; `smoke` only shows
@@ -101,7 +101,6 @@ def run(options: Options, terminal: Terminal) -> dict[str, Any]:
     page = output / "page.html"
     results.to_html(page)
     write_text(output / "tables.tex", results.to_latex())
-    results.to_csv(output / "tables")
     results.save_figures(output / "figures")
     terminal.print("")
     for line in summary_lines(results):

@@ -57,37 +57,6 @@ from palpate.core.files import NO_ROOM
 if TYPE_CHECKING:
     from palpate.report.results import Audit, Results
 
-#: Verbs whose first arguments may stand without their option: ``palpate score a/ --reference b/``.
-LEADING = {"score": "--generated"}
-#: Verb and option (and value) of earlier versions -> how it is written now. '' is every verb, or
-#: the verb itself.
-RENAMED: dict[tuple[str, str], str] = {
-    ("encoder", ""): "palpate train encoder",
-    ("train", ""): "palpate train generator",
-    ("", "--out"): "--output",
-    ("", "--towers"): "--encoder",
-    ("", "--encoders"): "--encoder",
-    ("train generator", "--encoders"): "--clip",
-    ("train generator", "--towers"): "--clip",
-    ("train generator", "--encoder"): "--clip",
-    ("split", "--group"): "--by",
-    ("demo", "--group"): "--by",
-    ("generate", "--manifest"): "the first argument: palpate generate tag/ --split noleak.json",
-    ("split", "--noleak"): "--noleak touch-and-go (or hct), after the samples",
-    ("audit", "--group"): "--by",
-    ("audit", "--processes"): "--threads",
-    ("import", "--set"): "an option for each name, e.g. --labels train.txt",
-    ("validate", "--set"): "an option for each name, e.g. --labels train.txt",
-    ("import", "--max-per-touch"): "--max-per-contact",
-    ("probe", "--balanced"): "the default; both accuracies are printed",
-    ("score", "--controls"): "the default; --no-controls turns it off",
-    ("split", "--by touch"): "--by contact",
-    ("audit", "--by touch"): "--by contact",
-    ("split", "--nulls own"): "--nulls single",
-    ("world", "--touches-per-video"): "--contacts-per-video",
-    ("world", "--frames-per-touch"): "--frames-per-contact",
-    ("world", "--leak touch"): "--leak contact",
-}
 #: Verb and argument of its function -> how the command line writes it, where that is not the
 #: argument's own name ("--sigma"). '' is every verb.
 OPTION_NAMES: dict[tuple[str, str], str] = {
@@ -261,12 +230,6 @@ def parse(name: str, options: type[Any], args: Sequence[str]) -> Any:
         PalpateError: in one line what tyro would draw a box around.
     """
     join_help_lines(options)
-    leading = LEADING.get(name, "")
-    if leading and args and not args[0].startswith("-"):
-        if leading in args:
-            must = f"An argument of palpate {name} must come after its option"
-            raise PalpateError(must, args[0], f"E.g. {VERBS[name].example}")
-        args = [leading, *args]
     box, about = io.StringIO(), inspect.cleandoc(options.__doc__ or "")
     try:
         with contextlib.redirect_stderr(box):
@@ -280,7 +243,6 @@ def parse(name: str, options: type[Any], args: Sequence[str]) -> Any:
     except SystemExit as stop:
         if stop.code in (0, None):
             raise
-        _answer_renamed(name, args)
         words = " ".join(re.sub(r"[\u2500-\u257f]+", " ", box.getvalue()).split())
         raise _parse_error(name, options, words) from None
 
@@ -325,9 +287,7 @@ def join_help_lines(options: type[Any]) -> None:
             default = cls.__dataclass_fields__[name].default
             many = default is dataclasses.MISSING and "tuple" in str(hints[name])
             if default is None or default is False or default == () or many:
-                cls.__annotations__[name] = _with_hint(hints[name], "")
-            elif default is True:
-                cls.__annotations__[name] = _with_hint(hints[name], "(on by default)")
+                cls.__annotations__[name] = _without_default(hints[name])
         body = ast.parse(textwrap.dedent(inspect.getsource(cls))).body[0].body  # type: ignore[attr-defined]
         for statement, doc in pairwise(body):
             if isinstance(statement, ast.AnnAssign) and isinstance(doc, ast.Expr):
@@ -345,15 +305,15 @@ def join_help_lines(options: type[Any]) -> None:
             join_help_lines(group)  # type: ignore[arg-type]
 
 
-def _with_hint(hint: Any, text: str) -> Any:
-    """Annotate a type with what its help shows as the default, unless it says so itself."""
+def _without_default(hint: Any) -> Any:
+    """Annotate a type so that its help shows no default, unless it says so itself."""
     extras = list(getattr(hint, "__metadata__", ()))
     for k, extra in enumerate(extras):
         if hasattr(extra, "help_behavior_hint"):
             if extra.help_behavior_hint is None:
-                extras[k] = dataclasses.replace(extra, help_behavior_hint=text)
+                extras[k] = dataclasses.replace(extra, help_behavior_hint="")
             return Annotated[hint.__origin__, *extras]
-    return Annotated[hint, tyro.conf.arg(help_behavior_hint=text)]
+    return Annotated[hint, tyro.conf.arg(help_behavior_hint="")]
 
 
 def _option_names(options: type[Any]) -> list[str]:
@@ -362,16 +322,6 @@ def _option_names(options: type[Any]) -> list[str]:
     with contextlib.redirect_stdout(text), contextlib.suppress(SystemExit):
         tyro.cli(options, args=["--help"], config=CONFIG)
     return re.findall(r"^\W*(?:-\w\b[^,\n]*, )?(--[a-z][\w-]*)", text.getvalue(), re.MULTILINE)
-
-
-def _answer_renamed(name: str, args: Sequence[str]) -> None:
-    """Raise for an option of an earlier version, with its new name."""
-    words = [word for arg in args for word in arg.split("=", 1)]
-    values = (f"{option} {value}" for option, value in pairwise(words))
-    for option in (*(word for word in words if word.startswith("--")), *values):
-        if new := RENAMED.get((name, option)) or RENAMED.get(("", option)):
-            must = f"{option} of palpate {name} is now {new}"
-            raise PalpateError(must, option, f"See: palpate {name} --help")
 
 
 def option_name(verb: str, argument: str) -> str:
@@ -541,12 +491,9 @@ def _require_words(args: Sequence[str]) -> None:
 
 def _call(name: str, args: Sequence[str]) -> tuple[Any, int]:
     if name not in VERBS:
-        first = [arg for arg in args[:1] if not arg.startswith("-") and not Path(arg).exists()]
-        near = difflib.get_close_matches(" ".join([name, *first]), VERBS, 1)
-        new = None if first and near else RENAMED.get((name, ""))
-        fix = f"Write: {new}" if new else f"Did you mean: palpate {near[0]}" if near else ""
-        must = f"The verb must be one of {', '.join(VERBS)}"
-        raise PalpateError(must, repr(name), fix or "See: palpate --help")
+        near = difflib.get_close_matches(" ".join([name, *args[:1]]), VERBS, 1)
+        fix = f"Did you mean: palpate {near[0]}" if near else "See: palpate --help"
+        raise PalpateError(f"The verb must be one of {', '.join(VERBS)}", repr(name), fix)
     module = importlib.import_module(f"palpate.cli.{VERBS[name].module}")
     options = parse(name, module.Options, args)
     terminal = Terminal(options, shlex.join(["palpate", *name.split(), *args]))
@@ -558,7 +505,6 @@ __all__ = [
     "CONFIG",
     "FAILED_CHECK",
     "OPTION_NAMES",
-    "RENAMED",
     "Common",
     "OptionalOutPath",
     "OutPath",

@@ -121,9 +121,4 @@ VERBS: dict[str, Verb] = {
         "Run a whole study of the paper: its tables, with controls, from one command",
         "palpate reproduce world-gelsight -o study/ --seeds 0 1 2",
     ),
-    "completion": Verb(
-        "completion",
-        "Print the completion script of a shell",
-        "palpate completion bash >> ~/.bash_completion",
-    ),
 }

@@ -444,16 +444,6 @@ class Results:
         """Scores, tables of a study and claims as LaTeX tables (booktabs)."""
         return _writer("latex").latex_tables(self)
 
-    def to_csv(self, folder: str | Path) -> list[Path]:
-        """Write each table and curve of a study, the claims and the scores as CSV files.
-
-        Numbers have full precision; an interval is the columns ``low`` and ``high``.
-
-        Returns:
-            The files.
-        """
-        return _writer("csv_files").save_csv(self, Path(folder))
-
     def save_figures(self, folder: str | Path) -> list[Path]:
         """Write the figures of a paper: curves and strips as SVG and PNG, images as PNG.
 
