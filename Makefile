@@ -55,6 +55,7 @@ format: $(DEV)   ## rewrite the sources in the project's style
 	$(BIN)/ruff check --fix .
 
 docs: $(DEV)     ## the docs site in site/; a broken link fails
+	$(BIN)/python recipes/reference_pages.py
 	$(BIN)/zensical build --clean --strict
 
 wheel: $(DEV)    ## build the wheel and try it alone in empty environments

@@ -1,17 +1,14 @@
 """Write the reference pages that are made from the code: commands and options of a world.
 
-python recipes/reference_pages.py            # fails if a page is not current
-python recipes/reference_pages.py --write
+``make docs`` runs it before it builds the site; the pages are not committed.
 """
 
 from __future__ import annotations
 
-import argparse
 import contextlib
 import io
 import os
 import re
-import sys
 from pathlib import Path
 
 from palpate.cli import VERBS, main
@@ -90,22 +87,12 @@ def commands() -> str:
 PAGES = {"world_options.md": world_options, "commands.md": commands}
 
 
-def run() -> int:
-    """Check the pages, or write them."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--write", action="store_true")
-    write, stale = parser.parse_args().write, []
+def write(folder: Path) -> None:
+    """Write both pages."""
     os.environ["COLUMNS"] = "96"
     for name, page in PAGES.items():
-        path, text = DOCS / name, page()
-        if not path.is_file() or path.read_text(encoding="utf-8") != text:
-            stale.append(name)
-            if write:
-                path.write_text(text, encoding="utf-8")
-    if stale and not write:
-        pass
-    return int(bool(stale) and not write)
+        (folder / name).write_text(page(), encoding="utf-8")
 
 
 if __name__ == "__main__":
-    sys.exit(run())
+    write(DOCS)
