@@ -151,6 +151,7 @@ def impact():
             (0.31, 0.455),
             (0.262, 0.401),
             0.0526,
+            "video",
         ),
         ImpactRow(
             "tactile pixels",
@@ -162,8 +163,20 @@ def impact():
             (0.283, 0.41),
             (0.102, 0.25),
             0.0526,
+            "video",
         ),
-        ImpactRow("tactile minus background", "1-NN", 0.61, 0.401, 0.209, None, None, None, 0.0526),
+        ImpactRow(
+            "tactile minus background",
+            "1-NN",
+            0.61,
+            0.401,
+            0.209,
+            None,
+            None,
+            None,
+            0.0526,
+            "video",
+        ),
     ]
     headline = (
         "A 1-NN on tactile pixels reaches 71.4 % under this split and 38.2 % without the leak: it "
@@ -350,11 +363,12 @@ def full_results(folder, n=6, side=64):
 
 
 def small_audit(worst=(), **changes):
-    """An audit of groups and gaps alone, without signals."""
+    """An audit of groups and gaps alone."""
     materials = [{"material": "wood", "train": 5, "test": 6, "groups_train": 6, "groups_test": 3}]
     audit = Audit("Orig", "video", 900, 100, 10, 5, 4, 80, 0.8, 3, 1, 24.0, 60)
     fields = {"gap_edges": [0, 10, 30, 60], "gap_counts": [10, 40, 30], "worst": worst}
     fields |= {"materials": materials, "notes": [text_note("A remark.")], "split": "ab" * 32}
+    fields |= {"signals": [Signal("shared video", 100, 80, 1.0)], "leaking_samples": 80}
     return dataclasses.replace(audit, **(fields | changes))
 
 

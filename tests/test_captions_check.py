@@ -183,7 +183,7 @@ def test_captions_and_samples_in_two_places(samples, tmp_path, capsys):
     more = ["--page", page, "-o", output, "--mask", tmp_path / "m", "--fail-over", "0.1"]
     assert main([*map(str, [*args, *more])]) == 1
     assert "naming their label" in page.read_text(encoding="utf-8")
-    assert json.loads(output.read_text())["format"] == "palpate-results/2"
+    assert json.loads(output.read_text())["format"] == "palpate-results/1"
     masked = pl.read_parquet(tmp_path / "m" / "captions.parquet")
     assert {"material plate", "Natural material plate", "Others plate"} == set(masked["text"])
     record = json.loads((tmp_path / "m" / "record.json").read_text())

@@ -135,7 +135,7 @@ def test_files_that_cannot_be_written_or_read_are_mistakes_too(
         '{"format": "palpate-split/1", "rule": {}, "digest": "x", "parts": {"train": 3}}'
     )
     row = {"metric": "m", "subject": "s", "value": "high"}
-    scores.write_text(json.dumps({"format": "palpate-results/2", "title": "t", "scores": [row]}))
+    scores.write_text(json.dumps({"format": "palpate-results/1", "title": "t", "scores": [row]}))
     for args, words in (
         (["audit", *lists, "-o", folder], f"{folder} must be writable"),
         (["audit", *lists, "-o", lists[0] + "/x.json"], "must be"),

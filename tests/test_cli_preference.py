@@ -62,7 +62,7 @@ def test_from_folders_to_a_row(capsys, folders, tmp_path):
     assert status == 0
     assert "human preference" in out
     assert re.search(r"^ours & \S*0\.\d+", outputs[1].read_text(), re.MULTILINE)
-    assert json.loads(outputs[0].read_text())["format"] == "palpate-results/2"
+    assert json.loads(outputs[0].read_text())["format"] == "palpate-results/1"
     assert main(["report", str(outputs[0]), "-o", str(tmp_path / "page.html"), "-q"]) == 0
     assert "human preference" in (tmp_path / "page.html").read_text()
 

@@ -263,9 +263,9 @@ def test_verify_counts_prints_what_differs_and_exits_1(capsys, sets):
     [
         (None, "The results file must exist"),
         ("[]", "must be a JSON object"),
-        ('{"format": "palpate-split/1"}', "must have the format palpate-results/2"),
-        ('{"format": "palpate-results/2", "title": "", "calls": [3]}', "must be as palpate writes"),
-        ('{"format": "palpate-results/2", "title": "", "calls": [{"verb": 1}]}', "must be as"),
+        ('{"format": "palpate-split/1"}', "must have the format palpate-results/1"),
+        ('{"format": "palpate-results/1", "title": "", "calls": [3]}', "must be as palpate writes"),
+        ('{"format": "palpate-results/1", "title": "", "calls": [{"verb": 1}]}', "must be as"),
     ],
 )
 def test_verify_says_in_one_line_that_a_file_is_no_results(capsys, sets, text, words):

@@ -168,9 +168,6 @@ def test_a_score_is_a_number_that_prints_how_it_was_made():
     lost = Score("TMMD", "a", inf, interval=(0.0, inf), null=(nan, 1.0), floor=-inf)
     assert (lost.value, lost.interval, lost.null, lost.floor) == (None,) * 4
     assert Score.from_json(lost.to_json()) == lost
-    assert Score.from_json({"metric": "m", "subject": "s", "value": 1, "note": "Old."}).notes == (
-        Note("text", {"text": "Old."}),
-    )
 
 
 @pytest.mark.parametrize("change", [{"bandwidth": 5.0}, {"encoder": "e2"}, {"settings": {"k": 1}}])

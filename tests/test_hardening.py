@@ -21,7 +21,7 @@ from palpate.core import PalpateError, atomic_folder, atomic_path, locked
 from palpate.data.manifest import Manifest
 
 INDEX = '{"format": "palpate-generated/1", "complete": true, "settings": {}, "digest": "x", '
-RESULTS = '{"format": "palpate-results/2", "title": "t"%s}'
+RESULTS = '{"format": "palpate-results/1", "title": "t"%s}'
 
 
 def zip_named_npy(path: Path) -> None:
@@ -91,7 +91,7 @@ def typed_manifest(path: Path) -> None:
         ),
         (
             "r.json",
-            '{"format": "palpate-results/2", "title": 3}',
+            '{"format": "palpate-results/1", "title": 3}',
             "report r.json -o p.html",
             "title",
         ),

@@ -5,7 +5,7 @@ import re
 import pytest
 
 from palpate.core import Note
-from palpate.report.first_screen import about, annotated, cards, caution, found, telling_columns
+from palpate.report.first_screen import about, annotated, cards, caution, telling_columns
 from palpate.report.page import render_page
 from palpate.report.results import Results
 from palpate.report.study import Claim, StudyTable
@@ -144,58 +144,6 @@ def test_cards_compare_the_same_subjects():
     assert all("interval" in row.drawing for row in made[0].rows[1:])
 
 
-def test_what_was_found_is_said_question_by_question():
-    def of(*verdicts, source="paper, table 3", measured=True):
-        return [Claim(f"c{k}", source, v, "", (), measured) for k, v in enumerate(verdicts)]
-
-    def said(*claims, **more):
-        return found(Results("T", claims=claims, **more)).removesuffix(
-            " Intervals are over videos."
-        )
-
-    assert found(Results("T")) == ""
-    assert said(*of("holds")) == "1 claim of the paper: 1 holds (“c0”)."
-    assert said(*of("undecided", "does not hold", "undecided", "undecided")) == (
-        "4 claims of the paper: 1 does not hold (“c1”), 3 undecided."
-    )
-    assert said(*of("holds", "holds", "undecided")) == (
-        "3 claims of the paper: 2 hold (“c0”; “c1”), 1 undecided."
-    )
-    assert said(*of("undecided", "undecided")) == "2 claims of the paper: all undecided."
-    beyond = of("does not hold", source="beyond the paper")
-    assert said(*of("undecided"), *of("undecided", measured=False), *beyond) == (
-        "2 claims of the paper: 1 undecided, 1 not measured; 1 beyond it: 1 does not hold (“c0”)."
-    )
-    leaks = said(*of("holds"), audits=[full_audit(), clean_audit()])
-    assert leaks.startswith("Test samples that leak: Orig 99.10 %, NoLeak 0 %. ")
-    seeds = found(Results("T", claims=of("holds"), settings={"seeds": [0, 1]}))
-    assert seeds.endswith("Intervals are over videos and seeds.")
-
-
-@pytest.mark.parametrize(
-    ("interval", "words"),
-    [
-        ((0.2, 0.4), "farther from real images than those"),
-        ((0.05, 0.4), "not told apart from real images"),
-    ],
-)
-def test_a_method_is_told_apart_by_its_interval_and_that_of_the_floor(interval, words):
-    real = score("TMMD", "real, other videos", 0.0, interval=(-0.1, 0.1))
-    scores = [score("TMMD", "Ours", 0.3, interval=interval), real]
-    columns = telling_columns(score_tables(scores))
-    results = Results("T", scores=scores, claims=[Claim("c", "s", "holds", "")])
-    assert f"By TMMD, Ours is {words} of other videos." in found(
-        results, columns, ["real, other videos"]
-    )
-    assert "By TMMD" not in found(results, telling_columns(score_tables(scores[:1])))  # no floor
-    # A metric that takes the empty background for real images cannot praise a method.
-    for near, neither in (((-0.2, 0.05), interval[0] < 0.1), ((0.5, 0.6), False)):
-        more = [*scores, score("TMMD", "empty background", 0.0, interval=near)]
-        said = found(results, telling_columns(score_tables(more)), [s.subject for s in more[1:]])
-        assert ("neither Ours nor the empty background from real" in said) == neither
-        assert (f"Ours is {words}" in said) != neither
-
-
 def test_a_card_never_loses_its_method_to_controls():
     more = {"higher_is_better": True, "null": None, "floor": None}
     names = ["ours", "a", "b", "c", "real"]
@@ -256,18 +204,6 @@ def test_methods_are_explained_once_below_the_verdict(tmp_path):
 def test_a_run_that_is_too_small_says_so():
     assert "can decide nothing" in caution(Results("T", settings={"preset": "smoke"}))
     assert caution(Results("T", settings={"preset": "mini"})) == ""
-
-
-def test_cards_of_an_audit_alone_say_what_gives_it_away_and_what_it_costs():
-    titles = [card.title for card in cards(Results("T", audits=[full_audit()]), [])]
-    assert titles == [
-        "Test samples that leak from train",
-        "What gives Orig away",
-        "Material accuracy, 1-NN on tactile pixels",
-    ]
-    (*_, near) = cards(Results("T", audits=[full_audit(impact=None)]), [])
-    assert [row.text for row in near.rows] == ["31", "304", "2,485"]
-    assert cards(Results("T"), []) == []
 
 
 def test_what_a_page_is_about():

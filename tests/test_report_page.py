@@ -140,7 +140,6 @@ def test_a_page_is_well_formed_and_complete(tmp_path):
         "median 24",
         "n = 240",
         "976 more in the JSON",
-        "n E oak 3 0.5 elm 4 0.25",
     ):
         assert text in tree.text, text
     ids = [a["id"] for _, a in tree.tags if "id" in a]
@@ -347,13 +346,13 @@ def test_settings_of_any_type_are_written(tmp_path):
 def test_headline_facts():
     facts = ["one", "two", "three"]
     assert summary_lines(Results("t", facts=[*facts, "four"])) == facts
-    shared = {"groups_shared": 0, "test_samples_in_shared_groups": 0, "leaked_fraction": 0.0}
-    audits = [small_audit(), small_audit(name="NoLeak", **shared)]
+    clean = {"signals": [Signal("shared video", 100, 0, 1.0)], "leaking_samples": 0}
+    audits = [small_audit(), small_audit(name="NoLeak", **clean)]
     scores = [score(value=None, interval=None), score(subject="GVST")]
     assert summary_lines(Results("t", audits=audits, scores=scores)) == [
-        "Orig: 80.0 % of the test samples leak; 80 of 100 come from a video that train has as "
-        "well.",
-        "NoLeak: no video is shared; none of the 100 test samples leaks.",
+        "Orig: 80.0 % of the test samples share a video with train. 80 of 100 test samples leak "
+        "(80.0 %).",
+        "NoLeak: None of 100 test samples leaks by the one signal checked.",
         "TMMD (lower is better): GVST 1.37 [1.01, 1.75]; floor 0.04.",
     ]
     assert summary_lines(Results("t")) == []

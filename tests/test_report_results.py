@@ -1,4 +1,4 @@
-"""Results and audits as objects: indexing, frames, files, earlier formats, the command."""
+"""Results and audits as objects: indexing, frames, files, the command."""
 
 import json
 import shutil
@@ -7,11 +7,9 @@ from pathlib import Path
 import pytest
 
 from palpate.cli import main
-from palpate.core import Note, PalpateError, Split
+from palpate.core import PalpateError
 from palpate.report.results import Audit, LeakPair, Results
 from report_fixtures import full_audit, full_results, images, score, small_audit
-
-FORMATS = Path(__file__).parent / "data" / "formats"
 
 
 def test_results_are_a_table_of_scores():
@@ -68,20 +66,6 @@ def test_showing_results_in_a_notebook_escapes_names():
     assert "<pre" in small_audit()._repr_html_()
 
 
-def test_files_of_version_1_are_read_and_drawn(tmp_path):
-    results = Results.load(FORMATS / "results-1.json")
-    assert results.notes[0] == Note("text", {"text": "Synthetic data."})
-    assert results["TMMD", "generated"].notes[0].params["text"].startswith("The interval takes")
-    assert results.audits[0].signals[-1].matches
-    results.to_html(tmp_path / "page.html")
-    for text in ((tmp_path / "page.html").read_text(), results.to_markdown(), str(results)):
-        assert "Synthetic data." in text
-        assert "leak" in text
-    split = Split.load(FORMATS / "split-1.json")
-    assert split.counts() == {"train": 2, "val": 1, "test": 1}
-    assert str(split).startswith("NoLeak: train 2, val 1, test 1")
-
-
 def test_the_command_merges_files_of_results_and_audits(capsys, tmp_path):
     full_audit(images(tmp_path, 8, 32), others=[small_audit()]).save(tmp_path / "audit.json")
     Results("S", scores=[score(split="b" * 64)]).save(tmp_path / "scores.json")
@@ -99,7 +83,7 @@ def test_the_command_merges_files_of_results_and_audits(capsys, tmp_path):
 @pytest.mark.parametrize(
     ("change", "words"),
     [
-        ({"format": "other"}, "must have the format palpate-results/2"),
+        ({"format": "other"}, "must have the format palpate-results/1"),
         ({"new": 1}, "new"),
         ({"signals": 5}, "int"),
         ({"others": [{"name": "x"}]}, "missing"),

@@ -14,11 +14,11 @@ import tyro
 
 from palpate.cli.terminal import Common, OutPath, Terminal, guard_output
 from palpate.core import Note, PalpateError, inside, read_record, short
-from palpate.report.results import AUDIT_FORMATS, RESULTS_FORMATS, Audit, Results
+from palpate.report.results import AUDIT_FORMAT, RESULTS_FORMAT, Audit, Results
 
 TITLE = "palpate report"
 #: Names of the files that a folder of figures holds.
-WRITTEN = re.compile(r"(background|curve|matrix|pairs|samples|strips)\b.*\.(png|svg)")
+WRITTEN = re.compile(r"(background|curve|pairs|samples|strips)\b.*\.(png|svg)")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -95,9 +95,9 @@ def read(path: Path, folders: Sequence[Path] = ()) -> Results:
     Raises:
         PalpateError: if it is missing, of another format, or incomplete.
     """
-    data = read_record(path, "results file", form=(*RESULTS_FORMATS, *AUDIT_FORMATS))
+    data = read_record(path, "results file", form=(RESULTS_FORMAT, AUDIT_FORMAT))
     try:
-        if data["format"] in AUDIT_FORMATS:
+        if data["format"] == AUDIT_FORMAT:
             results = replace(Audit.from_json(data).to_results(), title="")
         else:
             results = Results.from_json(data)

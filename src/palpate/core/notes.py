@@ -10,8 +10,6 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-from palpate.core.records import from_plain
-
 
 @dataclass(frozen=True)
 class Note:
@@ -28,10 +26,3 @@ class Note:
     def to_json(self) -> dict[str, Any]:
         """Return the note as a JSON object."""
         return {"code": self.code, "params": dict(self.params)}
-
-    @classmethod
-    def from_json(cls, data: Mapping[str, Any] | str) -> Note:
-        """Return the inverse of :meth:`to_json`; a string, as format 1 had it, becomes ``text``."""
-        if isinstance(data, str):
-            return cls("text", {"text": data})
-        return from_plain(cls, data)

@@ -145,10 +145,7 @@ class Score:
     @classmethod
     def from_json(cls, data: Mapping[str, Any]) -> Score:
         """Return the inverse of :meth:`to_json`."""
-        fields = dict(data)
-        sentence = fields.pop("note", "")  # format 1 had one string
-        notes = [*(fields.get("notes") or ()), *([sentence] if sentence else [])]
-        score = from_plain(cls, fields | {"notes": notes})
+        score = from_plain(cls, data)
         return replace(score, notes=tuple(score.notes))
 
 

@@ -26,7 +26,7 @@ from palpate.metrics.images import per_image
 from palpate.preference.arrays import FEWER, VoteArrays
 from palpate.preference.plan import REFERENCE, Plan
 from palpate.preference.statistics import Array, tau_b
-from palpate.report.results import RESULTS_FORMATS, Results
+from palpate.report.results import RESULTS_FORMAT, Results
 
 if TYPE_CHECKING:
     import polars as pl
@@ -109,7 +109,7 @@ def _metrics(plan: Plan, source: Any, lower: Sequence[str]) -> list[Metric]:
     if isinstance(source, str | Path):
         path = Path(source)
         source = read_json(path, "file of metrics") if path.suffix.lower() == ".json" else path
-        if isinstance(source, Mapping) and source.get("format") in RESULTS_FORMATS:
+        if isinstance(source, Mapping) and source.get("format") == RESULTS_FORMAT:
             source = Results.load(path)
     if isinstance(source, Results):
         metrics = _of_results(plan, source)

@@ -84,20 +84,19 @@ def matrix_rows(audit: Audit) -> list[GroupRow]:
 
 def impact_head(row: ImpactRow) -> list[str]:
     """Return the classifier, by what the leak-free splits were made, and a doubt."""
-    by = [f"by {row.group}"] if row.group else []
-    return [row.classifier, *by, *(["trained on some of these images"] if row.seen else [])]
+    doubt = ["trained on some of these images"] if row.seen else []
+    return [row.classifier, f"by {row.group}", *doubt]
 
 
-def impact_cells(row: ImpactRow) -> dict[str, tuple[float, tuple[float, float] | None, str, str]]:
-    """Return accuracy under both splits and cost, in percent: value, interval, and both as text."""
+def impact_cells(row: ImpactRow) -> dict[str, tuple[str, str]]:
+    """Return accuracy under both splits and cost, in percent, each with its interval, as text."""
     cells = {
         "Given split": (row.given, row.given_interval),
         "Leak-free": (row.clean, row.clean_interval),
         "Cost, points": (row.cost, row.cost_interval),
     }
-    result: dict[str, tuple[float, tuple[float, float] | None, str, str]] = {}
+    result: dict[str, tuple[str, str]] = {}
     for name, (value, interval) in cells.items():
-        wide = (100 * interval[0], 100 * interval[1]) if interval else None
-        text = f"[{number(wide[0], 1)}, {number(wide[1], 1)}]" if wide else ""
-        result[name] = (100 * value, wide, number(100 * value, 1), text)
+        pair = ", ".join(number(100 * limit, 1) for limit in interval or ())
+        result[name] = (number(100 * value, 1), f"[{pair}]" if pair else "")
     return result

@@ -1,4 +1,4 @@
-"""Drawings of a study: curves, strips of many subjects on one axis, and matrices by class."""
+"""Drawings of a study: curves, and strips of many subjects on one axis."""
 
 from __future__ import annotations
 
@@ -14,7 +14,6 @@ from palpate.report.notes import digits_of, number
 from palpate.report.plots import Axis, axis_of, ticks_of
 from palpate.report.study import Curve, Line
 from palpate.report.study_tables import Row, Sheet
-from palpate.report.tables import Heat
 
 #: Units of a curve: the whole width, the plot's height, and the places of its edges.
 WIDTH, PLOT, TOP, RIGHT = 400.0, 200.0, 26.0, 392.0
@@ -22,8 +21,6 @@ WIDTH, PLOT, TOP, RIGHT = 400.0, 200.0, 26.0, 392.0
 INKS = tuple(f"line{k}" for k in range(1, 7))
 #: Units of a strip: label, axis and number.
 STRIP, LABEL, AXIS, ROW = 640.0, 212.0, 240.0, 20.0
-#: Units of a square of a matrix.
-CELL = 30.0
 #: Most different x that are all labeled.
 LABELED = 8
 
@@ -300,27 +297,3 @@ def _strip_axis(axis: Axis | None, y: float) -> Iterable[Shape | Words]:
         x = _place(axis, tick)
         yield Shape([(x, y), (x, y + 4)], "soft")
         yield Words(x, y + 16, number(tick, digits), "middle")
-
-
-def matrix_drawing(heat: Heat) -> Drawing:
-    """Draw a matrix by class: numbers on squares that are stronger the larger the number.
-
-    Columns have the numbers of the rows, so that long names need no turned letters.
-    """
-    names = [
-        lines_of(f"{k}  {label}", LABEL - 6, most=1)[0] for k, label in enumerate(heat.labels, 1)
-    ]
-    parts: list[Shape | Words] = []
-    width = max([CELL, *(wide(text, 11) + 6 for row in heat.values for text in row)])
-    for k, name in enumerate(names):
-        x, y = LABEL + k * width, ROW + k * CELL
-        parts.append(Words(x + width / 2, ROW - 6, f"{k + 1}", "middle"))
-        parts.append(Words(0, y + CELL / 2 + 4, name, ink="ink"))
-        for n, (text, share) in enumerate(zip(heat.values[k], heat.shares[k], strict=True)):
-            left = LABEL + n * width
-            box = [(left, y), (left + width, y), (left + width, y + CELL), (left, y + CELL)]
-            parts.append(Shape(box, "line1", fill=True, opacity=0.05 + 0.45 * share))
-            middle = left + width / 2
-            parts.append(Words(middle, y + CELL / 2 + 4, text, "middle", ink="ink", size=11))
-    size = (LABEL + len(names) * width + 2, ROW + len(names) * CELL + 2)
-    return Drawing(*size, parts, f"{heat.title}. {heat.meaning}")

@@ -14,13 +14,13 @@ from PIL import Image, ImageDraw, ImageOps
 
 from palpate.core import atomic_path, write_text
 from palpate.report import audits
-from palpate.report.curves import Panel, curve_drawing, matrix_drawing, panels_of, strips_drawing
+from palpate.report.curves import Panel, curve_drawing, panels_of, strips_drawing
 from palpate.report.drawing import COLORS, Drawing, font_of, in_ascii
 from palpate.report.first_screen import COLUMNS, TELLING, telling_columns
 from palpate.report.page import gallery_images, in_turns, material_of, pair_images
 from palpate.report.results import Audit, Results
-from palpate.report.study_tables import controls_of, file_names, lay, scores_of_methods, sheets
-from palpate.report.tables import REAL, heat_tables, score_tables
+from palpate.report.study_tables import controls_of, file_names, lay, sheets
+from palpate.report.tables import REAL, score_tables
 from palpate.report.thumbnails import Wanted, read_image
 
 #: Samples and pairs side by side.
@@ -41,8 +41,8 @@ class Picture:
 def save_figures(results: Results, folder: Path, *, base: Path) -> list[Path]:
     """Write every figure of ``results`` into ``folder``.
 
-    Curves, strips (score tables, and tables of a study with intervals) and matrices by class are
-    SVG and PNG; samples, what the background is of an image, and leaking pairs are PNG.
+    Curves and strips (score tables, and tables of a study with intervals) are SVG and PNG; samples,
+    what the background is of an image, and leaking pairs are PNG.
 
     Args:
         results: what to draw.
@@ -82,9 +82,7 @@ def _drawings(results: Results) -> dict[str, Drawing]:
         panels = [p for p in panels_of(table) if any(s.interval for _, s, _ in p.rows)]
         if panels := sorted(panels, key=_telling)[:COLUMNS]:
             drawings[name] = strips_drawing(table.title, panels)
-    heats = heat_tables(scores_of_methods(results))
-    names = file_names("matrix", [heat.title for heat in heats])
-    return drawings | dict(zip(names, map(matrix_drawing, heats), strict=True))
+    return drawings
 
 
 def _telling(panel: Panel) -> int:

@@ -12,19 +12,11 @@ from palpate.report import plots
 from palpate.report.notes import number, p_text, percent, plural, sentence
 from palpate.report.results import Audit, Results
 from palpate.report.sentences import share_of
-from palpate.report.study import Claim
-from palpate.report.study_tables import by_verdict, verdict_word
 from palpate.report.tables import REAL, Cell, Column, Table, best_by_value, defined
 
 #: Columns of the verdict table, the most telling first; others follow as they come.
 TELLING = ("TMMD", "material accuracy", "D-TMMD", "CI-TMMD", "SSIM")
 COLUMNS, CARDS, CARD_ROWS = 5, 3, 4
-#: Fewer claims of one verdict than this are named on the first screen.
-NAMED = 3
-#: The control that is the floor of TMMD.
-FLOOR = "real, other videos"
-#: The control that no distance to real images may take for one.
-EMPTY = "empty background"
 #: Beginnings of metrics whose null is that generated and real images are alike.
 DISTANCES = ("TMMD", "FID", "CMMD", "KID")
 #: Width of the strip in a card, and of the one that explains strips, in pixels.
@@ -84,62 +76,6 @@ def about(results: Results, date: str, version: str) -> list[str]:
     return [*facts, date, f"palpate {version}"]
 
 
-def found(results: Results, columns: Sequence[Column] = (), controls: Collection[str] = ()) -> str:
-    """Return what a study found, question by question, in a few words, and what intervals cover."""
-    if not results.claims:
-        return ""
-    audits = [a for a in results.audits if a.against == "train" and a.test_samples]
-    leaks = ", ".join(f"{a.name} {share_of(a)}" for a in audits)
-    own = [c for c in results.claims if not c.source.startswith("paper")]
-    papers = [c for c in results.claims if c.source.startswith("paper")]
-    told = [f"{plural(len(papers), 'claim')} of the paper: {_verdicts(papers)}"] if papers else []
-    beyond = "beyond it" if papers else "claims"
-    told += [f"{len(own)} {beyond}: {_verdicts(own)}"] if own else []
-    seeds = results.settings.get("seeds")
-    covered = (
-        f"Intervals are over videos{' and seeds' * (isinstance(seeds, list) and len(seeds) > 1)}"
-    )
-    parts = [
-        leaks and f"Test samples that leak: {leaks}",
-        _apart(columns, controls),
-        "; ".join(told),
-        covered,
-    ]
-    return " ".join(f"{part}." for part in parts if part)
-
-
-def _apart(columns: Sequence[Column], controls: Collection[str]) -> str:
-    """Whether the first method is told apart from real images of other videos, by TMMD.
-
-    If the empty background is not, then that says nothing.
-    """
-    cells = [c for column in columns if column.metric == "TMMD" for c in column.cells if c.defined]
-    method = next((c.score for c in cells if c.score.subject not in {*controls, REAL}), None)
-    known = {c.score.subject: c.score.interval for c in cells}
-    floor, empty = known.get(FLOOR), known.get(EMPTY)
-    if method is None or floor is None or not method.interval:
-        return ""
-    if method.interval[0] > floor[1]:
-        return f"By TMMD, {method.subject} is farther from real images than those of other videos"
-    if empty and empty[0] <= floor[1]:
-        return (
-            f"TMMD tells neither {method.subject} nor the {EMPTY} from real images, so it says "
-            "nothing here"
-        )
-    return f"By TMMD, {method.subject} is not told apart from real images of other videos"
-
-
-def _verdicts(claims: Sequence[Claim]) -> str:
-    """``1 does not hold (“...”), 8 undecided, 12 not measured``; decided ones by name, if few."""
-    parts: list[str] = []
-    for verdict, same in by_verdict(claims).items():
-        named = verdict in ("holds", "does not hold") and len(same) < NAMED
-        names = f" ({'; '.join(f'“{c.claim}”' for c in same)})" * named
-        number_of = "all" if 1 < len(same) == len(claims) else str(len(same))
-        parts.append(f"{number_of} {verdict_word(verdict, len(same))}{names}")
-    return ", ".join(parts)
-
-
 def caution(results: Results) -> str:
     """Return what to know before any number: that a run is too small to decide anything; or ''."""
     if results.settings.get("preset") != "smoke":
@@ -163,7 +99,7 @@ def telling_columns(tables: Sequence[Table]) -> list[Column]:
 def cards(
     results: Results, columns: Sequence[Column], controls: Collection[str] = ()
 ) -> list[Card]:
-    """Return at most three cards: the leak, then the most telling scores, or more of the leak."""
+    """Return at most three cards: the leak, then the most telling scores."""
     audits = [audit for audit in results.audits if audit.test_samples]
     made = [_leak_card(audits)] if audits else []
     subjects: list[str] = []
@@ -172,9 +108,6 @@ def cards(
             shown = _compared(column, cells, controls, subjects)
             subjects = subjects or [cell.score.subject for cell in shown]
             made.append(_score_card(column, shown, len(cells), controls))
-    if audits and not columns:
-        made += [_signals_card(audits[0])] if audits[0].signals else []
-        made += _cost_cards(audits) or _gap_cards(audits[0])
     return made[:CARDS]
 
 
@@ -196,38 +129,6 @@ def _leak_card(audits: Sequence[Audit]) -> Card:
         near = f"; median{of}: {frames}" if frames else ""
         foot = f"Train has the same video, object or image{near}."
     return Card("Test samples that leak from train", rows, foot)
-
-
-def _signals_card(audit: Audit) -> Card:
-    signals = sorted((s for s in audit.signals if s.checked), key=lambda s: -s.fraction)
-    rows = [
-        CardRow(s.kind, plots.share_bar(s.fraction), percent(s.fraction))
-        for s in signals[:CARD_ROWS]
-    ]
-    return Card(f"What gives {audit.name} away", rows, "Share of the test samples by signal.")
-
-
-def _cost_cards(audits: Sequence[Audit]) -> list[Card]:
-    found = [a.impact for a in audits if a.impact and a.impact.rows]
-    if not found:
-        return []
-    row = found[0].rows[0]
-    given, clean = (row.given, row.given_interval), (row.clean, row.clean_interval)
-    pairs = (("given split", *given), ("leak-free", *clean))
-    rows = [
-        CardRow(label, plots.bar(UNIT, value, interval, mark=row.chance), percent(value))
-        for label, value, interval in pairs
-    ]
-    title = f"Material accuracy, {row.classifier} on {row.features}"
-    return [Card(title, rows, f"The dashed line is chance, {percent(row.chance)}.")]
-
-
-def _gap_cards(audit: Audit) -> list[Card]:
-    if audit.gap_median is None:
-        return []
-    gaps = (("least", audit.gap_min), ("median", audit.gap_median), ("most", audit.gap_max))
-    rows = [CardRow(label, Markup(""), number(gap, 0)) for label, gap in gaps]
-    return [Card("Frames to the nearest train frame", rows, "Of the same video.")]
 
 
 def _score_card(

@@ -12,7 +12,7 @@ import datetime
 import hashlib
 import re
 from collections import defaultdict
-from collections.abc import Hashable, Mapping, Sequence
+from collections.abc import Hashable, Sequence
 from functools import cache
 from importlib import resources
 from itertools import compress, zip_longest
@@ -138,7 +138,6 @@ def render_page(
         "about": first_screen.about(results, date, __version__),
         "purpose": _lede(results),
         "caution": first_screen.caution(results),
-        "found": first_screen.found(results, columns, controls),
         "facts": list(results.facts) or ([] if cards else sentences.summary_lines(results)),
         "cards": cards,
         "row_labels": _labels(samples),
@@ -365,7 +364,6 @@ def environment() -> Environment:
         "open_pairs": OPEN_PAIRS,
         "long_list": LONG_LIST,
         "READING": first_screen.READING,
-        "like_rows": _like_rows,
         "open_claims": OPEN_CLAIMS,
         "digits_of": digits_of,
         "verdict_marks": study_tables.MARKS,
@@ -404,13 +402,3 @@ def _leaf(value: Any) -> Markup:
         return Markup("<code>{}</code>").format(words[: words.find(":") + 13])
     is_path = "/" in words or "\\" in words
     return Markup("<code>{}</code>").format(words) if is_path else escape(words)
-
-
-def _like_rows(value: Mapping[str, Any]) -> list[str]:
-    """Return the keys that all of at least two flat entries share; such settings are a table."""
-    rows = list(value.values())
-    if len(rows) < 2 or not all(isinstance(r, Mapping) and r for r in rows):
-        return []
-    same = all(list(r) == list(rows[0]) for r in rows)
-    nested = any(isinstance(v, Mapping | list) for r in rows for v in r.values())
-    return list(rows[0]) if same and not nested else []

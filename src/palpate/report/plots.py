@@ -16,7 +16,7 @@ from markupsafe import Markup, escape
 
 from palpate.core import Score
 from palpate.report.notes import count, number, score_text
-from palpate.report.results import Audit, Impact, Signal
+from palpate.report.results import Audit, Signal
 
 WIDTH, HEIGHT, PAD = 148, 22, 7  # pixels of an interval bar
 LEFT, RIGHT = 13.0, 99.0  # percent of a histogram's width
@@ -77,18 +77,6 @@ def axis_of(scores: Iterable[Score]) -> Axis | None:
     return axis_over(
         v for s in scores for v in (s.value, s.floor, *(s.interval or ()), *(s.null or ()))
     )
-
-
-def impact_axes(impact: Impact) -> list[Axis | None]:
-    """Return the axes of accuracy under both splits and of the cost, in percent."""
-    accuracies: list[float] = [0.0]
-    costs: list[float] = [0.0]
-    for row in impact.rows:
-        accuracies += [row.given, row.clean, row.chance]
-        accuracies += [*(row.given_interval or ()), *(row.clean_interval or ())]
-        costs += [row.cost, *(row.cost_interval or ())]
-    accuracy, cost = (axis_over([100 * v for v in values]) for values in (accuracies, costs))
-    return [accuracy, accuracy, cost]
 
 
 def bar(

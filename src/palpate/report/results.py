@@ -27,10 +27,7 @@ from palpate.report.study import Claim, Curve, StudyTable
 if TYPE_CHECKING:
     import polars as pl
 
-RESULTS_FORMAT, AUDIT_FORMAT = "palpate-results/2", "palpate-audit/2"
-#: Every format that is read, newest first.
-RESULTS_FORMATS = (RESULTS_FORMAT, "palpate-results/1")
-AUDIT_FORMATS = (AUDIT_FORMAT, "palpate-audit/1")
+RESULTS_FORMAT, AUDIT_FORMAT = "palpate-results/1", "palpate-audit/1"
 #: The verdict where a leak could not show.
 CANNOT_TELL = "cannot tell"
 #: Keys of their JSON that are no fields.
@@ -112,12 +109,6 @@ class Signal:
         """Flagged share of the samples that could be checked; 0 if there are none."""
         return self.flagged / self.checked if self.checked else 0.0
 
-    @classmethod
-    def from_json(cls, data: Mapping[str, Any]) -> Signal:
-        """The inverse of ``dataclasses.asdict``; format 1 called ``matches`` ``found``."""
-        renamed = {"found": "matches"}
-        return from_plain(cls, {renamed.get(name, name): value for name, value in data.items()})
-
 
 @dataclass(frozen=True)
 class ImpactRow:
@@ -131,7 +122,7 @@ class ImpactRow:
         given_interval, clean_interval, cost_interval: 95 %, leaving out whole groups; None with
             fewer than two.
         chance: 1 / materials.
-        group: the column that the leak-free splits keep whole; '' in files of earlier versions.
+        group: the column that the leak-free splits keep whole.
         seen: whether the encoder of the features was trained on some of the samples.
     """
 
@@ -144,7 +135,7 @@ class ImpactRow:
     clean_interval: tuple[float, float] | None
     cost_interval: tuple[float, float] | None
     chance: float
-    group: str = ""
+    group: str
     seen: bool = False
 
 
@@ -192,14 +183,14 @@ class Audit:
             groups with most test samples first; at most ``MATRIX_ROWS`` of ``groups_in_all``.
         shared: column (video, session, object) that both parts know -> (test groups that are in
             train, test groups): whether the test part asks for new videos, or for new objects.
-        verdict: ``leaks``, ``none``, or ``cannot tell``; '' in files of earlier versions.
+        verdict: ``leaks``, ``none``, or ``cannot tell``.
         reason: why a leak might not show: nothing was touched (``untouched``), images are similar
             (``similar``), none are known to be unrelated (``chance``), there are none and equal
             names mean nothing (``names``), or ids alone are known (``ids``).
         impact: what the leak does to scores, if requested.
         commands: command lines that say what to do next.
         others: audits of the same test part against other data (an encoder's pretraining list).
-        call: what made it, for ``palpate verify``; None in files of earlier versions.
+        call: what made it, for ``palpate verify``.
         table: a polars frame with every signal of every test sample; not in the JSON.
     """
 
@@ -237,7 +228,7 @@ class Audit:
     table: Any = field(default=None, compare=False, repr=False)
 
     def __post_init__(self) -> None:
-        if self.signals and self.test_samples:  # files of earlier versions counted groups alone
+        if self.test_samples:
             share = self.leaking_samples / self.test_samples
             object.__setattr__(self, "leaked_fraction", round(share, 5) or share)
 
@@ -272,7 +263,7 @@ class Audit:
         return self.table
 
     def to_json(self) -> dict[str, Any]:
-        """A JSON object with ``format: palpate-audit/2``."""
+        """A JSON object with ``format: palpate-audit/1``."""
         return {"format": AUDIT_FORMAT, **plain(self)}
 
     @classmethod
@@ -293,7 +284,7 @@ class Audit:
         Raises:
             PalpateError: if it is missing, or no audit.
         """
-        data = read_record(Path(path), "audit file", form=AUDIT_FORMATS)
+        data = read_record(Path(path), "audit file", form=AUDIT_FORMAT)
         with reading_entry(Path(path), "The audit"):
             audit = cls.from_json(data)
         call = audit.call and audit.call.with_paths(_below(Path(path).parent))
@@ -497,12 +488,12 @@ class Results:
         return replace(self, audits=audits, calls=[c.with_paths(change) for c in self.calls])
 
     def to_json(self) -> dict[str, Any]:
-        """A JSON object with ``format: palpate-results/2``."""
+        """A JSON object with ``format: palpate-results/1``."""
         return {"format": RESULTS_FORMAT, **plain(self)}
 
     @classmethod
     def from_json(cls, data: Mapping[str, Any]) -> Results:
-        """The inverse of :meth:`to_json`; sentences of format 1 become notes of code ``text``."""
+        """The inverse of :meth:`to_json`; keys that a command adds are ignored."""
         return from_plain(cls, {k: v for k, v in data.items() if k not in COMMAND_KEYS})
 
     def save(self, path: str | Path) -> None:
@@ -518,7 +509,7 @@ class Results:
             PalpateError: if it is missing, or holds no results.
         """
         path = Path(path)
-        data = read_record(path, "results file", form=RESULTS_FORMATS)
+        data = read_record(path, "results file", form=RESULTS_FORMAT)
         with reading_entry(path, "The results"):
             results = cls.from_json(data)
         place = _below(path.parent)

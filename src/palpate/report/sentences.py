@@ -38,7 +38,7 @@ KINDS: tuple[tuple[str, str, str], ...] = (
         "have a near-duplicate photo in {data}",
     ),
     (
-        "near-duplicate t",  # tactile; format 1 called it touch
+        "near-duplicate tactile",
         "Its tactile image, without the sensor's background, can hardly be distinguished from one "
         "of {data}.",
         "have a near-duplicate tactile image in {data}",
@@ -154,17 +154,6 @@ def audit_line(audit: Audit) -> str:
     name = audit.name if audit.against == "train" else f"{audit.name} against {data_of(audit)}"
     if not audit.test_samples:
         return f"{name}: the test part is empty, so nothing can leak."
-    if not audit.signals:
-        if not audit.test_samples_in_shared_groups:
-            total = plural(audit.test_samples, "test sample")
-            return f"{name}: no {audit.group} is shared; none of the {total} leaks."
-        shared = count(audit.test_samples_in_shared_groups)
-        verb = "comes" if audit.test_samples_in_shared_groups == 1 else "come"
-        return (
-            f"{name}: {percent(audit.leaked_fraction)} of the test samples leak; {shared} of "
-            f"{count(audit.test_samples)} {verb} from a {audit.group} that {data_of(audit)} has as "
-            "well."
-        )
     flagged = [s for s in audit.signals if s.flagged and s.counts]
     strongest = sorted(flagged, key=lambda s: -s.fraction)[:3]
     shares: list[str] = []

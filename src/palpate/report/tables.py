@@ -255,7 +255,7 @@ def family_of(metric: str) -> Family:
 
 def notes_of(score: Score) -> list[Note]:
     """Return what a reader must know of a score: its notes, and what follows from its fields."""
-    notes = [note for note in score.notes if note.code != "ahead"]  # of earlier versions
+    notes = [*score.notes]
     if excluded := score.details.get("excluded"):
         notes.append(Note("excluded-classes", {"excluded": excluded}))
     if score.higher_is_better is None and score.details.get("gap") is not None:

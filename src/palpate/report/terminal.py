@@ -139,27 +139,9 @@ def _entry(cell: Entry) -> str:
 def _print_sheet(table: Sheet, console: Console, style: Style) -> None:
     console.print(Text(table.title, "bold"), soft_wrap=True)
     words = sheet_words(table)
-    for rows in _blocks(sheet_rows(table), words, console.width):
-        _print_rows(rows, console, words)
+    _print_rows(sheet_rows(table), console, words)
     _print_lines([*table.marks("*"), *_notes(table.notes, style)], console)
     console.print()
-
-
-def _blocks(
-    rows: Sequence[dict[str, str]], words: Sequence[str], width: int
-) -> list[list[dict[str, str]]]:
-    """Columns of rows in blocks that fit, each with the words that the rows begin with."""
-    names = [name for name in rows[0] if any(row[name] for row in rows)] if rows else []
-    lead = [*takewhile(words.__contains__, names)]
-    size = {name: 2 + max(len(name), *(len(row[name]) for row in rows)) for name in names}
-    blocks: list[list[str]] = [[]]
-    for name in names[len(lead) :]:
-        if blocks[-1] and sum(size[n] for n in (*lead, *blocks[-1], name)) > width:
-            blocks.append([])
-        blocks[-1].append(name)
-    if any(sum(size[n] for n in (*lead, *block)) > width for block in blocks):
-        return [[*rows]]  # a list then
-    return [[{n: row[n] for n in (*lead, *block)} for row in rows] for block in blocks]
 
 
 def _print_claims(claims: Sequence[Claim], console: Console) -> None:

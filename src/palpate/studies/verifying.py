@@ -16,7 +16,7 @@ from typing import Any
 from palpate.core import PalpateError, Progress, Score, few, plain, quiet, read_record, require
 from palpate.core.files import reading_entry
 from palpate.report.calls import DIGEST, OBJECT, PATH, ROWS, Call, digest_of, is_there
-from palpate.report.results import AUDIT_FORMATS, RESULTS_FORMATS, Audit, Results, Strip
+from palpate.report.results import AUDIT_FORMAT, RESULTS_FORMAT, Audit, Results, Strip
 from palpate.studies.comparing import (
     STATUSES,
     TOLERANCE,
@@ -138,8 +138,8 @@ def read_results(file: Path) -> Results:
     Raises:
         PalpateError: if it is missing, or holds neither.
     """
-    data = read_record(file, "results file", form=(*RESULTS_FORMATS, *AUDIT_FORMATS))
-    if data["format"] in AUDIT_FORMATS:
+    data = read_record(file, "results file", form=(RESULTS_FORMAT, AUDIT_FORMAT))
+    if data["format"] == AUDIT_FORMAT:
         return Results(title="", audits=[Audit.load(file)])
     return Results.load(file)
 
