@@ -30,8 +30,7 @@ FUNCTIONS = {
     "d_tmmd": ONE_SET,
     "distance": (
         "x, y, *, sigma=10.0, kernel=None, scale=1000.0, estimator='unbiased', groups_x=None, "
-        "groups_y=None, normalize='check', backend='auto', tolerance=0.0001, block=1024, "
-        "names=('x', 'y')"
+        "groups_y=None, normalize='check', backend='auto', block=1024"
     ),
     "fid": f"generated, reference, *, {ROWS}, **options",
     "four_scores": "generated, reference, *, floor=None, **options",
@@ -41,7 +40,6 @@ FUNCTIONS = {
         "metric, values, *, ids=None, groups=None, bounds=(-inf, inf), higher_is_better=True, "
         "notes=(), **fields"
     ),
-    "measure_contacts": CONTACT,
     "ms_ssim": f"{IMAGES}, **options",
     "per_image": f"metric, {IMAGES}",
     "prdc": f"generated, reference, k=5, *, {ROWS}, **options",
@@ -51,7 +49,7 @@ FUNCTIONS = {
     "tmmd": f"generated, reference, *, {ROWS.replace('ids=None,', 'ids=None, labels=None,', 1)}, "
     "**options",
 }
-CLASSES = {"TMMD", "ITMMD", "CITMMD", "DTMMD", "Comparison", "Distance", "Options"}
+CLASSES = {"TMMD", "Comparison", "Distance", "Options"}
 KERNELS = {"Gaussian", "Polynomial"}
 
 

@@ -43,7 +43,7 @@ def definition(x, y):
 def test_fid_is_the_definition_at_every_rank(n, m, d, seed, shift):
     rng = np.random.default_rng(seed)
     x, y = rng.normal(size=(n, d)) @ rng.normal(size=(d, d)) + shift, 2 * rng.normal(size=(m, d))
-    score = fid(features(x), features(y), interval=False)
+    score = fid(features(x), features(y))
     scale = (
         shift**2 * d + np.trace(np.atleast_2d(np.cov(x.T))) + np.trace(np.atleast_2d(np.cov(y.T)))
     )
@@ -56,9 +56,9 @@ def test_singular_covariances_are_never_complex():
     rng = np.random.default_rng(3)
     x, y = rng.normal(size=(12, 64)), rng.normal(size=(300, 64))
     y[:, 7] = 0.5  # a dead feature
-    score = fid(features(x), features(y), interval=False)
+    score = fid(features(x), features(y))
     assert score.value == pytest.approx(definition(x, y), rel=1e-7)
-    assert fid(features(y), features(y), interval=False).value == pytest.approx(0, abs=1e-9)
+    assert fid(features(y), features(y)).value == pytest.approx(0, abs=1e-9)
 
 
 def test_float32_and_a_common_mean_far_away_cost_nothing():
@@ -67,21 +67,10 @@ def test_float32_and_a_common_mean_far_away_cost_nothing():
         rng.normal(size=(400, 6)).astype(np.float32),
         (1.1 * rng.normal(size=(500, 6))).astype(np.float32),
     )
-    near = fid(features(x), features(y), interval=False).value
-    far = fid(
-        features(x.astype(np.float64) + 1e6), features(y.astype(np.float64) + 1e6), interval=False
-    ).value
+    near = fid(features(x), features(y)).value
+    far = fid(features(x.astype(np.float64) + 1e6), features(y.astype(np.float64) + 1e6)).value
     assert near == pytest.approx(definition(x, y), rel=1e-10)
     assert far == pytest.approx(near, rel=1e-6)
-
-
-def test_normalize_divides_rows_first():
-    rng = np.random.default_rng(5)
-    x, y = rng.normal(size=(60, 5)), 7 * rng.normal(size=(60, 5))
-    unit = [v / np.linalg.norm(v, axis=1, keepdims=True) for v in (x, y)]
-    score = fid(features(x), features(y), normalize=True, interval=False)
-    assert score.value == pytest.approx(definition(*unit))
-    assert score.settings["normalize"] is True
 
 
 @pytest.mark.parametrize("width", [3, 40])
@@ -178,10 +167,6 @@ def test_bad_input_is_rejected_by_name():
     broken[5, 2] = np.nan
     with pytest.raises(PalpateError, match=r"1 row \(5: '5'\)"):
         fid(features(good), features(broken))
-    zero = good.copy()
-    zero[2] = 0
-    with pytest.raises(PalpateError, match=r"zeros in 1 row \(2\)"):
-        fid(features(zero), features(good), normalize=True)
     with pytest.raises(PalpateError, match="one encoder"):
         fid(features(good, encoder="a" * 64), features(good, encoder="b" * 64))
     with pytest.raises(PalpateError, match="known for every row"):
@@ -192,18 +177,17 @@ def test_half_precision_is_widened_and_copies_are_counted():
     rng = np.random.default_rng(13)
     x, y = rng.normal(size=(2, 50, 4)).astype(np.float16)
     with pytest.warns(UserWarning, match="float16 features were widened"):
-        score = fid(features(x), features(y), interval=False)
+        score = fid(features(x), features(y))
     assert score.value == pytest.approx(definition(x, y), rel=1e-6)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         strided = fid(
             features(np.asfortranarray(x.astype(np.float32))[::2]),
             features(y.astype(np.float32)[::-1]),
-            interval=False,
         )
     assert strided.value == pytest.approx(definition(x[::2], y), rel=1e-6)
     both = np.concatenate([y[:3], x]).astype(np.float32)
-    score = fid(features(both), features(y.astype(np.float32)), interval=False)
+    score = fid(features(both), features(y.astype(np.float32)))
     assert Note("copied-rows", {"count": 3, "n": 53}) in score.notes
 
 

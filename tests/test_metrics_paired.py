@@ -1,7 +1,6 @@
 """Permutations of whole videos, paired differences, and copies of reference rows."""
 
 import itertools
-import math
 
 import numpy as np
 import pytest
@@ -11,7 +10,7 @@ from palpate.core import Note, PalpateError, Score
 from palpate.metrics import ci_tmmd, compare, four_scores, i_tmmd, tmmd
 from palpate.metrics.intervals import Scored, permutation_test
 from palpate.metrics.kernels import Gaussian, blocked_sums
-from palpate.metrics.paired import difference, excess_of, holm
+from palpate.metrics.paired import difference, holm
 from test_metrics_mmd import loop_mmd, mmd2, unit_rows
 from test_metrics_tactile import change, codes, keep, share, world
 
@@ -327,38 +326,6 @@ def test_the_excess_of_two_generators_is_compared_on_the_same_videos(three):
     bare = {name: change(s, groups=None) for name, s in sets.items()}
     scores = compare(bare, change(r, groups=None), permutations=0).scores
     assert not [s for s in scores if s.metric.endswith(" E")]
-
-
-@pytest.mark.parametrize(
-    ("bound", "note"),
-    [
-        (0.0, []),
-        (0.9e-5, []),
-        (2e-4, [Note("within-bound", {"bound": 2e-4})]),
-        (2.5e-5, [Note("within-bound", {"bound": 2.5e-5})]),
-        (201.0, None),
-        (math.inf, None),
-        (None, None),
-    ],
-)
-def test_an_excess_that_moments_do_not_bound_is_undefined(bound, note):
-    details = {"E": 3.0, "E_interval": (2.0, 4.0), "E_bound": bound, "unit": "group"}
-    score = Score(
-        "I-TMMD",
-        "g",
-        1.0,
-        scale=100.0,
-        details=details,
-        settings={"halves": "group"},
-        interval_method="jackknife",
-    )
-    found = excess_of(Scored(score, np.zeros(3), "abc", np.ones(3))).score
-    if note is None:
-        assert (found.value, found.interval, found.interval_method) == (None, None, "")
-        assert codes(found) == ["undefined:moments"]
-        return
-    assert (found.value, found.interval, found.details["bound"]) == (3.0, (2.0, 4.0), bound)
-    assert list(found.notes) == note
 
 
 def test_the_p_value_of_a_metric_without_direction_is_that_of_the_gap_to_the_floor(three):

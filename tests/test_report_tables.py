@@ -49,7 +49,7 @@ def test_decimals_follow_the_largest_value(values, digits):
         ("CI-TMMD", "Tactile features"),
         ("CMMD", "Image distributions"),
         ("recall (tactile)", "Image distributions"),
-        ("contact PSNR", "Image by image"),
+        ("contact SSIM", "Image by image"),
         ("recall@5", "Recognition"),
         ("novel", "Other metrics"),
     ],
@@ -186,7 +186,7 @@ def test_equal_notes_have_one_number():
         ({"floor": None}, "no-floor-of-tmmd"),
         ({"metric": "I-TMMD", "floor": None}, "floor-unknown"),
         ({"details": {"excluded": {"a": "few"}}}, "excluded-classes"),
-        ({"metric": "contact PSNR", "details": {"empty": 28.6}}, "no-contact-baseline"),
+        ({"metric": "contact SSIM", "details": {"empty": 28.6}}, "no-contact-baseline"),
     ],
 )
 def test_what_follows_from_the_fields_of_a_score_is_a_note(changes, code):

@@ -5,7 +5,7 @@
   anything. A contact turns the surface towards and away from colored lights, and leaves more.
   Gels of the world leave up to 2.4 gray levels, those of the real clips of Touch and Go 2.7 to 3.6;
   87 % of the contacts of the world, and every listed one of the clips, leave more than 4
-  (``python benchmarks/gel_contacts.py``).
+  (``benchmarks/gel_contacts.py``, commit 2254ad9).
 - *It is of another sensor.* The lights of another one come from other sides: the relative opponent
   colors of 4 x 4 cells, their mean left out, differ from those of the stock gel. GelSights of the
   world differ by up to 3, the real ones by up to 7.4 from the world's, DIGITs by more than 12.

@@ -17,11 +17,9 @@ and compared where the real image shows contact, so that the no-contact image ea
 * *SSIM*: the SSIM map of d' and d, with a window at every pixel, averaged over mask and channels.
   Its data range is 0.25, a few deviations of a contact: with 2, the range of d, C2 exceeds the
   contact's variance and the no-contact image scores above a real image of the same material.
-* *MS-SSIM*: the same maps at every scale that the image holds, weighted by the share of a cell in
-  the mask.
-* *PSNR*: -10 log10 of the mean squared d' - d over the mask, data range 1. A squared error prefers
-  the no-contact image to a wrong contact: compare with ``details["empty"]``, its score.
 * *IoU*: of the generated mask and the real one. A contact everywhere has ``details["area"]``.
+
+Compare each with ``details["empty"]``, the score of the no-contact image.
 
 For a network that compares images, such as LPIPS, :func:`contact_images` gives the differences as
 images, neutral gray outside the mask.
@@ -45,12 +43,10 @@ from palpate.metrics.images import (
     Array,
     ScoreOptions,
     as_unit,
-    fitting_scales,
     image_pairs,
     image_stack,
     local_maps,
     mean_score,
-    multiscale_similarity,
     require_side,
 )
 from palpate.metrics.inputs import checked_names, to_host
@@ -64,9 +60,7 @@ _SSIM_SETTINGS = WINDOW_SETTINGS | {"border": "mirror", "data_range": SSIM_RANGE
 METRICS: dict[str, tuple[tuple[float, float], bool, dict[str, Any]]] = {
     "contact residual": ((0, 2), False, {"energy": "both"}),
     "contact SSIM": ((-1, 1), True, _SSIM_SETTINGS),
-    "contact PSNR": ((-np.inf, np.inf), True, {"data_range": 1}),
     "contact IoU": ((0, 1), True, {}),
-    "contact MS-SSIM": ((0, 1), True, _SSIM_SETTINGS),
 }
 #: Least change that is a contact, on the scale of [0, 1].
 LEAST = 4 / 255
@@ -184,7 +178,7 @@ def _noise(background: Array, keep: Mask) -> float:
 def contact_scores(
     generated: Any, reference: Any, background: Any, **options: Unpack[ScoreOptions]
 ) -> list[Score]:
-    """Mean contact residual, SSIM, PSNR, IoU and MS-SSIM, over the images that show contact.
+    """Mean contact residual, SSIM and IoU, over the images that show contact.
 
     Args:
         generated: (n, h, w, 3 or 1) array or tensor, uint8 or float in [0, 1]; h, w >= 11.
@@ -193,14 +187,13 @@ def contact_scores(
         **options: :class:`palpate.metrics.images.ScoreOptions`.
 
     Returns:
-        Five scores: residual (0: identical, 1: no contact), SSIM, PSNR in dB, IoU of the masks,
-        MS-SSIM. Images without contact are excluded; ``details["no_contact"]`` counts them and
-        names the first ten.
+        Three scores: residual (0: identical, 1: no contact), SSIM, IoU of the masks. Images without
+        contact are excluded; ``details["no_contact"]`` counts them and names the first ten.
 
     Raises:
         PalpateError: on other shapes, dtypes or ranges, or images smaller than the window.
     """
-    return measure_contacts(generated, reference, background).scores(**options)
+    return contacts_of_each({"": generated}, reference, background)[""].scores(**options)
 
 
 @dataclass(frozen=True)
@@ -208,7 +201,7 @@ class Contacts:
     """What each pair scores on the contact; NaN where the real image shows none.
 
     Attributes:
-        values: metric -> (n,), those of :data:`METRICS`; a PSNR is infinite where identical.
+        values: metric -> (n,), those of :data:`METRICS`.
         empty: metric -> (n,) score of the no-contact image.
         area: (n,) share of the pixels in the real mask, 0 where it is empty.
         settings: of the comparison.
@@ -226,7 +219,6 @@ class Contacts:
         count, first = int(none.sum()), [names[i] for i in np.flatnonzero(none)[:10]]
         notes = [Note("no-contact", {"count": count, "n": n})] if count else []
         common = {"no_contact": {"count": count, "ids": first}, "area": _mean(self.area[~none])}
-        scales = {"contact MS-SSIM": {"scales": fitting_scales(self.settings["size"])}}
         return [
             mean_score(
                 metric,
@@ -234,7 +226,7 @@ class Contacts:
                 ids=names,
                 bounds=bounds,
                 higher_is_better=up,
-                settings=self.settings | settings | scales.get(metric, {}),
+                settings=self.settings | settings,
                 notes=notes,
                 details={"empty": _mean(self.empty[metric]), **common},
                 **fields,
@@ -243,15 +235,13 @@ class Contacts:
         ]
 
 
-def measure_contacts(generated: Any, reference: Any, background: Any) -> Contacts:
-    """Every contact metric of each pair; arguments and errors as :func:`contact_scores`."""
-    return contacts_of_each({"": generated}, reference, background)[""]
-
-
 def contacts_of_each(
     generated: Mapping[str, Any], reference: Any, background: Any
 ) -> dict[str, Contacts]:
-    """:func:`measure_contacts` of several stacks; what the real images show is measured once."""
+    """Every contact metric of each pair of several stacks, by name.
+
+    What the real images show is measured once. Arguments and errors as :func:`contact_scores`.
+    """
     y, gel = _checked(reference, background)
     stacks = {name: image_pairs(x, y)[0] for name, x in generated.items()}
     n = len(y)
@@ -333,14 +323,9 @@ def _in_contact(
 def _compare(x: Array, y: Array, kept: Mask) -> dict[str, float]:
     """Every metric of two differences (h, w, c) on the pixels ``kept``."""
     error, energy, generated = (float((v[kept] ** 2).mean()) for v in (x - y, y, x))
-    scales = fitting_scales(kept.shape)
-    with np.errstate(divide="ignore"):
-        level = -10 * np.log10(error)
     return {
         "contact residual": error / (energy + generated) if energy + generated else np.nan,
         "contact SSIM": float(local_maps(x, y, "mirror", SSIM_RANGE)[0][kept].mean()),
-        "contact PSNR": float(level),
-        "contact MS-SSIM": multiscale_similarity(x, y, scales, kept, SSIM_RANGE),
     }
 
 

@@ -99,10 +99,9 @@ def fid(
         reference_ids: m sample ids.
         reference_groups: m groups of ``reference``.
         encoder: digest of the encoder of both.
-        **options: ``interval=False`` computes none, which costs about twenty times the distance;
-            ``normalize=True`` divides every row by its norm first; ``subject`` and ``split``
-            are kept in the score; ``seed`` draws more than 20 groups, or rows where there are none,
-            into 20 blocks of about equal size, which are then left out.
+        **options: ``subject`` and ``split`` are kept in the score; ``seed`` draws more than 20
+            groups, or rows where there are none, into 20 blocks of about equal size, which are then
+            left out.
 
     Returns:
         Value and interval; ``details["mean_term"]``: the part |mu1 - mu2|^2.
@@ -147,8 +146,6 @@ def _fid(
     reference: FeatureSet,
     *,
     subject: str = "generated",
-    interval: bool = True,
-    normalize: bool = False,
     seed: int = 0,
     split: str | None = None,
 ) -> Scored:
@@ -156,43 +153,39 @@ def _fid(
     checked_whole(0, seed=seed)
     require_one_encoder(generated, reference, "Generated and reference")
     sets, names = (generated.features, reference.features), ("generated", "reference")
-    x, y = checked_pair(*sets, normalize=normalize, least=2, names=names)
+    x, y = checked_pair(*sets, normalize=False, least=2, names=names)
     center = (x.mean(axis=0, dtype=np.float64) + y.mean(axis=0, dtype=np.float64)) / 2
     a, b = _normal(x, center), _normal(y, center)
     value, delta = _distance(a, b), a[0] - b[0]
     details: dict[str, Any] = {"mean_term": float(delta @ delta)}
-    limits, method, replicates, units = None, "", np.zeros(0), []
-    if interval:
-        blocks = _draw_blocks(generated, reference, seed)
-        sets = ((x, blocks.x), (y, blocks.y))
-        if min(len(v) - np.bincount(at).max() for v, at in sets) > 1:
-            units = list(blocks.names)
-            without = (_without_each(v, at, len(units), center) for v, at in sets)
-            replicates = np.array([_distance(*pair) for pair in zip(*without, strict=True)])
-        error = float(jackknife_errors(replicates[:, None])[0])
-        limits = Spread(value, error, len(units) - 1, "").interval(0.0)
-        method = blocks.method if limits else ""
-        details |= blocks.details
+    blocks, replicates, units = _draw_blocks(generated, reference, seed), np.zeros(0), list[str]()
+    sets = ((x, blocks.x), (y, blocks.y))
+    if min(len(v) - np.bincount(at).max() for v, at in sets) > 1:
+        units = list(blocks.names)
+        without = (_without_each(v, at, len(units), center) for v, at in sets)
+        replicates = np.array([_distance(*pair) for pair in zip(*without, strict=True)])
+    error = float(jackknife_errors(replicates[:, None])[0])
+    limits = Spread(value, error, len(units) - 1, "").interval(0.0)
     n, d = min(len(x), len(y)), x.shape[1]
     copies = copies_across(x, y)
     notes = [Note("copied-rows", {"count": copies, "n": len(x)})] if copies else []
     notes.append(Note("fid-biased") if n > d else Note("fid-mostly-bias", {"n": n, "d": d}))
-    notes += [Note("no-interval-few-units")] if interval and limits is None else []
+    notes += [Note("no-interval-few-units")] if limits is None else []
     score = Score(
         "FID",
         subject,
         value,
         limits,
-        interval_method=method,
+        interval_method=blocks.method if limits else "",
         estimator="plug-in",
         n=len(x),
         m=len(y),
-        seed=seed if interval else None,
+        seed=seed,
         encoder=generated.encoder,
         reference=reference.digest,
         split=split,
-        details=details | {"version": __version__},
-        settings={"normalize": normalize, "covariance": "n - 1"},
+        details=details | blocks.details | {"version": __version__},
+        settings={"covariance": "n - 1"},
         notes=tuple(notes),
     )
     return Scored(score, replicates, units)
@@ -320,8 +313,8 @@ def prdc(
         encoder: digest of the encoder of both.
         **options: ``grouped``: look for neighbors in other groups only (see the top of this file),
             default where both sets have groups, False gives the values of the package ``prdc``;
-            ``normalize=True`` divides every row by its norm first; ``subject`` and ``split``
-            are kept in the scores; ``progress`` is called with the rows done.
+            ``subject`` and ``split`` are kept in the scores; ``progress`` is called with the rows
+            done.
 
     Returns:
         Four scores. Intervals are of the mean over rows (see :func:`prdc_rows`), robust to whole
@@ -344,7 +337,6 @@ def prdc_rows(
     k: int = 5,
     *,
     grouped: bool | None = None,
-    normalize: bool = False,
     subject: str = "generated",
     split: str | None = None,
     progress: Progress = quiet,
@@ -356,7 +348,7 @@ def prdc_rows(
     checked_whole(1, k=k)
     require_one_encoder(generated, reference, "Generated and reference")
     sets, names = (generated.features, reference.features), ("generated", "reference")
-    x, y = checked_pair(*sets, normalize=normalize, least=k + 1, names=names)
+    x, y = checked_pair(*sets, normalize=False, least=k + 1, names=names)
     groups = [checked_names("groups", s.groups, len(s.ids)) for s in (generated, reference)]
     known = None not in groups
     if grouped and not known:
@@ -398,7 +390,7 @@ def prdc_rows(
                 reference=reference.digest,
                 split=split,
                 higher_is_better=True,
-                settings={"k": k, "grouped": grouped, "normalize": normalize, "inside": "<"},
+                settings={"k": k, "grouped": grouped, "inside": "<"},
                 details=details | {"version": __version__},
                 notes=tuple(note for holds, note in notes if holds),
             )

@@ -304,37 +304,22 @@ def local_maps(
     return np.where(structure < 0, -np.abs(similarity), similarity), structure
 
 
-def multiscale_similarity(
-    x: Array, y: Array, scales: int, kept: NDArray[np.bool_] | None = None, data_range: float = 1.0
-) -> float:
-    """MS-SSIM in [0, 1] of two images (h, w, c), or of some of their pixels.
-
-    With ``kept`` (h, w) there is a window at every pixel, each scale is averaged with the share of
-    a cell that is kept as weight, and a last odd row or column is repeated instead of dropped.
-    """
-    border: Border = "valid" if kept is None else "mirror"
-    weights = None if kept is None else kept[..., None].astype(np.float64)
+def multiscale_similarity(x: Array, y: Array, scales: int) -> float:
+    """MS-SSIM in [0, 1] of two images (h, w, c)."""
     means = np.empty((scales, x.shape[2]))
     for j in range(scales):
         if j:
-            x, y = (_halved(v, None if kept is None else "edge") for v in (x, y))
-            weights = None if weights is None else _halved(weights, "constant")
-        similarity, structure = local_maps(x, y, border, data_range)
+            x, y = _halved(x), _halved(y)
+        similarity, structure = local_maps(x, y)
         factor = similarity if j == scales - 1 else structure
-        if weights is None:
-            means[j] = factor.mean(axis=(0, 1))
-        else:
-            means[j] = (factor * weights).sum(axis=(0, 1)) / weights.sum()
+        means[j] = factor.mean(axis=(0, 1))
     powers = np.maximum(means, 0) ** scale_weights(scales)[:, None]
     return float(powers.prod(axis=0).mean())
 
 
-def _halved(image: Array, pad: Literal["edge", "constant"] | None) -> Array:
-    """Means of 2 x 2 blocks of (h, w, c); an odd last row or column is padded, or dropped."""
+def _halved(image: Array) -> Array:
+    """Means of 2 x 2 blocks of (h, w, c); an odd last row or column is dropped."""
     h, w, c = image.shape
-    if pad is not None:
-        image = np.pad(image, [(0, h % 2), (0, w % 2), (0, 0)], mode=pad)
-        h, w = image.shape[:2]
     return image[: h // 2 * 2, : w // 2 * 2].reshape(h // 2, 2, w // 2, 2, c).mean(axis=(1, 3))
 
 

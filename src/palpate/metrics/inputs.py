@@ -300,13 +300,11 @@ def checked_whole(least: int, **values: Any) -> None:
             raise invalid(name, must, repr(value), "Drop it for the default")
 
 
-def checked_number(*, positive: bool = False, **values: Any) -> None:
-    """Reject parameters that are not finite numbers from 0 on, or above 0."""
-    for name, value in values.items():
-        number = isinstance(value, int | float | np.number) and not isinstance(value, bool)
-        if not number or not np.isfinite(value) or value < 0 or (positive and value == 0):
-            must = "must be positive" if positive else "must be a finite number of at least 0"
-            raise invalid(name, must, repr(value), "Drop it for the default")
+def checked_scale(scale: Any) -> None:
+    """Reject a factor on the result that is not a finite number above 0."""
+    number = isinstance(scale, int | float | np.number) and not isinstance(scale, bool)
+    if not number or not 0 < scale < np.inf:
+        raise invalid("scale", "must be positive", repr(scale), "Drop it for the default")
 
 
 def require_one_encoder(a: FeatureSet, b: FeatureSet, both: str) -> None:

@@ -37,7 +37,6 @@ from palpate.core import PalpateError, PalpateWarning, rng_for
 from palpate.metrics.inputs import (
     Array,
     Index,
-    checked_whole,
     host,
     in_threads,
     invalid,
@@ -139,14 +138,6 @@ class Polynomial(Kernel):
     degree: int = 3
     gamma: float | None = None
     coef0: float = 1.0
-
-    def __post_init__(self) -> None:
-        checked_whole(1, degree=self.degree)
-        gamma = 1.0 if self.gamma is None else self.gamma
-        for name, value, least in (("gamma", gamma, 0.0), ("coef0", self.coef0, -math.inf)):
-            if not (isinstance(value, int | float | np.number) and least < value < math.inf):
-                must = "must be a positive number" if name == "gamma" else "must be a finite number"
-                raise invalid(name, must, repr(value), "Drop it for KID's")
 
     def unit(self, width: int) -> float:
         """``1 / sqrt(gamma)``, so that t is ``gamma x.y``."""
@@ -256,7 +247,7 @@ def kernel_sums(
     kernel: Kernel,
     bound: Callable[[PairSums], float],
     backend: Backend = "auto",
-    tolerance: float = TOLERANCE,
+    scale: float = 1000.0,
     block: int = 1024,
     weights: Sequence[Array] = (),
 ) -> PairSums:
@@ -271,13 +262,14 @@ def kernel_sums(
         kernel: what is summed.
         bound: what the remainders of moments can change in the statistic that matters.
         backend: see the module.
-        tolerance: largest ``bound`` that ``auto`` takes moments with.
+        scale: of the statistic, which is at most twice as large.
         block: most rows of a block.
         weights: (N,) each, the same for samples of one (segment, unit): of
             ``PairSums.weighings``.
 
     Raises:
-        PalpateError: if moments are requested for another kernel, or for too many items.
+        PalpateError: if moments are requested for another kernel, a bandwidth that is too narrow,
+            or too many items.
     """
     width, rows = int(parts[0].shape[1]), len(segment)
     items, number = np.unique(np.stack([segment, unit]), axis=1, return_inverse=True)
@@ -301,9 +293,13 @@ def kernel_sums(
         one_of = np.unique(number, return_index=True)[1]
         sums = replace(sums, weighings=[sums.weighed(w[one_of]) for w in weights])
         remainder = bound(sums)
-        if backend == "moments" or remainder <= tolerance:
+        if backend == "moments" and not remainder <= 2 * scale:
+            must = "must be wide against the features for the moments back end"
+            got = f"a bound of {remainder:.2g}"
+            raise invalid("sigma", must, got, "Sum blocks", backend="blocked")
+        if backend == "moments" or remainder <= TOLERANCE * scale / 1000:
             return sums
-        reason = f"their bound {remainder:.2g} exceeds the tolerance {tolerance:.2g}"
+        reason = f"their bound is {remainder:.2g}"
     if rows > LONG:
         why = f" Moments were not taken: {reason}." if backend == "auto" and reason else ""
         text = f"All {rows**2 / 2:.2g} pairs are formed, which takes long.{why}"

@@ -62,8 +62,8 @@ from palpate.metrics.inputs import (
     Index,
     Normalize,
     checked_names,
-    checked_number,
     checked_pair,
+    checked_scale,
     checked_whole,
     copies_across,
     invalid,
@@ -71,7 +71,6 @@ from palpate.metrics.inputs import (
 from palpate.metrics.intervals import PairSums, Totals, mean_of_pairs
 from palpate.metrics.kernels import (
     BACKENDS,
-    TOLERANCE,
     Backend,
     Kernel,
     Sigma,
@@ -185,9 +184,7 @@ def distance(  # noqa: PLR0913
     groups_y: Any = None,
     normalize: Normalize = "check",
     backend: Backend = "auto",
-    tolerance: float = TOLERANCE,
     block: int = 1024,
-    names: tuple[str, str] = ("x", "y"),
 ) -> Distance:
     """Squared MMD between two sets of features (paper, Eq. 2), times ``scale``.
 
@@ -204,9 +201,7 @@ def distance(  # noqa: PLR0913
         normalize: ``"check"`` rejects rows not of unit length (1e-3), ``True`` normalizes,
             ``False`` takes them as they are.
         backend: ``"auto"``, ``"blocked"`` or ``"moments"``, see :mod:`palpate.metrics.kernels`.
-        tolerance: largest bound that ``auto`` accepts, at scale 1000.
         block: rows of a kernel block; memory is about ``block^2`` numbers a thread.
-        names: what errors and warnings call the two sets.
 
     Returns:
         The value. Blocked: float32 unit-norm features with an error below 1e-4 at scale 1000,
@@ -219,15 +214,14 @@ def distance(  # noqa: PLR0913
     """
     require_choice("estimator", estimator, ESTIMATORS)
     require_choice("backend", backend, BACKENDS)
-    checked_number(positive=True, scale=scale)
-    checked_number(tolerance=tolerance)
+    checked_scale(scale)
     checked_whole(1, block=block)
     checked_kernel(kernel)
     least = 1 if estimator == "biased" else 2
-    x, y = checked_pair(x, y, normalize=normalize, least=least, names=names)
+    x, y = checked_pair(x, y, normalize=normalize, least=least)
     if copies := copies_across(x, y):
-        text = f"{copies} rows of {names[0]} are bit for bit rows of {names[1]}"
-        warnings.warn(f"{text}: a copy is not a generator", PalpateWarning, stacklevel=2)
+        text = f"{copies} rows of x are bit for bit rows of y: a copy is not a generator"
+        warnings.warn(text, PalpateWarning, stacklevel=2)
     segment = np.repeat(np.arange(2), [len(x), len(y)])
     unit = segment  # no pair is excluded: a set is one item
     gx = checked_names("groups_x", groups_x, len(x))
@@ -245,7 +239,7 @@ def distance(  # noqa: PLR0913
         segments=2,
         kernel=kernel,
         backend=backend,
-        tolerance=tolerance * scale / 1000,
+        scale=scale,
         block=block,
         bound=lambda sums: largest_bound(sums, estimator, scale),
     )
@@ -258,10 +252,6 @@ def distance(  # noqa: PLR0913
         got = f"{len(set(gx or ()))} and {len(set(gy or ()))} groups"
         must = "Each set must have at least two groups, not all shared"
         raise PalpateError(must, got, "Pass more groups", example={"estimator": "unbiased"})
-    if bound > 2 * scale:  # more than the metric can be
-        must = "must be wide against the features for the moments back end"
-        got = f"a bound of {bound:.2g}"
-        raise invalid("sigma", must, got, "Sum blocks", backend="blocked")
     how = (sums.backend, estimator, kernel.settings(), kernel.bandwidth, scale)
     return Distance(value, bound, *how, m=len(x), n=len(y))
 
@@ -331,7 +321,7 @@ def plan_for(options: Mapping[str, Any], *, grouped: bool) -> Options:
     plan = Options(**{**asdict(PRESETS[preset]), **given})
     for name, choices in CHOICES.items():
         require_choice(name, getattr(plan, name), choices)
-    checked_number(positive=True, scale=plan.scale)
+    checked_scale(plan.scale)
     checked_whole(0, permutations=plan.permutations, seed=plan.seed)
     checked_kernel(plan.kernel)
     for name, value in (("estimator", "grouped"), ("halves", "group")):
@@ -432,18 +422,6 @@ def _even_means(t: Totals) -> tuple[Array, Array, Array]:
     with np.errstate(divide="ignore", invalid="ignore"):
         between = (total - inside) / (t.n**2 - pairs)
         return inside / (pairs - t.squares), between, t.diagonal / t.n
-
-
-def halves_bound(sums: PairSums, plan: Options) -> Array:
-    """(K,) what :func:`self_distances` may be off by; zeros where sums are exact."""
-    remainder = (sums.even or sums).bound if plan.halves == "group" else sums.bound
-    if remainder is None:
-        return np.zeros(sums.segments // 2)
-    if plan.halves != "group":
-        return _between_halves(mmd_bound(remainder.totals, _estimator(plan), plan.scale))
-    within, between, _ = _even_means(whole_sets(remainder.totals))
-    of_excess, of_spread = design_of(sums.totals, plan)
-    return plan.scale * (of_excess * (within + between) + of_spread * between)
 
 
 def _estimator(plan: Options) -> str:

@@ -30,16 +30,8 @@ import numpy as np
 from palpate.core import FeatureSet, Note, PalpateError, Score, require_comparable
 from palpate.metrics.inputs import Array, feature_set, require_one_encoder
 from palpate.metrics.intervals import Interval, Scored, Spread, jackknife_errors, spread_of_values
-from palpate.metrics.kernels import TOLERANCE
 from palpate.metrics.means import Mean, spread_of
-from palpate.metrics.tactile import (
-    UNBOUNDED,
-    floors_of,
-    four_of,
-    not_comparable,
-    tmmd_scored,
-    with_floor,
-)
+from palpate.metrics.tactile import floors_of, four_of, not_comparable, tmmd_scored, with_floor
 
 
 @dataclass(frozen=True)
@@ -205,31 +197,25 @@ def difference(a: Scored, b: Scored, floor: Scored | None = None) -> Score:
 def excess_of(result: Scored) -> Scored | None:
     """The between-group excess E of an I- or CI-TMMD as a score; None where there is none.
 
-    It does not depend on the number of groups, and its floor is that of the same classes. Where
-    moments do not bound it, it is undefined.
+    It does not depend on the number of groups, and its floor is that of the same classes.
     """
     score, d = result.score, result.score.details
     if d.get("E") is None or score.settings.get("halves") != "group":
         return None
-    bound = np.inf if d.get("E_bound") is None else float(d["E_bound"])  # JSON has no infinity
-    known = bound <= 2 * score.scale
-    interval = d.get("E_interval") if known else None
-    notes = [] if known else [UNBOUNDED]
-    if known and bound > TOLERANCE * score.scale / 1000:
-        notes = [Note("within-bound", {"bound": bound})]
+    interval = d.get("E_interval")
     kept = ("unit", "left_out", "units", "backend", "version", "classes", "excluded")
     of_excess = replace(
         score,
         metric=f"{score.metric} E",
-        value=d["E"] if known else None,
+        value=d["E"],
         interval=tuple(interval) if interval else None,
         null=None,
         interval_method=score.interval_method if interval else "",
         floor=d.get("E_floor"),
         estimator="unbiased",
         seed=None,
-        notes=tuple(notes),
-        details={k: d[k] for k in kept if k in d} | {"bound": bound if known else None},
+        notes=(),
+        details={k: d[k] for k in kept if k in d},
     )
     units = result.units if len(result.excess) else ()
     return Scored(of_excess, result.excess, units, groups=result.groups)

@@ -4,9 +4,9 @@ Row i of a belongs to row i of b. Ties count as a random order would, in expecta
 never look like hits. Strictly, only the key of the same sample is right; with texts, keys whose
 text has a cosine above a threshold to the query's are right as well (TVL), and the first counts.
 
-No matrix of all pairs is held, but for a bit each where texts are compared: rows are taken a block
-at a time. The best right key of each query is found first; then one product gives both
-directions, since a rank needs only counts over a row or a column.
+No matrix of all pairs is held: rows are taken a block at a time. The best right key of each query
+is found first; then one product gives both directions, since a rank needs only counts over a row or
+a column.
 
 With a above the best right key, t tied with it (itself included) and w of these wrong,
 ``P(top k) = 1 - C(w, s) / C(t, s)`` with ``s = min(max(k - a, 0), t)`` places that the ties share,
@@ -18,7 +18,6 @@ by jackknife over groups, turned back into ranks.
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Generator, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
@@ -175,20 +174,12 @@ def both_ranks(
         threshold: see :func:`retrieval`.
     """
     n = len(a)
-    similar = None if texts is None else _similar(texts, threshold)
     best = np.full((2, n), -np.inf, np.float32)
     for rows in blocks(n, n):
-        right = _right_keys(rows, n, similar)
-        if np.count_nonzero(right) < n // 4:  # products of few pairs, instead of all
-            i, j = np.divmod(np.flatnonzero(right), n)
-            columns, place = np.unique(j, return_inverse=True)
-            values = (a[rows] @ b[columns].T)[i, place]
-            np.maximum.at(best[0], i + rows.start, values)
-            np.maximum.at(best[1], j, values)
-        else:
-            cosines = np.where(right, a[rows] @ b.T, np.float32(-np.inf))
-            best[0, rows] = cosines.max(axis=1)
-            np.maximum(best[1], cosines.max(axis=0), out=best[1])
+        right = _right_keys(rows, n, texts, threshold)
+        cosines = np.where(right, a[rows] @ b.T, np.float32(-np.inf))
+        best[0, rows] = cosines.max(axis=1)
+        np.maximum(best[1], cosines.max(axis=0), out=best[1])
     # Products of other shapes add in another order: a quarter of the worst error of such a sum.
     tie = np.float32(max(TIE, a.shape[1] * 2**-26))
     high, low = best + tie, best - tie
@@ -196,7 +187,7 @@ def both_ranks(
     total = np.zeros(n)  # right keys of each query, the same in both directions
     for rows in blocks(n, n):
         cosines = a[rows] @ b.T
-        right = _right_keys(rows, n, similar)
+        right = _right_keys(rows, n, texts, threshold)
         total[rows] = _by_row(right)
         _count(cosines, rows, high, above)
         _count(cosines, rows, low, upper)
@@ -224,49 +215,18 @@ def unit_rows(x: NDArray[Any], name: str = "The features") -> Floats:
 
 
 def blocks(rows: int, columns: int) -> Generator[slice]:
-    """Slices of rows, of about ``CELLS`` cells and below 256 rows each: counts fit into a byte.
-
-    Each starts at a multiple of 8, for bits in bytes.
-    """
-    step = 8 * int(np.clip(CELLS // columns // 8, 1, 31))
+    """Slices of rows, of about ``CELLS`` cells and below 256 rows each: counts fit into a byte."""
+    step = int(np.clip(CELLS // columns, 1, 248))
     for start in range(0, rows, step):
         yield slice(start, min(start + step, rows))
 
 
-def _distinct(texts: Floats) -> tuple[Floats, NDArray[np.intp]]:
-    """Different rows in the order in which they come, and (n,) which of them each row is."""
-    numbers: dict[bytes, int] = {}
-    digests = (hashlib.blake2b(row.tobytes(), digest_size=16).digest() for row in texts)
-    code = np.array([numbers.setdefault(digest, len(numbers)) for digest in digests])
-    if len(numbers) == len(texts):
-        return texts, code
-    return texts[np.unique(code, return_index=True)[1]], code
-
-
-def _similar(texts: Floats, threshold: float) -> tuple[NDArray[np.uint8], NDArray[np.intp]]:
-    """Which distinct texts are similar, (m, m) as bits, and (n,) which of them each row has."""
-    texts, code = _distinct(texts)
-    m = len(texts)
-    bits = np.zeros((m, -(-m // 8)), np.uint8)
-    for rows in blocks(m, m):  # the upper triangle, and its mirror
-        similar = texts[rows] @ texts[rows.start :].T > threshold
-        bits[rows, rows.start // 8 :] |= np.packbits(similar, axis=1)
-        columns = slice(rows.start // 8, -(-rows.stop // 8))
-        bits[rows.start :, columns] |= np.packbits(np.ascontiguousarray(similar.T), axis=1)
-    return bits, code
-
-
-def _right_keys(
-    rows: slice, n: int, similar: tuple[NDArray[np.uint8], NDArray[np.intp]] | None
-) -> NDArray[np.bool_]:
+def _right_keys(rows: slice, n: int, texts: Floats | None, threshold: float) -> NDArray[np.bool_]:
     """Which keys are right for the queries among the rows, (rows, n)."""
     own = np.arange(rows.start, rows.stop)
-    if similar is None:
-        right = np.zeros((len(own), n), bool)
-    else:
-        bits, code = similar
-        right = np.unpackbits(bits[code[rows]], axis=1, count=len(bits)).view(bool)
-        right = right if len(bits) == n else right[:, code]
+    right = np.zeros((len(own), n), bool)
+    if texts is not None:
+        np.greater(texts[rows] @ texts.T, threshold, out=right)
     right[own - rows.start, own] = True
     return right
 

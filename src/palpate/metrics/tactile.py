@@ -24,7 +24,7 @@ Inception. CMMD (Jayasumana et al., arXiv 2401.09603): the biased one with a Gau
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -69,7 +69,6 @@ from palpate.metrics.mmd import (
     design_of,
     dispersion_of,
     half_of,
-    halves_bound,
     halves_of,
     largest_bound,
     mmd_bound,
@@ -147,7 +146,6 @@ def build_table(
     *,
     grouped: bool,
     median_of: FeatureSet | None = None,
-    further: Callable[[Table, Options], float] | None = None,
 ) -> Table:
     """Check the sets and pass once over all their pairs.
 
@@ -157,7 +155,6 @@ def build_table(
         plan: options.
         grouped: whether the groups of the sets are the jackknife's units; else samples are.
         median_of: whose median distance ``sigma="median"`` takes; else the last set's.
-        further: a bound that moments must keep as well, of a statistic without scale (D-TMMD).
 
     Raises:
         PalpateError: on features or groups that are rejected.
@@ -190,11 +187,6 @@ def build_table(
     def table_of(sums: PairSums) -> Table:
         return Table(sums, classes, unit, unit_names, kernel, parts[0], label)
 
-    def bound(sums: PairSums) -> float:
-        table = table_of(sums)
-        ratio = further(table, plan) * plan.scale / 1000 if further else 0.0
-        return max(_bound(table, plan), ratio)
-
     sums = kernel_sums(
         parts,
         segment,
@@ -202,8 +194,8 @@ def build_table(
         segments=reference_segment + 1,
         kernel=kernel,
         backend=plan.backend,
-        tolerance=TOLERANCE * plan.scale / 1000,
-        bound=bound,
+        scale=plan.scale,
+        bound=lambda sums: _bound(table_of(sums), plan),
         weights=_even_weights(units, segment, len(generated.ids)) if grouped else (),
     )
     copies = copies_across(*parts) if reference is not None else 0
@@ -234,22 +226,20 @@ def _segments(generated: FeatureSet, plan: Options) -> tuple[list[str], Index]:
 
 
 def _bound(table: Table, plan: Options) -> float:
-    """What moments may change in TMMD, I-TMMD or an entry of the matrix D, at most."""
-    halves, reference = table.set_halves(), table.sums.segment == table.sums.segments - 1
-    bounds = [largest_bound(table.whole_classes(), plan.estimator, plan.scale)]
-    if reference.any():
-        bounds.append(largest_bound(table.tmmd(), plan.estimator, plan.scale))
-    if np.isfinite(self_distances(halves.totals, plan)[0][0]):
-        bounds.append(float(halves_bound(halves, plan)[0]))
-    return max(b if np.isfinite(b) else np.inf for b in bounds)
+    """What moments may change in TMMD, or between classes; of one set alone in any distance."""
+    of_classes = largest_bound(table.whole_classes(), plan.estimator, plan.scale)
+    tmmd = table.tmmd()
+    if tmmd.segment.any():
+        return max(of_classes, largest_bound(tmmd, plan.estimator, plan.scale))
+    assert tmmd.bound is not None  # moments have one
+    return max(of_classes, float(mmd_bound(tmmd.bound.totals, "biased", plan.scale)[0, 0]))
 
 
 #: Designs that differ by less have one floor: the change is far below the noise of any floor.
 SAME_DESIGN = 0.01
-UNBOUNDED = Note("undefined", {"reason": "moments"})
 
 
-def scored(  # noqa: PLR0913
+def scored(
     metric: str,
     table: Table,
     generated: FeatureSet,
@@ -258,25 +248,17 @@ def scored(  # noqa: PLR0913
     *,
     estimate: Estimate | None = None,
     design: Array | None = None,
-    bound: float = 0.0,
-    limit: float | None = None,
     details: dict[str, Any],
     notes: Sequence[Note] = (),
     **fields: Any,
 ) -> Scored:
     """A score with everything that the plan and the set fix; ``fields`` are further ones.
 
-    NaN becomes None, and an undefined value loses its interval and has a note ``undefined``; so
-    does one whose ``bound`` (it is within this of the exact value, rounding aside) exceeds
-    ``limit``, by default as much as a distance can be. ``settings`` names the options that bear on
-    the metric, and are recorded.
+    NaN becomes None, and an undefined value loses its interval and has a note ``undefined``.
+    ``settings`` names the options that bear on the metric, and are recorded.
     """
     value = plain(estimate.values[0]) if estimate else None
     notes = list(notes)
-    if value is not None and not bound <= (2 * plan.scale if limit is None else limit):
-        value, notes = None, [UNBOUNDED]
-    elif value is not None and bound > TOLERANCE * (plan.scale / 1000 if limit is None else 1):
-        notes.insert(0, Note("within-bound", {"bound": float(bound)}))
     interval = estimate.interval(0) if estimate and value is not None else None
     if value is None:
         fields["null"] = None
@@ -284,8 +266,7 @@ def scored(  # noqa: PLR0913
         notes = notes or [Note("undefined", {"reason": "no-pairs"})]
     elif interval is None:
         notes.append(Note("no-interval", {"reason": "too-few"}))
-    common = {"unit": table.unit, "backend": table.sums.backend}
-    common |= {"bound": plain(float(bound)) if value is not None else None, "version": __version__}
+    common = {"unit": table.unit, "backend": table.sums.backend, "version": __version__}
     recorded = ("preset", "normalize", *settings)
     score = Score(
         metric,
@@ -443,7 +424,10 @@ def tmmd_of(table: Table, generated: FeatureSet, reference: FeatureSet, plan: Op
         notes.append(INDEPENDENT)
         if plan.estimator != "grouped" and (count := shared_ids(generated, reference)):
             notes.append(Note("dependent-pairs", {"count": count}))
-    details: dict[str, Any] = {"units": len(sums.units), "copies": table.copies}
+    bound = largest_bound(sums, plan.estimator, plan.scale)
+    if bound > TOLERANCE * plan.scale / 1000:
+        notes.append(Note("within-bound", {"bound": bound}))
+    details: dict[str, Any] = {"units": len(sums.units), "copies": table.copies, "bound": bound}
     details |= {"p_value": None, "permutations": None}
     null, draw = None, {"count": plan.permutations, "seed": plan.seed}
     if test := permutation_test(sums, plan.estimator, plan.scale, **draw):
@@ -457,7 +441,6 @@ def tmmd_of(table: Table, generated: FeatureSet, reference: FeatureSet, plan: Op
         plan,
         (),
         estimate=est,
-        bound=largest_bound(sums, plan.estimator, plan.scale),
         estimator=plan.estimator,
         m=len(reference.ids),
         reference=reference.digest if reference.features.shape[1] else None,
@@ -570,9 +553,7 @@ def _from_one_table(
     """Reference-free metrics of one set from one pass over its pairs."""
     grouped = features.groups is not None
     plan = plan_for(options, grouped=grouped)
-    further = ratio_bound if d_tmmd_of in metrics else None
-    common: dict[str, Any] = {"grouped": grouped, "median_of": median_of, "further": further}
-    table = build_table(features, None, plan, **common)
+    table = build_table(features, None, plan, grouped=grouped, median_of=median_of)
     return [metric(table, features, plan) for metric in metrics]
 
 
@@ -629,17 +610,10 @@ def _mean_of_halves(
     sd = float(np.sqrt((sds**2).sum())) / len(sds)
     dispersion = float(dispersion_of(whole, plan).mean())
     center = dispersion if plan.estimator == "biased" else 0.0
-    bounds = halves_bound(sums, plan)
     details |= {"z": (est.values[0] - center) / sd if sd > 0 else None, "dispersion": dispersion}
-    details |= {"units": len(sums.units), "E": None, "E_interval": None, "E_bound": None}
+    details |= {"units": len(sums.units), "E": None, "E_interval": None}
     if table.grouped:
-        # dist^2 of halves of whole groups is E times a number of the design.
-        positive = (design[0] > 0).all()
         details["E"], details["E_interval"] = est.values[1], est.interval(1)
-        if sums.bound is None:
-            details["E_bound"] = 0.0
-        elif positive:
-            details["E_bound"] = float((bounds / design[0]).mean())
     # 95 % of random halves; the true distribution leans to the right where few directions dominate.
     null = (center - 1.96 * sd, center + 1.96 * sd) if np.isfinite(sd + center) else None
     return scored(
@@ -650,7 +624,6 @@ def _mean_of_halves(
         ("halves",),
         estimate=None if notes else est,
         design=_design(design, sizes, plan),
-        bound=float(bounds.mean()),
         null=null,
         details=details,
         notes=notes or _halves_notes(plan, sums, grouped=table.grouped),
@@ -774,11 +747,9 @@ def d_tmmd_of(table: Table, generated: FeatureSet, plan: Options) -> Scored:
         "E_ratio_interval": est.interval(1) if use_excess else None,
         "units": len(sums.units),
     }
-    bound, notes = _d_bound(sums, matrix, plan), list[Note]()
+    notes: list[Note] = []
     if not np.isfinite(est.values[0]):
-        loose = largest_bound(sums, plan.estimator, plan.scale) > TOLERANCE * plan.scale / 1000
-        unknown = not bound <= 1 and loose
-        notes = [UNBOUNDED if unknown else Note("undefined", {"reason": "not-separate"})]
+        notes = [Note("undefined", {"reason": "not-separate"})]
     elif unstable:
         known = bool(np.isfinite(errors).all())
         notes = [Note("unstable-denominators", {"classes": unstable, "known_errors": known})]
@@ -790,36 +761,9 @@ def d_tmmd_of(table: Table, generated: FeatureSet, plan: Options) -> Scored:
         settings,
         estimate=est,
         design=_design(design, halves_of(whole_sets(sums.totals).n), plan),
-        bound=bound,
-        limit=1.0,
         notes=notes,
         **fields,
     )
-
-
-def ratio_bound(table: Table, plan: Options) -> float:
-    """How far D-TMMD from this table may be from the exact one; 0 where it is undefined."""
-    kept, _ = _usable(table, plan)
-    if len(kept) < 2:
-        return 0.0
-    sums = table.class_halves(kept)
-    return _d_bound(sums, d_matrix(sums.totals, plan), plan)
-
-
-def _d_bound(sums: PairSums, matrix: Array, plan: Options) -> float:
-    """As :func:`ratio_bound`: numerators and denominators moved apart by their bounds."""
-    if sums.bound is None:
-        return 0.0
-    remainder = mmd_bound(whole_sets(sums.bound.totals), plan.estimator, plan.scale)
-    np.fill_diagonal(remainder, halves_bound(sums, plan))
-    inner, below = np.diagonal(matrix), denominators(matrix, plan.denominator)
-    up, down = np.diagonal(remainder), denominators(remainder, plan.denominator)
-    if plan.aggregate == "ratio_of_means":
-        inner, below, up, down = (np.array([v.mean()]) for v in (inner, below, up, down))
-    inner, below = np.abs(inner), np.abs(below)
-    if not (below > down).all():
-        return float("inf")
-    return float(((inner + up) / (below - down) - inner / below).mean())
 
 
 def four_scores(
@@ -855,7 +799,7 @@ def four_of(
     both = generated.groups is not None and reference.groups is not None
     paired = not both and bool(shared_ids(generated, reference))
     plan, metrics = plan_for(options, grouped=both or paired), (i_tmmd_of, ci_tmmd_of, d_tmmd_of)
-    table = build_table(generated, reference, plan, grouped=both, further=ratio_bound)
+    table = build_table(generated, reference, plan, grouped=both)
     first = tmmd_of(table, generated, reference, plan)
     if both or (generated.groups is None and not paired):
         return [first, *(metric(table, generated, plan) for metric in metrics)]

@@ -1,18 +1,16 @@
-"""The four streaming metrics as true ``torchmetrics.Metric``: in collections, on Lightning modules.
+"""TMMD as a true ``torchmetrics.Metric``: in collections, on Lightning modules, over processes.
 
-``from palpate.metrics.torch_metric import TMMD, ITMMD, CITMMD, DTMMD`` takes the arguments of the
-class of the same name in :mod:`palpate.metrics.streaming`, and those of ``torchmetrics.Metric``.
-``compute()`` returns the value as a tensor (NaN where it is undefined), because loggers and
-torchmetrics take tensors; ``score()`` returns the whole :class:`palpate.core.Score`.
+``from palpate.metrics.torch_metric import TMMD`` takes the arguments of
+:class:`palpate.metrics.streaming.TMMD`, and those of ``torchmetrics.Metric``. ``compute()`` returns
+the value as a tensor (NaN where it is undefined), because loggers and torchmetrics take tensors;
+``score()`` returns the whole :class:`palpate.core.Score`.
 
 States, with their ``dist_reduce_fx``:
 
 * ``records`` ("cat"): byte strings that describe themselves
   (:class:`palpate.metrics.streaming.Batch`). Features, names and counts travel in one gather;
-  processes may have seen unequal numbers of rows, or none. Metrics of one collection whose settings
-  agree share one list (compute groups).
-* ``settings`` ("max"): digest of the settings, which must be the same in all processes and within a
-  compute group.
+  processes may have seen unequal numbers of rows, or none.
+* ``settings`` ("max"): digest of the settings, which must be the same in all processes.
 
 torch and torchmetrics are loaded when this module is, and by no other module of this room.
 """
@@ -45,40 +43,32 @@ THEIRS = (
 )
 
 
-class TorchMetric(Metric):
-    """What the four have in common; see the module.
+class TMMD(Metric):
+    """:class:`palpate.metrics.streaming.TMMD` for torchmetrics; see the module.
 
-    ``forward`` (calling the metric) adds a batch and returns the value of that batch alone: against
-    all real samples so far for TMMD, NaN where a set is missing. That costs a whole computation;
-    ``update`` does not. ``dist_sync_on_step`` does not apply to it.
+    ``forward`` (calling the metric) adds a batch and returns the value of that batch alone against
+    all real samples so far, NaN where a set is missing. That costs a whole computation; ``update``
+    does not. ``dist_sync_on_step`` does not apply to it.
     """
 
-    higher_is_better: bool | None = None
+    higher_is_better: bool | None = False
     is_differentiable = False
     full_state_update = False
-    plain_class: type[streaming.StreamingMetric]
 
     def __init__(self, **options: Any) -> None:
         super().__init__(**{name: options.pop(name) for name in THEIRS if name in options})
-        self.plain = self.plain_class(**options)
+        self.plain = streaming.TMMD(**options)
         self._score: Score | None = None
         settings = torch.tensor([*bytes.fromhex(self.plain.digest)], dtype=torch.uint8)
         self.add_state("settings", settings, dist_reduce_fx="max")
         self.add_state("records", [], dist_reduce_fx="cat")
 
     def update(
-        self,
-        features: Any,
-        real: bool = False,
-        *,
-        ids: Any = None,
-        labels: Any = None,
-        groups: Any = None,
+        self, features: Any, real: bool = False, *, ids: Any = None, groups: Any = None
     ) -> None:
-        """Add a batch, as :meth:`palpate.metrics.streaming.StreamingMetric.update`."""
-        columns: Any = {"real": real, "ids": ids, "labels": labels, "groups": groups}
+        """Add a batch, as :meth:`palpate.metrics.streaming.TMMD.update`."""
         self._score = None
-        batch = Batch.of(features, self.plain.plan.normalize, **columns)
+        batch = Batch.of(features, self.plain.plan.normalize, real=real, ids=ids, groups=groups)
         # It must fit the last batch, and the last of its set; the ninth byte is ``real``.
         of_set = (r for r in reversed(self.records) if len(r) and bool(r[8]) == batch.real)
         require_like(batch, self._read([*islice(of_set, 1), *self.records[-1:]]))
@@ -88,8 +78,8 @@ class TorchMetric(Metric):
         """The value, a float64 tensor on the metric's device; NaN where it is undefined.
 
         Raises:
-            PalpateError: as :meth:`palpate.metrics.streaming.StreamingMetric.compute`, or if
-                processes differ in settings that states depend on.
+            PalpateError: as :meth:`palpate.metrics.streaming.TMMD.compute`, or if processes differ
+                in settings that states depend on.
         """
         self._require_settings(self.settings)
         self._score = self.plain.score_of(self._read(self.records))
@@ -103,13 +93,10 @@ class TorchMetric(Metric):
 
     def forward(self, *args: Any, **kwargs: Any) -> Any:
         """Add a batch and return the value of the batch alone, see the class."""
-        for name, state in self.metric_state.items():  # a compute group shares its states
-            setattr(self, name, list(state) if isinstance(state, list) else state.clone())
         before = len(self.records)
         self.update(*args, **kwargs)
-        alone = self._read(self.records[before:])
-        if self.plain.needs_real:
-            alone = [*self._real(), *(b for b in alone if not b.real)]
+        added = self._read(self.records[before:])
+        alone = [*self._real(), *(b for b in added if not b.real)]
         score = None if self.plain.missing(alone) else self.plain.score_of(alone)
         self._forward_cache = self._tensor(score)
         return self._forward_cache
@@ -167,28 +154,3 @@ class TorchMetric(Metric):
     def _real(self) -> list[Batch]:
         """What was seen of real samples."""
         return [batch for batch in self._read(self.records) if batch.real]
-
-
-class TMMD(TorchMetric):
-    """:class:`palpate.metrics.streaming.TMMD` for torchmetrics."""
-
-    plain_class = streaming.TMMD
-    higher_is_better: bool | None = False
-
-
-class ITMMD(TorchMetric):
-    """:class:`palpate.metrics.streaming.ITMMD` for torchmetrics."""
-
-    plain_class = streaming.ITMMD
-
-
-class CITMMD(TorchMetric):
-    """:class:`palpate.metrics.streaming.CITMMD` for torchmetrics."""
-
-    plain_class = streaming.CITMMD
-
-
-class DTMMD(TorchMetric):
-    """:class:`palpate.metrics.streaming.DTMMD` for torchmetrics."""
-
-    plain_class = streaming.DTMMD

@@ -155,7 +155,6 @@ _UNDEFINED = {
     **EXCLUDED,
     "few-samples": "fewer than {least} samples",
     "no-pairs": "an average over no pairs",
-    "moments": "moments do not bound this value at this bandwidth; pass {arg:backend=blocked}",
     "few-groups": "each set needs two groups, not all shared, for the grouped estimator",
     "one-sample": "each set needs two samples",
     "no-class": "no class can be cut into halves",
