@@ -47,12 +47,12 @@ def counts(flag, truth, use=None):
     )
 
 
-def judge(leaky, threads):
+def judge(leaky):
     """Kind -> (true positives, false positives, false negatives), and missed changes."""
     truth = {kind: leaky.truth(kind) for kind in leaky.planted}
     same, copied = truth["identical sample"], truth["identical bytes"]
     alike, spared = truth["near-duplicate"] | same | copied, truth["time gap"]
-    found = audit(leaky.train, leaky.test, by="video", threads=threads).to_frame()
+    found = audit(leaky.train, leaky.test, by="video").to_frame()
     column = lambda name: found[name].to_numpy().astype(bool)
     out = {
         "identical sample": counts(column("identical_sample_flag"), same),
@@ -63,9 +63,7 @@ def judge(leaky, threads):
     missed = Counter()
     for modality in ("vision", "tactile"):
         known = column(f"near_duplicate_{modality}_flag")
-        hidden = near_duplicates(
-            anonymous(leaky.train), anonymous(leaky.test), modality, threads=threads
-        ).flag
+        hidden = near_duplicates(anonymous(leaky.train), anonymous(leaky.test), modality).flag
         out[f"near-duplicate {modality}, videos known"] = counts(known, alike, ~spared)
         out[f"near-duplicate {modality}, no metadata"] = counts(hidden, alike, ~spared)
         for flag, how in ((known, "known"), (hidden, "hidden")):
@@ -84,7 +82,6 @@ def main():
     parser.add_argument("--size", type=int, default=128)
     parser.add_argument("--look", default="gelsight", choices=("gelsight", "digit"))
     parser.add_argument("--flat", action="store_true")
-    parser.add_argument("--threads", type=int, default=2)
     options = parser.parse_args()
     materials = (*MATERIALS, "Glass") if options.flat else MATERIALS
     total, missed, samples, seconds = {}, Counter(), 0, 0.0
@@ -95,7 +92,7 @@ def main():
             )
             samples += len(leaky.test)
             start = time.perf_counter()
-            found, lost = judge(leaky, options.threads)
+            found, lost = judge(leaky)
             seconds += time.perf_counter() - start
         missed.update(lost)
         for kind, row in found.items():

@@ -16,8 +16,8 @@ TOP = Path(__file__).resolve().parents[1]
 #: Public function -> its parameters in order; keywords behind the star.
 SIGNATURES = {
     "audit": (
-        "train_or_data test * split pretrain by near_frames identity images modalities "
-        "false_positives encoder impact name worst cache threads root reading ids_in_time "
+        "train_or_data test * split pretrain by near_frames images modalities "
+        "false_positives encoder impact name worst cache root reading "
         "skip_bad progress allow_seen"
     ),
     "caption": (
@@ -38,9 +38,7 @@ SIGNATURES = {
         "sigma estimator backend normalize companions controls inception clip lpips "
         "permutations seed allow_seen cache progress"
     ),
-    "split": (
-        "data * by train val seed folds near noleak nulls tolerance cache reading skip_bad progress"
-    ),
+    "split": ("data * by train val seed folds near noleak cache reading skip_bad progress"),
     "train_encoder": (
         "data split * preset clip output epochs targets weights partners held_out seed device"
         " compute progress"

@@ -223,7 +223,7 @@ def test_cache_and_processes_change_nothing(tmp_path, monkeypatch):
     ]  # the last file is the first one's image again
     assert len(plain.pixels) == 5
     monkeypatch.setattr("palpate.leakage.thumbnails.PIECE", 2)
-    cached = thumbnails(order, cache=tmp_path / "cache", threads=2)
+    cached = thumbnails(order, cache=tmp_path / "cache")
     again = thumbnails(order, cache=tmp_path / "cache")
     pieces = sorted((tmp_path / "cache").glob("*.npz"))
     assert len(pieces) == 3

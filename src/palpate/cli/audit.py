@@ -36,13 +36,6 @@ class Comparison:
     """What train and test must not share; `auto`: the video, or what is known instead of it."""
     near_frames: int = 30
     """A gap of up to this many frames within a video is a leak by itself."""
-    ids_in_time: Switch = False
-    """The last number of an id or path is a time: samples without a video and frame are as near as
-    these numbers."""
-    identity: Literal["auto", "names", "images"] = "auto"
-    """What equal names in train and test mean: `names` the same thing, `images` nothing, so that
-    bytes and images decide; `auto`: names where both have one root, are of one published data set,
-    or have them from columns of tables."""
     images: bool = True
     """Compare image files and their content, not only tables."""
     modalities: tuple[Modality, ...] = ("vision", "tactile")
@@ -91,8 +84,6 @@ class Options(Common):
     """Skip bad rows of lists and tables, and list them."""
     cache: Path | None = None
     """Folder that keeps decoded images, so that another audit of them is quick."""
-    threads: int | None = None
-    """Threads that decode images (default: one per core)."""
     reading: Reading = field(default_factory=Reading)
     comparison: Comparison = field(default_factory=Comparison)
     outputs: Outputs = field(default_factory=Outputs)
@@ -116,7 +107,6 @@ def run(options: Options, terminal: Terminal) -> tuple[dict[str, Any], int]:
             reading=options.reading.options(),
             skip_bad=options.skip_bad,
             cache=cache,
-            threads=options.threads,
             worst=options.outputs.worst,
             progress=progress,
             **vars(options.comparison),
@@ -192,8 +182,6 @@ def _next_commands(options: Options, audit: Audit) -> list[str]:
     if audit.group == "none" and not near:
         return []
     by = "" if options.comparison.by == "auto" else f" --by {options.comparison.by}"
-    if "group-nulls" in codes:
-        by = f" --by {audit.group} --nulls single"
     commands = [f"palpate split {source}{by}{near} -o noleak.json"]
     if len(paths) == 1:
         commands.append(f"palpate audit {source} --split noleak.json")

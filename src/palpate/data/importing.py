@@ -11,14 +11,11 @@ from palpate.core import (
     PalpateError,
     Progress,
     Split,
-    atomic_folder,
-    digest_file,
     few,
     locked,
     quiet,
     require_choice,
     require_regular,
-    write_text,
 )
 from palpate.data.formats import FORMATS, Format
 from palpate.data.formats.base import (
@@ -185,20 +182,6 @@ def write_lists(manifest: Manifest, split: Split, output: Path) -> list[Path]:
         return form.write_lists(manifest, split, Path(output))
     parts = {part: manifest.part(split, part) for part in split.counts()}
     return [write_table(Path(output) / f"{part}.csv", rows) for part, rows in parts.items()]
-
-
-def write_summed_lists(manifest: Manifest, split: Split, output: Path) -> list[str]:
-    """The files of :func:`write_lists` in a new folder, with ``SHA256SUMS`` for ``sha256sum -c``.
-
-    Returns:
-        Their names.
-    """
-    with atomic_folder(Path(output)) as folder:
-        files = write_lists(manifest, split, folder)
-        names = sorted(file.relative_to(folder).as_posix() for file in files)
-        sums = "".join(f"{digest_file(folder / name)}  {name}\n" for name in names)
-        write_text(folder / "SHA256SUMS", sums)
-    return [*names, "SHA256SUMS"]
 
 
 def require_source(source: Path) -> None:

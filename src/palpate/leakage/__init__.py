@@ -1,6 +1,6 @@
 """Leakage: does a split leak, where, and a split that does not.
 
-``audit``, ``split`` and ``verify`` are imported on first use.
+``audit`` and ``split`` are imported on first use.
 """
 
 from __future__ import annotations
@@ -13,10 +13,9 @@ from palpate._lazy import import_name
 if TYPE_CHECKING:
     from palpate.leakage.auditing import audit
     from palpate.leakage.splitting import split
-    from palpate.leakage.verifying import verify
 
-__all__ = ["audit", "split", "verify"]
+__all__ = ["audit", "split"]
 
-_MODULES = {"audit": "auditing", "split": "splitting", "verify": "verifying"}
+_MODULES = {"audit": "auditing", "split": "splitting"}
 
 __getattr__ = partial(import_name, __name__, _MODULES)

@@ -20,25 +20,17 @@ import numpy as np
 import polars as pl
 from numpy.typing import NDArray
 
-from palpate.core import Note, PalpateError, Progress, Split, few, quiet, require, require_choice
+from palpate.core import Note, PalpateError, Progress, Split, few, quiet, require
 from palpate.data.manifest import MODALITIES, Manifest
 from palpate.leakage.content import shows_nothing
 from palpate.leakage.groups import GROUPS, shared_groups
-from palpate.leakage.inputs import (
-    Data,
-    Identity,
-    number_contacts,
-    read_all,
-    rename_unrelated,
-    shared_names,
-)
+from palpate.leakage.inputs import Data, number_contacts, read_all, rename_unrelated, shared_names
 from palpate.leakage.signals import (
     Flags,
     Gaps,
     by_contact,
     identical_bytes,
     identical_samples,
-    in_time,
     leaking,
     nearest_in_video,
     shared_group,
@@ -64,15 +56,12 @@ class _Options:
 
     by: str
     near_frames: int
-    identity: Identity
     images: bool
     modalities: Sequence[str]
     false_positives: float
     encoder: Embed | None
     worst: int
-    ids_in_time: bool
     cache: Path | None
-    threads: int | None
     progress: Progress
 
 
@@ -84,7 +73,6 @@ def audit(  # noqa: PLR0913
     pretrain: Data = None,
     by: str = "auto",
     near_frames: int = 30,
-    identity: Identity = "auto",
     images: bool = True,
     modalities: Sequence[str] = ("vision", "tactile"),
     false_positives: float = 0.001,
@@ -93,10 +81,8 @@ def audit(  # noqa: PLR0913
     name: str | None = None,
     worst: int = 12,
     cache: str | Path | None = None,
-    threads: int | None = None,
     root: str | Path | None = None,
     reading: Mapping[str, Any] | None = None,
-    ids_in_time: bool = False,
     skip_bad: bool = False,
     progress: Progress = quiet,
 ) -> Audit:
@@ -113,9 +99,6 @@ def audit(  # noqa: PLR0913
         by: what train and test must not share: a column, or ``auto`` for the video or what is known
             instead of it.
         near_frames: a gap of up to this many frames within a video is a leak by itself.
-        identity: what equal names in train and test mean: ``names`` the same thing, ``images``
-            nothing, so that bytes and images decide; ``auto`` names where both have one root, are
-            of one published data set, or have the names from columns of tables.
         images: compare image files and their content, not only tables.
         modalities: the images to compare.
         false_positives: rate at which unrelated images may pass for near-duplicates, in (0, 0.1].
@@ -124,13 +107,10 @@ def audit(  # noqa: PLR0913
         name: heading; default: the names of the inputs, or of the split.
         worst: how many of the strongest pairs to keep for each signal.
         cache: folder that keeps decoded images.
-        threads: that decode images; default: the number of cores, 16 at most.
         root: where the paths of tables start; default: the folder of the table.
         reading: how sources are read, as in :func:`palpate.load`: ``columns``, ``names``,
             ``classes``, ``side``, and the templates ``vision`` and ``tactile``, also of paths in
             lists whose images are not at hand.
-        ids_in_time: the last number of an id or path is a time: gaps of samples without a video and
-            frame are differences of these.
         skip_bad: skip bad rows of lists and tables, and note them.
         progress: callback.
 
@@ -148,15 +128,12 @@ def audit(  # noqa: PLR0913
     options = _Options(
         by,
         near_frames,
-        identity,
         images,
         modalities,
         false_positives,
         encoder,
         worst,
-        ids_in_time,
         None if cache is None else Path(cache),
-        threads,
         progress,
     )
     _check(options)
@@ -203,7 +180,6 @@ def _check(options: _Options) -> None:
     frames, worst = options.near_frames, options.worst
     require(frames >= 0, "near_frames", "must be at least 0", frames, 30)
     require(worst >= 0, "worst", "must be at least 0", worst, 12)
-    require_choice("identity", options.identity, ("auto", "names", "images"))
     known = set(options.modalities) <= set(MODALITIES)
     must = "must be among vision, tactile"
     require(known, "modalities", must, list(options.modalities), ["vision"])
@@ -271,7 +247,7 @@ def _group(train: Manifest, test: Manifest, options: _Options) -> str:
     group = known_group(train, test) if options.by == "auto" else options.by
     listed = all("path" in part.table.columns for part in (train, test))
     images = options.images and _with_images(train, test)
-    if group == NO_GROUP and (images or listed or options.ids_in_time):
+    if group == NO_GROUP and (images or listed):
         return group
     if group == NO_GROUP or not (_known(train, group) and _known(test, group)):
         raise PalpateError(
@@ -294,15 +270,13 @@ def _compare(
 ) -> Audit:
     """Audit one part against another."""
     group = _group(train, test, options)
-    shared = shared_names(train, test, options.identity)
+    shared = shared_names(train, test)
     train, test, equal = rename_unrelated(train, test, shared, (against, "test"))
     a, b = train.table, test.table
     groups = [set(t[group].drop_nulls()) if group != NO_GROUP else set[str]() for t in (a, b)]
     in_both = sorted(groups[0] & groups[1])
     in_shared = int(b[group].is_in(in_both).fill_null(False).sum()) if in_both else 0
-    gaps = nearest_in_video(
-        *by_contact(*(in_time(t) if options.ids_in_time else t for t in (a, b)))
-    )
+    gaps = nearest_in_video(*by_contact(a, b))
     flags = _signals(train, test, group, gaps, options, named=shared)
     leaks = leaking(flags, len(test))
     reason = _reason(train, test, group, flags, options, named=not equal)
@@ -357,7 +331,7 @@ def _reason(
     near = [f for f in flags if f.kind.startswith("near-duplicate")]
     if near and options.encoder is None:
         column = near[-1].kind.split()[-1]  # tactile images decide where there are any
-        if shows_nothing([train, test], column, options.threads, options.progress):
+        if shows_nothing([train, test], column, options.progress):
             return "untouched" if column == "tactile" else "similar"
     codes = {note.code for f in near[-1:] for note in f.notes}
     if "cannot-tell-untouched" in codes:
@@ -425,7 +399,6 @@ def _near_duplicates(train: Manifest, test: Manifest, modality: str, options: _O
         false_positives=options.false_positives,
         features=features,
         cache=options.cache,
-        threads=options.threads,
         progress=options.progress,
     )
 

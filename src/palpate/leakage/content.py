@@ -36,9 +36,7 @@ NOISE = 0.05
 Floats = NDArray[np.float32]
 
 
-def shows_nothing(
-    parts: Sequence[Manifest], column: str, threads: int | None = None, progress: Progress = quiet
-) -> bool:
+def shows_nothing(parts: Sequence[Manifest], column: str, progress: Progress = quiet) -> bool:
     """Whether the images of a column differ by light, drift and noise alone.
 
     Backgrounds are used if all samples have one.
@@ -56,7 +54,7 @@ def shows_nothing(
     known = column == "tactile" and all(background for _, background in rows)
     pairs = rows if known else [(path, path) for path, _ in rows]
     files = sorted({path for pair in pairs for path in pair if path})
-    small = dict(in_threads(_thumbnail, files, "looking for contact", progress, threads=threads))
+    small = dict(in_threads(_thumbnail, files, "looking for contact", progress))
     shown = [(small[a], small[b]) for a, b in pairs if a and b]
     shown = [(x, ground) for x, ground in shown if x is not None and ground is not None]
     if len(shown) < FEWEST:

@@ -8,7 +8,6 @@ smallest value of the first column in it, so that a group of one video has the v
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, Literal
 
 import numpy as np
 import polars as pl
@@ -21,7 +20,6 @@ from palpate.data.manifest import MODALITIES, Manifest
 
 #: Columns that a split can keep whole, and by which a split can be audited.
 GROUPS = ("video", "contact", "object", "session", "domain", "sensor")
-Nulls = Literal["raise", "single"]
 Ints = NDArray[np.int64]
 
 
@@ -98,9 +96,7 @@ def shared_groups(train: pl.DataFrame, test: pl.DataFrame) -> dict[str, tuple[in
     return shared
 
 
-def components(
-    manifest: Manifest, by: Sequence[str], links: Sequence[Any] = (), *, nulls: Nulls = "raise"
-) -> list[str]:
+def components(manifest: Manifest, by: Sequence[str], links: Sequence[Ints] = ()) -> list[str]:
     """The group of each sample.
 
     Args:
@@ -108,7 +104,6 @@ def components(
         by: columns whose values must not be shared between parts.
         links: (n,) integer labels each; samples with the same label, if not negative, stay
             together.
-        nulls: ``raise`` on a null in a column of ``by``; with ``single`` it joins nothing.
 
     Returns:
         n names, in row order; ``sample:<id>`` for samples without any value.
@@ -117,23 +112,14 @@ def components(
     for column in by:
         require(column in GROUPS, "by", f"must be among {', '.join(GROUPS)}", column, "video")
         empty = table[column].null_count()
-        if empty and (nulls == "raise" or empty == n):
+        if empty:
             raise PalpateError(
                 f"Every sample needs a {column} to be split by it",
                 f"{empty} of {n} samples without",
-                "Fill the column, choose another one"
-                + ("" if empty == n else ", or let each such sample be a group by itself"),
-                example={} if empty == n else {"nulls": "single"},
+                "Fill the column, or choose another one",
             )
     labels = [table[c].rank("dense").cast(pl.Int64).fill_null(0).to_numpy() - 1 for c in by]
-    for link in links:
-        label = np.asarray(link)
-        if label.shape != (n,) or label.dtype.kind not in "iu":
-            must = f"must be {n} integers, one a sample"
-            got = f"{label.dtype} of shape {label.shape}"
-            raise PalpateError(must, got, "Compute the labels on this manifest", argument="near")
-        labels.append(label.astype(np.int64))
-    return _names(manifest, by, _joined(labels, n))
+    return _names(manifest, by, _joined([*labels, *links], n))
 
 
 def _joined(labels: Sequence[Ints], n: int) -> Ints:

@@ -76,7 +76,6 @@ def near_duplicates(
     false_positives: float = RATE,
     features: tuple[object, object] | None = None,
     cache: Path | None = None,
-    threads: int | None = None,
     progress: Progress = quiet,
 ) -> Flags:
     """Flag test samples whose image is nearly that of a train sample.
@@ -88,14 +87,13 @@ def near_duplicates(
         false_positives: share of unrelated samples that may be flagged, in (0, 0.1].
         features: embeddings (n_train, d) and (n_test, d) to compare instead of the images.
         cache: folder for thumbnails, so that a rerun is quick; None keeps nothing.
-        threads: that decode.
         progress: callback.
 
     Raises:
         PalpateError: if the embeddings do not fit the samples.
     """
     if features is None:
-        images = pool(train, test, modality, cache=cache, threads=threads, progress=progress)
+        images = pool(train, test, modality, cache=cache, progress=progress)
     else:
         images = _embedded(features, train, test)
     base, queries = _shown(images, slice(len(train))), _shown(images, slice(len(train), None))

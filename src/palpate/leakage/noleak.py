@@ -30,8 +30,6 @@ RATIOS: dict[str, tuple[float, float]] = {
 }
 SEEDS = range(5)
 HCT_GROUPS = ("video", "session")
-#: Seconds between the starts of two HCT folders that count as one session.
-SESSION_GAP = "60 s"
 
 
 def load_record() -> dict[str, Any]:
@@ -96,16 +94,3 @@ def published(
     absent = sorted(set(videos.parts) - set(column))
     more = [Note("videos-without-samples", {"videos": absent, "of": len(videos)})] if absent else []
     return Split(parts, videos.rule, manifest.digest, [*notes, *more])
-
-
-def require_hct(manifest: Manifest) -> str:
-    """The gap that joined the sessions of HCT."""
-    gap = manifest.facts.get("session_gap", SESSION_GAP)
-    if gap != SESSION_GAP:
-        must = f"HCT-NoLeak joins folders that start within {SESSION_GAP}"
-        got = f"sessions joined within {gap}"
-        raise PalpateError(must, got, "Import HCT with the default gap")
-    if empty := manifest.table["session"].null_count():
-        must, got = "HCT-NoLeak needs the session of every sample", f"{empty} without"
-        raise PalpateError(must, got, "Import the tree with: palpate import --format hct")
-    return gap

@@ -63,14 +63,13 @@ def pool(
     modality: str,
     *,
     cache: Path | None,
-    threads: int | None = None,
     progress: Progress = quiet,
 ) -> Pool:
     """Decode one modality, ``vision`` or ``tactile``, of two manifests."""
     parts = (train, test)
     paths = _paths(parts, modality)
     behind = _paths(parts, "background") if modality == "tactile" else [None] * len(paths)
-    thumbs = thumbnails([*paths, *behind], cache=cache, threads=threads, progress=progress)
+    thumbs = thumbnails([*paths, *behind], cache=cache, progress=progress)
     row, recorded = thumbs.row[: len(paths)], thumbs.row[len(paths) :]
     notes = _unreadable_notes(paths, row, thumbs, modality)
     unit = next(

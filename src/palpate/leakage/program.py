@@ -119,9 +119,9 @@ def optimize(problem: Problem) -> Optimum:
     return Optimum(assignment, deviation, min(bound, deviation))
 
 
-def draw(problem: Problem, optimum: Optimum, seed: int, tolerance: float = 0.0) -> Ints:
-    """The assignment of a seed, at most ``tolerance`` above the optimum's largest deviation."""
-    limit = max(optimum.deviation, RESOLUTION) + tolerance
+def draw(problem: Problem, optimum: Optimum, seed: int) -> Ints:
+    """The assignment of a seed, whose largest deviation is the optimum's."""
+    limit = max(optimum.deviation, RESOLUTION)
     program = _Program(problem, limit)
     cost = rng_for(seed, "split").random((len(problem.counts), len(problem.target)))
     objective = program.objective(

@@ -16,16 +16,9 @@ import numpy as np
 
 from palpate.core import Note, PalpateError, Progress, Split, quiet, require
 from palpate.data.manifest import MODALITIES, Manifest
-from palpate.leakage.groups import (
-    Ints,
-    Nulls,
-    choose_group,
-    components,
-    nested_groups,
-    shared_groups,
-)
+from palpate.leakage.groups import Ints, choose_group, components, nested_groups, shared_groups
 from palpate.leakage.inputs import Data, read, read_all
-from palpate.leakage.noleak import HCT_GROUPS, published, require_hct
+from palpate.leakage.noleak import HCT_GROUPS, published
 from palpate.leakage.program import EXACT, RESOLUTION, Optimum, Problem, draw, optimize
 
 RULE_VERSION = 3
@@ -37,24 +30,20 @@ LEAST_FILL = 0.25
 
 @overload
 def split(  # pyright: ignore[reportOverlappingOverload]
-    data: Data, *, seed: int = 0, folds: None = None, **options: Any
+    data: Data, *, folds: None = None, **options: Any
 ) -> Split: ...
 @overload
-def split(
-    data: Data, *, seed: int | Sequence[int] = 0, folds: int | None = None, **options: Any
-) -> list[Split]: ...
+def split(data: Data, *, folds: int | None = None, **options: Any) -> list[Split]: ...
 def split(  # noqa: PLR0913  # pyright: ignore[reportInconsistentOverload]
     data: Data,
     *,
     by: str | Sequence[str] = "auto",
     train: float = 0.8,
     val: float = 0.0,
-    seed: int | Sequence[int] = 0,
+    seed: int = 0,
     folds: int | None = None,
-    near: Any = None,
+    near: str | None = None,
     noleak: str | None = None,
-    nulls: Nulls = "raise",
-    tolerance: float = 0.0,
     cache: str | Path | None = None,
     reading: Mapping[str, Any] | None = None,
     skip_bad: bool = False,
@@ -70,22 +59,18 @@ def split(  # noqa: PLR0913  # pyright: ignore[reportInconsistentOverload]
             the session, the video, the contact.
         train: wanted share of the train part, in (0, 1).
         val: wanted share of the validation part, in [0, 1); test gets the remainder.
-        seed: another seed gives another split of the same quality; several seeds give several.
+        seed: another seed gives another split of the same quality.
         folds: make so many folds; split k tests fold k (and, with ``val``, validates on fold
             k + 1). The shares are then those of the folds.
-        near: keep near-duplicate images together: ``vision``, ``tactile``, ``both``, or an array
-            with a label for each sample (negative: none).
+        near: keep near-duplicate images together: ``vision``, ``tactile`` or ``both``.
         noleak: the published split of ``touch-and-go``, or the same rule for ``hct``.
-        nulls: ``raise`` if a sample has no value in a column of ``by``, or let it be a ``single``.
-        tolerance: how far the largest deviation may be above the smallest possible one, for splits
-            that differ more.
         cache: folder that keeps decoded images for ``near``.
         reading: how the source is read, as in :func:`palpate.leakage.audit`.
         skip_bad: skip bad rows of lists and tables, and note them.
         progress: callback.
 
     Returns:
-        A split; with ``folds`` or several seeds a list. Its rule holds what was achieved:
+        A split; with ``folds`` a list. Its rule holds what was achieved:
         ``deviation`` (the largest, in [0, 1]), ``bound`` (no split by these groups has a smaller
         one), ``status``, ``limiting`` (the material that deviates most), ``rare`` and ``missing``
         (materials that are not in every part).
@@ -94,24 +79,23 @@ def split(  # noqa: PLR0913  # pyright: ignore[reportInconsistentOverload]
         PalpateError: on shares out of range, unknown or null groups, fewer groups than parts, or
             one group too large to be split off.
     """
-    _check(train, val, folds, tolerance, noleak)
-    seeds = [seed] if isinstance(seed, int) else list(seed)
+    _check(train, val, folds, noleak)
     if noleak == "touch-and-go":
         source = None if data is None else read(data, skip_bad, progress)
         manifest, notes = (source.manifest, source.notes) if source else (None, [])
-        return published(manifest, train, val, seeds[0], notes)
+        return published(manifest, train, val, seed, notes)
     (source,) = read_all([data], skip_bad, progress, None, reading, arguments=["data"])
     manifest, notes = source.manifest, source.notes
     rule: dict[str, Any] = {"name": "NoLeak"}
     if noleak == "hct":
-        by, rule = HCT_GROUPS, {"name": "HCT-NoLeak", "session_gap": require_hct(manifest)}
-    links, near_facts = near_links(manifest, near, cache, progress)
+        by, rule = HCT_GROUPS, {"name": "HCT-NoLeak"}
+    links, near_facts = _near_links(manifest, near, cache, progress)
     shares = {"train": train, "val": val, "test": 1 - train - val}
     if folds is not None:
         shares = {f"fold {k}": 1 / folds for k in range(folds)}
     shares = {part: round(share, 12) for part, share in shares.items() if share > 1e-9}
     columns, reason = _columns(manifest, by, links, len(shares))
-    groups = components(manifest, columns, links, nulls=nulls)
+    groups = components(manifest, columns, links)
     names, materials, problem = _problem(manifest, groups, columns, list(shares.values()))
     optimum = optimize(problem)
     rule |= {
@@ -120,52 +104,44 @@ def split(  # noqa: PLR0913  # pyright: ignore[reportInconsistentOverload]
         "group": columns[0] if columns else LINKED,
         "by": list(columns),
         "near": near_facts,
-        "nulls": nulls,
         "groups": len(names),
         "shares": shares,
-        "tolerance": tolerance,
     }
     notes += reason
     part_names = [list(shares)] if folds is None else _fold_parts(folds, val > 0)
     splits: list[Split] = []
-    for number in seeds if folds is None else seeds[:1]:
-        assignment = draw(problem, optimum, number, tolerance)
-        facts = rule | {"seed": number}
-        facts |= _achieved(problem, optimum, assignment, [*materials, "all samples"], list(shares))
-        for fold, parts in enumerate(part_names):
-            if folds is not None:
-                shares = {p: parts.count(p) / folds for p in dict.fromkeys(parts)}
-                name = f"NoLeak fold {fold} of {folds}"
-                facts |= {"name": name, "folds": folds, "fold": fold, "shares": shares}
-            where = {g: parts[k] for g, k in zip(names, assignment.tolist(), strict=True)}
-            of = {i: where[g] for i, g in zip(manifest.ids, groups, strict=True)}
-            more = [*notes, *_question(manifest, of), *_notes(manifest, facts)]
-            splits.append(Split(of, dict(facts), manifest.digest, more))
-    return splits[0] if isinstance(seed, int) and folds is None else splits
+    assignment = draw(problem, optimum, seed)
+    facts = rule | {"seed": seed}
+    facts |= _achieved(problem, optimum, assignment, [*materials, "all samples"], list(shares))
+    for fold, parts in enumerate(part_names):
+        if folds is not None:
+            shares = {p: parts.count(p) / folds for p in dict.fromkeys(parts)}
+            name = f"NoLeak fold {fold} of {folds}"
+            facts |= {"name": name, "folds": folds, "fold": fold, "shares": shares}
+        where = {g: parts[k] for g, k in zip(names, assignment.tolist(), strict=True)}
+        of = {i: where[g] for i, g in zip(manifest.ids, groups, strict=True)}
+        more = [*notes, *_question(manifest, of), *_notes(manifest, facts)]
+        splits.append(Split(of, dict(facts), manifest.digest, more))
+    return splits[0] if folds is None else splits
 
 
-def _check(
-    train: float, val: float, folds: int | None, tolerance: float, noleak: str | None
-) -> None:
+def _check(train: float, val: float, folds: int | None, noleak: str | None) -> None:
     if folds is None and not (0 < train < 1 and 0 <= val < 1 and 1 - train - val > 1e-9):
         must = "The shares of train and val must be positive and leave room for test"
         got = f"train {train}, val {val}"
         raise PalpateError(must, got, "Choose smaller shares", example={"train": 0.8, "val": 0.1})
     least = 2 + (val > 0)
-    require(0 <= tolerance < 1, "tolerance", "must lie in [0, 1)", tolerance, 0.01)
     require(folds is None or folds >= least, "folds", f"must be at least {least}", folds, 5)
     known = noleak in (None, "touch-and-go", "hct")
     require(known, "noleak", "must be touch-and-go or hct", noleak, "touch-and-go")
 
 
-def near_links(
-    manifest: Manifest, near: Any, cache: str | Path | None, progress: Progress
+def _near_links(
+    manifest: Manifest, near: str | None, cache: str | Path | None, progress: Progress
 ) -> tuple[list[Any], dict[str, Any] | None]:
     """Labels of near-duplicate clusters, and their description for the rule."""
     if near is None:
         return [], None
-    if not isinstance(near, str):
-        return [near], {"labels": 1}
     known = near in (*MODALITIES, "both")
     require(known, "near", "must be vision, tactile or both", near, "both")
     from palpate.leakage.near import near_groups
@@ -261,8 +237,7 @@ def _question(manifest: Manifest, parts: Mapping[str, str]) -> list[Note]:
 
 def _notes(manifest: Manifest, facts: dict[str, Any]) -> list[Note]:
     """What a reader must know of a split with these facts."""
-    counts = {c: manifest.table[c].null_count() for c in facts["by"]}
-    notes = [Note("single-groups", {"count": n, "group": c}) for c, n in counts.items() if n]
+    notes: list[Note] = []
     if not manifest.table["material"].count():
         notes.append(Note("no-materials"))
     parts = facts.get("folds") or len(facts["shares"])

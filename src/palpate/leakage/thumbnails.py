@@ -66,11 +66,7 @@ def thumbnail(path: Path) -> NDArray[np.uint8] | str:
 
 
 def thumbnails(
-    paths: Sequence[Path | None],
-    *,
-    cache: Path | None = None,
-    threads: int | None = None,
-    progress: Progress = quiet,
+    paths: Sequence[Path | None], *, cache: Path | None = None, progress: Progress = quiet
 ) -> Thumbnails:
     """Decode every distinct path once.
 
@@ -78,7 +74,6 @@ def thumbnails(
         paths: (n,) files; None where a sample has no image.
         cache: folder for the pieces; their names change with paths, file sizes and modification
             times, so another split of the same files uses them. None keeps nothing.
-        threads: that decode; default: the number of cores, 16 at most.
         progress: called with the number of files done.
     """
     names = [None if path is None else str(path) for path in paths]  # hashed quicker than paths
@@ -90,7 +85,7 @@ def thumbnails(
     for start in range(0, len(files), PIECE):
         progress("decoding images", start, len(files))
         piece = files[start : start + PIECE]
-        pixels, reasons = _piece(piece, cache, threads)
+        pixels, reasons = _piece(piece, cache)
         unreadable.update({str(piece[k]): reason for k, reason in sorted(reasons.items())})
         for k, name in enumerate(map(str, piece)):
             if k in reasons:
@@ -105,10 +100,10 @@ def thumbnails(
     return Thumbnails(row, np.stack(different) if different else empty, unreadable)
 
 
-def _piece(files: Sequence[Path], cache: Path | None, threads: int | None) -> Decoded:
+def _piece(files: Sequence[Path], cache: Path | None) -> Decoded:
     """Thumbnails of some files, from the cache if they are there."""
     if cache is None:
-        return _decode(files, threads)
+        return _decode(files)
     key = digest_json([VERSION, [[str(path), *file_stamp(path)] for path in files]])
     stored = cache / f"thumbnails-{short(key)}.npz"
     try:
@@ -116,7 +111,7 @@ def _piece(files: Sequence[Path], cache: Path | None, threads: int | None) -> De
             reasons = zip(piece["bad"].tolist(), piece["why"].tolist(), strict=True)
             return piece["pixels"], dict(reasons)
     except (OSError, ValueError, EOFError, KeyError, zipfile.BadZipFile):
-        pixels, bad = _decode(files, threads)  # absent or damaged
+        pixels, bad = _decode(files)  # absent or damaged
     with atomic_path(stored) as part, open(part, "wb") as file:
         np.savez(
             file, pixels=pixels, bad=np.array(list(bad), int), why=np.array([*bad.values()], str)
@@ -124,11 +119,11 @@ def _piece(files: Sequence[Path], cache: Path | None, threads: int | None) -> De
     return pixels, bad
 
 
-def _decode(files: Sequence[Path], threads: int | None) -> Decoded:
+def _decode(files: Sequence[Path]) -> Decoded:
     pixels, reasons = np.zeros((len(files), SIDE, SIDE, 3), np.uint8), dict[int, str]()
     starts = range(0, len(files), AT_ONCE)
     some = lambda k: [thumbnail(file) for file in files[k : k + AT_ONCE]]
-    for start, results in in_threads(some, starts, threads=threads):
+    for start, results in in_threads(some, starts):
         for k, result in enumerate(results, start):
             if isinstance(result, str):
                 reasons[k] = result

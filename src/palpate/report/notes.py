@@ -268,12 +268,12 @@ def _blank_images(params: Mapping[str, Any], _: Style) -> str:
     )
 
 
-def _equal_names(p: Mapping[str, Any], style: Style) -> str:
+def _equal_names(p: Mapping[str, Any], _: Style) -> str:
     equal = " and ".join(plural(n, f"equal {column}") for column, n in p["equal"].items())
     decided = "bytes and images decide" if p["images"] else "there are no images to compare"
     return (
         f"{p['roots'][0]} and {p['roots'][1]} have {equal}, which mean nothing by themselves: "
-        f"{decided}. If both are one data set: {style:identity=names}"
+        f"{decided}. If both are one data set, put both lists into one folder"
     )
 
 
@@ -422,10 +422,6 @@ LEAKAGE: dict[str, Sentence] = {
     "samples-in-no-part": "{count} of {of} samples of the manifest are in no part of the split",
     "signal-not-counted": "Reported, but not counted as a leak: the audit is not by {group}",
     "signal-nulls": "{count} {part} samples have no {group}: nothing is known of them",
-    "single-groups": (
-        "{count} samples have no {group}: each is a group by itself unless another column or "
-        "a near-duplicate joins it"
-    ),
     "split-of-other-manifest": "The split was made for another manifest (the digests differ)",
     "threshold-order": _threshold("order"),
     "threshold-videos": _threshold("videos"),
