@@ -1,4 +1,4 @@
-"""The verbs import, validate and export: options of every format, statuses, JSON and text."""
+"""The verbs import and validate: options of every format, statuses, JSON and text."""
 
 import errno
 import json
@@ -14,7 +14,6 @@ from data_fixtures import write_image
 from format_trees import TREES
 from palpate.cli import main
 from palpate.cli.importing import FormatOptions, TableOptions
-from palpate.core import Split
 from palpate.data.formats import FORMATS
 from palpate.data.manifest import Manifest
 
@@ -97,20 +96,18 @@ def test_validation_shows_facts_and_fails_on_what_is_requested(capsys, tag, tabl
     assert status == 0
     assert re.search(r"^samples +12 *$", out, re.MULTILINE)
     facts = ("CC BY 4.0", "121,861 frames of 126 videos", "https://touch-and-go.github.io")
-    for words in (*facts, "640 x 480", "(0.51808, 0.503, 0.51457)", "Complete."):
+    for words in (*facts, "640 x 480", "Complete."):
         assert words in out
     (tag / "dataset" / "20220601_182052" / "gelsight_frame" / "0000000007.jpg").unlink()
     status, out, _ = call(capsys, "validate", tag)
     assert (status, "Missing: 1" in out, "Not complete." in out) == (1, True, True)
-    assert call(capsys, "validate", tag, "--fail-on", "invalid")[0] == 0
     status, out, _ = call(capsys, "validate", tag, "--json")
     data = json.loads(out)
-    assert (status, data["ok"], data["failed"], data["samples"]) == (1, False, ["missing"], 11)
+    assert (status, data["ok"], data["samples"]) == (1, False, 11)
     assert [p["kind"] for p in data["missing"]] == ["missing-file"]
     assert (data["invalid"], data["facts"]["license"]) == ([], "CC BY 4.0")
-    assert call(capsys, "validate", table, *MAPS)[0] == 0
-    status, out, _ = call(capsys, "validate", table, *MAPS, "--fail-on", "suspicious")
-    assert (status, "Suspicious: 1" in out) == (1, True)
+    status, out, _ = call(capsys, "validate", table, *MAPS)
+    assert (status, "Suspicious: 1" in out) == (0, True)
     assert call(capsys, "validate")[0] == 2
 
 
@@ -167,32 +164,6 @@ def test_a_folder_of_one_kind_and_its_mistakes(capsys, table, tmp_path):
     assert (status, "Traceback" in err) == (2, False)
 
 
-def test_export_prints_how_to_read_it_again_and_that_works(capsys, small_manifest, tmp_path):
-    small_manifest.save(tmp_path / "m" / "manifest.parquet")
-    split = Split({i: ("test", "train")[k % 2] for k, i in enumerate(small_manifest.ids)})
-    split.save(tmp_path / "s.json")
-    export = ["export", tmp_path / "m", "--to", "jsonl", "-o", tmp_path / "my e's"]
-    status, out, _ = call(capsys, *export, "--split", tmp_path / "s.json")
-    assert status == 0
-    command = shlex.split(out.split("Read it with: palpate ")[1])
-    assert call(capsys, *command[:-1], tmp_path / "again", "--json")[0] == 0
-    assert Manifest.load(tmp_path / "again").digest == small_manifest.digest
-    again = Split.load(tmp_path / "again" / "splits" / "Orig.json")
-    assert again.digest == Split.load(tmp_path / "s.json").digest
-    assert call(capsys, *export)[0] == 2
-    assert call(capsys, "export", tmp_path / "m", "-o", tmp_path / "f")[0] == 2
-
-
-def test_export_to_hugging_face_and_back(capsys, small_manifest, tmp_path):
-    pytest.importorskip("datasets", reason="the extra hf is not installed")
-    small_manifest.save(tmp_path / "m" / "manifest.parquet")
-    export = ["export", tmp_path / "m", "--to", "hf", "-o", tmp_path / "e", "--json"]
-    status, out, _ = call(capsys, *export)
-    assert (status, json.loads(out)["samples"]) == (0, 48)
-    assert call(capsys, "import", tmp_path / "e", "-o", tmp_path / "again")[0] == 0
-    assert Manifest.load(tmp_path / "again").digest == small_manifest.digest
-
-
 def test_a_full_disk_is_reported_in_a_line_and_leaves_nothing(capsys, tag, tmp_path, monkeypatch):
     assert call(capsys, "import", tag, "-o", tmp_path / "m", "-q")[0] == 0
     real = Path.write_bytes
@@ -207,7 +178,6 @@ def test_a_full_disk_is_reported_in_a_line_and_leaves_nothing(capsys, tag, tmp_p
     output = tmp_path / "full"
     for args in (
         ["import", tag, "-o", output],
-        ["export", tmp_path / "m", "--to", "parquet", "-o", output],
         ["audit", tag / "train.txt", tag / "test.txt", "--table", output / "t.parquet"],
     ):
         status, _, err = call(capsys, *args, "-q")

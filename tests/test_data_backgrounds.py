@@ -1,6 +1,7 @@
 """Backgrounds proposed for samples that have none."""
 
 import json
+from dataclasses import replace
 
 import polars as pl
 import pytest
@@ -8,7 +9,7 @@ from PIL import Image
 
 from palpate.cli import main
 from palpate.core import PalpateError, Split
-from palpate.data import propose_backgrounds
+from palpate.data import load, propose_backgrounds
 from palpate.data.manifest import Manifest
 from test_data_contacts import gel_video
 
@@ -44,47 +45,15 @@ def frame_of(row):
     return int(row["background"].partition("/")[2][:3])
 
 
-def test_a_frame_may_be_named_as_the_reference_of_all_or_some_videos(folder, tmp_path, capsys):
-    manifest_of(folder, range(70)).save(folder / "manifest.parquet")
-    numbers = {(): (69, 69), ("v1=3",): (None, 3), ("v0=5", "v1=first"): (5, 0)}
-    for k, (words, expected) in enumerate(numbers.items()):
-        out = tmp_path / f"out{k}"
-        assert (
-            main(["background", str(folder), "-o", str(out), "--reference", *(words or ["69"])])
-            == 0
-        )
-        rows = Manifest.load(out).table.filter(pl.col("frame") == 69).to_dicts()
-        for row, frame in zip(rows, expected, strict=True):  # in no contact, so the reference
-            assert frame in (None, frame_of(row))
-    capsys.readouterr()
-    for words, text in {
-        ("70",): "must be the number of a frame of the video 'v0'. Got 70",
-        ("v7=0",): "--reference must be of a video without backgrounds. Got 'v7'",
-        ("fist",): "--reference must be one of auto, first, a frame. Got 'fist'",
-        ("first", "v0=1"): "--reference must be one reference, or one for each of some videos",
-    }.items():
-        command = ["background", str(folder), "-o", str(tmp_path / "no"), "--reference", *words]
-        assert (main(command), text in (error := capsys.readouterr().err)) == (2, True), error
-        assert not (tmp_path / "no").exists()
-
-
 CASES = {
-    "all frames": (range(70), {}, "contacts of the images, reference auto"),
-    "all frames, contacts named": (
-        range(70),
-        {"contact": contact_of},
-        "contacts of the manifest, reference auto",
-    ),
+    "all frames": (range(70), {}, "contacts of the images"),
+    "all frames, contacts named": (range(70), {"contact": contact_of}, "contacts of the manifest"),
     "frames in contact alone": (
         [*range(20, 31), *range(45, 56)],
         {"contact": contact_of},
-        "contacts of the manifest, reference auto",
+        "contacts of the manifest",
     ),
-    "every third": (
-        range(0, 70, 3),
-        {"contact": contact_of},
-        "contacts of the manifest, reference auto",
-    ),
+    "every third": (range(0, 70, 3), {"contact": contact_of}, "contacts of the manifest"),
 }
 
 
@@ -106,7 +75,7 @@ def test_a_contact_takes_the_gel_before_it(folder, tmp_path, case):
             assert 31 < before < 45
 
 
-def test_backgrounds_that_are_there_stay_unless_replaced(folder, tmp_path):
+def test_backgrounds_that_are_there_stay(folder, tmp_path):
     declared = lambda v, k: f"v{v}/000.png" if k < 50 else None
     manifest = manifest_of(folder, range(20, 56), background=declared, contact=contact_of)
     result = propose_backgrounds(manifest, tmp_path / "a")
@@ -116,17 +85,9 @@ def test_backgrounds_that_are_there_stay_unless_replaced(folder, tmp_path):
         "v0/000.png",
         "v1/000.png",
     }
-    replaced = propose_backgrounds(manifest, tmp_path / "b", replace_all=True)
-    assert replaced.kept == 0
     full = manifest_of(folder, range(3), background=lambda v, _: f"v{v}/000.png")
     with pytest.raises(PalpateError, match="a background for every sample"):
         propose_backgrounds(full, tmp_path / "c")
-
-
-def test_the_first_frame_is_the_reference_on_request(folder, tmp_path):
-    manifest = manifest_of(folder, range(10))
-    result = propose_backgrounds(manifest, tmp_path / "out", how="first")
-    assert {frame_of(row) for row in result.manifest.table.iter_rows(named=True)} == {0}
 
 
 def test_a_video_that_is_all_contact_gets_nothing(folder, tmp_path):
@@ -165,7 +126,9 @@ def test_contacts_of_a_world_take_a_frame_that_is_free(tmp_path, look):
     assert main([*args, "--frames-per-contact", "8", "--free-frames", "8"]) == 0
     lines = (tmp_path / "w" / "label.txt").read_text().split()
     labeled = {(line[:15], int(line[16:26])) for line in lines}
-    result = propose_backgrounds(tmp_path / "w", tmp_path / "out", replace_all=True)
+    world = load(tmp_path / "w")
+    bare = replace(world, table=world.table.with_columns(background=pl.lit(None, pl.String)))
+    result = propose_backgrounds(bare, tmp_path / "out")
     assert result.without == 0
     for video, background in result.manifest.table.select("video", "background").iter_rows():
         assert (video, int(background[-14:-4])) not in labeled

@@ -1,7 +1,5 @@
 """Contacts found in tactile videos: the untouched gel, the presses, the background of each."""
 
-from itertools import pairwise
-
 import numpy as np
 import pytest
 
@@ -184,14 +182,7 @@ def test_dropped_frames_and_unequal_streams_are_found():
     assert kinds(tactile, tactile=variable) == {}
 
 
-def test_a_changed_gel_is_found():
-    changed = np.concatenate(
-        [gel_video(100, ((20, 50),), 8), gel_video(100, ((20, 50),), 8, seed=9)]
-    )
-    assert "changed-gel" in kinds(changed)
-
-
-def test_real_clips_raise_no_suspicion_until_they_are_spoiled(clips):
+def test_real_clips_raise_no_suspicion(clips):
     names = sorted(path.name for path in (clips / "dataset").iterdir())
     videos = {}
     for name in names:
@@ -199,6 +190,3 @@ def test_real_clips_raise_no_suspicion_until_they_are_spoiled(clips):
             with VideoReader(clips / "dataset" / name / file) as reader:
                 videos[name, side] = reader.thumbnails(SIZE)
         assert kinds(videos[name, "tactile"], videos[name, "vision"]) == {}
-    for one, other in pairwise(names):
-        a, b = (videos[name, "tactile"] for name in (one, other))
-        assert "changed-gel" in kinds(np.concatenate([a[: len(a) // 2], b[len(b) // 2 :]]))

@@ -1,4 +1,4 @@
-"""Hugging Face data sets: exports come back whole, others by maps; nothing of theirs is run."""
+"""Hugging Face data sets: read by maps; nothing of theirs is run."""
 
 import json
 import subprocess
@@ -9,10 +9,9 @@ import pytest
 from format_trees import HF_MAPS as MAPS
 from format_trees import hf_kinds as kinds
 from format_trees import hf_rows, save_hf
-from palpate.core import MissingExtraError, PalpateError, ProblemsError, Split
-from palpate.data.exporting import export_dataset
+from palpate.core import MissingExtraError, PalpateError, ProblemsError
 from palpate.data.importing import import_dataset, validate
-from palpate.data.manifest import IMAGE_COLUMNS, Manifest
+from palpate.data.manifest import Manifest
 
 datasets = pytest.importorskip("datasets", reason="the extra hf is not installed")
 
@@ -24,14 +23,6 @@ BY_PATH = MAPS | {"frame": "split_part(split_part(path, '/', -1), '.', 1)"}
 @pytest.fixture
 def source(tmp_path):
     return save_hf(tmp_path / "mine", hf_rows(), **kinds())
-
-
-def same_bytes(one: Manifest, other: Manifest) -> bool:
-    return all(
-        (a is None and b is None) or one.path(a).read_bytes() == other.path(b).read_bytes()
-        for column in IMAGE_COLUMNS
-        for a, b in zip(one.column(column), other.column(column), strict=True)
-    )
 
 
 @pytest.mark.parametrize("form", ["saved", "parquet"])
@@ -55,77 +46,13 @@ def test_a_foreign_set_keeps_its_bytes_parts_and_labels(source, tmp_path, form):
     assert (result.facts["dataset"], result.facts["text_source"]) == (source.name, "none")
 
 
-@pytest.mark.parametrize("parted", [False, True])
-def test_what_was_exported_comes_back_whole(small_manifest, tmp_path, parted):
-    # in another order, which the parts tear apart
-    table = small_manifest.table.sample(fraction=1, shuffle=True, seed=3)
-    facts = {"dataset": "ours", "license": "CC0", "citation": "nobody, 2024"}
-    facts |= {"url": "https://example.org", "format": "touch-and-go", "text_source": "none"}
-    manifest = Manifest(table, small_manifest.root, facts)
-    parts = {i: ("train", "val", "test")[k % 3] for k, i in enumerate(manifest.ids) if k % 7}
-    split = Split(parts, {"method": "mine"}) if parted else None
-    files = export_dataset(manifest, tmp_path / "hf", to="hf", split=split).files
-    assert all(f.is_file() for f in files)
-    loaded = datasets.load_from_disk(str(tmp_path / "hf"))
-    assert sorted(loaded) == (["test", "train", "unused", "validation"] if parted else ["all"])
-    first = next(iter(loaded.values()))
-    assert isinstance(first.features["tactile"], datasets.Image)
-    assert first[0]["tactile"].size == (32, 32)
-    assert (first.info.license, first.info.citation) == ("CC0", "nobody, 2024")
-    assert json.loads(first.info.description)["digest"] == manifest.digest
-    again = import_dataset(tmp_path / "hf", tmp_path / "out")
-    assert again.manifest.digest == manifest.digest
-    assert dict(again.facts) == facts
-    assert same_bytes(manifest, again.manifest)
-    assert {n: (s.digest, s.rule) for n, s in again.splits.items()} == (
-        {"Orig": (split.digest, {"method": "mine"})} if split else {}
-    )
-
-
-@pytest.mark.parametrize(
-    ("to", "name"),
-    [("csv", "manifest.csv"), ("jsonl", "manifest.jsonl"), ("parquet", "samples.parquet")],
-)
-def test_tables_come_back_with_their_split(small_manifest, tmp_path, to, name):
-    text = small_manifest.table["id"] + ', "so\n called" 5"'
-    manifest = Manifest(small_manifest.table.with_columns(text=text), small_manifest.root, {})
-    split = Split({i: ("train", "test")[k % 2] for k, i in enumerate(manifest.ids) if k % 5})
-    files = export_dataset(manifest, tmp_path / "o", to=to, split=split).files
-    names = {f.relative_to(tmp_path / "o").as_posix() for f in files}
-    assert names == {name, "lists/train.csv", "lists/test.csv"}
-    again = import_dataset(tmp_path / "o" / name, tmp_path / "out", root=manifest.root)
-    assert again.manifest.digest == manifest.digest
-    assert again.splits["Orig"].digest == split.digest
-
-
-def test_an_export_is_whole_or_absent(small_manifest, tmp_path):
-    (tmp_path / "o").mkdir()
-    (tmp_path / "o" / "x").touch()
-    with pytest.raises(PalpateError, match="absent or an empty folder"):
-        export_dataset(small_manifest, tmp_path / "o", to="csv")
-    with pytest.raises(PalpateError, match="must be in the manifest"):
-        export_dataset(small_manifest, tmp_path / "p", to="csv", split=Split({"none": "train"}))
-    small_manifest.paths("tactile")[3].unlink()
-    with pytest.raises(ProblemsError, match="missing-file"):
-        export_dataset(small_manifest, tmp_path / "p", to="hf")
-    assert not (tmp_path / "p").exists()
-
-
-def test_equal_images_are_written_once_and_paths_of_exports_stay_inside(small_manifest, tmp_path):
+def test_equal_images_are_written_once(tmp_path):
     rows = hf_rows()
     for row in rows:
         row["gel"] = rows[0]["gel"]
     source = save_hf(tmp_path / "mine", rows, **kinds())
     result = import_dataset(source, tmp_path / "out", columns=BY_PATH)
     assert set(result.manifest.column("tactile")) == {"train/tactile/00000000.jpg"}
-    export_dataset(small_manifest, tmp_path / "hf", to="hf")
-    loaded = datasets.load_from_disk(str(tmp_path / "hf"))["all"]
-    outside = [f"../../{k}.png" for k in range(len(small_manifest))]
-    evil = loaded.remove_columns("tactile_path").add_column("tactile_path", outside)
-    evil.save_to_disk(str(tmp_path / "evil"))
-    again = import_dataset(tmp_path / "evil", tmp_path / "out2")
-    assert all(p.startswith("all/tactile/") for p in again.manifest.column("tactile"))
-    assert not [*tmp_path.glob("*.png"), *(tmp_path / "out2").glob("*.png")]
 
 
 def test_bad_rows_are_reported_with_their_place(tmp_path):
@@ -220,16 +147,13 @@ def test_numbers_that_are_no_class_are_reported_and_minus_one_is_inconclusive(tm
     assert None not in result.manifest.column("material")
 
 
-def test_a_missing_extra_says_what_to_install(small_manifest, source, tmp_path, monkeypatch):
+def test_a_missing_extra_says_what_to_install(source, tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "datasets", None)
     with pytest.raises(MissingExtraError, match=r"pip install -e '\.\[hf\]'"):
         import_dataset(source, tmp_path / "out", columns=MAPS)
-    with pytest.raises(MissingExtraError, match="datasets"):
-        export_dataset(small_manifest, tmp_path / "hf", to="hf")
-    assert not (tmp_path / "hf").exists()
 
 
 def test_formats_load_without_datasets():
-    code = "import sys, palpate.data.importing, palpate.data.exporting; "
+    code = "import sys, palpate.data.importing; "
     code += "assert not {'datasets', 'torch', 'pyarrow'} & set(sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0

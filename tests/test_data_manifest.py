@@ -1,32 +1,10 @@
 """The manifest: round trip, digest, validation with every problem at once, joining."""
 
-from pathlib import Path
-
 import polars as pl
 import pytest
 
 from palpate.core import PalpateError, ProblemsError, Split
 from palpate.data.manifest import Manifest
-
-DATA = Path(__file__).parent / "data" / "formats"
-#: Digests that earlier versions gave; they must never change.
-DIGEST_2 = "730f22036d6ba75b3e1d68c3bc065d14110f3522aed3f911b107450c539c9219"
-SPLIT_DIGEST = "4070ef1bf5e5cb30c9971062bf2ace25ad43843b9ee2a74fc23e17a31c52798f"
-
-
-def test_format_2_is_upgraded_and_saved_as_format_3_with_the_same_digest(tmp_path):
-    manifest = Manifest.load(DATA / "manifest-2.parquet")
-    assert manifest.digest == DIGEST_2
-    assert manifest.column("contact") == ["a#0001", "a#0001", "a#0002", "a#0002"]
-    assert manifest.column("material") == [None, *["Sandpaper No. 5"] * 3]
-    assert manifest.facts == {"dataset": "small", "text_source": "column text"}
-    manifest.save(tmp_path / "m.parquet")
-    metadata = pl.read_parquet_metadata(tmp_path / "m.parquet")
-    assert metadata["palpate.format"] == "palpate-manifest/3"
-    again = Manifest.load(tmp_path / "m.parquet")
-    assert (again.digest, again.root) == (DIGEST_2, DATA)
-    parts = dict(zip(manifest.ids, ("train", "train", "test", "val"), strict=True))
-    assert Split(parts).digest == SPLIT_DIGEST
 
 
 def test_round_trip_keeps_rows_digest_facts_and_a_root_that_moves_along(small_manifest, tmp_path):
@@ -78,7 +56,7 @@ def test_foreign_and_changed_files_are_rejected(small_manifest, tmp_path):
     small_manifest.table.write_parquet(path)
     with pytest.raises(PalpateError, match="another program"):
         Manifest.load(path)
-    metadata = {"palpate.format": "palpate-manifest/2", "palpate.root": "."}
+    metadata = {"palpate.format": "palpate-manifest/1", "palpate.root": "."}
     metadata["palpate.digest"] = small_manifest.digest
     small_manifest.table.head(3).write_parquet(path, metadata=metadata)
     with pytest.raises(PalpateError, match="another program"):

@@ -62,8 +62,6 @@ if TYPE_CHECKING:
 OPTION_NAMES: dict[tuple[str, str], str] = {
     ("audit", "train_or_data"): "TRAIN",
     ("audit", "test"): "TEST",
-    ("background", "how"): "--reference",
-    ("background", "replace_all"): "--replace",
     ("caption check", "captions"): "CAPTIONS",
     ("", "columns"): "--map",
     ("train encoder", "batch"): "--batch-size",

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 
 import tyro
 
@@ -12,7 +12,6 @@ from palpate.cli.importing import SourceOptions, format_options
 from palpate.cli.terminal import FAILED_CHECK, Switch, Terminal
 from palpate.core import PalpateError
 
-Kind = Literal["missing", "invalid", "suspicious"]
 ShowList = Annotated[
     Switch,
     tyro.conf.arg(name="list", help="Show the known formats, their facts and their options."),
@@ -23,13 +22,11 @@ ShowList = Annotated[
 class Options(SourceOptions):
     """Check a data set: facts, and what is missing, invalid or suspicious. Nothing is written.
 
-    The exit status is 1 if it fails.
+    The exit status is 1 if something is missing or invalid.
     """
 
     source: Annotated[Path | None, tyro.conf.Positional] = None
     """Root of the data set, a table, an import, or with `--format hf` a name on the hub."""
-    fail_on: tuple[Kind, ...] = ("missing", "invalid")
-    """What makes it fail."""
     show_list: ShowList = False
 
 
@@ -55,8 +52,7 @@ def run(options: Options, terminal: Terminal) -> tuple[dict[str, Any], int]:
             **format_options(options),
         )
     terminal.print(str(result))
-    failed = [kind for kind in dict.fromkeys(options.fail_on) if getattr(result, kind)]
-    return result.to_json() | {"failed": failed}, FAILED_CHECK if failed else 0
+    return result.to_json(), 0 if result.ok else FAILED_CHECK
 
 
 def _formats(terminal: Terminal) -> dict[str, Any]:

@@ -32,11 +32,6 @@ VERBS: dict[str, Verb] = {
         "Propose the gel before each contact as background of samples that have none",
         "palpate background tag/ -o tag_bg/",
     ),
-    "export": Verb(
-        "export",
-        "Write a manifest as a Hugging Face data set or a table",
-        "palpate export tag/ --to hf -o tag_hf/",
-    ),
     "caption": Verb(
         "caption",
         "Describe what each touch feels like, by a vision-language model",

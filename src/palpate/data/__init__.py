@@ -9,7 +9,6 @@ from palpate._lazy import import_name
 
 if TYPE_CHECKING:
     from palpate.data.backgrounds import Backgrounds, propose_backgrounds
-    from palpate.data.exporting import Exported, export_dataset
     from palpate.data.imported import Imported, Validation
     from palpate.data.importing import import_dataset, validate
     from palpate.data.manifest import Manifest
@@ -18,11 +17,9 @@ if TYPE_CHECKING:
 #: Public name -> its module, imported on first use, so that ``import palpate.data`` is free.
 _MODULES = {
     "Backgrounds": "backgrounds",
-    "Exported": "exporting",
     "Imported": "imported",
     "Manifest": "manifest",
     "Validation": "imported",
-    "export_dataset": "exporting",
     "import_dataset": "importing",
     "load": "reading",
     "propose_backgrounds": "backgrounds",
@@ -31,11 +28,9 @@ _MODULES = {
 
 __all__ = [
     "Backgrounds",
-    "Exported",
     "Imported",
     "Manifest",
     "Validation",
-    "export_dataset",
     "import_dataset",
     "load",
     "propose_backgrounds",

@@ -2,7 +2,7 @@
 
 A sample in a contact gets the last frame at rest before that contact. A sample in no contact, and a
 contact without such a frame, get the reference of the video: of its frames in no contact the one
-that most resembles the others, the first, or the one that was named.
+that most resembles the others.
 
 Contacts are those of the manifest, with all frames between their first and last; where it names
 none, they are detected in the images (:mod:`palpate.data.contacts`). The frames of a video are the
@@ -15,10 +15,10 @@ A video whose frames are all in contact has no background: nothing is made up.
 from __future__ import annotations
 
 import os
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 import polars as pl
@@ -32,7 +32,6 @@ from palpate.core import (
     plain,
     problem_lines,
     quiet,
-    require_choice,
 )
 from palpate.data.contacts import (
     LEAST,
@@ -50,8 +49,6 @@ from palpate.data.imported import Imported, removing_on_error, splits_of
 from palpate.data.manifest import Manifest
 from palpate.data.reading import load
 
-#: A number is that of a frame.
-How = Literal["auto", "first"] | int
 #: (first, last) position of a contact, both included.
 Run = tuple[int, int]
 
@@ -67,7 +64,7 @@ class Backgrounds:
         before: samples with the gel before their contact.
         reference: samples with the reference of their video.
         without: samples for which there is none.
-        methods: video -> how its contacts and its reference were found.
+        methods: video -> how its contacts were found.
         problems: videos without a background, unreadable images, weak contacts.
     """
 
@@ -102,28 +99,19 @@ class Backgrounds:
 
 
 def propose_backgrounds(
-    source: Any,
-    output: Path | str,
-    *,
-    how: How | Mapping[str, How] = "auto",
-    replace_all: bool = False,
-    progress: Progress = quiet,
-    **options: Any,
+    source: Any, output: Path | str, *, progress: Progress = quiet, **options: Any
 ) -> Backgrounds:
     """Write ``output/manifest.parquet`` with a background for each sample that has none.
 
     Args:
         source: a manifest, or whatever :func:`palpate.load` reads, with its images as files.
         output: folder to write to, without a manifest; the images stay where they are.
-        how: the reference of a video: ``auto`` (the frame most like the others), its ``first``
-            frame, or the number of a frame; by name of the video for some, others are ``auto``.
-        replace_all: replace the backgrounds that are there, too.
         progress: progress callback.
         options: of :func:`palpate.load`.
 
     Raises:
-        PalpateError: if the source cannot be read, has no tactile images, or the output holds a
-            manifest; on a video that is not there, or that lacks the frame.
+        PalpateError: if the source cannot be read, has no tactile images without a background, or
+            the output holds a manifest.
     """
     path = Path(output) / "manifest.parquet"
     if path.exists():
@@ -132,26 +120,22 @@ def propose_backgrounds(
     manifest = load(source, progress=progress, **options)
     table = manifest.table
     given: list[str | None] = table["background"].to_list()
-    given = [None] * len(given) if replace_all else given
     if not table["tactile"].count() or None not in given:
         got = "a background for every sample" if table["tactile"].count() else "no tactile images"
-        must, fix = "must have tactile images without a background", "Replace those that are there"
-        example = {"replace_all": True}
-        raise PalpateError(must, got, fix, argument="source", example=example)
+        must = "must have tactile images without a background"
+        raise PalpateError(must, got, "Nothing is to be done", argument="source")
     chosen, before, methods, problems = list(given), 0, dict[str, str](), list[Problem]()
     groups = _videos(table, given)
-    how_of = _references(how, groups)
     for done, (name, rows) in enumerate(groups.items()):
         progress("finding backgrounds", done, len(groups), name)
         video = _Video.read(manifest, rows, problems)
-        methods[name], backgrounds = video.backgrounds(how_of[name], name, problems)
+        methods[name], backgrounds = video.backgrounds(name, problems)
         for k, place, before_contact in backgrounds:
             if given[k] is None:
                 chosen[k] = os.path.relpath(place, manifest.root).replace(os.sep, "/")
                 before += before_contact
     progress("finding backgrounds", len(groups), len(groups))
-    ways = ", ".join(dict.fromkeys(map(str, how_of.values())))
-    facts = {**manifest.facts, "backgrounds": f"proposed: {ways}"}
+    facts = {**manifest.facts, "backgrounds": "proposed"}
     column = pl.Series("background", chosen, dtype=pl.String)
     proposed = Manifest(table.with_columns(column), manifest.root, facts)
     kept, without = len(given) - given.count(None), chosen.count(None)
@@ -172,7 +156,6 @@ class _Video:
     #: (n,) rows of the table that show each frame; none for further images of the folder.
     rows_of: list[list[int]]
     contact_of: list[str | None]  # (n,) the manifest's contact of each frame, if it is a sample
-    numbers: list[int | None]  # (n,) frames, where they are known
 
     @classmethod
     def read(
@@ -203,36 +186,27 @@ class _Video:
             images[good],
             [[row["row"] for row in some] for some in shown],
             [some[0]["contact"] if some else None for some in shown],
-            [samples[path][0]["frame"] if path in samples else int(path.stem) for path in kept],
         )
 
     def backgrounds(
-        self, how: How, name: str, problems: list[Problem]
+        self, name: str, problems: list[Problem]
     ) -> tuple[str, list[tuple[int, Path, bool]]]:
         """How they were found, and (row, its background, whether it is the gel before it)."""
         known = self._known()
         touched = {k for first, last in known for k in range(first, last + 1)}
         free = np.array([k for k in range(len(self.paths)) if k not in touched], np.int64)
-        named = isinstance(how, int)
-        if named and how not in self.numbers:
-            must = f"must be the number of a frame of the video {name!r}"
-            fix = "Name a frame for each video"
-            raise PalpateError(must, str(how), fix, argument="how", example={"how": f"{name}=0"})
-        if not len(free) and not named:
+        if not len(free):
             text = "all its images are in contact" if self.paths else "no image can be read"
             problems.append(Problem(name, "no-background", text))
             return "none", []
-        reference = self.numbers.index(how) if named else 0
-        if how == "auto":
-            reference = int(free[find_reference(self.thumbnails[free])])
-        way = f"frame {how}" if named else how
+        reference = int(free[find_reference(self.thumbnails[free])])
         if known:
             energy = contact_energy(self.thumbnails, self.thumbnails[reference])
-            runs, method = known, f"contacts of the manifest, reference {way}"
+            runs, method = known, "contacts of the manifest"
         else:
             contacts = find_contacts(self.thumbnails, reference)
             energy, runs = contacts.energy, contacts.runs
-            method = f"contacts of the images, reference {way}"
+            method = "contacts of the images"
         chosen, before = np.full(len(self.paths), reference), np.zeros(len(self.paths), bool)
         after = -1
         for first, last in runs:
@@ -258,21 +232,6 @@ class _Video:
             if contact is not None:
                 ends[contact] = (ends.get(contact, (k, k))[0], k)
         return sorted(ends.values())
-
-
-def _references(how: How | Mapping[str, How], videos: Collection[str]) -> dict[str, How]:
-    """The reference of each video."""
-    given: Mapping[str, How]
-    given = how if isinstance(how, Mapping) else dict.fromkeys(videos, how)
-    for name, value in given.items():
-        if name not in videos:
-            must, fix = "must be of a video without backgrounds", f"E.g. {next(iter(videos))}"
-            raise PalpateError(must, repr(name), fix, argument="how")
-        if not isinstance(value, int):
-            require_choice("how", value, ("auto", "first", "a frame"))
-    references: dict[str, How] = dict.fromkeys(videos, "auto")
-    references.update(given)
-    return references
 
 
 def _videos(table: pl.DataFrame, given: Sequence[str | None]) -> dict[str, list[dict[str, Any]]]:

@@ -161,10 +161,9 @@ def words_of(table: pl.DataFrame) -> str:
 def readable(facts: Facts) -> dict[str, Any]:
     """Facts of a data set as rows of a printed table."""
     rows = asdict(facts)
-    size, normalization = rows.pop("image_size"), rows.pop("normalization")
+    size = rows.pop("image_size")
     rows["published"] = rows.pop("samples")
-    rows["image_size"] = f"{size[0]} x {size[1]}" if size else None
-    return rows | {f"mean, std of {k}": f"{m}, {std}" for k, (m, std) in normalization.items()}
+    return rows | {"image_size": f"{size[0]} x {size[1]}" if size else None}
 
 
 def splits_of(folder: Path) -> dict[str, Split]:

@@ -57,9 +57,7 @@ SCHEMA: dict[str, type[pl.DataType]] = {
 }
 #: Modality -> its image column.
 MODALITIES = {"vision": "vision", "tactile": "tactile"}
-FORMAT = "palpate-manifest/3"
-#: In format 2 the column ``contact`` was called ``touch``; it is read and upgraded.
-FORMAT_2 = "palpate-manifest/2"
+FORMAT = "palpate-manifest/1"
 #: Prefix of the keys of facts in the metadata.
 FACT = "palpate.fact."
 #: Digits of a frame number, which has 64 bits; a longer one is none.
@@ -290,12 +288,10 @@ class Manifest:
             got = str(error).splitlines()[0]
             raise PalpateError(f"The manifest {path} must be a Parquet file", got, fix) from None
         written = meta.get("palpate.format")
-        if written == FORMAT_2:
-            table = table.rename({"touch": "contact"}, strict=False)
         columns = list(table.schema.items())
         further = table.schema.dtypes()[len(SCHEMA) :]
         known = columns[: len(SCHEMA)] == list(SCHEMA.items()) and {pl.String}.issuperset(further)
-        if written not in (FORMAT, FORMAT_2) or not known:
+        if written != FORMAT or not known:
             got = written or "a Parquet file of another program"
             raise PalpateError(f"The manifest {path} must have the format {FORMAT}", got, fix)
         for name in IMAGE_COLUMNS:

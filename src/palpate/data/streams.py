@@ -13,8 +13,6 @@ All checks see thumbnails (:mod:`palpate.data.contacts`), so a difference is in 
   reported where its correlation is at least 0.6, and 0.25 above that of every shift more than 5
   frames away, 0 included. Where photos do not show the press (the camera looks elsewhere, or is
   shaken by hand), no shift is distinct and nothing is reported.
-* ``changed-gel``: the untouched gel found in the first third and in the last differ by at least 4
-  gray levels, and by 0.7 times the strongest contact of either third.
 """
 
 from __future__ import annotations
@@ -25,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from palpate.data.contacts import Pixels, contact_energy, find_contacts
+from palpate.data.contacts import Pixels
 
 #: (kind, text) of what looks wrong.
 Finding = tuple[str, str]
@@ -33,8 +31,7 @@ FROZEN, STILL = 15, 0.05
 LEAP, VARIABLE = 1.5, 0.25
 SHORTER, FEWEST = 0.02, 3
 LONGEST_LAG, LEAST_LAG, CORRELATION, MARGIN, NEAR = 60, 3, 0.6, 0.25, 5
-GEL, OF_CONTACT = 4.0, 0.7
-#: Shorter recordings are not correlated, and their thirds hold too little.
+#: Shorter recordings are not correlated.
 LEAST_FRAMES = 60
 
 
@@ -52,7 +49,7 @@ def findings(
     problems += [p for name, times in seconds.items() for p in _dropped(name, times)]
     if len(changes) == 2:
         problems += _unequal(thumbnails, seconds) or lag_of(changes["tactile"], changes["vision"])
-    return problems + (_changed_gel(thumbnails["tactile"]) if "tactile" in thumbnails else [])
+    return problems
 
 
 def changes_of(images: Pixels) -> NDArray[np.float64]:
@@ -131,17 +128,3 @@ def _correlation(x: NDArray[np.float64], y: NDArray[np.float64], lag: int) -> fl
     a, b = x[max(0, lag) : len(x) + min(0, lag)], y[max(0, -lag) : len(y) - max(0, lag)]
     a, b = a - a.mean(), b - b.mean()
     return float(a @ b / np.sqrt((a @ a) * (b @ b) + 1e-9))
-
-
-def _changed_gel(tactile: Pixels) -> list[Finding]:
-    if len(tactile) < LEAST_FRAMES:
-        return []
-    third = len(tactile) // 3
-    ends = [find_contacts(tactile[:third]), find_contacts(tactile[-third:])]
-    first, last = ends[0].reference, len(tactile) - third + ends[1].reference
-    change = float(contact_energy(tactile[[last]], tactile[first])[0])
-    strongest = max(float(np.quantile(end.energy, 0.98)) for end in ends)
-    if change < max(GEL, OF_CONTACT * strongest):
-        return []
-    text = f"the untouched gel of frame {first} and that of frame {last} differ by {change:.1f} "
-    return [("changed-gel", f"{text}gray levels, the strongest contact by {strongest:.1f}")]

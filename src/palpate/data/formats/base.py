@@ -28,7 +28,6 @@ Cells = dict[str, Any]
 Row = tuple[str, Cells]
 #: Kinds of problems of files that are not there; every other kind means that a file or row is bad.
 MISSING = ("missing-", "unpaired")
-MeanStd = tuple[tuple[float, float, float], tuple[float, float, float]]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -46,8 +45,6 @@ class Facts:
     group: str  # what a split must keep whole, in words
     #: The manifest column of that group; the default of audits and splits.
     group_column: str = "video"
-    #: Crop that it is valid for -> (mean, std) of RGB in [0, 1].
-    normalization: Mapping[str, MeanStd] = field(default_factory=dict)
 
     def of_manifest(self) -> dict[str, str]:
         """The facts that a manifest keeps."""

@@ -60,7 +60,6 @@ FACTS = Facts(
     samples="39,154 in contact by contact.json, of which a user loaded 38,605 for training; "
     "356 in the test lists",
     group="trajectory folder; stricter: folders that follow each other in time (session)",
-    normalization=tvl.NORMALIZATION,
 )
 LOOKS_FOR = (
     "hct/, or dataN/ folders, with trajectories such as 4-1702596295.70/vision/ and .../tactile/"

@@ -10,18 +10,12 @@ Columns become manifest columns by their names or by map expressions (:mod:`palp
 in an expression an image is its file name, a class label its name. Images are written to
 ``out/images`` byte for byte as they were stored, equal ones once. A column of texts may name images
 too, as paths inside the source. The parts train, validation and test become the split ``Orig``.
-
-An export of palpate (``palpate export``) comes back whole: the same rows in the same order, the
-same paths, bytes, facts and digest. It holds, next to the images ``vision``, ``tactile`` and
-``background``, their paths as ``vision_path`` ..., the places of the rows as ``palpate_row``, and
-in the description JSON with the facts.
 """
 
 from __future__ import annotations
 
 import hashlib
 import io
-import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -32,11 +26,12 @@ from PIL import Image
 
 from palpate.core import PalpateError, Progress, atomic_path, inside, quiet
 from palpate.data.formats.base import Cells, Facts, Format, Into, Scan
-from palpate.data.formats.huggingface_source import ROW, Source, first_line, open_source
+from palpate.data.formats.huggingface_source import Source, first_line, open_source
 from palpate.data.images import BROKEN, Check, form_of
-from palpate.data.manifest import CLIMBS, IMAGE_COLUMNS, SCHEMA
+from palpate.data.manifest import IMAGE_COLUMNS, SCHEMA
 from palpate.data.mapping import ColumnMaps, compile_maps, text_of
 from palpate.data.rows import PART_NAMES, manifest_rows, odd_groups, read_classes
+from palpate.data.tables import LINE
 
 LOOKS_FOR = (
     "a folder written by save_to_disk of the library datasets, or of Parquet shards; for a name on "
@@ -104,10 +99,9 @@ class _Store:
     how: Check
     checked: dict[bytes, tuple[str, str | None]] = field(default_factory=dict)
     paths: dict[bytes, str] = field(default_factory=dict)
-    taken: dict[str, bytes] = field(default_factory=dict)
 
-    def put(self, data: bytes, path: str | None, default: str) -> str | tuple[str, str]:
-        """Put an image at ``path``, else where its bytes are already, else at ``default`` + suffix.
+    def put(self, data: bytes, default: str) -> str | tuple[str, str]:
+        """Put an image where its bytes are already, else at ``default`` + suffix.
 
         Returns:
             Its path below the folder, or what is wrong as (kind, text).
@@ -119,12 +113,9 @@ class _Store:
         if reason:
             return "bad-image", reason
         suffix = SUFFIXES.get(kind, f".{kind.lower()}")
-        path = path or self.paths.setdefault(digest, default + suffix)
-        if (before := self.taken.setdefault(path, digest)) != digest:
-            return "duplicate-path", f"another image of the data set has the path {path!r}"
-        if self.folder is not None and before is digest:
-            self._write(self.folder / path, data)
-        return path
+        if digest not in self.paths and self.folder is not None:
+            self._write(self.folder / f"{default}{suffix}", data)
+        return self.paths.setdefault(digest, default + suffix)
 
     def _write(self, path: Path, data: bytes) -> None:
         if not path.is_file():
@@ -154,36 +145,27 @@ def _scan(
     progress: Progress,
 ) -> Scan:
     """Read all rows; ``store`` takes their images."""
-    own = {*SCHEMA, ROW, *(f"{name}_path" for name in IMAGE_COLUMNS)}
-    more = tuple(name for name in source.names if source.description and name not in own)
-    maps = compile_maps(columns, source.names, [*SCHEMA, *more])
+    maps = compile_maps(columns, source.names, list(SCHEMA))
     if not {"vision", "tactile"} & set(maps.expressions):
         got = f"no vision and no tactile among {', '.join(source.names) or 'no columns'}"
         must, example = f"{source.name} must have a column for the images", {"vision": "COLUMN"}
         raise PalpateError(must, got, "Map your columns", example={"columns": example})
     names = dict(enumerate(source.labels.get(maps.source("material") or "", ()))) or None
     names = names if classes is None else read_classes(Path(classes))
-    result = Scan(store.folder or source.folder or Path(), dict(source.facts), more=more)
-    places: list[int] = []
+    result = Scan(store.folder or source.folder or Path(), dict(source.facts))
     total = sum(len(data) for data in source.splits.values() if hasattr(data, "__len__"))
     for split, first, batch in _batches(source):
         count = len(next(iter(batch.values())))
         reader = _BatchReader(source, maps, split, first, batch, result, store)
         for k, row in reader.rows(count, names):
-            places += [int(batch[ROW][k])] if ROW in batch else []
             row["split"] = PART_NAMES.get(split)
             result.rows.append((reader.where(k), row))
         progress("reading rows", first + count, total)
-    if places:  # an export of palpate: the order of its manifest
-        order = sorted(range(len(places)), key=places.__getitem__)
-        result.rows = [result.rows[k] for k in order]
     parts = sorted(split for split in source.splits if split in PART_NAMES)
     if len(parts) > 1:
-        rule = source.description.get("rule") or {"method": "official", "parts": parts}
-        result.split_name, result.split_rule = "Orig", dict(rule)
+        result.split_name, result.split_rule = "Orig", {"method": "official", "parts": parts}
     worded = any("text" in row for _, row in result.rows)
-    text_source = f"column {columns.get('text', 'text')}" if worded else "none"
-    result.facts.setdefault("text_source", text_source)
+    result.facts["text_source"] = f"column {columns.get('text', 'text')}" if worded else "none"
     result.suspicious = odd_groups(Path(source.name), result.rows)
     return result
 
@@ -222,7 +204,7 @@ class _BatchReader:
         stored = {t: c for t, c in sources.items() if c and c in self.source.images}
         plain = self.maps.without(list(stored))
         texts = {n: pl.Series(self._texts(n), dtype=pl.String) for n in plain.columns}
-        cells = plain.apply(pl.DataFrame({ROW: range(count)}).with_columns(**texts))
+        cells = plain.apply(pl.DataFrame({LINE: range(count)}).with_columns(**texts))
         problems = self.result.problems
         usable, inconclusive = manifest_rows(cells, count, self.where, classes, problems)
         self.result.inconclusive += inconclusive
@@ -272,11 +254,8 @@ class _BatchReader:
         data = _bytes(self.source, cell)
         if not isinstance(data, bytes):
             return data
-        is_export = self.source.description and f"{target}_path" in self.batch
-        path = self.batch[f"{target}_path"][k] if is_export else None
-        safe = path if path and not re.search(CLIMBS, path) else None
         default = self._place(k, target) if self.split else f"all/{self._place(k, target)}"
-        return self.store.put(data, safe, default)
+        return self.store.put(data, default)
 
 
 def _bytes(source: Source, value: Any) -> bytes | tuple[str, str] | None:

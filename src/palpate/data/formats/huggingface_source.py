@@ -15,10 +15,6 @@ from palpate.core import MissingExtraError, PalpateError
 
 #: Kinds of local folders and of hub data sets that are opened; none of them runs code of others.
 LOCAL, REMOTE = ("parquet", "arrow", "imagefolder"), ("parquet",)
-#: Marks the description of what palpate exported.
-MARK = "palpate-export/1"
-#: Column with the places of exported rows in their manifest.
-ROW = "palpate_row"
 
 
 @dataclass(frozen=True)
@@ -30,7 +26,6 @@ class Source:
     images: Sequence[str]  # columns of images
     labels: Mapping[str, Sequence[str]]  # columns of class labels -> the names of their classes
     names: Sequence[str]  # all columns
-    description: Mapping[str, Any]  # of an export of palpate, or empty
     facts: Mapping[str, str]  # for the manifest
     folder: Path | None  # where paths of images may point to, or None
 
@@ -60,13 +55,12 @@ def open_source(source: Path, config: str | None = None, revision: str | None = 
         splits[split] = data.with_format(None)
     labels = {n: list(f.names) for n, f in features.items() if isinstance(f, datasets.ClassLabel)}
     info = next(iter(splits.values())).info
-    description = _description(info.description)
     facts = {"dataset": name, "license": info.license, "citation": info.citation}
     facts |= {"url": info.homepage}
     facts = {key: str(value).strip() or "unknown" for key, value in facts.items()}
-    facts |= {"format": "hf", **description.get("facts", {})}
+    facts["format"] = "hf"
     folder = source if local else None
-    return Source(name, splits, images, labels, list(features), description, facts, folder)
+    return Source(name, splits, images, labels, list(features), facts, folder)
 
 
 def first_line(error: BaseException) -> str:
@@ -142,13 +136,3 @@ def _streamed(place: str, config: str | None, revision: str | None, local: bool)
         example = None if local else {"revision": "refs/convert/parquet"}
         raise PalpateError(must, str(builder.name), fix, example=example)
     return builder.as_streaming_dataset()
-
-
-def _description(text: str | None) -> dict[str, Any]:
-    """The description of an export of palpate; empty for any other."""
-    try:
-        data = json.loads(text or "")
-    except ValueError:
-        return {}
-    ours = isinstance(data, dict) and data.get("format") == MARK
-    return data if ours and isinstance(data.get("facts"), dict) else {}

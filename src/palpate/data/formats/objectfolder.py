@@ -37,9 +37,6 @@ FACTS = Facts(
     samples="1,417,600 touch frames of 100 objects (counted by T3)",
     group="object",
     group_column="object",
-    normalization={
-        "touch, 50 images (T3)": ((0.46676, 0.45028, 0.45292), (0.08171, 0.06973, 0.08618))
-    },
 )
 LOOKS_FOR = "<object>/tactile_data/<trial>/0/gelsight/"
 METADATA = "objectfolder_real_metadata.csv"

@@ -42,7 +42,6 @@ FACTS = Facts(
     image_size=tvl.IMAGE_SIZE,
     samples="4,587 by TVL's paper; 46 in the test list",
     group="none is given: clusters of near-duplicates",
-    normalization=tvl.NORMALIZATION,
 )
 LOOKS_FOR = "ssvtp/, or images_rgb/ with image_<id>_rgb.jpg and images_tac/ with image_<id>_tac.jpg"
 COLUMNS = ("url", "tactile", "caption")

@@ -50,9 +50,6 @@ FACTS = Facts(
     image_size=(640, 480),
     samples="121,861 frames of 126 videos in the official lists; label.txt has about twice as many",
     group="video",
-    normalization={
-        "touch, 50 images (T3)": ((0.51808, 0.50300, 0.51457), (0.13893, 0.11343, 0.13497))
-    },
 )
 LOOKS_FOR = (
     "label.txt (or train.txt, test.txt), and videos under dataset/, final_dataset/ or the folder "

@@ -22,17 +22,6 @@ CITATION = (
 )
 URL = "https://huggingface.co/datasets/mlfu7/Touch-Vision-Language-Dataset"
 IMAGE_SIZE = (240, 320)
-NORMALIZATION = {
-    "touch, zero-padded to a square and turned by 90 degrees (TVL)": (
-        (0.29175, 0.29713, 0.29104),
-        (0.18764, 0.19468, 0.21872),
-    ),
-    "touch minus background, signed and without offset (TVL)": (
-        (-0.00809, -0.01887, -0.01843),
-        (0.04535, 0.04403, 0.05333),
-    ),
-    "touch, not padded, 50 images (T3)": ((0.42094, 0.44041, 0.44151), (0.14661, 0.08972, 0.09041)),
-}
 COLUMNS = ("url", "tactile", "tactile_background", "caption")
 
 

@@ -57,12 +57,6 @@ FACTS = Facts(
     sensor="GelSight",
     samples="3,170,795 touch frames, 726,740 of them in contact (counted by T3)",
     group="video (= recording); the column domain says whether its objects are seen or unseen",
-    normalization={
-        "touch in contact, 50 images (T3)": (
-            (0.36917, 0.51738, 0.51782),
-            (0.13530, 0.11039, 0.10001),
-        )
-    },
 )
 LOOKS_FOR = (
     "data_lst/{train,eval}_{vision2touch,touch2vision}.txt, or recordings "
