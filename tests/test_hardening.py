@@ -64,7 +64,7 @@ def typed_manifest(path: Path) -> None:
                 ("p.parquet", "validate p.parquet"),
                 ("p.parquet", "background p.parquet -o o"),
                 ("p.json", "report p.json -o page.html"),
-                ("p.npy", "score p.npy --reference p.npy"),
+                ("p.npy", "score --generated p.npy --reference p.npy"),
             )
         ),
         ("p.jpg", os.mkfifo, "generate p.jpg -o t.png", "an image that can be read"),

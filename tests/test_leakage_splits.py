@@ -486,7 +486,7 @@ def test_the_published_split_by_command(capsys, tmp_path, real_data):
         (["LISTS", "-o", "x", "--near", "tactile"], "need tactile images"),
         (["LISTS", "nowhere", "-o", "x"], "no file nowhere"),
         (["--noleak", "touch-and-go", "-o", "x", "--train", "0.9"], "train 0.8 and val 0.0"),
-        (["--noleak", "visgel", "-o", "x"], "--noleak touch-and-go"),
+        (["--noleak", "visgel", "-o", "x"], "--noleak must be one of"),
         (["LISTS", "--noleak", "touch-and-go", "-o", "x"], "8 of 8 that are not"),
         (["--noleak", "hct", "-o", "x"], "no path"),
         (["LISTS", "--noleak", "touch-and-go", "-o", "x", "--by", "video"], "has its rule"),
