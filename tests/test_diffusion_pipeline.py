@@ -189,13 +189,13 @@ def test_a_changed_folder_is_rejected(tmp_path):
     cases = [
         (about | {"condition": about["condition"] | {"dropout": 0.2}}, "must match its palpate"),
         (about | {"latents": about["latents"] | {"std": [1, 1, 1]}}, "must match its palpate"),
-        ({"format": "other"}, "must have the format palpate-pipeline/2"),
+        ({"format": "other"}, "must have the format palpate-pipeline/1"),
         ({k: v for k, v in about.items() if k != "sampler"}, "no sampler"),
         (about | {"sampler": {"methods": "ddim"}}, "must be as palpate writes them"),
         (about | {"size": None}, "must be as palpate writes them"),
         (about | {"size": 30}, "must be one for the autoencoder"),
         (about | {"condition": about["condition"] | {"taus": 1}}, "unexpected .* 'taus'"),
-        (about | {"format": "palpate-pipeline/3"}, "must have the format palpate-pipeline/2"),
+        (about | {"format": "palpate-pipeline/3"}, "must have the format palpate-pipeline/1"),
         ([], "must be a JSON object"),
     ]
     for content, message in cases:

@@ -88,9 +88,7 @@ from palpate.encoders.models import (
 from palpate.encoders.preprocess import Preprocess, to_unit
 from palpate.training.cards import write_model_cards
 
-FORMAT = "palpate-pipeline/2"
-#: Format 1 called the encoders ``towers``; it is still read, and the digest still covers its name.
-FORMAT_1 = "palpate-pipeline/1"
+FORMAT = "palpate-pipeline/1"
 KEYS = ("digest", "preset", "size", "condition", "schedule", "sampler", "latents", "autoencoder")
 COPY_AGAIN = "Copy the whole folder again"
 SYNTHETIC = (
@@ -311,7 +309,7 @@ class TactilePipeline(DiffusionPipeline):
         """SHA-256 of all that the images depend on, except seed, sampler, type and input."""
         weights = self.denoiser.state_dict()
         parts: list[Any] = [
-            FORMAT_1,
+            FORMAT,
             asdict(self.stats),
             facts(self.schedule),
             facts(self.denoiser.policy),
@@ -671,9 +669,9 @@ class TactilePipeline(DiffusionPipeline):
                 says, or the hub is out of reach.
         """
         folder = find_model(source, "generator", "pipeline", FIX_MODEL)
-        note, forms = folder / "palpate.json", (FORMAT, FORMAT_1)
-        about = read_record(note, "card of the pipeline", form=forms, keys=KEYS)
-        vision = about.get("encoders", about.get("towers"))  # format 1
+        note = folder / "palpate.json"
+        about = read_record(note, "card of the pipeline", form=FORMAT, keys=KEYS)
+        vision = about.get("encoders")
         if "shared" in about:
             autoencoder, encoders = _shared_parts(str(about["shared"]))
             if _digests(autoencoder, encoders) != (about["autoencoder"], vision):
@@ -682,8 +680,7 @@ class TactilePipeline(DiffusionPipeline):
                 raise PalpateError(must, "those of another version of palpate", fix)
         else:
             autoencoder = load_autoencoder(folder / "autoencoder")
-            place = folder / ("encoders" if about["format"] == FORMAT else "towers")
-            encoders = EncoderSet.load(place) if vision else None
+            encoders = EncoderSet.load(folder / "encoders") if vision else None
         gel = folder / "gel.png"
         try:
             latents = about["latents"]

@@ -10,7 +10,7 @@ crop to ``size``, then ``(x / 255 - mean) / std`` per channel, as in CLIP's
 
 A saved set is a folder::
 
-    palpate.json   {"format": "palpate-encoders/2", "digests": {modality: sha256}, "card": {...}}
+    palpate.json   {"format": "palpate-encoders/1", "digests": {modality: sha256}, "card": {...}}
     clip/          CLIPModel, its tokenizer and preprocessor_config.json
     tactile/       CLIPVisionModelWithProjection and preprocessor_config.json
     */seen.safetensors   digests of the images that an encoder was trained on, if they are known
@@ -26,7 +26,7 @@ import json
 import math
 from collections.abc import Generator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal, get_args
 
@@ -89,9 +89,7 @@ from palpate.training.cards import write_model_cards
 
 Modality = Literal["vision", "text", "tactile"]
 MODALITIES: tuple[Modality, ...] = get_args(Modality)
-FORMAT, CLIP_FORMAT = "palpate-encoders/2", "palpate-clip/1"
-#: Format 1 called the tactile encoder ``touch`` and a set of encoders ``towers``; it is still read.
-FORMAT_1 = "palpate-towers/1"
+FORMAT, CLIP_FORMAT = "palpate-encoders/1", "palpate-clip/1"
 #: Kinds of transformers' models that see, and whether they read, too.
 FAMILIES = {
     "clip": True,
@@ -201,21 +199,18 @@ class ClipEncoders:
 
     def digest(self, modality: str) -> str:
         """SHA-256 of the vision or the text encoder."""
-        config, model = _config(self.model), self.model
+        config, model, facts = _config(self.model), self.model, {"family": self.family}
         if modality == "vision":
-            facts: dict[str, Any] = {"preprocess": self.preprocess.facts}
+            facts |= {"preprocess": asdict(self.preprocess)}
             facts |= architecture(getattr(config, "vision_config", config))
-            parts = {"tower": getattr(model, "vision_model", model)}
-            if self.family == "clip":
-                parts |= {"projection": model.visual_projection}
-            else:
-                facts |= {"family": self.family}
-            return digest_modules(parts, facts)
-        facts = {"tokenizer": _tokenizer_digest(self.tokenizer)}
-        facts |= architecture(config.text_config)
-        parts = {"tower": model.text_model}
+            parts = {"encoder": getattr(model, "vision_model", model)}
+        else:
+            facts |= {"tokenizer": _tokenizer_digest(self.tokenizer)}
+            facts |= architecture(config.text_config)
+            parts = {"encoder": model.text_model}
         if self.family == "clip":
-            parts |= {"projection": model.text_projection}
+            vision = modality == "vision"
+            parts["projection"] = model.visual_projection if vision else model.text_projection
         return digest_modules(parts, facts)
 
     def save(self, folder: Path, *, half: bool = False) -> None:
@@ -265,7 +260,7 @@ def load_clip(source: str | Path, *, device: str = "cpu") -> ClipEncoders:
     name, folder = find_single(source, "clip", "CLIP", CLIP_FIX)
     local, must = name == str(folder), f"{source} must be a CLIP model"
     note = folder / "palpate.json"
-    if note.is_file() and read_record(note, "card of the CLIP").get("format") in (FORMAT, FORMAT_1):
+    if note.is_file() and read_record(note, "card of the CLIP").get("format") == FORMAT:
         return EncoderSet.load(source, device=device).clip
     config = folder / "config.json"
     family = read_record(config, "model").get("model_type") if config.is_file() else "clip"
@@ -417,9 +412,9 @@ class EncoderSet:
         if modality in ("vision", "text"):
             return self._clip(modality).digest(modality)
         tactile, preprocess = self._tactile(modality)
-        facts = {"preprocess": preprocess.facts, **architecture(getattr(tactile, "config", {}))}
-        facts |= {"sensor": self.sensor} if self.sensor else {}
-        return digest_modules({"touch": tactile}, facts)
+        facts = {"preprocess": asdict(preprocess), "sensor": self.sensor}
+        facts |= architecture(getattr(tactile, "config", {}))
+        return digest_modules({"encoder": tactile}, facts)
 
     def seen_by(self, modality: str) -> Digests | None:
         """Digests of the images that one encoder was trained on; None: unknown, or of texts."""
@@ -531,12 +526,12 @@ class EncoderSet:
         note = folder / "palpate.json"
         if not note.is_file() or read_record(note, "card").get("format") == CLIP_FORMAT:
             return cls(load_clip(source, device=device))
-        about = _read_card(folder, (FORMAT, FORMAT_1))
+        about = _read_card(folder, FORMAT)
         # A shipped CLIP keeps its name, so that cards of what is trained with it say so.
         clip = load_clip(source if is_shipped(source) else folder / "clip")
         encoders = cls(clip, card=about["card"])
         if "tactile" in about["digests"]:
-            place = folder / ("tactile" if about["format"] == FORMAT else "touch")
+            place = folder / "tactile"
             must = f"The tactile encoder {place} must hold config.json and model.safetensors"
             options = {"local_files_only": True, "use_safetensors": True}
             kind = CLIPVisionModelWithProjection
@@ -648,7 +643,7 @@ def _counts(seen: Mapping[str, Digests | None]) -> dict[str, Any]:
     return {"seen": counts} if counts else {}
 
 
-def _read_card(folder: Path, form: str | tuple[str, ...]) -> dict[str, Any]:
+def _read_card(folder: Path, form: str) -> dict[str, Any]:
     about = read_record(
         folder / "palpate.json", "card of the encoders", form=form, keys=("digests", "card")
     )
@@ -657,9 +652,6 @@ def _read_card(folder: Path, form: str | tuple[str, ...]) -> dict[str, Any]:
     if not all(isinstance(part, dict) for part in parts) or {*kinds} - {int}:
         must = f"digests, card and seen in {folder / 'palpate.json'} must be as palpate writes them"
         raise PalpateError(must, "other values", "Fetch the encoder again")
-    if about["format"] == FORMAT_1:
-        names = {"touch": "tactile"}
-        about["digests"] = {names.get(k, k): v for k, v in about["digests"].items()}
     return about
 
 

@@ -366,17 +366,11 @@ def architecture(config: Any) -> dict[str, Any]:
 
 
 def digest_tensors(tensors: Mapping[str, Tensor], facts: Mapping[str, Any] | None = None) -> str:
-    """SHA-256 over facts (JSON) and names, types, shapes and values; the same on every device.
-
-    With facts the types are NumPy's names (``float32``), without them torch's (``torch.float32``):
-    digests of encoders and of diffusion models differ in that, and models that are in use carry
-    them.
-    """
-    state = hashlib.sha256(b"" if facts is None else canonical_json(dict(facts)).encode())
+    """SHA-256 over facts (JSON) and names, types, shapes and values; the same on every device."""
+    state = hashlib.sha256(canonical_json(dict(facts or {})).encode())
     for name in sorted(tensors):
         value = tensors[name].detach().cpu().contiguous()
-        kind = str(value.dtype) if facts is None else str(value.dtype).removeprefix("torch.")
-        state.update(f"{name} {kind} {tuple(value.shape)}\n".encode())
+        state.update(f"{name} {value.dtype} {tuple(value.shape)}\n".encode())
         state.update(value.numpy().tobytes())
     return state.hexdigest()
 

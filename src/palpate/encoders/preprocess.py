@@ -17,7 +17,7 @@ import hashlib
 import math
 import os
 from collections.abc import Mapping, Sequence
-from dataclasses import KW_ONLY, asdict, dataclass
+from dataclasses import KW_ONLY, asdict, dataclass, replace
 from functools import lru_cache
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
@@ -50,7 +50,7 @@ from palpate.data.images import (
 from palpate.data.manifest import Manifest
 
 SAVE_AGAIN = "Save the encoders again"
-#: What an image processor may have of these; the first is the default.
+#: What an image processor may have of these.
 CHOICES = {
     "fitting": ("crop", "pad", "squash"),
     "turn": ("none", "left", "portrait"),
@@ -131,18 +131,17 @@ class Preprocess:
             (r, g, b), (sr, sg, sb) = map(float, mean), map(float, std)
             whole = isinstance(config.get("size"), Mapping) and "height" in config["size"]
             whole = whole or patches is not None
-            more: dict[str, Any] = {"fitting": "squash"} if whole else {}
-            more |= {"resample": config["resample"]} if config.get("resample") is not None else {}
-            more |= config.get("palpate") or {}
-            chosen: dict[str, Any] = {name: more.pop(name, of[0]) for name, of in CHOICES.items()}
-            bad = [
-                f"{name} {v!r}" for name, v in chosen.items() if v not in CHOICES.get(name, (v,))
-            ]
-            chosen["subtract"] = tuple(map(str, more.pop("subtract", ())))
+            own: dict[str, Any] = {"fitting": "squash" if whole else "crop", "turn": "none"}
+            own |= {"resample": 3 if config.get("resample") is None else config["resample"]}
+            own |= config.get("palpate") or {}
+            own["subtract"] = tuple(map(str, own.get("subtract", ())))
+            bad = [f"{name} {own[name]!r}" for name, of in CHOICES.items() if own[name] not in of]
+            bad += own.keys() - {*CHOICES, "subtract"}
             bad += [f"std {v}" for v in (sr, sg, sb) if not 1e-6 < v < math.inf]
             bad += [f"mean {v}" for v in (r, g, b) if not math.isfinite(v)]
-            if bad or more:
-                raise ValueError(", ".join([*bad, *more]))
+            if bad:
+                raise ValueError(", ".join(bad))
+            made = cls(resize, resize, (r, g, b), (sr, sg, sb), **own)
         except (AttributeError, KeyError, TypeError, ValueError) as error:
             must = f"Size, crop and statistics in {path} must be those of an image processor"
             raise PalpateError(must, str(error), SAVE_AGAIN) from None
@@ -153,12 +152,11 @@ class Preprocess:
             must, got = f"{path} must give the encoder's {side} px", f"{crop} px from {resize} px"
             raise PalpateError(must, got, "Set size and crop_size to the encoder's")
         if not config.get("do_normalize", True):
-            return cls(side, resize, (0.0,) * 3, (1.0,) * 3, **chosen)
-        return cls(side, resize, (r, g, b), (sr, sg, sb), **chosen)
+            made = replace(made, mean=(0.0,) * 3, std=(1.0,) * 3)
+        return replace(made, size=side)
 
     def to_config(self) -> dict[str, Any]:
         """The same as a ``preprocessor_config.json`` for transformers' ``CLIPImageProcessor``."""
-        more = {k: v for k, v in self.facts.items() if k not in ("size", "resize", "mean", "std")}
         return {
             "image_processor_type": "CLIPImageProcessor",
             "do_convert_rgb": True,
@@ -172,20 +170,13 @@ class Preprocess:
             "do_normalize": True,
             "image_mean": list(self.mean),
             "image_std": list(self.std),
-            **({"palpate": more} if more else {}),
+            "palpate": {name: getattr(self, name) for name in ("fitting", "turn", "subtract")},
         }
-
-    @property
-    def facts(self) -> dict[str, Any]:
-        """What belongs into the encoder's digest: all that is not the center square of a CLIP."""
-        clip = asdict(Preprocess(self.size, self.resize))
-        keep = ("size", "resize", "mean", "std")
-        return {k: v for k, v in asdict(self).items() if k in keep or v != clip[k]}
 
     @property
     def plain(self) -> bool:
         """Whether the center square is all, as :func:`palpate.data.images.square` cuts it."""
-        return self.facts.keys() == {"size", "resize", "mean", "std"}
+        return replace(self, mean=CLIP_MEAN, std=CLIP_STD) == Preprocess(self.size, self.resize)
 
     @property
     def shape(self) -> tuple[int, int, int]:
@@ -326,7 +317,7 @@ def prepared_images(
 
     if cache is None:
         return fill(np.empty(shape, np.uint8))
-    geometry = {k: v for k, v in preprocess.facts.items() if k not in ("mean", "std")}
+    geometry = asdict(replace(preprocess, mean=CLIP_MEAN, std=CLIP_STD))
     key = digest_json([geometry, image_stamp(manifest, column), frames.stamps(manifest.root)])
     return mapped_images(Path(cache) / f"{column}-prepared-{short(key)}.npy", shape, fill)
 

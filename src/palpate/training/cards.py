@@ -51,7 +51,7 @@ _FORMATS = {
         ("clip",),
         'from palpate.encoders.encoder_set import load_clip\n\nclip = load_clip("{name}")',
     ),
-    "palpate-encoders/2": _Format(
+    "palpate-encoders/1": _Format(
         "Vision, text and tactile encoders",
         "transformers",
         "feature-extraction",
@@ -67,7 +67,7 @@ _FORMATS = {
         "from palpate.diffusion.autoencoder import load_autoencoder\n\n"
         'autoencoder = load_autoencoder("{name}")',
     ),
-    "palpate-pipeline/2": _Format(
+    "palpate-pipeline/1": _Format(
         "From a photo to a tactile image",
         "diffusers",
         "image-to-image",
