@@ -43,7 +43,7 @@ from palpate.diffusion.pipeline import TactilePipeline, build_scheduler, startin
 from palpate.diffusion.presets import preset_named
 from palpate.diffusion.training import DiffusionLoss
 from palpate.encoders.encoder_set import encode_tactile, new_tactile
-from palpate.encoders.losses import Labels, in_chunks, three_way
+from palpate.encoders.losses import in_chunks, three_way
 from palpate.encoders.presets import preset as encoder_preset
 from palpate.training.engine import Losses, Task, fit
 from palpate.training.options import Compute, LoopOptions
@@ -102,8 +102,8 @@ def encoder_steps(chosen, batch, chunk):
 
     def loss(module, batch):
         embedded = in_chunks(partial(encode_tactile, module), batch["pixels"], chunk)
-        labels = Labels(torch.arange(len(embedded), device=embedded.device))
-        return Losses(three_way(embedded, batch["text"], batch["vision"], 10.0, labels)[0])
+        texts = torch.arange(len(embedded), device=embedded.device)
+        return Losses(three_way(embedded, batch["text"], batch["vision"], 10.0, texts)[0])
 
     return model, loss, lambda step: {name: rows[step.rows] for name, rows in data.items()}
 

@@ -2,10 +2,8 @@
 
 ::
 
-    python benchmarks/training.py [--only encoded-once overhead processes embedding memory]
+    python benchmarks/training.py [--only overhead processes embedding memory]
 
-- ``encoded-once``: steps a second with frozen partners embedded once, over embedding them in each
-  step (preset mini; wanted: 1.4).
 - ``overhead``: seconds of a step of the engine, over a bare PyTorch loop of the same model, batch
   and optimizer (wanted: below 1.03).
 - ``processes``: images a second of two gloo processes, one thread each, over one process with one
@@ -46,7 +44,7 @@ from palpate.core import quiet, rng_for
 from palpate.encoders.contrastive import TactileLoss, TactileModel, new_clip
 from palpate.encoders.embed import embed_images
 from palpate.encoders.encoder_set import EncoderSet, Preprocess, new_tactile
-from palpate.encoders.losses import ALL_PAIRS, Labels, in_chunks, three_way
+from palpate.encoders.losses import in_chunks, three_way
 from palpate.encoders.preprocess import to_unit
 from palpate.encoders.presets import preset
 from palpate.encoders.rows import Rows, augmented, draw, numbers, unit
@@ -61,29 +59,19 @@ WORDS = ["rough", "smooth", "soft", "hard", "grained", "ribbed", "woven", "sharp
 class Images(Rows):
     """Rows of random images, texts and photos in memory."""
 
-    def __init__(self, n: int, trainable: bool = False) -> None:
+    def __init__(self, n: int) -> None:
         rng = rng_for(0, "benchmark")
         side = MINI.image
-        self.images, self.photos = (
-            rng.integers(0, 256, (n, side, side, 3), dtype=np.uint8) for _ in range(2)
-        )
+        self.images = rng.integers(0, 256, (n, side, side, 3), dtype=np.uint8)
         self.captions = [", ".join(rng.choice(WORDS, 3, replace=False)) for _ in range(n)]
-        self.phrases = sorted(set(self.captions))
-        self.texts = self.first = numbers(self.captions)
-        self.count, self.contacts = torch.ones(n, dtype=torch.long), torch.arange(n)
-        self.photo, self.without_photo, self.trainable = torch.arange(n), 0, trainable
-        self.clip = new_clip(MINI, self.phrases, 0)
-        self.text, self.vision = torch.randn(len(self.phrases), 128), torch.randn(n, 128)
+        self.texts = numbers(self.captions)
+        self.photo, self.without_photo = torch.arange(n), 0
+        self.text, self.vision = (torch.randn(n, 128) for _ in range(2))
         self.text, self.vision = (t / t.norm(dim=1, keepdim=True) for t in (self.text, self.vision))
-        if trainable:
-            self.text = self.vision = None
-        else:
-            self.photos = None
 
 
-def tactile_model(trainable=False, clip=None):
-    tactile = new_tactile(MINI.tactile_config(128), 0)
-    return TactileModel(tactile, clip.model if trainable else None)
+def tactile_model():
+    return TactileModel(new_tactile(MINI.tactile_config(128), 0))
 
 
 def clocks():
@@ -125,25 +113,6 @@ def engine_steps(rows, model, steps, loss, folder, progress=quiet):
     fit(model, task, options, Path(folder), compute=compute, progress=progress)
 
 
-def encoded_once():
-    """Frozen partners from a table, or embedded in every step."""
-    rows, live = Images(1024), Images(1024, trainable=True)
-    preprocess = Preprocess(MINI.image, MINI.image)
-
-    def steps(part, live):
-        def run():
-            model = tactile_model(live, part.clip)
-            loss = TactileLoss(part, part.clip, preprocess, "identical-text", ALL_PAIRS)
-            with tempfile.TemporaryDirectory() as folder:
-                engine_steps(part, model, 6, loss, folder)
-
-        return run
-
-    for p in live.clip.model.parameters():
-        p.requires_grad_(False)
-    return {"wanted": "at least 1.4", **in_turns(steps(live, True), steps(rows, False), 3)}
-
-
 def overhead(steps=40):
     """The engine and the shortest loop that does the same to the same model, step by step in turns.
 
@@ -153,7 +122,7 @@ def overhead(steps=40):
     rows = Images(1024)
     preprocess, course = Preprocess(MINI.image, MINI.image), MINI.tactile_course
     options = replace(course.options(1024, 0), steps=steps)
-    loss = TactileLoss(rows, rows.clip, preprocess, "identical-text", ALL_PAIRS)
+    loss = TactileLoss(rows, preprocess, "identical-text")
     model, order = tactile_model(), RowOrder(1024, options.batch, 0)
     optimizer = torch.optim.AdamW(model.parameters(), lr=options.lr, foreach=True)
 
@@ -165,10 +134,10 @@ def overhead(steps=40):
         pixels = preprocess.normalize(augmented(pixels, draw(course.augment, step)))
         embedded = model.tactile(pixel_values=pixels).image_embeds
         embedded = embedded / embedded.norm(dim=1, keepdim=True)
-        text, vision = rows.text[rows.first[index]], rows.vision[index]
+        text, vision = rows.text[index], rows.vision[index]
         how = {"targets": "identical-text"}
-        labels = Labels(rows.texts[index])
-        total, _ = three_way(embedded, text, vision, model.log_scale.exp(), labels, **how)
+        scale, texts = model.log_scale.exp(), rows.texts[index]
+        total, _ = three_way(embedded, text, vision, scale, texts, **how)
         total.backward()
         torch.nn.utils.clip_grad_norm_(model.parameters(), 1.0)
         optimizer.step()
@@ -190,13 +159,13 @@ def overhead(steps=40):
 WORKER = """
 import sys, tempfile, torch
 sys.path.insert(0, sys.argv[1])
-from training import Images, Preprocess, TactileLoss, ALL_PAIRS
+from training import Images, Preprocess, TactileLoss
 from training import clocks, engine_steps, tactile_model
 from palpate.training.processes import connect, place
 connect("cpu")
 torch.set_num_threads(1)
 rows = Images(1024)
-loss = TactileLoss(rows, rows.clip, Preprocess(64, 64), "identical-text", ALL_PAIRS)
+loss = TactileLoss(rows, Preprocess(64, 64), "identical-text")
 with tempfile.TemporaryDirectory() as folder:
     engine_steps(rows, tactile_model(), 1, loss, folder)
     print("ready", flush=True)
@@ -289,8 +258,8 @@ def contrastive_step(model, config, batch, chunk):
     def encode(x):
         return torch.nn.functional.normalize(model(pixel_values=x).image_embeds, dim=1)
 
-    labels = Labels(torch.arange(batch))
-    total, _ = three_way(in_chunks(encode, pixels, chunk), text, vision, 10.0, labels)
+    rows = in_chunks(encode, pixels, chunk)
+    total, _ = three_way(rows, text, vision, 10.0, torch.arange(batch))
     model.zero_grad()
     total.backward()
     return float(total.detach()), torch.cat(
@@ -317,13 +286,7 @@ def memory(batch=256, chunk=8):
     }
 
 
-PARTS = {
-    "encoded-once": encoded_once,
-    "overhead": overhead,
-    "processes": processes,
-    "embedding": embedding,
-    "memory": memory,
-}
+PARTS = {"overhead": overhead, "processes": processes, "embedding": embedding, "memory": memory}
 
 
 def main() -> None:

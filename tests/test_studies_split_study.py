@@ -124,7 +124,6 @@ def test_a_field_of_a_preset_is_switched_off_or_refused(capsys, monkeypatch, tmp
     course = presets[0].tactile_course
     assert (course.clip_norm, course.lr, course.patience) == (None, 0.5, None)
     for words, must in (
-        (("--clip", "palpate/mini", "--clip-lr", "1"), "--clip-lr is of the vision and text"),
         (("--warmup", "1.5"), "--warmup must lie in [0, 1]"),
         (("--augment-crop", "5"), "--augment-crop must lie in [0, 0.99]"),
     ):

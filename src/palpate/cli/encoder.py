@@ -7,12 +7,12 @@ from typing import Any, Literal
 
 from palpate.cli.presets import EncoderPresetName, Training, preset_flags, print_plan, with_flags
 from palpate.cli.terminal import Switch, Terminal, require_extra
-from palpate.core import PalpateError
 from palpate.encoders.presets import PRESETS, EncoderPreset
 
 _SKIP = ("name", "cost", "pretrained", "tactile_course.epochs", "targets")
-_IDLE = tuple(f"clip_course.{name}" for name in ("evaluations", "patience", "keep"))
-_FLAGS = ("tactile_course", _SKIP + _IDLE)
+#: Of the vision and text encoders that are trained first where none are given.
+_CLIP = ("clip_course", "vision", "text", "dim", "vocabulary", "context")
+_FLAGS = ("tactile_course", _SKIP + _CLIP)
 _Preset = preset_flags("Preset", EncoderPreset, *_FLAGS)
 
 
@@ -27,21 +27,13 @@ class Options(Training):
     """Size and course; `tvl-*` are TVL's and `paper` is the paper's, for GPUs."""
     epochs: float | None = None
     """Default: the preset's."""
-    targets: Literal["diagonal", "identical-text", "soft-text", "exclude"] | None = None
+    targets: Literal["diagonal", "identical-text", "soft-text"] | None = None
     """`diagonal` is the paper's loss; `identical-text` counts equal captions as positives;
-    `soft-text` is TVL's; with `exclude` rows of one contact or with equal captions are no negatives
-    of each other. Default: the preset's."""
-    weights: tuple[float, float, float] = (1.0, 1.0, 1.0)
-    """Of the pairs tactile-text, vision-text, tactile-vision; 0 switches one off."""
-    partners: Literal["frozen", "trainable"] = "frozen"
-    """Whether vision and text learn along."""
-    held_out: float = 0.0
-    """Share of the train videos on which loss and probe are measured in training, where the split
-    has no part val (which is taken otherwise)."""
+    `soft-text` is TVL's. Default: the preset's."""
     dry_run: Switch = False
     """Print parameters, memory, operations and time, and stop."""
     fields: _Preset = field(default_factory=_Preset)  # pyright: ignore[reportInvalidTypeForm]
-    """Fields of the preset; `--clip-...` are of the vision and text encoders trained first."""
+    """Fields of the preset."""
 
 
 def run(options: Options, terminal: Terminal) -> dict[str, Any]:
@@ -51,14 +43,10 @@ def run(options: Options, terminal: Terminal) -> dict[str, Any]:
     from palpate.encoders.contrastive import plan_encoder, train_encoder
 
     preset = with_flags(PRESETS[options.preset], options.fields, *_FLAGS)
-    given = [k for k, v in vars(options.fields).items() if v is not None and k.startswith("clip_")]
-    if options.clip and (idle := sorted(set(given) - {"clip_norm"})):
-        must, fix = "is of the vision and text encoders that are trained first", "Leave one out"
-        raise PalpateError(must, f"--clip {options.clip} as well", fix, argument=idle[0])
     data, machine = (options.data, options.split), options.machine
     if options.dry_run:
-        how: dict[str, Any] = {"held_out": options.held_out, "device": machine.device}
-        plan = plan_encoder(*data, preset=preset, epochs=options.epochs, **how)
+        how: dict[str, Any] = {"epochs": options.epochs, "device": machine.device}
+        plan = plan_encoder(*data, preset=preset, **how)
         return print_plan(terminal, f"Plan of {options.output}", plan)
     with terminal.progress() as progress:
         encoders = train_encoder(
@@ -68,9 +56,6 @@ def run(options: Options, terminal: Terminal) -> dict[str, Any]:
             output=options.output,
             epochs=options.epochs,
             targets=options.targets,
-            weights=options.weights,
-            partners=options.partners,
-            held_out=options.held_out,
             seed=options.seed,
             device=machine.device,
             compute=machine.compute,

@@ -1,7 +1,7 @@
 """Training of encoders by contrast (paper section 3; the losses are in ``losses``).
 
 Vision and text are frozen, so L_vision,text moves only the temperature; it stays in the loss and in
-the log because the paper has it there. With ``partners="trainable"`` both learn along.
+the log because the paper has it there.
 
 The tactile encoder trains on the train part of a split only, against embeddings of the frozen
 encoders that are computed once. The batch stays whole on any number of processes and however many
@@ -18,7 +18,7 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 import torch
@@ -28,7 +28,7 @@ from torch import Tensor, nn
 from transformers import CLIPModel, CLIPVisionModelWithProjection
 
 from palpate import __version__
-from palpate.core import PalpateError, Progress, Split, digest_json, digest_lines, quiet, rng_for
+from palpate.core import PalpateError, Progress, Split, digest_json, digest_lines, quiet
 from palpate.data.images import image_stamp
 from palpate.data.manifest import Manifest
 from palpate.data.reading import load
@@ -43,12 +43,11 @@ from palpate.encoders.encoder_set import (
     seeded,
 )
 from palpate.encoders.losses import (
-    ALL_PAIRS,
     LOG_SCALE_START,
-    Labels,
     clamped_scale,
     in_chunks,
-    require_weights,
+    info_nce,
+    text_targets,
     three_way,
 )
 from palpate.encoders.models import digest_tensors, move, pick_device
@@ -71,8 +70,6 @@ from palpate.training.processes import (
 )
 from palpate.training.steps import Step
 
-Partners = Literal["frozen", "trainable"]
-
 
 def train_encoder(  # noqa: PLR0913 - a public verb
     data: Manifest | str | Path,
@@ -83,15 +80,14 @@ def train_encoder(  # noqa: PLR0913 - a public verb
     output: Path | str | None = None,
     epochs: float | None = None,
     targets: Targets | None = None,
-    weights: Sequence[float] = ALL_PAIRS,
-    partners: Partners = "frozen",
-    held_out: float = 0.0,
     seed: int = 0,
     device: str = "auto",
     compute: Compute | None = None,
     progress: Progress = quiet,
 ) -> EncoderSet:
     """Train a tactile encoder on the train part of a split, against vision and text.
+
+    Loss and probe of the part ``val``, where the split has one, are measured while it trains.
 
     The accuracy of a linear material probe on the test part goes into the card
     (``card["scores"]``). Run again with the same ``output`` to resume. Under ``torchrun`` every
@@ -103,15 +99,12 @@ def train_encoder(  # noqa: PLR0913 - a public verb
             the data.
         preset: ``mini``, ``tiny``, ``tvl-tiny``, ``tvl-small``, ``tvl-base`` or ``paper``, or a
             preset.
-        clip: hub id or folder of a frozen CLIP, or ``palpate/mini``; a DINO, with weights 0, 0, 1.
-            Default: the preset's, or a small one that is trained first on the same train part.
+        clip: hub id or folder of a frozen CLIP, or ``palpate/mini``; a DINO, which teaches without
+            texts. Default: the preset's, or a small one that is trained first on the same train
+            part.
         output: folder for the encoders, new or empty; None keeps them in memory.
         epochs: of the tactile encoder; default: the preset's.
         targets: see :data:`~palpate.encoders.presets.Targets`; default: the preset's.
-        weights: of the pairs tactile-text, vision-text, tactile-vision; 0 switches one off.
-        partners: ``trainable``: vision and text learn along with the tactile encoder.
-        held_out: share of the train part, by video, on which loss and probe are measured while it
-            trains, if the split has no part ``val``; which is taken where there is one.
         seed: of weights, order and augmentation.
         device: ``auto``, ``cpu``, ``cuda`` or ``mps``.
         compute: how to run it on the machine at hand.
@@ -126,20 +119,17 @@ def train_encoder(  # noqa: PLR0913 - a public verb
     if epochs is not None and not 0 < epochs < math.inf:
         fix = "Leave it out for the preset's length"
         raise PalpateError("must be a positive number", str(epochs), fix, argument="epochs")
-    require_weights(weights)
     chosen, device = preset_of(preset), connect(device)
     manifest, split = load(data), load_split(data, split)
     output = None if output is None else Path(output)
     with work_folder(output) as work:
         common: dict[str, Any] = {"seed": seed, "targets": targets, "cache": work / "cache"}
         common |= {"device": device, "compute": compute, "progress": progress}
-        common["held_out"] = held_out
         source = clip or chosen.pretrained
         if source is None:
             source = train_clip(manifest, split, chosen, work / "clip", **common)
         elif not isinstance(source, ClipEncoders):
             source = load_clip(source, device=device)
-        common |= {"weights": weights, "partners": partners}
         encoders = train_tactile(
             manifest, split, source, chosen, work / "tactile", epochs=epochs, **common
         )
@@ -164,7 +154,6 @@ def plan_encoder(
     *,
     preset: str | EncoderPreset = "mini",
     epochs: float | None = None,
-    held_out: float = 0.0,
     device: str = "auto",
 ) -> dict[str, Any]:
     """What :func:`train_encoder` would take; only the manifest is read.
@@ -173,7 +162,7 @@ def plan_encoder(
         see :func:`palpate.training.estimate.estimate`.
     """
     chosen, split = preset_of(preset), load_split(data, split)
-    train, _ = _parts(load(data), split, held_out, 0)
+    train = train_part(load(data), split)
 
     def forward(model: nn.Module, rows: int, where: torch.device) -> Tensor:
         return encode_tactile(model, torch.zeros(rows, 3, chosen.image, chosen.image, device=where))
@@ -213,13 +202,11 @@ def preset_of(name: str | EncoderPreset) -> EncoderPreset:
 
 
 class TactileModel(nn.Module):
-    """What trains: the tactile encoder, the temperature, and the partners if they are trainable."""
+    """What trains: the tactile encoder and the temperature."""
 
-    def __init__(
-        self, tactile: CLIPVisionModelWithProjection, partners: CLIPModel | None = None
-    ) -> None:
+    def __init__(self, tactile: CLIPVisionModelWithProjection) -> None:
         super().__init__()
-        self.tactile, self.partners = tactile, partners
+        self.tactile = tactile
         self.log_scale = nn.Parameter(torch.tensor(LOG_SCALE_START))
 
 
@@ -228,10 +215,8 @@ class TactileLoss:
     """The loss of a batch of :class:`~palpate.encoders.rows.Rows`."""
 
     rows: Rows
-    clip: ClipEncoders
     preprocess: Preprocess
     targets: Targets
-    weights: Sequence[float]
     chunk: int | None = None
 
     def encode(self, module: nn.Module, unit_images: Tensor) -> Tensor:
@@ -242,19 +227,13 @@ class TactileLoss:
     def __call__(self, module: nn.Module, batch: Batch) -> Losses:
         """Return the loss of the three pairs, and each of them to log."""
         assert isinstance(module, TactileModel)
-        scale, clip = clamped_scale(module.log_scale), self.clip
+        scale = clamped_scale(module.log_scale)
         images = augmented(unit(batch["images"]), batch)
         tactile = in_chunks(partial(self.encode, module), images, self.chunk)
-        text, vision = batch.get("text"), batch.get("vision")
-        whole = partial(gather_rows, batch=len(batch["texts"]))
-        if module.partners is not None and clip.tokenizer is not None:
-            text = whole(_encode_phrases(clip, self.rows.phrases, batch["phrase"]))
-        if "photos" in batch:
-            photos = clip.preprocess(unit(batch["photos"]))
-            vision = whole(in_chunks(clip.encode_vision, photos, self.chunk))
-        labels = Labels(batch["texts"], batch["contacts"], batch.get("seen"))
-        how: dict[str, Any] = {"targets": self.targets, "weights": self.weights}
-        total, logs = three_way(whole(tactile), text, vision, scale, labels, **how)
+        whole = gather_rows(tactile, batch=len(batch["texts"]))
+        partners = batch.get("text"), batch.get("vision"), scale, batch["texts"]
+        how: dict[str, Any] = {"photos": batch.get("photos"), "targets": self.targets}
+        total, logs = three_way(whole, *partners, **how)
         return Losses(total, {**logs, "scale": scale.detach()}, tactile.sum(dim=1))
 
     def probe(self, others: Rows, module: nn.Module) -> dict[str, float]:
@@ -277,9 +256,6 @@ def train_tactile(  # noqa: PLR0913 - one row per choice of the training
     epochs: float | None = None,
     seed: int = 0,
     targets: Targets | None = None,
-    weights: Sequence[float] = ALL_PAIRS,
-    partners: Partners = "frozen",
-    held_out: float = 0.0,
     start: EncoderSet | None = None,
     cache: Path | None = None,
     device: str = "auto",
@@ -292,15 +268,12 @@ def train_tactile(  # noqa: PLR0913 - one row per choice of the training
         manifest: samples with tactile images; rows without a photo are left out of the vision
             pairs.
         split: its parts ``train`` and ``val`` are read; its digest goes into the card.
-        clip: the encoders to learn from; moved to ``device``. Trainable ones are copied.
+        clip: the encoders to learn from; moved to ``device``.
         preset: size and course.
         folder: of the checkpoint and the log.
         epochs: default: the preset's.
         seed: of the initial weights, the order and the augmentation.
         targets: default: the preset's.
-        weights: of the pairs tactile-text, vision-text, tactile-vision; 0 switches one off.
-        partners: see :func:`train_encoder`.
-        held_out: see :func:`train_encoder`.
         start: go on from this set's tactile encoder instead of random weights (the paper's); it
             must have the preset's size. Its card goes into the new card, so that the data it was
             trained on stays declared.
@@ -316,40 +289,31 @@ def train_tactile(  # noqa: PLR0913 - one row per choice of the training
         PalpateError: if the train part is empty, or a sample lacks a tactile image.
     """
     where = pick_device(connect(device))
-    compute, trainable = compute or Compute(), partners == "trainable"
-    if clip.tokenizer is None and (weights[0] or weights[1]):
-        must, fix = "must be 0, 0 and 1 for a vision encoder without text", "Or choose a CLIP"
-        raise PalpateError(must, f"{tuple(weights)}", fix, argument="weights")
-    train, held = _parts(manifest, split, held_out, seed)
-    clip = copy.deepcopy(clip) if trainable else clip
+    compute = compute or Compute()
+    train, held = train_part(manifest, split), manifest.part(split, "val")
     move(clip.model, where)
-
-    def read(part: Manifest) -> Rows:
-        options: dict[str, Any] = {"cache": cache, "progress": progress, "trainable": trainable}
-        return Rows(part, clip, preset.preprocess, subsets=preset.text_subsets, **options)
-
+    read = partial(Rows, clip=clip, preprocess=preset.preprocess, cache=cache, progress=progress)
     with first_alone():
-        rows, others = read(train), None if held is None else read(held)
+        rows, others = read(train), read(held) if len(held) else None
     tactile, preprocess = _first_weights(preset, clip.dim, rows.images, seed, start)
     course, mode = preset.tactile_course, targets or preset.targets
     options = course.options(len(train), seed, epochs)
-    _require_pairs(rows, options, weights, trainable=trainable)
+    _require_rows(train, options)
+    if clip.tokenizer is None and int((rows.photo >= 0).sum()) < 2:
+        must = "A vision encoder without text must have two photos to teach"
+        raise shared(PalpateError(must, "fewer in the train part", "Choose a CLIP"))
     _require_held_out(held, options)
     facts = _facts(preset, train, split, (rows.captions, rows.text_source), options) | {
         "targets": mode,
-        "weights": list(weights),
         "vision": clip.digest("vision"),
         "text": clip.digest("text") if clip.tokenizer is not None else None,
         "start": start.digest("tactile") if start else None,
     }
-    facts |= {"partners": partners} if trainable else {}
-    facts |= {"held_out": held.digest} if held is not None else {}
+    facts |= {"held_out": held.digest} if len(held) else {}
     facts |= {"without_photo": rows.without_photo} if rows.without_photo else {}
 
-    loss = TactileLoss(rows, clip, preprocess, mode, weights, compute.chunk)
-    if trainable:
-        clip.model.requires_grad_(True)
-    model = TactileModel(tactile, clip.model if trainable else None).to(where)
+    loss = TactileLoss(rows, preprocess, mode, compute.chunk)
+    model = TactileModel(tactile).to(where)
     task = Task(
         "training the tactile encoder",
         len(train),
@@ -357,11 +321,10 @@ def train_tactile(  # noqa: PLR0913 - one row per choice of the training
         loss,
         digest_json([facts, _stamps(train)]),
         train.ids,
-        None if others is None else (len(others.captions), others.load),
+        None if others is None else (len(held), others.load),
         None if others is None else partial(loss.probe, others),
     )
     log = fit(model, task, options, folder, compute=compute, progress=progress)
-    clip.model.eval().requires_grad_(False)
     card = _card(facts, options, log, where) | {"clip": clip.name, "clip_card": clip.card}
     card["start_card"] = start.card if start else None
     card["synthetic"] = train.synthetic if not start or start.card.get("synthetic") else False
@@ -371,37 +334,7 @@ def train_tactile(  # noqa: PLR0913 - one row per choice of the training
         plain = replace(preset.preprocess, subtract=())
         images = prepared_images(train, "tactile", plain, cache, progress)
     seen = union(digest_images(images), start.seen if start else None)
-    if rows.photos is not None:
-        _note_seen(clip, rows.photos)
     return EncoderSet(clip, model.tactile.eval().requires_grad_(False), preprocess, card, seen)
-
-
-def _note_seen(clip: ClipEncoders, photos: NDArray[np.uint8]) -> None:
-    """Keep that vision was trained on photos; of a public one they are a part of what it saw."""
-    if clip.seen is None:
-        clip.card = {**clip.card, "seen_in_part": True}
-    clip.seen = union(digest_images(photos), clip.seen)
-
-
-def _require_pairs(
-    rows: Rows, options: LoopOptions, weights: Sequence[float], *, trainable: bool
-) -> None:
-    """Check that there are samples to compare with each other.
-
-    Raises:
-        PalpateError: if not.
-    """
-    _require_rows(rows.manifest, options)
-    if not (weights[0] or weights[2] or trainable):
-        must = "must keep a pair with the tactile encoder, which trains alone"
-        raise shared(
-            PalpateError(must, f"{tuple(weights)}", "Or train the partners", argument="weights")
-        )
-    if not (weights[0] or weights[1]) and int((rows.photo >= 0).sum()) < 2:
-        must = "must leave a pair of which there are two samples"
-        raise shared(
-            PalpateError(must, f"{tuple(weights)}", "Photos are missing", argument="weights")
-        )
 
 
 def _require_rows(
@@ -416,35 +349,14 @@ def _require_rows(
         raise shared(PalpateError(must, "1", fix, argument=argument))
 
 
-def _require_held_out(held: Manifest | None, options: LoopOptions) -> None:
-    if held is None and (options.keep == "best" or options.patience):
+def _require_held_out(held: Manifest, options: LoopOptions) -> None:
+    if not len(held) and (options.keep == "best" or options.patience):
         name = "keep" if options.keep == "best" else "patience"
-        must = "needs a held-out part: a part val of the split, or a share of the train videos"
-        raise shared(PalpateError(must, "none", "Pass held_out", argument=name))
-    if held is not None and len(held) == 1 and options.evaluations:
+        must, fix = "needs a part val of the split", "Make one: palpate split --val 0.1"
+        raise shared(PalpateError(must, "none", fix, argument=name))
+    if len(held) == 1 and options.evaluations:
         must = "The held-out part must hold two samples: the loss compares them with each other"
         raise shared(PalpateError(must, f"one, {held.ids[0]}", "Make another split: palpate split"))
-
-
-def _parts(
-    manifest: Manifest, split: Split, share: float, seed: int
-) -> tuple[Manifest, Manifest | None]:
-    """The train part and the held-out part: ``val``, or a share of the videos of train, if any."""
-    train, held = train_part(manifest, split), manifest.part(split, "val")
-    if len(held) or not share:
-        return train, held if len(held) else None
-    if not 0 < share < 1:
-        raise PalpateError("must lie in [0, 1)", str(share), "", argument="held_out")
-    videos = sorted({str(v) for v in train.column("video")})
-    count = min(len(videos) - 1, max(1, round(share * len(videos))))
-    out = set(rng_for(seed, "held-out").permutation(videos)[:count]) if count else set[str]()
-    ids = [[], []]
-    for name, video in zip(train.ids, train.column("video"), strict=True):
-        ids[str(video) in out].append(name)
-    if not all(ids):
-        must, fix = "needs at least two videos in train", "Leave it out"
-        raise PalpateError(must, f"{len(videos)}", fix, argument="held_out")
-    return train.take(ids[0]), train.take(ids[1])
 
 
 def _encode_phrases(clip: ClipEncoders, phrases: Sequence[str], which: Tensor) -> Tensor:
@@ -515,7 +427,6 @@ def train_clip(  # noqa: PLR0913 - as train_tactile
     epochs: float | None = None,
     seed: int = 0,
     targets: Targets | None = None,
-    held_out: float = 0.0,
     start: ClipEncoders | None = None,
     cache: Path | None = None,
     device: str = "auto",
@@ -524,7 +435,7 @@ def train_clip(  # noqa: PLR0913 - as train_tactile
 ) -> ClipEncoders:
     """Train a fresh vision and text encoder on the train part of a split, by InfoNCE of that pair.
 
-    Arguments as :func:`train_tactile`; what is held out is left out. Without photos the vision
+    Arguments as :func:`train_tactile`. Without photos the vision
     encoder is trained on the tactile images, as the text encoder needs a partner; the card says so.
     Run again to resume.
 
@@ -539,7 +450,7 @@ def train_clip(  # noqa: PLR0913 - as train_tactile
             preset takes a pretrained CLIP, or has this course keep the best weights or stop early.
     """
     where, compute = pick_device(connect(device)), compute or Compute()
-    train, side, missing = _pictured(_parts(manifest, split, held_out, seed)[0])
+    train, side, missing = _pictured(train_part(manifest, split))
     course, words = _clip_course(preset), "photos" if side == "vision" else "samples"
     options = course.options(len(train), seed, epochs)
     _require_rows(train, options, words, "clip_batch_size")
@@ -566,9 +477,9 @@ def train_clip(  # noqa: PLR0913 - as train_tactile
         encoded = in_chunks(clip.encode_vision, pixels, compute.chunk)
         text = gather_rows(_encode_phrases(clip, distinct, batch["phrase"]))
         scale = clamped_scale(clip.model.logit_scale)
-        labels, vision = Labels(batch["texts"]), gather_rows(encoded)
-        how: dict[str, Any] = {"targets": mode, "weights": (1, 0, 0)}  # one pair alone
-        total, _ = three_way(vision, text, None, scale, labels, **how)
+        with torch.autocast(encoded.device.type, enabled=False):
+            vision, text = gather_rows(encoded).float(), text.float()
+            total = info_nce(vision, text, scale, text_targets(mode, batch["texts"], text))
         return Losses(total, {"scale": scale.detach()}, encoded.sum(dim=1))
 
     known = {m: start.digest(m) for m in ("vision", "text")} if start else {}

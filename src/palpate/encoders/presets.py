@@ -21,17 +21,15 @@ if TYPE_CHECKING:
 
 #: ``diagonal``: the paper's, every other row is a negative. ``identical-text``: rows with equal
 #: captions share the target mass of the two text pairs. ``soft-text``: TVL's target of the text
-#: pairs, softmax(t_i.t_j / 0.05). ``exclude``: rows of one contact or with equal captions are no
-#: negatives of each other, in any pair.
-Targets = Literal["diagonal", "identical-text", "soft-text", "exclude"]
+#: pairs, softmax(t_i.t_j / 0.05).
+Targets = Literal["diagonal", "identical-text", "soft-text"]
 
 
 @dataclass(frozen=True)
 class Augment:
     """Random changes of training images; never used in evaluation (recipes, pitfall 5).
 
-    A random window of the square, resampled bilinearly, then its colors turned and stretched, then
-    ``gain * x + offset`` per image.
+    A random window of the square, resampled bilinearly, then ``gain * x + offset`` per image.
 
     Attributes:
         crop: the window's side is 1 - ``crop`` to 1 of the image's.
@@ -40,9 +38,6 @@ class Augment:
         flips: mirror each axis with probability 1/2. Off: a flip must hit both images of a pair or
             none, and it swaps the sides that a sensor's colored lights come from.
         quarter_turns: rotate by a random multiple of 90 degrees. Off, for the same reason.
-        saturation: colors are stretched by a factor within 1 +- this, from gray.
-        hue: colors are turned about gray by at most this part of a full turn (in YIQ).
-        share: of the images whose colors, contrast and brightness change.
     """
 
     crop: float = 0.1
@@ -50,19 +45,9 @@ class Augment:
     offset: float = 0.05
     flips: bool = False
     quarter_turns: bool = False
-    saturation: float = 0.0
-    hue: float = 0.0
-    share: float = 1.0
 
     def __post_init__(self) -> None:
-        for name, top in {
-            "crop": 0.99,
-            "gain": 10,
-            "offset": 1,
-            "saturation": 1,
-            "hue": 1,
-            "share": 1,
-        }.items():
+        for name, top in {"crop": 0.99, "gain": 10, "offset": 1}.items():
             if not 0 <= getattr(self, name) <= top:
                 must, got = f"must lie in [0, {top}]", str(getattr(self, name))
                 raise PalpateError(must, got, "Choose another value", argument=f"augment_{name}")
@@ -151,8 +136,6 @@ class EncoderPreset:
         tactile_course, clip_course: how each is trained; None without a fresh CLIP.
         targets: what rows with equal captions are to each other
             (:data:`Targets`); ``diagonal`` is the paper's loss.
-        text_subsets: in training, show a random non-empty part of a text that is a list of
-            adjectives (TVL).
         fitting: how tactile images become squares: ``crop`` takes the center, ``pad`` the whole
             between black borders, ``squash`` the whole.
         turn: ``left`` turns tactile images counterclockwise, ``portrait`` those that are wide.
@@ -176,7 +159,6 @@ class EncoderPreset:
     vocabulary: int = 1024
     context: int = 32
     targets: Targets = "identical-text"
-    text_subsets: bool = False
     fitting: Literal["crop", "pad", "squash"] = "crop"
     turn: Literal["none", "left", "portrait"] = "none"
     subtract: bool = False
@@ -286,14 +268,14 @@ PAPER = EncoderPreset(
 
 
 def _tvl(name: str, size: Size, lr: float, cost: str) -> EncoderPreset:
-    """TVL's training (recipes, section 3): soft text targets, subsets of adjectives, its views.
+    """TVL's training (recipes, section 3) but for its changes of color and parts of texts.
 
     Its brightness and contrast factors in [0.9, 1.1] have a deviation of 0.058 each: together a
     gain of 0.08; a contrast about the mean (0.3) is an offset of 0.02.
     """
-    view = Augment(0.0, 0.08, 0.02, flips=True, quarter_turns=True, saturation=0.2, hue=0.05)
-    course = replace(_TVL, lr=lr, augment=replace(view, share=0.8))
-    more: dict[str, Any] = {"patch": 16, "targets": "soft-text", "text_subsets": True}
+    view = Augment(0.0, 0.08, 0.02, flips=True, quarter_turns=True)
+    course = replace(_TVL, lr=lr, augment=view)
+    more: dict[str, Any] = {"patch": 16, "targets": "soft-text"}
     more |= {"fitting": "pad", "turn": "left", "data_statistics": True}
     return replace(PAPER, name=name, tactile=size, tactile_course=course, cost=cost, **more)
 

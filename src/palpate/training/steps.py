@@ -38,10 +38,6 @@ class Step:
         """Uniform numbers in [0, 1), (rows, *shape)."""
         return torch.rand(len(self.all_rows), *shape, generator=self.generator)[self.mine]
 
-    def rand_all(self) -> Tensor:
-        """Uniform numbers in [0, 1) of the whole batch, (batch,)."""
-        return torch.rand(len(self.all_rows), generator=self.generator)
-
     def randn(self, *shape: int) -> Tensor:
         """Standard normal numbers, (rows, *shape)."""
         return torch.randn(len(self.all_rows), *shape, generator=self.generator)[self.mine]
