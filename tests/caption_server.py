@@ -154,7 +154,6 @@ class _Handler(BaseHTTPRequestHandler):
                 {"message": message, "finish_reason": "length" if fault == "truncated" else "stop"}
             ],
             "usage": {"prompt_tokens": 700, "completion_tokens": 30},
-            "system_fingerprint": "fp_1",
         }
         body = {"no-completion": {"answer": 42}, "page": b"<html>"}.get(fault, body)
         self.send(200, body, cut=20 if fault == "reset" else None)

@@ -6,7 +6,7 @@ from dataclasses import replace
 import polars as pl
 import pytest
 
-from palpate.captions import caption, mask_captions
+from palpate.captions import caption
 from palpate.cli import main
 from palpate.core import PalpateError, ProblemsError, Split
 from palpate.data import import_dataset, texts
@@ -110,12 +110,9 @@ def with_other_photos(manifest, root):
     return other
 
 
-@pytest.mark.parametrize("make", ["caption", "mask"])
-def test_captions_of_other_photos_with_the_same_ids_are_an_error(data, tmp_path, make, capsys):
+def test_captions_of_other_photos_with_the_same_ids_are_an_error(data, tmp_path, capsys):
     made = tmp_path / "c"
     caption(data, made, template="{material} in {video}")
-    if make == "mask":
-        made = mask_captions(tmp_path / "c", tmp_path / "m").path.parent
     with_other_photos(Manifest.load(data), tmp_path / "other").save(tmp_path / "o/manifest.parquet")
     joins = ["import", tmp_path / "o", "--text", made, "-o", tmp_path / "x"]
     for command in (joins, ["caption", "check", made, "--data", tmp_path / "o"]):

@@ -2,7 +2,6 @@
 
 import json
 import os
-import re
 import signal
 import subprocess
 import sys
@@ -83,18 +82,6 @@ def test_units(data, tmp_path, per, count):
     assert server.count == count
 
 
-def test_a_crop_is_a_second_image_and_another_question(data, tmp_path):
-    with FakeServer() as server:
-        describe(data, tmp_path / "c", server)
-        describe(data, tmp_path / "c", server, crop=(0.25, 0.25, 0.75, 0.75))
-        with pytest.raises(PalpateError, match="from 0 to 1"):
-            describe(data, tmp_path / "c", server, crop=(0.5, 0, 0.25, 1))
-    assert server.count == 24
-    content = server.payloads[-1]["messages"][0]["content"]
-    assert [part["type"] for part in content] == ["text", "image_url", "image_url"]
-    assert "second image" in content[0]["text"]
-
-
 FAULTS = {
     "busy": ("429 0", 13, 12, ()),
     "busy without a time": ("429", 13, 12, ()),
@@ -137,19 +124,20 @@ def test_replies_that_are_asked_for_again_are_kept_with_the_reason(data, tmp_pat
     assert (server.count, again.record) == (14, result.record)
 
 
-def test_a_run_that_goes_on_repeats_no_try(data, tmp_path):
-    """Cut after the first of two tries, it sends the second request and the tables are equal."""
+def test_a_run_that_goes_on_asks_about_no_photo_that_has_an_answer(data, tmp_path):
+    """Cut after the first of two tries, it begins with that photo's first, to the same table."""
     with FakeServer(lambda number: "truncated" if number in (5, 6) else None) as server:
         describe(data, tmp_path / "c", server, concurrency=1)
         whole, log = table_of(tmp_path / "c"), tmp_path / "c" / "replies.jsonl"
         log.write_text("".join(log.read_text().splitlines(keepends=True)[:5]))
         first = server.payloads[4]
-        server.count, server.payloads = 5, []
+        server.count, server.payloads = 4, []
         result = describe(data, tmp_path / "c", server, concurrency=1)
-    assert len(server.payloads) == 9
-    assert server.payloads[0]["max_tokens"] == 2 * first["max_tokens"]
-    assert server.payloads[0]["seed"] == first["seed"] + 1
-    assert (result.record["unused"], table_of(tmp_path / "c")) == ({"truncated": 2}, whole)
+    assert len(server.payloads) == 10
+    assert server.payloads[0] == first
+    assert server.payloads[1]["max_tokens"] == 2 * first["max_tokens"]
+    assert server.payloads[1]["seed"] == first["seed"] + 1
+    assert (result.record["unused"], table_of(tmp_path / "c")) == ({"truncated": 3}, whole)
 
 
 def test_a_hanging_request_is_sent_again(data, tmp_path, quick):
@@ -158,28 +146,22 @@ def test_a_hanging_request_is_sent_again(data, tmp_path, quick):
     assert (server.count, result.record["counts"]["texts"]) == (13, 12)
 
 
-def test_what_stays_unusable_is_flagged_kept_and_asked_again_on_request(data, tmp_path):
-    bad = {"on": True}
-    with FakeServer(lambda number: "truncated" if bad["on"] else None) as server:
+def test_what_stays_unusable_is_flagged_and_kept(data, tmp_path):
+    with FakeServer(lambda number: "truncated") as server:
         result = describe(data, tmp_path / "c", server)
         assert result.record["counts"]["flags"] == {"truncated": 12}
         assert server.count == 36, "three tries each"
         assert [p["max_tokens"] for p in server.payloads[:1]] == [300]
         assert max(p["max_tokens"] for p in server.payloads) == 1200
         assert describe(data, tmp_path / "c", server).record["counts"]["texts"] == 0
-        assert server.count == 36, "what was answered is not asked again"
-        bad["on"] = False
-        result = describe(data, tmp_path / "c", server, again=True)
-    assert (server.count, result.record["counts"]["texts"]) == (48, 12)
-    assert result.record["counts"]["flags"] == {}
-    assert result.record["unused"] == {"repeated": 12, "truncated": 24}
-    assert result.record["tokens"]["out"] == 48 * 30
+    assert server.count == 36, "what was answered is not asked again"
+    assert result.record["unused"] == {"truncated": 24}
+    assert result.record["tokens"]["out"] == 36 * 30
 
 
-def test_a_server_that_answers_as_another_model_is_noted(data, tmp_path):
+def test_the_record_names_the_model_that_answered(data, tmp_path):
     with FakeServer(lambda number: "other-model") as server:
         result = describe(data, tmp_path / "c", server)
-    assert [note.code for note in result.notes] == ["captions-other-model"]
     assert result.record["answered_as"] == {"other/model": 12}
 
 
@@ -331,15 +313,6 @@ GOOD = '{"adjectives": ["rough", "dry", "hard"], "surface_visible": true}'
 ODD = {
     "half a character": (reply(GOOD.replace("dry", "dry\\ud800")), "rough, dry?, hard"),
     "half a character outside": (reply(GOOD.replace("dry", "dry\ud800")), "rough, dry?, hard"),
-    "a fingerprint that is no text": (reply(GOOD, system_fingerprint={"a": 1}), "rough, dry, hard"),
-    "no number of tokens": (reply(GOOD, usage={"prompt_tokens": "x"}), "rough, dry, hard"),
-    "infinitely many tokens": (
-        (
-            200,
-            json.dumps(reply(GOOD, usage=7)[1]).replace("7", '{"prompt_tokens": 1e999}').encode(),
-        ),
-        "rough, dry, hard",
-    ),
     "the end of a thought alone": (reply(f"It is {{soft}}.</think>{GOOD}"), "rough, dry, hard"),
     "a key that is a word": (reply(GOOD, model="a rough one"), "rough, dry, hard"),
 }
@@ -371,15 +344,6 @@ def test_no_usable_caption_at_all_is_noted_and_exits_1(data, tmp_path, capsys):
     assert "Next:" not in output.out
 
 
-def test_a_request_is_never_repeated_with_again(data, tmp_path):
-    with FakeServer(lambda number: "truncated") as server:
-        for again in (False, True, True):
-            describe(data, tmp_path / "c", server, again=again)
-    sent = [json.dumps(payload, sort_keys=True) for payload in server.payloads]
-    assert len(set(sent)) == len(sent) == 3 * 36
-    assert max(payload["max_tokens"] for payload in server.payloads) == 1200
-
-
 def test_a_404_of_a_listed_model_is_of_the_address(data, tmp_path):
     with FakeServer(lambda number: "404") as server, pytest.raises(PalpateError) as caught:
         describe(data, tmp_path / "c", server)
@@ -404,27 +368,19 @@ def test_single_requests_that_the_server_does_not_take_are_listed(data, tmp_path
 WRONG = {
     "no URL": ("--server localhost:8000/v1", "http://HOST:PORT"),
     "password in the URL": ("--server http://me:secret@host/v1", "without password"),
-    "port": ("--server http://localhost:99999/v1", "http://HOST:PORT"),
     "refused": ("--server http://127.0.0.1:9/v1 --model m", "Connection refused"),
     "refused, no model": ("--server http://127.0.0.1:9/v1", "Connection refused"),
     "path": ("--server {url}/x --model m", "http://HOST:PORT/v1"),
     "path, no model": ("--server {url}/x", "Name it, or give the base"),
     "model": ("--server {url} --model gpt", "It has fake/vlm-7b"),
-    "variable": ("--server {url} --key-variable NONE_7", "NONE_7, which is not set"),
     "body": ("--server {url} --body [1]", "a JSON object"),
-    "nothing": ("", "one of server, local, template"),
-    "two": ("--server {url} --template", "server and template"),
+    "nothing": ("", "server or template. Got none"),
+    "two": ("--server {url} --template", "server or template. Got both"),
     "concurrency": ("--server {url} --concurrency 0", "--concurrency must be a positive number"),
     "timeout": ("--server {url} --timeout -1", "--timeout must be a positive number"),
     "reply": ("--server {url} --max-tokens 0", "--max-tokens must be a positive number"),
     "prompt": ("--server {url} --prompt none.txt", "touch-sentence/1"),
-    "host without a name": ("--server http://a..b/v1", "http://HOST:PORT"),
-    "host in brackets": ("--server http://[foo]/v1", "http://HOST:PORT"),
-    "no JSON value": ('--server {url} --body {{"temperature":NaN}}', "--body must hold values"),
-    "prices": ("--server {url} --dry-run --prices 1 nan", "--prices must be numbers"),
-    "format": ("--template {{frame:q}}", "--template must have formats"),
-    "conversion": ("--template {{material!x}}", "--template must have formats"),
-    "nested format": ("--template {{frame:{{x}}}}", "--template must have formats"),
+    "format": ("--template {{frame:q}}", "--template must be a text with columns in braces"),
 }
 
 
@@ -456,19 +412,19 @@ def test_a_wrong_key_is_named_by_its_variable_and_never_shown(
 
 
 def test_a_key_that_the_server_repeats_is_not_kept(data, tmp_path, monkeypatch):
-    monkeypatch.setenv("MY_KEY", KEY)
+    monkeypatch.setenv("PALPATE_CAPTION_KEY", KEY)
     with FakeServer(lambda number: "echo", key=KEY) as server:
-        describe(data, tmp_path / "c", server, key_variable="MY_KEY")
+        describe(data, tmp_path / "c", server)
     for path in (tmp_path / "c").iterdir():
         assert KEY.encode() not in path.read_bytes()
 
 
-@pytest.mark.parametrize("field", ["error", "detail", "cause", "fingerprint", "model", "id"])
+@pytest.mark.parametrize("field", ["error", "detail", "cause", "model", "id"])
 def test_a_key_that_comes_back_in_escapes_is_not_kept(data, tmp_path, monkeypatch, capsys, field):
     key = "sk/planted/7c1f"
     monkeypatch.setenv("PALPATE_CAPTION_KEY", key)
-    said, name = "".join(f"\\u{ord(sign):04x}" for sign in key), "system_fingerprint"
-    body = {field if field != "fingerprint" else name: "SAID"} | {"error": {"message": "SAID"}}
+    said = "".join(f"\\u{ord(sign):04x}" for sign in key)
+    body = {field: "SAID"} | {"error": {"message": "SAID"}}
     body = body if field in ("error", "detail", "cause") else reply(GOOD, **body | {"error": 0})[1]
     for escaped in (said, key.replace("/", "\\/")):
         fault = json.dumps(body).replace("SAID", escaped).encode()
@@ -489,9 +445,6 @@ def test_a_key_that_comes_back_in_escapes_is_not_kept(data, tmp_path, monkeypatc
         ("no-completion", "choices"),
         ("page", "no JSON: '<html>'"),
         ((200, b""), "no JSON: ''"),
-        ((200, b"[" * 200_000), "no JSON"),
-        ((400, b"[" * 700 + b"]" * 700), "status 400"),
-        ((200, b'{"error": ' + b"[" * 900 + b"]" * 900 + b"}"), "status 400"),
         ((200, b"no gzip", {"Content-Encoding": "gzip"}), "DecodingError"),
         ((200, {"error": {"message": "upstream is busy", "code": 502}}), "502: upstream is busy"),
         ((200, {"error": "no images"}), "status 400: no images"),
@@ -524,8 +477,7 @@ def test_broken_photos_of_equal_bytes_are_all_listed(data, tmp_path, small_manif
         path.write_bytes(b"")
     with FakeServer() as server:
         result = describe(data, tmp_path / "c", server)
-        estimate = describe(data, tmp_path / "c", server, dry_run=True)
-    assert (server.count, estimate.requests, estimate.unreadable) == (6, 0, 6)
+    assert server.count == 6
     assert [problem.where for problem in result.problems] == sorted(map(str, paths[2:24:4]))
     assert result.record["counts"]["flags"] == {"bad-image": 6}
 
@@ -547,24 +499,16 @@ def test_equal_photos_are_asked_about_once(data, tmp_path, small_manifest):
     assert (server.count, result.record["counts"]["different"]) == (1, 1)
 
 
-def test_a_dry_run_sends_and_writes_nothing(data, tmp_path, quick, small_manifest):
+def test_a_dry_run_sends_and_writes_nothing(data, tmp_path, quick):
     with FakeServer() as server:
-        estimate = describe(data, tmp_path / "c", server, dry_run=True, prices=(2.5, 10))
-        assert (estimate.requests, estimate.measured, server.count) == (12, 0, 0)
-        assert estimate.price == pytest.approx(
-            (2.5 * estimate.tokens[0] + 10 * estimate.tokens[1]) / 1e6
-        )
+        estimate = describe(data, tmp_path / "c", server, dry_run=True)
+        assert (estimate.photos, estimate.requests, server.count) == (12, 12, 0)
         assert not (tmp_path / "c").exists()
         server.faults = lambda number: "500" if number > 4 else None
         with pytest.raises(StoppedError):
             describe(data, tmp_path / "c", server, concurrency=1)
-        photos = small_manifest.paths("vision")
-        photos[26].write_bytes(photos[26].read_bytes()[:-40])
-        photos[30].unlink()
         estimate = describe(data, tmp_path / "c", server, dry_run=True)
-    assert (estimate.requests, estimate.measured, estimate.tokens) == (6, 4, (4200, 180))
-    assert estimate.unreadable == 2
-    assert re.search(" 6, none for photos", str(estimate))
+    assert str(estimate) == "12 photos need 8 requests; no photo was sent"
 
 
 def test_the_client_is_loaded_when_a_server_is_asked_and_missed_in_one_line(

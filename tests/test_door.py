@@ -20,8 +20,8 @@ SIGNATURES = {
         "skip_bad progress allow_seen"
     ),
     "caption": (
-        "data output * server model local template prompt per crop concurrency timeout max_tokens "
-        "seed body key_variable again prices dry_run progress"
+        "data output * server model template prompt per concurrency timeout max_tokens seed body "
+        "dry_run progress"
     ),
     "generate": (
         "photos * text weight gel model output split part seed noise guidance steps batch"

@@ -10,7 +10,6 @@ from palpate._lazy import import_name
 if TYPE_CHECKING:
     from palpate.captions.captioning import Captions, Estimate, StoppedError, caption
     from palpate.captions.checking import check_captions
-    from palpate.captions.masking import mask_captions
     from palpate.captions.prompts import Prompt
 
 #: Public name -> its module, imported on first use.
@@ -21,17 +20,8 @@ _MODULES = {
     "StoppedError": "captioning",
     "caption": "captioning",
     "check_captions": "checking",
-    "mask_captions": "masking",
 }
 
-__all__ = [
-    "Captions",
-    "Estimate",
-    "Prompt",
-    "StoppedError",
-    "caption",
-    "check_captions",
-    "mask_captions",
-]
+__all__ = ["Captions", "Estimate", "Prompt", "StoppedError", "caption", "check_captions"]
 
 __getattr__ = partial(import_name, __name__, _MODULES)

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from string import Formatter
-from typing import Any
 
 from palpate.captions.units import Units
 from palpate.core import PalpateError
@@ -34,30 +32,17 @@ def template_texts(template: str, manifest: Manifest, units: Units, seed: int) -
         if None in cells.values():
             texts.append(None)
         elif template:
-            texts.append(_filled(template, cells))
+            texts.append(template.format(**cells))
         else:
             texts.append(caption(cells["material"], rows[first[unit]]["id"], seed))
     return texts
-
-
-def _filled(template: str, cells: Mapping[str, Any]) -> str:
-    """The template with these values.
-
-    Raises:
-        PalpateError: if a format in it is none, or not one of such a value.
-    """
-    try:
-        return template.format(**cells)
-    except (ValueError, TypeError, LookupError) as error:
-        must, fix = "must have formats that fit the columns", "Leave the format out"
-        raise PalpateError(must, f"{template!r}: {error}", fix, argument="template") from None
 
 
 def _columns(template: str) -> list[str]:
     """The columns that a template names.
 
     Raises:
-        PalpateError: if there is none, or another name in braces.
+        PalpateError: if there is none, or anything else in braces.
     """
     must = "must be a text with columns in braces"
     example = {"template": "{material} of {object}"}
@@ -66,7 +51,7 @@ def _columns(template: str) -> list[str]:
     except ValueError as error:
         raise PalpateError(must, str(error), "", argument="template", example=example) from None
     names = [name for _, name, _, _ in parts if name is not None]
-    unknown = [name for name in names if name not in SCHEMA]
+    unknown = [n for _, n, form, how in parts if n is not None and (n not in SCHEMA or form or how)]
     if unknown or not names:
         got = f"{{{unknown[0]}}}" if unknown else f"{template!r}, which names none"
         fix = f"Columns are {', '.join(SCHEMA)}"

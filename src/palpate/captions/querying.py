@@ -1,4 +1,4 @@
-"""Query a model about many photos at once; every reply is kept, and no request is repeated."""
+"""Query a model about many photos at once; every reply is kept, and answers are asked for once."""
 
 from __future__ import annotations
 
@@ -9,9 +9,10 @@ from pathlib import Path
 from queue import Empty, SimpleQueue
 from typing import Any, TypeVar
 
-from palpate.captions.photos import QUALITY, SIDE, Crop, prepared
+from palpate.captions.photos import QUALITY, SIDE, prepared
 from palpate.captions.prompts import Description, Prompt
-from palpate.captions.replies import Describer, RejectedError, Replies, Reply, ReplyLog, Request
+from palpate.captions.replies import RejectedError, Replies, Reply, ReplyLog, Request
+from palpate.captions.server import Server
 from palpate.captions.units import Units
 from palpate.core import PalpateError, Problem, Progress, digest_json
 from palpate.data.images import file_digest, in_threads
@@ -22,8 +23,6 @@ ATTEMPTS = 3
 AGAIN_TEMPERATURE = 0.5
 #: So many photos, spread over all, are tried first: if the server takes none, others are not sent.
 PROBES = 16
-#: Photos that a thread reads at a time: handing over one costs more than its digest.
-AT_ONCE = 32
 #: Seconds after which Ctrl-C is noticed: once polars has run, it interrupts no waiting.
 CTRL_C = 0.2
 T = TypeVar("T")
@@ -37,7 +36,6 @@ class Question:
     Attributes:
         model: its name, as it was requested.
         prompt: the instruction, with the schema of its reply.
-        crop: part of the photo that is sent as well.
         max_tokens: longest reply.
         seed: of the first try.
         body: further fields of every request to a server.
@@ -45,7 +43,6 @@ class Question:
 
     model: str
     prompt: Prompt
-    crop: Crop | None
     max_tokens: int
     seed: int
     body: Mapping[str, Any]
@@ -53,7 +50,7 @@ class Question:
     @property
     def parameters(self) -> dict[str, Any]:
         """Everything next to model and prompt that a reply depends on."""
-        sent = {"side": SIDE, "quality": QUALITY, "crop": self.crop}
+        sent = {"side": SIDE, "quality": QUALITY}
         return {"max_tokens": self.max_tokens, "seed": self.seed, "body": dict(self.body), **sent}
 
     def key(self, image: str) -> str:
@@ -63,19 +60,11 @@ class Question:
 
 @dataclass(frozen=True)
 class Pending:
-    """A photo without an answer.
-
-    Attributes:
-        key: of the answer.
-        sample: the sample's id.
-        path: the file.
-        tries: replies to it so far; no request is repeated.
-    """
+    """A photo without an answer: the answer's key, the sample's id, and the file."""
 
     key: str
     sample: str
     path: Path
-    tries: tuple[Reply, ...]
 
 
 @dataclass(frozen=True)
@@ -98,13 +87,7 @@ class Photos:
         ids, vision = manifest.ids, manifest.column("vision")
         paths = [None if row is None else manifest.path(vision[row]) for row in units.described]
         distinct = list(dict.fromkeys(path for path in paths if path is not None))
-        some = [tuple(distinct[k : k + AT_ONCE]) for k in range(0, len(distinct), AT_ONCE)]
-        read = lambda files: {file: file_digest(file) for file in files}
-        digests: dict[Path, str | None] = {}
-        for k, (_, part) in enumerate(in_threads(read, some)):
-            progress("reading photos", min(k * AT_ONCE, len(distinct)), len(distinct))
-            digests |= part
-        progress("reading photos", len(distinct), len(distinct))
+        digests = dict(in_threads(file_digest, distinct, "reading photos", progress))
         of_paths = [None if path is None else digests[path] for path in paths]
         keys = [None if digest is None else question.key(digest) for digest in of_paths]
         samples = ["" if row is None else ids[row] for row in units.described]
@@ -119,25 +102,15 @@ class Photos:
         """The keys, each once, in a fixed order."""
         return sorted({key for key in self.keys if key is not None})
 
-    @property
-    def first(self) -> Path:
-        """One of the photos."""
-        return next(path for path in self.paths if path is not None)
-
-    def pending(self, replies: Replies, prompt: Prompt, *, again: bool = False) -> list[Pending]:
-        """Photos without an answer, each once; with ``again`` also those without a usable one."""
-
-        def open_(key: str) -> bool:
-            answer = replies.answers.get(key)
-            return answer is None or (again and answer.read(prompt).text is None)
-
+    def pending(self, replies: Replies) -> list[Pending]:
+        """Photos without an answer, each once."""
         pending: dict[str, Pending] = {}
         for key, sample, path in zip(self.keys, self.samples, self.paths, strict=True):
-            if key is not None and path is not None and key not in pending and open_(key):
-                pending[key] = Pending(key, sample, path, replies.tries(key))
+            if key is not None and path is not None and key not in replies.answers:
+                pending.setdefault(key, Pending(key, sample, path))
         return list(pending.values())
 
-    def problems(self, queried: Sequence[Problem] = ()) -> list[Problem]:
+    def problems(self, queried: Sequence[Problem]) -> list[Problem]:
         """Photos whose files cannot be read, and those of requests with a problem or equal ones."""
         pairs = zip(self.paths, self.keys, strict=True)
         keys = {str(path): key for path, key in pairs if path is not None}
@@ -164,7 +137,7 @@ class Photos:
 def query_all(
     pending: list[Pending],
     question: Question,
-    describer: Describer,
+    server: Server,
     log: ReplyLog,
     *,
     threads: int,
@@ -184,11 +157,11 @@ def query_all(
 
     def work(photo: Pending) -> Problem | None:
         try:
-            images = prepared(photo.path, question.crop)
+            image = prepared(photo.path)
         except PalpateError as error:
             return Problem(str(photo.path), "bad-image", error.got)
         try:
-            for reply in _replies(images, photo.tries, question, describer):
+            for reply in _replies(image, question, server):
                 log.append(photo.key, photo.sample, question.prompt.name, reply)
         except RejectedError as error:
             reply = Reply(str(error), question.model, finish="rejected", unused="rejected")
@@ -215,29 +188,22 @@ def query_all(
     return problems
 
 
-def _replies(
-    images: tuple[bytes, ...], tries: Sequence[Reply], question: Question, describer: Describer
-) -> Iterator[Reply]:
-    """Replies until one can be used or there were ``ATTEMPTS``; all but the last are ``unused``."""
-    request = Request(images, question.prompt, question.max_tokens, 0.0, question.seed)
-    for reply in tries:
-        request = _next(request, reply, question)
-    for left in range(ATTEMPTS - 1 - len(tries) % ATTEMPTS, -1, -1):
-        reply = describer.describe(request)
+def _replies(image: bytes, question: Question, server: Server) -> Iterator[Reply]:
+    """Replies until one can be used or there were ``ATTEMPTS``; all but the last are ``unused``.
+
+    The request after a reply that cannot be used samples, with more room if that was cut.
+    """
+    request = Request(image, question.prompt, question.max_tokens, 0.0, question.seed)
+    for attempt in range(1, ATTEMPTS + 1):
+        reply = server.describe(request)
         description = reply.read(question.prompt)
-        if description.answered or not left:
+        if description.answered or attempt == ATTEMPTS:
             yield reply
-            break
+            return
         yield replace(reply, unused=description.flags[0])
-        request = _next(request, reply, question)
-
-
-def _next(request: Request, reply: Reply, question: Question) -> Request:
-    """The request after a reply that cannot be used: sampled, with more room if that was cut."""
-    room = request.max_tokens * (2 if reply.finish == "length" else 1)
-    room = min(room, question.max_tokens * 2 ** (ATTEMPTS - 1))
-    seed = request.seed + 1
-    return replace(request, max_tokens=room, temperature=AGAIN_TEMPERATURE, seed=seed)
+        room = request.max_tokens * (2 if reply.finish == "length" else 1)
+        seed = request.seed + 1
+        request = replace(request, max_tokens=room, temperature=AGAIN_TEMPERATURE, seed=seed)
 
 
 def in_daemons(

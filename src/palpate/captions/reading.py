@@ -1,4 +1,4 @@
-"""Captions to check or to mask: what ``palpate caption`` wrote, or any samples that have texts."""
+"""Captions to check: what ``palpate caption`` wrote, or any samples that have texts."""
 
 from __future__ import annotations
 

@@ -4,8 +4,7 @@ The log is ``replies.jsonl``: one JSON object a line for every finished request,
 arrives and never changed::
 
     {"key": "<sha256>", "id": "video/frame", "prompt": "touch-adjectives/1", "model": "...",
-     "raw": "{...}", "refused": false, "finish": "stop", "tokens": [812, 31], "seconds": 1.42,
-     "fingerprint": null, "unused": null}
+     "raw": "{...}", "refused": false, "finish": "stop", "tokens": [812, 31], "unused": null}
 
 ``key`` is SHA-256 over the model, the digest of the prompt, the bytes of the image file and the
 parameters. The same request finds its answer there; a killed run loses what was in flight. A reply
@@ -20,10 +19,9 @@ import json
 import os
 import threading
 from collections import defaultdict
-from collections.abc import Iterable
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import BinaryIO, Protocol
+from typing import BinaryIO
 
 from palpate.captions.prompts import Description, Prompt
 from palpate.core import PalpateError
@@ -34,26 +32,17 @@ class Request:
     """One question to a model.
 
     Attributes:
-        images: JPEG files: the photo and, if a crop was requested, that part of it.
+        image: JPEG file.
         prompt: the instruction, with the schema of its reply.
         max_tokens: longest reply.
         temperature, seed: of the sampling.
     """
 
-    images: tuple[bytes, ...]
+    image: bytes
     prompt: Prompt
     max_tokens: int
     temperature: float
     seed: int
-
-    @property
-    def text(self) -> str:
-        """What the model reads."""
-        return self.prompt.body if len(self.images) == 1 else f"{self.prompt.body}\n\n{CROP}"
-
-
-#: Added to the prompt where a crop follows the photo.
-CROP = "The second image is the part of the photo where the sensor touches the surface."
 
 
 @dataclass(frozen=True)
@@ -66,8 +55,6 @@ class Reply:
         refused: the server itself calls the reply a refusal.
         finish: why it ended: ``stop``, or ``length`` where it was cut.
         tokens: of the request and of the reply.
-        seconds: from request to reply.
-        fingerprint: of the server's configuration, if it says so.
         unused: why it is not the answer; None where it is.
     """
 
@@ -76,8 +63,6 @@ class Reply:
     refused: bool = False
     finish: str = "stop"
     tokens: tuple[int, int] = (0, 0)
-    seconds: float = 0.0
-    fingerprint: str | None = None
     unused: str | None = None
 
     def read(self, prompt: Prompt) -> Description:
@@ -88,31 +73,6 @@ class Reply:
         return description
 
 
-class Describer(Protocol):
-    """Anything that describes an image: a server, or a model in this process.
-
-    Attributes:
-        model: its name, part of the key of every reply.
-        threads: most requests at once that it can take; 0 for any number.
-    """
-
-    model: str
-    threads: int
-
-    def describe(self, request: Request) -> Reply:
-        """Answer a request; called from several threads.
-
-        Raises:
-            RejectedError: if this one request cannot be answered.
-            PalpateError: if none can.
-        """
-        ...
-
-    def close(self) -> None:
-        """Free what it holds."""
-        ...
-
-
 class RejectedError(Exception):
     """The server does not take this one request (too large, no valid image ...)."""
 
@@ -121,31 +81,20 @@ class Replies:
     """Replies by key.
 
     Attributes:
-        answers: the one that counts: the last that is not ``unused``.
-        others: those that came before it.
+        answers: the one that counts.
+        unused: those that came before it.
     """
 
     def __init__(self) -> None:
         self.answers: dict[str, Reply] = {}
-        self.others: defaultdict[str, list[Reply]] = defaultdict(list)
+        self.unused: defaultdict[str, list[Reply]] = defaultdict(list)
 
     def add(self, key: str, reply: Reply) -> None:
         """Add the next reply to a key."""
-        if reply.unused is not None:
-            self.others[key].append(reply)
-        else:
-            if key in self.answers:
-                self.others[key].append(self.answers[key])
+        if reply.unused is None:
             self.answers[key] = reply
-
-    def tries(self, key: str) -> tuple[Reply, ...]:
-        """All replies to a key, without rejected requests."""
-        every = [*self.others.get(key, ()), *filter(None, [self.answers.get(key)])]
-        return tuple(reply for reply in every if reply.unused != "rejected")
-
-    def others_of(self, keys: Iterable[str]) -> list[Reply]:
-        """The other replies to these keys."""
-        return [reply for key in keys for reply in self.others.get(key, ())]
+        else:
+            self.unused[key].append(reply)
 
 
 def read_replies(path: Path) -> tuple[Replies, int]:
@@ -168,8 +117,6 @@ def read_replies(path: Path) -> tuple[Replies, int]:
             try:
                 row = json.loads(line)
                 fields = {name: row[name] for name in Reply.__dataclass_fields__}
-                fields["tokens"] = (int(row["tokens"][0]), int(row["tokens"][1]))
-                hash(tuple(fields.values()))  # raises for lists and objects
                 replies.add(row["key"], Reply(**fields))
             except (ValueError, TypeError, LookupError):
                 must, got = f"{path} must hold replies only", f"another line {number}"

@@ -10,21 +10,18 @@ file, log or error.
 from __future__ import annotations
 
 import base64
-import email.utils
 import json
 import os
 import re
 import threading
-import time
 from collections.abc import Mapping
-from queue import SimpleQueue
 from typing import Any
 
 from palpate.captions.prompts import LONGEST, valid
 from palpate.captions.replies import RejectedError, Reply, Request
 from palpate.core import MissingExtraError, PalpateError, few
 
-#: Where the key is looked for unless another variable is named.
+#: Where the key is looked for.
 KEY_VARIABLE = "PALPATE_CAPTION_KEY"
 #: How often a request is sent to a busy or failing server.
 TRIES = 6
@@ -34,7 +31,7 @@ LONGEST_PAUSE = 60.0
 LONGEST_WAIT = 600.0
 #: Statuses after which the same request may well succeed, next to 5xx.
 BUSY = (408, 409, 425, 429)
-#: Shorter keys may be words of a caption, which is kept as it is.
+#: Shorter keys are stand-ins for servers without keys, and may be words of a caption.
 SHORT_KEY = 8
 
 
@@ -44,7 +41,6 @@ class Server:
     Args:
         url: the API's base, mostly ending in ``/v1``.
         model: its name there; None for the only one that the server has.
-        key_variable: environment variable that holds the key; None looks into ``KEY_VARIABLE``.
         body: further fields of every request; null removes a default one.
         timeout: longest silence of the server, in seconds.
         pause: seconds before the second try; doubles with every further one.
@@ -52,17 +48,14 @@ class Server:
 
     Raises:
         MissingExtraError: without httpx2.
-        PalpateError: if the URL is none, the variable is not set, or the model is unknown.
+        PalpateError: if the URL or the key is none, or the model is unknown.
     """
-
-    threads = 0
 
     def __init__(
         self,
         url: str,
         model: str | None = None,
         *,
-        key_variable: str | None = None,
         body: Mapping[str, Any] | None = None,
         timeout: float = 120.0,
         pause: float = 1.0,
@@ -76,59 +69,51 @@ class Server:
         self._refused = httpx2.ConnectError
         self._answered = False
         self.url = _checked_url(url)
-        self._variable = key_variable or KEY_VARIABLE
-        self._key = _key(self._variable, required=key_variable is not None)
+        self._key = _key()
         self._pause, self._body = pause, dict(body or {})
         headers = {"Authorization": f"Bearer {self._key}"} if self._key else {}
-        limits = httpx2.Limits(max_connections=1, keepalive_expiry=60)
-        secure = httpx2.create_ssl_context()
-        # A client a thread: the threads of one client wait for each other's locks.
-        self._opened = [
-            httpx2.Client(headers=headers, timeout=timeout, limits=limits, verify=secure)
-            for _ in range(connections)
-        ]
-        self._clients: SimpleQueue[Any] = SimpleQueue()
-        for client in self._opened:
-            self._clients.put(client)
+        limits = httpx2.Limits(max_connections=connections, keepalive_expiry=60)
+        self._client = httpx2.Client(
+            base_url=self.url, headers=headers, timeout=timeout, limits=limits
+        )
         self._closed = threading.Event()
-        # Parsed once, which would else take a tenth of a request.
-        names = {"POST": "chat/completions", "GET": "models"}
-        self._urls = {method: httpx2.URL(f"{self.url}/{name}") for method, name in names.items()}
         self.model = model or self._only_model()
 
     def close(self) -> None:
         """Close all connections; threads that still run send nothing more."""
         self._closed.set()
-        for client in self._opened:
-            client.close()
+        self._client.close()
 
     def describe(self, request: Request) -> Reply:
-        """Ask the server; see :class:`palpate.captions.replies.Describer`."""
-        start = time.perf_counter()
+        """Answer a request; called from several threads.
+
+        Raises:
+            RejectedError: if this one request cannot be answered.
+            PalpateError: if none can.
+        """
         answer = self._answer(self._payload(request))
         try:
             choice = answer["choices"][0]
-            message, usage = choice["message"], answer.get("usage")
+            message, usage = choice["message"], answer.get("usage") or {}
             refusal, finish = message.get("refusal"), str(choice.get("finish_reason") or "stop")
-            raw = _text_of(message.get("content")) or str(refusal or "")
+            raw = str(message.get("content") or refusal or "")
+            tokens = (usage.get(name) or 0 for name in ("prompt_tokens", "completion_tokens"))
+            inward, outward = map(int, tokens)
             return Reply(
                 raw=self._cleaned(raw)[:LONGEST],
-                model=self._cleaned(_string(answer.get("model"))) or self.model,
+                model=self._cleaned(str(answer.get("model") or self.model)),
                 refused=bool(refusal) or finish == "content_filter",
                 finish=self._cleaned(finish),
-                tokens=(_tokens(usage, "prompt_tokens"), _tokens(usage, "completion_tokens")),
-                seconds=round(time.perf_counter() - start, 3),
-                fingerprint=self._cleaned(_string(answer.get("system_fingerprint"))) or None,
+                tokens=(inward, outward),
             )
         except (LookupError, TypeError, ValueError, AttributeError) as error:
             got = f"{type(error).__name__} at {str(error)[:80]}"
             raise RejectedError(f"the reply is no chat completion ({got})") from None
 
     def _payload(self, request: Request) -> dict[str, Any]:
-        data = [base64.b64encode(image).decode() for image in request.images]
-        urls = [{"url": f"data:image/jpeg;base64,{text}"} for text in data]
-        images = [{"type": "image_url", "image_url": url} for url in urls]
-        content = [{"type": "text", "text": request.text}, *images]
+        url = f"data:image/jpeg;base64,{base64.b64encode(request.image).decode()}"
+        image = {"type": "image_url", "image_url": {"url": url}}
+        content = [{"type": "text", "text": request.prompt.body}, image]
         schema = {"name": "description", "schema": request.prompt.schema, "strict": True}
         body: dict[str, Any] = {
             "model": self.model,
@@ -153,7 +138,7 @@ class Server:
                 break
             wait = min(LONGEST_PAUSE, self._pause * 2**k)
             try:
-                response = self._request("POST", json=payload)
+                response = self._request("POST", "chat/completions", json=payload)
             except self._errors as error:
                 failure = self._gone(self._reason(error))
                 if isinstance(error, self._refused) and not self._answered:
@@ -173,22 +158,15 @@ class Server:
             elif status != 200:
                 raise self._refusal(status, answer)
             elif isinstance(answer, str):
-                failure = RejectedError(
-                    f"the reply is no JSON: {self._scrubbed(self._cleaned(answer))[:80]!r}"
-                )
+                failure = RejectedError(f"the reply is no JSON: {self._cleaned(answer)[:80]!r}")
             else:
                 return answer
         raise failure
 
-    def _request(self, method: str, **content: Any) -> Any:
-        """The response to a request, by a client that no other thread uses."""
-        client = self._clients.get()
-        try:
-            if self._closed.is_set():
-                raise self._gone("closed")
-            return client.request(method, self._urls[method], **content)
-        finally:
-            self._clients.put(client)
+    def _request(self, method: str, path: str, **content: Any) -> Any:
+        if self._closed.is_set():
+            raise self._gone("closed")
+        return self._client.request(method, path, **content)
 
     def _gone(self, reason: str, fix: str = "Check its address and that it runs") -> Exception:
         """Nobody is there any more, or was."""
@@ -200,7 +178,7 @@ class Server:
         """What a status other than 200 means."""
         got = f"status {status}: {self._message(answer)}"
         if status in (401, 403):
-            where = f"the environment variable {self._variable}"
+            where = f"the environment variable {KEY_VARIABLE}"
             fix = f"Put a key into {where}" if self._key is None else f"Check the key in {where}"
             must = "must be a server that accepts the key"
             return PalpateError(must, f"{self.url}: {got}", fix, argument="server")
@@ -218,7 +196,7 @@ class Server:
     def _models(self) -> list[str]:
         """Names of the server's models; empty if it does not list them."""
         try:
-            response = self._request("GET")
+            response = self._request("GET", "models")
             listed = _parsed(response)["data"] if response.status_code == 200 else []
             return [self._cleaned(str(model["id"])) for model in listed]
         except (self._errors, LookupError, TypeError, ValueError):
@@ -231,7 +209,7 @@ class Server:
             PalpateError: if there is none, or a choice.
         """
         try:
-            response = self._request("GET")
+            response = self._request("GET", "models")
         except self._errors as error:
             raise self._gone(self._reason(error)) from None
         if response.status_code in (401, 403):
@@ -246,11 +224,12 @@ class Server:
 
     def _reason(self, error: Exception) -> str:
         """What broke the connection, in words; the library's may repeat a header."""
-        return f"{type(error).__name__} {self._scrubbed(str(error))}".strip()
+        return f"{type(error).__name__} {self._cleaned(str(error))}".strip()
 
     def _cleaned(self, text: str) -> str:
-        """A text without the key, and with characters that exist."""
-        return self._scrubbed(valid(text), SHORT_KEY)
+        """A text without the key, which some servers repeat, and with characters that exist."""
+        text = valid(text)
+        return text.replace(self._key, "***") if len(self._key) >= SHORT_KEY else text
 
     def _message(self, answer: Any) -> str:
         """What an error reply says, in one short line."""
@@ -259,15 +238,7 @@ class Server:
             answer = error["message"] if isinstance(error, dict) else error
         except (LookupError, AttributeError):
             pass
-        try:
-            text = str(answer)
-        except RecursionError:
-            text = "a deeply nested message"
-        return " ".join(self._scrubbed(valid(text)).split())[:200] or "no message"
-
-    def _scrubbed(self, text: str, least: int = 1) -> str:
-        """A text without the key, which some servers repeat, if it has ``least`` characters."""
-        return text.replace(self._key, "***") if self._key and len(self._key) >= least else text
+        return " ".join(self._cleaned(str(answer)).split())[:200] or "no message"
 
 
 def _checked_url(url: str) -> str:
@@ -276,8 +247,7 @@ def _checked_url(url: str) -> str:
     Raises:
         PalpateError: if it is no http(s) URL, or holds a password or a query, which would be kept.
     """
-    match = re.fullmatch(r"https?://[\w.\-\[\]:]+?(:(?P<port>\d{1,5}))?(/[^?#\s]*)?", url)
-    if match is None or int(match["port"] or 0) > 65535 or not _is_host(url):
+    if not re.fullmatch(r"https?://[\w.\-\[\]:]+(/[^?#\s]*)?", url):
         must = "must be http://HOST:PORT or https://HOST and a path, without password or query"
         shown = re.sub(r"//[^/]*@", "//***@", url.partition("?")[0])
         fix = "Most servers: http://localhost:8000/v1"
@@ -285,34 +255,20 @@ def _checked_url(url: str) -> str:
     return url.rstrip("/").removesuffix("/chat/completions")
 
 
-def _is_host(url: str) -> bool:
-    """Whether the host of a URL can be looked up."""
-    import httpx2
-
-    try:
-        return bool(httpx2.URL(url).host.encode("idna"))
-    except (httpx2.InvalidURL, UnicodeError):
-        return False
-
-
-def _key(variable: str, *, required: bool) -> str | None:
-    key = os.environ.get(variable, "").strip()
-    if (required and not key) or not re.fullmatch(r"[\x21-\x7e]*", key):
-        must = "must name an environment variable that holds the key"
-        got = f"{variable}, {'with signs that no key has' if key else 'which is not set'}"
-        raise PalpateError(must, got, f"export {variable}=...", argument="key_variable")
-    return key or None
+def _key() -> str:
+    """The key; empty without one."""
+    key = os.environ.get(KEY_VARIABLE, "").strip()
+    if not re.fullmatch(r"[\x21-\x7e]*", key):
+        must, got = f"{KEY_VARIABLE} must hold a key", "signs that no key has"
+        raise PalpateError(must, got, f"export {KEY_VARIABLE}=...")
+    return key
 
 
 def _retry_after(value: str, default: float) -> float:
-    """Seconds that the server asks to wait: a number, or a date."""
+    """Seconds that the server asks to wait, where it gives a number."""
     try:
         return max(0.0, float(value))
     except ValueError:
-        pass
-    try:
-        return max(0.0, email.utils.parsedate_to_datetime(value).timestamp() - time.time())
-    except (TypeError, ValueError):
         return default
 
 
@@ -330,22 +286,5 @@ def _parsed(response: Any) -> Any:
     """The JSON of a response, else its text."""
     try:
         return json.loads(response.content)
-    except (ValueError, RecursionError):
+    except ValueError:
         return response.text
-
-
-def _tokens(usage: Any, name: str) -> int:
-    """A number of tokens; 0 where a server does not give one."""
-    count = usage.get(name) if isinstance(usage, dict) else None
-    return int(count) if isinstance(count, int | float) and 0 <= count < 1e12 else 0
-
-
-def _string(value: Any) -> str:
-    return value if isinstance(value, str) else ""
-
-
-def _text_of(content: Any) -> str:
-    """The text of a message: a text, or a list of parts."""
-    if isinstance(content, list):
-        return "".join(str(part.get("text") or "") for part in content)
-    return str(content or "")

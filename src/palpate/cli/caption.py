@@ -16,14 +16,13 @@ from palpate.core import PalpateError
 
 @dataclass(frozen=True, kw_only=True)
 class Source:
-    """Where captions come from: one of --server, --local and --template."""
+    """Where captions come from: --server or --template."""
 
     server: Annotated[str | None, tyro.conf.arg(metavar="URL")] = None
-    """Base URL of an OpenAI-compatible API, e.g. http://localhost:8000/v1."""
+    """Base URL of an OpenAI-compatible API, e.g. http://localhost:8000/v1; its key is read from the
+    environment variable PALPATE_CAPTION_KEY."""
     model: str | None = None
     """Its model (default: the only one that it has)."""
-    local: Annotated[str | None, tyro.conf.arg(metavar="FOLDER_OR_ID")] = None
-    """A model of transformers for this process: its folder, or its id on the hub."""
     template: Annotated[tuple[str, ...] | None, tyro.conf.arg(metavar="[TEXT]")] = None
     """No model: columns in braces (`"{material} of {object}"`), or adjectives of the material."""
 
@@ -36,10 +35,6 @@ class RequestOptions:
     """`touch-adjectives/1`, `touch-sentence/1`, or a prompt file."""
     per: Literal["contact", "frame", "object"] = "contact"
     """What has a description of its own; that of its middle frame is copied to the others."""
-    crop: Annotated[
-        tuple[float, float, float, float] | None, tyro.conf.arg(metavar="LEFT TOP RIGHT BOTTOM")
-    ] = None
-    """Also send this part of the photo, where the sensor touches; from 0 to 1."""
     concurrency: int = 8
     """Requests at once."""
     timeout: float = 120.0
@@ -50,10 +45,6 @@ class RequestOptions:
     """Of the model's sampling, and of templates."""
     body: Annotated[str | None, tyro.conf.arg(metavar="JSON")] = None
     """Further fields of every request, as a JSON object; null removes a field."""
-    key_variable: Annotated[str | None, tyro.conf.arg(metavar="NAME")] = None
-    """Environment variable that holds the server's key (default: PALPATE_CAPTION_KEY, if set)."""
-    again: Switch = False
-    """Ask again where the reply was a refusal or could not be used."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -72,9 +63,7 @@ class Options(Common):
     source: Source = field(default_factory=Source)
     requests: RequestOptions = field(default_factory=RequestOptions)
     dry_run: Switch = False
-    """Send no photo; print requests, tokens, time and price."""
-    prices: Annotated[tuple[float, float] | None, tyro.conf.arg(metavar="IN OUT")] = None
-    """With --dry-run: prices of a million tokens in and out."""
+    """Send no photo; print how many requests it takes."""
 
 
 def run(options: Options, terminal: Terminal) -> tuple[dict[str, Any], int]:
@@ -91,7 +80,6 @@ def run(options: Options, terminal: Terminal) -> tuple[dict[str, Any], int]:
                 options.data,
                 options.output,
                 dry_run=options.dry_run,
-                prices=options.prices,
                 progress=progress,
                 **arguments,
             )
@@ -121,7 +109,7 @@ def _object(text: str | None) -> dict[str, Any] | None:
     """
     try:
         value = None if text is None else json.loads(text)
-    except (ValueError, RecursionError):
+    except ValueError:
         value = text
     if value is not None and not isinstance(value, dict):
         must, example = "must be a JSON object", {"body": '{"temperature": null}'}

@@ -32,8 +32,6 @@ class Options(Common):
     fail_over: float | None = None
     """Exit with status 1 if more than this share of the captions is flagged: names its label, has
     visual words or digits, is a refusal, empty or overlong."""
-    mask: Annotated[Path | None, tyro.conf.arg(metavar="FOLDER")] = None
-    """Also write a new version of the captions without the names of materials."""
     output: OptionalOutPath = None
     """Write the scores as JSON, for `palpate report`."""
     page: Path | None = None
@@ -44,7 +42,7 @@ class Options(Common):
 
 def run(options: Options, terminal: Terminal) -> tuple[dict[str, Any], int]:
     """Check, print the table, write."""
-    from palpate.captions import check_captions, mask_captions
+    from palpate.captions import check_captions
     from palpate.captions.checking import FLAGGED, SHARE
 
     limit = options.fail_over
@@ -63,9 +61,6 @@ def run(options: Options, terminal: Terminal) -> tuple[dict[str, Any], int]:
             **extra,
         )
     shown = terminal.deliver(results, output=options.output, page=options.page)
-    if options.mask:
-        masked = mask_captions(options.captions, options.mask, data=options.data, **extra)
-        terminal.print(str(masked))
     flagged = float(results[SHARE, FLAGGED])
     failed = limit is not None and flagged > limit
     if failed:

@@ -630,9 +630,6 @@ CAPTIONS: dict[str, Sentence] = {
         "Captions were filled from columns ({template}): they say no more than these do, and "
         "scores that use them measure the label"
     ),
-    "captions-other-model": lambda p, _: (
-        f"The server answered as {few(p['models'])}, not as {p['model']}"
-    ),
     "captions-words": lambda p, _: (
         "Most often: " + ", ".join(f"{word} {count}" for word, count in p["words"].items())
     ),
