@@ -25,7 +25,7 @@ STUDY = Study(
     "A small study",
     (1, 3),
     {"leak": "contact", "seed": 71},
-    methods=(METHODS[OURS], METHODS["GVST"], METHODS["Ours w/ BG"]),  # rulers rank three
+    methods=(METHODS[OURS], METHODS["GVST"], METHODS["Ours w/ BG"]),
     presets={"tiny": TINY},
 )
 

@@ -246,14 +246,3 @@ def test_differences_of_seeds_are_joined_by_metric_pair_and_preset():
     claims = paper_claims([study(1, 0.005)], tasks={}, people=PEOPLE)
     assert len({c.claim for c in claims}) == len(claims) == 1 + 2 + 9 + 1
     assert claims[0].verdict == "undecided"  # no task was measured
-
-
-def test_the_distance_of_patches_stands_in_for_lpips():
-    other = difference("patch distance (palpate/mini vision)", 5, pair=("Ours", "Ours w/ BG"))
-    made = {c.claim: c for c in preference_claims([other], PEOPLE)}
-    claim = made["LPIPS prefers what people do not"]
-    assert claim.verdict == "holds"
-    assert claim.why.startswith(
-        "Lead by patch distance (palpate/mini vision) (below 0: behind): of Ours over Ours w/ BG −5"
-    )
-    assert made["FID prefers what people do not"].verdict == "undecided"

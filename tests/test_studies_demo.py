@@ -66,12 +66,12 @@ def whole(tmp_path_factory) -> Path:
 def test_the_page_is_made_again_number_by_number_where_the_run_was_moved(whole, tmp_path):
     shutil.copytree(whole, tmp_path / "moved")
     checked = verify(tmp_path / "moved" / "page.json")
-    assert checked.counts["same"] == len(checked.checks) > 100
+    assert checked.counts["same"] == len(checked.checks) > 50
     image = next((tmp_path / "moved" / "generated").rglob("*.png"))
     Image.effect_noise(Image.open(image).size, 64).convert("RGB").save(image)
     changed = {c.name for c in verify(tmp_path / "moved" / "page.json").checks if c.why}
-    assert {"stage generated", "stage scores, made again", "fact Distance"} <= changed
-    assert "stage split, made again" not in changed
+    assert {"stage generated", "TMMD of generated (grouped)"} <= changed
+    assert "stage split" not in changed
 
 
 def test_the_demo_ends_in_a_page_with_everything_on_it(whole):

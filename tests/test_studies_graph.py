@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 
 from palpate.core import PalpateError, locked
-from palpate.studies.graph import Node, plan_graph, run_graph
+from palpate.studies.graph import Node, run_graph
 
 
 def write(text, folder, before, progress):
@@ -70,14 +70,12 @@ def test_one_process_and_two_write_the_same_stages(tmp_path):
         (node("b", "a", text="other"), {"b", "d"}),
         (node("b", "a", version=2), {"b", "d"}),
         (node("b", "a", "c"), {"b", "d"}),
-        (node("b", "a", cost=9.0), set()),
     ],
 )
 def test_a_changed_node_builds_itself_and_what_reads_it(tmp_path, changed, names):
     run_graph(DIAMOND, tmp_path)
     nodes = [changed if n.name == "b" else n for n in DIAMOND]
-    planned, lines = plan_graph(nodes, tmp_path), []
-    assert {p.name for p in planned if not p.done} == names
+    lines = []
     run_graph(nodes, tmp_path, print_line=lines.append)
     assert built(lines) == names
 
@@ -90,19 +88,10 @@ def test_what_reads_a_stage_is_built_again_where_that_has_other_files(tmp_path, 
     shutil.rmtree(tmp_path / "a")
     other = Node("a", partial(write, text), {"text": "a"})
     nodes = [other if n.name == "a" else n for n in DIAMOND]
-    assert not any(p.done for p in plan_graph(nodes, tmp_path))
     lines = []
     run_graph(nodes, tmp_path, jobs=jobs, print_line=lines.append)
     assert built(lines) == names
     assert texts(tmp_path)["d"] == f"{text}b{text}cd"
-    assert all(p.done for p in plan_graph(nodes, tmp_path))
-
-
-def test_a_plan_writes_nothing_and_gives_costs_in_order(tmp_path):
-    nodes = [node("b", "a", cost=7.0), node("a", cost=5.0)]
-    planned = [(p.name, p.done, p.cost) for p in plan_graph(nodes, tmp_path / "run")]
-    assert planned == [("a", False, 5.0), ("b", False, 7.0)]
-    assert not (tmp_path / "run").exists()
 
 
 @pytest.mark.parametrize(
@@ -115,9 +104,8 @@ def test_a_plan_writes_nothing_and_gives_costs_in_order(tmp_path):
     ],
 )
 def test_a_graph_that_cannot_be_run(tmp_path, nodes, words):
-    for call in (plan_graph, run_graph):
-        with pytest.raises(PalpateError, match=words):
-            call(nodes, tmp_path / "run")
+    with pytest.raises(PalpateError, match=words):
+        run_graph(nodes, tmp_path / "run")
     assert not (tmp_path / "run").exists()
 
 
@@ -136,7 +124,7 @@ def test_an_error_stops_the_run_and_finished_nodes_stay(tmp_path, jobs, error):
         run_graph(nodes, tmp_path, jobs=jobs, print_line=lines.append)
     assert str(raised.value) == str(error)
     assert "b: stopped by an error" in lines
-    assert [p.done for p in plan_graph(nodes, tmp_path)] == [True, False, False]
+    assert [p.parent.name for p in tmp_path.glob("*/stage.json")] == ["a"]
 
 
 def die(folder, before, progress):
@@ -192,27 +180,6 @@ def test_gpus_are_dealt_out_and_threads_are_those_of_one_process(tmp_path, monke
 
 def rest(seconds, folder, before, progress):
     time.sleep(seconds)
-
-
-def test_time_left_follows_costs_and_what_finished_nodes_took(tmp_path):
-    chain = [
-        Node(f"n{k}", partial(rest, 0.2), {}, (f"n{k - 1}",) if k else (), cost=100.0)
-        for k in range(3)
-    ]
-    reports = []
-    run_graph(chain, tmp_path, progress=lambda *args: reports.append(args))
-    whole = [args for args in reports if args[0] == "all stages"]
-    assert whole[0][1:] == (0, 3, "about 5 min left")  # 300 s of costs
-    after = [args[3] for args in whole if args[1] == 1]
-    assert after[0] == "about 46 s left"  # 200 s of costs, of 130 s that took 30.2 s
-
-
-def test_short_nodes_say_little_of_the_time_left(tmp_path):
-    """A world that takes a tenth of what it should leaves the cost of the trainings as it is."""
-    nodes = [node("a", cost=10.0), node("b", "a", cost=5000.0)]
-    lines = []
-    run_graph(nodes, tmp_path, print_line=lines.append)
-    assert "1 of 2 stages, about 82 min left" in lines  # 83 of costs
 
 
 @pytest.mark.parametrize("jobs", [1, 2])

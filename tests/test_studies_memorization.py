@@ -178,18 +178,3 @@ def test_embeddings_take_embeddings_of_train(capsys, tmp_path, monkeypatch):
     status, _, err = call(capsys, *args[:4], "--train", "folder")
     assert status == 2
     assert "train must be of the kind of the reference" in err or "--train" in err
-
-
-def test_the_table_has_a_row_for_each_method_and_split():
-    from palpate.core import Score
-    from palpate.studies.memorization import memorization_table
-
-    orig = [*memorization(planted(0.5), TEST, TRAIN, subject="Ours"), Score("SSIM", "Ours", 0.5)]
-    table = memorization_table({"Orig": orig, "NoLeak": memorization(TEST, TEST, TRAIN)}, ["x"])
-    assert table.columns[2:] == [
-        "memorized share (tactile features)",
-        "nearness to train (tactile features)",
-    ]
-    assert [row[:2] for row in table.rows] == [["Ours", "Orig"], ["generated", "NoLeak"]]
-    assert table.rows[0][2] is orig[0]
-    assert float(table.rows[0][2]) > 0.4

@@ -1,7 +1,6 @@
 """Studies: their objects and nodes, controls against planted truths, tables from forged scores."""
 
 import json
-import re
 import shutil
 from dataclasses import replace
 from functools import partial
@@ -24,7 +23,7 @@ from palpate.studies.controls import CONTROLS, FLOOR, NEAREST
 from palpate.studies.graph import in_order
 from palpate.studies.making import slug
 from palpate.studies.methods import METHODS, OURS, Method, Setting
-from palpate.studies.reproduce import nodes_of, plan_of, planned
+from palpate.studies.reproduce import nodes_of, plan_of
 from palpate.studies.stages import stage_digest
 from palpate.studies.study import NOLEAK, ORIG, STUDIES, Study
 from palpate.studies.study_tables import Scores, study_tables
@@ -42,9 +41,8 @@ def test_no_two_names_share_a_folder():
 
 
 def test_compared_methods_differ_in_what_their_row_says():
-    """By-text shares the training of Ours; every other pair of methods has trainings of its own."""
-    shared = [{a.name, b.name} for a, b in combinations(TRAINED, 2) if a.training == b.training]
-    assert shared == [{OURS, "Ours, by text"}]
+    rows = [(m.condition, m.background, m.vq) for m in TRAINED]
+    assert all(a != b for a, b in combinations(rows, 2))
     for preset in WORLD.presets.values():
         made = {m.name: m.preset(preset.diffusion) for m in TRAINED}
         for other in made.values():
@@ -70,7 +68,6 @@ def test_nodes_train_once_for_each_split_and_seed():
         for judge in (ORIG, NOLEAK):  # both encoders judge both generators
             after = nodes[f"scores-{split}-by-{judge}-{seed}"].after
             assert {f"encoder-{judge}-{seed}", f"images-ours-{split}-{seed}"} <= {*after}
-    assert "ours-by-text-NoLeak-0" not in nodes
     assert "gvst-Orig-0" not in nodes
     judged = nodes["scores-NoLeak-by-NoLeak-1"]
     assert {*judged.inputs["methods"]} == {*METHODS}
@@ -83,11 +80,9 @@ def test_another_seed_leaves_the_nodes_of_the_first(tmp_path):
         for seeds in ((0,), (0, 1))
     )
     changed = {name for name in one if one[name] != two[name]}
-    over_seeds = {"results", "appearance", "rulers", "utility", "forty"}
-    assert changed == over_seeds
-    for name in ("utility", "forty"):
-        read = {n.name: n for n in nodes_of(plan_of(WORLD, seeds=(0, 1)))}[name].after
-        assert {"images-ours-NoLeak-0", "images-ours-NoLeak-1"} <= {*read}
+    assert changed == {"results", "utility"}
+    read = {n.name: n for n in nodes_of(plan_of(WORLD, seeds=(0, 1)))}["utility"].after
+    assert {"images-ours-NoLeak-0", "images-ours-NoLeak-1"} <= {*read}
 
 
 def digests(study, **options):
@@ -121,8 +116,7 @@ def test_other_shipped_weights_build_what_reads_them(monkeypatch):
     after = digests(WORLD)
     trained = [n for n in before if n.startswith(("encoder", "ours", "gvst", "images-ours"))]
     assert all(before[name] == after[name] for name in trained)
-    for name in ("images-palpate-mini-NoLeak-0", "rulers"):
-        assert before[name] != after[name], name
+    assert before["images-palpate-mini-NoLeak-0"] != after["images-palpate-mini-NoLeak-0"]
 
 
 @pytest.mark.parametrize("part", ["clip", "encoders", "autoencoder", "generator"])
@@ -167,12 +161,8 @@ def test_the_size_of_the_paper_needs_its_autoencoder(tmp_path):
     assert made["paper"].keys() == made["mini"].keys()
 
 
-def bright(setting, by=1, **more):
-    raise NotImplementedError
-
-
-def brighter(by):
-    return lambda setting: bright(setting, by)
+def closed(by):
+    return lambda setting: by
 
 
 def made_by(make):
@@ -180,20 +170,9 @@ def made_by(make):
     return digests(study)["images-mine-NoLeak-0"]
 
 
-def test_functions_are_told_apart_by_what_they_are_given():
-    makes = [bright, brighter(1), brighter(2), partial(bright, by=1), partial(bright, by=2)]
-    makes += [partial(bright, darken=bright), partial(bright, darken=controls.mean_image)]
-    assert len({*map(made_by, makes)}) == len(makes)
-    assert made_by(partial(bright, by=2)) == made_by(partial(bright, by=2))
-
-
-class Callable:
-    def __call__(self, setting):
-        raise NotImplementedError
-
-
-@pytest.mark.parametrize("make", [Callable(), len, partial(bright, by=Callable())])
-def test_a_function_without_source_is_refused(make):
+@pytest.mark.parametrize("make", [closed(1), len, partial(controls.mean_image, by=1)])
+def test_a_function_without_source_or_with_values_of_another_is_refused(make):
+    assert made_by(controls.mean_image) != made_by(controls.one_image)
     with pytest.raises(PalpateError, match="must be a function of a file"):
         made_by(make)
 
@@ -205,41 +184,6 @@ def test_a_method_of_your_own_trains_nothing():
     assert "images-mine-NoLeak-0" in nodes
     assert "mine-NoLeak-0" not in nodes
     assert "mine" in nodes["scores-NoLeak-by-NoLeak-0"].inputs["methods"]
-
-
-def test_a_dry_run_writes_nothing(tmp_path, capsys):
-    run = tmp_path / "run"
-    assert main(["reproduce", "world-digit", "-o", str(run), "--dry-run", "--json"]) == 0
-    stages = json.loads(capsys.readouterr().out)["stages"]
-    assert not run.exists()
-    assert [s["name"] for s in stages[:2]] == ["world", "data"]
-    assert stages[-1]["name"] == "results"
-    assert not any(s["done"] for s in stages)
-
-
-def test_costs_are_those_that_the_preset_states(tmp_path):
-    one, two = (
-        sum(s.cost for s in planned(plan_of(WORLD, seeds=seeds), tmp_path)) / 60
-        for seeds in ((0,), (0, 1))
-    )
-    stated = WORLD.presets["mini"].cost
-    once, seed = map(int, re.findall(r"(\d+) minutes", stated))
-    assert two - one == pytest.approx(seed, rel=0.1)
-    assert 2 * one - two == pytest.approx(once, rel=0.1)
-    assert one / 2 < 90, "preset mini must stay under 90 minutes on two cores"
-
-
-def test_a_training_costs_what_its_preset_says_and_the_rest_a_share(tmp_path):
-    smoke, mini = (
-        {s.name: s.cost for s in planned(plan_of(WORLD, preset=p), tmp_path)} for p in WORLD.presets
-    )
-    encoder, autoencoder, method = WORLD.presets["smoke"].seconds
-    trained = [
-        smoke[f"{name}-NoLeak{end}"]
-        for name, end in (("encoder", "-0"), ("autoencoder", ""), ("ours", "-0"))
-    ]
-    assert trained == [encoder, autoencoder, method]
-    assert smoke["utility"] == pytest.approx(WORLD.presets["smoke"].rest * mini["utility"])
 
 
 def test_a_human_study_must_be_one(tmp_path):
@@ -278,7 +222,7 @@ def test_a_study_on_disk_needs_a_root(small_manifest, tmp_path):
     with pytest.raises(PalpateError, match="must be given for the study mine"):
         plan_of(study)
     small_manifest.save(tmp_path / "data" / "manifest.parquet")
-    names = [s.name for s in planned(plan_of(study, root=tmp_path / "data"), tmp_path / "run")]
+    names = [n.name for n in nodes_of(plan_of(study, root=tmp_path / "data"))]
     assert "world" not in names
     assert names[0] == "data"
 
@@ -547,10 +491,8 @@ def test_the_study_at_smoke(tmp_path):
     results = Results.load(run / "results.json")
     titles = [table.title.partition(":")[0] for table in results.tables]
     assert titles[:3] == ["Table 1", "Table 3", "Table 4"]
-    further = {"Material accuracy by training data", "Which ruler", "Memorization"}
-    assert further <= {table.title for table in results.tables}
-    assert results.curves
-    assert {"beyond the paper", "paper, section 3.1"} <= {claim.source for claim in results.claims}
+    assert "Material accuracy by training data" in {table.title for table in results.tables}
+    assert "beyond the paper" in {claim.source for claim in results.claims}
     rows = [row[0] for row in results.tables[1].rows]
     assert {*METHODS, *CONTROLS, controls.HALVES, judging.HALF_PROBES} == {*rows}
     assert len(results.audits) == 2
@@ -560,8 +502,8 @@ def test_the_study_at_smoke(tmp_path):
         for cell in (c for row in table.rows for c in row if isinstance(c, Score)):
             assert (run / cell.details["stage"] / "stage.json").is_file()
     checked = verify(run / "results.json").counts
-    assert checked["same"] > 1000
-    assert checked["differs"] == checked["untraced"] == 0
+    assert checked["same"] > 300
+    assert checked["differs"] == checked["cannot check"] == 0
     times = {p: p.stat().st_mtime_ns for p in run.glob("*/stage.json")}
     # The images of a method, given as another system's, score as that method's.
     given = f"theirs={run / 'images-gvst-NoLeak-0' / 'images'}"

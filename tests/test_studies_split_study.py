@@ -2,7 +2,6 @@
 
 import json
 import os
-import shutil
 import signal
 import subprocess
 import sys
@@ -20,7 +19,6 @@ from palpate.data import Manifest
 pytest.importorskip("torch")
 from palpate.encoders.presets import PRESETS
 from palpate.studies.split_study import compare_splits
-from palpate.studies.verifying import verify
 
 
 @pytest.fixture
@@ -85,10 +83,6 @@ def test_a_planted_leak_costs_what_it_is_worth(data, tmp_path, capsys, monkeypat
     assert "points" in capsys.readouterr().out
     assert {p: p.stat().st_mtime_ns for p in stages} == stages
     assert "noleak" in (tmp_path / "drop.html").read_text()
-    checked = verify("drop.json")  # with the encoders of the run
-    assert checked.counts["same"] == len(checked.checks) > 50
-    shutil.rmtree("run/noleak-1")
-    assert "The stage noleak-1 must be there" in str(verify("drop.json"))
 
 
 @pytest.mark.slow

@@ -2,21 +2,26 @@
 
 from collections import Counter
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
-from palpate.core import FeatureSet, PalpateError
-from palpate.studies.controls import CEILING
+from palpate.core import FeatureSet, PalpateError, Score
+from palpate.report.results import Results
+from palpate.report.study import StudyTable
+from palpate.studies import utility as utility_module
+from palpate.studies.controls import CEILING, NEAREST
 from palpate.studies.utility import (
+    GAIN,
     REAL,
     Draws,
     Training,
-    _tested,
+    _hits,
     fewest_videos,
-    linear_map,
     material_utility,
-    retrieval_utility,
+    measure_utility,
+    table_over_seeds,
     utility,
     utility_claims,
 )
@@ -64,7 +69,7 @@ def material():
 
 
 def test_noise_does_not_help_and_real_images_of_other_videos_do(material):
-    rows = cells(material[0])
+    rows = cells(material)
     assert all(float(gain) <= 0.02 for gain in rows["gain by noise"])
     one = rows["gain by good"][0]
     assert one.interval[0] > 0.02
@@ -75,7 +80,7 @@ def test_noise_does_not_help_and_real_images_of_other_videos_do(material):
 
 
 def test_the_claim_follows_the_gain_at_one_video(material):
-    made = {c.claim: c for c in utility_claims(material[0])}
+    made = {c.claim: c for c in utility_claims(material)}
     assert made["Images of good help a classifier of real touch"].verdict == "holds"
     noise = made["Images of noise help a classifier of real touch"]
     assert noise.verdict in ("undecided", "does not hold")
@@ -90,21 +95,20 @@ def test_the_claim_follows_the_gain_at_one_video(material):
                 for c in row[1:]
             ),
         ]
-        for row in material[0].rows
+        for row in material.rows
         if str(row[0]).startswith("gain")
     ]
-    flipped = utility_claims(replace(material[0], rows=reversed_rows))
+    flipped = utility_claims(replace(material, rows=reversed_rows))
     assert flipped[1].verdict == "does not hold"
 
 
-def test_controls_are_rows_and_neither_lines_nor_claims():
+def test_controls_are_rows_and_no_claims():
     good = {name: like_test(videos(20, "other", 4)) for name in ("made", "retrieved")}
     draws = Draws(shots=(1,), draws=1)
-    table, curve = material_utility(TRAIN, TEST, good, draws, controls=["retrieved"])
+    table = material_utility(TRAIN, TEST, good, draws, controls=["retrieved"])
     aside = ["k real + retrieved", "retrieved alone", "gain by retrieved"]
     assert sorted(table.controls) == sorted(aside)
     assert {*aside} < {*cells(table)}
-    assert [line.label for line in curve.lines] == [REAL, "k real + made", "made alone"]
     assert [c.claim for c in utility_claims(table)] == [
         "Images of made help a classifier of real touch"
     ]
@@ -112,37 +116,38 @@ def test_controls_are_rows_and_neither_lines_nor_claims():
 
 def test_no_image_trains_what_names_its_video(material):
     """Of the test images themselves a probe would know each video's deviation by heart."""
-    rows = cells(material[0])
+    rows = cells(material)
     good, leak = (float(rows[f"{REAL} + {name}"][0]) for name in ("good", "leak"))
     assert leak == pytest.approx(good, abs=0.08)
-    by_heart = material_utility(TRAIN, TEST, {"x": _renamed(TEST)}, FEW)[0]
+    by_heart = material_utility(TRAIN, TEST, {"x": _renamed(TEST)}, FEW)
     assert float(cells(by_heart)[f"{REAL} + x"][0]) > leak + 0.15
 
 
-def test_every_fold_leaves_out_as_many_videos_of_a_class():
+def test_every_fold_leaves_out_as_many_videos_of_a_class(monkeypatch):
     """Else a class is rarer in training where it is tested, and no knowledge is below chance."""
     uneven = [
         i for i, g in zip(TEST.ids, TEST.groups, strict=True) if g not in ("test0-1", "test2-3")
     ]
     test, seen = TEST.take(uneven), []
 
-    def fit(features):
+    def named(features, rows, l2):
         pairs = {*zip(features.labels, features.groups, strict=True)}
         seen.append(Counter(label for label, _ in pairs))
-        return lambda rows: np.zeros(len(rows.ids))
+        return [""] * len(rows)
 
-    _tested(Draws(folds=3), 0, test, Training(generated=test), fit)
+    monkeypatch.setattr(utility_module, "_named", named)
+    _hits(Draws(folds=3), 0, test, Training(generated=test))
     assert seen == 3 * [{"class 0": 12, "class 1": 13, "class 2": 12, "class 3": 13}]
     other = Training(generated=replace(test, groups=[f"other {g}" for g in test.groups]))
     seen.clear()
-    _tested(Draws(folds=3), 0, test, other, fit)
+    _hits(Draws(folds=3), 0, test, other)
     assert seen == [{"class 0": 19, "class 1": 20, "class 2": 19, "class 3": 20}]
 
 
 def test_a_claim_names_what_a_perfect_generator_would_add():
     good = {name: like_test(videos(20, "other", 4)) for name in ("made", CEILING)}
     draws = Draws(shots=(1,), draws=1)
-    table = material_utility(TRAIN, TEST, good, draws, controls=[CEILING])[0]
+    table = material_utility(TRAIN, TEST, good, draws, controls=[CEILING])
     [claim] = utility_claims(table)
     assert "Images of a perfect generator would change it by 0." in claim.why
     assert claim.why.endswith("] at k = 1.")
@@ -153,13 +158,8 @@ def _renamed(features):
     return replace(features, groups=[f"renamed {g}" for g in features.groups])
 
 
-def test_the_curve_is_the_table_and_says_how_it_was_drawn(material):
-    table, curve = material
-    rows = cells(table)
-    assert curve.log_x
-    for line in curve.lines:
-        assert [x for x, _ in line.points] == [1, 2, 4]
-        assert [s.value for _, s in line.points] == [s.value for s in rows[line.label]]
+def test_scores_say_how_they_were_drawn_and_gains_are_paired(material):
+    rows = cells(material)
     score = rows[REAL][0]
     assert len(score.details["by_seed"]) == 3
     assert score.value == pytest.approx(np.mean(score.details["by_seed"]))
@@ -185,7 +185,7 @@ def test_the_drawn_videos_are_nested_and_the_same_for_all_sets():
         len({f for f, g in zip(fold, TEST.groups, strict=True) if g == v}) == 1 for v in TEST.groups
     )
     assert set(FEW.fold_of(TEST, TRAIN)) == {0}
-    table, _ = material_utility(TRAIN, TEST, {}, Draws(shots=(1, 16), draws=2))
+    table = material_utility(TRAIN, TEST, {}, Draws(shots=(1, 16), draws=2))
     assert cells(table)[REAL][1] is None  # no class has 16 videos
 
 
@@ -213,48 +213,9 @@ def test_k_is_what_every_tested_class_has_without_its_fold():
     assert fewest_videos(Draws(), part([5, 1], "v"), part([5, 1], "v")) == 0
 
 
-def test_the_map_is_the_minimum_and_without_data_the_identity():
-    rng = np.random.default_rng(0)
-    x, turn = rng.normal(size=(40, 3)), np.linalg.qr(rng.normal(size=(3, 3)))[0]
-    weight, bias = linear_map(x, x @ turn + 2, 1e-9)
-    assert np.allclose(weight, turn, atol=1e-6)
-    assert np.allclose(bias, 2, atol=1e-6)
-    weight, _ = linear_map(x, x @ turn, 1e9)
-    assert np.allclose(weight, np.eye(3), atol=1e-6)
-
-    def loss(w):
-        b = (x @ turn).mean(axis=0) - x.mean(axis=0) @ w
-        error = ((x @ w + b - x @ turn) ** 2).sum()
-        return error + 40 * 0.5 / 3 * ((w - np.eye(3)) ** 2).sum()
-
-    best, _ = linear_map(x, x @ turn, 0.5)
-    steps = (0.01 * rng.normal(size=(3, 3)) for _ in range(20))
-    assert all(loss(best) < loss(best + step) for step in steps)
-
-
-def test_pairs_of_other_videos_help_retrieval_and_shuffled_ones_do_not():
-    turn = np.linalg.qr(np.random.default_rng(5).normal(size=(DIM, DIM)))[0].astype(np.float32)
-    every = [TRAIN, TEST]
-    x = np.concatenate([part.features for part in every])
-    ids = [i for part in every for i in part.ids]
-    keys = FeatureSet(ids, (x @ turn + 0.05).astype(np.float32))
-    shuffled = np.random.default_rng(6).permutation(TEST.features)
-    generated = {"good": TEST, "wrong": replace(TEST, features=shuffled)}
-    table = retrieval_utility(TRAIN, TEST, keys, generated, draws=FEW)
-    rows = cells(table)
-    assert rows["gain by good"][0].interval[0] > 0
-    assert float(rows["gain by wrong"][2]) < 0.02
-    assert float(rows["the encoder"][0]) < float(rows[f"{REAL} + good"][0])
-    assert rows[REAL][0].metric == "top-5 of 240 (vision by tactile)"
-    with pytest.raises(PalpateError, match="share a space"):
-        retrieval_utility(TRAIN, TEST, FeatureSet(ids, x[:, :3]), {})
-
-
 def test_mistakes_are_named():
     with pytest.raises(PalpateError, match="'test' must have materials"):
         material_utility(TRAIN, replace(TEST, labels=None), {})
-    with pytest.raises(PalpateError, match="in order"):
-        Draws(shots=(2, 1))
 
 
 def test_an_encoder_that_saw_test_videos_is_rejected(tmp_path):
@@ -290,18 +251,62 @@ def test_an_encoder_that_saw_test_videos_is_rejected(tmp_path):
     Manifest.from_rows(rows, folder).save(folder / "manifest.parquet")
     generated = {"Ours": folder}
     encoders = make_encoders()
-    tables, curve = utility(manifest, split, encoders, generated, Draws(shots=(1,), draws=2))
-    assert [t.title for t in tables] == [
-        "Material accuracy by training data",
-        "Retrieval of vision by training data",
-        "Retrieval of text by training data",
-    ]
+    table = utility(manifest, split, encoders, generated, Draws(shots=(1,), draws=2))
     # A test video a class: nothing is left to train its own material on, so no "Ours alone".
-    assert {line.label for line in curve.lines} == {REAL, f"{REAL} + Ours"}
-    assert cells(tables[0])[REAL][0].split == split.digest
+    assert {*cells(table)} == {REAL, f"{REAL} + Ours", "gain by Ours"}
+    assert cells(table)[REAL][0].split == split.digest
     from palpate.encoders.preprocess import digest_images
 
     pixels = np.stack([np.asarray(Image.open(p)) for p in manifest.paths("tactile")])
     encoders.seen = np.unique(digest_images(encoders.preprocess("tactile").fit(pixels)))
     with pytest.raises(PalpateError, match="has not seen"):
         utility(manifest, split, encoders, generated, Draws(shots=(1,), draws=2))
+
+
+def score(value, subject="Ours"):
+    return Score("accuracy", subject, value, (value - 0.05, value + 0.05))
+
+
+def table_of(*cells):
+    return StudyTable("T", "", ["trained on", "k = 1", "k = 2"], [[f"{GAIN}Ours", *cells]])
+
+
+def test_cells_are_means_and_what_a_seed_lacks_is_left_out():
+    tables = [table_of(score(0.1), score(0.5)), table_of(score(0.3), None)]
+    (label, mean, none), *_ = table_over_seeds(tables).rows
+    assert label == f"{GAIN}Ours"
+    assert mean.value == pytest.approx(0.2)
+    assert mean.details["by_seed"] == [0.1, 0.3]
+    assert mean.interval[1] - mean.interval[0] > 0.1  # wider than that of one seed
+    assert none is None
+
+
+@pytest.mark.parametrize(
+    ("gains", "verdict"), [((0.1,), "holds"), ((0.1, -0.08, 0.02), "undecided")]
+)
+def test_whether_images_help_is_decided_by_all_seeds(tmp_path, monkeypatch, gains, verdict):
+    """One training may gain where the next loses."""
+    left = list(gains)
+
+    def forged(manifest, split, judge, images, draws, *, controls, progress):
+        assert controls == [NEAREST]
+        assert images[NEAREST].name == "real-nearest-photo"
+        gain = score(left.pop(0), images["Ours"].parent.name)
+        assert judge == tmp_path / f"encoder-{gain.subject[-1]}" / "encoders"
+        gain = score(gain.value)
+        return table_of(gain, gain)
+
+    monkeypatch.setattr(utility_module, "utility", forged)
+    monkeypatch.setattr(utility_module, "data_of", lambda after, name: (None, None))
+    load = SimpleNamespace(load=lambda folder, device: folder)
+    monkeypatch.setattr(utility_module, "EncoderSet", load)
+    runs = {f"encoder-{k}": {"Ours": f"images-{k}"} for k in range(len(gains))}
+    names = [n for encoders, made in runs.items() for n in (encoders, *made.values())]
+    names.append("controls-NoLeak")
+    after = {name: tmp_path / name for name in names}
+    (after["controls-NoLeak"] / "real-nearest-photo").mkdir(parents=True)
+    how = {"runs": runs, "controls": [NEAREST, "mean image"], "draws": Draws(), "device": "cpu"}
+    measure_utility(tmp_path, after, lambda *_: None, **how)
+    results = Results.load(tmp_path / "results.json")
+    assert results.claims[0].verdict == verdict
+    assert results.tables[0].rows[0][1].details["by_seed"] == list(gains)

@@ -77,7 +77,7 @@ COMMANDS: dict[str, int] = {
     "--companions ssim psnr --permutations 0": 4,
     "score --generated IN/manifest --reference IN/manifest --split IN/split/split.json "
     "--encoder IN/models/encoders --permutations 9": 1,
-    "verify IN/results/audit.json --tolerance 1e-3 -o OUT/v.json": 4,
+    "verify IN/results/audit.json --tolerance 1e-3": 4,
     "verify IN/results/scores.json --json": 4,
     "report IN/results/audit.json IN/results/scores.json -o OUT/page.html": 8,
     "world -o OUT/w --preset tiny --size 16 --materials 2 --workers 1": 1,

@@ -8,7 +8,7 @@ from typing import Annotated, Any, Literal
 
 import tyro
 
-from palpate.cli.terminal import Common, OutPath, Switch, Terminal, require_extra
+from palpate.cli.terminal import Common, OutPath, Terminal, require_extra
 from palpate.core import PalpateError
 
 #: Names of ``palpate.studies.study.STUDIES``, without its imports.
@@ -56,8 +56,6 @@ class Options(Common):
     """Processes that run stages at the same time."""
     device: str = "auto"
     """auto, cpu, cuda, mps."""
-    dry_run: Switch = False
-    """Print the stages, which are done, and what the others cost; write nothing."""
 
 
 def run(options: Options, terminal: Terminal) -> dict[str, Any]:
@@ -67,7 +65,7 @@ def run(options: Options, terminal: Terminal) -> dict[str, Any]:
     from palpate.core import write_text
     from palpate.evaluation.companions import Weights
     from palpate.report import summary_lines
-    from palpate.studies.reproduce import plan_of, planned, run_study
+    from palpate.studies.reproduce import plan_of, run_study
     from palpate.studies.study import STUDIES
 
     output = options.output
@@ -83,8 +81,6 @@ def run(options: Options, terminal: Terminal) -> dict[str, Any]:
         vq=options.vq,
         weights=Weights(inception=options.inception, clip=options.clip, lpips=options.lpips),
     )
-    if options.dry_run:
-        return _print_plan(planned(plan, output), terminal)
     kept = any(output.glob("*.partial")) or any(output.glob("*/stage.json"))
     if output.is_dir() and any(output.iterdir()) and not kept:
         must, got = "must be new, empty, or a run folder", f"{output}, with other files"
@@ -121,15 +117,3 @@ def _folders(values: tuple[str, ...]) -> dict[str, Path]:
             raise PalpateError(must, value, "", argument="method", example=example)
         folders[name] = Path(folder)
     return folders
-
-
-def _print_plan(stages: Any, terminal: Terminal) -> dict[str, Any]:
-    """The stages with their costs."""
-    left = sum(stage.cost for stage in stages if not stage.done)
-    for stage in stages:
-        state = "done" if stage.done else "to do"
-        terminal.print(f"{state:>5}  {stage.cost:>6.0f} s  {stage.name}")
-    done = sum(stage.done for stage in stages)
-    terminal.print(f"{len(stages)} stages, {done} done; about {left / 60:.0f} minutes of one core")
-    rows = [{"name": s.name, "done": s.done, "seconds": s.cost} for s in stages]
-    return {"stages": rows, "seconds_left": left}

@@ -8,17 +8,15 @@ from typing import Annotated, Any
 
 import tyro
 
-from palpate.cli.terminal import FAILED_CHECK, Common, OptionalOutPath, Terminal, guard_output
-from palpate.core import write_json
+from palpate.cli.terminal import FAILED_CHECK, Common, Terminal
 
 
 @dataclass(frozen=True, kw_only=True)
 class Options(Common):
-    """Make the numbers of a results file again from its inputs, and compare one by one.
+    """Make the numbers of a results file again from its inputs, and compare them.
 
-    Each input and each number is the same, differs, cannot be checked (an input is missing, or was
-    never a file) or is untraced (the file does not say where it comes from). Exits with status 1 if
-    something differs or is untraced.
+    Each score, audit, table and input is the same, differs, or cannot be checked (an input is
+    missing, or was never a file). Exits with status 1 if something differs.
     """
 
     results: Annotated[Path, tyro.conf.Positional]
@@ -28,20 +26,13 @@ class Options(Common):
     tolerance: float = 1e-6
     """Relative difference up to which two numbers are the same, if not to the sixth decimal:
     another machine adds in another order. Counts and digests must be equal."""
-    output: OptionalOutPath = None
-    """Write every check as JSON."""
 
 
 def run(options: Options, terminal: Terminal) -> tuple[dict[str, Any], int]:
     """Verify, print the counts and all that is not the same, write."""
-    if options.output:
-        guard_output(options.output, [options.results], (b'"format": "palpate-verification',))
     from palpate.studies.verifying import verify
 
     with terminal.progress() as progress:
         checked = verify(options.results, tolerance=options.tolerance, progress=progress)
-    for line in checked.lines:
-        terminal.print(line)
-    if options.output:
-        write_json(options.output, checked.to_json())
+    terminal.print(str(checked))
     return checked.to_json(), 0 if checked.ok else FAILED_CHECK

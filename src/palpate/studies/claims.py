@@ -31,8 +31,6 @@ TRADITIONAL = ("SSIM", "PSNR", "LPIPS", "FID", "CMMD")
 FAMILY = ("TMMD", "I-TMMD", "CI-TMMD", "D-TMMD")
 #: What feature metrics are called whose features are of a tactile encoder: none of the paper's.
 TACTILE = "(tactile)"
-#: What counts for a metric without its weights (:mod:`palpate.studies.photo_companions`).
-STAND_INS = {"LPIPS": "patch distance"}
 PEOPLE = "human preference"
 #: How to read a lead.
 BEHIND = "below 0: behind"
@@ -157,8 +155,7 @@ def _of_metric(metric: str, difference: Score) -> bool:
     name = metric_of(difference)
     if metric in FAMILY:
         return name == metric
-    known = metric, STAND_INS.get(metric)
-    return name.partition(" (")[0] in known and not name.endswith(TACTILE)
+    return name.partition(" (")[0] == metric and not name.endswith(TACTILE)
 
 
 def _between(differences: Iterable[Score], metric: str, a: str, b: str) -> list[Score]:

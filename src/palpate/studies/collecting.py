@@ -14,7 +14,6 @@ from palpate.diffusion.generation import Generated
 from palpate.evaluation.probing import results_of
 from palpate.report.notes import percent
 from palpate.report.results import Audit, GalleryItem, Results
-from palpate.report.study import Curve
 from palpate.studies.claims import Names, differences_over_seeds, effect_table, paper_claims
 from palpate.studies.controls import FLOOR, NEAREST
 from palpate.studies.demo_page import gallery as gallery_of
@@ -28,7 +27,6 @@ from palpate.studies.judging import (
     stamped,
 )
 from palpate.studies.making import After, Facts
-from palpate.studies.memorization import memorization_table
 from palpate.studies.methods import BACKGROUND, OURS, VQ
 from palpate.studies.study import NOLEAK, ORIG, SPLITS, Study
 from palpate.studies.study_tables import FAMILY, READING, RETRIEVAL, Scores, same_task, study_tables
@@ -45,14 +43,14 @@ def collect(
     probes: Mapping[str, Sequence[str]],
     gallery: Mapping[str, str],
     people: Path | None = None,
-    questions: Sequence[str] = (),
+    useful: bool = False,
 ) -> Facts:
     """Write ``results.json``: everything but the record of the run.
 
     ``judgments``: (split of the images, split of the judge) -> nodes, one a seed; ``probes``: split
     -> nodes; ``gallery``: split -> node of the images that are shown; ``people``: results of a
-    human study, columns of table 3 and evidence of claims; ``questions``: nodes of further tables,
-    curves and claims.
+    human study, columns of table 3 and evidence of claims; ``useful``: whether there is the stage
+    ``utility``.
     """
     manifest = Manifest.load(after["data"])
     splits = {name: Split.load(after["split"] / f"{name}.json") for name in SPLITS}
@@ -71,12 +69,8 @@ def collect(
     tables = [
         *study_tables(study, judged, known, **names, extra=extra, people=votes),
         effect_table([d for d in differences_over_seeds(noleak) if _compares(d, methods)]),
-        memorization_table(
-            {split: [*judged[split, split].by_name.values()] for split in SPLITS},
-            controls=names["controls"],
-        ),
     ]
-    answers = [Results.load(after[node] / "results.json") for node in questions]
+    answers = [Results.load(after["utility"] / "results.json")] if useful else []
     tables += [table for answer in answers for table in answer.tables]
     images = [m for m in methods if m.startswith("GVST")]
     tasks = {**_tasks_of_encoders(probed.scores), **_tasks_of_generators(seeds)}
@@ -98,7 +92,6 @@ def collect(
         },
         notes=notes,
         tables=[replace(t, rows=_staged_rows(t.rows, stage)) for t in tables],
-        curves=[_staged_curve(c, stage) for a in answers for c in a.curves],
         claims=[replace(c, evidence=[stamped(s, stage) for s in c.evidence]) for c in claims],
     )
     results.save(place / "results.json")
@@ -162,11 +155,6 @@ def _is(score: Score, metric: str) -> bool:
 
 def _staged_rows(rows: Sequence[Sequence[Any]], stage: str) -> list[list[Any]]:
     return [[stamped(c, stage) if isinstance(c, Score) else c for c in row] for row in rows]
-
-
-def _staged_curve(curve: Curve, stage: str) -> Curve:
-    lines = [replace(n, points=[(x, stamped(s, stage)) for x, s in n.points]) for n in curve.lines]
-    return replace(curve, lines=lines)
 
 
 def _leak(audits: Sequence[Audit]) -> str:

@@ -7,24 +7,20 @@ from pathlib import Path
 
 from palpate.core import FeatureSet, Progress, quiet
 from palpate.data.manifest import Manifest
-from palpate.diffusion.generation import Generated
 from palpate.encoders.embed import embed
 from palpate.encoders.encoder_set import EncoderSet
 from palpate.evaluation.inputs import read
 
 
 def embed_generated(
-    images: Generated | Path | str,
-    manifest: Manifest,
-    encoders: EncoderSet,
-    progress: Progress = quiet,
+    images: Path, manifest: Manifest, encoders: EncoderSet, progress: Progress = quiet
 ) -> FeatureSet:
     """Tactile features (n, d) of generated images.
 
     Materials, videos, sensors and no-contact images are those of the manifest's samples.
 
     Args:
-        images: a folder of ``palpate generate``, also as it was returned, or one with a manifest.
+        images: a folder of ``palpate generate``, or one with a manifest.
         manifest: samples of the same ids, and perhaps others.
         encoders: with a tactile one.
         progress: progress callback.
@@ -34,8 +30,7 @@ def embed_generated(
     """
     import polars as pl
 
-    folder = images.folder if isinstance(images, Generated) else images
-    made = read(str(folder), "generated").manifest
+    made = read(str(images), "generated").manifest
     assert made is not None  # a folder holds images
     paths = [str(path.resolve()) for path in made.paths("tactile")]
     part = manifest.take(made.ids)

@@ -13,9 +13,8 @@ from __future__ import annotations
 import multiprocessing
 import os
 import signal
-import time
 import traceback
-from collections.abc import Callable, Collection, Generator, Mapping, Sequence
+from collections.abc import Callable, Generator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from functools import partial
@@ -28,8 +27,6 @@ from palpate.core import PalpateError, Progress, few, locked, quiet, require
 from palpate.core.processes import exit_with_parent
 from palpate.studies.stages import Run, Stage, finished_stage, stage_digest
 
-#: Share of all costs that counts as measured before any node is done.
-PRIOR = 0.1
 Build = Callable[[Path, Mapping[str, Path], Progress], Mapping[str, Any] | None]
 PrintLine = Callable[[str], None]
 Channel = Any  # one end of a pipe, whose type depends on the system
@@ -47,7 +44,6 @@ class Node:
         inputs: what it reads besides earlier stages: options, digests, seeds.
         after: names of earlier nodes; their digests enter its own.
         version: raised by hand when the stage comes to write other bytes.
-        cost: expected seconds of one core; 0: unknown.
         measures: it trains nothing: ``palpate verify`` builds it again, to compare.
     """
 
@@ -56,38 +52,7 @@ class Node:
     inputs: Mapping[str, Any]
     after: Sequence[str] = ()
     version: int = 1
-    cost: float = 0.0
     measures: bool = False
-
-
-@dataclass(frozen=True)
-class Planned:
-    """What running would do with a node.
-
-    Attributes:
-        name: of the node.
-        done: whether its stage exists for the same inputs, and those that it reads exist. After one
-            that does not it may turn out to be done, if that is made again with the same files.
-        cost: seconds: what it took, or else is expected to take (0: unknown).
-    """
-
-    name: str
-    done: bool
-    cost: float
-
-
-def plan_graph(nodes: Sequence[Node], folder: Path) -> list[Planned]:
-    """Return what :func:`run_graph` would do, in its order; nothing is written.
-
-    Raises:
-        PalpateError: as :func:`run_graph` does for the nodes.
-    """
-    ordered, done = in_order(nodes), dict[str, Stage]()
-    _take_finished(ordered, Path(folder), done)
-    return [
-        Planned(n.name, n.name in done, done[n.name].seconds if n.name in done else n.cost)
-        for n in ordered
-    ]
 
 
 def run_graph(
@@ -109,9 +74,7 @@ def run_graph(
         jobs: processes that build nodes; 1: this one. Each computes with OMP_NUM_THREADS threads,
             or where that is not set with its share of the cores, when sums may differ from those of
             other ``jobs`` in the last bits. Several GPUs are dealt out in turn.
-        print_line: called with one line for each stage begun, reused or done, and with the time
-            left: from the costs, scaled by what finished nodes took, as if a tenth of the whole had
-            taken what it costs before: the first nodes are short.
+        print_line: called with one line for each stage begun, reused or done.
         progress: called with what is done within a node, and over the whole.
 
     Returns:
@@ -173,25 +136,9 @@ def _reads(ordered: Sequence[Node]) -> dict[str, dict[str, Any]]:
     return reads
 
 
-def _take_finished(
-    ordered: Sequence[Node], folder: Path, stages: dict[str, Stage], begun: Collection[str] = ()
-) -> list[Stage]:
-    """Add to ``stages`` those that exist for the same inputs and files of earlier stages."""
-    reads, new = _reads(ordered), list[Stage]()
-    for node in ordered:
-        if node.name in {*stages, *begun} or not stages.keys() >= set(node.after):
-            continue
-        digest = stage_digest(node.name, reads[node.name], node.version)
-        outputs = {name: stages[name].outputs for name in node.after}
-        if (stage := finished_stage(folder / node.name, digest, outputs)) is not None:
-            stages[node.name] = stage
-            new.append(stage)
-    return new
-
-
 @dataclass
 class _Whole:
-    """All nodes of a run: what is done, what is running, and the time left."""
+    """All nodes of a run: what is done, and what is running."""
 
     ordered: Sequence[Node]
     folder: Path
@@ -199,12 +146,19 @@ class _Whole:
     print_line: PrintLine
     progress: Progress
     stages: dict[str, Stage] = field(default_factory=dict[str, Stage])
-    begun: dict[str, float] = field(default_factory=dict[str, float])  # name -> when
+    begun: set[str] = field(default_factory=set[str])
 
     def take_finished(self) -> None:
         """Take what needs no work, from now on or once what it reads has been made again."""
-        for stage in _take_finished(self.ordered, self.folder, self.stages, self.begun):
-            self.print_line(f"{stage.folder.name}: already done ({stage.seconds:.0f} s then)")
+        reads = _reads(self.ordered)
+        for node in self.ordered:
+            if node.name in {*self.stages, *self.begun} or not self.stages.keys() >= {*node.after}:
+                continue
+            digest = stage_digest(node.name, reads[node.name], node.version)
+            outputs = {name: self.stages[name].outputs for name in node.after}
+            if (stage := finished_stage(self.folder / node.name, digest, outputs)) is not None:
+                self.stages[node.name] = stage
+                self.print_line(f"{node.name}: already done ({stage.seconds:.0f} s then)")
 
     def ready(self) -> _Task | None:
         """The first node that may begin."""
@@ -216,50 +170,19 @@ class _Whole:
         return _Task(node, self.folder, _reads(self.ordered)[node.name], outputs)
 
     def begin(self, node: Node) -> None:
-        self.begun[node.name] = time.monotonic()
+        self.begun.add(node.name)
         self.show()
 
     def end(self, stage: Stage) -> None:
-        self.begun.pop(stage.folder.name)
+        self.begun.remove(stage.folder.name)
         self.stages[stage.folder.name] = stage
         self.take_finished()
         self.show()
         if len(self.stages) < len(self.ordered):
-            self.print_line(f"{len(self.stages)} of {len(self.ordered)} stages{self.remark()}")
+            self.print_line(f"{len(self.stages)} of {len(self.ordered)} stages")
 
     def show(self) -> None:
-        done, total = len(self.stages), len(self.ordered)
-        self.progress("all stages", done, total, self.remark().removeprefix(", "))
-
-    def remark(self) -> str:
-        left = self.seconds_left()
-        return "" if left is None else f", about {_words(left)} left"
-
-    def seconds_left(self) -> float | None:
-        """Expected seconds until the end; None where no cost is known.
-
-        At least the longest chain, and at least an equal share of the work for each process.
-        """
-        known = [n for n in self.ordered if n.cost > 0]
-        if not known:
-            return None
-        took = [(n.cost, self.stages[n.name].seconds) for n in known if n.name in self.stages]
-        prior = PRIOR * sum(n.cost for n in known)
-        cost, seconds = (prior + sum(c[k] for c in took) for k in (0, 1))
-        now, left, chain = time.monotonic(), dict[str, float](), dict[str, float]()
-        for node in self.ordered:
-            expected = node.cost * seconds / cost - (now - self.begun.get(node.name, now))
-            left[node.name] = 0.0 if node.name in self.stages else max(expected, 0.0)
-            before = max((chain[name] for name in node.after), default=0.0)
-            chain[node.name] = before + left[node.name]
-        return max(sum(left.values()) / self.jobs, *chain.values())
-
-
-def _words(seconds: float) -> str:
-    """A duration as people say it: ``40 s``, ``12 min``, ``3.5 h``."""
-    if seconds < 90:
-        return f"{seconds:.0f} s"
-    return f"{seconds / 60:.0f} min" if seconds < 90 * 60 else f"{seconds / 3600:.1f} h"
+        self.progress("all stages", len(self.stages), len(self.ordered))
 
 
 @dataclass(frozen=True)

@@ -27,7 +27,6 @@ from palpate.metrics.probe import fit_probe
 from palpate.studies.controls import FLOOR, HALVES, MEMORIZED, NEAREST, ONE, WRONG, nearest_rows
 from palpate.studies.making import After, Facts, cache_of, control_folders, data_of
 from palpate.studies.methods import OURS
-from palpate.studies.photo_companions import photo_companions
 from palpate.studies.study import SPLITS, Judged, Metric
 
 #: Controls that are train images, which a probe of material was fitted to.
@@ -98,7 +97,7 @@ class Judging:
         methods: name -> node of its images.
         controls: names.
         metrics: further ones.
-        clip: frozen encoders, for FID and CMMD.
+        clip: frozen encoders, of whose photos some are the nearest.
         size: side of the images in pixels.
         seed: of the trainings.
         permutations: of the permutation test of TMMD.
@@ -150,20 +149,10 @@ def judge_images(
     real = load_images(test.paths("tactile"), judging.size)
     features = embed(test, judge, "tactile", cache=cache, still=True)
     made = {n: replace(features, features=embed_images(x, judge)) for n, x in images.items()}
-    vision = EncoderSet(load_clip(judging.clip, device=device))
-    scores += photo_companions(
-        images,
-        real,
-        vision,
-        ids=test.ids,
-        groups=features.groups,
-        name=judging.clip,
-        split=split.digest,
-        progress=progress,
-    )
     scores = [s for s in scores if _compares(s, methods)]
     if NEAREST in made and features.labels is not None:
         train = manifest.part(split, "train")
+        vision = EncoderSet(load_clip(judging.clip, device=device))
         rows = nearest_rows(train, test, vision, cache=cache)
         scores += _cross_fitted(
             embed(train, judge, cache=cache), made[NEAREST], features, rows, split

@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,7 +26,7 @@ from palpate.diffusion.presets import DiffusionPreset
 Images = NDArray[np.uint8]
 #: The paper's training, driven at test time by the photo in the place of the text.
 OURS = "Ours"
-BRIDGE, GVST, BEST = "Ours w/ memory bridge", "GVST", "best"
+GVST, BEST = "GVST", "best"
 #: Behind the paper's kind of autoencoder, which is not given the gel; with it and without.
 VQ, BACKGROUND = "Ours, VQ", "Ours w/ BG"
 #: What ``palpate generate`` uses without a model.
@@ -93,7 +93,6 @@ class Method:
         background: the denoiser sees the no-contact image.
         vq: behind the paper's kind of autoencoder, which codes the gel with the touch, instead of
             the one that is given the no-contact image.
-        drive: what it is given for a test sample: its photo, or its text.
         make: makes the images in place of a diffusion model, in any way.
     """
 
@@ -102,17 +101,11 @@ class Method:
     condition: Mapping[str, Any] = field(default_factory=dict[str, Any])
     background: bool = False
     vq: bool = False
-    drive: Literal["photo", "text"] = "photo"
     make: Make | None = None
 
     def preset(self, base: DiffusionPreset) -> DiffusionPreset:
         """The preset with what differs."""
         return replace(base, condition=replace(base.condition, **self.condition))
-
-    @property
-    def training(self) -> dict[str, Any]:
-        """What its training depends on: methods of one training differ in what drives them."""
-        return {"condition": self.condition, "background": self.background, "vq": self.vq}
 
 
 def shipped(setting: Setting) -> Images:
@@ -127,13 +120,6 @@ METHODS: Mapping[str, Method] = {
     method.name: method
     for method in (
         Method(OURS, "Trained on texts, driven by the photo's embedding in their place.", BARE),
-        Method("Ours, by text", "Ours, driven by each sample's own text.", BARE, drive="text"),
-        Method(
-            BRIDGE,
-            "Ours, with texts and photos less their training means; the photo is replaced by its "
-            "projection on the training texts.",
-            {**BARE, "gap": "memory"},
-        ),
         Method(
             GVST,
             "The same token from photos in training, too: no text.",

@@ -24,7 +24,6 @@ class DemoPreset:
         train: share of the train part.
         tactile_epochs: passes of the tactile encoder over the pretraining samples, then over the
             train part (the first are left out where it goes on from a ready one).
-        cost: measured on two CPU cores.
     """
 
     name: str
@@ -36,7 +35,6 @@ class DemoPreset:
     start: bool = False
     train: float = 0.75
     tactile_epochs: tuple[float, float] = (5, 6)
-    cost: str = ""
 
 
 #: Materials that feel different: with all twenty, minutes of training stay close to chance.
@@ -58,15 +56,7 @@ PRESETS = {
     p.name: p
     for p in (
         #              name    world   pretraining                encoder diffusion
-        DemoPreset(
-            "tiny",
-            _TINY,
-            replace(_TINY, seed=1000),
-            "tiny",
-            "tiny",
-            train=0.75,
-            cost="for tests: under a minute",
-        ),
+        DemoPreset("tiny", _TINY, replace(_TINY, seed=1000), "tiny", "tiny", train=0.75),
         DemoPreset(
             "mini",
             _MINI,
@@ -76,7 +66,6 @@ PRESETS = {
             models="palpate/mini",
             start=True,
             train=0.85,
-            cost="about 4 minutes on two x86-64 cores, one of them busy most of the time",
         ),
     )
 }

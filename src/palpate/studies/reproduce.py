@@ -22,7 +22,7 @@ from itertools import product
 from pathlib import Path
 from typing import Any
 
-from palpate.core import PalpateError, Progress, digest_file, plain, quiet, read_json, require
+from palpate.core import PalpateError, Progress, digest_file, quiet, read_json, require
 from palpate.evaluation.companions import Weights
 from palpate.evaluation.inputs import read as read_samples
 from palpate.preference.scoring import PREFERENCE
@@ -30,31 +30,14 @@ from palpate.report.results import Results
 from palpate.sim.presets import MINI_SEEDS
 from palpate.studies import making
 from palpate.studies.collecting import collect
-from palpate.studies.controls import NEAREST
 from palpate.studies.demo import model_stamp, require_unseen, stamp
-from palpate.studies.graph import Node, Planned, plan_graph, run_graph
+from palpate.studies.graph import Node, run_graph
 from palpate.studies.judging import Judging, judge_images, probe_encoders
-from palpate.studies.lengths import SAMPLING, SHARES
 from palpate.studies.making import slug
-from palpate.studies.methods import BACKGROUND, GVST, OURS, SHIPPED, VQ, Method, shipped
-from palpate.studies.questions import (
-    MOVED,
-    USEFUL,
-    compare_on_forty,
-    compare_rulers,
-    measure_compute,
-    measure_moves,
-    measure_utility,
-    move_images,
-    retrieve_moved,
-    sample_in_steps,
-)
+from palpate.studies.methods import SHIPPED, Method, shipped
 from palpate.studies.stages import Stage
 from palpate.studies.study import NOLEAK, SPLITS, STUDIES, Preset, Study
-from palpate.studies.utility import Draws
-
-#: Stages whose tables, curves and claims come after those of the paper.
-QUESTIONS = ("utility", "compute", "appearance", "forty", "rulers")
+from palpate.studies.utility import USEFUL, Draws, measure_utility
 
 
 @dataclasses.dataclass(frozen=True)
@@ -64,9 +47,7 @@ class Plan:
     Attributes:
         study: what is run.
         preset: how large.
-        seeds: one training of every encoder and method each. Splits and autoencoders are made once;
-            trainings of other lengths, numbers of sampling steps, and the encoders that rank the
-            generators are of the first.
+        seeds: one training of every encoder and method each; splits and autoencoders are made once.
         root: the data set on disk, for a study that is not of the world.
         others: name -> folder of images of the test part (of the split without leaks) that another
             system made.
@@ -180,7 +161,6 @@ def nodes_of(plan: Plan) -> list[Node]:
     """The nodes of a run; those of another seed, method or split come on top of what is there."""
     study, preset, device = plan.study, plan.preset, plan.device
     nodes = [*_data_nodes(plan)]
-    trained = set[str]()
     for split in SPLITS:
         nodes += _autoencoder_nodes(plan, split)
         after = ["data", "split", f"autoencoder-{split}"]
@@ -188,33 +168,32 @@ def nodes_of(plan: Plan) -> list[Node]:
         inputs: dict[str, Any] = {"controls": {n: _source(f) for n, f in study.controls.items()}}
         inputs |= {"size": preset.diffusion.size, **_clip(preset)}
         name = f"controls-{split}"
-        nodes.append(Node(name, partial(make, device=device), inputs, after, version=3, cost=20))
+        nodes.append(Node(name, partial(make, device=device), inputs, after))
     for seed, split in product(plan.seeds, SPLITS):
         encoder = f"encoder-{split}-{seed}"
         how: dict[str, Any] = {"preset": preset.encoder, "clip": preset.clip}
         build = partial(making.make_encoders, split=split, seed=seed, device=device, **how)
         inputs = {"preset": preset.encoder, **_clip(preset), "seed": seed}
-        nodes.append(Node(encoder, build, inputs, ["data", "split"], cost=preset.seconds[0]))
+        nodes.append(Node(encoder, build, inputs, ["data", "split"]))
         build = partial(probe_encoders, split=split, encoders=encoder, device=device)
         after = ["data", "split", encoder]
         name = f"probe-{split}-{seed}"
-        nodes.append(Node(name, build, {}, after, cost=15, measures=True))
+        nodes.append(Node(name, build, {}, after, measures=True))
         for method in study.trained_on(split):
-            nodes += _method_nodes(plan, method, split, seed, trained)
+            nodes += _method_nodes(plan, method, split, seed)
     nodes += [
         Node(
             _images_of_others(name),
             partial(making.take_images, split=NOLEAK, folder=folder, size=preset.diffusion.size),
             {"folder": read_samples(folder, str(folder)).image_digest()},
             ["data", "split"],
-            cost=5,
         )
         for name, folder in plan.others.items()
     ]
     for seed, split, judge in product(plan.seeds, SPLITS, SPLITS):
         nodes.append(_score_node(plan, split, judge, seed))
-    questions = _question_nodes(plan)
-    nodes += questions
+    useful = _utility_nodes(plan)
+    nodes += useful
     judgments = {(s, j): [_scores(s, j, n) for n in plan.seeds] for s, j in product(SPLITS, SPLITS)}
     probes = {split: [f"probe-{split}-{seed}" for seed in plan.seeds] for split in SPLITS}
     shown = {split: _images(study.on_both[0], split, plan.seeds[0]) for split in SPLITS}
@@ -226,28 +205,15 @@ def nodes_of(plan: Plan) -> list[Node]:
         probes=probes,
         gallery=shown,
         people=plan.people,
-        questions=[node.name for node in questions if node.name in QUESTIONS],
+        useful=bool(useful),
     )
     read = [node for of in (judgments, probes) for nodes in of.values() for node in nodes]
-    after = [
-        "data",
-        "split",
-        *shown.values(),
-        *read,
-        *(n.name for n in questions if n.name in QUESTIONS),
-    ]
+    after = ["data", "split", *shown.values(), *read, *(node.name for node in useful)]
     inputs = {"study": study.name, "title": study.title, "tables": study.tables}
     inputs |= {"paper": study.paper, "methods": plan.methods, "controls": list(study.controls)}
     inputs |= {"people": plan.people and digest_file(plan.people)}
-    nodes.append(Node("results", build, inputs, after, version=7, cost=10, measures=True))
-    return [_priced(node, preset.rest) for node in nodes]
-
-
-def _priced(node: Node, rest: float) -> Node:
-    """The node with the cost of its preset: a training has its own."""
-    trains = (making.make_encoders, making.make_autoencoder, making.make_generator)
-    trained = getattr(node.build, "func", node.build) in trains
-    return node if trained else dataclasses.replace(node, cost=rest * node.cost)
+    nodes.append(Node("results", build, inputs, after, measures=True))
+    return nodes
 
 
 def run_study(
@@ -281,11 +247,6 @@ def run_study(
     return results
 
 
-def planned(plan: Plan, folder: Path) -> list[Planned]:
-    """What a run would do with each stage; nothing is written."""
-    return plan_graph(nodes_of(plan), folder)
-
-
 def _world(study: Study, preset: Preset) -> Any:
     return dataclasses.replace(preset.world, **(study.world or {}))
 
@@ -296,15 +257,15 @@ def _data_nodes(plan: Plan) -> list[Node]:
     if study.world is not None:
         world = _world(study, plan.preset)
         build = partial(making.make_world, options=world)
-        nodes.append(Node("world", build, {"options": world, "digest": world.digest}, cost=10))
+        nodes.append(Node("world", build, {"options": world, "digest": world.digest}))
     build = partial(making.read_data, study=study, root=plan.root)
     inputs: dict[str, Any] = {"read": _source(study.read)}
     if plan.root is not None:
         inputs |= {"root": str(plan.root.resolve()), "stamp": stamp(plan.root)}
-    nodes.append(Node("data", build, inputs, [node.name for node in nodes], cost=10))
+    nodes.append(Node("data", build, inputs, [node.name for node in nodes]))
     inputs = {} if study.noleak is None else {"noleak": study.noleak}
     build = partial(making.make_splits, noleak=study.noleak)
-    nodes.append(Node("split", build, inputs, ["data"], cost=25, measures=True))
+    nodes.append(Node("split", build, inputs, ["data"], measures=True))
     return nodes
 
 
@@ -320,131 +281,29 @@ def _autoencoder_nodes(plan: Plan, split: str) -> list[Node]:
         if isinstance(options, str):
             inputs = {**how, "options": model_stamp("autoencoder", options)}
         build = partial(making.make_autoencoder, device=plan.device, **how)
-        nodes.append(Node(name, build, inputs, ["data", "split"], cost=preset.seconds[1]))
+        nodes.append(Node(name, build, inputs, ["data", "split"]))
     return nodes
 
 
-def _question_nodes(plan: Plan) -> list[Node]:
-    """What generation is for, what moves it, and which ruler: as far as the data allow."""
-    study, preset = plan.study, plan.preset
-    trained = {m.name: m for m in study.trained_on(NOLEAK) if m.make is None}
-    nodes, controls, seeds = list[Node](), [*study.controls], len(plan.seeds)
-
-    def made(names: Sequence[str]) -> list[dict[str, str]]:
-        """The images of methods by name, one a seed."""
-        return [{n: _images(n, NOLEAK, s) for n in names} for s in plan.seeds]
-
-    useful = [n for n in study.useful if n in trained]
-    if 2 not in study.tables and useful:
-        judges = [f"encoder-{NOLEAK}-{s}" for s in plan.seeds]
-        runs = dict(zip(judges, made(useful), strict=True))
-        given: dict[str, Any] = {"draws": Draws(), "controls": [c for c in USEFUL if c in controls]}
-        build = partial(measure_utility, runs=runs, device=plan.device, **given)
-        after = ["data", "split", *judges, f"controls-{NOLEAK}"]
-        after += [node for of in runs.values() for node in of.values()]
-        inputs = {**given, "methods": useful}
-        cost = 200 * seeds
-        nodes.append(Node("utility", build, inputs, after, version=5, cost=cost, measures=True))
-    if useful:
-        nodes += _compute_nodes(plan, {n: trained[n] for n in useful})
-    names = [n for n in study.moved if n in trained]
-    if study.world is not None and len(names) > 1:
-        nodes += _appearance_nodes(plan, {n: trained[n] for n in names})
-    paired = [n for n in (OURS, GVST, VQ, BACKGROUND) if n in trained]
-    if len(paired) > 1:
-        how: dict[str, Any] = {"clip": preset.clip, "size": preset.diffusion.size}
-        how |= {"controls": controls}
-        build = partial(compare_on_forty, runs=made(paired), device=plan.device, **how)
-        after = ["data", "split", *(node for of in made(paired) for node in of.values())]
-        after.append(f"controls-{NOLEAK}")
-        inputs = {**how, **_clip(preset)}
-        nodes.append(Node("forty", build, inputs, after, version=3, cost=15 * seeds, measures=True))
-    if len(trained) > 2:
-        nodes.append(_ruler_node(plan, [*trained]))
-    return nodes
-
-
-def _ruler_node(plan: Plan, methods: Sequence[str]) -> Node:
-    """Encoders of the first seed and, if there is one, the shipped one rank all images."""
-    controls, shipped_one = [*plan.study.controls], plan.preset.ruler
-    rulers = {f"trained on {s}": f"encoder-{s}-{plan.seeds[0]}" for s in SPLITS}
-    images = {(n, seed): _images(n, NOLEAK, seed) for n, seed in product(methods, plan.seeds)}
-    after = ["data", "split", f"controls-{NOLEAK}", *rulers.values(), *images.values()]
-    rulers |= {} if shipped_one is None else {shipped_one: shipped_one}
-    build = partial(compare_rulers, rulers=rulers, images=images, controls=controls)
-    build = partial(build, device=plan.device)
-    inputs: dict[str, Any] = {"rulers": rulers, "controls": controls}
-    inputs["shipped"] = model_stamp("encoders", shipped_one)
-    return Node("rulers", build, inputs, after, version=3, cost=75, measures=True)
-
-
-def _compute_nodes(plan: Plan, methods: Mapping[str, Method]) -> list[Node]:
-    """Shorter trainings, and other numbers of sampling steps, of the first seed."""
-    preset, seed = plan.preset, plan.seeds[0]
-    judge, nodes = f"encoder-{NOLEAK}-{seed}", list[Node]()
-    trained, sampled = dict[str, dict[int, str]](), dict[str, str]()
-    for name, method in methods.items():
-        trained[name] = {preset.steps: _images(name, NOLEAK, seed)}
-        for share in SHARES:
-            steps = round(share * preset.steps)
-            shorter = dataclasses.replace(method, name=f"{name} {steps} steps")
-            nodes += _method_nodes(_of_one(plan, shorter, steps), shorter, NOLEAK, seed, set())
-            trained[name][steps] = nodes[-1].name
-        sampled[name] = f"sampled-{slug(name)}-{seed}"
-        generator = _generator(plan.study, method, NOLEAK, seed)
-        build = partial(sample_in_steps, generator=generator, encoders=judge, seed=seed)
-        build = partial(build, device=plan.device)
-        inputs = {"samples": MOVED, "steps": SAMPLING, "seed": seed}
-        after = ["data", "split", generator, judge]
-        nodes.append(Node(sampled[name], build, inputs, after, cost=60))
-    build = partial(measure_compute, encoders=judge, trained=trained, sampled=sampled)
-    images = [node for of in trained.values() for node in of.values()]
-    after = ["data", "split", judge, *images, *sampled.values()]
-    build = partial(build, device=plan.device)
-    inputs = {"trained": {name: [*of.values()] for name, of in trained.items()}}
-    return [*nodes, Node("compute", build, inputs, after, cost=20, measures=True)]
-
-
-def _of_one(plan: Plan, method: Method, steps: int) -> Plan:
-    """The plan of one method alone, trained for other steps."""
-    (encoder, autoencoder, full), share = plan.preset.seconds, steps / plan.preset.steps
-    seconds = encoder, autoencoder, full * share
-    preset = dataclasses.replace(plan.preset, steps=steps, seconds=seconds)
-    study = dataclasses.replace(plan.study, methods=[method])
-    return dataclasses.replace(plan, study=study, preset=preset)
-
-
-def _appearance_nodes(plan: Plan, methods: Mapping[str, Method]) -> list[Node]:
-    nodes, moved = list[Node](), dict[str, list[tuple[str, str]]]()
-    options = _world(plan.study, plan.preset)
-    for (name, method), seed in product(methods.items(), plan.seeds):
-        generator, judge = _generator(plan.study, method, NOLEAK, seed), f"encoder-{NOLEAK}-{seed}"
-        node = f"moved-{slug(name)}-{seed}"
-        build = partial(move_images, generator=generator, encoders=judge, options=options)
-        build = partial(build, seed=seed, device=plan.device)
-        after = ["data", "split", generator, judge]
-        nodes.append(Node(node, build, {"samples": MOVED, "seed": seed}, after, cost=90))
-        moved.setdefault(name, []).append((node, judge))
-    for seed in plan.seeds if NEAREST in plan.study.controls else ():
-        node, judge = f"moved-{slug(NEAREST)}-{seed}", f"encoder-{NOLEAK}-{seed}"
-        build = partial(retrieve_moved, encoders=judge, options=options, clip=plan.preset.clip)
-        build = partial(build, device=plan.device)
-        inputs = {"samples": MOVED, **_clip(plan.preset)}
-        after = ["data", "split", judge]
-        nodes.append(Node(node, build, inputs, after, cost=30, measures=True))
-        moved.setdefault(NEAREST, []).append((node, judge))
-    read = [node for pairs in moved.values() for pair in pairs for node in pair]
-    ours, other = plan.study.moved[:2]
-    build = partial(measure_moves, moved=moved, ours=ours, other=other, device=plan.device)
-    after = ["data", "split", *dict.fromkeys(read)]
-    inputs = {"moved": list(moved)}
-    return [*nodes, Node("appearance", build, inputs, after, version=3, cost=10, measures=True)]
-
-
-def _generator(study: Study, method: Method, split: str, seed: int) -> str:
-    """The node that trains a method: that of the first one of the same training."""
-    same = (m for m in study.methods if m.make is None and m.training == method.training)
-    return f"{slug(next(same).name)}-{split}-{seed}"
+def _utility_nodes(plan: Plan) -> list[Node]:
+    """What generated images add for a classifier of materials, where there are some."""
+    study = plan.study
+    useful = [m.name for m in study.trained_on(NOLEAK) if m.make is None and m.name in study.useful]
+    if 2 in study.tables or not useful:
+        return []
+    runs = {
+        f"encoder-{NOLEAK}-{seed}": {name: _images(name, NOLEAK, seed) for name in useful}
+        for seed in plan.seeds
+    }
+    inputs: dict[str, Any] = {
+        "draws": Draws(),
+        "controls": [c for c in USEFUL if c in study.controls],
+    }
+    build = partial(measure_utility, runs=runs, device=plan.device, **inputs)
+    after = ["data", "split", *runs, f"controls-{NOLEAK}"]
+    after += [node for of in runs.values() for node in of.values()]
+    inputs["methods"] = useful
+    return [Node("utility", build, inputs, after, measures=True)]
 
 
 def _images_of_others(name: str) -> str:
@@ -459,33 +318,28 @@ def _scores(split: str, judge: str, seed: int) -> str:
     return f"scores-{split}-by-{judge}-{seed}"
 
 
-def _method_nodes(
-    plan: Plan, method: Method, split: str, seed: int, trained: set[str]
-) -> list[Node]:
-    """Training, unless another method shares it and has its node, and images."""
-    preset, study = plan.preset, plan.study
+def _method_nodes(plan: Plan, method: Method, split: str, seed: int) -> list[Node]:
+    """Training, unless it makes its images itself, and images."""
+    preset = plan.preset
     how: dict[str, Any] = {"split": split, "seed": seed, "preset": preset, "device": plan.device}
     nodes, generator = list[Node](), ""
     autoencoder = f"autoencoder-vq-{split}" if method.vq else f"autoencoder-{split}"
     if method.make is None:
-        generator = _generator(study, method, split, seed)
-        if generator not in trained:
-            trained.add(generator)
-            inputs = {"method": method.training, "diffusion": method.preset(preset.diffusion)}
-            inputs |= {"steps": preset.steps, **_clip(preset), "seed": seed}
-            inputs |= {"precision": preset.precision}
-            build = partial(making.make_generator, method=method, autoencoder=autoencoder, **how)
-            after = ["data", "split", autoencoder]
-            nodes.append(Node(generator, build, inputs, after, cost=preset.seconds[2]))
+        generator = f"{slug(method.name)}-{split}-{seed}"
+        inputs = {"diffusion": method.preset(preset.diffusion), "background": method.background}
+        inputs |= {"steps": preset.steps, **_clip(preset), "seed": seed}
+        inputs |= {"precision": preset.precision}
+        build = partial(making.make_generator, method=method, autoencoder=autoencoder, **how)
+        nodes.append(Node(generator, build, inputs, ["data", "split", autoencoder]))
     build = partial(making.make_images, method=method, generator=generator, **how)
-    inputs = {"drive": method.drive, "seed": seed}
+    inputs = {"seed": seed}
     if method.make is not None:
         inputs |= {"make": _source(method.make), "size": preset.diffusion.size}
         inputs |= {"steps": preset.steps, **_clip(preset)}
     if method.make is shipped:
         inputs |= {"weights": model_stamp("generator", SHIPPED)}
     after = ["data", "split", generator or autoencoder]
-    nodes.append(Node(_images(method.name, split, seed), build, inputs, after, cost=75))
+    nodes.append(Node(_images(method.name, split, seed), build, inputs, after))
     return nodes
 
 
@@ -517,7 +371,7 @@ def _score_node(plan: Plan, split: str, judge: str, seed: int) -> Node:
         inputs["weights"] = _stamps(plan.weights)
     after = ["data", "split", encoder, f"controls-{split}", *methods.values()]
     name = _scores(split, judge, seed)
-    return Node(name, build, inputs, after, version=4, cost=60, measures=True)
+    return Node(name, build, inputs, after, measures=True)
 
 
 def _clip(preset: Preset) -> dict[str, str | None]:
@@ -533,29 +387,20 @@ def _stamps(weights: Weights) -> dict[str, Any]:
     return {name: stamp for name, stamp in made.items() if stamp}
 
 
-def _source(function: Any) -> Any:
+def _source(function: Callable[..., Any]) -> str:
     """What names a function: its module, its name, and the digest of its source.
 
-    Of a partial one its arguments, too, and of one made within another what it holds of that.
-
     Raises:
-        PalpateError: if it has no source, or holds what JSON cannot.
+        PalpateError: if it has no source, or holds values of another function.
     """
-    if isinstance(function, partial):
-        return [_source(function.func), *map(_source, function.args), _source(function.keywords)]
-    if isinstance(function, Mapping):
-        return {key: _source(value) for key, value in function.items()}
     try:
-        if not callable(function):
-            return plain(function)
         text = hashlib.sha256(inspect.getsource(function).encode()).hexdigest()
-    except (OSError, TypeError, SyntaxError):
-        must = "What a study reads or makes its images with must be a function of a file, or a "
-        must += "functools.partial of one with numbers and words"
-        raise PalpateError(must, f"{function!r}"[:200], "Write it in a module") from None
-    name = f"{function.__module__}.{function.__qualname__} {text}"
-    cells = [_source(cell.cell_contents) for cell in getattr(function, "__closure__", None) or ()]
-    return [name, *cells] if cells else name
+    except (OSError, TypeError):
+        text = ""
+    if not text or getattr(function, "__closure__", None):
+        must = "What a study reads or makes its images with must be a function of a file"
+        raise PalpateError(must, f"{function!r}"[:200], "Write it in a module")
+    return f"{function.__module__}.{function.__qualname__} {text}"
 
 
 def settings_of(plan: Plan, stages: Mapping[str, Stage], jobs: int) -> dict[str, Any]:

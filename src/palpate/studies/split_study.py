@@ -18,7 +18,6 @@ from palpate.data.reading import load
 from palpate.encoders import EncoderSet, train_encoder
 from palpate.encoders.encoder_set import load_clip
 from palpate.evaluation.probing import Plan, Probed, measure, named, plan_of, results_of
-from palpate.report.calls import Call
 from palpate.report.results import Results
 from palpate.studies.making import fresh
 from palpate.studies.stages import Run
@@ -38,7 +37,6 @@ def compare_splits(  # noqa: PLR0913 - those of training
     compute: Compute | None = None,
     print_line: Callable[[str], None] = lambda line: None,
     progress: Progress = quiet,
-    run: Run | None = None,
     **options: Any,
 ) -> Results:
     """Train a tactile encoder on each split with each seed, and score it under that split.
@@ -55,7 +53,6 @@ def compare_splits(  # noqa: PLR0913 - those of training
         compute: how to train on the machine at hand; see :func:`palpate.train_encoder`.
         print_line: called with one line a training.
         progress: called with what is done.
-        run: in place of ``work``, one that makes its stages in its own way.
         options: of probing; see :func:`palpate.probe`.
 
     Returns:
@@ -70,10 +67,7 @@ def compare_splits(  # noqa: PLR0913 - those of training
         raise PalpateError("A study of splits must run in one process", processes, fix)
     once = 0 < len(seeds) == len(set(seeds))
     require(once, "seeds", "must hold at least one seed, each once", list(seeds), (0, 1, 2))
-    given = {"data": data, "splits": named(splits, "split"), "work": Path(work), "clip": clip}
-    given |= {"preset": preset, "epochs": epochs, "seeds": seeds, **options}
-    call = Call.of("probe --train", compare_splits, given)
-    run = run or Run(Path(work), print_line)
+    run = Run(Path(work), print_line)
     manifest, folder = load(data), run.folder
     loaded = {name: Split.load(split) for name, split in named(splits, "split").items()}
     axis = "split" if len(loaded) > 1 else ""
@@ -117,9 +111,7 @@ def compare_splits(  # noqa: PLR0913 - those of training
     settings = {**training, "preset": getattr(preset, "name", preset), "seeds": list(seeds)}
     settings |= frozen
     more = {"training": settings, "trainings": facts}
-    encoders = {"encoder": {name: fact["encoder"] for name, fact in facts.items()}}
-    call = call.with_digests({**results.settings["digests"], **encoders})
-    return replace(results, settings={**results.settings, **more}, calls=[call])
+    return replace(results, settings={**results.settings, **more})
 
 
 def _digests(clip: str) -> dict[str, str]:

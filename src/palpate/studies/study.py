@@ -21,7 +21,7 @@ from palpate.encoders.presets import EncoderPreset
 from palpate.sim import PRESETS as WORLDS
 from palpate.sim import WorldOptions
 from palpate.studies.controls import CONTROLS
-from palpate.studies.methods import BEST, BRIDGE, GVST, METHODS, OURS, SHIPPED, Images, Make, Method
+from palpate.studies.methods import BEST, GVST, METHODS, OURS, SHIPPED, Images, Make, Method
 from palpate.training.options import Precision
 
 #: The data set's own split, and ours.
@@ -44,11 +44,7 @@ class Preset:
             or a trained one's folder, hub id or ``.ckpt``; None: it must be given.
         clip: frozen vision and text encoders: a shipped name, hub id or folder.
         precision: of the methods' training (:class:`~palpate.training.options.Compute`).
-        ruler: another set of encoders that ranks the methods: a shipped name, or none.
         permutations: of the permutation test of TMMD.
-        cost: what a run takes once and for each seed, and where that was measured.
-        seconds: of one core, for one training of an encoder, of an autoencoder, and of a method.
-        rest: what all other stages take, of what they take with ``mini``.
     """
 
     name: str
@@ -60,11 +56,7 @@ class Preset:
     vq: AutoencoderOptions | str | None
     clip: str
     precision: Precision = "float32"
-    ruler: str | None = "palpate/mini"
     permutations: int = 999
-    cost: str = ""
-    seconds: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    rest: float = 1.0
 
 
 @dataclass(frozen=True)
@@ -111,10 +103,7 @@ class Study:
         on_both: names of methods that are trained on the data set's own split as well.
         controls: name -> what makes their images.
         metrics: further metrics.
-        useful: names of methods whose images train classifiers, where there are materials, and
-            which are trained shorter and sampled in other numbers of steps as well.
-        moved: names of methods whose photos are shown otherwise, on the world; text is said to be a
-            filter of the first one, against images in the second one.
+        useful: names of methods whose images train classifiers, where there are materials.
         presets: sizes by name.
         paper: whether the data are those of the paper, whose numbers then stand beside ours.
     """
@@ -130,7 +119,6 @@ class Study:
     controls: Mapping[str, Make] = field(default_factory=lambda: dict(CONTROLS))
     metrics: Sequence[Metric] = ()
     useful: Sequence[str] = (OURS, BEST)
-    moved: Sequence[str] = (OURS, GVST, BRIDGE)
     presets: Mapping[str, Preset] = field(default_factory=lambda: PRESETS)
     paper: bool = False
 
@@ -186,9 +174,6 @@ PRESETS: Mapping[str, Preset] = {
             vq=replace(_VQ, widths=(16, 32), codes=256, steps_free=60, steps_quantized=20, crop=0),
             clip="palpate/mini",
             permutations=99,
-            cost="for tests: under 8 minutes on two x86-64 cores",
-            seconds=(2, 11, 4),
-            rest=0.1,
         ),
         Preset(
             "mini",
@@ -200,9 +185,6 @@ PRESETS: Mapping[str, Preset] = {
             vq=_VQ,
             clip="palpate/mini",
             precision="bf16",  # 1.35 times as many steps a second with AMX, .65 without
-            cost="world-gelsight: 30 minutes of one idle x86-64 core, and 80 minutes a seed; the "
-            "record, on busy ones: 36, and 82 to 137",
-            seconds=(135, 140, 415),
         ),
     )
 }
@@ -220,9 +202,6 @@ ON_DISK: Mapping[str, Preset] = {
         vq=None,
         clip="openai/clip-vit-large-patch14",
         precision="bf16",
-        ruler=None,
-        cost="counted: at least 12 hours of an H100 a seed on Touch and Go",
-        seconds=(3600, 1800, 700),
     ),
 }
 
@@ -239,10 +218,9 @@ STUDIES: Mapping[str, Study] = {
             "world-digit",
             "The study on the procedural world, DIGIT",
             (2, 4),
-            {"look": "digit", "layout": "hct", "leak": "frame", "seed": 72},
+            {"look": "digit", "layout": "frames", "leak": "frame", "seed": 72},
             # The paper has its table of all methods on Touch and Go alone.
-            methods=[METHODS[n] for n in (OURS, "Ours, by text", GVST, BEST, SHIPPED)],
-            moved=(),
+            methods=[METHODS[n] for n in (OURS, GVST, BEST, SHIPPED)],
         ),
         Study(
             "tag",

@@ -196,9 +196,7 @@ def _of_methods(context: _Context, number: int) -> StudyTable:
     methods = context.methods if number == 3 else prior
     metrics = [*FAMILY]
     if number == 3:
-        of_photos = [
-            m for m in scores.metrics if m.startswith(("LPIPS", "FID", "CMMD", "patch distance"))
-        ]
+        of_photos = [m for m in scores.metrics if m.startswith(("LPIPS", "FID", "CMMD"))]
         metrics = ["SSIM", "PSNR", *of_photos, *FAMILY, MATERIAL, *context.extra]
     subjects = context.present(NOLEAK, [*methods, *context.controls])
     metrics = [m for m in metrics if any(scores.get(m, s) for s in subjects)]

@@ -1,33 +1,31 @@
-"""Results made again: what their inputs hash to now, and what each of their numbers comes to.
+"""Does a results file come out again? What made it is run once more, and the two are compared.
 
-A results file names the calls that made its scores and audits (:mod:`palpate.report.calls`). Each
-is made again on the files of today, and every number of the file is compared with what comes out.
+A results file names the calls that made its scores and audits (:mod:`palpate.report.calls`): each
+is made again on the files of today. Results in a run folder name its stages instead: those that
+train must hold the files of their records, and those that measure (splits and audits, probes,
+scores, tables) are built again in a temporary folder from the stored data, images and encoders.
+
+Numbers agree if ``|a - b| <= tolerance * max(|a|, |b|)``, or to the sixth decimal: scores near zero
+are differences of sums over embeddings of 32 bits, whose last ones depend on processor and threads.
+Words, counts and digests must be equal. Notes, times and places of files are not compared.
 """
 
 from __future__ import annotations
 
+import tempfile
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from importlib import import_module
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
-from palpate.core import PalpateError, Progress, Score, few, plain, quiet, read_record, require
+from palpate.core import PalpateError, Progress, few, plain, quiet, read_json, read_record, require
 from palpate.core.files import reading_entry
-from palpate.report.calls import DIGEST, OBJECT, PATH, ROWS, Call, digest_of, is_there
-from palpate.report.results import AUDIT_FORMAT, RESULTS_FORMAT, Audit, Results, Strip
-from palpate.studies.comparing import (
-    STATUSES,
-    TOLERANCE,
-    Check,
-    Status,
-    audit_numbers,
-    number_difference,
-    score_difference,
-    score_name,
-)
-from palpate.studies.verifying_runs import is_run, verify_run
+from palpate.report.calls import OBJECT, PATH, ROWS, Call, is_there
+from palpate.report.results import AUDIT_FORMAT, RESULTS_FORMAT, Audit, Results
+from palpate.studies.graph import Node, in_order
+from palpate.studies.stages import Stage, stage_of, stage_outputs
 
 FORMAT = "palpate-verification/1"
 #: Verb -> module and function of its calls.
@@ -35,68 +33,70 @@ FUNCTIONS = {
     "score": ("palpate.evaluation.scoring", "score"),
     "probe": ("palpate.evaluation.probing", "probe"),
     "audit": ("palpate.evaluation.auditing", "audit"),
-    "probe --train": ("palpate.studies.verifying_runs", "compare_splits_again"),
     "caption check": ("palpate.captions.checking", "check_captions"),
     "preference score": ("palpate.preference.scoring", "score"),
 }
-NO_CALL = "no call in the file makes it"
+#: Lists of results whose items are compared.
+PARTS = ("calls", "scores", "audits", "facts", "tables", "claims", "strips")
+#: Relative, for sums whose order may change from run to run.
+TOLERANCE = 1e-6
+#: Absolute, where the relative one is not 0.
+DECIMAL = 1e-6
+#: The least tolerance of some numbers. Descriptors of near-duplicates have 16 and 32 bits: another
+#: order of their sums moves a threshold by 3e-5, and the score of a pair, of four digits, by one of
+#: them. p-values and effect sizes of untrained models, 1e-5 apart, are moved by 2e-3.
+LEAST = {
+    **dict.fromkeys(("threshold", "score"), 5e-4),
+    **dict.fromkeys(("p_value", "p_better", "p_adjusted", "effect size"), 5e-3),
+}
+#: Keys of what no later run repeats, and of places of files.
+PASSING = ("notes", "commands", "version", "stage", "seconds", PATH)
+PLACES = ("vision", "tactile", "background")
+
+Status = Literal["same", "differs", "cannot check"]
+
+
+@dataclass(frozen=True)
+class Check:
+    """What became of one score, audit, table, claim, sentence, call or stage, and why."""
+
+    name: str
+    status: Status
+    why: str = ""
 
 
 @dataclass(frozen=True)
 class Verification:
-    """All checks of one results file.
-
-    Attributes:
-        file: its path.
-        checks: inputs first, then the numbers in the order of the file.
-        tolerance: relative difference up to which two numbers are the same.
-    """
+    """All checks of one results file."""
 
     file: str
     checks: Sequence[Check]
-    tolerance: float
 
     @property
     def counts(self) -> dict[str, int]:
         """How many checks ended in each status."""
         count = Counter(check.status for check in self.checks)
-        return {status: count[status] for status in STATUSES}
+        return {status: count[status] for status in ("same", "differs", "cannot check")}
 
     @property
     def ok(self) -> bool:
-        """Whether nothing differs and nothing is untraced."""
-        return not (self.counts["differs"] or self.counts["untraced"])
-
-    @property
-    def lines(self) -> list[str]:
-        """The counts, then a line for each difference and for each other reason."""
-        lines = [", ".join(f"{status} {count}" for status, count in self.counts.items())]
-        lines += [f"differs: {c.name}: {c.why}" for c in self.checks if c.status == "differs"]
-        for status in ("cannot check", "untraced"):
-            reasons: dict[str, list[str]] = {}
-            for check in self.checks:
-                if check.status == status:
-                    reasons.setdefault(check.why, []).append(check.name)
-            lines += [f"{status}: {few(names)}: {why}" for why, names in reasons.items()]
-        return lines
+        """Whether nothing differs."""
+        return not self.counts["differs"]
 
     def __str__(self) -> str:
-        """The lines of :attr:`lines`."""
-        return "\n".join(self.lines)
+        """The counts, then a line for each difference and for each reason of no check."""
+        lines = [", ".join(f"{status} {count}" for status, count in self.counts.items())]
+        lines += [f"differs: {c.name}: {c.why}" for c in self.checks if c.status == "differs"]
+        unchecked = [check for check in self.checks if check.status == "cannot check"]
+        for why in dict.fromkeys(check.why for check in unchecked):
+            lines.append(f"cannot check: {few(c.name for c in unchecked if c.why == why)}: {why}")
+        return "\n".join(lines)
 
     def to_json(self) -> dict[str, Any]:
         """A JSON object with ``format: palpate-verification/1``."""
-        facts = {"file": self.file, "tolerance": self.tolerance, "ok": self.ok}
-        return {"format": FORMAT, **facts, **{"counts": self.counts, "checks": plain(self.checks)}}
-
-
-@dataclass(frozen=True)
-class Again:
-    """A call made again: its result, or why there is none."""
-
-    call: Call
-    result: Results | Audit | None
-    reason: str = ""
+        checks = plain(self.checks)
+        facts = {"file": self.file, "ok": self.ok, "counts": self.counts, "checks": checks}
+        return {"format": FORMAT, **facts}
 
 
 def verify(
@@ -107,7 +107,7 @@ def verify(
     Args:
         path: a file of ``palpate score -o``, ``palpate probe -o``, ``palpate audit -o``,
             ``palpate preference score -o``, ``palpate caption check -o``, the JSON of a page, or
-            results in a run folder (:mod:`palpate.studies.verifying_runs`).
+            results in a run folder.
         tolerance: relative difference up to which two numbers are the same, in [0, 1); the default
             is for sums whose order may change. Digests and counts must be equal.
         progress: called with what is done.
@@ -117,54 +117,85 @@ def verify(
     """
     require(0 <= tolerance < 1, "tolerance", "must lie in [0, 1)", tolerance, TOLERANCE)
     file = Path(path)
-    results = read_results(file)
-    scores, checks = numbers_of(results), list[Check]()
-    if is_run(results):
-        checks, scores = verify_run(file, results, tolerance, progress)
-        results = replace(results, audits=[], facts=[], strips=[])  # verified with the run
-    calls = [*results.calls, *(a.call for a in results.audits if a.call is not None)]
-    made = [repeat(call, file, progress) for call in calls]
-    checks += [check for again in made for check in input_checks(again)]
-    checks += _score_checks(scores, made, tolerance)
-    checks += _audit_checks(results.audits, made, tolerance)
-    checks += _fact_checks(results.facts, made)
-    checks += _strip_checks(results.strips, made, tolerance)
-    return Verification(str(file), _distinct(checks), tolerance)
-
-
-def read_results(file: Path) -> Results:
-    """The results of a file, or its audit as results; paths are from the working directory.
-
-    Raises:
-        PalpateError: if it is missing, or holds neither.
-    """
     data = read_record(file, "results file", form=(RESULTS_FORMAT, AUDIT_FORMAT))
     if data["format"] == AUDIT_FORMAT:
-        return Results(title="", audits=[Audit.load(file)])
-    return Results.load(file)
+        results = Results(title="", audits=[Audit.load(file)])
+    else:
+        results = Results.load(file)
+    if isinstance(results.settings.get("stages"), Mapping):
+        checks, after, reasons = _run_again(results, file, progress)
+    else:
+        checks, (after, reasons) = list[Check](), _calls_again(results, file, progress)
+    before = _items(results)
+    for name in dict.fromkeys([*before, *after]):
+        if name not in after and reasons:
+            checks.append(Check(name, "cannot check", "; ".join(dict.fromkeys(reasons))))
+        elif name not in after or name not in before:
+            where = "in the file, not made again" if name in before else "not in the file"
+            checks.append(Check(name, "differs", where))
+        else:
+            why = difference(before[name], after[name], tolerance)
+            checks.append(Check(name, "differs" if why else "same", why))
+    return Verification(str(file), checks)
 
 
-def numbers_of(results: Results) -> list[Score]:
-    """Every score of the file: in its list, its tables, its curves and its claims."""
-    cells = [c for t in results.tables for row in t.rows for c in row if isinstance(c, Score)]
-    points = [score for c in results.curves for line in c.lines for _, score in line.points]
-    evidence = [score for claim in results.claims for score in claim.evidence]
-    return [*results.scores, *cells, *points, *evidence]
+def _items(results: Results) -> dict[str, Any]:
+    """Every score, audit, sentence, table, claim, strip and call by what it is called."""
+    items, seen = dict[str, Any](), Counter[str]()
+    for part in PARTS:
+        for item in plain(getattr(results, part)):
+            name = _name(part, item)
+            seen[name] += 1
+            items[name if seen[name] == 1 else f"{name} ({seen[name]})"] = item
+    if "stages" in results.settings:
+        items["digests"] = plain(results.settings.get("digests"))
+    return items
 
 
-def repeat(call: Call, file: Path, progress: Progress = quiet) -> Again:
-    """Make a call of a file again; a call that cannot be made gives the reason."""
-    try:
-        module, name = FUNCTIONS[call.verb]
-    except KeyError:
-        return Again(call, None, f"palpate {call.verb} is no verb that can be verified"[:200])
-    try:
-        with reading_entry(file, f"The call of palpate {call.verb}"):
-            arguments = {name: _decoded(value) for name, value in call.arguments.items()}
-            result = getattr(import_module(module), name)(**arguments, progress=progress)
-    except (PalpateError, OSError) as error:
-        return Again(call, None, " ".join(str(error).split()))
-    return Again(call, result)
+def _name(part: str, item: Any) -> str:
+    if part == "scores":
+        preset = item["settings"].get("preset")
+        return f"{item['metric']} of {item['subject']}" + (f" ({preset})" if preset else "")
+    if part == "facts":
+        return f"fact {item[:60]!r}"
+    if part == "strips":
+        return f"retrieved {item['keys']} for {item['queries']} {item['query']['id']}"
+    key = {"calls": "verb", "audits": "name", "tables": "title", "claims": "claim"}[part]
+    return f"{part.removesuffix('s')} {item[key]}"
+
+
+def _calls_again(
+    results: Results, file: Path, progress: Progress
+) -> tuple[dict[str, Any], list[str]]:
+    """The items that the calls of a file make now, and why some calls cannot be made."""
+    calls = [*results.calls, *(a.call for a in results.audits if a.call is not None)]
+    parts: dict[str, list[Any]] = {part: [] for part in PARTS}
+    reasons = [] if calls else ["no call in the file makes it"]
+    for call in calls:
+        try:
+            with reading_entry(file, f"The call of palpate {call.verb}"):
+                made = _made(call, progress)
+        except (PalpateError, OSError) as error:
+            reasons.append(" ".join(str(error).split()))
+            continue
+        for part, items in parts.items():
+            items += getattr(made, part)
+    return _items(Results(title="", **parts)), reasons
+
+
+def _made(call: Call, progress: Progress) -> Results:
+    """What a call makes now.
+
+    Raises:
+        PalpateError: if an input is missing, or never was a file.
+    """
+    if call.verb not in FUNCTIONS:
+        must = f"The verb of a call must be one of {', '.join(FUNCTIONS)}"
+        raise PalpateError(must, repr(call.verb), "Run it again yourself")
+    module, name = FUNCTIONS[call.verb]
+    arguments = {name: _decoded(value) for name, value in call.arguments.items()}
+    made = getattr(import_module(module), name)(**arguments, progress=progress)
+    return made if isinstance(made, Results) else Results(title="", audits=[made])
 
 
 def _decoded(value: Any) -> Any:
@@ -183,153 +214,137 @@ def _decoded(value: Any) -> Any:
         if ROWS in value:
             from palpate.data.reading import load
 
-            if (manifest := load(path)).digest != value[ROWS]:
-                must, got = f"{path} must hold the samples of the call", "other samples"
-                raise PalpateError(must, got, "Save the samples that were passed")
-            return manifest
+            return load(path)
         return path
     if isinstance(value, Mapping):
         return {key: _decoded(item) for key, item in value.items()}
     return [_decoded(item) for item in value] if isinstance(value, list) else value
 
 
-def input_checks(again: Again) -> list[Check]:
-    """Files by the digests of the call's arguments, and what was read of them by its result."""
-    call, checks = again.call, list[Check]()
-    of = f"of palpate {call.verb}"
-    for name, value in _paths(call.arguments):
-        path, digest = Path(str(value[PATH])), value.get(DIGEST)
-        shown = f"{name.replace('_', ' ')} {path} {of}"
-        if not is_there(path):
-            checks.append(Check(shown, "cannot check", f"nothing at {path}", "input"))
-        elif digest is not None:
-            now = digest_of(path, name)
-            checks.append(_digest_check(shown, str(digest), now))
-    for name, digest in call.digests.items():
-        shown = f"{name} {of}"
-        if again.result is None:
-            checks.append(Check(shown, "cannot check", again.reason, "input"))
-        else:
-            now = next((c.digests.get(name) for c in _calls_of(again.result)), None)
-            checks.append(_digest_check(shown, digest, now))
-    return checks
+def _run_again(
+    results: Results, file: Path, progress: Progress
+) -> tuple[list[Check], dict[str, Any], list[str]]:
+    """Checks of the stages next to a file; what they make now, and why it cannot be made."""
+    folder = file.absolute().parent
+    checks = [_stage_check(name, folder, of) for name, of in results.settings["stages"].items()]
+    with tempfile.TemporaryDirectory() as place:
+        try:
+            with reading_entry(file, "The settings"):
+                again = _study_again if "study" in results.settings else _demo_again
+                made = again(results.settings, folder, Path(place), progress)
+        except (PalpateError, OSError) as error:
+            return checks, {}, [" ".join(str(error).split())]
+    return checks, _items(made), []
 
 
-def _digest_check(name: str, before: str, after: str | None) -> Check:
-    if before == after:
-        return Check(name, "same", kind="input")
-    now = "nothing" if after is None else f"SHA-256 {after[:12]}"
-    return Check(name, "differs", f"SHA-256 {before[:12]} in the file, {now} now", "input")
+def _stage_check(name: str, folder: Path, stated: Any) -> Check:
+    """Whether a stage holds the files of its record, and of the results."""
+    try:
+        before = read_json(folder / name / "stage.json", "stage record")["outputs"]
+    except (PalpateError, OSError, KeyError, TypeError):
+        return Check(f"stage {name}", "cannot check", f"no record at {folder / name}")
+    if isinstance(stated, Mapping):
+        before = stated.get("outputs", before)
+    why = difference(before, stage_outputs(folder / name), 0.0)
+    return Check(f"stage {name}", "differs" if why else "same", why)
 
 
-def _calls_of(result: Results | Audit) -> list[Call]:
-    if isinstance(result, Results):
-        return [*result.calls]
-    return [] if result.call is None else [result.call]
+def _study_again(
+    settings: Mapping[str, Any], folder: Path, place: Path, progress: Progress
+) -> Results:
+    """The results of a study; what was given to it lies in the run folder, wherever it was."""
+    from palpate.evaluation.companions import Weights
+    from palpate.studies.making import slug
+    from palpate.studies.reproduce import nodes_of, plan_of, settings_of
+    from palpate.studies.study import NOLEAK, STUDIES
+
+    if settings["study"] not in STUDIES:
+        must = f"The study must be one of {', '.join(STUDIES)}, to be made again"
+        raise PalpateError(must, repr(settings["study"]), "Verify it where it is defined")
+    options = settings["options"]
+    others = options["methods of others"]
+    plan = plan_of(
+        STUDIES[settings["study"]],
+        preset=settings["preset"],
+        seeds=settings["seeds"],
+        root=options["root"] and folder / "data",
+        others={name: folder / f"images-{slug(name)}-{NOLEAK}" / "images" for name in others},
+        people=options["people"] and folder / "results" / "people.json",
+        steps=options["steps of a method"],
+        vq=options["vq"],
+        weights=Weights(**options["weights"]),
+    )
+    stages = _measured(nodes_of(plan), folder, place, progress)
+    made = Results.load(place / "results" / "results.json")
+    return replace(made, settings=settings_of(plan, stages, options["jobs"]))
 
 
-def _paths(value: Any, name: str = "") -> list[tuple[str, Mapping[str, Any]]]:
-    """(argument, record) of every file in the arguments of a call."""
-    if isinstance(value, Mapping):
-        if PATH in value:
-            return [(name, value)]
-        return [pair for key, item in value.items() for pair in _paths(item, name or str(key))]
-    if isinstance(value, list):
-        return [pair for item in value for pair in _paths(item, name)]
-    return []
+def _demo_again(
+    settings: Mapping[str, Any], folder: Path, place: Path, progress: Progress
+) -> Results:
+    from palpate.studies.demo import DemoOptions, demo_nodes, demo_of
+    from palpate.studies.demo_page import results_of
+
+    given = dict(settings["options"])
+    options = DemoOptions(**given | {"data": given["data"] and Path(given["data"])})
+    stages = _measured(demo_nodes(options), folder, place, progress)
+    return results_of(demo_of(options, stages), "")
 
 
-def _score_checks(scores: Sequence[Score], made: Sequence[Again], tolerance: float) -> list[Check]:
-    again: dict[str, list[Score]] = {}
-    for result in (a.result for a in made if isinstance(a.result, Results)):
-        for score in result.scores:
-            again.setdefault(score_name(score), []).append(score)
-    listed = {id(score) for group in again.values() for score in group}
-    checks: list[Check] = []
-    for score in scores:
-        name = score_name(score)
-        differences = {
-            id(other): score_difference(score, other, tolerance) for other in again.get(name, ())
-        }
-        equal = [key for key, difference in differences.items() if not difference]
-        listed -= {*(equal or differences)}
-        if equal:
-            checks.append(Check(name, "same"))
-        elif differences:
-            checks.append(Check(name, "differs", next(iter(differences.values()))))
-        else:
-            checks.append(_unmade(name, made, Results))
-    gone = [score for group in again.values() for score in group if id(score) in listed]
-    return checks + [
-        Check(score_name(score), "differs", f"not in the file, {float(score):.8g} now")
-        for score in gone
-    ]
+def _measured(
+    nodes: Sequence[Node], folder: Path, place: Path, progress: Progress
+) -> dict[str, Stage]:
+    """All stages: those that measure are built below ``place``, the others are those of the run.
+
+    Raises:
+        PalpateError: if a stage is not there.
+    """
+    stages: dict[str, Stage] = {}
+    for done, node in enumerate(in_order(nodes)):
+        progress("stages", done, len(nodes), node.name)
+        record = read_json(folder / node.name / "stage.json", "stage record")
+        stages[node.name] = stage_of(folder / node.name, record)
+        if node.measures:
+            made = place / node.name
+            made.mkdir()
+            facts = node.build(made, {n: stages[n].folder for n in node.after}, quiet)
+            stages[node.name] = replace(stages[node.name], folder=made, facts=dict(facts or {}))
+    return stages
 
 
-def _unmade(name: str, made: Sequence[Again], kind: type) -> Check:
-    """A number that no call gives: of a call that cannot be made, if there is one."""
-    of_audit = kind is Audit
-    reasons = [a.reason for a in made if a.result is None and (a.call.verb == "audit") == of_audit]
-    if reasons:
-        return Check(name, "cannot check", "; ".join(dict.fromkeys(reasons)))
-    return Check(name, "untraced", NO_CALL)
+def difference(before: Any, after: Any, tolerance: float) -> str:
+    """Where two JSON values differ first, with both numbers; '' where they agree."""
+    return next(_differences(before, after, tolerance, ""), "")
 
 
-def _audit_checks(audits: Sequence[Audit], made: Sequence[Again], tolerance: float) -> list[Check]:
-    """Every number of every audit; one among the others of another is of that one's call."""
-    by_call = {id(a.call): a for a in made}
-    others = [other for audit in audits if audit.call is not None for other in audit.others]
-    checks: list[Check] = []
-    for audit in audits:
-        if audit.call is None and audit in others:
-            continue
-        again = None if audit.call is None else by_call[id(audit.call)]
-        start = f"audit {audit.name}: " if audit.name else "audit: "
-        before = audit_numbers(audit, start)
-        if again is None or not isinstance(again.result, Audit):
-            reason = NO_CALL if again is None else again.reason or "its call makes no audit"
-            status: Status = "cannot check" if again is not None and again.reason else "untraced"
-            checks += [Check(name, status, reason) for name in before]
-            continue
-        after = audit_numbers(again.result, start)
-        for name in dict.fromkeys([*before, *after]):
-            why = number_difference(before.get(name), after.get(name), tolerance)
-            checks.append(Check(name, "differs" if why else "same", why))
-    return checks
+def _differences(a: Any, b: Any, tolerance: float, name: str) -> Iterator[str]:
+    if isinstance(a, Mapping) and isinstance(b, Mapping):
+        if "effect size" in str(a.get("metric")):
+            tolerance = max(tolerance, LEAST["effect size"])
+        for key in dict.fromkeys([*a, *b]):
+            x, y = a.get(key), b.get(key)
+            place = key in PLACES and all(isinstance(value, str | None) for value in (x, y))
+            if key not in PASSING and not place:
+                least = max(tolerance, LEAST.get(key, 0.0))
+                yield from _differences(x, y, least, f"{name} {key.replace('_', ' ')}".strip())
+    elif isinstance(a, list) and isinstance(b, list) and len(a) == len(b):
+        for k, (x, y) in enumerate(zip(a, b, strict=True), 1):
+            yield from _differences(x, y, tolerance, f"{name} {k}")
+    elif not _close(a, b, tolerance):
+        yield f"{name} {_text(a)} in the file, {_text(b)} now".strip()
 
 
-def _fact_checks(facts: Iterable[str], made: Sequence[Again]) -> list[Check]:
-    """The sentences with numbers that stand above the tables."""
-    known = {f for a in made if isinstance(a.result, Results) for f in a.result.facts}
-    numbered = [fact for fact in facts if any(c.isdigit() for c in fact)]
-    return [
-        Check(f"fact {fact[:60]!r}", "same")
-        if fact in known
-        else _unmade(f"fact {fact[:60]!r}", made, Results)
-        for fact in numbered
-    ]
+def _close(a: Any, b: Any, tolerance: float) -> bool:
+    numbers = all(isinstance(v, int | float) and not isinstance(v, bool) for v in (a, b))
+    if not numbers or (isinstance(a, int) and isinstance(b, int)):
+        return type(a) is type(b) and a == b
+    return abs(a - b) <= max(tolerance * max(abs(a), abs(b)), DECIMAL * (tolerance > 0))
 
 
-def _strip_checks(strips: Sequence[Strip], made: Sequence[Again], tolerance: float) -> list[Check]:
-    """What an encoder retrieved for some queries: similarities and ranks."""
-    results = [a.result for a in made if isinstance(a.result, Results)]
-    again = {_strip_name(strip): strip for result in results for strip in result.strips}
-    checks: list[Check] = []
-    for strip in strips:
-        name = _strip_name(strip)
-        if name not in again:
-            checks.append(_unmade(name, made, Results))
-            continue
-        why = number_difference(plain(strip), plain(again[name]), tolerance)
-        checks.append(Check(name, "differs" if why else "same", why))
-    return checks
-
-
-def _strip_name(strip: Strip) -> str:
-    of = f" of {strip.subject}" if strip.subject else ""
-    return f"retrieved {strip.keys} for {strip.queries} {strip.query.id}{of}"
-
-
-def _distinct(checks: Sequence[Check]) -> list[Check]:
-    """Each check once: a number may stand in several tables."""
-    return list(dict.fromkeys(checks))
+def _text(value: Any) -> str:
+    """A value in a line: a float by the digits that tell it from others, a list by its length."""
+    if isinstance(value, float):
+        return f"{value:.8g}"
+    if isinstance(value, list | Mapping):
+        return f"{len(value)} entries"
+    return "nothing" if value is None else f"{value}"[:80]
