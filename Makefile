@@ -15,13 +15,17 @@ PIP    = $(BIN)/python -m pip install --quiet --disable-pip-version-check
 # Spinning threads make two busy cores several times slower than one.
 export OMP_WAIT_POLICY := passive
 
-.PHONY: help demo test test-fast test-slow nightly coverage lint format docs wheel lock clean
+.PHONY: help demo record test test-fast test-slow nightly coverage lint format docs wheel lock clean
 
 help:            ## list the targets
 	@grep -E '^[a-z-]+: .*##' $(MAKEFILE_LIST) | sed -E 's/:[^#]*##/\t/' | expand -t 14
 
 demo: $(READY)   ## the whole pipeline on the embedded world; DATA=path runs it on a Touch and Go tree
 	$(BIN)/palpate demo --output $(OUT) $(if $(DATA),--data $(DATA))
+
+record:          ## RUN=runs/study: pack results, page, tables and figures of a run into dist/, for a release
+	mkdir -p dist
+	tar -czf dist/record-$(notdir $(RUN:/=)).tar.gz -C $(RUN) results.json page.html page.md tables.tex figures
 
 test: test-fast test-slow  ## all tests, fast ones first
 

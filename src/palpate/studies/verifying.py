@@ -180,7 +180,7 @@ def _calls_again(
             continue
         for part, items in parts.items():
             items += getattr(made, part)
-    return _items(Results(title="", **parts)), reasons
+    return _items(replace(Results(title=""), **parts)), reasons
 
 
 def _made(call: Call, progress: Progress) -> Results:
@@ -285,8 +285,9 @@ def _demo_again(
     from palpate.studies.demo import DemoOptions, demo_nodes, demo_of
     from palpate.studies.demo_page import results_of
 
-    given = dict(settings["options"])
-    options = DemoOptions(**given | {"data": given["data"] and Path(given["data"])})
+    given: dict[str, Any] = {**settings["options"]}
+    given["data"] = given["data"] and Path(given["data"])
+    options = DemoOptions(**given)
     stages = _measured(demo_nodes(options), folder, place, progress)
     return results_of(demo_of(options, stages), "")
 
