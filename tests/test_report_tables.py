@@ -8,7 +8,7 @@ from palpate.core import Note, PalpateError
 from palpate.report.notes import decimals, number, percent, plural, score_text
 from palpate.report.results import Results
 from palpate.report.study_tables import score_sheets
-from palpate.report.tables import family_of, heat_tables, rankings, score_tables, settings_of
+from palpate.report.tables import family_of, heat_tables, rankings, score_tables
 from report_fixtures import difference, score, text_note
 
 
@@ -207,13 +207,3 @@ def test_only_square_matrices_of_numbers_are_drawn():
     assert heat.labels == ["x", "y"]
     assert heat.values == [["0.100", "2.000"], ["2.000", "–"]]
     assert heat.shares == [[0.05, 1.0], [1.0, 0.0]]
-
-
-def test_settings_name_the_reference_of_each_subject():
-    from palpate.report.results import Results
-
-    scores = [score(subject=s, reference="r" * 64) for s in "ab"]
-    assert settings_of(Results("t", scores=scores, settings={"x": 1})) == {
-        "x": 1,
-        "reference images": {"a": "r" * 64, "b": "r" * 64},
-    }

@@ -67,11 +67,10 @@ def latex_tables(results: Results) -> str:
         PalpateError: if two scores that share a column were not made with the same settings.
     """
     laid = [(table, [table.text] if table.text else []) for table in sheets(results)]
-    command = [f"Command: {results.commands[0]}"] if results.commands else []
     for table in score_tables(results.scores):
         for part in score_sheets(table):
             facts = "; ".join(f"{what} {_short(how)}" for what, how in part.made)
-            laid.append((part, [*([facts] if facts else []), *command]))
+            laid.append((part, [facts] if facts else []))
     names = file_names("tab", [table.title for table, _ in laid])
     parts = [_sheet(t, caption, name) for (t, caption), name in zip(laid, names, strict=True)]
     parts.insert(len(results.tables), _claims(results.claims))

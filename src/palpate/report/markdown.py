@@ -10,13 +10,13 @@ import json
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
-from palpate.core import Note
+from palpate.core import Note, plain
 from palpate.report.notes import HOW_TO_READ, sentence
 from palpate.report.results import Results
 from palpate.report.sentences import purpose, summary_lines
 from palpate.report.study import Claim
 from palpate.report.study_tables import Sheet, curve_table, difference_sheet, sheet, tally
-from palpate.report.tables import Table, facts_of, marks, score_tables, settings_of
+from palpate.report.tables import Table, facts_of, marks, score_tables
 from palpate.report.terminal import NAMES, audit_text, score_rows, sheet_rows, sheet_words
 
 _SPECIAL = str.maketrans({c: f"\\{c}" for c in "\\`*_[]|<>"})
@@ -41,7 +41,7 @@ def render_markdown(results: Results) -> str:
         "Curves": curves,
         "Scores": [HOW_TO_READ, "", *tables] if tables else [],
         "Leakage audit": [line for a in results.audits for line in _fenced(audit_text(a))],
-        "Settings and digests": _tree(settings_of(results)),
+        "Settings and digests": _tree(plain(results.settings)),
         "Commands": _fenced("\n".join(results.commands), "sh"),
     }
     for title, body in sections.items():

@@ -28,7 +28,7 @@ from palpate.report import audits, curves, first_screen, plots, sentences, study
 from palpate.report.notes import count, digits_of, number, percent, plural, sentence, where
 from palpate.report.results import GalleryItem, LeakPair, Results, Strip
 from palpate.report.study_tables import sheets
-from palpate.report.tables import defined, heat_tables, score_tables, settings_of
+from palpate.report.tables import defined, heat_tables, score_tables
 from palpate.report.thumbnails import Album, Wanted, fit
 
 #: Samples of the first screen; their images take at most a third of the bytes.
@@ -148,7 +148,7 @@ def render_page(
         "folded": len(tables) > 1,
         "reading": first_screen.annotated(tables),
         "heats": heat_tables(study_tables.scores_of_methods(results)),
-        "settings": settings_of(results),
+        "settings": plain(results.settings),
         "citations": CITATIONS,
         "style": Markup(_template("style.css")),
         "script": Markup(script),

@@ -17,7 +17,6 @@ from typing import Any
 from palpate.core import Note, Score, columns, plain, short
 from palpate.core.score import ARROWS, BETTER
 from palpate.report.notes import decimals, digits_of, number
-from palpate.report.results import Results
 
 #: What the name of a metric ends in where the score is the difference of two generators.
 DIFFERENCE = " difference"
@@ -497,18 +496,6 @@ def _made(column: Sequence[Score]) -> list[tuple[str, str]]:
         ("split", first.split or ""),
     ]
     return [(what, how) for what, how in rows if how]
-
-
-def settings_of(results: Results) -> dict[str, Any]:
-    """Return the settings of results, with the digest of each subject's reference images."""
-    references: dict[str, dict[str, None]] = {}
-    for score in results.scores:
-        if score.reference and not score.metric.endswith(DIFFERENCE):
-            references.setdefault(score.subject, {})[score.reference] = None
-    settings: dict[str, Any] = plain(results.settings)
-    if references:
-        settings["reference images"] = {name: ", ".join(d) for name, d in references.items()}
-    return settings
 
 
 def heat_tables(scores: Sequence[Score]) -> list[Heat]:
