@@ -8,7 +8,7 @@ from PIL import Image
 
 from palpate.core import Note, SampleRef, Score
 from palpate.report.results import Audit, GalleryItem, Impact, ImpactRow, LeakPair, Results, Signal
-from palpate.report.study import Claim, Curve, Line, StudyTable
+from palpate.report.study import Claim, StudyTable
 
 #: Gaps of Touch and Go's own split, as `palpate audit` finds them.
 GAPS = {
@@ -411,8 +411,7 @@ class Tree(HTMLParser):
 
 
 def study_results(folder, n=12, side=64):
-    """A study: claims, tables with controls, curves with bands, next to every other section."""
-    rng = np.random.default_rng(3)
+    """A study: claims, tables with controls, next to every other section."""
 
     def measure(metric, subject, value, higher=False, spread=0.1, **changes):
         interval = tuple(sorted((value * (1 - spread), value * (1 + spread))))
@@ -443,35 +442,6 @@ def study_results(folder, n=12, side=64):
         StudyTable("Compute", "On two cores.", ["method", "starts from", "time"], compute),
     ]
 
-    def line(label, start, step, n=4):
-        points = [(2.0**k, start + step * k + 0.02 * rng.standard_normal()) for k in range(n)]
-        scores = [
-            measure("accuracy", label, y, True, 0.08, null=None, floor=None) for _, y in points
-        ]
-        return Line(label, [(x, s) for (x, _), s in zip(points, scores, strict=True)])
-
-    y = "material accuracy on new videos"
-    curves = [
-        Curve(
-            "What generation is for",
-            "A classifier trained on k real videos a class, plus generated images.",
-            "real videos a class, k",
-            y,
-            [
-                line("real", 0.3, 0.1),
-                line("real and generated", 0.4, 0.08),
-                line("generated", 0.35, 0),
-            ],
-            log_x=True,
-        ),
-        Curve(
-            "Quality against compute",
-            "",
-            "minutes",
-            y,
-            [line(m, 0.2 + 0.1 * k, 0.05, 5) for k, m in enumerate(methods)],
-        ),
-    ]
     accuracy = [measure("accuracy", s, v, True) for s, v in (("Orig", 0.8), ("NoLeak", 0.5))]
     claims = [
         Claim(
@@ -497,4 +467,4 @@ def study_results(folder, n=12, side=64):
     ]
     audits = [full_audit(images(folder, 16)), clean_audit()]
     results = dataclasses.replace(full_results(folder, n, side), audits=audits)
-    return dataclasses.replace(results, tables=tables, curves=curves, claims=claims)
+    return dataclasses.replace(results, tables=tables, claims=claims)

@@ -1,8 +1,6 @@
-"""Tables, curves and claims of a study: on the page, in text, in LaTeX and as figures."""
+"""Tables and claims of a study: on the page, in text, in LaTeX and as figures."""
 
 import dataclasses
-import io
-import itertools
 import json
 import math
 import re
@@ -11,18 +9,18 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from PIL import Image, ImageFont
+from PIL import Image
 
 from palpate.cli import main
 from palpate.core import SampleRef
 from palpate.report import drawing, write_report
-from palpate.report.curves import Panel, curve_drawing, panels_of, strips_drawing
+from palpate.report.curves import Panel, panels_of, strips_drawing
 from palpate.report.drawing import Shape, Words
 from palpate.report.first_screen import telling_columns
 from palpate.report.page import OPEN_CLAIMS, render_page
 from palpate.report.results import GalleryItem, Results
-from palpate.report.study import Claim, Curve, Line, StudyTable
-from palpate.report.study_tables import brief, curve_table, file_names, lay, says_more, sheet, tally
+from palpate.report.study import Claim, StudyTable
+from palpate.report.study_tables import brief, file_names, lay, says_more, sheet, tally
 from palpate.report.tables import score_tables
 from palpate.report.terminal import as_text
 from palpate.studies.evidence import in_words
@@ -159,9 +157,6 @@ def test_every_front_end_has_every_number_verdict_and_reason(study):
             assert part in text, part
         assert "Table 4: generators" in text
         assert "1 holds, 1 does not hold, 1 undecided" in text
-    for text in (texts[0], texts[1], shown):  # curves are figures in LaTeX
-        assert "What generation is for" in text
-        assert "real and generated" in text
     assert (
         Results.from_json(json.loads(json.dumps(results.to_json()))).to_json() == results.to_json()
     )
@@ -194,7 +189,7 @@ def test_the_terminal_shows_the_tables_of_a_study_instead_of_every_score(study):
 def test_the_page_has_its_sections_in_order_and_folds_what_is_folded(study):
     results, folder = study
     html, _ = page_text(results, folder)
-    parts = ['class="card"', 'id="claims"', 'id="scores"', 'id="study"', 'id="curves"']
+    parts = ['class="card"', 'id="claims"', 'id="scores"', 'id="study"']
     places = [html.index(part) for part in [*parts, 'id="gallery"', 'id="leakage"', 'id="cite"']]
     assert places == sorted(places)
     assert "<h3>Table 4: generators</h3>" in html
@@ -276,7 +271,7 @@ def test_files_are_named_by_kind_and_title_and_differ():
     titles = ["Table 3: methods", "Table 3: methods!", "中", "x" * 90]
     names = file_names("table", titles)
     assert names == ["table-3-methods", "table-3-methods-2", "table", f"table-{'x' * 48}"]
-    assert len({*file_names("curve", ["a", "a 2", "a", "a"])}) == 4
+    assert len({*file_names("tab", ["a", "a 2", "a", "a"])}) == 4
 
 
 def test_everything_is_escaped(tmp_path):
@@ -284,9 +279,8 @@ def test_everything_is_escaped(tmp_path):
     table = StudyTable(
         NASTY, NASTY, [NASTY, NASTY], [[NASTY, bad], [NASTY, None]], True, [NASTY], False
     )
-    curve = Curve(NASTY, NASTY, NASTY, NASTY, [Line(NASTY, [(1, bad), (2, bad)])])
     claim = Claim(NASTY, NASTY, "holds", NASTY, [bad])
-    results = Results(NASTY, tables=[table], curves=[curve], claims=[claim])
+    results = Results(NASTY, tables=[table], claims=[claim])
     html, text = page_text(results, tmp_path)
     assert "<script>alert" not in html
     assert html.count("<script") == 1
@@ -313,12 +307,8 @@ def test_many_rows_long_words_and_empty_things_are_drawn(tmp_path):
         ),
         StudyTable("No rows", "", ["method", "value"], []),
     ]
-    curves = [
-        Curve("Nothing", "", "x", "y", []),
-        Curve("No points", "", "x", "y", [Line(LONG, [])]),
-    ]
     claims = [Claim(LONG, LONG, "undecided", LONG, [up(LONG, None)])]
-    results = Results("T", tables=tables, curves=curves, claims=claims)
+    results = Results("T", tables=tables, claims=claims)
     _html, text = page_text(results, tmp_path)
     assert text.count("undefined") == 1
     for text in (str(results), results.to_markdown(), results.to_latex()):
@@ -328,164 +318,15 @@ def test_many_rows_long_words_and_empty_things_are_drawn(tmp_path):
             )
             > 20
         )
-    assert len(results.save_figures(tmp_path / "figures")) == 4
-
-
-# --- curves ---------------------------------------------------------------------------------
-
-
-def curve_of(points, **changes):
-    return Curve("C", "", "x", "y", [Line("a", points)], **changes)
-
-
-def shapes(curve, *, fill, ink="line1"):
-    parts = curve_drawing(curve).parts
-    return [p for p in parts if isinstance(p, drawing.Shape) and p.ink == ink and p.fill == fill]
-
-
-def markers(curve):
-    """Centers of the first line's markers, without that of the legend."""
-    filled = [s for s in shapes(curve, fill=True) if s.opacity == 1]
-    return np.array([np.mean(s.points, axis=0) for s in filled])[:-1]
-
-
-@pytest.mark.parametrize("log", [False, True])
-def test_points_bands_and_labels_of_a_curve_are_on_one_scale(log):
-    rng = np.random.default_rng(0)
-    xs, ys = [1, 2, 4, 8], rng.uniform(0.2, 0.8, 4)
-    points = [(x, up("a", y, interval=(y - 0.05, y + 0.1))) for x, y in zip(xs, ys, strict=True)]
-    curve = curve_of(points, log_x=log)
-    drawn = markers(curve)
-    across, down = (
-        np.polyfit(np.log(xs) if log else xs, drawn[:, 0], 1),
-        np.polyfit(ys, drawn[:, 1], 1),
-    )
-    assert np.allclose(np.polyval(across, np.log(xs) if log else xs), drawn[:, 0], atol=1e-6)
-    assert np.allclose(np.polyval(down, ys), drawn[:, 1], atol=1e-6)
-    assert across[0] > 0 > down[0]
-    (band,) = [s for s in shapes(curve, fill=True) if s.opacity < 1]
-    expected = [*np.polyval(down, ys - 0.05), *np.polyval(down, ys + 0.1)[::-1]]
-    assert np.allclose([y for _, y in band.points], expected)
-    words = [p for p in curve_drawing(curve).parts if isinstance(p, drawing.Words)]
-    labels = {w.text: w.x for w in words if w.anchor == "middle"}
-    assert [labels[f"{x}"] for x in xs] == pytest.approx(drawn[:, 0])
-    heights = {float(w.text): w.y - 4 for w in words if w.anchor == "end" and w.text != "x"}
-    assert np.polyval(down, [*heights]) == pytest.approx([*heights.values()])
-
-
-def test_an_undefined_score_interrupts_a_line_and_a_lone_point_has_a_bar():
-    gap = curve_of([(1, up("a", 0.5)), (2, up("a", 0.6)), (3, up("a", None)), (4, up("a", 0.7))])
-    runs = [s for s in shapes(gap, fill=False) if s.width == 2]
-    assert [len(s.points) for s in runs] == [2, 2]  # the second is the legend's
-    assert len(markers(gap)) == 3
-    lone = curve_of([(5, up("a", 0.5, interval=(0.4, 0.7)))])
-    whiskers = [s for s in shapes(lone, fill=False) if s.width == 1.4]
-    assert len(whiskers) == 3
-    assert not [s for s in shapes(lone, fill=True) if s.opacity < 1]
-    bare = curve_of([(1, up("a", 0.5, interval=None)), (2, up("a", 0.5, interval=None))])
-    assert not [s for s in shapes(bare, fill=True) if s.opacity < 1]
-    zero = [(x, up("a", 0.1 * x)) for x in (0, 1, 10)]  # has no logarithm
-    assert np.allclose(markers(curve_of(zero, log_x=True)), markers(curve_of(zero)))
-
-
-def test_lines_differ_without_their_colors():
-    lines = [Line(f"l{k}", [(x, up("a", 0.1 * k)) for x in (1, 2)]) for k in range(20)]
-    parts = curve_drawing(Curve("C", "", "x", "y", lines)).parts
-    dashes = [p.dash for p in parts if isinstance(p, drawing.Shape) and p.width == 2][:20]
-    marks = [drawing.marker(k, 0, 0, "line1")[-1] for k in range(20)]
-    forms = {(d, str(m.points), m.fill) for d, m in zip(dashes, marks, strict=True)}
-    assert len(forms) == 20
-
-
-def test_numbers_of_a_curve_are_a_table_of_all_its_x():
-    a, b = up("a", 0.5), up("b", 0.6)
-    table = curve_table(Curve("C", "Text.", "k", "y", [Line("a", [(1, a)]), Line("b", [(0.5, b)])]))
-    assert (list(table.columns), table.rows) == (
-        ["k", "a", "b"],
-        [["0.5", None, b], ["1", a, None]],
-    )
+    assert results.save_figures(tmp_path / "figures") == []
 
 
 # --- drawings as files ----------------------------------------------------------------------
 
 
-def test_dashes_cover_the_same_share_as_a_walk_along_the_line():
-    line, pattern = [(0.0, 0.0), (30.0, 40.0), (30.0, 100.0), (100.0, 100.0)], (7.0, 3.0, 2.0, 3.0)
-    pieces = drawing.dashed(line, pattern, 2)
-
-    def place(t):  # a point at a length along the line
-        for (x0, y0), (x1, y1) in itertools.pairwise(line):
-            length = math.dist((x0, y0), (x1, y1))
-            if t <= length:
-                return x0 + (x1 - x0) * t / length, y0 + (y1 - y0) * t / length
-            t -= length
-        raise AssertionError
-
-    for t in np.arange(0.5, 180, 1.0):
-        drawn = (t % 30) < 14 or 20 <= (t % 30) < 24
-        near = min(
-            np.linalg.norm(np.subtract(place(t), np.add(a, np.subtract(b, a) * s)))
-            for piece in pieces
-            for a, b in itertools.pairwise(piece)
-            for s in np.linspace(0, 1, 60)
-        )
-        assert (near < 0.4) == drawn, t
-    assert drawing.dashed(line, (), 2) == [line]
-
-
-def test_png_and_svg_are_the_same_drawing(tmp_path):
-    red = drawing.Shape([(10, 10), (30, 10), (30, 30), (10, 30)], "line2", fill=True)
-    veil = drawing.Shape([(40, 0), (80, 0), (80, 40), (40, 40)], "line1", fill=True, opacity=0.5)
-    rule = drawing.Shape([(0, 50), (80, 50)], "ink", width=4)
-    text = drawing.Words(40, 75, "Ours é ↓", "middle", ink="ink", size=16)
-    picture = drawing.Drawing(80, 80, [red, veil, rule, text], "a <drawing>")
-    image = Image.open(io.BytesIO(picture.to_png()))
-    assert image.size == (320, 320)
-
-    def color(x, y):
-        return "#{:02x}{:02x}{:02x}".format(*image.convert("RGB").getpixel((4 * x, 4 * y)))
-
-    assert [color(20, 20), color(5, 5), color(40, 50)] == ["#d55e00", "#ffffff", "#15191e"]
-    halves = [int(color(60, 20)[k : k + 2], 16) for k in (1, 3, 5)]
-    assert halves == pytest.approx([(255 + c) / 2 for c in (0x00, 0x72, 0xB2)], abs=1)
-    letters = np.asarray(image.convert("L"))[4 * 58 : 4 * 80] < 100
-    assert letters.any()
-    columns = np.flatnonzero(letters.any(axis=0)) / 4
-    assert abs((columns[0] + columns[-1]) / 2 - 40) < 3
-    root = ET.fromstring(str(picture.to_svg()))
-    assert root.find("{*}title").text == "a <drawing>"
-    assert [p.get("d")[0] for p in root.findall(".//{*}path")] == ["M"] * 3
-    assert "var(--line2)" in picture.to_svg(themed=True)
-    assert "var(" not in picture.to_svg()
-
-
-def test_long_words_are_cut_to_the_lines_that_there_are():
-    cut = drawing.lines_of("x" * 100, 120, size=12, most=2)
-    letters = len(cut[0])
-    assert [len(line) for line in cut] == [letters, letters]
-    assert cut[1].endswith("x...")
-    assert drawing.lines_of("short", 120) == ["short"]
-    assert drawing.lines_of("", 120) == [""]
-
-
-def test_without_fonts_words_are_written_in_ascii(monkeypatch):
-    drawing.font_of.cache_clear()
-
-    true = ImageFont.truetype
-
-    def missing(font, *_, **options):
-        if isinstance(font, str):
-            raise OSError
-        return true(font, *_, **options)
-
-    monkeypatch.setattr(ImageFont, "truetype", missing)
-    try:
-        words = drawing.Words(2, 20, "TMMD ↓ é", ink="ink")
-        assert drawing.font_of(20)[1] is False
-        assert drawing.Drawing(200, 30, [words], "").to_png()
-    finally:
-        drawing.font_of.cache_clear()
-    assert drawing.in_ascii("é − 中") == "e - ?"
+def test_long_words_are_cut():
+    assert drawing.cut_to("x" * 100, 120) == f"{'x' * 12}..."
+    assert drawing.cut_to("short", 120) == "short"
 
 
 def test_strips_draw_value_interval_null_and_floor_and_hollow_controls(study):
@@ -497,9 +338,7 @@ def test_strips_draw_value_interval_null_and_floor_and_hollow_controls(study):
     rows.append(("inside", dataclasses.replace(rows[0][1], interval=None), True))
     parts = strips_drawing("T", [Panel("TMMD", rows)]).parts
     dots = [
-        p
-        for p in parts
-        if isinstance(p, drawing.Shape) and p.ink == "line1" and len(p.points) == 16
+        p for p in parts if isinstance(p, drawing.Shape) and p.ink == "mark" and len(p.points) == 16
     ]
     assert [p.fill for p in dots] == [True] * 7 + [False]
     centers = [np.mean(p.points, axis=0)[0] for p in dots]
@@ -548,9 +387,7 @@ def test_figures_hold_samples_pairs_and_the_background(tmp_path, monkeypatch):
     results = dataclasses.replace(results, gallery=gallery)
     files = {path.name: path for path in results.save_figures("figures")}
     assert {"samples.png", "background.png", "pairs-orig.png"} <= set(files)
-    assert {
-        path.suffix for name, path in files.items() if name.startswith(("curve", "strips"))
-    } == {".svg", ".png"}
+    assert {path.suffix for name, path in files.items() if "strips" in name} == {".svg"}
     samples = np.asarray(Image.open(files["samples.png"]).convert("RGB"))
     assert (samples == (200, 20, 30)).all(axis=-1).sum() == 2 * 256 * 256
     background = np.asarray(Image.open(files["background.png"]).convert("RGB"))
@@ -563,14 +400,14 @@ def test_figures_hold_samples_pairs_and_the_background(tmp_path, monkeypatch):
 
 def test_the_command_writes_figures_and_replaces_no_other_file(tmp_path, capsys):
     results = study_results(tmp_path, 2)
-    results = dataclasses.replace(results, curves=results.curves[:1], audits=results.audits[1:])
+    results = dataclasses.replace(results, audits=results.audits[1:])
     page = write_report(results, tmp_path / "first.html", base=tmp_path).page
     given = [str(page.with_suffix(".json")), "-o", str(tmp_path / "page.html"), "-q"]
     folder = tmp_path / "figures"
     for _ in range(2):  # its own files are replaced
         assert main(["report", *given, "--figures", str(folder)]) == 0
     again = Results.load(tmp_path / "page.json")
-    assert [len(getattr(again, n)) for n in ("tables", "curves", "claims")] == [2, 1, 3]
+    assert [len(getattr(again, n)) for n in ("tables", "claims")] == [2, 3]
     assert {p.suffix for p in folder.iterdir()} == {".svg", ".png"}
     (folder / "thesis.csv").touch()
     capsys.readouterr()

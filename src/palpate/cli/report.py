@@ -18,7 +18,7 @@ from palpate.report.results import AUDIT_FORMAT, RESULTS_FORMAT, Audit, Results
 
 TITLE = "palpate report"
 #: Names of the files that a folder of figures holds.
-WRITTEN = re.compile(r"(background|curve|pairs|samples|strips)\b.*\.(png|svg)")
+WRITTEN = re.compile(r"(background|pairs|samples|strips)\b.*\.(png|svg)")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -37,7 +37,7 @@ class Options(Common):
     images: tuple[Path, ...] = ()
     """Folders whose images the page may show, next to those of the results."""
     figures: Path | None = None
-    """Folder for figures: curves and scores (.svg and .png), samples and pairs (.png)."""
+    """Folder for figures: scores (.svg), samples and pairs (.png)."""
 
 
 def run(options: Options, terminal: Terminal) -> dict[str, Any]:

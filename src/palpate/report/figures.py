@@ -1,7 +1,6 @@
-"""Figures of a paper as files: curves and strips as SVG and PNG, images as PNG.
+"""Figures of a paper as files: strips of scores as SVG, images as PNG.
 
-Drawings differ by dashes and markers as well as by color and are white, whatever the page is; a
-figure has no title, which belongs into its caption.
+They are white, whatever the page is; a figure has no title, which belongs into its caption.
 """
 
 from __future__ import annotations
@@ -9,13 +8,14 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
-from PIL import Image, ImageDraw, ImageOps
+from PIL import Image, ImageDraw, ImageFont, ImageOps
 
 from palpate.core import atomic_path, write_text
 from palpate.report import audits
-from palpate.report.curves import Panel, curve_drawing, panels_of, strips_drawing
-from palpate.report.drawing import COLORS, Drawing, font_of, in_ascii
+from palpate.report.curves import Panel, panels_of, strips_drawing
+from palpate.report.drawing import COLORS, Drawing
 from palpate.report.first_screen import COLUMNS, TELLING, telling_columns
 from palpate.report.page import gallery_images, in_turns, material_of, pair_images
 from palpate.report.results import Audit, Results
@@ -41,8 +41,8 @@ class Picture:
 def save_figures(results: Results, folder: Path, *, base: Path) -> list[Path]:
     """Write every figure of ``results`` into ``folder``.
 
-    Curves and strips (score tables, and tables of a study with intervals) are SVG and PNG; samples,
-    what the background is of an image, and leaking pairs are PNG.
+    Strips (of scores, and of tables of a study with intervals) are SVG; samples, what the
+    background is of an image, and leaking pairs are PNG.
 
     Args:
         results: what to draw.
@@ -59,11 +59,8 @@ def save_figures(results: Results, folder: Path, *, base: Path) -> list[Path]:
     drawings = _drawings(results)  # scores are checked before anything is written
     files: list[Path] = []
     for name, drawing in drawings.items():
-        svg, png = folder / f"{name}.svg", folder / f"{name}.png"
-        write_text(svg, str(drawing.to_svg()))
-        with atomic_path(png) as part:
-            part.write_bytes(drawing.to_png())
-        files += [svg, png]
+        write_text(path := folder / f"{name}.svg", str(drawing.to_svg()))
+        files.append(path)
     for name, picture in _pictures(results).items():
         with atomic_path(path := folder / f"{name}.png") as part:
             _grid(picture, base).save(part, "png")
@@ -72,8 +69,7 @@ def save_figures(results: Results, folder: Path, *, base: Path) -> list[Path]:
 
 
 def _drawings(results: Results) -> dict[str, Drawing]:
-    names = file_names("curve", [curve.title for curve in results.curves])
-    drawings = dict(zip(names, map(curve_drawing, results.curves), strict=True))
+    drawings: dict[str, Drawing] = {}
     columns = telling_columns(score_tables(results.scores))
     if panels := panels_of(lay(columns, {REAL, *controls_of(results)})):
         drawings["strips-scores"] = strips_drawing("Scores", panels)
@@ -137,12 +133,14 @@ def _pairs(audit: Audit) -> Picture | None:
 
 def _grid(picture: Picture, base: Path) -> Image.Image:
     """Draw the images; one that is missing or broken is an empty field."""
-    font, whole = font_of(LETTERS)
+    try:
+        font: Any = ImageFont.truetype("DejaVuSans.ttf", LETTERS)
+    except OSError:  # PIL's own lacks letters with accents
+        font = ImageFont.load_default(LETTERS)
 
     def text(words: str, room: float) -> str:
-        words = words if whole else in_ascii(words)
         while font.getlength(words) > room and len(words) > 1:
-            words = words[:-2].rstrip() + ("…" if whole else ".")
+            words = words[:-2].rstrip() + "."
         return words
 
     left = max(round(font.getlength(label)) for label, _ in picture.rows) + 3 * GAP
@@ -156,7 +154,7 @@ def _grid(picture: Picture, base: Path) -> Image.Image:
     for r, (label, row) in enumerate(picture.rows):
         y = top + r * (SIDE + GAP)
         place = (left - 2 * GAP, y + SIDE // 2)
-        pen.text(place, label if whole else in_ascii(label), COLORS["ink"], font, "rm")
+        pen.text(place, label, COLORS["ink"], font, "rm")
         for k, wanted in enumerate(row):
             image.paste(_field(wanted, base, picture.crop), (left + k * (SIDE + GAP), y))
     return image

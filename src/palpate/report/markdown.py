@@ -15,7 +15,7 @@ from palpate.report.notes import HOW_TO_READ, sentence
 from palpate.report.results import Results
 from palpate.report.sentences import purpose, summary_lines
 from palpate.report.study import Claim
-from palpate.report.study_tables import Sheet, curve_table, difference_sheet, sheet, tally
+from palpate.report.study_tables import Sheet, difference_sheet, sheet, tally
 from palpate.report.tables import Table, facts_of, marks, score_tables
 from palpate.report.terminal import NAMES, audit_text, score_rows, sheet_rows, sheet_words
 
@@ -34,11 +34,9 @@ def render_markdown(results: Results) -> str:
         lines += ["## Read this first", "", *_items(map(sentence, results.notes))]
     tables = [line for table in score_tables(results.scores) for line in _scores(table)]
     studied = [line for table in map(sheet, results.tables) for line in _sheet(table)]
-    curves = [line for curve in results.curves for line in _sheet(sheet(curve_table(curve)))]
     sections = {
         "Claims": _claims(results.claims),
         "Tables": studied,
-        "Curves": curves,
         "Scores": [HOW_TO_READ, "", *tables] if tables else [],
         "Leakage audit": [line for a in results.audits for line in _fenced(audit_text(a))],
         "Settings and digests": _tree(plain(results.settings)),

@@ -24,7 +24,7 @@ from markupsafe import Markup, escape
 
 from palpate import __version__
 from palpate.core import PalpateError, Progress, SampleRef, plain, quiet, write_json, write_text
-from palpate.report import audits, curves, first_screen, plots, sentences, study_tables
+from palpate.report import audits, first_screen, plots, sentences, study_tables
 from palpate.report.notes import count, digits_of, number, percent, plural, sentence, where
 from palpate.report.results import GalleryItem, LeakPair, Results, Strip
 from palpate.report.study_tables import sheets
@@ -368,7 +368,7 @@ def environment() -> Environment:
         "digits_of": digits_of,
         "verdict_marks": study_tables.MARKS,
     }
-    for module in (audits, curves, first_screen, plots, sentences, study_tables):
+    for module in (audits, first_screen, plots, sentences, study_tables):
         functions |= {k: v for k, v in vars(module).items() if callable(v)}
     env.globals.update(functions)
     words: dict[str, Any] = {"count": count, "number": number}

@@ -22,7 +22,7 @@ from palpate.core.records import from_plain
 from palpate.core.samples import SampleRef
 from palpate.core.score import Score
 from palpate.report.calls import Call
-from palpate.report.study import Claim, Curve, StudyTable
+from palpate.report.study import Claim, StudyTable
 
 if TYPE_CHECKING:
     import polars as pl
@@ -359,7 +359,7 @@ class Results:
         notes: what a reader must see first (synthetic data, fallbacks, skipped inputs).
         commands: command lines that reproduce the run or say what to do next.
         strips: what an encoder retrieved for some queries.
-        tables, curves, claims: of a study.
+        tables, claims: of a study.
         calls: what made the scores, for ``palpate verify``; audits have their own.
     """
 
@@ -373,7 +373,6 @@ class Results:
     commands: Sequence[str] = ()
     strips: Sequence[Strip] = ()
     tables: Sequence[StudyTable] = ()
-    curves: Sequence[Curve] = ()
     claims: Sequence[Claim] = ()
     calls: Sequence[Call] = ()
 
@@ -436,9 +435,7 @@ class Results:
         return _writer("latex").latex_tables(self)
 
     def save_figures(self, folder: str | Path) -> list[Path]:
-        """Write the figures of a paper: curves and strips as SVG and PNG, images as PNG.
-
-        They are white and read without colors: lines differ by dashes and markers.
+        """Write the figures of a paper: strips of scores as SVG, images as PNG; all are white.
 
         Returns:
             The files.

@@ -185,7 +185,7 @@ def purpose(results: Results) -> str:
     if results.claims:
         paper = any(claim.source.startswith("paper") for claim in results.claims)
         parts.append(f"which claims{' of Gungor et al. (ICCV 2025)' * paper} hold")
-    if not parts and (results.tables or results.curves):
+    if not parts and results.tables:
         parts.append("what did a study measure")
     if not parts:
         return "Results of palpate; nothing has been measured yet."

@@ -1,4 +1,4 @@
-"""What a study adds to results: tables of scores and words, curves, and claims with verdicts.
+"""What a study adds to results: tables of scores and words, and claims with verdicts.
 
 Every number in them is a :class:`~palpate.core.Score`; ``details["stage"]`` names the stage of the
 run folder that it was made in, which ``palpate verify`` follows.
@@ -37,34 +37,6 @@ class StudyTable:
     best: bool = False
     controls: Sequence[str] = ()
     folded: bool = True
-
-
-@dataclass(frozen=True)
-class Line:
-    """One line of a curve: its label, and (x, score) points in order of x."""
-
-    label: str
-    points: Sequence[tuple[float, Score]]
-
-
-@dataclass(frozen=True)
-class Curve:
-    """Scores over a number, such as accuracy over real videos a class.
-
-    Attributes:
-        title: its heading.
-        text: what it shows and how to read it.
-        x, y: labels of the axes, with units.
-        lines: what is drawn, in order of the legend; intervals as bands.
-        log_x: whether x is drawn on a logarithmic axis.
-    """
-
-    title: str
-    text: str
-    x: str
-    y: str
-    lines: Sequence[Line]
-    log_x: bool = False
 
 
 @dataclass(frozen=True)

@@ -1,7 +1,7 @@
-"""Tables, laid out: what every front end writes of the scores, tables and curves of results.
+"""Tables, laid out: what every front end writes of the scores and tables of results.
 
 A :class:`Sheet` comes from a table of a study (:func:`sheet`), from scores (:func:`lay`,
-:func:`score_sheets`) or from a curve. The best of a column is marked by value alone, among the rows
+:func:`score_sheets`). The best of a column is marked by value alone, among the rows
 that are no controls; a dagger marks the one that paired differences decide for.
 """
 
@@ -17,7 +17,7 @@ from palpate.core import Note, Score
 from palpate.core.score import ARROWS, BETTER
 from palpate.report.notes import confidence, digits_of, number, p_text
 from palpate.report.results import Results
-from palpate.report.study import Claim, Curve, StudyTable
+from palpate.report.study import Claim, StudyTable
 from palpate.report.tables import (
     BASELINES,
     REAL,
@@ -271,15 +271,6 @@ def difference_sheet(table: Table) -> Sheet:
     text = "a - b; where the interval excludes 0 the difference is more than chance."
     title = f"Paired differences: {table.title}"
     return Sheet(title, text, False, heads, rows, footnotes.notes)
-
-
-def curve_table(curve: Curve) -> StudyTable:
-    """Return the numbers of a curve: a row for each x, a column for each line."""
-    xs = sorted({x for line in curve.lines for x, _ in line.points})
-    known = [dict(line.points) for line in curve.lines]
-    rows = [[f"{x:g}", *(points.get(x) for points in known)] for x in xs]
-    columns = [curve.x, *(line.label for line in curve.lines)]
-    return StudyTable(curve.title, f"{curve.y}. {curve.text}".strip(), columns, rows)
 
 
 def tally(claims: Sequence[Claim]) -> str:

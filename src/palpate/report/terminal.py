@@ -30,7 +30,7 @@ from palpate.report.sentences import (
     threshold_text,
 )
 from palpate.report.study import Claim
-from palpate.report.study_tables import Entry, Sheet, curve_table, difference_sheet, sheet, tally
+from palpate.report.study_tables import Entry, Sheet, difference_sheet, sheet, tally
 from palpate.report.tables import BASELINES, Table, defined, marks, rankings, score_tables
 
 #: Columns that are text; all others are numbers, flush right.
@@ -48,8 +48,7 @@ def print_result(result: Results | Audit, console: Console, style: Style = COMMA
         _print_scores(result.scores, console, style)
     for audit in result.audits:
         print_result(audit, console, style)
-    tables = [*result.tables, *map(curve_table, result.curves)]
-    for table in map(sheet, tables):
+    for table in map(sheet, result.tables):
         _print_sheet(table, console, style)
     if result.tables and result.scores:
         console.print(f"The {len(result.scores):,} scores behind them: Results.to_frame()\n")
