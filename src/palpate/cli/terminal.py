@@ -148,15 +148,11 @@ class Terminal:
                 write_text(latex, results.to_latex())
         return results.to_json() if self.json else {}
 
-    def problems(self, title: str, problems: Sequence[Problem]) -> None:
-        """List problems on standard error, below a title and their number."""
-        if problems:
-            self.print_line(f"{title} {len(problems)}:")
-            list_problems(problems, self.print_line)
-
     def skipped(self, problems: Sequence[Problem]) -> None:
-        """List what ``--skip-bad`` skipped."""
-        self.problems("Skipped", problems)
+        """List on standard error what ``--skip-bad`` skipped."""
+        if problems:
+            self.print_line(f"Skipped {len(problems)}:")
+            list_problems(problems, self.print_line)
 
     def facts(self, title: str, rows: Mapping[str, Any]) -> None:
         """Print a two-column table of names and values."""

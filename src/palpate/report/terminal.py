@@ -211,6 +211,3 @@ def audit_text(audit: Audit, style: Style = PYTHON) -> str:
         lines.append(audit.impact.headline)
         lines += [f"  {sentence(note, style)}" for note in audit.impact.notes]
     return "\n".join([*lines, *(audit_text(other, style) for other in audit.others)])
-
-
-__all__ = ["as_text", "audit_text", "print_result", "score_rows", "sheet_rows", "sheet_words"]
