@@ -72,42 +72,6 @@ def test_the_distance_is_the_published_formula(states, network, size):
         assert result[k] == pytest.approx(expect, rel=1e-5)
 
 
-@pytest.mark.parametrize("size", [(32, 32), (64, 48)])
-def test_a_mask_weighs_the_places_of_every_stage(states, network, size):
-    first, second = pairs(3, *size)
-    mask = np.zeros((3, *size), bool)
-    mask[0, 5:20, 9:30] = True
-    mask[1] = True
-    result = lpips_per_image(first, second, network, mask=mask, batch=2)
-    assert result[1] == pytest.approx(lpips_per_image(first, second, network)[1], rel=1e-6)
-    assert np.isnan(result[2])
-    stages = [written_out(states[0], v[0].transpose(2, 0, 1) / 127.5 - 1) for v in (first, second)]
-    expect = 0.0
-    for i, (a, b) in enumerate(zip(*stages, strict=True)):
-        (h, w), (rows, columns) = size, a.shape[1:]
-        weight = np.array(
-            [
-                [
-                    mask[
-                        0,
-                        r * h // rows : -(-(r + 1) * h // rows),
-                        c * w // columns : -(-(c + 1) * w // columns),
-                    ].mean()
-                    for c in range(columns)
-                ]
-                for r in range(rows)
-            ]
-        )
-        places = (states[1][f"lin{i}.model.1.weight"].double().numpy()[0] * (a - b) ** 2).sum(
-            axis=0
-        )
-        expect += (weight * places).sum() / weight.sum()
-    assert result[0] == pytest.approx(expect, rel=1e-5)
-    for bad in (mask[:2], mask[:, :-1], mask.astype(float)):
-        with pytest.raises(PalpateError, match="`mask` must be boolean of shape"):
-            lpips_per_image(first, second, network, mask=bad)
-
-
 def test_identical_images_are_at_0_and_the_distance_is_symmetric_and_grows(network):
     first, second = pairs()
     assert (lpips_per_image(first, first, network) == 0).all()

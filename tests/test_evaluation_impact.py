@@ -19,7 +19,7 @@ from palpate.data.importing import import_dataset
 from palpate.data.manifest import Manifest
 from palpate.evaluation import impact as module
 from palpate.evaluation import impact_features
-from palpate.evaluation.impact import nearest_hits, thin
+from palpate.evaluation.impact import nearest_hits
 from palpate.evaluation.impact_features import Source, fit_reduction
 from palpate.leakage.splitting import split as leak_free_split
 from palpate.report.results import Impact
@@ -92,25 +92,6 @@ def test_ties_count_as_a_random_choice_would() -> None:
     np.testing.assert_allclose(hits, [2 / 3, 1 / 3, 0, 1 / 2])
 
 
-def test_thinning_keeps_every_class_and_the_shares_of_groups() -> None:
-    classes = np.repeat([0, 1, 2], [600, 299, 1])
-    groups = np.concatenate([np.arange(600) % 4, 4 + np.arange(299) % 2, [6]])
-    rows = np.arange(900) + 1000
-    kept = thin(rows, groups, classes, 90, seed=3)
-    assert len(kept) == 90 == len(set(kept.tolist()))
-    assert set(kept.tolist()) <= set(rows.tolist())
-    assert np.bincount(classes[kept - 1000])[2] == 1
-    assert np.abs(np.bincount(classes[kept - 1000]) - [60, 29.9, 0.1]).max() <= 1
-    assert np.abs(np.bincount(groups[kept - 1000])[:4] - 15).max() <= 1
-    assert (
-        kept.tolist()
-        == thin(rows, groups, classes, 90, seed=3).tolist()
-        != thin(rows, groups, classes, 90, seed=4).tolist()
-    )
-    assert sorted(thin(rows, groups, classes, 900, seed=3).tolist()) == rows.tolist()
-    assert sorted(classes[thin(rows, groups, classes, 3, seed=3) - 1000].tolist()) == [0, 1, 2]
-
-
 def test_the_reduction_spans_the_principal_axes_of_train_alone() -> None:
     rng = np.random.default_rng(2)
     x = (rng.standard_normal((300, 60)) * 0.8 ** np.arange(60)).astype(np.float32) @ np.linalg.qr(
@@ -121,9 +102,8 @@ def test_the_reduction_spans_the_principal_axes_of_train_alone() -> None:
     train = np.arange(200)
     found = fit_reduction(source, train, 6, seed=0)
     centered = x[:200].astype(float) - x[:200].mean(axis=0)
-    _, s, axes = np.linalg.svd(centered, full_matrices=False)
+    _, _, axes = np.linalg.svd(centered, full_matrices=False)
     np.testing.assert_allclose(found.axes @ found.axes.T, axes[:6].T @ axes[:6], atol=1e-3)
-    assert found.explained == pytest.approx((s[:6] ** 2).sum() / (s**2).sum(), abs=1e-4)
     np.testing.assert_allclose(
         np.linalg.norm(found.apply(source, train), axis=1),
         np.linalg.norm(centered @ axes[:6].T, axis=1),
@@ -204,7 +184,6 @@ def test_a_run_is_the_explicit_one() -> None:
     assert found.rows[0].given == pytest.approx(np.mean(hits[0]))
     assert found.rows[0].clean == pytest.approx(np.mean(np.concatenate(hits[1:])))
     assert found.rows[0].given - found.rows[0].clean > 0.1
-    assert found.settings["features"]["x"]["1-NN"] == [round(float(np.mean(h)), 5) for h in hits]
 
 
 def test_equal_input_gives_an_equal_result_whatever_the_order() -> None:
@@ -247,7 +226,6 @@ def test_both_sides_get_the_same_materials_and_as_many_train_samples() -> None:
     assert (found.rows[0].given, found.settings["test_samples"][0]) == (1.0, 24)
     assert found.settings["train_samples"] <= 48
     notes = {note.code: note.params for note in found.notes}
-    assert "uneven-materials" not in notes
     assert notes["no-material"] == {"count": 5}
     assert notes["materials-excluded"]["materials"] == found.settings["left_out"]
 
@@ -266,12 +244,7 @@ def test_features_may_be_sets_by_id_and_keep_cosine_order() -> None:
         seeds=(0,),
     )
     assert [r.features for r in found.rows] == ["set", "set", "array", "array", "scaled", "scaled"]
-    facts = found.settings["features"]
-    assert [
-        facts["set"]["digest"],
-        facts["array"]["standardized"],
-        facts["scaled"]["standardized"],
-    ] == ["encoder", False, True]
+    assert found.settings["features"]["set"] == "encoder"
     assert [r.given for r in found.rows[:2]] == [r.given for r in found.rows[2:4]]
 
 
@@ -295,12 +268,10 @@ def test_each_kind_of_pixels_has_a_row(small_manifest: Manifest, tmp_path: Path)
     again = impact(bare, split, seeds=(0,))
     assert [r.features for r in again.rows] == ["tactile pixels"] * 2
     assert again.rows[0] == found.rows[0]
-    codes = [note.code for note in again.notes]
-    assert [c for c in codes if c.startswith("no-")] == ["no-background", "no-images"]
 
 
 def test_tactile_minus_background_is_the_difference(small_manifest: Manifest) -> None:
-    sources, notes = impact_features.pixel_sources(small_manifest)
+    sources = impact_features.pixel_sources(small_manifest)
     at = np.array([3, 17])
     by_name = {s.name: s.read(at) for s in sources}
     raw = [
@@ -311,45 +282,6 @@ def test_tactile_minus_background_is_the_difference(small_manifest: Manifest) ->
         by_name["tactile minus background"].reshape(2, 32, 32, 3),
         np.array(raw[0]) - np.array(raw[1]),
     )
-    assert notes == []
-
-
-def test_new_objects_have_rows_of_their_own_where_the_split_knows_its_objects() -> None:
-    """Frames of an object are alike, and objects of a material no more than others."""
-    rows = [
-        {
-            "id": f"{o}/{v}/{f}",
-            "video": f"{o}/{v}",
-            "frame": f,
-            "object": f"o{o}",
-            "material": f"m{o % 2}",
-        }
-        for o in range(16)
-        for v in range(3)
-        for f in range(4)
-    ]
-    samples = Manifest.from_rows(rows, Path())
-    objects = np.random.default_rng(0).normal(size=(16, 12)).astype(np.float32)
-    features = {"object": np.repeat(objects, 12, axis=0)}
-    result = impact(samples, by_frame(samples), features=features)
-    accuracy = {(row.group, row.classifier): (row.given, row.clean) for row in result.rows}
-    assert accuracy["video", "1-NN"] == (1, 1)  # a new video of a known object is recognized
-    given, new = accuracy["object", "1-NN"]
-    assert (given, new < 0.8) == (1, True)
-    assert f"Of new objects (splits by object): {100 * new:.1f} %." in result.headline
-    assert (
-        from_plain(Impact, json.loads(json.dumps(asdict(result), default=asdict))).rows[-1].group
-        == "object"
-    )
-    by_object = leak_free_split(samples, by="object", train=0.5)
-    assert {row.group for row in impact(samples, by_object, features=features).rows} == {"video"}
-    one_each = [row | {"material": row["object"]} for row in rows]
-    one_each = Manifest.from_rows(one_each, Path())  # no material is in two objects
-    result = impact(one_each, by_frame(one_each), features=features)
-    assert ({row.group for row in result.rows}, result.notes[-1].code) == (
-        {"video"},
-        "impact-not-by",
-    )
 
 
 def test_a_leak_free_split_is_not_charged() -> None:
@@ -358,7 +290,6 @@ def test_a_leak_free_split_is_not_charged() -> None:
     found = impact(manifest, split, features={"v": one_hot(manifest.column("video"))}, seeds=(0,))
     assert ("shares no video" in found.headline, "worth" in found.headline) == (True, False)
     assert found.rows[0].cost == pytest.approx(0, abs=0.02)
-    assert "no-shared-group" in [note.code for note in found.notes]
 
 
 def refuse(match: str, manifest: Manifest, split: Split | None = None, **options: object) -> None:
@@ -408,21 +339,6 @@ def test_missing_and_broken_pictures_are_named(small_manifest: Manifest) -> None
         PalpateError, match=r"Every sample must have a vision image here\. Got 1 without"
     ):
         impact(holes, split)
-
-
-def test_a_common_material_is_noted_next_to_chance() -> None:
-    base = videos(3, 4, 6)
-    more = [
-        {"id": f"w{v}/{k}", "video": f"w{v}", "frame": k, "material": "M0"}
-        for v in range(12)
-        for k in range(6)
-    ]
-    manifest = Manifest.from_rows([*base.table.iter_rows(named=True), *more], Path())
-    flat = {"flat": np.ones((len(manifest), 2))}
-    found = impact(manifest, by_frame(manifest), features=flat, seeds=(0,))
-    assert found.settings["majority"][0] == round(16 / 24, 5) == round(found.rows[1].given, 5)
-    [note] = [n for n in found.notes if n.code == "uneven-materials"]
-    assert note.params["share"] == found.settings["majority"][0]
 
 
 def test_features_without_any_spread_give_chance() -> None:

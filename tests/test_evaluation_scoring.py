@@ -16,10 +16,7 @@ from palpate.data.manifest import Manifest
 from palpate.evaluation import companions, inputs, score, scoring
 from palpate.evaluation.controls import matched_features
 from palpate.metrics import Polynomial, compare, contact_scores, distance, i_tmmd, ssim
-from palpate.metrics.distributions import prdc_rows
-from palpate.metrics.intervals import spread_of_values
-from palpate.metrics.mmd import sample_units
-from score_calls import DIM, FRAMES, GROUPS, IDS, by_key, codes, feature_sets, paint, unit
+from score_calls import DIM, GROUPS, IDS, by_key, codes, feature_sets, paint, unit
 
 SETS = feature_sets()
 TEST, TRAIN = IDS[:24], IDS[24:]
@@ -64,12 +61,12 @@ def test_embeddings_agree_with_loops_and_with_the_library():
     for s in [*library.scores, *library.differences]:
         got = scores[s.metric, s.subject, "grouped"]
         assert (got.value, got.interval, got.floor) == (s.value, s.interval, s.floor), s.metric
-    for metric in ("FID", "KID", "Precision", "Recall", "Density", "Coverage"):
+    for metric in ("FID", "KID"):
         assert f"{metric} (embeddings)" in {m for m, _, _ in scores}
     assert results.settings["digests"] == {"encoder": "e" * 64, "reference": SETS["real"].digest}
 
 
-@pytest.mark.parametrize("companion", ["kid", "prdc", "fid", "cmmd"])
+@pytest.mark.parametrize("companion", ["kid", "fid", "cmmd"])
 def test_companions_on_features_have_paired_differences(companion):
     made = {name: SETS[name] for name in ("near", "far")}
     results = score(made, SETS["real"], companions=[companion], permutations=0)
@@ -87,29 +84,6 @@ def test_companions_on_features_have_paired_differences(companion):
         direct = distance(SETS["near"].features, SETS["real"].features, **options).value
         assert near.value == pytest.approx(direct, abs=1e-6)
         assert "kid-interval" in [n.code for n in near.notes]
-
-
-def test_differences_of_precision_take_the_groups_of_the_rows_they_average():
-    order = np.random.default_rng(0).permutation(IDS)
-    made = {"a": SETS["near"], "b": SETS["far"].take([*order])}
-    few = 6 * FRAMES
-    videos = [f"w{v}" for v in range(6) for _ in range(FRAMES)]
-    names = [f"r{k}" for k in range(few)]
-    real = FeatureSet(names, SETS["real"].features[:few], None, videos, "e" * 64)
-    scores = by_key(score(made, real, companions=["prdc"], permutations=0))
-    rows = [prdc_rows(SETS[name], real)[1] for name in ("near", "far")]
-    for metric, groups in (
-        ("Precision", GROUPS),
-        ("Density", GROUPS),
-        ("Recall", videos),
-        ("Coverage", videos),
-    ):
-        delta = rows[0][metric] - rows[1][metric]
-        got = scores[f"{metric} (embeddings) difference", "a - b", None]
-        assert got.value == pytest.approx(delta.mean(), abs=1e-12)
-        interval = spread_of_values(delta, groups).interval()
-        assert (got.interval is None) == (interval is None)
-        assert interval is None or got.interval == pytest.approx(interval, abs=1e-9)
 
 
 def test_bare_arrays_have_no_groups_and_pair_by_row():
@@ -155,17 +129,6 @@ def test_several_bandwidths_have_names_of_their_own():
     assert single["TMMD", "generated", "paper"].bandwidth == 1
 
 
-def test_a_preset_with_another_estimator_says_so():
-    def presets(**options):
-        scores = by_key(score({"g": SETS["far"]}, SETS["real"], **FAST, **options))
-        return {preset for metric, _, preset in scores if metric == "TMMD"}
-
-    assert presets() == {"grouped", "paper"}
-    assert presets(estimator="biased") == {"paper, biased"}
-    assert presets(estimator="biased", presets=["cmmd", "paper-tables"]) == {"cmmd", "paper-tables"}
-    assert presets(estimator="grouped") == {"grouped", "paper, grouped"}
-
-
 def test_a_split_scores_the_test_part_against_the_floor_of_the_train_part():
     results = score({"g": SETS["far"]}, SETS["real"], split=SPLIT, **FAST)
     s = by_key(results)["TMMD", "g", "paper"]
@@ -205,8 +168,9 @@ def test_collapse_and_copies_are_noted():
         real, features=np.vstack([real.features[:5], SETS["far"].features[5:]])
     )
     results = score({"still": still, "copied": copied}, real, **FAST)
-    [copies] = [n.params for n in results.notes if n.code == "copies"]
-    assert copies == {"subject": "copied", "copies": 5, "n": 48}
+    notes = by_key(results)["TMMD", "copied", "paper"].notes
+    [copies] = [n.params for n in notes if n.code == "copied-rows"]
+    assert copies == {"count": 5, "n": 48}
     below = {n.params["subject"] for n in results.notes if n.code == "below-floor"}
     assert below == {"still"}
 
@@ -216,57 +180,19 @@ def test_of_many_rows_only_fid_is_computed_by_default(monkeypatch):
     monkeypatch.setattr(scoring, "MANY", 10)
     results = score({"g": SETS["far"]}, SETS["real"], permutations=0)
     assert {m for m, _, _ in by_key(results) if "(embeddings)" in m} == {"FID (embeddings)"}
-    assert [n.params.get("name") for n in results.notes] == [None, "kid", "prdc"]
+    assert [n.params.get("name") for n in results.notes] == [None, "kid"]
     assert codes(results)[0] == "wide-sigma-alone"
     results = score({"g": SETS["far"]}, SETS["real"], companions=["kid"], permutations=0)
     assert "KID (embeddings)" in {m for m, _, _ in by_key(results)}
 
 
 def test_a_default_companion_that_cannot_be_computed_becomes_a_note():
-    few = {name: s.take([IDS[0], IDS[7], IDS[13]]) for name, s in SETS.items()}
-    results = score({"g": few["far"]}, few["real"], presets=["paper"], permutations=0)
-    assert [n.params["name"] for n in results.notes if n.code == "companion-skipped"] == ["prdc"]
+    few = {name: s.take([IDS[0]]) for name, s in SETS.items()}
+    results = score({"g": few["far"]}, few["real"], presets=["cmmd"], sigma=10, permutations=0)
+    skipped = [n.params["name"] for n in results.notes if n.code == "companion-skipped"]
+    assert skipped == ["fid"]
     with pytest.raises(PalpateError):
-        score({"g": few["far"]}, few["real"], presets=["paper"], companions=["prdc"])
-
-
-@pytest.fixture
-def streamed(tmp_path, monkeypatch):
-    monkeypatch.setattr(inputs, "STREAMED", 500)
-    rng = np.random.default_rng(5)
-    for name, shift in (("big", 0.1), ("base", 0.0)):
-        np.save(tmp_path / f"{name}.npy", unit(rng.normal(size=(600, 16)) + 2 + shift))
-    return tmp_path / "big.npy", tmp_path / "base.npy"
-
-
-def test_many_bare_rows_are_streamed_and_never_held(streamed, monkeypatch):
-    calls = []
-    monkeypatch.setattr(
-        scoring, "distance", lambda x, y, **how: calls.append((x, y)) or distance(x, y, **how)
-    )
-    monkeypatch.setattr(inputs.Samples, "feature_set", lambda *_: pytest.fail("held in memory"))
-    results = score(*streamed)
-    [s] = results
-    assert all(isinstance(x, np.memmap) for x in calls[0])
-    exact = distance(*map(np.load, streamed), backend="blocked").value
-    assert abs(s.value - exact) <= s.details["bound"] + 1e-6
-    assert (s.metric, s.subject, s.details["backend"]) == ("TMMD", "big", "moments")
-    assert 0 < s.details["bound"] < 1e-4
-    assert codes(results) == ["streamed"]
-    assert s.reference == results.settings["digests"]["reference"]
-
-
-def test_streamed_rows_with_shared_ids_lose_the_pairs_of_one_scene(streamed, tmp_path):
-    ids = [f"scene {k}" for k in range(600)]
-    for file in streamed:
-        table = pl.DataFrame({"id": ids, "features": np.load(file).tolist()})
-        table.write_parquet(tmp_path / f"{file.stem}.parquet")
-    [s] = score(tmp_path / "big.parquet", tmp_path / "base.parquet")
-    assert (s.settings["preset"], s.estimator, s.bandwidth) == ("grouped", "grouped", 10)
-    x, y = map(np.load, streamed)
-    block = sample_units(ids, 0)[0] * 50 // 600
-    exact = distance(x, y, estimator="grouped", groups_x=block, groups_y=block).value
-    assert s.value == pytest.approx(exact, abs=1e-4)
+        score({"g": few["far"]}, few["real"], presets=["cmmd"], sigma=10, companions=["fid"])
 
 
 def test_two_plain_folders_show_sigma_10_and_multi_without_pairs_of_one_scene():
@@ -280,20 +206,6 @@ def test_two_plain_folders_show_sigma_10_and_multi_without_pairs_of_one_scene():
     assert results["I-TMMD", "g"].settings["preset"] == "paper"
     [paper] = score({"g": made}, real, presets=["paper"], **FAST)["TMMD"]
     assert "dependent-pairs" in {n.code for n in paper.notes}
-
-
-@pytest.mark.parametrize(
-    ("options", "words"),
-    [
-        ({"presets": ["grouped"]}, "`estimator` must be unbiased or biased"),
-        ({"sigma": "multi"}, "one Gaussian bandwidth"),
-        ({"sigma": 0.3}, "`sigma` must be wide .* backend='blocked'"),
-        ({"companions": ["fid"]}, "`companions` must go with rows that fit"),
-    ],
-)
-def test_what_streamed_rows_cannot_have(streamed, options, words):
-    with pytest.raises(PalpateError, match=words):
-        score(*streamed, **options)
 
 
 def changed(**fields) -> FeatureSet:
@@ -391,40 +303,25 @@ def test_images_in_memory_pair_by_position_on_request():
     assert s.value == pytest.approx(ssim(made, PICTURES).value, abs=1e-12)
 
 
-def test_lpips_of_whole_images_and_of_their_contact(tmp_path, small_manifest):
+def test_lpips_is_the_mean_over_pairs(tmp_path, small_manifest):
     pytest.importorskip("torch")
     from lpips_files import random_states, save_states
     from palpate.encoders.perceptual import load_lpips, lpips_per_image
-    from palpate.metrics import contact_images
 
     made = {n: paint(tmp_path / n, small_manifest.ids, seed) for seed, n in enumerate("ab", 5)}
     files = save_states(random_states(), tmp_path)
     folders = [tmp_path / n for n in made]
     scores = by_key(score(folders, small_manifest, companions=["lpips"], lpips=files))
     network = load_lpips(*files)
-    real, gel = (
-        np.stack([np.asarray(Image.open(p)) for p in small_manifest.paths(k)])
-        for k in ("tactile", "background")
-    )
-
-    def on_contact(x):
-        cut = contact_images(x, real, gel)
-        return lpips_per_image(cut.generated, cut.reference, network, mask=cut.mask)
-
-    x = {n: np.stack([images[i] for i in small_manifest.ids]) for n, images in made.items()}
-    for metric, of in (
-        ("LPIPS", lambda v: lpips_per_image(v, real, network)),
-        ("contact LPIPS", on_contact),
-    ):
-        values = {n: of(v) for n, v in x.items()}
-        for n, v in values.items():
-            assert scores[metric, n, None].value == pytest.approx(np.nanmean(v), rel=1e-5)
-        difference = scores[f"{metric} difference", "a - b", None].value
-        assert difference == pytest.approx(
-            np.nanmean(values["a"] - values["b"]), rel=1e-3, abs=1e-6
-        )
-    empty = scores["contact LPIPS", "a", None].details["empty"]
-    assert empty == pytest.approx(np.nanmean(on_contact(gel)), rel=1e-5)
+    real = np.stack([np.asarray(Image.open(p)) for p in small_manifest.paths("tactile")])
+    values = {
+        n: lpips_per_image(np.stack([images[i] for i in small_manifest.ids]), real, network)
+        for n, images in made.items()
+    }
+    for n, v in values.items():
+        assert scores["LPIPS", n, None].value == pytest.approx(v.mean(), rel=1e-5)
+    difference = scores["LPIPS difference", "a - b", None].value
+    assert difference == pytest.approx((values["a"] - values["b"]).mean(), rel=1e-3, abs=1e-6)
 
 
 def test_unpaired_images_are_an_error_and_disjoint_ones_a_note(tmp_path):
@@ -509,13 +406,7 @@ def test_images_are_embedded_and_scored_as_their_features(tmp_path, small_manife
         got = scores[s.metric, "a", "grouped"].value
         assert got == pytest.approx(s.value, rel=1e-6, abs=1e-6), s.metric
     metrics = {m for m, _, _ in scores}
-    for metric in (
-        "FID (tactile) difference",
-        "SSIM",
-        "MS-SSIM",
-        "contact residual",
-        "Precision (tactile)",
-    ):
+    for metric in ("FID (tactile) difference", "SSIM", "MS-SSIM", "contact residual"):
         assert metric in metrics
     assert not [m for m in metrics if m.startswith(("CMMD", "LPIPS", "material"))]
     assert results.settings["digests"]["tactile encoder"] == mini.digest("tactile")
@@ -600,29 +491,6 @@ def test_one_background_stands_for_all_images_of_a_folder(tmp_path, small_manife
         score(SETS["far"], SETS["real"], background=gel)
 
 
-def test_clusters_stand_in_for_materials_and_say_so(tmp_path, small_manifest, mini):
-    bare = {k: dataclasses.replace(SETS[k], labels=None) for k in ("near", "far", "real")}
-    results = score({"a": bare["near"], "b": bare["far"]}, bare["real"], labels="cluster:3", **FAST)
-    for metric, marked in {"TMMD": False, "I-TMMD": False, "CI-TMMD": True, "D-TMMD": True}.items():
-        for s in [*results[metric], *results[f"{metric} difference"]]:
-            assert ("pseudo-labels" in {n.code for n in s.notes}) == marked
-            assert (s.settings.get("labels") == "cluster:3 of the reference's features") == marked
-    assert {*results["CI-TMMD"][0].details["classes"]} <= {f"cluster {k}" for k in (1, 2, 3)}
-    again = score(bare["near"], bare["real"], labels="cluster:3", **FAST)
-    assert again["D-TMMD", "generated"].value == results["D-TMMD", "a"].value
-    paint(tmp_path / "g", small_manifest.ids, 1)
-    options = {"encoder": mini, "labels": "cluster:2", **FAST}
-    of_photos = score(tmp_path / "g", small_manifest, **options)["CI-TMMD", "g"]
-    assert of_photos.settings["labels"] == "cluster:2 of photos"
-    for labels, made, words in (
-        ("cluster:x", bare["far"], "cluster: and a number"),
-        ("cluster:40", bare["far"], "four samples a cluster"),
-        ("cluster:3", bare["far"].features, "share no ids"),
-    ):
-        with pytest.raises(PalpateError, match=words):
-            score(made, bare["real"], labels=labels, **FAST)
-
-
 def test_tactile_images_without_photos_are_scored(tmp_path, small_manifest, mini):
     paint(tmp_path / "g", small_manifest.ids, 1)
     table = small_manifest.table.with_columns(vision=pl.lit(None, pl.String))
@@ -633,8 +501,6 @@ def test_tactile_images_without_photos_are_scored(tmp_path, small_manifest, mini
     subjects = {s.subject for s in results["TMMD"]}
     assert subjects == {"g", "background only", "real, same material"}
     results.to_html(tmp_path / "page.html")
-    labels = score(tmp_path / "g", reference, encoder=mini, labels="cluster:2", **FAST)
-    assert labels["CI-TMMD", "g"].settings["labels"] == "cluster:2 of the reference's features"
 
 
 def test_an_interrupted_run_goes_on_from_its_embeddings(

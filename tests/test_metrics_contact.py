@@ -10,7 +10,7 @@ import pytest
 from scipy import ndimage, stats
 
 from palpate.core import Note, PalpateError, require_comparable
-from palpate.metrics import background_digest, contact, contact_images, contact_mask, contact_scores
+from palpate.metrics import background_digest, contact, contact_mask, contact_scores
 from palpate.metrics.contact import contacts_of_each
 from palpate.sim import Video, World, WorldOptions
 from palpate.sim.plan import first_contact, plan_world
@@ -332,23 +332,6 @@ def test_scores_of_other_backgrounds_are_not_comparable():
     require_comparable([score, contact_residual(*backwards)])
 
 
-def test_contact_images_are_gray_outside_the_contact():
-    background, real = pressed(16)
-    made = pressed(17)[1]
-    images = contact_images(made, real, background)
-    for image, source in ((images.generated, made), (images.reference, real)):
-        assert image.dtype == np.float32
-        assert (image[~images.mask] == 0.5).all()
-        expected = np.clip(0.5 + source - background, 0, 1)[images.mask]
-        np.testing.assert_allclose(image[images.mask], expected, atol=1e-6)
-    in_bytes = contact_images(*map(bytes_of, (made, real, background)))
-    both = images.mask & in_bytes.mask
-    assert np.abs(in_bytes.reference - images.reference)[both].max() < 0.01
-    assert not (images.mask & ~contact_mask(real, background)).any()
-    assert images.mask.any(axis=(1, 2)).all()
-    assert not contact_images(made, background, background).mask.any()
-
-
 # ---- bad input
 
 GEL, REAL = pressed(12)
@@ -361,7 +344,7 @@ def with_pixel(x, value):
     return x
 
 
-@pytest.mark.parametrize("call", [contact_scores, contact_images])
+@pytest.mark.parametrize("call", [contact_scores])
 @pytest.mark.parametrize(
     ("made", "real", "background", "words"),
     [

@@ -12,7 +12,6 @@ from unittest.mock import patch
 
 import numpy as np
 import polars as pl
-from safetensors.numpy import save_file
 
 import palpate
 from data_fixtures import write_video
@@ -70,8 +69,7 @@ COMMANDS: dict[str, int] = {
     "split IN/touch-and-go -o OUT/s.json --lists OUT/lists --train 0.5": 1,
     "score --generated IN/vectors/a.npy --reference IN/vectors/b.npy --permutations 9": 5,
     "score --generated IN/vectors/a.npz --reference IN/vectors/b.npz -o OUT/s.json": 4,
-    "score --generated IN/vectors/a.safetensors --reference IN/vectors/b.safetensors": 4,
-    "score --generated IN/vectors/a.parquet --reference IN/vectors/b.parquet "
+    "score --generated IN/vectors/a.npy --reference IN/vectors/b.npz "
     "--labels IN/vectors/labels.csv --latex OUT/t.tex --permutations 0": 4,
     "score --generated IN/generated --reference IN/manifest -o OUT/s.json "
     "--companions ssim psnr --permutations 0": 4,
@@ -154,7 +152,7 @@ def _tables(folder: Path) -> None:
 
 
 def _vectors(folder: Path) -> None:
-    """Embeddings of twelve samples in every form, twice."""
+    """Embeddings of twelve samples in both forms, twice."""
     place = folder / "vectors"
     place.mkdir()
     ids = [f"s{k}" for k in range(12)]
@@ -164,10 +162,6 @@ def _vectors(folder: Path) -> None:
         x /= np.linalg.norm(x, axis=1, keepdims=True)
         np.save(place / f"{name}.npy", x)
         np.savez(place / f"{name}.npz", features=x, ids=np.array(ids), labels=np.array(labels))
-        metadata = {"ids": json.dumps(ids), "labels": json.dumps(labels)}
-        save_file({"features": x}, place / f"{name}.safetensors", metadata)
-        columns = {"id": ids, "features": x.tolist(), "material": labels}
-        pl.DataFrame(columns).write_parquet(place / f"{name}.parquet")
     rows = [[i, label, f"v{k // 3}"] for k, (i, label) in enumerate(zip(ids, labels, strict=True))]
     write_csv(place / "labels.csv", ("id", "material", "video"), rows)
 

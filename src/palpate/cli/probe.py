@@ -42,7 +42,7 @@ class Training:
 
 @dataclass(frozen=True, kw_only=True)
 class Options(Common):
-    """Score what an encoder's embeddings know: classes, by a linear probe and k-NN fitted to the
+    """Score what an encoder's embeddings know: classes, by a linear probe fitted to the
     train part, and which text and image belong to a sample, by retrieval within the test part.
 
     Several encoders, or several splits, are compared with paired differences.
@@ -61,8 +61,6 @@ class Options(Common):
     group: Literal["auto", "video", "contact", "object"] = "auto"
     """What stays together in cross-validation and intervals; `auto` takes what the split kept
     whole, else the video."""
-    neighbors: int = 20
-    """k of k-NN."""
     top: tuple[int, ...] = (1, 5, 10)
     """Ranks within which retrieval must find a right key."""
     pool: int | None = None
@@ -97,7 +95,7 @@ def run(options: Options, terminal: Terminal) -> dict[str, Any]:
         marks = (b"palpate",) if page else (b'"format": "palpate-',)
         guard_output(output, [options.manifest, *options.split], marks)
     one_or_all = lambda values: values[0] if len(values) == 1 else list(values)
-    names = ("modality", "label", "group", "neighbors", "top", "pool", "text_threshold", "seed")
+    names = ("modality", "label", "group", "top", "pool", "text_threshold", "seed")
     arguments: dict[str, Any] = {name: getattr(options, name) for name in names}
     with terminal.progress() as progress:
         if training.train:

@@ -12,9 +12,7 @@ import tyro
 from palpate.cli.terminal import Common, OptionalOutPath, Switch, Terminal, guard_output
 from palpate.core import PalpateError, is_stream
 
-Companion = Literal[
-    "fid", "kid", "cmmd", "prdc", "ssim", "psnr", "ms-ssim", "contact", "lpips", "none"
-]
+Companion = Literal["fid", "kid", "cmmd", "ssim", "psnr", "ms-ssim", "contact", "lpips", "none"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -24,10 +22,7 @@ class Samples:
     names: tuple[str, ...] = ()
     """Names of the generators in the tables, instead of those of their folders and files."""
     labels: Path | None = None
-    """CSV or Parquet file with the columns id, material, video, in place of what the inputs
-    have; or `cluster:8`, eight clusters of the reference's photos (else features) for materials."""
-    groups: Path | None = None
-    """The same for groups alone, where labels and groups are in two files."""
+    """CSV or Parquet file with the columns id, material, video: instead of the inputs' own."""
     group: Literal["auto", "video", "contact", "object"] = "auto"
     """What stays together in halves and intervals; `auto` takes what the split kept whole, else the
     video."""
@@ -45,10 +40,6 @@ class Metrics:
     """Bandwidths: numbers, `median` (of the reference's distances), `multi` (five around it).
     Default: 10, comparable with the literature; for TMMD also `multi`, which sees more than the
     mean."""
-    estimator: Literal["unbiased", "biased", "grouped"] | None = None
-    """Instead of the presets' estimators."""
-    backend: Literal["auto", "blocked", "moments"] = "auto"
-    """Kernel-sum backend."""
     normalize: Literal["check", "yes", "no"] = "check"
     """Embeddings that are not of unit length: stop, divide by the norm, or keep them."""
     companions: tuple[Companion, ...] | None = None
@@ -76,7 +67,7 @@ class Options(Common):
 
     generated: tuple[Path, ...]
     """What to score, one entry a generator: folders of images or of `palpate generate`, manifests,
-    or embeddings (.npy, .npz, .safetensors, .parquet)."""
+    or embeddings (.npy, .npz)."""
     reference: Path
     """The real tactile images, of the same kinds. Ids are relative file names."""
     encoder: str | None = None
@@ -91,8 +82,7 @@ class Options(Common):
     """What the generator was trained on, e.g. a folder or manifest of train images: adds how near
     its images lie to these (memorization). Of a manifest that --split knows, its train part."""
     allow_seen: Switch = False
-    """Score with an encoder that was trained on some of the real images, or chose generated ones
-    (--best-of); every score says so."""
+    """Score with an encoder that was trained on some of the real images; every score says so."""
     output: OptionalOutPath = None
     """Write scores, gallery and settings as JSON, for `palpate report`."""
     latex: Path | None = None
@@ -140,7 +130,7 @@ def _check_outputs(options: Options) -> None:
     """Raise before anything is computed if an output cannot be written."""
     samples = options.samples
     given = (options.split, options.train)
-    read = (options.reference, *given, samples.labels, samples.groups, *options.generated)
+    read = (options.reference, *given, samples.labels, *options.generated)
     inputs = [path for path in read if path]
     if options.output:
         guard_output(options.output, inputs)

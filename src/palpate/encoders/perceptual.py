@@ -23,7 +23,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
-from torch.nn.functional import adaptive_avg_pool2d, max_pool2d, relu
+from torch.nn.functional import max_pool2d, relu
 
 from palpate.core import PalpateError, Progress, quiet
 from palpate.encoders.embed import exact
@@ -81,21 +81,12 @@ class Lpips(nn.Module):
             features.append(x / (x.square().sum(dim=1, keepdim=True).sqrt() + EPSILON))
         return features
 
-    def forward(self, first: Tensor, second: Tensor, weights: Tensor | None = None) -> Tensor:
-        """The distances (b,), float64, of pixels (b, 3, h, w) in [-1, 1]; differentiable.
-
-        ``weights`` (b, 1, h, w), not negative and not all 0, is averaged over the pixels of every
-        position of a stage and weighs it there.
-        """
+    def forward(self, first: Tensor, second: Tensor) -> Tensor:
+        """The distances (b,), float64, of pixels (b, 3, h, w) in [-1, 1]; differentiable."""
         total = torch.zeros(len(first), dtype=torch.float64, device=first.device)
         stages = zip(self.stages_of(first), self.stages_of(second), self.heads, strict=True)
         for a, b, head in stages:
-            distance = head((a - b).square()).double()
-            if weights is None:
-                total = total + distance.mean(dim=(1, 2, 3))
-            else:
-                w = adaptive_avg_pool2d(weights.double(), distance.shape[2:])
-                total = total + (w * distance).sum(dim=(1, 2, 3)) / w.sum(dim=(1, 2, 3))
+            total = total + head((a - b).square()).double().mean(dim=(1, 2, 3))
         return total
 
 
@@ -133,7 +124,6 @@ def lpips_per_image(
     reference: NDArray[Any],
     network: Lpips,
     *,
-    mask: NDArray[np.bool_] | None = None,
     batch: int = 64,
     progress: Progress = quiet,
 ) -> NDArray[np.float64]:
@@ -144,13 +134,11 @@ def lpips_per_image(
             64 px patches, or of whole images.
         reference: the same shape; image i is the partner of generated image i.
         network: of :func:`load_lpips`.
-        mask: (n, h, w): the pixels whose distances are averaged; the others only lend the network
-            their surroundings. Default: all.
         batch: pairs at a time.
         progress: called with the number of pairs done.
 
     Returns:
-        (n,) distances, 0 for identical images; lower is better. NaN where the mask is empty.
+        (n,) distances, 0 for identical images; lower is better.
 
     Raises:
         PalpateError: on other shapes, dtypes, ranges (image numbers are named), or images smaller
@@ -162,19 +150,13 @@ def lpips_per_image(
         must = f"must be at least {SMALLEST} x {SMALLEST} for LPIPS"
         got = f"{shape[1]} x {shape[2]}"
         raise PalpateError(must, got, "Score larger images", argument="generated")
-    if mask is not None and (mask.shape != shape[:3] or mask.dtype != bool):
-        must, got = f"must be boolean of shape {shape[:3]}", f"{mask.dtype} of shape {mask.shape}"
-        raise PalpateError(must, got, "Pass one mask per image", argument="mask")
     distances = np.empty(len(generated), np.float64)
     device = network.get_buffer("shift").device
     with exact():
         for start in range(0, len(distances), batch):
             rows = slice(start, start + batch)
             pair = (_pixels(images[rows], device) for images in (generated, reference))
-            weights = None
-            if mask is not None:
-                weights = torch.from_numpy(mask[rows][:, None].astype(np.float32)).to(device)
-            distances[rows] = network(*pair, weights).cpu().numpy()
+            distances[rows] = network(*pair).cpu().numpy()
             progress("LPIPS", min(start + batch, len(distances)), len(distances))
     return distances
 

@@ -5,13 +5,12 @@ name           needs      score
 =============  =========  ================================================================
 ``fid``        features   Frechet distance, of Inception's features if its weights are given
 ``kid``        features   MMD^2 with the kernel (x.y / d + 1)^3, as ``fid``
-``prdc``       features   precision, recall, density and coverage of nearest neighbors
 ``cmmd``       features   biased MMD^2, of CLIP's features if a CLIP is given
 ``ssim``       pairs      structural similarity
 ``psnr``       pairs      peak signal-to-noise ratio
 ``ms-ssim``    pairs      structural similarity at several scales
-``contact``    pairs      residual, SSIM, PSNR, IoU, MS-SSIM of the contact; needs backgrounds
-``lpips``      pairs      LPIPS, also of the contact if there are backgrounds; needs weights
+``contact``    pairs      residual, SSIM and IoU of the contact; needs backgrounds
+``lpips``      pairs      LPIPS; needs weights
 =============  =========  ================================================================
 
 "Pairs" are a generated and a real image of one id.
@@ -29,27 +28,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from palpate.core import FeatureSet, Note, PalpateError, Progress, Score
-from palpate.metrics import (
-    Polynomial,
-    background_digest,
-    compare_fid,
-    compare_tmmd,
-    contact_images,
-    mean_score,
-    per_image,
-)
-from palpate.metrics.contact import SETTINGS, contacts_of_each
-from palpate.metrics.distributions import prdc_rows
+from palpate.metrics import Polynomial, compare_fid, compare_tmmd, mean_score, per_image
+from palpate.metrics.contact import contacts_of_each
 from palpate.metrics.paired import mean_differences
 
 Images = NDArray[np.uint8]
-Name = Literal["fid", "kid", "prdc", "cmmd", "ssim", "psnr", "ms-ssim", "contact", "lpips"]
+Name = Literal["fid", "kid", "cmmd", "ssim", "psnr", "ms-ssim", "contact", "lpips"]
 #: With more rows the companions that form all pairs must be requested by name.
 MANY = 50_000
 #: The CLIP of published CMMD (arXiv 2401.09603).
 CMMD_CLIP = "openai/clip-vit-large-patch14-336"
-#: Pairs whose contacts are cut out at a time.
-BATCH = 256
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -171,7 +159,7 @@ def choose(
     Raises:
         PalpateError: for an unknown name, or a companion whose inputs are not there.
     """
-    has = {name: weights.for_features(name)[1] is not None for name in FEATURES if name != "prdc"}
+    has = {name: weights.for_features(name)[1] is not None for name in FEATURES}
     able = {name: encoder or has.get(name, False) for name in FEATURES}
     able |= dict.fromkeys(PAIRS, images)
     able |= {"contact": images and background, "lpips": images and weights.lpips is not None}
@@ -202,20 +190,16 @@ def _lacking(name: str, weights: Weights, *, images: bool) -> PalpateError:
         from palpate.encoders.perceptual import FIX
 
         return PalpateError("must hold the two files of LPIPS", "none", FIX, argument="lpips")
-    fix = "Pass an encoder"
-    if name != "prdc":
-        from palpate.encoders.inception import FIX
+    from palpate.encoders.inception import FIX
 
-        kind = weights.for_features(name)[0]
-        where = {"inception": FIX, "clip": f"Fetch one with: hf download {CMMD_CLIP}"}
-        fix = f"{fix}, or weights of {kind}. {where[kind]}"
+    kind = weights.for_features(name)[0]
+    where = {"inception": FIX, "clip": f"Fetch one with: hf download {CMMD_CLIP}"}
+    fix = f"Pass an encoder, or weights of {kind}. {where[kind]}"
     must = "must need no features of images without an encoder"
     return PalpateError(must, name, fix, example={"encoder": "palpate/mini"}, **argument)
 
 
-def score_features(
-    names: Sequence[str], features: Features, default: bool, progress: Progress
-) -> Outcome:
+def score_features(names: Sequence[str], features: Features, default: bool) -> Outcome:
     """Compute companions, among :data:`FEATURES`, on given features.
 
     By ``default`` nobody requested them: one that raises, or forms too many pairs, becomes a note.
@@ -225,7 +209,7 @@ def score_features(
         if default and name != "fid" and features.rows > MANY:
             outcome.notes.append(Note("too-many-rows", {"name": name, "rows": MANY}))
             continue
-        _attempt(outcome, name, lambda name=name: FEATURES[name](features, progress), default)
+        _attempt(outcome, name, lambda name=name: FEATURES[name](features), default)
     return outcome
 
 
@@ -265,16 +249,16 @@ def _compared(
     return outcome
 
 
-def _fid(features: Features, _: Progress) -> Outcome:
+def _fid(features: Features) -> Outcome:
     return _compared(compare_fid, features, "FID")
 
 
-def _cmmd(features: Features, _: Progress) -> Outcome:
+def _cmmd(features: Features) -> Outcome:
     options: dict[str, Any] = {**features.family, "preset": "cmmd"}
     return _compared(compare_tmmd, features, "TMMD", "CMMD", **options)
 
 
-def _kid(features: Features, _: Progress) -> Outcome:
+def _kid(features: Features) -> Outcome:
     options: dict[str, Any] = {"preset": "paper", "normalize": False, "permutations": 0}
     outcome = _compared(compare_tmmd, features, "TMMD", "KID", kernel=Polynomial(), **options)
     for scores in (outcome.scores, outcome.differences):
@@ -282,31 +266,6 @@ def _kid(features: Features, _: Progress) -> Outcome:
         for k, s in enumerate(scores):
             settings = {key: value for key, value in s.settings.items() if key != "preset"}
             scores[k] = replace(s, settings=settings, notes=[*noted, *s.notes])
-    return outcome
-
-
-def _prdc(features: Features, progress: Progress) -> Outcome:
-    outcome = Outcome()
-    for sets in features.batches():
-        first = next(iter(sets.values()))
-        options: dict[str, Any] = {"split": features.common["split"], "progress": progress}
-        results = {
-            name: prdc_rows(s.take(list(first.ids)), features.reference, subject=name, **options)
-            for name, s in sets.items()
-        }
-        # Precision and density average over generated rows, recall and coverage over real ones.
-        groups = (first.groups, features.reference.groups) * 2
-        for k, metric_groups in enumerate(groups):
-            scores = {name: s[k] for name, (s, _) in results.items()}
-            if len(sets) > 1:
-                values = {name: rows[s[k].metric] for name, (s, rows) in results.items()}
-                grouped = scores[next(iter(scores))].settings["grouped"]
-                between = mean_differences(scores, values, metric_groups if grouped else None)
-                outcome.differences += _renamed(
-                    between, scores[next(iter(scores))].metric, features
-                )
-            for s in scores.values():
-                outcome.scores += _renamed([s], s.metric, features)
     return outcome
 
 
@@ -347,60 +306,26 @@ def _contact(pairs: Pairs) -> Outcome:
 
 
 def _lpips(pairs: Pairs) -> Outcome:
-    """LPIPS of whole images and, where there are backgrounds, of the contact alone."""
     from palpate.encoders.perceptual import load_lpips, lpips_per_image
 
     assert pairs.weights.lpips is not None  # `choose` requires it
     network, real = load_lpips(*map(Path, pairs.weights.lpips)), pairs.reference
-    settings = {"network": "alex", "version": "0.1", "size": [int(v) for v in real.shape[1:3]]}
-    more: dict[str, Any] = {**pairs.common, "higher_is_better": False, "encoder": network.digest}
-
-    def outcome_of(metric: str, values: Mapping[str, Any], **extra: Any) -> Outcome:
-        scores = {
-            name: mean_score(metric, v, subject=name, **more, **extra) for name, v in values.items()
-        }
-        return _with_differences(pairs, scores, lambda name: values[name])
-
-    whole = {
-        n: lpips_per_image(x, real, network, progress=pairs.progress)
-        for n, x in pairs.images.items()
+    size = [int(v) for v in real.shape[1:3]]
+    options: dict[str, Any] = {
+        "higher_is_better": False,
+        "encoder": network.digest,
+        "settings": {"network": "alex", "version": "0.1", "size": size},
+        **pairs.common,
     }
-    outcome = outcome_of("LPIPS", whole, settings=settings)
-    if pairs.background is None:
-        return outcome
-    empty = _contact_lpips(pairs.background, pairs, network)
-    contact = {name: _contact_lpips(x, pairs, network) for name, x in pairs.images.items()}
-    settings |= SETTINGS | {"background": background_digest(pairs.background)}
-    bare = int(np.isnan(empty).sum())
-    gel = float(np.nanmean(empty)) if bare < len(real) else None
-    on_contact = outcome_of("contact LPIPS", contact, settings=settings, details={"empty": gel})
-    if bare:
-        note = Note("no-contact", {"count": bare, "n": len(real)})
-        on_contact.scores = [replace(s, notes=[*s.notes, note]) for s in on_contact.scores]
-    outcome.add(on_contact)
-    return outcome
+    values = {
+        name: lpips_per_image(x, real, network, progress=pairs.progress)
+        for name, x in pairs.images.items()
+    }
+    scores = {n: mean_score("LPIPS", v, subject=n, **options) for n, v in values.items()}
+    return _with_differences(pairs, scores, lambda name: values[name])
 
 
-def _contact_lpips(images: Images, pairs: Pairs, network: Any) -> NDArray[np.float64]:
-    """LPIPS (n,) of the differences to the background inside the contact mask; NaN if empty."""
-    from palpate.encoders.perceptual import lpips_per_image
-
-    assert pairs.background is not None
-    values = np.empty(len(images))
-    for start in range(0, len(images), BATCH):
-        at = slice(start, start + BATCH)
-        cut = contact_images(images[at], pairs.reference[at], pairs.background[at])
-        values[at] = lpips_per_image(cut.generated, cut.reference, network, mask=cut.mask)
-        pairs.progress("LPIPS of the contact", min(start + BATCH, len(images)), len(images))
-    return values
-
-
-FEATURES: Mapping[str, Callable[[Features, Progress], Outcome]] = {
-    "fid": _fid,
-    "kid": _kid,
-    "prdc": _prdc,
-    "cmmd": _cmmd,
-}
+FEATURES: Mapping[str, Callable[[Features], Outcome]] = {"fid": _fid, "kid": _kid, "cmmd": _cmmd}
 PAIRS: Mapping[str, Callable[[Pairs], Outcome]] = {
     "ssim": partial(_mean_of_pairs, metric="SSIM"),
     "psnr": partial(_mean_of_pairs, metric="PSNR"),

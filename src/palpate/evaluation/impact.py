@@ -11,13 +11,9 @@ hit is the share of them with the right label: what a random choice among them w
 average. Equally near means within the rounding of float32, ``TIE (||x||^2 + max ||z||^2)``.
 
 What is held equal: the samples (train and test of the given split, of materials that can be
-compared), the shares, the number of train samples (larger train parts are thinned evenly), the
+compared), the shares, the number of train samples (larger train parts are thinned at random), the
 features and their reduction (fitted to each train part alone), the classifiers, and how the probe's
 penalty is chosen (on the train part, leaving out groups).
-
-Two questions: leak-free splits keep whole the group of the audit, and once more the coarsest known
-group (:func:`palpate.leakage.groups.nested_groups`), unless the given split does so. If objects are
-known, the second row says what is left for new objects.
 
 What can be compared: a material needs two groups, one for each part, and must occur in both parts
 of the given and of every leak-free split.
@@ -37,20 +33,18 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
-import polars as pl
 from numpy.typing import NDArray
 
 from palpate.core import FeatureSet, Note, PalpateError, Progress, Split, quiet, require, rng_for
 from palpate.data.manifest import Manifest
 from palpate.evaluation.impact_features import (
-    SIZE,
     Rows,
     Source,
     fit_reduction,
     given_sources,
     pixel_sources,
 )
-from palpate.leakage.groups import GROUPS, nested_groups
+from palpate.leakage.groups import GROUPS
 from palpate.leakage.splitting import split as leak_free_split
 from palpate.metrics.means import Mean, mean_of, spread_of
 from palpate.metrics.probe import fit_probe
@@ -73,7 +67,6 @@ Codes = NDArray[np.int64]
 class _Parts:
     """One split of the compared samples: numbers of its train and test samples."""
 
-    digest: str
     train: Rows
     test: Rows
 
@@ -84,20 +77,20 @@ class _Design:
 
     Attributes:
         ids: the samples.
-        at: their rows in the features.
         material, group: codes into ``materials`` and ``groups``, one per sample.
         splits: the given split, then the leak-free ones.
+        clean: digests of the latter.
         notes: what was excluded, and what qualifies the result.
         settings: sizes and baselines.
     """
 
     ids: list[str]
-    at: Rows
     material: Codes
     group: Codes
     materials: list[str]
     groups: list[str]
     splits: list[_Parts]
+    clean: list[str]
     notes: list[Note]
     settings: dict[str, Any]
 
@@ -119,8 +112,7 @@ def impact(
     Args:
         manifest: the samples, with materials.
         split: the split in question; its train and test parts are compared.
-        group: column that the leak-free splits keep whole and that intervals are made over. If a
-            coarser one is known, there are rows of it, too.
+        group: column that the leak-free splits keep whole and that intervals are made over.
         features: ``pixels`` (tactile, tactile minus background, vision: those that the manifest
             has), or name -> features of the samples.
         seeds: one leak-free split each; the clean accuracy is that of their test samples together.
@@ -131,7 +123,7 @@ def impact(
         progress: called with what is done.
 
     Returns:
-        A row for each kind of features, classifier and group. The headline is about the first one:
+        A row for each kind of features and classifier. The headline is about the first one:
         1-NN on tactile pixels (vision without tactile), or on the first of ``features``; the rule
         is fixed so that nobody picks the largest number.
 
@@ -142,88 +134,39 @@ def impact(
     """
     require(len(features) > 0, "features", "must hold features to classify by", features)
     design = _design(manifest, split, group, seeds)
-    coarser, more = _coarser(manifest, split, design, seeds)
-    notes = [*design.notes, *more]
     if isinstance(features, str):
-        samples = manifest.take(design.ids)
-        sources, more = pixel_sources(samples, cache=cache, progress=progress)
-        notes += more
+        sources = pixel_sources(manifest.take(design.ids), cache=cache, progress=progress)
     else:
         sources = given_sources(features, design.ids)
-    rows, facts = _measure(design, sources, seen, progress)
+    rows = _measure(design, sources, seen, progress)
     settings = {
         **design.settings,
-        "size": SIZE if isinstance(features, str) else None,
         "components": COMPONENTS,
-        "features": facts,
-        "interval": "leave-one-group-out jackknife over test groups, paired, t, 95 %",
+        "features": {source.name: source.digest for source in sources},
     }
-    headline = _headline(
-        rows[0], name or str(split.rule.get("name") or "the given split"), settings
-    )
-    if coarser is not None:
-        further, facts = _measure(coarser, sources, seen, progress)
-        column, rows = coarser.settings["group"], rows + further
-        settings[f"by {column}"] = coarser.settings | {"features": facts}
-        headline += f" Of new {column}s (splits by {column}): {100 * further[0].clean:.1f} %."
-    digests = [parts.digest for parts in design.splits[1:]]
-    return Impact(rows, headline, design.settings["group"], digests, settings, notes)
+    title = name or str(split.rule.get("name") or "the given split")
+    headline = _headline(rows[0], title, settings)
+    return Impact(rows, headline, group, design.clean, settings, design.notes)
 
 
 def _measure(
     design: _Design, sources: Sequence[Source], seen: Collection[str], progress: Progress
-) -> tuple[list[ImpactRow], dict[str, Any]]:
-    """Rows for each kind of features and classifier, and facts on the features."""
+) -> list[ImpactRow]:
+    """Rows for each kind of features and classifier."""
     rows: list[ImpactRow] = []
-    facts: dict[str, Any] = {}
     column, total = design.settings["group"], len(sources) * len(design.splits)
     for number, source in enumerate(sources):
         means: dict[str, list[Mean]] = {c: [] for c in CLASSIFIERS}
-        fits: list[tuple[float, float]] = []
         for k, parts in enumerate(design.splits):
             done = number * len(design.splits) + k
             progress(f"classifying materials by {column}", done, total, source.name)
-            by_classifier, penalty, explained = _classify(source, parts, design)
-            fits.append((penalty, round(explained, 4)))
-            for c in CLASSIFIERS:
-                means[c].append(by_classifier[c])
-        facts[source.name] = {
-            "digest": source.digest,
-            "columns": source.width,
-            "standardized": source.standardize,
-            "penalty": [penalty for penalty, _ in fits],
-            "explained": [explained for _, explained in fits],
-            **{c: [round(float(m.score), 5) for m in means[c]] for c in CLASSIFIERS},
-        }
+            for c, mean in _classify(source, parts, design).items():
+                means[c].append(mean)
         chance = 1 / len(design.materials)
         of_source = [_row(source.name, c, means[c], chance, column) for c in CLASSIFIERS]
         rows += [replace(row, seen=source.name in seen) for row in of_source]
     progress(f"classifying materials by {column}", total, total)
-    return rows, facts
-
-
-def _coarser(
-    manifest: Manifest, split: Split, design: _Design, seeds: Sequence[int]
-) -> tuple[_Design | None, list[Note]]:
-    """The same by the coarsest group, if there is one and the given split shares it; and notes."""
-    pool = manifest.take(design.ids)
-    column, *finer = [*nested_groups(pool), ""]
-    parts = {i: split.parts[i] for i in design.ids}
-    given = pool.table.with_columns(part=pl.Series([*parts.values()]))
-    if design.settings["group"] not in finer or not _shares(given, column):
-        return None, []
-    try:
-        other = _design(pool, replace(split, parts=parts), column, seeds)
-    except PalpateError as error:
-        return None, [Note("impact-not-by", {"group": column, "reason": str(error)})]
-    place = {i: k for k, i in enumerate(design.ids)}
-    notes = [note for note in other.notes if note not in design.notes]
-    return replace(other, at=np.array([place[i] for i in other.ids])), notes
-
-
-def _shares(table: pl.DataFrame, column: str) -> bool:
-    """Whether a group of a column is in two parts."""
-    return table.select(column, "part").n_unique() > table[column].n_unique()
+    return rows
 
 
 def _design(manifest: Manifest, split: Split, group: str, seeds: Sequence[int]) -> _Design:
@@ -243,12 +186,7 @@ def _design(manifest: Manifest, split: Split, group: str, seeds: Sequence[int]) 
     notes: list[Note] = []
     if len(rows) < len(inside):
         notes.append(Note("no-material", {"count": len(inside) - len(rows)}))
-    if "val" in split.parts.values():
-        notes.append(Note("val-excluded"))
     owners = _owners(pool, group)
-    videos = pool.table["video"].drop_nulls().n_unique()
-    if group == "contact" and videos not in (0, pool.table["contact"].n_unique()):
-        notes.append(Note("shared-videos"))
     here, given = [labels[k] for k in rows], [str(part_of[k]) for k in rows]
     excluded = _incomparable(here, owners, [given], group)
     rows, here, owners, given = _without(excluded, here, rows, here, owners, given)
@@ -259,10 +197,8 @@ def _design(manifest: Manifest, split: Split, group: str, seeds: Sequence[int]) 
     late = _incomparable(here, owners, parts, group)
     rows, here, owners, *parts = _without(late, here, rows, here, owners, *parts)
     excluded |= late
-    digests = [split.digest, *(p.digest for p in plans)]
     splits = [
-        _Parts(d, *(np.flatnonzero(np.array(p) == part) for part in ("train", "test")))
-        for d, p in zip(digests, parts, strict=True)
+        _Parts(*(np.flatnonzero(np.array(p) == part) for part in ("train", "test"))) for p in parts
     ]
     materials, material = code(here)
     groups, owner = code(owners)
@@ -270,15 +206,21 @@ def _design(manifest: Manifest, split: Split, group: str, seeds: Sequence[int]) 
         "given_split": split.digest,
         "group": group,
         "seeds": list(seeds),
-        "train_share": round(share, 5),
         "materials": materials,
         "left_out": excluded,
-        **_sizes(splits, owner, material),
+        "train_samples": min(len(s.train) for s in splits),
+        "test_samples": [len(s.test) for s in splits],
+        "test_groups": [len(np.unique(owner[s.test])) for s in splits],
+        "shared_groups": len(np.intersect1d(owner[splits[0].train], owner[splits[0].test])),
     }
-    settings["deviation"] = [round(p.rule["deviation"], 5) for p in plans]
-    notes += _qualifications(settings, excluded, len(plans) - len(set(digests[1:])))
-    ids, at = [ids[k] for k in rows], np.arange(len(rows))
-    return _Design(ids, at, material, owner, materials, groups, splits, notes, settings)
+    if excluded:
+        total = len(excluded) + len(materials)
+        notes.append(Note("materials-excluded", {"materials": excluded, "total": total}))
+    if (fewest := min(settings["test_groups"])) < 5:
+        notes.append(Note("few-test-groups", {"count": fewest, "group": group}))
+    clean = [p.digest for p in plans]
+    ids = [ids[k] for k in rows]
+    return _Design(ids, material, owner, materials, groups, splits, clean, notes, settings)
 
 
 def _owners(pool: Manifest, column: str) -> list[str]:
@@ -328,63 +270,23 @@ def _without(
     return [[column[k] for k in keep] for column in columns]
 
 
-def _sizes(splits: Sequence[_Parts], owner: Codes, material: Codes) -> dict[str, Any]:
-    """Sizes and baselines of all splits: lists are in the order given, then clean by seed."""
-    size = min(len(s.train) for s in splits)
-    common = [int(np.bincount(material[s.train]).argmax()) for s in splits]
-    guess = [float((material[s.test] == c).mean()) for s, c in zip(splits, common, strict=True)]
-    return {
-        "train_samples": size,
-        "probe_train_samples": min(size, PROBE_ROWS),
-        "test_samples": [len(s.test) for s in splits],
-        "test_groups": [len(np.unique(owner[s.test])) for s in splits],
-        "shared_groups": len(np.intersect1d(owner[splits[0].train], owner[splits[0].test])),
-        "majority": [round(g, 5) for g in guess],
-    }
-
-
-def _qualifications(
-    settings: Mapping[str, Any], excluded: Mapping[str, str], repeated: int
-) -> list[Note]:
-    """Notes on materials, splits and groups that qualify the result."""
-    notes: list[Note] = []
-    column, materials = settings["group"], settings["materials"]
-    if excluded:
-        total = len(excluded) + len(materials)
-        notes.append(Note("materials-excluded", {"materials": dict(excluded), "total": total}))
-    if repeated > 0:
-        params = {"repeated": repeated, "n": len(settings["seeds"]), "group": column}
-        notes.append(Note("repeated-splits", params))
-    if settings["shared_groups"] == 0:
-        notes.append(Note("no-shared-group", {"group": column}))
-    if (share := settings["majority"][0]) > 1.5 / len(materials):
-        notes.append(Note("uneven-materials", {"share": share}))
-    if (few := min(settings["test_groups"])) < 5:
-        notes.append(Note("few-test-groups", {"count": few, "group": column}))
-    return notes
-
-
-def _classify(
-    source: Source, parts: _Parts, design: _Design
-) -> tuple[dict[str, Mean], float, float]:
-    """Classify under one split: two accuracies, the probe's penalty, the share of variance kept."""
+def _classify(source: Source, parts: _Parts, design: _Design) -> dict[str, Mean]:
+    """Accuracy of each classifier under one split."""
     size, seed = int(design.settings["train_samples"]), int(design.settings["seeds"][0])
-    at, group, material = design.at, design.group, design.material
-    train = thin(parts.train, group[parts.train], material[parts.train], size, seed)
-    reduction = fit_reduction(source, at[train], COMPONENTS, seed)
-    x, z = reduction.apply(source, at[train]), reduction.apply(source, at[parts.test])
+    group, material = design.group, design.material
+    train = thin(parts.train, size, seed)
+    reduction = fit_reduction(source, train, COMPONENTS, seed)
+    x, z = reduction.apply(source, train), reduction.apply(source, parts.test)
     y, truth, owner = material[train], material[parts.test], group[parts.test]
-    few = thin(np.arange(len(train)), group[train], y, min(size, PROBE_ROWS), seed)
-    rows = train[few]
-    ids = [design.ids[k] for k in rows]
-    labels = [design.materials[k] for k in y[few]]
-    known = FeatureSet(ids, x[few], labels, [design.groups[k] for k in group[rows]])
+    few = train[:PROBE_ROWS]  # in a random order
+    labels = [design.materials[k] for k in material[few]]
+    groups = [design.groups[k] for k in group[few]]
+    known = FeatureSet([design.ids[k] for k in few], x[: len(few)], labels, groups)
     probe = fit_probe(known, seed=seed)
     right = np.array(probe.predict(z)) == np.array(design.materials)[truth]
     hits = {"1-NN": nearest_hits(z, x, truth, y), "linear probe": right}
     groups = [design.groups[k] for k in owner]
-    means = {c: mean_of(c, hits[c], groups, subject=source.name) for c in CLASSIFIERS}
-    return means, probe.l2, reduction.explained
+    return {c: mean_of(c, hits[c], groups, subject=source.name) for c in CLASSIFIERS}
 
 
 def _row(
@@ -450,32 +352,9 @@ def nearest_hits(
     return out
 
 
-def thin(rows: Codes, groups: Codes, classes: Codes, count: int, seed: int) -> Codes:
-    """Choose rows evenly: every class keeps its share (at least one row), and so every group.
-
-    Each class gets ``count * n_c / n`` rows, rounded so that the sum is ``count``; within a class
-    the rows, sorted by group and at random within it, are taken at equal steps from a random start,
-    so a group keeps its share to within one row. Groups and classes are numbers, one a row, and
-    ``count`` is at least that of classes. The rows come in a random order.
-    """
-    rng = rng_for(seed, "impact thin", count)
-    order = rng.permutation(len(rows))
-    if len(rows) <= count:
-        return rows[order]
-    sizes = np.bincount(classes)
-    exact = count * sizes / len(rows)
-    quota = np.where(sizes > 0, np.maximum(np.floor(exact), 1), 0).astype(np.int64)
-    while (off := count - int(quota.sum())) != 0:
-        room = (quota < sizes) if off > 0 else (quota > 1)
-        gap = np.where(room, (exact - quota) * np.sign(off), -np.inf)
-        quota[int(gap.argmax())] += np.sign(off)
-    chosen: list[Codes] = []
-    for c in np.flatnonzero(quota):
-        of_class = order[classes[order] == c]
-        line = of_class[np.argsort(groups[of_class], kind="stable")]
-        at = (np.arange(quota[c]) + rng.random()) * len(line) / quota[c]
-        chosen.append(line[at.astype(np.int64)])
-    return rows[rng.permutation(np.concatenate(chosen))]
+def thin(rows: Codes, count: int, seed: int) -> Codes:
+    """At most ``count`` of the rows, at random."""
+    return rng_for(seed, "impact thin", count).permutation(rows)[:count]
 
 
 def code(names: Sequence[str]) -> tuple[list[str], Codes]:

@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from palpate.core import FeatureSet, Note, PalpateError, Progress, quiet, rng_for
+from palpate.core import FeatureSet, PalpateError, Progress, quiet, rng_for
 from palpate.data.images import cached_images
 from palpate.data.manifest import Manifest
 
@@ -61,12 +61,11 @@ class Source:
 
 @dataclass(frozen=True)
 class Reduction:
-    """``((x - mean) / spread) @ axes``; ``explained`` is the share of variance kept."""
+    """``((x - mean) / spread) @ axes``."""
 
     mean: NDArray[np.float32]
     spread: NDArray[np.float32]
     axes: NDArray[np.float32]
-    explained: float
 
     def apply(self, source: Source, rows: Rows) -> NDArray[np.float32]:
         """The reduced features of some rows, (rows, components)."""
@@ -77,8 +76,8 @@ class Reduction:
 
 def pixel_sources(
     manifest: Manifest, *, cache: Path | None = None, progress: Progress = quiet
-) -> tuple[list[Source], list[Note]]:
-    """The kinds of pixels that a manifest has, and a note for each that it lacks.
+) -> list[Source]:
+    """The kinds of pixels that a manifest has.
 
     Raises:
         PalpateError: if there are neither vision nor tactile images, or only some samples have one.
@@ -93,17 +92,13 @@ def pixel_sources(
         must = "Pixels as features need vision or tactile images"
         raise PalpateError(must, "names alone", fix)
     sources: list[Source] = []
-    notes = [Note("no-images", {"column": n}) for n in ("tactile", "vision") if n not in present]
     for name in present:
         images = cached_images(manifest, name, SIZE, cache, progress)
         sources.append(_pixels(f"{name} pixels", images))
         if name == "tactile" and not nulls["background"]:
             background = cached_images(manifest, "background", SIZE, cache, progress)
             sources.append(_pixels("tactile minus background", images, background))
-    if "tactile" in present and nulls["background"]:
-        counts = {"count": nulls["background"], "n": len(manifest)}
-        notes.insert(0, Note("no-background", counts))
-    return sources, notes
+    return sources
 
 
 def given_sources(features: Mapping[str, FeatureSet], ids: Sequence[str]) -> list[Source]:
@@ -157,7 +152,7 @@ def fit_reduction(source: Source, train: Rows, components: int, seed: int) -> Re
     spread = np.where(flat, 1, spread).astype(np.float32)
     x /= spread
     if source.width <= components:
-        return Reduction(mean, spread, np.eye(source.width, dtype=np.float32)[:, ~flat], 1.0)
+        return Reduction(mean, spread, np.eye(source.width, dtype=np.float32)[:, ~flat])
     width = min(components + EXTRA, *x.shape)
     start = rng_for(seed, "impact pca", source.name).standard_normal((source.width, width))
     basis = start.astype(np.float32)
@@ -166,6 +161,4 @@ def fit_reduction(source: Source, train: Rows, components: int, seed: int) -> Re
     values, turn = np.linalg.eigh(((y := x @ basis).T @ y).astype(np.float64))
     values, turn = values[::-1][:components], turn[:, ::-1][:, :components]
     kept = values > 1e-7 * max(values[0], 1e-30)
-    total = float(np.einsum("ij,ij->", x, x, dtype=np.float64))
-    explained = float(values[kept].sum()) / total if total else 1.0
-    return Reduction(mean, spread, basis @ turn[:, kept].astype(np.float32), explained)
+    return Reduction(mean, spread, basis @ turn[:, kept].astype(np.float32))

@@ -2,12 +2,12 @@
 
 A source is a folder of images, a manifest, a folder of ``palpate generate``, a file of embeddings
 (:mod:`palpate.evaluation.embedding_files`), an array or tensor of images or features, a list of
-images or image files, a polars or pandas frame, or a :class:`palpate.core.FeatureSet`. The id of an
+images or image files, or a :class:`palpate.core.FeatureSet`. The id of an
 image in a folder is its path below the folder, with ``/`` and without the suffix. Rows without ids
 are numbered.
 
-What a source lacks is completed from the keywords ``labels`` and ``groups`` (which also replace
-what a source has), then, for a generator, from the reference, by id. What is known of a part of the
+What a source lacks is completed from the keyword ``labels`` (which also replaces what a source
+has), then, for a generator, from the reference, by id. What is known of a part of the
 ids only is an error: scores of some of the samples would pass for scores of all.
 """
 
@@ -46,12 +46,9 @@ from palpate.evaluation.embedding_files import (
     LABELS,
     SUFFIXES,
     Embeddings,
-    as_polars,
     checked,
-    embeddings_of_table,
     first_of,
     read_embeddings,
-    read_parquet,
     require_ids,
     text_column,
 )
@@ -70,8 +67,6 @@ KINDS = (
 )
 #: Decoded images of more bytes than this are kept in a file of the cache.
 IN_MEMORY = 1 << 30
-#: Embeddings of more rows without labels and groups are streamed, for TMMD alone.
-STREAMED = 50_000
 
 
 @dataclass(frozen=True)
@@ -90,7 +85,6 @@ class Samples:
         encoder: digest of the encoder that made the features.
         path: file of the features.
         background: one no-contact image for all of a reference.
-        widened: half-precision type that the features were converted from, if any.
         generator: settings of ``palpate generate``, for its folders.
     """
 
@@ -106,17 +100,10 @@ class Samples:
     encoder: str | None = None
     path: Path | None = None
     background: Samples | None = None
-    widened: str = ""
     generator: Mapping[str, Any] | None = None
 
     def __len__(self) -> int:
         return len(self.ids)
-
-    @property
-    def streamed(self) -> bool:
-        """Whether there are too many rows to hold, and nothing but TMMD to compute from them."""
-        bare = self.labels is None and self.groups is None
-        return self.features is not None and bare and len(self) > STREAMED
 
     @property
     def has_background(self) -> bool:
@@ -247,8 +234,6 @@ def read(source: Source, name: str, group: str = "video") -> Samples:
         samples = _of_embeddings(known, name)
     elif hasattr(source, "table") and hasattr(source, "root"):
         samples = _of_manifest(source, name, group)
-    elif hasattr(source, "columns"):
-        samples = _read_frame(source, name, group)
     else:
         samples = _read_array(source, name)
     if not len(samples):
@@ -346,18 +331,7 @@ def _of_embeddings(embeddings: Embeddings, source: str, path: Path | None = None
         features=embeddings.features,
         encoder=embeddings.encoder,
         path=path,
-        widened=embeddings.widened,
     )
-
-
-def _read_frame(frame: Any, name: str, group: str) -> Samples:
-    table = as_polars(frame)
-    if "tactile" not in table.columns:
-        return _of_embeddings(checked(embeddings_of_table(table, name), name), name)
-    from palpate.data.manifest import SCHEMA, Manifest
-
-    rows = table.select(c for c in table.columns if c in SCHEMA).to_dicts()
-    return _of_manifest(Manifest.from_rows(rows, Path.cwd()), name, group)
 
 
 def _read_array(source: Any, name: str) -> Samples:
@@ -429,7 +403,6 @@ def read_inputs(
     *,
     names: Sequence[str] | None,
     labels: Source,
-    groups: Source,
     group: str,
     background: Source,
     split: Split | None,
@@ -452,7 +425,7 @@ def read_inputs(
             must, got = "must go with images", "embeddings"
             raise PalpateError(must, got, "Drop it", argument="background")
         real = replace(real, background=read([background], "background"))
-    known = keywords_of(labels, groups, column, exact=group != "auto")
+    known = keywords_of(labels, column, exact=group != "auto")
     given = {i for keyword in known for i in keyword.values}
     real = complete(real, known)
     made = {
@@ -463,8 +436,7 @@ def read_inputs(
     if real.numbered:  # row k of a generator is not row k of the reference
         real = replace(real, ids=[f"{REFERENCE} {i}" for i in real.ids])
     made = {name: from_reference(samples, real) for name, samples in made.items()}
-    widened = [s for s in (real, *made.values()) if s.widened]
-    notes = [Note("widened", {"source": s.source, "type": s.widened}) for s in widened]
+    notes: list[Note] = []
     train = None
     if split is not None:
         whole, real, train = real, *_parts(real, split)
@@ -553,18 +525,12 @@ class _Keyword:
     source: str
 
 
-def keywords_of(labels: Source, groups: Source, group: str, *, exact: bool) -> list[_Keyword]:
-    """The columns of the keywords ``labels`` (which may hold groups as well) and ``groups``."""
-    group_names = (group,) if exact else (group, *GROUPS)
-    wanted = {"labels": LABELS} | ({} if groups is not None else {"groups": group_names})
-    keywords = [] if labels is None else _read_keyword(labels, "labels", wanted)
-    if groups is not None:
-        keywords += _read_keyword(groups, "groups", {"groups": group_names})
-    return keywords
-
-
-def _read_keyword(source: Source, name: str, wanted: Mapping[str, Sequence[str]]) -> list[_Keyword]:
-    table, where = _table(source, wanted[name][0], name)
+def keywords_of(source: Source, group: str, *, exact: bool) -> list[_Keyword]:
+    """The columns of the keyword ``labels``, which may hold groups as well."""
+    if source is None:
+        return []
+    wanted = {"labels": LABELS, "groups": (group,) if exact else (group, *GROUPS)}
+    table, where = _table(source)
     columns = {kind: first_of(table.columns, options) for kind, options in wanted.items()}
     if "id" not in table.columns or not any(columns.values()):
         must = f"{where} must have a column id, and {' or '.join(c[0] for c in wanted.values())}"
@@ -579,24 +545,28 @@ def _read_keyword(source: Source, name: str, wanted: Mapping[str, Sequence[str]]
     ]
 
 
-def _table(source: Source, column: str, argument: str) -> tuple[pl.DataFrame, str]:
-    """A CSV or Parquet file, a frame, id -> value, or one value per row, with a column ``id``."""
+def _table(source: Source) -> tuple[pl.DataFrame, str]:
+    """A CSV or Parquet file, a frame, id -> material, or one material per row, as a table."""
     import polars as pl
+
+    from palpate.data.manifest import reading_parquet
 
     if isinstance(source, str | Path):
         path = Path(source)
         try:
             if path.suffix.lower() == ".parquet":
-                return read_parquet(path)[1], str(path)
+                with reading_parquet():
+                    return pl.read_parquet(path, glob=False), str(path)
             return pl.read_csv(path, infer_schema=False, glob=False), str(path)  # 007 stays a name
         except Exception as error:  # polars raises many kinds
             got = str(error).splitlines()[0] if path.exists() else "no such file"
             fix = "Write one with the columns id, material, video"
             raise PalpateError(f"{path} must be a CSV or Parquet file", got, fix) from None
-    if hasattr(source, "columns"):
-        return as_polars(source), f"`{argument}`"
+    if isinstance(source, pl.DataFrame):
+        return source, "`labels`"
     values = source if isinstance(source, Mapping) else {str(k): v for k, v in enumerate(source)}
-    return pl.DataFrame({"id": list(values), column: list(values.values())}), f"`{argument}`"
+    columns = {"id": list(values), LABELS[0]: list(values.values())}
+    return pl.DataFrame(columns), "`labels`"
 
 
 def with_known_ids(samples: Samples, known: Sequence[str]) -> Samples:
@@ -782,42 +752,4 @@ def guard(
     if split is not None and unknown and card.get("split") != split.digest:
         known = card.get("split") is not None
         notes.append(Note("encoder-of-other-split" if known else "encoder-without-split"))
-    return notes
-
-
-def guard_choice(
-    digest: str, generators: Mapping[str, Samples], *, allow_seen: bool = False
-) -> dict[str, list[Note]]:
-    """Raise if an encoder judges images that it chose, or whose generator was aligned with it.
-
-    Args:
-        digest: of the tactile encoder.
-        generators: what it judges, by name.
-        allow_seen: note it instead.
-
-    Returns:
-        By name, what readers must know of such images, and of all that were chosen.
-
-    Raises:
-        PalpateError: if the encoder chose some of the images, or guided their generator's training.
-    """
-    notes: dict[str, list[Note]] = {name: [] for name in generators}
-    for name, samples in generators.items():
-        settings = samples.generator or {}
-        if digest in settings.get("guides", ()):
-            if not allow_seen:
-                must = "The tactile encoder must judge images of generators not aligned with it"
-                got = f"{name!r}, whose training followed this encoder"
-                fix = "Score with another encoder, or allow it: every score then says so"
-                raise PalpateError(must, got, fix, example={"allow_seen": True})
-            notes[name].append(Note("aligned"))
-        if not settings.get("chosen_by"):
-            continue
-        same = settings["chosen_by"] == digest
-        if same and not allow_seen:
-            must = "The tactile encoder must judge images that it has not chosen"
-            got = f"{name!r}, the best of {settings.get('best_of')} by this encoder"
-            fix = "Score with another encoder, or allow it: every score then says so"
-            raise PalpateError(must, got, fix, example={"allow_seen": True})
-        notes[name].append(Note("chosen", {"n": settings.get("best_of"), "same": same}))
     return notes

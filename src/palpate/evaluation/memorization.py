@@ -26,7 +26,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from palpate.core import FeatureSet, PalpateError, Score, require
+from palpate.core import FeatureSet, PalpateError, Score
 from palpate.metrics.inputs import Array, require_one_encoder
 from palpate.metrics.intervals import Spread, jackknife_errors
 
@@ -79,7 +79,6 @@ def memorization(
     train: FeatureSet,
     *,
     space: str = FEATURES,
-    quantile: float = QUANTILE,
     subject: str = "generated",
     split: str | None = None,
     settings: dict[str, Any] | None = None,
@@ -91,7 +90,6 @@ def memorization(
         real: rows of real test images, with groups.
         train: rows of the train images of the generator.
         space: what the rows are, kept in the name of the scores.
-        quantile: p of the memorized share, in (0, 1).
         subject: what is scored, kept in the scores.
         split: digest of the split, kept in the scores.
         settings: more to keep in the scores.
@@ -101,10 +99,8 @@ def memorization(
         images that are nearest to train, with the train image.
 
     Raises:
-        PalpateError: if one of the three is empty, widths or encoders differ, or the quantile is
-            out of range.
+        PalpateError: if one of the three is empty, or widths or encoders differ.
     """
-    require(0 < quantile < 1, "quantile", "must lie between 0 and 1", quantile, QUANTILE)
     for name, features in (("generated", generated), ("real test", real), ("train", train)):
         if not len(features.ids):
             must, fix = f"There must be {name} images", "Check the folder or the split"
@@ -118,7 +114,7 @@ def memorization(
     made, at = nearest(generated.features, train.features)
     test, _ = nearest(real.features, train.features)
     groups = _units(generated), _units(real)
-    threshold = float(np.quantile(test, quantile))
+    threshold = float(np.quantile(test, QUANTILE))
     first = [int(k) for k in np.argsort(made, kind="stable")[:10]]
     details: dict[str, Any] = {
         "quantile distance": threshold,
@@ -139,10 +135,10 @@ def memorization(
         "details": details,
     }
     settings = {"space": space, "train": len(train.ids), **(settings or {})}
-    share = _spread(lambda d, r: (d < np.quantile(r, quantile)).mean(), made, test, groups)
+    share = _spread(lambda d, r: (d < np.quantile(r, QUANTILE)).mean(), made, test, groups)
     area = _spread(_nearness, made, test, groups)
     return [
-        _score(f"{SHARE} ({space})", share, quantile, common, settings | {"quantile": quantile}),
+        _score(f"{SHARE} ({space})", share, QUANTILE, common, settings | {"quantile": QUANTILE}),
         _score(f"{NEARNESS} ({space})", area, 0.5, common, settings),
     ]
 

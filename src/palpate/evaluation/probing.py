@@ -1,4 +1,4 @@
-"""What an encoder's embeddings know: classes by a linear probe and k-NN, and retrieval.
+"""What an encoder's embeddings know: classes by a linear probe, and retrieval.
 
 A classifier is trained on the train part of a split and scored on its test part; retrieval is
 within the test part. Several encoders, or several splits, become columns next to each other with
@@ -59,7 +59,6 @@ class Plan:
     modality: Modality = "tactile"
     label: str | Sequence[str] = "material"
     group: str = "auto"
-    neighbors: int = 20
     top: Sequence[int] = (1, 5, 10)
     pool: int | None = None
     text_threshold: float = TVL_THRESHOLD
@@ -72,10 +71,9 @@ class Plan:
 
 @dataclass
 class Probed:
-    """What one encoder scores under one split: means, median ranks, retrieved keys, notes."""
+    """What one encoder scores under one split: means, retrieved keys, notes."""
 
     means: list[Mean] = field(default_factory=list[Mean])
-    medians: list[Score] = field(default_factory=list[Score])
     strips: list[Strip] = field(default_factory=list[Strip])
     notes: list[Note] = field(default_factory=list[Note])
 
@@ -88,7 +86,6 @@ def probe(  # noqa: PLR0913 - one argument a choice
     modality: Modality = "tactile",
     label: str | Sequence[str] = "material",
     group: str = "auto",
-    neighbors: int = 20,
     top: Sequence[int] = (1, 5, 10),
     pool: int | None = None,
     text_threshold: float = TVL_THRESHOLD,
@@ -110,7 +107,6 @@ def probe(  # noqa: PLR0913 - one argument a choice
             left out, with a note.
         group: column whose values stay together in cross-validation and intervals; ``auto`` takes
             what the split kept whole, else the video.
-        neighbors: k of k-NN.
         top: ranks within which retrieval must find a right key; none skips retrieval.
         pool: rank among so many test samples drawn at random. Default: all, and under several
             splits as many as the smallest test part has.
@@ -123,8 +119,8 @@ def probe(  # noqa: PLR0913 - one argument a choice
         progress: called with what is done.
 
     Returns:
-        Accuracy and balanced accuracy by a linear probe and k-NN, next to chance and the commonest
-        class; retrieval in both directions within the test part; and paired differences.
+        Accuracy and balanced accuracy by a linear probe, next to chance and the commonest class;
+        retrieval in both directions within the test part; and paired differences.
 
     Raises:
         PalpateError: if nothing can be measured, images are missing or unreadable, or the encoder
@@ -148,7 +144,7 @@ def probe(  # noqa: PLR0913 - one argument a choice
     plan = plan_of(
         manifest,
         loaded,
-        Plan(modality, label, group, neighbors, top, pool, text_threshold, seed, allow_seen, axis),
+        Plan(modality, label, group, top, pool, text_threshold, seed, allow_seen, axis),
     )
     runs: dict[str, list[Probed]] = {}
     for s, e in ((s, e) for s in loaded for e in sets):
@@ -171,7 +167,6 @@ def plan_of(manifest: Manifest, splits: Mapping[str, Split], plan: Plan) -> Plan
     labels = [plan.label] if isinstance(plan.label, str) else list(plan.label)
     for name in labels:
         manifest.column(name)  # raises for a column that is not there
-    require(plan.neighbors >= 1, "neighbors", "must be at least 1", plan.neighbors)
     require(min(plan.top, default=1) >= 1, "top", "must be ranks from 1", [*plan.top])
     groups = {str(split.rule.get("group", "video")) for split in splits.values()}
     group = plan.group if plan.group != "auto" else groups.pop() if len(groups) == 1 else "video"
@@ -239,7 +234,6 @@ def measure(
         raise PalpateError(must, "neither", fix, example={"label": "material"})
     noted = lambda score: replace(score, notes=[*score.notes, *notes])
     result.means = [replace(mean, score=noted(mean.score)) for mean in result.means]
-    result.medians = [noted(score) for score in result.medians]
     return result
 
 
@@ -265,9 +259,7 @@ def _classify(
     if without := values[1].count(""):
         result.notes.append(Note("probe-unlabeled", {"label": label, "count": without}))
     train, test = (replace(f, labels=v) for f, v in zip(features, values, strict=True))
-    means = class_accuracies(
-        train, test, label=label, neighbors=plan.neighbors, seed=plan.seed, **common
-    )
+    means = class_accuracies(train, test, label=label, seed=plan.seed, **common)
     if unseen := means[0].score.details["unseen_classes"]:
         note = {"subject": common["subject"], "label": label, "classes": unseen}
         result.notes.append(Note("probe-unseen-classes", note))
@@ -293,8 +285,7 @@ def _retrieve(
         options |= {"texts": keys.features, "threshold": plan.text_threshold}
         ways += retrieval(queries, keys, names=names, **options)
     for way in ways:
-        result.means += way.top
-        result.medians.append(way.median)
+        result.means += way
     subject = str(common["subject"]) if plan.axis else ""
     for x, y, names in (
         (queries, keys, (plan.modality, other)),
@@ -351,13 +342,12 @@ def results_of(
                 by_metric.setdefault(mean.score.metric, {}).setdefault(subject, []).append(mean)
         for means in (sets.get(subject) for sets in by_metric.values()):
             scores += [means[0].score if single else over_seeds(means)] if means else []
-        scores += [median for run in of if single for median in run.medians]
     differences = [d for sets in by_metric.values() for d in differences_of_means(sets)]
     all_runs = [run for of in runs.values() for run in of]
     notes = list({canonical_json(note): note for run in all_runs for note in run.notes}.values())
     if any("similar text" in metric for metric in by_metric):
         notes.append(Note("probe-text-threshold", {"threshold": plan.text_threshold}))
-    names = ("modality", "label", "group", "neighbors", "top", "pool", "text_threshold", "seed")
+    names = ("modality", "label", "group", "top", "pool", "text_threshold", "seed")
     digests = {"manifest": manifest.digest}
     digests |= {
         f"split {name}" if len(splits) > 1 else "split": s.digest for name, s in splits.items()

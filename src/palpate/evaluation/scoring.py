@@ -9,7 +9,6 @@ notes, results. Metrics of one name with another bandwidth get names of their ow
 
 from __future__ import annotations
 
-import sys
 import tempfile
 from collections.abc import Mapping, Sequence
 from contextlib import nullcontext
@@ -20,7 +19,6 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
-from palpate import __version__
 from palpate.core import (
     FeatureSet,
     Note,
@@ -57,17 +55,13 @@ from palpate.evaluation.inputs import (
     Inputs,
     Samples,
     Source,
-    from_reference,
     guard,
-    guard_choice,
     load_encoders,
     read,
     read_inputs,
 )
 from palpate.evaluation.memorization import FEATURES, PIXELS, contact_rows, memorization
-from palpate.metrics import PRESETS, compare, compare_tmmd, distance, require_same_ids, tmmd
-from palpate.metrics.kernels import MOMENT_BYTES
-from palpate.metrics.mmd import BLOCKS_OF_MANY, sample_units
+from palpate.metrics import PRESETS, compare, compare_tmmd, require_same_ids, tmmd
 from palpate.report.calls import OBJECT, PATH, Call
 from palpate.report.results import GalleryItem, Results
 
@@ -76,8 +70,6 @@ if TYPE_CHECKING:
 
 #: Bandwidth of the paper; the name of a metric says any other one where several are requested.
 SIGMA = 10.0
-#: Error of streamed moments at scale 1000 from which a note reports it.
-BOUND = 1e-4
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -87,14 +79,12 @@ class Family:
     Attributes:
         presets: empty for those that fit the groups.
         sigmas: bandwidths; empty for the default.
-        estimator: in place of the presets' own.
-        options: backend, permutations, normalize; the companion ``cmmd`` takes them as well.
+        options: permutations, normalize; the companion ``cmmd`` takes them as well.
         common: seed and digest of the split, for all metrics.
     """
 
     presets: Sequence[str]
     sigmas: Sequence[float | str]
-    estimator: str | None
     options: Mapping[str, Any]
     common: Mapping[str, Any]
 
@@ -103,20 +93,15 @@ class Family:
 
         Of bandwidths that nobody requested, ``multi`` is for TMMD alone, of the first preset.
         """
-        fits: Sequence[str | None] = ("paper",)
-        if self.estimator in (None, "grouped"):
-            fits = ("grouped", "paper") if grouped else (None,)
-        presets = self.presets or fits
+        presets: Sequence[str | None] = self.presets or (
+            ("grouped", "paper") if grouped else (None,)
+        )
         columns: list[tuple[str | None, float | str]]
         columns = [(p, s) for p in presets for s in self.sigmas or (SIGMA,)]
         return columns + [(presets[0], "multi")] * (not self.sigmas and rows <= MANY)
 
     def named(self, score: Score, sigma: float | str) -> Score:
-        """A score with an unusual estimator in its preset, and bandwidth in the metric's name."""
-        preset = score.settings["preset"]
-        if self.estimator not in (None, PRESETS[preset].estimator):
-            preset = f"{preset}, {self.estimator}"
-        score = replace(score, settings={**score.settings, "preset": preset})
+        """A score with an unusual bandwidth in the metric's name."""
         if len(self.sigmas) == 1 or sigma == SIGMA:
             return score
         tag = f"(σ {sigma})" if isinstance(sigma, str) else f"(σ = {sigma:g})"
@@ -147,7 +132,6 @@ def score_family(
             **features.common,
             "preset": preset,
             "sigma": sigma,
-            **({"estimator": family.estimator} if family.estimator else {}),
         }
         least = None
         if further is not None:
@@ -169,65 +153,6 @@ def score_family(
     return outcome
 
 
-def score_streamed(
-    inputs: Inputs, family: Family, companions: Sequence[str] | None, progress: Progress
-) -> Outcome:
-    """TMMD of arrays that are too long to hold: rows are read once, and only moments are kept."""
-    if inputs.train is not None or companions:
-        must, fix = "must go with rows that fit in memory", "Pass groups, or drop it"
-        got = "so many rows without groups, which are streamed for TMMD alone"
-        argument = "companions" if companions else "split"
-        raise PalpateError(must, got, fix, argument=argument)
-    options = dict(family.options)
-    del options["permutations"]
-    auto = options["backend"] == "auto"
-    if auto:
-        options["backend"] = "moments"
-    real, digest, seed = inputs.reference, inputs.reference.digest, family.common["seed"]
-    columns = family.columns(grouped=False, rows=sys.maxsize)
-    todo = [(n, s, p, sigma) for n, s in inputs.generators.items() for p, sigma in columns]
-    outcome = Outcome(notes=[*inputs.notes, Note("streamed")])
-    for done, (name, samples, fitting, sigma) in enumerate(todo):
-        progress("streaming", done, len(todo))
-        x, y = samples.features, real.features
-        assert x is not None  # images are not streamed
-        scenes, units = not {*samples.ids}.isdisjoint(real.ids), dict[str, Any]()
-        preset = fitting or ("grouped" if scenes else "paper")
-        estimator: Any = family.estimator or PRESETS[preset].estimator
-        if scenes and estimator == "grouped":
-            numbers, _, names_of = sample_units([*samples.ids, *real.ids], seed)
-            few = max(2, min(BLOCKS_OF_MANY, MOMENT_BYTES // (8 * x.shape[1] ** 2)))
-            of_rows = numbers * few // len(names_of)  # blocks whose moments fit
-            units = {"groups_x": of_rows[: len(samples)], "groups_y": of_rows[len(samples) :]}
-        called = (f"The features of {name!r}", "The reference features")
-        how: dict[str, Any] = {"sigma": sigma, "estimator": estimator, **units, **options}
-        d = distance(x, y, names=called, **how)
-        notes = [Note("no-interval-streamed")]
-        if d.bound > BOUND and auto:
-            fix, example = "Choose a larger one, or wait for the exact sum", {"backend": "blocked"}
-            must, got = "must be wide for streamed rows", f"an error of {d.bound:.2g} at {sigma}"
-            raise PalpateError(must, got, fix, argument="sigma", example=example)
-        if d.bound > BOUND:
-            notes.append(Note("within-bound", {"bound": d.bound}))
-        streamed = Score(
-            "TMMD",
-            name,
-            d.value,
-            estimator=d.estimator,
-            bandwidth=d.bandwidth,
-            scale=d.scale,
-            n=d.m,
-            m=d.n,
-            reference=digest,
-            split=family.common["split"],
-            settings={**d.kernel, "preset": preset, "normalize": options["normalize"]},
-            details={"backend": d.backend, "bound": d.bound, "version": __version__},
-            notes=notes,
-        )
-        outcome.scores.append(family.named(streamed, sigma))
-    return outcome
-
-
 Preset = Literal["grouped", "paper", "paper-tables", "cmmd"]
 #: Rows of the gallery.
 GALLERY = 40
@@ -241,14 +166,11 @@ def score(  # noqa: PLR0913
     split: Split | str | Path | None = None,
     names: Sequence[str] | None = None,
     labels: Source = None,
-    groups: Source = None,
     group: str = "auto",
     background: Source = None,
     train: Source = None,
     presets: Sequence[Preset] | None = None,
     sigma: float | str | Sequence[float | str] | None = None,
-    estimator: Literal["unbiased", "biased", "grouped"] | None = None,
-    backend: Literal["auto", "blocked", "moments"] = "auto",
     normalize: Literal["check"] | bool = "check",
     companions: Sequence[Name] | None = None,
     controls: bool = True,
@@ -265,19 +187,16 @@ def score(  # noqa: PLR0913
 
     Args:
         generated: what to score: a folder of images or of ``palpate generate``, a manifest, a file
-            of embeddings, an array or tensor of images or features, a list of images, a frame; for
-            several generators a list of these, or name -> one of these.
+            of embeddings, an array or tensor of images or features, a list of images; for several
+            generators a list of these, or name -> one of these.
         reference: the real samples, of the same kind. Ids (relative file names) pair samples.
         encoder: name or folder of a set of encoders, or an ``EncoderSet``; its tactile encoder
             gives the features of images. Embeddings need none.
         split: a split or its file: its test part is scored, its train part gives the floor of TMMD
             (train videos matched by material), a material probe and the controls.
         names: of the generators, in the tables.
-        labels: materials, and possibly groups, by id: a CSV or Parquet file or a frame with the
-            columns id, material, video; id -> material; or one material per row. ``"cluster:8"``
-            takes eight clusters of the reference's photos (without photos or encoder: of its
-            features) for materials, by id; a note of CI- and D-TMMD says so.
-        groups: the same for groups.
+        labels: materials, and possibly groups, by id: a CSV or Parquet file with the columns id,
+            material, video; id -> material; or one material per row.
         group: the column whose values stay together in halves and intervals; ``auto`` takes what
             the split kept whole, else the video.
         background: one image (or its file) of the sensor without contact, for all real images: what
@@ -291,8 +210,6 @@ def score(  # noqa: PLR0913
         sigma: bandwidth or bandwidths: numbers, ``"median"``, ``"multi"``. Default: 10, which is
             comparable, and for TMMD also ``multi``, which sees more than the mean (up to 50,000
             rows).
-        estimator: instead of the presets' own.
-        backend: of kernel sums.
         normalize: for embeddings that are not of unit length: raise, divide by the norm, or keep
             them.
         companions: further scores (:mod:`palpate.evaluation.companions`); an empty list is none.
@@ -303,8 +220,7 @@ def score(  # noqa: PLR0913
         lpips: the two files of LPIPS: AlexNet's weights and the heads.
         permutations: relabelings of the permutation test of TMMD; 0 for none.
         seed: of random halves, permutations and the choice of control images.
-        allow_seen: score with an encoder that was trained on some of the reference's images, or
-            that chose generated ones (``best_of``) or guided their generator (``align``); every
+        allow_seen: score with an encoder that was trained on some of the reference's images; every
             score says so.
         cache: folder for embeddings and decoded images, which an interrupted run finds again.
         progress: called with what is done.
@@ -325,13 +241,11 @@ def score(  # noqa: PLR0913
     """
     call = Call.of("score", score, locals())
     split = None if split is None else Split.load(split)
-    labels, clusters = _clusters(labels)
     requested: Any = [companions] if isinstance(companions, str) else companions
     family = Family(
         presets=_presets(presets),
         sigmas=_sigmas(sigma),
-        estimator=estimator,
-        options={"backend": backend, "permutations": permutations, "normalize": normalize},
+        options={"permutations": permutations, "normalize": normalize},
         common={"seed": seed, "split": split.digest if split else None},
     )
     inputs = read_inputs(
@@ -339,7 +253,6 @@ def score(  # noqa: PLR0913
         reference,
         names=names,
         labels=labels,
-        groups=groups,
         group=group,
         background=background,
         split=split,
@@ -356,8 +269,7 @@ def score(  # noqa: PLR0913
             raise PalpateError(must, got, fix, argument="encoder", example=example)
     elif used := [n for n, v in {"encoder": encoder, "cache": cache, **vars(weights)}.items() if v]:
         raise PalpateError("must go with images", "embeddings", "Drop it", argument=used[0])
-    streamed = any(s.streamed for s in (inputs.reference, *inputs.generators.values()))
-    chosen, pairs = _companions(inputs, requested, weights, encoder, streamed=streamed)
+    chosen, pairs = _companions(inputs, requested, weights, encoder)
     encoders = load_encoders(encoder, progress) if images else None
     of_encoder: list[Note] = []
     if encoders is not None:
@@ -365,20 +277,12 @@ def score(  # noqa: PLR0913
         how: dict[str, Any] = {"split": split, "allow_seen": allow_seen, "progress": progress}
         of_encoder = guard(encoders, "tactile", judged, **how)
     digest = encoders.digest("tactile") if encoders is not None else ""
-    choices = guard_choice(digest, inputs.generators, allow_seen=allow_seen)
-    if streamed:
-        outcome = score_streamed(inputs, family, requested, progress)
-    else:
-        with tempfile.TemporaryDirectory() if cache is None else nullcontext(cache) as folder:
-            run = _Run(
-                inputs, family, encoders, weights, Path(folder), cache is not None, progress, seen
-            )
-            run, of = run.clustered(clusters) if clusters else (run, "")
-            outcome = run.score(chosen, pairs=pairs, controls=controls)
-            outcome = _with_clusters(outcome, clusters, of) if clusters else outcome
-    outcome.scores = with_warnings(
-        outcome.scores, inputs, split, digest, of_encoder, choices=choices
-    )
+    with tempfile.TemporaryDirectory() if cache is None else nullcontext(cache) as folder:
+        run = _Run(
+            inputs, family, encoders, weights, Path(folder), cache is not None, progress, seen
+        )
+        outcome = run.score(chosen, pairs=pairs, controls=controls)
+    outcome.scores = with_warnings(outcome.scores, inputs, split, digest, of_encoder)
     settings = _settings(inputs, family, outcome, encoders, seen)
     settings |= {"split rule": dict(split.rule)} if split is not None else {}
     settings |= {"encoder": str(encoder)} if encoders is not None else {}
@@ -387,7 +291,7 @@ def score(  # noqa: PLR0913
         scores=[*outcome.scores, *outcome.differences],
         gallery=_gallery(inputs, seed),
         settings=settings,
-        notes=[*outcome.notes, *_copies(outcome)],
+        notes=outcome.notes,
         calls=[_named(call, inputs).with_digests(_digests_read(settings))],
     )
 
@@ -403,9 +307,6 @@ def _train_samples(source: Source, inputs: Inputs, split: Split | None) -> Sampl
         must, fix = "must be of the kind of the reference", "Pass images with images"
         got = "embeddings" if real.features is None else "images"
         raise PalpateError(must, got, fix, argument="train")
-    if any(s.streamed for s in (train, real, *inputs.generators.values())):
-        must, fix = "must go with rows that fit in memory", "Pass groups, or drop it"
-        raise PalpateError(must, "rows that are streamed", fix, argument="train")
     if split is not None and not {*train.ids}.isdisjoint(split.parts):
         train = train.take([i for i in train.ids if split.parts.get(i) == "train"])
     return train
@@ -445,42 +346,8 @@ def _sigmas(sigma: float | str | Sequence[float | str] | None) -> tuple[float | 
     return tuple(dict.fromkeys(values))
 
 
-def _clusters(labels: Source) -> tuple[Source, int]:
-    """Labels, and how many clusters stand in for them: ``cluster:8`` -> (None, 8)."""
-    word, _, count = str(labels).partition(":") if isinstance(labels, str | Path) else ("", "", "")
-    if word != "cluster":
-        return labels, 0
-    if not count.isdecimal() or int(count) < 2:
-        must = "must be a file, or cluster: and a number of at least 2"
-        example = {"labels": "cluster:8"}
-        raise PalpateError(must, repr(str(labels)), "", argument="labels", example=example)
-    return None, int(count)
-
-
-def _with_clusters(outcome: Outcome, clusters: int, of: str) -> Outcome:
-    """Scores that looked at classes, and their differences, say that these are clusters."""
-    of_classes = {s.metric for s in outcome.scores if "classes" in s.details}
-    for scores in (outcome.scores, outcome.differences):
-        scores[:] = [
-            replace(
-                s,
-                settings={**s.settings, "labels": f"cluster:{clusters} of {of}"},
-                notes=[*s.notes, Note("pseudo-labels", {"clusters": clusters, "of": of})],
-            )
-            if s.metric.removesuffix(" difference") in of_classes
-            else s
-            for s in scores
-        ]
-    return outcome
-
-
 def _companions(
-    inputs: Inputs,
-    requested: Sequence[str] | None,
-    weights: Weights,
-    encoder: Any,
-    *,
-    streamed: bool,
+    inputs: Inputs, requested: Sequence[str] | None, weights: Weights, encoder: Any
 ) -> tuple[Chosen, bool]:
     """What is compared next to the TMMD family, and whether every image has its reference.
 
@@ -491,8 +358,7 @@ def _companions(
     real, made = inputs.reference, inputs.generators
     images, background = real.features is None, real.has_background
     able = {"images": images, "encoder": encoder is not None or not images}
-    names = [] if streamed else requested
-    chosen = choose(names, weights, **able, background=background)
+    chosen = choose(requested, weights, **able, background=background)
     if not chosen.pairs:
         return chosen, False
     if real.numbered:  # pairs by position are taken on request alone
@@ -505,14 +371,14 @@ def _companions(
             require_same_ids(samples.ids, real.ids)
         except PalpateError as error:
             fix = "Score the same samples on both sides, or request companions without pairs"
-            example = {"companions": ["fid", "kid", "prdc"]}
+            example = {"companions": ["fid", "kid"]}
             raise PalpateError(f"{name}: {error.must}", error.got, fix, example=example) from None
     return chosen, True
 
 
 @dataclass(frozen=True)
 class _Run:
-    """One call of :func:`score` on rows that fit in memory."""
+    """One call of :func:`score`."""
 
     inputs: Inputs
     family: Family
@@ -551,8 +417,7 @@ class _Run:
             outcome.notes.append(Note("row-pairs" if paired else "no-differences"))
         if encoder:
             outcome.add(score_family(features, self.family, train=train, progress=self.progress))
-            default, progress = chosen.default, self.progress
-            outcome.add(score_features(chosen.features, features, default, progress))
+            outcome.add(score_features(chosen.features, features, chosen.default))
         if chosen.standard or pairs:
             outcome.add(self._score_pixels(chosen, features, extra, pairs=pairs))
         if chosen.pairs and not pairs:
@@ -566,50 +431,6 @@ class _Run:
             for scores in (outcome.scores, outcome.differences):
                 scores[:] = [replace(s, reference=digest) if s.m else s for s in scores]
         return outcome
-
-    def clustered(self, count: int) -> tuple[_Run, str]:
-        """The same samples with clusters of the reference for labels, and what was clustered.
-
-        Photos say more of a material than touch does, and no generator is judged by its own.
-
-        Raises:
-            PalpateError: with too few samples, or generators of other ids.
-        """
-        from scipy.cluster.vq import kmeans2
-
-        real, seed = self.inputs.reference, self.family.common["seed"]
-        manifest = real.manifest
-        photos = manifest is not None and not manifest.table["vision"].null_count()
-        if self.encoders is not None and manifest is not None and photos:
-            from palpate.encoders.embed import embed
-
-            options: dict[str, Any] = {"progress": self.progress}
-            x, of = embed(manifest, self.encoders, "vision", **options).features, "photos"
-        elif self.encoders is not None or real.features is not None:
-            x, of = self._features(real).features, "the reference's features"
-        else:
-            fix, example = "Pass an encoder", {"encoder": "palpate/mini"}
-            must, got = "must be a file where there are no features", "clusters"
-            raise PalpateError(must, got, fix, argument="labels", example=example)
-        rows = np.asarray(x, np.float64)
-        distinct = np.unique(rows, axis=0)
-        if len(distinct) < 4 * count:
-            got = f"{count} of {len(distinct)} different samples"
-            must = "must leave four samples a cluster"
-            raise PalpateError(must, got, "Choose fewer", argument="labels")
-        first = distinct[rng_for(seed, "clusters").choice(len(distinct), count, replace=False)]
-        number = kmeans2(rows, first, iter=100, minit="matrix")[1]
-        real = replace(real, labels=[f"cluster {k + 1}" for k in number])
-        made = {
-            name: from_reference(replace(s, labels=None), real)
-            for name, s in self.inputs.generators.items()
-        }
-        if other := next((s for s in made.values() if s.labels is None), None):
-            must = "must be a file where generated and real images share no ids"
-            raise PalpateError(must, f"clusters for {other.source}", "", argument="labels")
-        train = self.inputs.train and replace(self.inputs.train, labels=None)
-        inputs = replace(self.inputs, generators=made, reference=real, train=train)
-        return replace(self, inputs=inputs), of
 
     def _memorization(self, train: Samples) -> list[Score]:
         """How near each generator's images lie to its train images, in every space there is."""
@@ -685,7 +506,7 @@ class _Run:
         if len(set(sizes.values())) > 1:
             got = ", ".join(f"{name} {size}" for name, size in sizes.items())
             fix = "Resize them, or request companions without pixels"
-            example = {"companions": ["fid", "kid", "prdc"]}
+            example = {"companions": ["fid", "kid"]}
             must = "Generators must have images of one size for scores of pixels"
             raise PalpateError(must, got, fix, example=example)
         return next(iter(sizes.values()))
@@ -705,10 +526,10 @@ class _Run:
         for kind in dict.fromkeys(self.weights.for_features(name) for name in chosen.standard):
             names = [n for n in chosen.standard if self.weights.for_features(n) == kind]
             other = self._standard(kind, features, subjects, images, reference)
-            outcome.add(score_features(names, other, False, self.progress))
+            outcome.add(score_features(names, other, False))
         if pairs:
             gel = None
-            if real.has_background and {"contact", "lpips"} & {*chosen.pairs}:
+            if "contact" in chosen.pairs:
                 gel = real.pixels(size, self.cache, self.progress, "background")
             groups = None if real.groups is None or "" in real.groups else real.groups
             common = {"ids": real.ids, "groups": groups, "split": self.family.common["split"]}
@@ -777,15 +598,6 @@ def _settings(
     return settings
 
 
-def _copies(outcome: Outcome) -> list[Note]:
-    copies: dict[str, Note] = {}
-    for s in outcome.scores:
-        if count := s.details.get("copies"):
-            params = {"subject": s.subject, "copies": count, "n": s.n}
-            copies.setdefault(s.subject, Note("copies", params))
-    return [*copies.values()]
-
-
 def _gallery(inputs: Inputs, seed: int) -> list[GalleryItem]:
     """Some of the samples that are files on both sides, chosen by seed alone."""
     real, made = inputs.reference.manifest, next(iter(inputs.generators.values())).manifest
@@ -808,12 +620,8 @@ def with_warnings(
     split: Split | None,
     digest: str,
     of_encoder: Sequence[Note],
-    *,
-    choices: Mapping[str, Sequence[Note]],
 ) -> list[Score]:
-    """The scores with notes on the encoder, on generators that may have seen test samples, and on
-    chosen images.
-    """
+    """The scores with notes on the encoder, and on generators that may have seen test samples."""
     of_generator = {
         name: [Note("generator-of-other-split")]
         for name, s in inputs.generators.items()
@@ -828,7 +636,6 @@ def with_warnings(
                 *s.notes,
                 *(of_encoder if s.encoder == digest else []),
                 *of_generator.get(s.subject, []),
-                *choices.get(s.subject, []),
             ],
         )
         for s in scores

@@ -1,11 +1,11 @@
 """Metrics of generated tactile images: arrays or tensors in, :class:`palpate.core.Score` out.
 
-On features of an encoder: the TMMD family, KID, CMMD, FID, precision, recall, density and coverage.
+On features of an encoder: the TMMD family, KID, CMMD and FID.
 On pairs of images: SSIM, PSNR and MS-SSIM; residual, SSIM and IoU of the contact alone.
 """
 
-from palpate.metrics.contact import background_digest, contact_images, contact_mask, contact_scores
-from palpate.metrics.distributions import compare_fid, fid, prdc
+from palpate.metrics.contact import background_digest, contact_mask, contact_scores
+from palpate.metrics.distributions import compare_fid, fid
 from palpate.metrics.images import mean_score, ms_ssim, per_image, psnr, require_same_ids, ssim
 from palpate.metrics.kernels import Gaussian, Polynomial
 from palpate.metrics.mmd import PRESETS, Distance, Options, distance
@@ -27,7 +27,6 @@ __all__ = [
     "compare",
     "compare_fid",
     "compare_tmmd",
-    "contact_images",
     "contact_mask",
     "contact_scores",
     "d_tmmd",
@@ -39,7 +38,6 @@ __all__ = [
     "mean_score",
     "ms_ssim",
     "per_image",
-    "prdc",
     "psnr",
     "require_same_ids",
     "ssim",

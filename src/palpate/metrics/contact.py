@@ -20,9 +20,6 @@ and compared where the real image shows contact, so that the no-contact image ea
 * *IoU*: of the generated mask and the real one. A contact everywhere has ``details["area"]``.
 
 Compare each with ``details["empty"]``, the score of the no-contact image.
-
-For a network that compares images, such as LPIPS, :func:`contact_images` gives the differences as
-images, neutral gray outside the mask.
 """
 
 from __future__ import annotations
@@ -261,33 +258,6 @@ def contacts_of_each(
                 values[name][metric][i] = value
     size = {"size": list(y.shape[1:3]), "background": background_digest(background)}
     return {name: Contacts(of, empty, area, SETTINGS | size) for name, of in values.items()}
-
-
-class ContactImages(NamedTuple):
-    """Differences to the background as images, for a network that compares images.
-
-    Attributes:
-        generated: (n, h, w, c) float32 in [0, 1]: 0.5 + image - background in the mask, else 0.5.
-        reference: the same of the real images.
-        mask: (n, h, w): the pixels compared; all False where the real image shows no contact.
-    """
-
-    generated: NDArray[np.float32]
-    reference: NDArray[np.float32]
-    mask: Mask
-
-
-def contact_images(generated: Any, reference: Any, background: Any) -> ContactImages:
-    """The contact of each pair as images; arguments and errors as :func:`contact_scores`."""
-    y, gel = _checked(reference, background)
-    x = image_pairs(generated, y)[0]
-    images = [np.full(y.shape, 0.5, np.float32) for _ in range(2)]
-    masks = np.zeros(y.shape[:3], bool)
-    for i, (none, real, contact) in _in_contact(y, gel):
-        masks[i] = kept = contact.kept
-        for image, difference in zip(images, (as_unit(x[i]) - none, real), strict=True):
-            image[i][kept] = np.clip(0.5 + difference[kept], 0, 1)
-    return ContactImages(images[0], images[1], masks)
 
 
 def _checked(reference: Any, background: Any) -> tuple[NDArray[Any], NDArray[Any]]:

@@ -226,7 +226,7 @@ def read_sources(
     Raises:
         PalpateError: if one has no image files, or no id is common.
     """
-    known = keywords_of(labels, None, "video", exact=False)
+    known = keywords_of(labels, "video", exact=False)
     real = complete(_files(read(reference, REFERENCE)), known)
     taken = (REFERENCE, GEL, COPY, EXAMPLE, SAME)
     sources = named_sources(generated, names, taken)

@@ -236,14 +236,12 @@ METRICS: dict[str, Sentence] = {
     "no-interval-over-images": (
         "No interval: one image or one group, or no variation between them"
     ),
-    "no-interval-over-groups": "No interval: one group, or no variation between them",
     "no-interval-few-units": "No interval: too few groups or samples to leave some out",
     "fewer-scales": (
         "{scales} of the 5 scales (five need {least} pixels a side), weights divided by their sum: "
         "not comparable with MS-SSIM of 5"
     ),
     "no-contact": "{count} of {n} real images show no contact, excluded from the mean",
-    "empty-balls": "{count} of {n} {of} rows occur more than k times: their balls hold nothing",
     "fid-mostly-bias": (
         "Not meaningful: {n} samples do not span the {d} dimensions, so the value is mostly bias"
     ),
@@ -384,7 +382,6 @@ LEAKAGE: dict[str, Sentence] = {
         f"{p['count']} {p['modality']} images cannot be read and were not "
         f"compared ({few(p['files'])})"
     ),
-    "impact-not-by": "What known {group}s are worth could not be measured: {reason}",
     "impact-of-nothing": (
         "What leaking costs was not measured: without contact, or with images that are similar, "
         "a classifier recognizes recordings by the drift of the sensor, not materials"
@@ -470,46 +467,12 @@ EVALUATION: dict[str, Sentence] = {
         "query's. TVL derived 0.6356 for OpenCLIP ViT-L/14; the cosines of another text encoder "
         "mean something else. The details say how many keys were right"
     ),
-    "no-background": (
-        "{count} of {n} samples have no background: tactile images are used as they are only"
-    ),
-    "no-images": "No sample has a {column} image: no features of it",
     "no-material": "{count} samples without a material are excluded",
-    "no-shared-group": (
-        "The given split shares no {group} between train and test: a difference is due to which of "
-        "them are in test"
-    ),
-    "repeated-splits": (
-        "{repeated} of {n} seeds gave a leak-free split that another gave: there are too few "
-        "{group} "
-        "groups for more"
-    ),
-    "shared-videos": (
-        "Whole contacts are kept together, but train and test share videos: what a shared video is "
-        "worth is not in this number, and contacts of one video are less independent than the "
-        "intervals take them to be"
-    ),
-    "uneven-materials": (
-        "Materials are not equally common. Always guessing the commonest material of train scores "
-        "{share:.1%} under the given split, not chance"
-    ),
-    "val-excluded": (
-        "The validation part of the given split is excluded; the leak-free splits are made of its "
-        "train and test samples"
-    ),
     "below-floor": (
         "{metric}, {subject}: below the floor of real images, so these vary less than real "
         "ones do; that is not better"
     ),
     "companion-skipped": "{name} skipped: {must}; got {got}",
-    "copies": (
-        "{subject}: {copies} of {n} generated rows are bit for bit rows of the reference: a copy "
-        "is not a generator"
-    ),
-    "pseudo-labels": (
-        "The classes are {clusters} clusters of {of}, not materials: not comparable with scores "
-        "over materials"
-    ),
     "synthetic-encoder": lambda p, _: (
         "The encoder was trained on simulated tactile images alone, and "
         + ("these are real" if p["real"] else "nothing says whether these are real")
@@ -526,13 +489,6 @@ EVALUATION: dict[str, Sentence] = {
     "pretraining-sets": (
         "The {modality} encoder was trained on {sets}, without a list of the images: if these are "
         "of one of them, it may have seen them"
-    ),
-    "aligned": lambda *_: (
-        "The generator was trained to agree with the encoder that scores it: the score flatters it"
-    ),
-    "chosen": lambda p, _: (
-        f"Each of these images is the best of {p['n']} by a tactile encoder"
-        + (", the same that scores them: the score is of its own choice" if p["same"] else "")
     ),
     "text-cut": (
         "The text has {tokens} tokens, of which its encoder reads {most}: the words at its end "
@@ -574,7 +530,6 @@ EVALUATION: dict[str, Sentence] = {
     "no-differences": (
         "No differences between generators: their rows have no ids, and differ in number"
     ),
-    "no-interval-streamed": "No interval: neither groups nor repeats are known",
     "no-pairs": "Scores of pairs of images skipped: generated and reference share no id",
     "outside-test-part": (
         "{name}: {skipped} of {n} samples lie outside the split's test part, and were skipped"
@@ -584,10 +539,6 @@ EVALUATION: dict[str, Sentence] = {
         "were resized, and smaller images score higher"
     ),
     "row-pairs": "Row k of every generator is taken for the same sample: the rows have no ids",
-    "streamed": (
-        "Streamed, as there are too many rows to hold: TMMD alone, without interval, p-value or "
-        "companions"
-    ),
     "too-many-rows": (
         "{name} skipped: it forms all pairs of more than {rows:,} rows; request it with "
         "{arg:companions}"
@@ -596,7 +547,6 @@ EVALUATION: dict[str, Sentence] = {
         "Sigma 10 alone: several bandwidths form all pairs of more than {rows:,} rows; request "
         "them with {arg:sigma=multi}"
     ),
-    "widened": "The features in {source}: {type} was widened to float32; its rounding stays",
 }
 
 
