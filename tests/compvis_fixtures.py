@@ -13,11 +13,10 @@ from torch.nn.functional import conv2d, group_norm, interpolate, pad, silu
 
 State = dict[str, Tensor]
 VQ_F4 = {"mult": (1, 2, 4), "z": 3, "codes": 64}
-KL_F8 = {"mult": (1, 2, 4, 4), "z": 4, "codes": None}
 
 
 def make_state(
-    mult: tuple[int, ...], z: int, codes: int | None, *, middle: bool = True, levels: tuple = ()
+    mult: tuple[int, ...], z: int, codes: int, *, middle: bool = True, levels: tuple = ()
 ) -> State:
     """Random weights of a model of 32 channels with two blocks a level; `levels` attend as well."""
     rng, state = torch.Generator().manual_seed(0), {}
@@ -63,11 +62,9 @@ def make_state(
             weight(f"encoder.down.{i}.downsample.conv", width, width, 3)
     mid("encoder.mid", before)
     norm("encoder.norm_out", before)
-    moments = z if codes else 2 * z
-    weight("encoder.conv_out", moments, before, 3)
-    weight("quant_conv", moments, moments, 1)
-    if codes:
-        state["quantize.embedding.weight"] = torch.randn(codes, z, generator=rng)
+    weight("encoder.conv_out", z, before, 3)
+    weight("quant_conv", z, z, 1)
+    state["quantize.embedding.weight"] = torch.randn(codes, z, generator=rng)
     weight("post_quant_conv", z, z, 1)
     weight("decoder.conv_in", before, z, 3)
     mid("decoder.mid", before)
@@ -85,7 +82,7 @@ def make_state(
 
 
 def encode(state: State, x: Tensor) -> Tensor:
-    """What `quant_conv` gives: latents before quantization, or mean and log variance."""
+    """What `quant_conv` gives: latents before quantization."""
     x = _conv(state, "encoder.conv_in", x)
     for i in range(_levels(state)):
         for j in range(2):
@@ -99,12 +96,11 @@ def encode(state: State, x: Tensor) -> Tensor:
 
 
 def decode(state: State, z: Tensor) -> Tensor:
-    """The image of latents; those of a model with codes are replaced by the nearest code first."""
-    codes = state.get("quantize.embedding.weight")
-    if codes is not None:
-        flat = z.permute(0, 2, 3, 1)
-        nearest = (flat[..., None, :] - codes).square().sum(-1).argmin(-1)
-        z = codes[nearest].permute(0, 3, 1, 2)
+    """The image of latents; they are replaced by the nearest code first."""
+    codes = state["quantize.embedding.weight"]
+    flat = z.permute(0, 2, 3, 1)
+    nearest = (flat[..., None, :] - codes).square().sum(-1).argmin(-1)
+    z = codes[nearest].permute(0, 3, 1, 2)
     x = _conv(state, "decoder.conv_in", _conv(state, "post_quant_conv", z))
     x = _middle(state, "decoder.mid", x)
     for i in reversed(range(_levels(state))):

@@ -199,7 +199,6 @@ def test_training_learns_and_uses_its_codes(tmp_path):
     untrained = measure_reconstruction(random_model(), test)
     assert result.psnr > untrained.psnr + 4
     assert result.perplexity > 8 > untrained.perplexity
-    assert result.codes == 32
 
 
 def test_latent_statistics_by_hand():

@@ -1,5 +1,5 @@
 """Conditions other than embeddings: the map of a photo that is trained with the denoiser (GVST),
-the words of a text, the patches of a photo.
+and the patches of a photo.
 """
 
 import json
@@ -133,58 +133,46 @@ def test_gvst_from_the_command_line_needs_no_text_and_no_encoder(
     assert "--clip must have text and vision" in capsys.readouterr().err
 
 
-STATES = ConditionPolicy(width=12, source="both", words=5, patches=4, dropout=0.2)
+PATCHES = ConditionPolicy(width=12, source="both", patches=4, dropout=0.2)
 
 
-def state_pipeline(source="both", **changes):
+def patch_pipeline():
     encoders = make_encoders()
-    policy = replace(STATES, width=encoders.dim, source=source, **changes)
-    base = make_pipeline(policy=replace(policy, words=0, patches=0))
-    widths = dict.fromkeys(inputs_of(policy), encoders.clip.model.config.vision_config.hidden_size)
-    denoiser = Denoiser(base.unet, policy, widths=widths).eval()
+    policy = replace(PATCHES, width=encoders.dim)
+    base = make_pipeline(policy=replace(policy, patches=0))
+    width = encoders.clip.model.config.vision_config.hidden_size
+    denoiser = Denoiser(base.unet, policy, patch_width=width).eval()
     return replace(base, denoiser=denoiser, encoders=EncoderSet(encoders.clip))
 
 
-def test_states_are_those_of_the_last_layer_of_transformers():
+def test_patches_are_those_of_the_last_layer_of_transformers():
     clip = make_encoders().clip
-    texts = ["a rough wall", "soft"]
-    ids = clip.tokenizer(texts, padding="max_length", max_length=6, truncation=True)["input_ids"]
     pixels = torch.randn(2, 3, *[clip.preprocess.size] * 2)
     with torch.no_grad():
-        words = clip.model.text_model(torch.tensor(ids)).last_hidden_state
         whole = clip.model.vision_model(pixels).last_hidden_state[:, 1:]
-        encoders = EncoderSet(clip)
-        assert torch.equal(encoders.states("text", texts, 6), words)
-        assert torch.allclose(encoders.states("vision", pixels, whole.shape[1]), whole, atol=1e-6)
-        mean = encoders.states("vision", pixels, 1)
+        assert torch.allclose(clip.patches(pixels, whole.shape[1]), whole, atol=1e-6)
+        mean = clip.patches(pixels, 1)
     assert torch.allclose(mean[:, 0], whole.mean(1), atol=1e-5)
-    with pytest.raises(PalpateError, match="`words` must be at most"):
-        encoders.states("text", texts, 1000)
 
 
-def test_states_follow_their_embedding_and_are_null_where_there_are_none():
-    pipeline = state_pipeline()
+def test_patches_follow_their_embedding_and_are_null_where_there_are_none():
+    pipeline = patch_pipeline()
     photo, text = pipeline.embed(photos(2)), pipeline.embed_text("rough")
-    assert (photo.shape[1], text.shape[1]) == (1 + 4, 1 + 5)
+    assert photo.shape[1] == 1 + 4
     condition = pipeline.denoiser.condition
-    both = condition(photo, text.expand(2, -1, -1))
-    assert both.shape[1] == 2 + 5 + 4  # two embeddings, words, patches
-    assert torch.equal(both[:, 2:7], text[:, 1:].expand(2, -1, -1))
-    assert torch.equal(both[:, 7:], photo[:, 1:])
-    assert not condition(photo)[:, 2:7].any()
-    assert not condition(None, text)[:, 7:].any()
+    both = condition(photo, text.expand(2, -1))
+    assert both.shape[1] == 2 + 4  # two embeddings, patches
+    assert torch.equal(both[:, 2:], photo[:, 1:])
+    assert not condition(None, text)[:, 2:].any()
     # A bare embedding is known, too.
     assert torch.equal(condition(photo[:, 0])[:, 1], condition(photo)[:, 1])
-    # A photo in the place of a text has no words.
-    alone = state_pipeline("text").denoiser
-    assert inputs_of(alone.policy) == ("words",)
-    assert not alone.condition(photo[:, 0])[:, 1:].any()
+    # A photo in the place of a text brings its embedding alone.
+    assert not inputs_of(replace(PATCHES, source="text"))
 
 
-@pytest.mark.parametrize("source", ["text", "vision", "both", "mixed"])
-def test_states_are_dropped_with_their_embedding_and_alone(source):
-    policy = replace(STATES, source=source)
-    n, ones = 4000, {"words": torch.ones(4000, 5, 12), "patches": torch.ones(4000, 4, 12)}
+@pytest.mark.parametrize("source", ["vision", "both"])
+def test_patches_are_dropped_with_their_embedding_and_alone(source):
+    policy, n = replace(PATCHES, source=source), 4000
     loss = DiffusionLoss(
         torch.zeros(n, 3, 2, 2),
         {s: torch.ones(n, 1, 12) for s in policy.sources},
@@ -192,35 +180,28 @@ def test_states_are_dropped_with_their_embedding_and_alone(source):
         stats=LatentStats((0.0,) * 3, (1.0,) * 3),
         schedule=TINY.schedule,
         policy=policy,
-        inputs={name: ones[name] for name in inputs_of(policy)},
+        inputs={"patches": torch.ones(n, 4, 12)},
     )
     batch = loss.load(Step(0, np.arange(n), 0))
     dropped = batch["dropped"][:, :, 0]
     assert dropped.shape[1] == sum(lengths_of(policy))
-    ends = np.cumsum((0, *lengths_of(policy)))
-    parts = [dropped[:, a:b] for a, b in pairwise(ends)]
-    assert all(bool((p == p[:, :1]).all()) for p in parts)  # an input goes as a whole
-    vectors, states = parts[: slots_of(policy)], parts[slots_of(policy) :]
-    given = [~p[:, 0] for p in states]
-    for name, known in zip(inputs_of(policy), given, strict=True):
-        own = vectors[0 if name == "words" else -1][:, 0]
-        assert not (known & own).any()
-        share = 0.8 * 0.5 * (0.5 if source == "mixed" else 1)
-        assert float(known.float().mean()) == pytest.approx(share, abs=0.03)
-    if source == "mixed":  # a row is of the photo or of the text
-        assert not (given[0] & given[1]).any()
+    slots = slots_of(policy)
+    photo, patches = dropped[:, slots - 1], dropped[:, slots:]
+    assert bool((patches == patches[:, :1]).all())  # they go as a whole
+    known = ~patches[:, 0]
+    assert not (known & photo).any()
+    assert float(known.float().mean()) == pytest.approx(0.8 * 0.5, abs=0.03)
 
 
-@pytest.mark.parametrize("source", ["text", "both"])
-def test_words_and_patches_from_training_to_a_saved_pipeline(small_manifest, tmp_path, source):
-    condition = replace(TINY.condition, words=5, patches=4, tokens=2, learned=True)
+def test_patches_from_training_to_a_saved_pipeline(small_manifest, tmp_path):
+    condition = replace(TINY.condition, patches=4)
     preset = replace(TINY, condition=condition, loop=replace(TINY.loop, steps=2))
     encoders, split = make_encoders(), by_video(small_manifest)
-    options = {"preset": preset, "source": source, "device": "cpu"}
+    options = {"preset": preset, "source": "both", "device": "cpu"}
     made = train_generator(small_manifest, split, encoders, output=tmp_path / "m", **options)
     again = TactilePipeline.from_pretrained(tmp_path / "m", device="cpu")
     assert again.digest == made.digest
-    assert [*again.denoiser.maps] == (["words"] if source == "text" else ["words", "patches"])
+    assert [*again.denoiser.maps] == ["patches"]
     first = small_manifest.paths("vision")[:2]
     images = [arrays(again(first, text=text)) for text in (None, "rough", "smooth")]
     assert not any(np.array_equal(a, b) for a, b in pairwise(images))

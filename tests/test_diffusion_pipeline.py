@@ -67,9 +67,6 @@ def test_photos_in_any_form_give_the_same_images(tmp_path):
         assert np.array_equal(arrays(pipeline(form)), base)
     one = arrays(pipeline(files[0]))
     assert np.abs(one.astype(int) - base[:1]).max() <= 1
-    calls = []
-    pipeline(rows, progress=lambda what, done, total, remark="": calls.append((done, total)))
-    assert calls[-1] == (2, 2)
 
 
 def test_text_and_vision_embeddings_fill_the_same_slot():
@@ -148,7 +145,6 @@ def test_the_background_variant_uses_its_background():
         (lambda p: p(photos(1), steps=1001), "`steps` must lie in 1 to 1000"),
         (lambda p: p.sampler_with(batch=0), "`batch` must be at least 1"),
         (lambda p: p(photos(2), ids=["a"]), "Every id needs one condition"),
-        (lambda p: p(photos(2), generator=[torch.Generator()]), r"`generator` .*Got 1 for 2"),
         (lambda p: p(photos(1) / 255), "`images` must be uint8"),
         (lambda p: p(7), "`images` must be files, PIL images"),
         (lambda p: p("nowhere.jpg"), "nowhere.jpg: no such file"),
@@ -195,7 +191,7 @@ def test_a_changed_folder_is_rejected(tmp_path):
         (about | {"size": None}, "must be as palpate writes them"),
         (about | {"size": 30}, "must be one for the autoencoder"),
         (about | {"condition": about["condition"] | {"taus": 1}}, "unexpected .* 'taus'"),
-        (about | {"format": "palpate-pipeline/3"}, "must have the format palpate-pipeline/1"),
+        (about | {"format": "palpate-pipeline/2"}, "must have the format palpate-pipeline/1"),
         ([], "must be a JSON object"),
     ]
     for content, message in cases:
@@ -204,22 +200,6 @@ def test_a_changed_folder_is_rejected(tmp_path):
             TactilePipeline.from_pretrained(tmp_path / "p")
     with pytest.raises(PalpateError, match="no folder"):
         TactilePipeline.from_pretrained(tmp_path / "nowhere")
-
-
-@pytest.mark.parametrize("many", [False, True], ids=["one generator", "one each"])
-def test_generators_decide_the_noise_instead_of_seed_and_ids(many):
-    pipeline = make_pipeline()
-
-    def images(seed=3, batch=4, **options):
-        one = torch.Generator().manual_seed(seed)
-        each = [torch.Generator().manual_seed(seed + k) for k in range(6)]
-        made = replace(pipeline, sampler=replace(pipeline.sampler, batch=batch))
-        return arrays(made(photos(6), generator=each if many else one, **options)).astype(int)
-
-    base = images()
-    assert np.array_equal(images(seed=3, ids=list("abcdef")), base)
-    assert np.abs(images(batch=6) - base).max() <= 1
-    assert not np.array_equal(images(seed=4), base)
 
 
 def test_batches_of_1_and_16_give_the_same_images():
@@ -252,7 +232,6 @@ def test_the_progress_bar_counts_steps_and_can_be_turned_off(capsys):
     pipeline = make_pipeline()
     pipeline(photos(5), steps=3)
     assert f"{3 * 2}/{3 * 2}" in capsys.readouterr().err  # two batches of 4
-    pipeline(photos(1), steps=2, progress=lambda *_: None)
     pipeline.set_progress_bar_config(disable=True)
     pipeline(photos(1), steps=2)
     assert not capsys.readouterr().err
@@ -274,13 +253,9 @@ def test_it_is_a_pipeline_of_diffusers(tmp_path):
     for name, (_, kind) in parts.items():  # each loads with diffusers alone
         getattr(diffusers, kind).from_pretrained(tmp_path / "p" / name)
     assert TactilePipeline.from_pretrained(tmp_path / "p").digest == pipeline.digest
-    for options in ({"safe_serialization": False}, {"variant": "fp16"}):
-        with pytest.raises(PalpateError, match="must be saved as safetensors"):
-            pipeline.save_pretrained(tmp_path / "q", **options)
 
 
-@pytest.mark.parametrize("way", ["push_to_hub", "save_pretrained"])
-def test_pushed_to_the_hub_with_its_own_card_it_comes_back(tmp_path, monkeypatch, way):
+def test_pushed_to_the_hub_with_its_own_card_it_comes_back(tmp_path, monkeypatch):
     pipeline, hub = without_encoders(make_pipeline()), tmp_path / "hub"
     name = SimpleNamespace(repo_id="me/touch")
 
@@ -292,35 +267,12 @@ def test_pushed_to_the_hub_with_its_own_card_it_comes_back(tmp_path, monkeypatch
     monkeypatch.setattr(hub_utils, "create_repo", lambda *_, **__: name)
     monkeypatch.setattr(hub_utils, "upload_folder", upload)
     monkeypatch.setattr(hub_utils, "load_or_create_model_card", lambda *_, **__: blank)
-    if way == "push_to_hub":
-        pipeline.push_to_hub("me/touch")
-    else:
-        pipeline.save_pretrained(tmp_path / "p", push_to_hub=True, repo_id="me/touch")
+    pipeline.push_to_hub("me/touch")
     card = (hub / "README.md").read_text()
     assert "TactilePipeline.from_pretrained" in card
     assert pipeline.digest in card
     monkeypatch.setattr(huggingface_hub, "snapshot_download", lambda *_, **__: str(hub))
     assert TactilePipeline.from_pretrained("me/touch", device="cpu").digest == pipeline.digest
-
-
-def test_another_scheduler_samples_and_belongs_to_the_settings(tmp_path):
-    pipeline = without_encoders(make_pipeline())
-    c, base = torch.randn(5, 6), pipeline.digest
-    first = pipeline.sample(c, list("abcde"), seed=0)
-    config = pipeline.scheduler.config
-    for kind in (diffusers.UniPCMultistepScheduler, diffusers.EulerAncestralDiscreteScheduler):
-        pipeline.scheduler = kind.from_config(config)
-        made = pipeline.sample(c, list("abcde"), seed=0)
-        assert not np.array_equal(made, first)
-        # Noise that the scheduler adds belongs to the sample, too.
-        alone = pipeline.sample(c[2:4], ["c", "d"], seed=0)
-        assert np.abs(alone.astype(int) - made[2:4]).max() <= 1
-        assert pipeline.other_scheduler["_class_name"] == kind.__name__
-        with pytest.raises(PalpateError, match="sampler's scheduler"):
-            pipeline.save(tmp_path / "p")
-    assert pipeline.digest == base
-    pipeline.sampler = replace(pipeline.sampler, steps=2)
-    assert pipeline.other_scheduler is None
 
 
 def test_the_unet_computes_in_another_type_and_is_saved_in_32_bits(tmp_path):
@@ -336,15 +288,6 @@ def test_the_unet_computes_in_another_type_and_is_saved_in_32_bits(tmp_path):
     again = TactilePipeline.from_pretrained(tmp_path / "p")
     assert (again.dtype, again.digest) == (torch.float32, pipeline.digest)
     assert np.array_equal(again.to("cpu", torch.bfloat16).sample(c, ["a", "b"], seed=0), made)
-
-
-def test_a_changed_part_changes_the_digest():
-    pipeline, other = make_pipeline(), make_pipeline()
-    next(other.unet.parameters()).data.add_(1e-3)
-    before = pipeline.digest
-    pipeline.unet = other.unet
-    assert pipeline.denoiser.unet is other.unet
-    assert pipeline.digest == other.digest != before
 
 
 @pytest.mark.parametrize(

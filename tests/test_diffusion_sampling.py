@@ -15,26 +15,22 @@ MEAN, SPREAD = 1.7, 0.4
 
 
 def exact(schedule: Schedule, mean, spread: float):
-    """The exact predictor for data N(mean, spread^2): E[eps | z_t], or E[v | z_t]."""
+    """The exact predictor for data N(mean, spread^2): E[eps | z_t]."""
     alphas = schedule.alphas().float()
 
     def predict(z, t, tokens, background):
         a = alphas[t].reshape(-1, 1, 1, 1)
         m = mean(tokens) if callable(mean) else mean
-        eps = (z - a.sqrt() * m) * (1 - a).sqrt() / (a * spread**2 + 1 - a)
-        if schedule.prediction == "epsilon":
-            return eps
-        return (eps - (1 - a).sqrt() * z) / a.sqrt()
+        return (z - a.sqrt() * m) * (1 - a).sqrt() / (a * spread**2 + 1 - a)
 
     return predict
 
 
-@pytest.mark.parametrize("prediction", ["epsilon", "v_prediction"])
 @pytest.mark.parametrize(
     ("method", "steps", "tolerance"), [("ddim", 200, 0.02), ("ddim", 1000, 0.01), ("dpm", 20, 0.02)]
 )
-def test_gaussian_data_come_out_with_their_mean_and_spread(method, steps, tolerance, prediction):
-    schedule = Schedule(prediction=prediction)
+def test_gaussian_data_come_out_with_their_mean_and_spread(method, steps, tolerance):
+    schedule = Schedule()
     ids = [f"s{k}" for k in range(128)]
     z = sample(
         exact(schedule, MEAN, SPREAD),

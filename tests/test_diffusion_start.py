@@ -11,7 +11,7 @@ from mini_fixtures import make_encoders
 from palpate.core import PalpateError, Split
 from palpate.data.manifest import Manifest
 from palpate.diffusion.autoencoder import LatentStats
-from palpate.diffusion.options import ConditionPolicy, Schedule, UNetOptions
+from palpate.diffusion.options import Schedule, UNetOptions
 from palpate.diffusion.presets import TINY
 from palpate.diffusion.training import train_denoiser, train_pipeline
 from palpate.encoders.encoder_set import EncoderSet
@@ -55,25 +55,10 @@ def test_it_begins_with_the_given_weights_and_leaves_those_alone(tmp_path):
     assert same(train(tmp_path / "d", 2, start), moved)
 
 
-def test_its_geometry_is_its_own_and_what_it_learned_beside_the_unet_tells_runs_apart(tmp_path):
+def test_its_geometry_is_its_own(tmp_path):
     start = make_pipeline().denoiser
     wide = UNetOptions(widths=(16, 16), attention=(False, True), layers=1, head_width=16, groups=8)
     assert same(train(tmp_path / "a", 0, start, unet=wide), start)
-    policy = ConditionPolicy(width=6, tokens=2, learned=True)
-    how = {"policy": policy, "unet": None}
-    start = make_pipeline(policy=policy).denoiser
-    first = train(tmp_path / "b", 2, start, **how)
-    start.expand.weight.data.add_(1)
-    second = train(tmp_path / "b", 2, start, **how)
-    assert not torch.equal(first.expand.weight, second.expand.weight)
-    assert torch.equal(second.expand.weight, train(tmp_path / "c", 2, start, **how).expand.weight)
-
-
-def test_a_learned_unconditional_token_goes_along(tmp_path):
-    policy = ConditionPolicy(width=6, null="learned")
-    start = make_pipeline(policy=policy).denoiser
-    made = train(tmp_path / "a", 0, start, policy=policy)
-    assert torch.equal(made.null, start.null)
 
 
 def test_other_encoders_autoencoders_and_schedules_are_rejected(small_manifest, tmp_path):
@@ -102,10 +87,7 @@ def test_other_encoders_autoencoders_and_schedules_are_rejected(small_manifest, 
     for change, word in (
         ({"encoders": make_encoders(seed=4)}, "another vision encoder"),
         ({"autoencoder": other}, "another autoencoder"),
-        (
-            {"preset": replace(preset, schedule=Schedule(prediction="v_prediction"))},
-            "another schedule",
-        ),
+        ({"preset": replace(preset, schedule=Schedule(prediction="flow"))}, "another schedule"),
     ):
         with pytest.raises(PalpateError, match=word):
             run(**change)
@@ -120,12 +102,10 @@ def test_other_encoders_autoencoders_and_schedules_are_rejected(small_manifest, 
     assert all(name in made.notice for name in made.training["materials"])
     # What it goes on from was trained on another split of these data, further back on real ones.
     first = {"manifest": manifest.digest, "split": "a", "materials": ["Felt"], "synthetic": True}
-    first |= {"align": {"encoder": "guide"}}
-    between = {**first, "split": "b", "materials": [], "align": None, "start_record": first}
+    between = {**first, "split": "b", "materials": [], "start_record": first}
     start.training = between
     on = run()
     assert on.earlier_splits == ["a", "b"]
-    assert on.guides == ["guide"]
     assert "Felt" in on.notice
     start.training = {**between, "start_record": {**first, "synthetic": False}}
     assert not run().notice

@@ -14,7 +14,6 @@ from PIL import Image
 
 from diffusion_fixtures import make_pipeline, photos
 from palpate.core import PalpateError
-from palpate.diffusion.estimating import estimate
 from palpate.diffusion.generation import Generated, generate
 
 av = pytest.importorskip("av")
@@ -53,15 +52,6 @@ def test_a_video_gives_an_image_a_frame_of_one_noise_and_a_video(clip, tmp_path)
     assert np.abs(first - np.asarray(made.images[2], int)).max() <= 1
     # A second run finds all frames.
     assert generate(clip, model=pipeline, output=tmp_path / "out").made == 0
-
-
-def test_the_dry_run_of_a_video_is_of_its_call(clip, tmp_path):
-    pipeline = make_pipeline()
-    generate(clip, model=pipeline, output=tmp_path / "out")
-    found = estimate(clip, model=pipeline, output=tmp_path / "out")
-    assert (found.images, found.missing) == (6, 0)
-    with pytest.raises(PalpateError, match="must be 1 for a video"):
-        estimate(clip, model=pipeline, best_of=2)
 
 
 def test_videos_beside_photos_are_not_left_out_in_silence(clip, tmp_path):

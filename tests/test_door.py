@@ -25,7 +25,7 @@ SIGNATURES = {
     ),
     "generate": (
         "photos * text weight gel model output split part seed noise guidance steps batch"
-        " best_of best_by skip_bad device progress"
+        " skip_bad device progress"
     ),
     "load": "source * format images skip_bad progress **options",
     "probe": (
@@ -43,16 +43,15 @@ SIGNATURES = {
     ),
     "train_autoencoder": "data split * preset start judge output seed device compute progress",
     "train_generator": (
-        "data split clip * preset autoencoder unet start output source background align"
-        " align_weight judge steps seed device compute progress"
+        "data split clip * preset autoencoder unet start output source background"
+        " judge steps seed device compute progress"
     ),
     "validate": "source * format check progress **options",
     "Encoder.from_pretrained": "source * modality device",
     "Encoder.encode": "self inputs * batch progress",
     "TactilePipeline.from_pretrained": "source * device",
     "TactilePipeline.__call__": (
-        "self photos * text weight ids seed guidance steps gel generator callback_on_step_end"
-        " progress"
+        "self photos * text weight ids seed guidance steps gel callback_on_step_end"
     ),
     "World.__init__": "self options * cache appearance",
     "Manifest.load": "path root",

@@ -68,8 +68,6 @@ def test_encoders_and_a_generator_from_the_command_line(data, tmp_path, capsys, 
     started = ["train", "generator", *common, "--start", "model", "--dry-run", "-o", "on"]
     assert main(started) == 0
     assert json.loads(capsys.readouterr().out)["parameters"] == facts["parameters"]
-    assert main([*started, "--source", "vision"]) == 2  # refused as the training would
-    assert "another source and tokens" in " ".join(capsys.readouterr().err.split())
     assert main([*started, "--lr", "1e-4", "--batch-size", "4"]) == 0
     capsys.readouterr()
     for idle in (["--sampler-guidance", "2"], ["--unet-layers", "3"]):  # one is as in the preset
@@ -173,7 +171,7 @@ def test_a_set_of_encoders_or_a_clip_conditions_a_generator(data, tmp_path):
             "another background",
         ),
         (
-            lambda m, s: train_generator(m, s, preset="sd15", unet="u", start="palpate/mini"),
+            lambda m, s: train_generator(m, s, unet="u", start="palpate/mini"),
             "`unet` must be left out with start",
         ),
     ],

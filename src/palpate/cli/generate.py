@@ -42,17 +42,8 @@ class Options(Common):
     """Sampling steps (default: the model's)."""
     batch: int | None = None
     """Images at a time; the images do not depend on it."""
-    best_of: int = 1
-    """Make so many of each and keep the one whose tactile embedding is most similar to the photo or
-    text."""
-    best_by: str | None = None
-    """With --best-of: the encoders that choose (`palpate train encoder`); `palpate score` rejects
-    their tactile encoder for these images."""
     skip_bad: Switch = False
     """Skip unreadable photos and list them."""
-    dry_run: Switch = False
-    """Write nothing; print images, network evaluations, time and disk, from a batch that is sampled
-    with few steps."""
     device: str = "auto"
     """auto, cpu, cuda, mps."""
 
@@ -63,16 +54,9 @@ def run(options: Options, terminal: Terminal) -> dict[str, Any]:
     from palpate.diffusion.generation import generate
 
     arguments = dict(vars(options))
-    for name in ("as_json", "quiet", "photos", "dry_run"):
+    for name in ("as_json", "quiet", "photos"):
         arguments.pop(name)
     photos: Any = (options.photos[0] if len(options.photos) == 1 else options.photos) or None
-    if options.dry_run:
-        from palpate.diffusion.estimating import estimate
-
-        with terminal.progress() as progress:
-            needed = estimate(photos, progress=progress, **arguments)
-        terminal.print(str(needed))
-        return needed.to_json()
     with terminal.progress() as progress:
         made = generate(photos, progress=progress, **arguments)
     for note in made.notes:

@@ -25,28 +25,22 @@ class Options(Training):
     id, or palpate/mini. `--source resnet` needs none."""
     autoencoder: str | None = None
     """Pretrained autoencoder: folder or hub id of a diffusers VQModel or AutoencoderKL, a .ckpt of
-    latent diffusion (vq-f4, kl-f8), or palpate/mini. Default: a small one, trained first on the
+    latent diffusion (vq-f4), or palpate/mini. Default: a small one, trained first on the
     train part."""
     unet: str | None = None
-    """Trained U-Net of diffusers to go on from: folder or hub id of it or of its generator, whose
-    autoencoder is the default. Default: random weights; the preset `sd15` needs one."""
+    """Trained U-Net of diffusers to go on from: folder or hub id of it or of its generator.
+    Default: random weights."""
     start: str | None = None
     """Generator of palpate to go on from: its folder, or palpate/mini. Its encoders and autoencoder
     stand for those that are not given, and the preset gives the training loop alone. Default:
     random weights."""
-    preset: Literal["mini", "tiny", "small", "paper", "sd15"] = "mini"
-    """Geometry, schedule and length: `small` for one small GPU, `paper` is the paper's, `sd15` goes
-    on from Stable Diffusion 1.5."""
+    preset: Literal["mini", "tiny", "small", "paper"] = "mini"
+    """Geometry, schedule and length: `small` for one small GPU, `paper` is the paper's."""
     source: Sources | None = None
     """What training conditions on: `resnet` is GVST, the baseline without text and encoders;
     `vision` is it with the encoder's photo. Default: the preset's."""
     background: Switch = False
     """The variant that also sees the no-contact image."""
-    align: str | None = None
-    """Encoder that the U-Net's middle block is pulled to (REPA): a folder of palpate or
-    transformers, a hub id, a public tactile encoder. It may not score this generator."""
-    align_weight: float = 0.5
-    """Of that term in the loss."""
     judge: str = "palpate/mini"
     """Encoders whose tactile encoder judges, by TMMD and by material, what of images outside of
     train survives the autoencoder; or none."""
@@ -73,7 +67,7 @@ def run(options: Options, terminal: Terminal) -> dict[str, Any]:
     data, machine = (options.data, options.split), options.machine
     if options.dry_run:
         how: dict[str, Any] = {"background": options.background, "device": machine.device}
-        how |= {"unet": options.unet, "source": options.source, "start": options.start}
+        how |= {"unet": options.unet or options.start, "source": options.source}
         plan = plan_generator(*data, preset=preset, steps=options.steps, **how)
         return print_plan(terminal, f"Plan of {options.output}", plan)
     with terminal.progress() as progress:
@@ -87,8 +81,6 @@ def run(options: Options, terminal: Terminal) -> dict[str, Any]:
             output=options.output,
             source=options.source,
             background=options.background,
-            align=options.align,
-            align_weight=options.align_weight,
             judge=options.judge,
             steps=options.steps,
             seed=options.seed,
@@ -104,7 +96,6 @@ def run(options: Options, terminal: Terminal) -> dict[str, Any]:
         "steps": record["loop"]["steps"],
         "batch": record["loop"]["batch"],
         "learning_rate": record["loop"]["lr"],
-        "learning_rate_if_the_batch_is_each_of_two_gpus": 2 * record["loop"]["lr"],
         "processes": record["processes"],
         "text_source": record["text_source"],
         "source": record["source"],

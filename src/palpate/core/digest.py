@@ -129,13 +129,3 @@ def seed_for(seed: int, *names: str | int) -> int:
 def rng_for(seed: int, *names: str | int) -> np.random.Generator:
     """Return a NumPy generator for (seed, names), e.g. ``rng_for(0, "noise", sample_id)``."""
     return np.random.default_rng(seed_for(seed, *names))
-
-
-def facts(options: Any) -> dict[str, Any]:
-    """The fields of a record, for files and digests, which stay those of earlier versions."""
-    old = {f.name for f in dataclasses.fields(options) if f.metadata.get("later")}
-    return {
-        name: value
-        for name, value in dataclasses.asdict(options).items()
-        if name not in old or value != type(options).__dataclass_fields__[name].default
-    }

@@ -1,14 +1,9 @@
 """The frozen autoencoder: z = E(x), x_hat = D(z) (paper section 2).
 
-:class:`Autoencoder` is one of two kinds of diffusers models, in their own folder format or from a
-file of latent diffusion (:mod:`palpate.diffusion.compvis`):
-
-- ``VQModel`` (e.g. ``vq-f4``): *encode* gives the latents before quantization, *decode* quantizes
-  first: the semantics of latent diffusion's ``VQModelInterface``. Its ``scaling_factor`` is not
-  used, as there.
-- ``AutoencoderKL`` (e.g. Stable Diffusion's ``kl-f8``): *encode* gives the mode of the posterior,
-  ``z = scaling_factor (mode - shift_factor)``, as Stable Diffusion's denoiser sees it; *decode*
-  inverts this.
+:class:`Autoencoder` is a ``VQModel`` of diffusers (e.g. ``vq-f4``), in its own folder format or
+from a file of latent diffusion (:mod:`palpate.diffusion.compvis`): *encode* gives the latents
+before quantization, *decode* quantizes first: the semantics of latent diffusion's
+``VQModelInterface``. Its ``scaling_factor`` is not used, as there.
 
 :class:`BackgroundAutoencoder` is ours: it is given the gel without contact, and codes the rest.
 
@@ -27,12 +22,11 @@ import logging
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any, Literal, cast
+from typing import Any, Literal
 
 import numpy as np
 import torch
 from diffusers.configuration_utils import ConfigMixin, register_to_config
-from diffusers.models.autoencoders.autoencoder_kl import AutoencoderKL
 from diffusers.models.autoencoders.vq_model import VQModel
 from diffusers.models.modeling_utils import ModelMixin
 from diffusers.utils import logging as diffusers_logging
@@ -62,16 +56,15 @@ FIX = (
     "weights, or a hub id within reach"
 )
 FILES = (".ckpt", ".safetensors")
-KINDS: dict[str, Any] = {"VQModel": VQModel, "AutoencoderKL": AutoencoderKL}
 #: Where the autoencoder lies in the folders of whole generators.
-WITHIN = ("vae", "vqvae", "autoencoder")
+WITHIN = ("vqvae", "autoencoder")
 
 # diffusers announces its fallbacks (no accelerate here) at each load.
 diffusers_logging.set_verbosity(logging.ERROR)
 
 
 class Autoencoder(nn.Module):
-    """A VQModel or AutoencoderKL with an optional patch stem.
+    """A VQModel with an optional patch stem.
 
     Attributes:
         net: the diffusers model.
@@ -79,9 +72,7 @@ class Autoencoder(nn.Module):
         card: JSON facts about how it was trained and how well it reconstructs.
     """
 
-    def __init__(
-        self, net: VQModel | AutoencoderKL, patch: int = 1, card: dict[str, Any] | None = None
-    ) -> None:
+    def __init__(self, net: VQModel, patch: int = 1, card: dict[str, Any] | None = None) -> None:
         super().__init__()
         self.net, self.patch, self.card = net, patch, card or {}
         channels = (net.config["in_channels"], net.config["out_channels"])
@@ -99,13 +90,12 @@ class Autoencoder(nn.Module):
     def channels(self) -> int:
         """Channels of the latents."""
         config = self.net.config
-        return int(config.get("vq_embed_dim") or config["latent_channels"])
+        return int(config["vq_embed_dim"] or config["latent_channels"])
 
     @property
-    def codebook(self) -> int | None:
-        """Entries of the codebook; None without one."""
-        size = self.net.config.get("num_vq_embeddings")
-        return None if size is None else int(size)
+    def codebook(self) -> int:
+        """Entries of the codebook."""
+        return int(self.net.config["num_vq_embeddings"])
 
     @property
     def digest(self) -> str:
@@ -115,34 +105,17 @@ class Autoencoder(nn.Module):
 
     def latents(self, unit: Tensor) -> Tensor:
         """Encode images (n, 3, h, w) in [-1, 1] to unquantized latents (n, c, h / f, w / f)."""
-        encoded: Any = self.net.encode(pixel_unshuffle(unit, self.patch), return_dict=False)[0]
-        if isinstance(self.net, VQModel):
-            return cast("Tensor", encoded)
-        scale, shift = self._scale
-        return scale * (encoded.mode() - shift)
+        encoded: Any = self.net.encode(pixel_unshuffle(unit, self.patch), return_dict=False)
+        return encoded[0]
 
     def image(self, latents: Tensor, *, quantize: bool = True) -> tuple[Tensor, Tensor]:
-        """Decode latents to images (n, 3, h, w) near [-1, 1]; return them and the codebook loss.
-
-        Without a codebook the loss is 0 and ``quantize`` has no meaning.
-        """
+        """Decode latents to images (n, 3, h, w) near [-1, 1]; return them and the codebook loss."""
         decode: Any = self.net.decode
-        if isinstance(self.net, VQModel):
-            made, loss = decode(latents, force_not_quantize=not quantize, return_dict=False)
-        else:
-            scale, shift = self._scale
-            (made,), loss = decode(latents / scale + shift, return_dict=False), torch.zeros(())
+        made, loss = decode(latents, force_not_quantize=not quantize, return_dict=False)
         return pixel_shuffle(made, self.patch), loss
 
-    @property
-    def _scale(self) -> tuple[float, float]:
-        """Factor and shift of the latents of a KL autoencoder."""
-        return self.net.config["scaling_factor"], self.net.config.get("shift_factor") or 0.0
-
-    def codes(self, latents: Tensor) -> Tensor | None:
-        """Return the index of the nearest code at each position, int64 (n, h, w), if any."""
-        if not isinstance(self.net, VQModel):
-            return None
+    def codes(self, latents: Tensor) -> Tensor:
+        """Return the index of the nearest code at each position, int64 (n, h, w)."""
         _, _, (_, _, index) = self.net.quantize(latents)
         return index.reshape(latents.shape[0], *latents.shape[2:])
 
@@ -169,7 +142,7 @@ class Autoencoder(nn.Module):
 
     @torch.no_grad()
     def decode(self, latents: Tensor, batch: int = 32) -> NDArray[np.uint8]:
-        """Latents (n, c, h, w), quantized first if it has codes -> bytes (n, f h, f w, 3)."""
+        """Latents (n, c, h, w), quantized first -> bytes (n, f h, f w, 3)."""
         device = next(self.parameters()).device
         height, width = (self.factor * side for side in latents.shape[2:])
         parts = [np.empty((0, height, width, 3), np.uint8)]
@@ -202,8 +175,8 @@ class Autoencoder(nn.Module):
     def load(cls, source: str | Path) -> Autoencoder:
         """Load a shipped autoencoder (``palpate/mini``), a folder, a hub id, or a file.
 
-        A folder (a hub id) is that of a VQModel or AutoencoderKL, or holds one as ``vae``,
-        ``vqvae`` or ``autoencoder``; safetensors are preferred, an old ``.bin`` is read as weights
+        A folder (a hub id) is that of a VQModel, or holds one as ``vqvae`` or ``autoencoder``;
+        safetensors are preferred, an old ``.bin`` is read as weights
         only. For a file see :func:`~palpate.diffusion.compvis.read_compvis`. Weights are float32 in
         memory.
 
@@ -224,11 +197,11 @@ class Autoencoder(nn.Module):
         config = folder / "config.json"
         about = read_json(config, "configuration of a model") if config.is_file() else {}
         kind = about.get("_class_name") if isinstance(about, dict) else None
-        must = f"The autoencoder {source} must be a diffusers {' or '.join(KINDS)}"
-        if kind not in KINDS:
+        must = f"The autoencoder {source} must be a diffusers VQModel"
+        if kind != "VQModel":
             raise PalpateError(must, f"{kind or 'no'} model in {config.name}", FIX)
         options = {"low_cpu_mem_usage": False, "local_files_only": name == str(root)}
-        net = load_model(KINDS[kind], name, must, FIX, subfolder=inside or None, **options)
+        net = load_model(VQModel, name, must, FIX, subfolder=inside or None, **options)
         note = folder / "palpate.json"
         if not note.is_file():
             called = str(source) if is_hub_id(source) else root.resolve().name

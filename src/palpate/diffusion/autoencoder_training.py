@@ -21,7 +21,6 @@ import copy
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import cast
 
 import numpy as np
 import torch
@@ -207,7 +206,6 @@ def _set_codebook(
     chosen = np.sort(rng.choice(len(images), size=min(len(images), count), replace=False))
     latents = model.encode(images[chosen]).permute(0, 2, 3, 1).reshape(-1, model.channels)
     centers = k_means(latents.double().numpy(), options.codes, rng)
-    assert isinstance(model.net, VQModel)
     model.net.quantize.embedding.weight.data.copy_(torch.from_numpy(centers))
 
 
@@ -248,19 +246,13 @@ class Reconstruction:
         psnr: mean over images of 10 log10(1 / MSE), values in [0, 1].
         ssim: mean structural similarity (Wang et al. 2004: Gaussian window of 11, sigma 1.5, range
             1).
-        psnr_free: ``psnr`` without quantization; this and the next three are None without codes.
-        perplexity: exp of the entropy of the codes used; at most the number of codes.
-        dead: codes never used on these images.
-        codes: entries of the codebook.
+        perplexity: exp of the entropy of the codes used, at most their number; None without codes.
     """
 
     n: int
     psnr: float
     ssim: float
-    psnr_free: float | None = None
     perplexity: float | None = None
-    dead: int | None = None
-    codes: int | None = None
 
 
 @torch.no_grad()
@@ -274,8 +266,8 @@ def measure_reconstruction(
 
     ``background`` holds the gel of each image, for an autoencoder that is given them.
     """
-    codes = autoencoder.codebook if isinstance(autoencoder, Autoencoder) else None
-    counts = np.zeros(codes or 0, dtype=np.int64)
+    vq = autoencoder if isinstance(autoencoder, Autoencoder) else None
+    counts = np.zeros(vq.codebook if vq else 0, dtype=np.int64)
     rows: list[NDArray[np.float64]] = []
     for start in range(0, len(images), batch):
         part = slice(start, start + batch)
@@ -285,16 +277,13 @@ def measure_reconstruction(
         # Rounded to bytes first: what is scored is the image that a user gets.
         made = autoencoder.decode(z, *gels, batch=batch)
         scored = [per_image("PSNR", made, pixels), per_image("SSIM", made, pixels)]
-        if codes is not None and isinstance(autoencoder, Autoencoder):
-            z = z.to(next(autoencoder.parameters()).device)
-            free = to_bytes(autoencoder.image(z, quantize=False)[0])
-            scored.append(per_image("PSNR", free, pixels))
-            index = cast("Tensor", autoencoder.codes(z))
-            counts += np.bincount(index.flatten().cpu().numpy(), minlength=codes)
+        if vq is not None:
+            index = vq.codes(z.to(next(vq.parameters()).device)).flatten()
+            counts += np.bincount(index.cpu().numpy(), minlength=len(counts))
         rows.append(np.stack([score.values for score in scored]))
-    psnr, ssim, *free = map(float, np.concatenate(rows, axis=1).mean(axis=1))
-    if codes is None:
+    psnr, ssim = map(float, np.concatenate(rows, axis=1).mean(axis=1))
+    if vq is None:
         return Reconstruction(len(images), psnr, ssim)
     share = counts[counts > 0] / counts.sum()
-    perplexity, dead = float(np.exp(-(share * np.log(share)).sum())), int((counts == 0).sum())
-    return Reconstruction(len(images), psnr, ssim, free[0], perplexity, dead, codes)
+    perplexity = float(np.exp(-(share * np.log(share)).sum()))
+    return Reconstruction(len(images), psnr, ssim, perplexity)

@@ -1,4 +1,4 @@
-"""Autoencoders in one file, by the names of latent diffusion (CompVis): ``vq-f4``, ``kl-f8`` ...
+"""VQ autoencoders in one file, by the names of latent diffusion (CompVis): ``vq-f4`` ...
 
 =================================  ===============================================
 in the file                        diffusers
@@ -12,7 +12,7 @@ in the file                        diffusers
 =================================  ===============================================
 
 ``quant_conv``, ``post_quant_conv`` and ``quantize.embedding`` are the same. In a whole latent
-diffusion or Stable Diffusion checkpoint the names begin with ``first_stage_model.``, and all others
+diffusion checkpoint the names begin with ``first_stage_model.``, and all others
 are left. So are ``loss.`` (discriminator and LPIPS) and ``model_ema.``.
 
 The geometry is read off the shapes, the number of groups of all normalizations is 32, as in all of
@@ -27,7 +27,6 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from diffusers.models.autoencoders.autoencoder_kl import AutoencoderKL
 from diffusers.models.autoencoders.vq_model import VQModel
 from torch import Tensor
 
@@ -60,11 +59,8 @@ _NAMES = (
 )
 
 
-def read_compvis(path: Path) -> VQModel | AutoencoderKL:
-    """Read an autoencoder of latent diffusion; weights are float32, without gradients.
-
-    The scale of the latents of a KL autoencoder is no weight: it is ``scale_factor`` where the file
-    has it, else 0.18215, Stable Diffusion's.
+def read_compvis(path: Path) -> VQModel:
+    """Read a VQ autoencoder of latent diffusion; weights are float32, without gradients.
 
     Raises:
         PalpateError: if the file is unreadable, holds more than weights, or not exactly one such
@@ -73,15 +69,13 @@ def read_compvis(path: Path) -> VQModel | AutoencoderKL:
     whole = read_weights(path, FIX_PICKLE)
     inner = {k.removeprefix(PREFIX): v for k, v in whole.items() if k.startswith(PREFIX)}
     state = {k: v for k, v in (inner or whole).items() if not k.startswith(LEFT)}
-    kind, config = _geometry(path, state)
-    if kind is AutoencoderKL and inner and "scale_factor" in whole:
-        config["scaling_factor"] = float(whole["scale_factor"])
+    config = _geometry(path, state)
     with torch.device("meta"):
-        model = kind(**config)
+        model = VQModel(**config)
     levels = len(config["block_out_channels"])
     needed = {_name(k, levels): (k, tuple(v.shape)) for k, v in model.state_dict().items()}
     shapes = {name: _shape(name, value) for name, value in state.items()}
-    _require_equal(path, kind.__name__, {k: s for k, (_, s) in needed.items()}, shapes)
+    _require_equal(path, {k: s for k, (_, s) in needed.items()}, shapes)
     weights = {
         ours: state[theirs].reshape(shape).to(torch.float32, copy=True)
         for theirs, (ours, shape) in needed.items()
@@ -90,12 +84,12 @@ def read_compvis(path: Path) -> VQModel | AutoencoderKL:
     return model.eval().requires_grad_(False)
 
 
-def _geometry(path: Path, state: Mapping[str, Tensor]) -> tuple[Any, dict[str, Any]]:
-    """The class of the model and the options that make it."""
+def _geometry(path: Path, state: Mapping[str, Tensor]) -> dict[str, Any]:
+    """The options that make the model."""
 
     def size(name: str, axis: int) -> int:
         if name not in state or state[name].ndim <= axis:
-            must = f"{path} must be an autoencoder of latent diffusion"
+            must = f"{path} must be a VQ autoencoder of latent diffusion"
             theirs = any(".down_blocks." in other for other in state)
             fix = "Pass the folder with its config.json" if theirs else FIX
             raise PalpateError(must, f"no weight {name}", fix)
@@ -104,32 +98,28 @@ def _geometry(path: Path, state: Mapping[str, Tensor]) -> tuple[Any, dict[str, A
     def count(pattern: str) -> int:
         return len({m[1] for name in state if (m := re.match(pattern, name))})
 
-    first = size("encoder.conv_in.weight", 1)
     levels = max(1, count(r"encoder\.down\.(\d+)\."))
     widths = [size(f"encoder.down.{i}.block.0.conv1.weight", 0) for i in range(levels)]
     if any(width % GROUPS for width in widths):
         must = f"{path} must have levels whose widths are multiples of {GROUPS}"
         raise PalpateError(must, ", ".join(map(str, widths)), FIX)
-    # What the decoder's first convolution reads are the latents, before `post_quant_conv`.
-    channels = size("decoder.conv_in.weight", 1)
     attends = [f"encoder.down.{i}.attn.0.q.weight" in state for i in range(levels)]
     back = [f"decoder.up.{i}.attn.0.q.weight" in state for i in reversed(range(levels))]
-    config: dict[str, Any] = {
-        "in_channels": first,
+    book = "quantize.embedding.weight"
+    return {
+        "in_channels": size("encoder.conv_in.weight", 1),
         "out_channels": size("decoder.conv_out.weight", 0),
         "down_block_types": tuple(f"{'Attn' * a}DownEncoderBlock2D" for a in attends),
         "up_block_types": tuple(f"{'Attn' * a}UpDecoderBlock2D" for a in back),
         "block_out_channels": tuple(widths),
         "layers_per_block": count(r"encoder\.down\.0\.block\.(\d+)\."),
-        "latent_channels": channels,
+        # What the decoder's first convolution reads are the latents, before `post_quant_conv`.
+        "latent_channels": size("decoder.conv_in.weight", 1),
         "norm_num_groups": GROUPS,
         "mid_block_add_attention": any(".mid.attn_1." in name for name in state),
+        "num_vq_embeddings": size(book, 0),
+        "vq_embed_dim": size(book, 1),
     }
-    if size("encoder.conv_out.weight", 0) == 2 * channels:  # mean and log variance
-        return AutoencoderKL, config
-    book = "quantize.embedding.weight"
-    book_size = {"num_vq_embeddings": size(book, 0), "vq_embed_dim": size(book, 1)}
-    return VQModel, config | book_size
 
 
 def _name(ours: str, levels: int) -> str:
@@ -148,10 +138,7 @@ def _shape(name: str, value: Tensor) -> tuple[int, ...]:
 
 
 def _require_equal(
-    path: Path,
-    kind: str,
-    needed: Mapping[str, tuple[int, ...]],
-    shapes: Mapping[str, tuple[int, ...]],
+    path: Path, needed: Mapping[str, tuple[int, ...]], shapes: Mapping[str, tuple[int, ...]]
 ) -> None:
     """Raise unless names and shapes agree."""
     both = [name for name in needed if name in shapes]
@@ -168,5 +155,5 @@ def _require_equal(
         f"{len(names)} {what}: {', '.join(names[:SHOWN])}" for what, names in kinds.items() if names
     ]
     if problems:
-        must = f"{path} must hold the weights of one {kind} and no other"
+        must = f"{path} must hold the weights of one VQModel and no other"
         raise PalpateError(must, "; ".join(problems), FIX)

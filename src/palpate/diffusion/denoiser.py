@@ -3,17 +3,17 @@
 The condition is one *projected* embedding c of the shared space, so that text and vision embeddings
 fit into the same slot (paper section 2; section 9, "token type"):
 
-    token = sqrt(d) * (c - m_source) / ||c - m_source||,   repeated k times
+    token = sqrt(d) * (c - m_source) / ||c - m_source||
 
 with m_source = 0 (``gap="none"``, the paper's reading) or the mean of that modality on the train
-part (``"mean-shift"``, which closes the constant part of the gap between text and vision
-embeddings). ``"memory"`` also keeps the training texts, and projects a photo that takes the place
-of a text on them; ``"pairs"`` finds them by the photos that they were given for. The unconditional
-token of classifier-free guidance is all zeros, or learned. All of this is part of the checkpoint.
+part (``"pairs"``, which closes the constant part of the gap between text and vision embeddings).
+``"pairs"`` also keeps the training texts and the photos that they were given for, and gives a photo
+in the place of a text by the texts of the training photos near it. The unconditional token of
+classifier-free guidance is all zeros. All of this is part of the checkpoint.
 
-The words of a text and the patches of a photo may follow as tokens, through a trained matrix. The
-baseline GVST (``source="resnet"``) has no embedding: its tokens are the map that a residual
-network, part of the denoiser, makes of the photo.
+The patches of a photo may follow as tokens, through a trained matrix. The baseline GVST
+(``source="resnet"``) has no embedding: its tokens are the map that a residual network, part of the
+denoiser, makes of the photo.
 
 With ``UNetOptions.modulate`` the token is also added, through two layers, to the embedding of the
 time step, which shifts every residual block. That is not in the paper; a small network trains
@@ -46,8 +46,10 @@ from palpate.encoders.models import (
     save_model,
 )
 
-#: What a memory consists of: training texts, and the mean photo of each.
+#: What ``pairs`` remembers: training texts, and the mean photo of each.
 MEMORY = ("memory", "keys")
+#: Temperature of its weights.
+TAU = 0.02
 FIX_UNET = "Pass a folder or hub id, e.g. of Stable Diffusion 1.5"
 
 
@@ -85,25 +87,17 @@ def slots_of(policy: ConditionPolicy) -> int:
     return {"both": 2, "resnet": 0}.get(policy.source, 1)
 
 
-def repeats_of(policy: ConditionPolicy) -> int:
-    """Copies of an embedding that go into the denoiser: k, or one that k are made of."""
-    return 1 if policy.learned else policy.tokens
-
-
 def inputs_of(policy: ConditionPolicy) -> tuple[str, ...]:
-    """What else tokens are made of: ``photos``, or ``words`` and ``patches``."""
+    """What else tokens are made of: the ``photos``, or their ``patches``."""
     if policy.source == "resnet":
         return ("photos",)
-    counts = {"words": (policy.words, "text"), "patches": (policy.patches, "vision")}
-    known = {name: policy.source in ("mixed", "both", s) for name, (_, s) in counts.items()}
-    return tuple(name for name, (count, _) in counts.items() if count and known[name])
+    return ("patches",) if policy.patches and "vision" in policy.sources else ()
 
 
 def lengths_of(policy: ConditionPolicy) -> tuple[int, ...]:
     """Tokens of each embedding, then of each input."""
-    tokens = {"photos": PHOTO_TOKENS, "words": policy.words, "patches": policy.patches}
-    each = tuple(tokens[name] for name in inputs_of(policy))
-    return (repeats_of(policy),) * slots_of(policy) + each
+    tokens = {"photos": PHOTO_TOKENS, "patches": policy.patches}
+    return (1,) * slots_of(policy) + tuple(tokens[name] for name in inputs_of(policy))
 
 
 def find_unet(source: str | Path) -> tuple[str, Path, str]:
@@ -181,15 +175,6 @@ class PhotoMap(nn.Module):
         return self.norm(self.net(x).flatten(2).transpose(1, 2))
 
 
-def _state_map(name: str, width: int, out: int) -> nn.Module:
-    """Map states to tokens; those of words begin as they are, as pretrained networks know them."""
-    linear = nn.Linear(width, out)
-    if width == out:
-        nn.init.eye_(linear.weight)
-        nn.init.zeros_(linear.bias)
-    return nn.Sequential(nn.LayerNorm(width) if name == "patches" else nn.Identity(), linear)
-
-
 class Denoiser(nn.Module):
     """U-Net, condition policy, and what makes tokens of a sample's condition.
 
@@ -208,8 +193,8 @@ class Denoiser(nn.Module):
         unet: UNet2DConditionModel,
         policy: ConditionPolicy,
         means: Mapping[Source, Tensor] | None = None,
-        memory: tuple[Tensor, Tensor | None] | None = None,
-        widths: Mapping[str, int] | None = None,
+        memory: tuple[Tensor, Tensor] | None = None,
+        patch_width: int | None = None,
     ) -> None:
         """Take what the policy's ``gap`` needs.
 
@@ -217,38 +202,33 @@ class Denoiser(nn.Module):
             unet: the network.
             policy: how embeddings become tokens.
             means: the training mean (d,) of each source.
-            memory: embeddings (m, d) of the different training texts, and of ``gap="pairs"`` the
+            memory: of ``gap="pairs"``: embeddings (m, d) of the different training texts, and the
                 mean of the photos of each (m, d).
-            widths: of the states of words and patches; default: that of the embeddings.
+            patch_width: of the states of patches; default: that of the embeddings.
         """
         super().__init__()
-        self.unet, self.policy = unet, policy
-        self.slots, self.repeats = slots_of(policy), repeats_of(policy)
+        self.unet, self.policy, self.slots = unet, policy, slots_of(policy)
         self.background = unet.config["in_channels"] > unet.config["out_channels"]
+        self.pairs = policy.gap == "pairs"
         # A source without a mean is marked by NaN, and raises when it is used.
-        fill = 0.0 if policy.gap == "none" else float("nan")
-        known = means if means is not None and policy.gap != "none" else {}
-        rows = [known.get(s, torch.full((policy.width,), fill)).float() for s in SOURCES]
-        self.register_buffer("means", torch.stack(rows))
-        learned = policy.null == "learned"
-        self.null = nn.Parameter(0.02 * torch.randn(policy.width)) if learned else None
-        self.expand = (
-            nn.Linear(policy.width, policy.tokens * policy.width)
-            if policy.learned and slots_of(policy)
-            else None
-        )
-        self.guide: Any = None  # an alignment, in training alone
+        fill = torch.full((policy.width,), float("nan") if self.pairs else 0.0)
+        known = means if means is not None and self.pairs else {}
+        self.register_buffer("means", torch.stack([known.get(s, fill).float() for s in SOURCES]))
         self.maps = nn.ModuleDict()
-        for name in inputs_of(policy):
-            width = (widths or {}).get(name, policy.width)
-            photos = name == "photos"
-            self.maps[name] = PhotoMap(policy) if photos else _state_map(name, width, policy.width)
-        self.recalls = {"memory": MEMORY[:1], "pairs": MEMORY}.get(policy.gap, ())
-        kept = memory or (None, None)
-        for name, source, rows in zip(MEMORY, ("text", "vision"), kept, strict=True):
-            if name in self.recalls:
-                empty = torch.zeros(1, policy.width)  # until load() fills it
-                self.register_buffer(name, empty if rows is None else self._unit(rows, source))
+        if "photos" in inputs_of(policy):
+            self.maps["photos"] = PhotoMap(policy)
+        if "patches" in inputs_of(policy):
+            width = patch_width or policy.width
+            parts = nn.LayerNorm(width), nn.Linear(width, policy.width)
+            self.maps["patches"] = nn.Sequential(*parts)
+        if self.pairs:
+            texts, photos = memory or (None, None)
+            self.register_buffer("memory", self._remembered(texts, "text"))
+            self.register_buffer("keys", self._remembered(photos, "vision"))
+
+    def _remembered(self, rows: Tensor | None, source: Source) -> Tensor:
+        """Unit embeddings (m, d); until load() fills it, one of zeros."""
+        return torch.zeros(1, self.policy.width) if rows is None else self._unit(rows, source)
 
     @property
     def channels(self) -> int:
@@ -266,26 +246,22 @@ class Denoiser(nn.Module):
         return next(self.unet.parameters()).dtype
 
     def tokens(self, conditions: Tensor, source: Source) -> Tensor:
-        """Embeddings (n, d) of one source -> tokens (n, k, d) of one slot.
+        """Embeddings (n, d) of one source -> tokens (n, 1, d) in its own place.
 
         Raises:
             PalpateError: for another width, or a source whose training mean is unknown.
         """
-        unit = self._unit(conditions.to(self.device), source)
-        if source == "vision" and self.recalls and self.slots == 1:
-            unit, _ = self.recall(unit)
-        return self._repeated(unit)
+        return self._token(self._unit(conditions.to(self.device), source))
 
     def condition(
         self, photos: Tensor | None, texts: Tensor | None = None, weight: float = 0.5
     ) -> Tensor:
-        """The tokens (n, slots k, d) of samples described by photos, by texts, or by both.
+        """The tokens (n, k, d) of samples described by photos, by texts, or by both.
 
         Args:
             photos: embeddings (n, d), with tokens of their patches (n, 1 + p, d), of GVST tokens
                 (n, 64, d), or None.
-            texts: embeddings (n, d), with tokens of their words (n, 1 + w, d), or None; at least
-                one of the two.
+            texts: embeddings (n, d), or None; at least one of the two.
             weight: with both, the share of the photo where the two take one place.
 
         Raises:
@@ -293,33 +269,27 @@ class Denoiser(nn.Module):
         """
         if "photos" in self.maps:
             return self._map(photos, texts)
-        photo, of_photo = self._split(photos, "vision")
-        text, of_text = self._split(texts, "text")
+        photo = patches = text = None
+        if photos is not None:
+            photos = photos.to(self.device)
+            if photos.ndim == 3:
+                photos, patches = photos[:, 0], photos[:, 1:]
+            photo = self._unit(photos, "vision")
+        if texts is not None:
+            text = self._unit(texts.to(self.device), "text")
         place = photo if self.slots == 1 else None  # of two slots the photo has its own
-        if photo is not None and self.recalls:
+        if photo is not None and self.pairs:
             place, photo = self.recall(photo)
         if text is not None:
             mixed = text if place is None else weight * place + (1 - weight) * text
             place = nn.functional.normalize(mixed, dim=1)
-        null = self.null_tokens(1)
-        slots = (place,) if self.slots == 1 else (place, photo)
         n = len(next(e for e in (photo, text) if e is not None))
-        parts = [None if e is None else self._repeated(e) for e in slots]
-        parts += [{"words": of_text, "patches": of_photo}[name] for name in inputs_of(self.policy)]
+        slots = (place,) if self.slots == 1 else (place, photo)
+        parts = [None if e is None else self._token(e) for e in slots]
+        parts += [patches for _ in inputs_of(self.policy)]
+        null = self.null_tokens(n)
         lengths = zip(parts, lengths_of(self.policy), strict=True)
-        given = [null[:, :k].expand(n, -1, -1) if p is None else p for p, k in lengths]
-        return torch.cat(given, dim=1)
-
-    def _split(
-        self, conditions: Tensor | None, source: Source
-    ) -> tuple[Tensor | None, Tensor | None]:
-        """Unit embeddings (n, d), and the tokens behind them if there are any."""
-        if conditions is None:
-            return None, None
-        conditions = conditions.to(self.device)
-        if conditions.ndim == 2:
-            return self._unit(conditions, source), None
-        return self._unit(conditions[:, 0], source), conditions[:, 1:]
+        return torch.cat([null[:, :k] if p is None else p for p, k in lengths], dim=1)
 
     def _map(self, photos: Tensor | None, texts: Tensor | None) -> Tensor:
         shape = (PHOTO_TOKENS, self.policy.width)
@@ -332,19 +302,12 @@ class Denoiser(nn.Module):
         return photos.to(self.device)
 
     def recall(self, photos: Tensor) -> tuple[Tensor, Tensor]:
-        """What the memory knows of photos, as unit embeddings (n, d).
-
-        Of ``memory``: the mean of the training texts nearest to each photo, and the photo itself.
-        Of ``pairs``: the means of the texts, and of the photos, of the training photos nearest to
-        it.
-        """
-        paired = self.policy.gap == "pairs"
-        keys = self.keys if paired else self.memory
+        """Means of texts and of photos, near these in training, as unit embeddings (n, d)."""
         texts, near = [], []
         for rows in photos.split(1024):
-            weights = torch.softmax(rows @ keys.T / self.policy.tau, dim=1)
+            weights = torch.softmax(rows @ self.keys.T / TAU, dim=1)
             texts.append(weights @ self.memory)
-            near.append(weights @ keys if paired else rows)
+            near.append(weights @ self.keys)
         unit = nn.functional.normalize
         return unit(torch.cat(texts), dim=1), unit(torch.cat(near), dim=1)
 
@@ -361,21 +324,18 @@ class Denoiser(nn.Module):
             raise PalpateError(must, "a checkpoint without it", fix)
         return nn.functional.normalize(conditions.float() - mean.to(conditions.device), dim=1)
 
-    def _repeated(self, unit: Tensor) -> Tensor:
-        token = unit * self.policy.width**0.5
-        return token.unsqueeze(1).expand(-1, self.repeats, -1)
+    def _token(self, unit: Tensor) -> Tensor:
+        return (unit * self.policy.width**0.5).unsqueeze(1)
 
     def null_tokens(self, n: int) -> Tensor:
-        """The unconditional tokens (n, k, d): of all embeddings and inputs."""
+        """The unconditional tokens (n, k, d), zeros: of all embeddings and inputs."""
         shape = (n, sum(lengths_of(self.policy)), self.policy.width)
-        return (
-            torch.zeros(shape, device=self.device) if self.null is None else self.null.expand(shape)
-        )
+        return torch.zeros(shape, device=self.device)
 
     def forward(
         self, x: Tensor, t: Tensor, tokens: Tensor, background: Tensor | None = None
     ) -> Tensor:
-        """The network's output (n, c, h, w): noise, v or velocity, as the schedule says.
+        """The network's output (n, c, h, w): noise or velocity, as the schedule says.
 
         Args:
             x: noisy normalized latents (n, c, h, w).
@@ -385,13 +345,9 @@ class Denoiser(nn.Module):
         """
         x = x if background is None else torch.cat([x, background], dim=1)
         first = None
-        vectors, states = tokens.tensor_split([self.slots * self.repeats], dim=1)
         if self.unet.config["class_embed_type"] == "projection":
-            first = vectors[:, :: self.repeats] if self.slots else states.mean(1, keepdim=True)
-            first = first.flatten(1)
-        if self.expand is not None:
-            vectors = self.expand(vectors).reshape(len(x), -1, self.policy.width)
-            tokens = torch.cat([vectors, states], dim=1)
+            vectors = tokens[:, : self.slots] if self.slots else tokens.mean(1, keepdim=True)
+            first = vectors.flatten(1)
         kind = self.dtype
         options: Any = {"encoder_hidden_states": tokens.to(kind)}
         options["class_labels"] = None if first is None else first.to(kind)
@@ -404,7 +360,7 @@ class Denoiser(nn.Module):
         return round_to_half({"unet": self.unet})
 
     def save(self, folder: Path, *, half: bool = False) -> None:
-        """Write the U-Net and ``condition.safetensors`` (means, memory, learned parts).
+        """Write the U-Net and ``condition.safetensors`` (means, memory, trained maps).
 
         With ``half``, :meth:`halve` first (this object too), and the U-Net's weights and the memory
         are 16-bit; the few others stay float32.
@@ -431,9 +387,9 @@ class Denoiser(nn.Module):
         require_regular(Path(folder) / "condition.safetensors")
         try:
             extra = load_file(Path(folder) / "condition.safetensors")
-            states = [name for name in inputs_of(policy) if name != "photos"]
-            widths = {name: extra[f"maps.{name}.1.weight"].shape[1] for name in states}
-            model = cls(unet, policy, widths=widths)
+            patches = "patches" in inputs_of(policy)
+            width = extra["maps.patches.1.weight"].shape[1] if patches else None
+            model = cls(unet, policy, patch_width=width)
             wanted = {k for k in model.state_dict() if not k.startswith("unet.")}
             if wanted != set(extra):
                 raise KeyError(f"other entries than {', '.join(sorted(wanted))}")

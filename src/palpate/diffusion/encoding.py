@@ -1,4 +1,4 @@
-"""Latents and states of a data set, encoded once into memory maps that training reads."""
+"""Latents and patches of a data set, encoded once into memory maps that training reads."""
 
 from __future__ import annotations
 
@@ -9,21 +9,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from palpate.core import (
-    Progress,
-    atomic_path,
-    digest_json,
-    digest_lines,
-    quiet,
-    read_json,
-    short,
-    write_json,
-)
+from palpate.core import Progress, atomic_path, digest_json, quiet, read_json, short, write_json
 from palpate.data.images import image_stamp
 from palpate.data.manifest import Manifest
 from palpate.diffusion.autoencoder import AnyAutoencoder
-from palpate.encoders.embed import exact, texts_of
-from palpate.encoders.encoder_set import EncoderSet, Modality
+from palpate.encoders.embed import exact
+from palpate.encoders.encoder_set import EncoderSet
 from palpate.encoders.preprocess import prepared_images, to_unit
 
 CACHE_FORMAT = "palpate-latents/1"
@@ -65,39 +56,26 @@ def encode_latents(
     return _mapped(folder / "latents", about, code, **how)
 
 
-def encode_states(
-    part: Manifest,
-    encoders: EncoderSet,
-    modality: Modality,
-    count: int,
-    *,
-    folder: Path,
-    column: str | None = None,
-    progress: Progress = quiet,
+def encode_patches(
+    part: Manifest, encoders: EncoderSet, count: int, *, folder: Path, progress: Progress = quiet
 ) -> NDArray[np.float16]:
-    """States of an encoder's last layer (see ``EncoderSet.states``), as a read-only memory map.
-
-    ``column`` has the images; by default that of the modality.
+    """States of the photos' patches (see ``ClipEncoders.patches``), as a read-only memory map.
 
     Returns:
         float16 (n, count, width).
     """
-    texts = texts_of(part)[0] if modality == "text" else []
-    column = column or modality
-    stamp = digest_lines(texts) if texts else image_stamp(part, column)
-    preprocess = None if texts else encoders.preprocess(modality)
-    images = None if preprocess is None else prepared_images(part, column, preprocess, folder)
+    preprocess = encoders.preprocess("vision")
+    images = prepared_images(part, "vision", preprocess, folder)
 
     def code(rows: slice) -> NDArray[np.float16]:
-        batch: Any = texts[rows]
-        if preprocess is not None and images is not None:
-            batch = preprocess(to_unit(images[rows], encoders.device))
         with exact():
-            return encoders.states(modality, batch, count).half().cpu().numpy()
+            pixels = preprocess(to_unit(images[rows], encoders.device))
+            return encoders.clip.patches(pixels, count).half().cpu().numpy()
 
-    about = {"key": digest_json([encoders.digest(modality), stamp, count]), "ids": part.ids}
-    file = folder / f"{column}-states-{short(digest_json(about))}"
-    return _mapped(file, about, code, progress=progress, what=f"encoding {modality}")
+    key = [encoders.digest("vision"), image_stamp(part, "vision"), count]
+    about = {"key": digest_json(key), "ids": part.ids}
+    file = folder / f"vision-states-{short(digest_json(about))}"
+    return _mapped(file, about, code, progress=progress, what="encoding vision")
 
 
 def _mapped(

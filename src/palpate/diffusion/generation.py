@@ -23,7 +23,7 @@ from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Se
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager, nullcontext
 from dataclasses import asdict, dataclass, field, replace
-from functools import lru_cache, partial
+from functools import lru_cache
 from itertools import chain, islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar, cast
@@ -50,7 +50,7 @@ from palpate.core import (
     short,
     write_json,
 )
-from palpate.core.digest import canonical_json, facts
+from palpate.core.digest import canonical_json
 from palpate.core.records import from_plain
 from palpate.data.images import BROKEN, SUFFIXES, VIDEOS, check_image, read_image, square
 from palpate.encoders.models import FIX_MODEL, find_model
@@ -59,10 +59,8 @@ if TYPE_CHECKING:  # torch takes seconds to import, and what is checked first ne
     from torch import Tensor
 
     from palpate.data.manifest import Manifest
-    from palpate.diffusion.choosing import Chooser
     from palpate.diffusion.options import SamplerOptions
     from palpate.diffusion.pipeline import TactilePipeline
-    from palpate.encoders.encoder_set import EncoderSet
 
 FORMAT = "palpate-generated/1"
 T = TypeVar("T")
@@ -188,8 +186,6 @@ def generate(  # noqa: PLR0913 - a public verb, step by step
     guidance: float | None = None,
     steps: int | None = None,
     batch: int | None = None,
-    best_of: int = 1,
-    best_by: EncoderSet | str | Path | None = None,
     skip_bad: bool = False,
     device: str = "auto",
     progress: Progress = quiet,
@@ -217,9 +213,6 @@ def generate(  # noqa: PLR0913 - a public verb, step by step
         guidance: scale of classifier-free guidance, 1 is none; default: the pipeline's.
         steps: of the solver; default: the pipeline's.
         batch: images at once, which they do not depend on; default: the pipeline's.
-        best_of: make so many of each, from different noise, and keep the one whose tactile
-            embedding is most similar to the condition.
-        best_by: the encoders that choose it; their tactile encoder must not score these images.
         skip_bad: list unreadable photos in the result instead of raising.
         device: ``auto``, ``cpu``, ``cuda`` or ``mps``.
         progress: called while the work goes on.
@@ -235,7 +228,7 @@ def generate(  # noqa: PLR0913 - a public verb, step by step
     _require_condition(photos, text, weight)
     options: dict[str, Any] = {"text": text, "weight": weight, "gel": gel, "seed": seed}
     options |= {"guidance": guidance, "steps": steps, "batch": batch}
-    options |= {"best_of": best_of, "best_by": best_by, "noise": noise, "progress": progress}
+    options |= {"noise": noise, "progress": progress}
     if photos is not None and in_memory(photos):
         with tempfile.TemporaryDirectory() as folder:
             options |= {"model": model, "device": device}
@@ -263,8 +256,6 @@ def prepare(  # noqa: PLR0913 - as the verb
     guidance: float | None = None,
     steps: int | None = None,
     batch: int | None = None,
-    best_of: int = 1,
-    best_by: EncoderSet | str | Path | None = None,
     skip_bad: bool = False,
     device: str = "auto",
     progress: Progress = quiet,
@@ -276,29 +267,19 @@ def prepare(  # noqa: PLR0913 - as the verb
     single = _is_single(output, paths or [Path(str(text))])
     if photos is not None and not skip_bad:
         _require_readable(paths)
-    if best_of < 1:
-        example = {"best_of": 4}
-        got = str(best_of)
-        raise PalpateError("must be at least 1", got, "", argument="best_of", example=example)
     model = loaded(model, device, progress)
     sampler = model.sampler_with(guidance=guidance, steps=steps, batch=batch)
     if single:  # not among the copies that fill a batch: a fraction of the time
         sampler = replace(sampler, batch=1)
     words = None if text is None else model.embed_text(text)
-    chooser = None
-    if best_of > 1:
-        from palpate.diffusion.choosing import Chooser
-
-        chooser = Chooser.load(best_of, best_by, model)
     settings = _settings(model, sampler, seed)
     settings |= {"text": text, "weight": None if photos is None else weight} if text else {}
     settings |= {} if noise is None else {"noise": noise}
-    settings |= {} if chooser is None else chooser.settings
     target = _Target(output, single, settings, model.notice)
     inputs = _inputs(model, manifest, table or {str(text): None}, gel)
     how: dict[str, Any] = {"weight": weight, "seed": seed, "sampler": sampler}
     notes = [*_text_notes(model, text), *_gel_notes(model, gel)]
-    return Run(model, inputs, target, words, chooser, noise, how, skip_bad, notes)
+    return Run(model, inputs, target, words, noise, how, skip_bad, notes)
 
 
 def _text_notes(model: TactilePipeline, text: str | None) -> list[Note]:
@@ -325,7 +306,6 @@ class Run:
         inputs: one an image.
         target: where the images go.
         words: embedding (1, d) of the text, or None.
-        chooser: of the best of several images, or None.
         noise: the id whose noise all have, or None.
         how: the other arguments of :meth:`TactilePipeline.sample`.
         skip_bad: whether unreadable photos are skipped.
@@ -336,7 +316,6 @@ class Run:
     inputs: Sequence[_Input]
     target: _Target
     words: Tensor | None
-    chooser: Chooser | None
     noise: str | None
     how: Mapping[str, Any]
     skip_bad: bool
@@ -382,16 +361,13 @@ class Run:
         photos = None if not rows else cast("Tensor", rows[0].new_tensor(np.stack(rows)))
         grounds = [one.ground for one in chunk if one.ground is not None]
         names = [one.item.id if self.noise is None else self.noise for one in chunk]
-        sample = partial(
-            self.model.sample,
+        return self.model.sample(
             photos,
+            names,
             texts=self.words,
             background=np.stack(grounds) if grounds else None,
             **how,
         )
-        if self.chooser is None:
-            return sample(names)
-        return self.chooser.best(sample, names, photos, self.words, how["weight"])
 
     def _require_none(self, bad: Mapping[str, Problem]) -> None:
         if bad and not self.skip_bad:
@@ -461,9 +437,6 @@ def frames_of(
     """
     from palpate.diffusion.video import save_frames
 
-    if (copies := options.get("best_of", 1)) > 1:
-        must, fix = "must be 1 for a video, whose frames share their noise", "Pass its frames"
-        raise PalpateError(must, str(copies), fix, argument="best_of")
     frames, rate = save_frames(video, folder, model.vision_size, progress)
     options["noise"] = video.name
     return frames, rate
@@ -726,17 +699,16 @@ def _require_readable(paths: Sequence[Path], argument: str = "photos") -> None:
 
 def _settings(pipeline: TactilePipeline, sampler: SamplerOptions, seed: int) -> dict[str, Any]:
     """All that an image depends on next to its photo; the batch is no part of it."""
-    other = {"scheduler": pipeline.other_scheduler, "dtype": str(pipeline.dtype)}
-    usual = {"scheduler": None, "dtype": "torch.float32"}
-    return {k: v for k, v in other.items() if v != usual[k]} | {
-        **({"guides": pipeline.guides} if pipeline.guides else {}),
+    dtype = str(pipeline.dtype)
+    return {
+        **({} if dtype == "torch.float32" else {"dtype": dtype}),
         **({"earlier_splits": pipeline.earlier_splits} if pipeline.earlier_splits else {}),
         "pipeline": pipeline.digest,
         "split": pipeline.training.get("split"),
         "preset": pipeline.preset,
         "seed": seed,
         "size": pipeline.size,
-        "sampler": {k: v for k, v in facts(sampler).items() if k != "batch"},
+        "sampler": {k: v for k, v in asdict(sampler).items() if k != "batch"},
     }
 
 

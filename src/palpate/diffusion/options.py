@@ -2,21 +2,18 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Literal
 
 if TYPE_CHECKING:
     from torch import Tensor
 
 Source = Literal["text", "vision"]
-Sources = Literal["text", "vision", "mixed", "both", "resnet"]
+Sources = Literal["text", "vision", "both", "resnet"]
 SOURCES: tuple[Source, ...] = ("text", "vision")
-Prediction = Literal["epsilon", "v_prediction", "flow"]
-Method = Literal["ddim", "dpm", "euler", "heun"]
+Method = Literal["ddim", "dpm"]
 #: Tokens of a photo: a map of 8 x 8.
 PHOTO_TOKENS = 64
-#: Of a field that models of earlier versions lack: `facts` leaves it out at its default.
-LATER = {"later": True}
 
 
 @dataclass(frozen=True)
@@ -108,92 +105,65 @@ class UNetOptions:
 
 @dataclass(frozen=True)
 class ConditionPolicy:
-    """How an embedding becomes tokens.
+    """How an embedding becomes a token.
 
     Attributes:
         width: d, length of the embeddings and of the tokens.
-        tokens: k, how often the token is repeated, or with ``learned`` how many are made of it.
-        null: the unconditional token, ``zeros`` or ``learned``.
-        gap: ``none``; ``mean-shift``: subtract the mean of the source's training embeddings;
-            ``memory``: so, and give a photo in the place of a text by its projection on the
-            training texts, the mean of these weighted by softmax(cosine / ``tau``) (DeCap, Li et
-            al., ICLR 2023); ``pairs``: as ``memory``, with the cosine to the photos of each text in
-            place of the text, and a photo in its own place by the same mean of training photos.
+        gap: ``none``; ``pairs``: subtract the mean of the source's training embeddings, and give a
+            photo in the place of a text by the texts of the training photos that are near it, the
+            mean of these weighted by softmax(cosine / 0.02), and in its own place by the same mean
+            of the photos.
         noise: standard deviation, in units of the token's typical entry, of Gaussian noise added in
             training.
         dropout: probability that training replaces the condition by the unconditional token; with
             ``both``, for each of the two on its own.
         source: what training conditions on: ``text`` (the paper), ``vision`` (the paper's baseline
-            without text), ``mixed`` (one of them for each row), ``both`` (two tokens: text, then
-            photo), ``resnet`` (that baseline as published, GVST: 8 x 8 tokens that a residual
-            network makes of the photo; it is trained with the denoiser, and no encoder is needed).
-        tau: temperature of ``memory`` and ``pairs``.
-        photo_share: with ``mixed``, the share of the rows that are conditioned on the photo.
-        learned: make the k tokens from the embedding by a trained matrix.
+            without text), ``both`` (two tokens: text, then photo), ``resnet`` (that baseline as
+            published, GVST: 8 x 8 tokens that a residual network makes of the photo; it is trained
+            with the denoiser, and no encoder is needed).
         photo_size: of ``resnet``: side of the photos in pixels, a power of 2 from 16 on.
         photo_width: of ``resnet``: channels of its first level, a multiple of 4; each further level
             halves the size and doubles them, up to eight times.
-        words: tokens that follow the embedding of a text: the states of its first words in the
-            encoder's last layer, padding included; 0: none.
-        patches: tokens that follow the embedding of a photo: the states of its patches there,
-            averaged to a square of so many; 0: none.
-        drop_states: probability that training drops these alone, so that the embedding alone is
-            known, too: of a photo in the place of a text, or of a bare vector.
+        patches: tokens that follow the embedding of a photo: the states of its patches in the
+            encoder's last layer, averaged to a square of so many; 0: none.
     """
 
     width: int
-    tokens: int = 1
-    null: Literal["zeros", "learned"] = "zeros"
-    gap: Literal["none", "mean-shift", "memory", "pairs"] = "none"
+    gap: Literal["none", "pairs"] = "none"
     noise: float = 0.0
     dropout: float = 0.1
     source: Sources = "text"
-    tau: float = field(default=0.02, metadata=LATER)
-    photo_share: float = field(default=0.5, metadata=LATER)
-    learned: bool = field(default=False, metadata=LATER)
-    photo_size: int = field(default=64, metadata=LATER)
-    photo_width: int = field(default=32, metadata=LATER)
-    words: int = field(default=0, metadata=LATER)
-    patches: int = field(default=0, metadata=LATER)
-    drop_states: float = field(default=0.5, metadata=LATER)
+    photo_size: int = 64
+    photo_width: int = 32
+    patches: int = 0
 
     @property
     def sources(self) -> tuple[Source, ...]:
         """The sources whose embeddings training needs."""
         if self.source == "resnet":
             return ()
-        return SOURCES if self.source in ("mixed", "both") else (self.source,)
-
-    @property
-    def recalls(self) -> bool:
-        """Whether a photo asks the memory of training texts."""
-        return self.gap in ("memory", "pairs")
+        return SOURCES if self.source == "both" else (self.source,)
 
 
 @dataclass(frozen=True)
 class Schedule:
     """The forward process, and what the network predicts.
 
-    ``epsilon`` (the paper) and ``v_prediction``: z_t = sqrt(a_t) z + sqrt(1 - a_t) eps.
-    ``flow``: z_t = (1 - t) z + t eps, and the network predicts eps - z (flow matching, Lipman et
-    al. 2023; Liu et al. 2023), with t = sigmoid(normal(``time_mean``, 1)) in training (Esser et al.
-    2024).
+    ``epsilon`` (the paper): z_t = sqrt(a_t) z + sqrt(1 - a_t) eps. ``flow``: z_t = (1 - t) z + t
+    eps, and the network predicts eps - z (flow matching, Lipman et al. 2023; Liu et al. 2023), with
+    t = sigmoid(normal(0.5, 1)) in training (Esser et al. 2024).
 
     Attributes:
         beta_start, beta_end: first and last beta; sqrt(beta) is linear between them
             (diffusers' ``scaled_linear``); not of ``flow``.
         steps: T; a time in [0, 1] goes into the network as T t.
         prediction: see above.
-        min_snr: g of the min-SNR weight, or None for Eq. 1's uniform weight; not of ``flow``.
-        time_mean: of ``flow``.
     """
 
     beta_start: float = 0.0015
     beta_end: float = 0.0195
     steps: int = 1000
-    prediction: Prediction = "epsilon"
-    min_snr: float | None = None
-    time_mean: float = field(default=0.5, metadata=LATER)
+    prediction: Literal["epsilon", "flow"] = "epsilon"
 
     def alphas(self) -> Tensor:
         """a_t = prod_{s<=t} (1 - beta_s) for t = 1..T as float64 (T,)."""
@@ -209,14 +179,13 @@ class SamplerOptions:
     """How to sample.
 
     Attributes:
-        method: ``dpm`` (DPM-Solver++ of order 2); ``ddim`` (eta 0) for epsilon and v; ``euler``
-            and ``heun`` for flow matching.
+        method: ``dpm`` (DPM-Solver++ of order 2), or ``ddim`` (eta 0), for epsilon alone.
         steps: network evaluations per sample (two each under guidance).
         guidance: s; 1 means none.
         batch: samples at once; results do not depend on it (up to rounding).
-        low, high: guide only at times t / T in [low, high] (Kynkaanniemi et al. 2024).
         rescale: share phi of the guidance rescaling of Lin et al. (2024), which pulls the spread of
             the guided prediction back to that of the conditional one; 0 is the plain formula.
+        high: guide only at times t / T up to this (Kynkaanniemi et al. 2024).
     """
 
     method: Method = "ddim"
@@ -224,5 +193,4 @@ class SamplerOptions:
     guidance: float = 7.5
     batch: int = 16
     rescale: float = 0.0
-    low: float = field(default=0.0, metadata=LATER)
-    high: float = field(default=1.0, metadata=LATER)
+    high: float = 1.0

@@ -13,7 +13,7 @@ image depends on (seed, id) and not on what else is generated.
 ::
 
     model_index.json  the parts and their classes, as diffusers writes them
-    unet/          the denoiser, diffusers' format, and condition.safetensors (means, learned null)
+    unet/          the denoiser, diffusers' format, and condition.safetensors (means, memory, maps)
     autoencoder/   the autoencoder, diffusers' format, and its palpate.json
     encoders/      the vision (and text) encoder whose embeddings the denoiser knows
     scheduler/     scheduler_config.json, diffusers' format: for programs that read only the parts
@@ -28,14 +28,11 @@ either case and checked on loading.
 
 from __future__ import annotations
 
-import copy
-import inspect
 import json
 import math
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import nullcontext
 from dataclasses import asdict, dataclass, field, fields, replace
-from functools import cached_property, partial
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -44,26 +41,13 @@ import torch
 from diffusers.pipelines.pipeline_utils import DiffusionPipeline
 from diffusers.schedulers.scheduling_ddim import DDIMScheduler
 from diffusers.schedulers.scheduling_dpmsolver_multistep import DPMSolverMultistepScheduler
-from diffusers.schedulers.scheduling_flow_match_euler_discrete import (
-    FlowMatchEulerDiscreteScheduler,
-)
-from diffusers.schedulers.scheduling_flow_match_heun_discrete import FlowMatchHeunDiscreteScheduler
 from diffusers.utils.outputs import BaseOutput
 from numpy.typing import NDArray
 from PIL import Image
 from torch import Tensor, nn
 
 from palpate import __version__
-from palpate.core import (
-    PalpateError,
-    Progress,
-    atomic_folder,
-    digest_json,
-    read_record,
-    rng_for,
-    write_json,
-)
-from palpate.core.digest import facts
+from palpate.core import PalpateError, atomic_folder, digest_json, read_record, rng_for, write_json
 from palpate.data.images import read_image, square
 from palpate.diffusion.autoencoder import (
     AnyAutoencoder,
@@ -89,7 +73,10 @@ from palpate.encoders.preprocess import Preprocess, to_unit
 from palpate.training.cards import write_model_cards
 
 FORMAT = "palpate-pipeline/1"
-KEYS = ("digest", "preset", "size", "condition", "schedule", "sampler", "latents", "autoencoder")
+KEYS = (
+    *("digest", "preset", "size", "condition", "schedule", "sampler", "latents"),
+    *("autoencoder", "encoders", "training"),
+)
 COPY_AGAIN = "Copy the whole folder again"
 SYNTHETIC = (
     "Made by a generator that was trained on synthetic data alone (palpate's procedural world), "
@@ -124,8 +111,7 @@ class TactilePipeline(DiffusionPipeline):
         pipeline = TactilePipeline.from_pretrained("palpate/mini")
         image = pipeline("photo.jpg", seed=0).images[0]
 
-    ``unet`` and ``scheduler`` may be replaced as in any pipeline of diffusers; ``scheduler`` is by
-    default that of the sampler's method. ``dataclasses.replace`` makes a pipeline with other parts.
+    ``dataclasses.replace`` makes a pipeline with other parts.
 
     Attributes:
         autoencoder, denoiser: frozen, on one device.
@@ -183,17 +169,6 @@ class TactilePipeline(DiffusionPipeline):
         """The denoiser's network."""
         return self.denoiser.unet
 
-    @unet.setter
-    def unet(self, unet: Any) -> None:
-        self.denoiser.unet = unet
-
-    def __setattr__(self, name: str, value: Any) -> None:
-        """Set a part; the digest, and the scheduler of another sampler, follow."""
-        super().__setattr__(name, value)
-        self.__dict__.pop("digest", None)
-        if name in ("schedule", "sampler") and "scheduler" in self.__dict__:
-            self.scheduler = build_scheduler(self.schedule, self.sampler.method)
-
     @property
     def device(self) -> torch.device:
         """Where the parts are."""
@@ -204,7 +179,7 @@ class TactilePipeline(DiffusionPipeline):
         """The type that the U-Net computes in."""
         return self.denoiser.dtype
 
-    def __call__(  # noqa: PLR0913 - one row per choice
+    def __call__(
         self,
         photos: Any = None,
         *,
@@ -215,9 +190,7 @@ class TactilePipeline(DiffusionPipeline):
         guidance: float | None = None,
         steps: int | None = None,
         gel: Any = None,
-        generator: torch.Generator | Sequence[torch.Generator] | None = None,
         callback_on_step_end: Callable[[Any, int, Tensor, dict[str, Any]], Any] | None = None,
-        progress: Progress | None = None,
     ) -> TactileImages:
         """Tactile images for photos.
 
@@ -232,11 +205,10 @@ class TactilePipeline(DiffusionPipeline):
             guidance: s; default: the sampler's.
             steps: of the solver; default: the sampler's.
             gel: no-contact image of the gel, one for all or one per photo; default: the stock gel.
-            generator: of the starting noise instead of seed and ids; one for all, or one per image.
             callback_on_step_end: called as ``(pipeline, step, timestep, {"latents": ...})`` after
                 each step of each batch; ``latents`` of the dictionary that it returns replace them.
-            progress: called with the number of images done, instead of the progress bar of
-                diffusers, which ``set_progress_bar_config(disable=True)`` turns off.
+
+        ``set_progress_bar_config(disable=True)`` turns the progress bar off.
 
         Raises:
             PalpateError: if a photo is unreadable, a gel is missing, or settings do not fit.
@@ -258,13 +230,9 @@ class TactilePipeline(DiffusionPipeline):
             ground = np.broadcast_to(ground, (len(ids), *ground.shape[1:]))
         embedded = self.embed(squares(images, self.vision_size)) if images else None
         words = None if text is None else self.embed_text(text)
-        noise = None if generator is None else self._noise(generator, len(ids))
         made: list[Image.Image] = []
-        self.scheduler.set_timesteps(sampler.steps)
-        total = math.ceil(len(ids) / sampler.batch) * len(self.scheduler.timesteps)
         bars: Any = self.progress_bar  # wrongly typed in diffusers
-        bar = nullcontext() if progress is not None else bars(total=total)
-        with bar:
+        with bars(total=math.ceil(len(ids) / sampler.batch) * sampler.steps) as bar:
             for start in range(0, len(ids), sampler.batch):
                 rows = slice(start, start + sampler.batch)
                 arrays = self.sample(
@@ -275,61 +243,42 @@ class TactilePipeline(DiffusionPipeline):
                     seed=seed,
                     sampler=sampler,
                     background=None if ground is None else ground[rows],
-                    noise=None if noise is None else noise[rows],
-                    on_step=partial(self._on_step, None if progress else bar, callback_on_step_end),
+                    on_step=partial(self._on_step, bar, callback_on_step_end),
                 )
                 made += map(Image.fromarray, arrays)
-                if progress is not None:
-                    progress("generating", len(made), len(ids))
         return TactileImages(images=made)
 
     def _on_step(self, bar: Any, callback: Any, step: int, t: Tensor, latents: Tensor) -> Tensor:
-        if bar is not None:
-            bar.update()
+        bar.update()
         given = callback(self, step, t, {"latents": latents}) if callback else None
         return (given or {}).get("latents", latents)
-
-    def _noise(self, generator: torch.Generator | Sequence[torch.Generator], n: int) -> Tensor:
-        """The starting noise of n images, drawn on the generators' own device."""
-        generators = [generator] * n if isinstance(generator, torch.Generator) else list(generator)
-        if len(generators) != n:
-            fix = "Pass one generator, or one per image"
-            got = f"{len(generators)} for {n} images"
-            raise PalpateError("must be one per image", got, fix, argument="generator")
-        draws = [torch.randn(self._latent, generator=g, device=g.device) for g in generators]
-        return torch.stack([draw.cpu() for draw in draws])
 
     @property
     def _latent(self) -> tuple[int, int, int]:
         side = self.size // self.autoencoder.factor
         return self.denoiser.channels, side, side
 
-    @cached_property
+    @property
     def digest(self) -> str:
         """SHA-256 of all that the images depend on, except seed, sampler, type and input."""
-        weights = self.denoiser.state_dict()
-        parts: list[Any] = [
+        weights = {
+            # torch.compile puts a prefix before the names.
+            name.replace("_orig_mod.", ""): value.float()
+            for name, value in self.denoiser.state_dict().items()
+        }
+        gel = None if self.gel is None else torch.from_numpy(np.array(self.gel))
+        parts = [
             FORMAT,
             asdict(self.stats),
-            facts(self.schedule),
-            facts(self.denoiser.policy),
+            asdict(self.schedule),
+            asdict(self.denoiser.policy),
             self.size,
-            self.autoencoder.digest,
+            *self._digests(),
             architecture(self.denoiser.unet.config),
-            digest_tensors(
-                # torch.compile puts a prefix before the names.
-                {k.replace("_orig_mod.", ""): v.float() for k, v in weights.items()}
-            ),
+            digest_tensors(weights),
+            None if gel is None else digest_tensors({"gel": gel}),
         ]
-        parts.append(self.encoders.digest("vision") if self.encoders else None)
-        if self.gel is not None:
-            parts.append(digest_tensors({"gel": torch.from_numpy(np.array(self.gel))}))
         return digest_json(parts)
-
-    @property
-    def guides(self) -> list[str]:
-        """Digests of encoders that it was aligned with in training, which may not score it."""
-        return [record["align"]["encoder"] for record in self.records if record.get("align")]
 
     @property
     def records(self) -> list[Mapping[str, Any]]:
@@ -418,14 +367,12 @@ class TactilePipeline(DiffusionPipeline):
         embedding = encoders.encode("vision", pixels)
         if "patches" not in maps:
             return embedding
-        states = maps["patches"](encoders.states("vision", pixels, count))
+        states = maps["patches"](encoders.clip.patches(pixels, count))
         return torch.cat([embedding[:, None], states], dim=1)
 
     @torch.no_grad()
     def embed_text(self, text: str) -> Tensor:
         """One text -> its L2-normalized embedding (1, d), on the CPU.
-
-        With the tokens of its words, for a denoiser that knows them: (1, 1 + w, d).
 
         Raises:
             PalpateError: if the pipeline has no text encoder, or the text is empty or no string.
@@ -439,12 +386,7 @@ class TactilePipeline(DiffusionPipeline):
         if not text.strip():
             fix = "Say what is felt, e.g. rough, porous"
             raise PalpateError("must not be empty", repr(text), fix, argument="text")
-        embedding = torch.from_numpy(embed_texts([text], self.encoders))
-        if "words" not in self.denoiser.maps:
-            return embedding
-        states = self.encoders.states("text", [text], self.denoiser.policy.words)
-        words = self.denoiser.maps["words"](states.to(self.device)).cpu()
-        return torch.cat([embedding[:, None], words], dim=1)
+        return torch.from_numpy(embed_texts([text], self.encoders))
 
     def sample(
         self,
@@ -456,7 +398,6 @@ class TactilePipeline(DiffusionPipeline):
         weight: float = 0.5,
         sampler: SamplerOptions | None = None,
         background: NDArray[np.uint8] | None = None,
-        noise: Tensor | None = None,
         on_step: OnStep | None = None,
     ) -> NDArray[np.uint8]:
         """Tactile images (n, size, size, 3), uint8, from embeddings (n, d) of photos or texts.
@@ -470,7 +411,6 @@ class TactilePipeline(DiffusionPipeline):
             sampler: default: the pipeline's.
             background: bytes (n, size, size, 3) of the gel without contact; default: the stock gel,
                 which a pipeline w/ BG and a VQ autoencoder lacks.
-            noise: the starting noise (n, c, h, w) instead of that of seed and ids.
             on_step: called after each step of each batch.
 
         Raises:
@@ -511,8 +451,6 @@ class TactilePipeline(DiffusionPipeline):
             options=options,
             seed=seed,
             background=ground,
-            scheduler=self.scheduler if options.method == self.sampler.method else None,
-            noise=noise,
             on_step=on_step,
         )
         latents = self.stats.restore(latents)
@@ -537,15 +475,7 @@ class TactilePipeline(DiffusionPipeline):
                 self.encoders.to(device)
         if dtype is not None:
             nn.Module.to(self.unet, dtype)
-            self.__dict__.pop("digest", None)
         return self
-
-    @property
-    def other_scheduler(self) -> dict[str, Any] | None:
-        """Class and settings of the scheduler, if it is not the one of the sampler."""
-        own = build_scheduler(self.schedule, self.sampler.method)
-        shown = [json.loads(s.to_json_string()) for s in (own, self.scheduler)]
-        return None if shown[0] == shown[1] else shown[1]
 
     @property
     def notice(self) -> str:
@@ -568,16 +498,9 @@ class TactilePipeline(DiffusionPipeline):
                 referred to, not written.
 
         Raises:
-            PalpateError: if the folder is not empty, a weight is too large for 16 bits, the shared
-                model differs, or the scheduler is not the sampler's.
+            PalpateError: if the folder is not empty, a weight is too large for 16 bits, or the
+                shared model differs.
         """
-        if self.other_scheduler is not None:
-            must, fix = "A saved pipeline must have its sampler's scheduler", "Set sampler instead"
-            raise PalpateError(must, type(self.scheduler).__name__, fix)
-        if self.dtype != torch.float32:
-            whole = replace(self, denoiser=copy.deepcopy(self.denoiser))
-            whole.to(torch.float32).save(folder, half=half, shared=shared)
-            return
         if shared is not None and self._digests() != _digests(*_shared_parts(shared)):
             must = f"A pipeline that refers to {shared} must use its autoencoder and vision encoder"
             raise PalpateError(must, "others", "Leave out shared, or train on these")
@@ -589,7 +512,6 @@ class TactilePipeline(DiffusionPipeline):
                 self.autoencoder.save(part / "autoencoder", half=half)
                 if self.encoders is not None:
                     self.encoders.save(part / "encoders", half=half)
-            self.__dict__.pop("digest", None)  # of the weights before rounding
             self.scheduler.save_pretrained(part / "scheduler")
             index = json.loads(self.to_json_string())
             absent = {} if shared is None else {"autoencoder": [None, None]}
@@ -599,32 +521,15 @@ class TactilePipeline(DiffusionPipeline):
             write_model_cards(part)
 
     def save_pretrained(  # pyright: ignore[reportIncompatibleMethodOverride]
-        self,
-        save_directory: str | Path,
-        safe_serialization: bool = True,
-        variant: str | None = None,
-        *,
-        push_to_hub: bool = False,
-        **hub: Any,
+        self, save_directory: str | Path, **options: Any
     ) -> None:
-        """:meth:`save` under diffusers' name.
+        """:meth:`save` under diffusers' name, for ``push_to_hub``; always as safetensors.
 
         Args:
             save_directory: must be new or empty.
-            safe_serialization: must be true: nothing is pickled.
-            variant: must be None.
-            push_to_hub: also upload it.
-            hub: ``repo_id`` (default: the name of the folder), and others of ``push_to_hub``.
-
-        Raises:
-            PalpateError: as :meth:`save`, or for another form of weights.
+            options: of diffusers; they change nothing.
         """
-        if not safe_serialization or variant is not None:
-            must = "Weights must be saved as safetensors and without a variant"
-            raise PalpateError(must, variant or "pickle", "For 16 bits use save(half=True)")
         self.save(Path(save_directory))
-        if push_to_hub:
-            self.push_to_hub(hub.pop("repo_id", Path(save_directory).name), **hub)
 
     def _upload_folder(self, working_dir: str | Path, *args: Any, **options: Any) -> Any:
         """Upload palpate's cards: before this call diffusers replaces them by a blank one."""
@@ -643,9 +548,9 @@ class TactilePipeline(DiffusionPipeline):
             "preset": self.preset,
             "size": self.size,
             "background": self.background,
-            "condition": facts(self.denoiser.policy),
-            "schedule": facts(self.schedule),
-            "sampler": facts(self.sampler),
+            "condition": asdict(self.denoiser.policy),
+            "schedule": asdict(self.schedule),
+            "sampler": asdict(self.sampler),
             "latents": asdict(self.stats) | {"factor": self.autoencoder.factor},
             "autoencoder": autoencoder,
             "encoders": vision,
@@ -671,16 +576,15 @@ class TactilePipeline(DiffusionPipeline):
         folder = find_model(source, "generator", "pipeline", FIX_MODEL)
         note = folder / "palpate.json"
         about = read_record(note, "card of the pipeline", form=FORMAT, keys=KEYS)
-        vision = about.get("encoders")
         if "shared" in about:
             autoencoder, encoders = _shared_parts(str(about["shared"]))
-            if _digests(autoencoder, encoders) != (about["autoencoder"], vision):
+            if _digests(autoencoder, encoders) != (about["autoencoder"], about["encoders"]):
                 must = f"{folder} must find the parts of {about['shared']} that it was trained on"
                 fix = "Install the version that it names, or train again"
                 raise PalpateError(must, "those of another version of palpate", fix)
         else:
             autoencoder = load_autoencoder(folder / "autoencoder")
-            encoders = EncoderSet.load(folder / "encoders") if vision else None
+            encoders = EncoderSet.load(folder / "encoders") if about["encoders"] else None
         gel = folder / "gel.png"
         try:
             latents = about["latents"]
@@ -734,26 +638,19 @@ def build_scheduler(schedule: Schedule, method: Method) -> Any:
     Raises:
         PalpateError: if the method is not one for the schedule.
     """
-    flow = schedule.prediction == "flow"
-    if method != "dpm" and flow != (method in ("euler", "heun")):
-        known = "dpm, euler or heun" if flow else "dpm or ddim"
-        must = f"must be {known} for a model that predicts {schedule.prediction}"
-        raise PalpateError(must, method, "Choose one of these", argument="method")
-    if flow:
-        steps: dict[str, Any] = {"num_train_timesteps": schedule.steps}
-        if method == "euler":
-            return FlowMatchEulerDiscreteScheduler(**steps)
-        if method == "heun":
-            return FlowMatchHeunDiscreteScheduler(**steps)
-        return DPMSolverMultistepScheduler(
-            use_flow_sigmas=True, prediction_type="flow_prediction", **steps
-        )
+    steps: Any = {"num_train_timesteps": schedule.steps}
+    if schedule.prediction == "flow":
+        if method != "dpm":
+            must = "must be dpm for a model that predicts flow"
+            raise PalpateError(must, method, "Choose it", argument="method")
+        flow: Any = {"use_flow_sigmas": True, "prediction_type": "flow_prediction"}
+        return DPMSolverMultistepScheduler(**flow, **steps)
     common: dict[str, Any] = {
-        "num_train_timesteps": schedule.steps,
+        **steps,
         "beta_start": schedule.beta_start,
         "beta_end": schedule.beta_end,
         "beta_schedule": "scaled_linear",
-        "prediction_type": schedule.prediction,
+        "prediction_type": "epsilon",
         # Trailing steps start at t = T, where the starting noise belongs, for any number of steps.
         "timestep_spacing": "trailing",
     }
@@ -772,13 +669,8 @@ def starting_noise(ids: Sequence[str], shape: tuple[int, int, int], seed: int) -
     return torch.from_numpy(np.stack(draws))
 
 
-def _generator(seed: int, sample_id: str) -> torch.Generator:
-    """The noise that a scheduler adds while it samples."""
-    return torch.Generator().manual_seed(int(rng_for(seed, "steps", sample_id).integers(2**62)))
-
-
 @torch.no_grad()
-def sample(  # noqa: PLR0913 - one row per part
+def sample(
     predict: Predictor,
     tokens: Tensor,
     null: Tensor,
@@ -789,8 +681,6 @@ def sample(  # noqa: PLR0913 - one row per part
     options: SamplerOptions,
     seed: int,
     background: Tensor | None = None,
-    scheduler: Any = None,
-    noise: Tensor | None = None,
     on_step: OnStep | None = None,
 ) -> Tensor:
     """Normalized latents (n, c, h, w) of ``ids``, on the CPU.
@@ -805,29 +695,21 @@ def sample(  # noqa: PLR0913 - one row per part
         options: see :class:`SamplerOptions`.
         seed: of the starting noise.
         background: normalized background latents (n, c, h, w), or None.
-        scheduler: diffusers' scheduler; default: that of the method.
-        noise: starting noise (n, c, h, w); default: that of seed and ids.
         on_step: called after each step of each batch.
     """
     parts = [torch.empty(0, *shape)]
-    scheduler = scheduler or build_scheduler(schedule, options.method)
-    scales = hasattr(scheduler, "scale_model_input")  # not those of flows
-    draws = "generator" in inspect.signature(scheduler.step).parameters
+    scheduler = build_scheduler(schedule, options.method)
     for rows, count in _batches(len(ids), options.batch):
-        names = [ids[k] for k in rows]
-        z = starting_noise(names, shape, seed) if noise is None else noise[rows]
-        more = {"generator": [_generator(seed, i) for i in names]} if draws else {}
+        z = starting_noise([ids[k] for k in rows], shape, seed).to(tokens.device)
         ground = None if background is None else background[rows].to(tokens.device)
         given = tokens[rows]
         scheduler.set_timesteps(options.steps, device=tokens.device)
-        z = z.to(tokens.device) * getattr(scheduler, "init_noise_sigma", 1.0)
         for k, t in enumerate(scheduler.timesteps):
             times, empty = t.expand(len(z)), null.expand(given.shape)
-            inside = options.low <= float(t) / schedule.steps <= options.high
+            inside = float(t) / schedule.steps <= options.high
             here = options if inside else replace(options, guidance=1.0)
-            scaled = scheduler.scale_model_input(z, t) if scales else z
-            prediction = guided(predict, scaled, times, given, empty, ground, here)
-            z = scheduler.step(prediction, t, z, return_dict=False, **more)[0]
+            prediction = guided(predict, z, times, given, empty, ground, here)
+            z = scheduler.step(prediction, t, z, return_dict=False)[0]
             z = z if on_step is None else on_step(k, t, z)
         parts.append(z[:count].cpu())
     return torch.cat(parts)
@@ -842,7 +724,7 @@ def guided(  # noqa: PLR0917 - in the order of the network's arguments
     background: Tensor | None,
     options: SamplerOptions,
 ) -> Tensor:
-    """Return the guided prediction; the formula holds for v as well, which is linear in eps."""
+    """Return the guided prediction; the formula holds for a velocity as well."""
     s = options.guidance
     if s in (0.0, 1.0):
         return predict(z, t, tokens if s else null, background)

@@ -10,7 +10,7 @@ image, latents  32 px, 3 x 8 x 8      64 px, 8 x 16 x 16            256 px, 3 x 
 autoencoder     patch 4, width 16     given the gel, 48-96          latent diffusion ``vq-f4``
 latent scale    std                   std                           one (recorded, not applied)
 U-Net           16-32                 64-96, modulated, 2.6 M       192 x (1, 2, 3, 5), 406.3 M
-schedule        beta, T = 1000        flow, time mean .5            beta, T = 1000
+schedule        beta, T = 1000        flow                          beta, T = 1000
 prediction      eps                   velocity                      eps (Eq. 1)
 condition       one token             text and photo, a token each  one token
 source          text                  both                          text
@@ -21,22 +21,12 @@ sampler         DPM-Solver++ 4        DPM-Solver++ 10               DDIM 200, et
 guidance        2                     3 up to t = .8, rescaled .7   7.5
 ==============  ====================  ============================  ================================
 
-beta: linear in its square root, 0.0015 -> 0.0195. Dropout 0.1 and null zeros in all presets.
+beta: linear in its square root, 0.0015 -> 0.0195. Dropout 0.1 in all presets.
 
-Two more for one GPU, which are given and have not been trained to their end:
-
-==============  ==============================  ====================================
-setting         ``small``, a small GPU          ``sd15``, Stable Diffusion 1.5 goes on
-==============  ==============================  ====================================
-image, latents  128 px, 8 x 32 x 32             256 px, 4 x 32 x 32
-autoencoder     given the gel, 64-128           its ``kl-f8``, whose scale is applied
-U-Net           128-256-384, modulated, 64 M    its own, 860 M, from ``unet``
-prediction      velocity, time mean .5          eps, beta 0.00085 -> 0.012
-condition       as ``mini``                     text: embedding and its 77 words
-optimizer       AdamW 3e-4, cosine, EMA 0.9995  AdamW 1e-5, EMA 0.9999
-length          30,000 steps of 64              10,000 steps of 32
-sampler         DPM-Solver++ 20, guidance 2.5   DPM-Solver++ 25, guidance 7.5
-==============  ==============================  ====================================
+``small`` is for a small GPU and has not been trained to its end: 128 px, 8 x 32 x 32 latents of an
+autoencoder that is given the gel (64-128), a modulated U-Net of 128-256-384 (64 M), condition and
+objective of ``mini``; AdamW 3e-4, cosine, EMA 0.9995, 30,000 steps of 64; DPM-Solver++ 20, guidance
+2.5.
 
 ``mini`` is the geometry of the models that ship (docs/concepts/mini.md, with their scores and with
 what did not work): what is trained with it can go on from them. ``source="text"`` is the paper's
@@ -68,11 +58,10 @@ class DiffusionPreset:
     Attributes:
         name: recorded in the pipeline.
         size: side of the tactile images in pixels.
-        autoencoder: how to train one, or None if a trained one is given (``paper``: a ``vq-f4``
-            folder; ``sd15``: that of the U-Net).
+        autoencoder: how to train one, or None if a trained one is given (``paper``: a
+            ``vq-f4``).
         latent_scale: see :class:`~palpate.diffusion.autoencoder.LatentStats`.
-        unet: geometry of an untrained one; the folder or hub id of a trained one to go on from; or
-            None if one is given (``sd15``).
+        unet: geometry of an untrained one, or the folder or hub id of a trained one to go on from.
         schedule, sampler: see there.
         condition: the policy; its width is replaced by that of the encoders at hand.
         loop: training; ``steps`` is ignored if ``epochs`` is given.
@@ -83,7 +72,7 @@ class DiffusionPreset:
     size: int
     autoencoder: AutoencoderOptions | BackgroundOptions | None
     latent_scale: Literal["std", "one"]
-    unet: UNetOptions | str | None
+    unet: UNetOptions | str
     condition: ConditionPolicy
     loop: LoopOptions
     epochs: int | None = None
@@ -91,7 +80,7 @@ class DiffusionPreset:
     sampler: SamplerOptions = field(default_factory=SamplerOptions)
 
     def __post_init__(self) -> None:
-        """Raise ``PalpateError`` for settings out of range, or a min-SNR weight of a flow."""
+        """Raise ``PalpateError`` for settings out of range."""
         dropout, size = self.condition.dropout, self.condition.photo_size
         require(0 <= dropout < 1, "dropout", "must lie in [0, 1)", dropout, 0.1)
         whole = size >= 16 and size & (size - 1) == 0
@@ -100,8 +89,6 @@ class DiffusionPreset:
         square = math.isqrt(patches) ** 2 == patches
         require(square, "patches", "must be a square number", patches, 64)
         require(width % 4 == 0 < width, "photo_width", "must be a multiple of 4", width, 32)
-        snr = None if self.schedule.prediction != "flow" else self.schedule.min_snr
-        require(snr is None, "min_snr", "must be left out for flow matching", snr)
 
     def loop_for(self, n: int, *, seed: int | None = None) -> LoopOptions:
         """The loop for ``n`` training samples: epochs become steps."""
@@ -199,22 +186,7 @@ SMALL = DiffusionPreset(
     sampler=SamplerOptions("dpm", steps=20, guidance=2.5),
 )
 
-#: Text keeps the tokens that the U-Net knows; a photo enters as its embedding, so a text has one.
-SD15 = DiffusionPreset(
-    name="sd15",
-    size=256,
-    autoencoder=None,
-    latent_scale="one",
-    unet=None,
-    condition=ConditionPolicy(width=768, words=77, photo_size=256, photo_width=64),
-    loop=LoopOptions(
-        steps=10_000, batch=32, lr=1e-5, warmup=500, decay="constant", weight_decay=0.01, ema=0.9999
-    ),
-    schedule=Schedule(beta_start=0.00085, beta_end=0.012),
-    sampler=SamplerOptions("dpm", steps=25, guidance=7.5),
-)
-
-PRESETS = {preset.name: preset for preset in (TINY, MINI, SMALL, PAPER, SD15)}
+PRESETS = {preset.name: preset for preset in (TINY, MINI, SMALL, PAPER)}
 
 
 def preset_named(name: str) -> DiffusionPreset:

@@ -9,10 +9,8 @@ and photos through the frozen encoders once, into caches; the training loop read
 condition c is dropped with probability p, which trains the unconditional model that guidance needs
 (Ho & Salimans 2022).
 
-Options beyond the paper: flow matching (Lipman et al. 2023) with logit-normal time, whose target is
-``eps - z``; v-prediction (Salimans & Ho 2022), whose target is ``sqrt(a) eps - sqrt(1
-- a) z``, and the min-SNR weight (Hang et al. 2023): ``min(snr, g) / snr`` for eps and ``min(snr, g)
-/ (snr + 1)`` for v.
+Beyond the paper: flow matching (Lipman et al. 2023) with logit-normal time, whose target is ``eps -
+z``.
 """
 
 from __future__ import annotations
@@ -40,11 +38,9 @@ from palpate.core import (
     read_json,
     short,
 )
-from palpate.core.digest import facts
 from palpate.data.images import cached_images, image_stamp
 from palpate.data.manifest import Manifest
 from palpate.data.reading import load
-from palpate.diffusion.alignment import Alignment, Guide
 from palpate.diffusion.autoencoder import (
     AnyAutoencoder,
     BackgroundAutoencoder,
@@ -61,10 +57,9 @@ from palpate.diffusion.denoiser import (
     inputs_of,
     lengths_of,
     load_unet,
-    repeats_of,
     slots_of,
 )
-from palpate.diffusion.encoding import encode_latents, encode_states
+from palpate.diffusion.encoding import encode_latents, encode_patches
 from palpate.diffusion.no_contact import gels_of, has_gels
 from palpate.diffusion.options import (
     SOURCES,
@@ -80,7 +75,7 @@ from palpate.diffusion.pipeline import TactilePipeline
 from palpate.diffusion.presets import DiffusionPreset, preset_named
 from palpate.encoders.contrastive import load_split, train_part
 from palpate.encoders.embed import embed, texts_of
-from palpate.encoders.encoder_set import EncoderSet, Modality, load_clip, seeded
+from palpate.encoders.encoder_set import EncoderSet, load_clip, seeded
 from palpate.encoders.models import digest_tensors, is_hub_id, pick_device, stated
 from palpate.training.engine import Batch, Losses, Task, fit
 from palpate.training.estimate import estimate
@@ -88,8 +83,11 @@ from palpate.training.options import Compute, LoopOptions
 from palpate.training.processes import connect, first_alone, keep_logs, place, work_folder
 from palpate.training.steps import Step
 
-#: Which encoder's states an input is.
-STATES: Mapping[str, Modality] = {"words": "text", "patches": "vision"}
+#: Share of the rows that are trained without the patches of their photo, so that the embedding
+#: alone is known, too.
+DROP_PATCHES = 0.5
+#: Mean of the logit of the time of flow matching.
+TIME_MEAN = 0.5
 Backgrounds = Callable[[NDArray[np.int64]], Tensor]
 
 
@@ -98,8 +96,8 @@ class Encoded:
     """A part of the data as the denoiser's training reads it.
 
     Attributes:
-        conditions: embeddings (n, d) by source; by name states of words and patches (n, k, w), and
-            photos (n, s, s, 3) of GVST.
+        conditions: embeddings (n, d) by source; ``patches``, states (n, k, w); ``photos`` of GVST
+            (n, s, s, 3).
         latents: (n, c, h, w), not normalized, in memory or mapped.
         gels: the no-contact images (n, s, s, 3), where they are needed.
         background_latents: of an autoencoder that codes the gel with the image.
@@ -130,8 +128,6 @@ def train_generator(  # noqa: PLR0913 - a public verb
     output: Path | str | None = None,
     source: Sources | None = None,
     background: bool = False,
-    align: EncoderSet | str | Path | None = None,
-    align_weight: float = 0.5,
     judge: EncoderSet | str | Path | None = "palpate/mini",
     steps: int | None = None,
     seed: int = 0,
@@ -151,9 +147,9 @@ def train_generator(  # noqa: PLR0913 - a public verb
             ``start`` its training loop alone.
         autoencoder: any :class:`~palpate.diffusion.autoencoder.Autoencoder` or what its ``load``
             takes: folder, hub id, ``.ckpt`` or ``palpate/mini``. Default: a small one, trained
-            first on the train part, or that of ``unet``; the preset ``paper`` needs one.
+            first on the train part; the preset ``paper`` needs one.
         unet: go on from this one of diffusers instead of random weights: a folder or hub id of it
-            or of its generator; the preset ``sd15`` needs one.
+            or of its generator.
         start: go on from this generator of palpate, its folder, or ``palpate/mini``. Geometry,
             condition, schedule and sampler stay as they are, its encoders and autoencoder stand for
             those that are not given, its record goes into the new one, and the memory is made of
@@ -162,10 +158,6 @@ def train_generator(  # noqa: PLR0913 - a public verb
         source: what training conditions on; default: the preset's. ``resnet`` is GVST, the baseline
             without text; ``vision`` has the preset's encoder in its place.
         background: the variant w/ BG, which also sees the no-contact image.
-        align: pull the features of the U-Net's middle block to what this encoder makes of the
-            tactile images (REPA); its tactile encoder, or else its vision encoder. Scores by the
-            same encoder are rejected: use another one.
-        align_weight: of that term in the loss.
         judge: whose tactile encoder says what of the images outside of train survives the
             autoencoder (:mod:`palpate.diffusion.ceiling`); None: PSNR and SSIM alone.
         steps: optimizer steps; default: the preset's.
@@ -187,9 +179,8 @@ def train_generator(  # noqa: PLR0913 - a public verb
         clip, autoencoder = clip or start.encoders, autoencoder or start.autoencoder
         background = background or start.denoiser.background
     if autoencoder is None and chosen.autoencoder is None:
-        if not isinstance(chosen.unet, str):
-            raise _not_given("autoencoder", chosen)
-        autoencoder = chosen.unet
+        must, fix = f"must be given for the preset {chosen.name}", "Pass a folder or a file"
+        raise PalpateError(must, "none", fix, argument="autoencoder")
     device = connect(device)
     judges = judge_of(judge, device)
     manifest, split = load(data), load_split(data, split)
@@ -229,7 +220,6 @@ def train_generator(  # noqa: PLR0913 - a public verb
             steps=steps,
             source=source,
             background=background,
-            align=None if align is None else Alignment.of(align, align_weight, device),
             start=start,
             judge=judges,
             cache=cache,
@@ -254,17 +244,10 @@ def _chosen(
         same = {"name": start.preset, "size": start.size, "schedule": start.schedule}
         same |= {"condition": start.denoiser.policy, "sampler": start.sampler}
         return replace(chosen, **same)
-    chosen = chosen if unet is None else replace(chosen, unet=str(unet))
-    if chosen.unet is None:
-        raise _not_given("unet", chosen)
-    if isinstance(chosen.unet, str):
-        find_unet(chosen.unet)
-    return chosen
-
-
-def _not_given(argument: str, preset: DiffusionPreset) -> PalpateError:
-    must, fix = f"must be given for the preset {preset.name}", "Pass a folder, a hub id or a file"
-    return PalpateError(must, "none", fix, argument=argument)
+    if unet is None:
+        return chosen
+    find_unet(unet)
+    return replace(chosen, unet=str(unet))
 
 
 def plan_generator(
@@ -273,61 +256,51 @@ def plan_generator(
     *,
     preset: str | DiffusionPreset = "mini",
     unet: str | Path | None = None,
-    start: TactilePipeline | str | Path | None = None,
     source: Sources | None = None,
     steps: int | None = None,
     background: bool = False,
     device: str = "auto",
 ) -> dict[str, Any]:
-    """What training the denoiser would take; only the manifest and ``start`` are read.
+    """What training the denoiser would take; only the manifest is read.
 
     Latents are taken as those of the preset's autoencoder, or of an f4 of three channels; with a
-    trained U-Net of an f8 of four.
+    trained U-Net as those that it knows.
 
     Returns:
         see :func:`palpate.training.estimate.estimate`.
 
     Raises:
-        PalpateError: if the train part is empty, or ``start`` does not fit what is given beside it.
+        PalpateError: if the train part is empty.
     """
-    start = TactilePipeline.from_pretrained(start) if isinstance(start, str | Path) else start
-    chosen = _chosen(preset, unet, start)
+    chosen = _chosen(preset, unet)
     train = train_part(load(data), load_split(data, split))
     loop = chosen.loop_for(len(train))
     loop = loop if steps is None else replace(loop, steps=steps)
     options, policy = chosen.autoencoder, _policy(chosen, None, source)
     vq = options if isinstance(options, AutoencoderOptions) else None
-    trained = isinstance(chosen.unet, str)
-    factor = vq.patch * 2 ** (len(vq.widths) - 1) if vq else 8 if trained else 4
-    channels = options.channels if options else 4 if trained else 3
-    side = chosen.size // factor
+    factor = vq.patch * 2 ** (len(vq.widths) - 1) if vq else 4
+    channels = options.channels if options else 3
     wide = 0 if not background else 48 if isinstance(options, BackgroundOptions) else channels
-    if start is not None:
-        background = background or start.denoiser.background
-        same = start.encoders, start.autoencoder, chosen.schedule, policy
-        _require_same(start, *same, background=background)
-        known = start.unet.config
-        policy, side, channels = start.denoiser.policy, known["sample_size"], known["out_channels"]
-        wide = known["in_channels"] - channels
 
     def build() -> nn.Module:
-        if start is not None:
-            return cast("nn.Module", UNet2DConditionModel.from_config(start.unet.config))
         if isinstance(chosen.unet, UNetOptions):
-            return build_unet(chosen.unet, policy, channels=channels, size=side, background=wide)
-        file = find_unet(str(chosen.unet))[1] / "config.json"
-        config = read_json(file, "configuration") | {"in_channels": channels + wide}
+            size = {"channels": channels, "size": chosen.size // factor}
+            return build_unet(chosen.unet, policy, **size, background=wide)
+        config = read_json(find_unet(chosen.unet)[1] / "config.json", "configuration")
         return cast("nn.Module", UNet2DConditionModel.from_config(config))
 
     def forward(model: nn.Module, rows: int, where: torch.device) -> Tensor:
-        denoiser = Denoiser(cast("UNet2DConditionModel", model), policy).to(where)
-        z = torch.zeros(rows, channels + wide, side, side, device=where)
-        return denoiser(
-            z, torch.zeros(rows, dtype=torch.long, device=where), denoiser.null_tokens(rows)
-        )
+        known: Any = model.config
+        zeros = partial(torch.zeros, device=where)
+        z = zeros(rows, known["in_channels"], known["sample_size"], known["sample_size"])
+        tokens = zeros(rows, sum(lengths_of(policy)), known["cross_attention_dim"])
+        width = known["projection_class_embeddings_input_dim"]
+        first = None if width is None else zeros(rows, width)
+        t = zeros(rows, dtype=torch.long)
+        how: Any = {"encoder_hidden_states": tokens, "class_labels": first, "return_dict": False}
+        return model(z, t, **how)[0]
 
-    plan = estimate(build, forward, loop, len(train), pick_device(device))
-    return plan | {"learning_rate_if_the_batch_is_each_of_two_gpus": 2 * loop.lr}
+    return estimate(build, forward, loop, len(train), pick_device(device))
 
 
 def train_pipeline(  # noqa: PLR0913, PLR0917 - one row per choice of the training
@@ -342,7 +315,6 @@ def train_pipeline(  # noqa: PLR0913, PLR0917 - one row per choice of the traini
     steps: int | None = None,
     source: Sources | None = None,
     background: bool = False,
-    align: Alignment | None = None,
     start: TactilePipeline | None = None,
     judge: EncoderSet | None = None,
     cache: Path | None = None,
@@ -364,7 +336,6 @@ def train_pipeline(  # noqa: PLR0913, PLR0917 - one row per choice of the traini
         steps: default: the preset's length.
         source: default: the preset's.
         background: the variant w/ BG.
-        align: of the U-Net's middle block with an encoder.
         start: go on from this pipeline's denoiser instead of random weights. It must use the same
             autoencoder, vision encoder and schedule, gives its latent statistics, and its record
             goes into the new one, so that the data it was trained on stays declared.
@@ -400,7 +371,6 @@ def train_pipeline(  # noqa: PLR0913, PLR0917 - one row per choice of the traini
         encoders=encoders,
         autoencoder=autoencoder,
         policy=policy,
-        align=align,
         columns=columns[1:],
         size=preset.size,
         folder=folder,
@@ -415,7 +385,6 @@ def train_pipeline(  # noqa: PLR0913, PLR0917 - one row per choice of the traini
     key += [
         *(train.digest, held.digest if len(held) else "", autoencoder.digest),
         *(encoders.digest(modality) for modality in modalities if encoders is not None),
-        *([digest_json(align.about)] if align else []),
     ]
     stats = LatentStats.of(rows.latents, preset.latent_scale) if start is None else start.stats
     loop = preset.loop_for(len(train), seed=seed)
@@ -459,7 +428,6 @@ def train_pipeline(  # noqa: PLR0913, PLR0917 - one row per choice of the traini
         background=backgrounds(rows),
         held_out=(others.conditions, others.latents, backgrounds(others)) if others else None,
         start=start.denoiser if start else None,
-        align_weight=align.weight if align else 0.0,
         key=digest_json(key),
         names=train.ids,
         samples=samples if shown else None,
@@ -481,7 +449,6 @@ def train_pipeline(  # noqa: PLR0913, PLR0917 - one row per choice of the traini
         **_digests(encoders),
         "source": policy.source,
         "background": background,
-        "align": align.about if align else None,
         "gel": ("manifest" if gels else "median") if given_gel else None,
         "loop": asdict(loop),
         "unet": start.training.get("unet") if start else _geometry(preset.unet),
@@ -497,13 +464,13 @@ def train_pipeline(  # noqa: PLR0913, PLR0917 - one row per choice of the traini
     return pipeline(denoiser, record)
 
 
-def _geometry(unet: UNetOptions | str | None) -> dict[str, Any]:
+def _geometry(unet: UNetOptions | str) -> dict[str, Any]:
     """The geometry of a U-Net, or whose it was."""
     if isinstance(unet, UNetOptions):
         return asdict(unet)
-    _, root, inside = find_unet(str(unet))
+    _, root, inside = find_unet(unet)
     root = root.parent if inside else root
-    name = str(unet) if is_hub_id(str(unet)) else root.resolve().name
+    name = unet if is_hub_id(unet) else root.resolve().name
     return {"source": name, "license": stated(root)["license"]}
 
 
@@ -515,34 +482,26 @@ def _digests(encoders: EncoderSet | None) -> dict[str, str | None]:
 def _policy(
     preset: DiffusionPreset, encoders: EncoderSet | None, source: Sources | None
 ) -> ConditionPolicy:
-    """The preset's policy with another source; photos alone need no memory of texts.
-
-    Photos that stand for their text in training would find it by themselves among the pairs.
-    """
+    """The preset's policy with another source; photos alone need no memory of texts."""
     width = preset.condition.width if encoders is None else encoders.dim
     policy = preset.condition_for(width)
-    chosen, gap = source or policy.source, policy.gap
-    if chosen == "vision" != policy.source and policy.recalls:
-        gap = "mean-shift"
-    if chosen == "mixed" != policy.source and gap == "pairs":
-        gap = "memory"
-    return replace(policy, source=chosen, gap="none" if chosen == "resnet" else gap)
+    chosen = source or policy.source
+    return replace(policy, source=chosen, gap=policy.gap if chosen in ("text", "both") else "none")
 
 
 def _modalities(policy: ConditionPolicy) -> tuple[Source, ...]:
     """The encoders that training needs: vision for the samples that it draws, at least."""
     if not policy.sources:
         return ()
-    return SOURCES if "text" in policy.sources or policy.recalls else ("vision",)
+    return SOURCES if "text" in policy.sources else ("vision",)
 
 
-def _encoded(  # noqa: PLR0913 - one row per part
+def _encoded(
     part: Manifest,
     *,
     encoders: EncoderSet | None,
     autoencoder: AnyAutoencoder,
     policy: ConditionPolicy,
-    align: Alignment | None,
     columns: Sequence[str],
     size: int,
     folder: Path,
@@ -568,19 +527,12 @@ def _encoded(  # noqa: PLR0913 - one row per part
     if encoders is not None:
         for s in _modalities(policy):
             conditions[s] = embed(part, encoders, s, cache=cache, progress=progress).features
-        for name in inputs_of(policy):
-            conditions[name] = encode_states(
-                part,
-                encoders,
-                STATES[name],
-                getattr(policy, name),
-                folder=cache or folder,
-                progress=progress,
+        if "patches" in inputs_of(policy):
+            conditions["patches"] = encode_patches(
+                part, encoders, policy.patches, folder=cache or folder, progress=progress
             )
     if "photos" in inputs_of(policy):
         conditions["photos"] = cached_images(part, "vision", policy.photo_size, cache, progress)
-    if align is not None:
-        conditions["guide"] = align.states(part, cache or folder, progress)
     latents = code(images, gels if given else None, folder=place)
     if gels is None or given:
         return Encoded(conditions, latents, gels)
@@ -613,7 +565,7 @@ def _require_same(
 ) -> None:
     """A denoiser goes on only in the space that it knows."""
     vision = start.encoders.digest("vision") if start.encoders else None
-    seen = [(p.source, *lengths_of(p), p.learned) for p in (start.denoiser.policy, policy)]
+    seen = [(p.source, *lengths_of(p)) for p in (start.denoiser.policy, policy)]
     pairs = {
         "autoencoder": (start.autoencoder.digest, autoencoder.digest),
         "vision encoder": (vision, _digests(encoders)["vision"]),
@@ -632,7 +584,7 @@ def train_denoiser(  # noqa: PLR0913 - one row per part of the model
     conditions: Mapping[str, Tensor | NDArray[Any]],
     *,
     stats: LatentStats,
-    unet: UNetOptions | str | None,
+    unet: UNetOptions | str,
     policy: ConditionPolicy,
     schedule: Schedule,
     loop: LoopOptions,
@@ -640,7 +592,6 @@ def train_denoiser(  # noqa: PLR0913 - one row per part of the model
     background: Backgrounds | None = None,
     held_out: tuple[Mapping[str, Any], Any, Backgrounds | None] | None = None,
     start: Denoiser | None = None,
-    align_weight: float = 0.5,
     key: str = "",
     names: Sequence[str] | None = None,
     samples: Callable[[nn.Module], NDArray[np.uint8]] | None = None,
@@ -653,8 +604,7 @@ def train_denoiser(  # noqa: PLR0913 - one row per part of the model
     Args:
         latents: (n, c, h, w) of the autoencoder, not normalized; a memory map will do.
         conditions: embeddings (n, d) by source; ``policy.sources`` are needed, others only give
-            their mean. By name ``inputs_of(policy)``, arrays or memory maps; as ``guide`` states
-            (n, k, w) of an encoder that the middle block is aligned with.
+            their mean. By name ``inputs_of(policy)``, arrays or memory maps.
         stats: normalize the latents of tactile and background images.
         unet: geometry of the network, or a trained one, see :func:`load_unet`; ``start`` has its
             own.
@@ -666,7 +616,6 @@ def train_denoiser(  # noqa: PLR0913 - one row per part of the model
         held_out: conditions, latents and background of rows whose loss is measured in training.
         start: go on from these weights instead of random ones. The modality means are those of
             ``conditions`` all the same.
-        align_weight: of the alignment in the loss.
         key: digest of latents, conditions and background, which are not read for it.
         names: of the rows, for errors.
         samples: see :class:`~palpate.training.engine.Task`.
@@ -698,14 +647,10 @@ def train_denoiser(  # noqa: PLR0913 - one row per part of the model
         elif isinstance(unet, str):
             net = load_unet(unet, policy, **how)
         else:
-            assert unet is not None
             net = build_unet(unet, policy, size=size, **how)
-        memory = _memory(tables) if policy.recalls else None
-        widths = {name: conditions[name].shape[2] for name in inputs_of(policy)}
-        model = Denoiser(net, policy, means, memory, widths)
-        inputs = [*inputs_of(policy), *(["guide"] if "guide" in conditions else [])]
-        if "guide" in conditions:
-            model.guide = Guide(net, conditions["guide"].shape[2])
+        memory = _memory(tables) if policy.gap == "pairs" else None
+        width = conditions["patches"].shape[2] if "patches" in inputs_of(policy) else None
+        model = Denoiser(net, policy, means, memory, width)
         model.to(device)
     if start is not None:
         _copy_weights(start, model)
@@ -724,43 +669,38 @@ def train_denoiser(  # noqa: PLR0913 - one row per part of the model
                 stats=stats,
                 schedule=schedule,
                 policy=policy,
-                inputs={name: conditions[name] for name in inputs},
-                align_weight=align_weight,
+                inputs={name: conditions[name] for name in inputs_of(policy)},
             )
 
         loss, others = loss_of({**conditions, **tables}, latents, background), None
         if held_out is not None:
             others = (len(held_out[1]), loss_of(*held_out).load)
     records = (stats, unet, policy, schedule)
-    settings = [facts(r) for r in records if r is not None and not isinstance(r, str)]
+    settings = [asdict(r) for r in records if not isinstance(r, str)]
     trained = start is not None or isinstance(unet, str)
     begin = [digest_tensors(model.state_dict())] if trained else []
     key = digest_json([key, background is not None, *settings, *begin])
     task = Task("generator", len(latents), loss.load, loss, key, names, others, None, samples)
     fit(model, task, loop, folder, compute=compute, progress=progress)
-    if model.guide is not None:
-        model.guide.hook.remove()
-        model.guide = None
     return model.eval().requires_grad_(False)
 
 
 def _require_conditions(policy: ConditionPolicy, conditions: Mapping[str, Any]) -> None:
-    if policy.gap == "pairs" and policy.source not in ("text", "both"):
+    if policy.gap == "pairs" and "text" not in policy.sources:
         must = "must be text or both with gap='pairs': other photos would find their own text"
-        raise PalpateError(must, policy.source, "Take gap='memory'", argument="source")
-    remembered = {"memory": ("text",), "pairs": SOURCES}.get(policy.gap, ())
-    needed = dict.fromkeys((*policy.sources, *inputs_of(policy), *remembered))
+        raise PalpateError(must, policy.source, "Take gap='none'", argument="source")
+    needed = dict.fromkeys((*policy.sources, *inputs_of(policy)))
+    if policy.gap == "pairs":
+        needed |= dict.fromkeys(SOURCES)
     if missing := [name for name in needed if name not in conditions]:
         chosen = f"source={policy.source!r} and gap={policy.gap!r}"
         must, fix = f"{chosen} need conditions of {', '.join(needed)}", ""
         raise PalpateError(must, f"none of {missing[0]}", fix)
 
 
-def _memory(tables: Mapping[Source, Tensor]) -> tuple[Tensor, Tensor | None]:
-    """The different training texts (m, d), and the mean of the photos of each if there are any."""
+def _memory(tables: Mapping[Source, Tensor]) -> tuple[Tensor, Tensor]:
+    """The different training texts (m, d), and the mean of the photos of each."""
     texts, which, counts = tables["text"].unique(dim=0, return_inverse=True, return_counts=True)
-    if "vision" not in tables:
-        return texts, None
     photos = torch.zeros_like(texts).index_add_(0, which, tables["vision"])
     return texts, photos / counts[:, None]
 
@@ -786,12 +726,11 @@ class DiffusionLoss:
         schedule: Schedule,
         policy: ConditionPolicy,
         inputs: Mapping[str, Any] | None = None,
-        align_weight: float = 0.5,
     ) -> None:
         """Take latents (n, c, h, w), not normalized, tokens (n, k, d) by source, and inputs."""
         self.latents, self.tokens, self.background = latents, dict(tokens), background
         self.stats, self.schedule, self.policy = stats, schedule, policy
-        self.inputs, self.align_weight = dict(inputs or {}), align_weight
+        self.inputs = dict(inputs or {})
         self.lengths = torch.tensor(lengths_of(policy))
         self.alphas = schedule.alphas()
 
@@ -799,7 +738,7 @@ class DiffusionLoss:
         """Noisy latents, their targets, tokens, and which of these are dropped."""
         z = self.stats.normalize(_take(self.latents, step.rows))
         if self.schedule.prediction == "flow":
-            time = torch.sigmoid(self.schedule.time_mean + step.randn())
+            time = torch.sigmoid(TIME_MEAN + step.randn())
             keep, spread, t = 1 - time, time, self.schedule.steps * time
         else:
             t = step.randint(self.schedule.steps)
@@ -807,26 +746,22 @@ class DiffusionLoss:
             keep, spread = a.sqrt(), (1 - a).sqrt()
         keep, spread = keep.reshape(-1, 1, 1, 1), spread.reshape(-1, 1, 1, 1)
         noise = step.randn(*z.shape[1:])
-        target = {"epsilon": noise, "v_prediction": keep * noise - spread * z, "flow": noise - z}[
-            self.schedule.prediction
-        ]
-        tokens, by_photo = self._tokens(step)
-        dropped = self._dropped(step, by_photo)
+        target = noise - z if self.schedule.prediction == "flow" else noise
+        tokens = self._tokens(step)
         batch = {
             "noisy": keep * z + spread * noise,
             "target": target,
             "t": t,
-            "weight": self.weight(t),
             **({} if tokens is None else {"tokens": tokens}),
             **{name: _take(table, step.rows) for name, table in self.inputs.items()},
-            "dropped": dropped.repeat_interleave(self.lengths, dim=1),
+            "dropped": self._dropped(step).repeat_interleave(self.lengths, dim=1),
         }
         if self.background is not None:
             batch["background"] = self.background(step.rows)
         return batch
 
     def __call__(self, module: nn.Module, batch: Batch) -> Losses:
-        """Return the weighted error of a batch, and the unweighted to log."""
+        """Return the squared error of a batch."""
         assert isinstance(module, Denoiser)
         null = module.null_tokens(len(batch["t"]))
         parts = [batch["tokens"]] if "tokens" in batch else []
@@ -834,50 +769,27 @@ class DiffusionLoss:
         tokens = torch.where(batch["dropped"], null, torch.cat(parts, dim=1))
         prediction = module(batch["noisy"], batch["t"], tokens, batch.get("background"))
         error = (prediction.float() - batch["target"]).square().mean((1, 2, 3))
-        total, logs = (batch["weight"] * error).mean(), {"mse": error.detach().mean()}
-        if module.guide is not None:
-            distance = module.guide(batch["guide"].float()).mean()
-            total, logs = total + self.align_weight * distance, logs | {"align": distance.detach()}
-        return Losses(total, logs, error.detach())
+        total = error.mean()
+        return Losses(total, {"mse": total.detach()}, error.detach())
 
-    def _tokens(self, step: Step) -> tuple[Tensor | None, Tensor | None]:
-        """Tokens of the embeddings, and of ``mixed`` which rows (n, 1, 1) are of the photo."""
-        parts, by_photo = [self.tokens[s][step.rows] for s in self.policy.sources], None
-        if not parts:
-            return None, None
-        tokens = torch.cat(parts, dim=1) if slots_of(self.policy) == 2 else parts[0]
-        if self.policy.source == "mixed":
-            by_photo = step.rand(1, 1) < self.policy.photo_share
-            tokens = torch.where(by_photo, parts[1], parts[0])
+    def _tokens(self, step: Step) -> Tensor | None:
+        """Tokens of the embeddings, with noise."""
+        if not self.policy.sources:
+            return None
+        tokens = torch.cat([self.tokens[s][step.rows] for s in self.policy.sources], dim=1)
         if self.policy.noise:
-            # One draw per embedding: the k tokens stay copies of each other.
             noise = step.randn(slots_of(self.policy), self.policy.width)
-            noise = noise.repeat_interleave(repeats_of(self.policy), dim=1)
             tokens = nn.functional.normalize(tokens + self.policy.noise * noise, dim=2)
             tokens = tokens * self.policy.width**0.5
-        return tokens, by_photo
+        return tokens
 
-    def _dropped(self, step: Step, by_photo: Tensor | None) -> Tensor:
-        """Which embeddings and inputs (n, parts, 1) are dropped; states also with theirs."""
+    def _dropped(self, step: Step) -> Tensor:
+        """Which embeddings and inputs (n, parts, 1) are dropped; patches also with their photo."""
         draws = step.rand(len(self.lengths), 1)
-        dropped = draws < self.policy.dropout
-        for k, name in enumerate(
-            inputs_of(self.policy) if slots_of(self.policy) else (), slots_of(self.policy)
-        ):
-            text = name == "words"
-            theirs = dropped[:, 0 if text else slots_of(self.policy) - 1]
-            if by_photo is not None:
-                theirs = theirs | (by_photo[:, 0] == text)
-            dropped[:, k] = theirs | (draws[:, k] < self.policy.drop_states)
+        dropped, slots = draws < self.policy.dropout, slots_of(self.policy)
+        if "patches" in self.inputs:
+            dropped[:, slots:] = dropped[:, slots - 1 : slots] | (draws[:, slots:] < DROP_PATCHES)
         return dropped
-
-    def weight(self, t: Tensor) -> Tensor:
-        """The min-SNR weight of each step."""
-        if self.schedule.min_snr is None:
-            return torch.ones(len(t))
-        snr = (self.alphas[t] / (1 - self.alphas[t])).float()
-        epsilon = self.schedule.prediction == "epsilon"
-        return snr.clamp(max=self.schedule.min_snr) / (snr if epsilon else snr + 1)
 
 
 def _take(table: Tensor | NDArray[Any], rows: NDArray[np.int64]) -> Tensor:

@@ -53,7 +53,6 @@ from palpate.core import (
     digest_json,
     quiet,
     read_record,
-    require,
     require_regular,
     seed_for,
     write_json,
@@ -181,21 +180,23 @@ class ClipEncoders:
         inputs = {"pixel_values": pixels, **inputs}
         return normalize(_projected(self.model.get_image_features(**inputs)), dim=-1)
 
-    def states(self, modality: str, batch: Tensor | Sequence[str], count: int) -> Tensor:
-        """States of the last layer, before the projection; see :meth:`EncoderSet.states`."""
-        if modality == "vision":
-            model: Any = getattr(self.model, "vision_model", self.model)
-            pixels = torch.as_tensor(batch)
-            inputs = _patches(pixels, self.model) if self.family == "siglip2" else {}
-            return patch_states(model(**{"pixel_values": pixels, **inputs}), pixels, model, count)
-        config: Any = _config(self.model).text_config
-        context = int(config.max_position_embeddings)
-        require(count <= context, "words", f"must be at most {context}, the encoder's", count)
-        texts = [str(text).lower() if self.family != "clip" else str(text) for text in batch]
-        fill: dict[str, Any] = {"padding": "max_length", "truncation": True, "max_length": count}
-        ids = self.tokenizer(texts, return_tensors="pt", **fill)["input_ids"]
-        # Without a mask, as the generators that were trained on these states saw them.
-        return self.model.text_model(input_ids=ids.to(self.model.device)).last_hidden_state
+    def patches(self, pixels: Tensor, count: int) -> Tensor:
+        """States of a photo's patches in the last layer, before the projection.
+
+        Args:
+            pixels: preprocessed (n, 3, size, size).
+            count: a square number; the patches are averaged to so many.
+
+        Returns:
+            (n, count, width); what others put before the patches (CLS) is left out.
+        """
+        model: Any = getattr(self.model, "vision_model", self.model)
+        inputs = _patches(pixels, self.model) if self.family == "siglip2" else {}
+        output = model(**{"pixel_values": pixels, **inputs})
+        grid = pixels.shape[2] // int(model.config.patch_size)
+        states = output.last_hidden_state[:, -(grid**2) :].transpose(1, 2)
+        states = states.unflatten(2, (grid, grid))
+        return adaptive_avg_pool2d(states, math.isqrt(count)).flatten(2).transpose(1, 2)
 
     def digest(self, modality: str) -> str:
         """SHA-256 of the vision or the text encoder."""
@@ -384,28 +385,6 @@ class EncoderSet:
             names = [self.sensor] * len(pixels) if self.sensor else sensors
             return tactile.encode(pixels, names)
         return encode_tactile(tactile, pixels)
-
-    def states(self, modality: str, batch: Tensor | Sequence[str], count: int) -> Tensor:
-        """States of an encoder's last layer, which share no space: (n, count, width).
-
-        Args:
-            modality: ``text``, ``vision`` or ``tactile``.
-            batch: texts, of which the first ``count`` words are taken with their padding, or
-                preprocessed pixels (n, 3, size, size), whose patches are averaged to a square.
-            count: of images a square number.
-
-        Raises:
-            PalpateError: if the text encoder reads fewer words, or the encoder has no patches.
-        """
-        if modality != "tactile":
-            return self._clip(modality).states(modality, batch, count)
-        tactile: Any = self._tactile(modality)[0]
-        if isinstance(tactile, TactileModule):
-            must, fix = "must be a transformer of palpate or transformers", "Choose another"
-            raise PalpateError(must, f"{tactile.format.name}", fix, argument="encoder")
-        pixels = torch.as_tensor(batch)
-        model = tactile.vision_model
-        return patch_states(model(pixel_values=pixels), pixels, model, count)
 
     def digest(self, modality: str) -> str:
         """SHA-256 of one encoder: weights, architecture, preprocessing."""
@@ -683,13 +662,6 @@ def _patches(pixels: Tensor, model: Any) -> dict[str, Tensor]:
     shapes = torch.full((n, 2), side, device=pixels.device)
     mask = torch.ones(rows.shape[:2], dtype=torch.int32, device=pixels.device)
     return {"pixel_values": rows, "pixel_attention_mask": mask, "spatial_shapes": shapes}
-
-
-def patch_states(output: Any, pixels: Tensor, model: Any, count: int) -> Tensor:
-    """States (n, count, width) of a transformer's patches, averaged; of others' (CLS) none."""
-    grid = pixels.shape[2] // int(model.config.patch_size)
-    states = output.last_hidden_state[:, -(grid**2) :].transpose(1, 2).unflatten(2, (grid, grid))
-    return adaptive_avg_pool2d(states, math.isqrt(count)).flatten(2).transpose(1, 2)
 
 
 def _projected(output: Any) -> Tensor:
