@@ -39,8 +39,8 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import numpy as np
 import torch
+from common import Judge, JudgeLoss, by_video
 from diffusers import DPMSolverMultistepScheduler, UNet2DConditionModel
-from generator_ablation import Judge, JudgeLoss, by_video
 from PIL import Image
 
 from palpate.core import quiet
@@ -145,9 +145,9 @@ class Bench:
                 image.save(folder / f"{k:04}.jpg", quality=90)
         return sorted(folder.iterdir())
 
-    def overlap(self, share=1):
+    def overlap(self):
         """Turns over parts of the photos, so that other work disturbs both."""
-        files, turns = self.files()[::share], (2 if self.sizes.small else 8)
+        files, turns = self.files(), (2 if self.sizes.small else 8)
         parts = [files[k::turns] for k in range(turns)]
         small = np.stack([np.asarray(Image.open(f).resize((64, 64))) for f in files[:64]])
         rows = self.pipeline.embed(small)
@@ -163,13 +163,6 @@ class Bench:
 
         generate(files[:2], model=self.pipeline, output=self.work / f"warm {time.time_ns()}")
         return {"photos": len(files), "pixels": PHOTO, **in_turns(whole, alone, turns)}
-
-    def overlap_two(self):
-        """Sampling on two threads, which leaves no core for reading and writing."""
-        torch.set_num_threads(2)
-        result = self.overlap(share=5)
-        torch.set_num_threads(1)
-        return result
 
     @staticmethod
     def frames(paths, folder):
@@ -341,7 +334,7 @@ class Bench:
         both = torch.cat([pipeline.denoiser.null_tokens(1).expand(tokens.shape), tokens])
         s, images = pipeline.sampler.guidance, {}
         # The loop guides at every step by the plain formula; so must the pipeline here.
-        plainly = replace(pipeline.sampler, low=0.0, high=1.0, rescale=0.0)
+        plainly = replace(pipeline.sampler, high=1.0, rescale=0.0)
 
         @torch.no_grad()
         def plain(_):
@@ -412,7 +405,6 @@ PARTS = {
     "start": Bench.start,
     "steps": Bench.steps,
     "overlap": Bench.overlap,
-    "overlap, two threads": Bench.overlap_two,
 }
 
 
@@ -441,7 +433,7 @@ def ends(row):
     return f"{value:.3f} [{low:.3f}, {high:.3f}]" if low == low else f"{value:.3f}"
 
 
-def page(results, load, minutes):
+def page(results):
     """The whole Markdown file."""
     rows = []
 
@@ -453,11 +445,6 @@ def page(results, load, minutes):
     r = results["overlap"]
     many = f"`generate` of {r['photos']:,} photos of {r['pixels'][0]} x {r['pixels'][1]}"
     add(f"{many} into a folder / sampling alone", r, "at most 1.05 (wall)")
-    add(
-        "a fifth of them, sampling on two threads",
-        results["overlap, two threads"],
-        "(not told on a busy machine)",
-    )
     what = f"frames of {PHOTO[0]} x {PHOTO[1]} read and encoded in each step / cached"
     add(f"training, {what}", results["cached"]["read"], "at least 1.4")
     add("training, only encoded in each step / cached", results["cached"]["held"], "")
@@ -478,22 +465,16 @@ def page(results, load, minutes):
     start, loop = results["start"], results["diffusers"]
     bf16 = results["bf16"].get("sampling", {}).get("mean difference of a pixel")
     rounding = "" if bf16 is None else f" bf16 changes a pixel by {bf16:.2f} of 255 on average."
-    amx = "has AMX" if torch.cpu.get_capabilities().get("amx_bf16") else "has no AMX"
     return f"""# Generating: speed
 
 Made by a committed command; do not edit by hand. {platform.machine()}, {os.cpu_count()} cores,
-torch {torch.__version__}, one thread unless said; {datetime.date.today().isoformat()}; other work
-on the machine: load {load[0]:.1f} at the start, {load[1]:.1f} at the end; {minutes:.0f} minutes.
+torch {torch.__version__}, one thread unless said; {datetime.date.today().isoformat()}.
 
     python benchmarks/generating.py --write docs/studies/generating.md
 
 The shipped generator, on photos of a procedural world that it has not seen. Both of a pair ran in
 turns in one process, and the ratio is the median over turns; processor seconds are those of all
-threads, so work that another core does meanwhile counts in them and not in the wall's ratio. Photos
-of 1024 x 768, tried first, gave 1.098 (processor) and 1.124 (wall) in the first row: larger ones
-cost more to read than sampling hides on busy cores. The plain loop and the pipeline do the same
-work: the middle half of {loop["turns"]} turns lies at {loop["quartiles"][0]} to
-{loop["quartiles"][1]}.
+threads.
 
 | first / second | processor s, a turn (a step) | ratio, processor | ratio, wall | wanted |
 |---|---|---|---|---|
@@ -503,8 +484,6 @@ One photo with `palpate generate photo.jpg -o t.png`, start-up included:
 {start["processor seconds"]} processor seconds (median of {start["runs"]}; wanted: below 8). The
 pipeline makes {loop["images a processor second"]} images a processor second; its images and those
 of the plain loop differ by {loop["largest difference of a pixel"]} of 255 at most.{rounding}
-bf16 is faster on processors with AMX: on one it sampled 1.577 and trained 1.346 times as fast (27
-November 2026). This one {amx}.
 
 ## Few steps against many
 
@@ -532,7 +511,7 @@ def main():
     minutes = (time.perf_counter() - begin) / 60
     print(f"{minutes:.1f} minutes, load {load:.1f} to {os.getloadavg()[0]:.1f}")
     if chosen.write and len(results) == len(PARTS):
-        text = page(results, (load, os.getloadavg()[0]), minutes)
+        text = page(results)
         chosen.write.write_text(text, encoding="utf-8")
 
 

@@ -1,15 +1,15 @@
-"""What the presets made for GPUs cost on one: training steps and sampling, plain and fast.
+"""What the preset ``paper`` costs on a GPU: training steps and sampling, plain and fast.
 
     python benchmarks/gpu.py --write docs/studies/gpu.md
     python benchmarks/gpu.py --device cpu --small      # a try of the code without a GPU
 
-- ``train``: the tactile encoder of ``paper``, and the U-Nets of ``paper`` and ``sd15``, in steps of
-  the training engine: in float32, with TF32, in bf16, and in bf16 with ``torch.compile``.
-- ``cached``: the same of both U-Nets where each step also encodes its images and texts, as a loop
+- ``train``: the tactile encoder, and the U-Net, in steps of the training engine: in float32, with
+  TF32, in bf16, and in bf16 with ``torch.compile``.
+- ``cached``: the same of the U-Net where each step also encodes its images and texts, as a loop
   without caches does; they lie in memory, so reading them is not in it (wanted: at least 1.4 times
   the seconds of the cached step).
-- ``sample``: ``paper`` (DDIM, 200 steps) and ``sd15`` (DPM-Solver++, 25), guided, with their
-  autoencoders: by a plain float32 loop of diffusers' parts, and by the pipeline in the same modes.
+- ``sample``: DDIM with 200 steps, guided, with the autoencoder: by a plain float32 loop of
+  diffusers' parts, and by the pipeline in the same modes.
 
 Weights are random, in the published sizes: what a step costs does not depend on them. Operations
 are counted by PyTorch (without those that cached gradients repeat); the share is that of the
@@ -32,7 +32,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from diffusers import AutoencoderKL, UNet2DConditionModel, VQModel
+from diffusers import VQModel
 from torch.utils.flop_counter import FlopCounterMode
 from transformers import CLIPTextConfig, CLIPTextModelWithProjection
 
@@ -64,14 +64,14 @@ MODES = {
     "bf16 + compile": ("bf16", {"compile": True}),
 }
 PLAIN = "float32, plain loop of diffusers"
-#: Channels of the autoencoders' levels: of latent diffusion's vq-f4, of Stable Diffusion's kl-f8.
-LEVELS = {"paper": (128, 256, 512), "sd15": (128, 256, 512, 512)}
-#: The text encoder of CLIP ViT-L/14, which both presets are conditioned on.
+#: Channels of the levels of latent diffusion's vq-f4.
+LEVELS = (128, 256, 512)
+#: The text encoder of CLIP ViT-L/14, which the preset is conditioned on.
 TEXT = {"hidden_size": 768, "intermediate_size": 3072, "num_attention_heads": 12}
 ENCODED = ", encoded in each step"
 #: Of the page's table.
 COLUMNS = ["what", "mode", "batch", "ms a step", "images a second", "ratio"]
-COLUMNS += ["TFLOP/s", "of peak", "GB", "s in all", "day"]
+COLUMNS += ["TFLOP/s", "of peak", "GB", "day"]
 
 
 class EnoughError(Exception):
@@ -85,13 +85,10 @@ def synchronized():
     return time.perf_counter()
 
 
-def denoiser(name, chosen):
-    """The untrained denoiser of a preset; of ``sd15`` in the geometry of Stable Diffusion 1.5."""
-    policy, side = chosen.condition, chosen.size // 2 ** (len(LEVELS[name]) - 1)
-    if chosen.unet is not None:
-        return Denoiser(build_unet(chosen.unet, policy, channels=3, size=side), policy), side
-    unet = UNet2DConditionModel(cross_attention_dim=policy.width, sample_size=side)
-    return Denoiser(unet, policy), side
+def denoiser(chosen):
+    """The untrained denoiser of a preset."""
+    policy, side = chosen.condition, chosen.size // 2 ** (len(LEVELS) - 1)
+    return Denoiser(build_unet(chosen.unet, policy, channels=3, size=side), policy), side
 
 
 def encoder_steps(chosen, batch, chunk):
@@ -108,18 +105,16 @@ def encoder_steps(chosen, batch, chunk):
     return model, loss, lambda step: {name: rows[step.rows] for name, rows in data.items()}
 
 
-def autoencoder(name, channels):
-    """The untrained autoencoder of a preset."""
-    levels = LEVELS[name]
+def autoencoder(channels):
+    """The untrained autoencoder."""
     sizes = {
-        "down_block_types": ("DownEncoderBlock2D",) * len(levels),
-        "up_block_types": ("UpDecoderBlock2D",) * len(levels),
-        "block_out_channels": levels,
+        "down_block_types": ("DownEncoderBlock2D",) * len(LEVELS),
+        "up_block_types": ("UpDecoderBlock2D",) * len(LEVELS),
+        "block_out_channels": LEVELS,
         "layers_per_block": 2,
         "latent_channels": channels,
     }
-    net = AutoencoderKL(**sizes) if name == "sd15" else VQModel(**sizes)
-    return Autoencoder(net.eval().requires_grad_(False))
+    return Autoencoder(VQModel(**sizes).eval().requires_grad_(False))
 
 
 class Live:
@@ -136,34 +131,28 @@ class Live:
             return self.function(rows).float().cpu()
 
 
-def encoded_steps(name, chosen, batch, device, mode):
+def encoded_steps(chosen, batch, device, mode):
     """`denoiser_steps` where latents, and what a text becomes, are made anew in each step."""
-    model, loss, load = denoiser_steps(name, chosen, batch)
-    code = autoencoder(name, model.channels).to(device)
+    model, loss, load = denoiser_steps(chosen, batch)
+    code = autoencoder(model.channels).to(device)
     config = CLIPTextConfig(**TEXT, projection_dim=model.policy.width)
     text = CLIPTextModelWithProjection(config).to(device).eval()
     pixels = torch.randint(256, (batch, 3, chosen.size, chosen.size), dtype=torch.uint8)
     words = torch.randint(config.vocab_size, (batch, 77))
-
-    def states(rows):
-        found = text(rows)
-        return found.last_hidden_state if model.policy.words else found.text_embeds[:, None]
-
     loss.latents = Live(pixels, device, mode, lambda rows: code.latents(rows / 127.5 - 1))
-    table = loss.inputs if model.policy.words else loss.tokens
-    table["words" if model.policy.words else "text"] = Live(words, device, mode, states)
+    embedded = lambda rows: text(rows).text_embeds[:, None]
+    loss.tokens["text"] = Live(words, device, mode, embedded)
     return model, loss, load
 
 
-def denoiser_steps(name, chosen, batch):
+def denoiser_steps(chosen, batch):
     """The denoiser, its loss, and the data of a batch of latents."""
-    model, side = denoiser(name, chosen)
+    model, side = denoiser(chosen)
     policy = model.policy
     latents = torch.randn(batch, model.channels, side, side)
     tokens = {source: torch.randn(batch, 1, policy.width) for source in policy.sources}
-    states = {"words": torch.randn(batch, policy.words, policy.width)} if policy.words else {}
     how = {"stats": LatentStats.of(latents), "schedule": chosen.schedule, "policy": policy}
-    loss = DiffusionLoss(latents, tokens, None, inputs=states, **how)
+    loss = DiffusionLoss(latents, tokens, None, **how)
     return model, loss, loss.load
 
 
@@ -198,12 +187,12 @@ def steps(built, batch, device, mode, count):
     return float(np.median(np.diff(at)[2:])), counter.get_total_flops() / 2
 
 
-def generator(name, chosen, device):
+def generator(chosen, device):
     """The pipeline of a preset, with random weights."""
-    model, _ = denoiser(name, chosen)
+    model, _ = denoiser(chosen)
     ones = (1.0,) * model.channels
     return TactilePipeline(
-        autoencoder=autoencoder(name, model.channels),
+        autoencoder=autoencoder(model.channels),
         denoiser=model.eval().requires_grad_(False),
         stats=LatentStats((0.0,) * model.channels, ones, "one"),
         schedule=chosen.schedule,
@@ -229,12 +218,12 @@ def plain_loop(pipeline, rows, ids, count, at):
     return pipeline.autoencoder.decode(z)
 
 
-def sampling(name, chosen, device, mode, batch, count):
+def sampling(chosen, device, mode, batch, count):
     """Seconds of a sampler step and of decoding a batch, and operations of an image's step."""
     precision, how = MODES.get(mode, ("float32", {}))
     torch.backends.cuda.matmul.allow_tf32 = precision != "float32"
     torch.backends.cudnn.allow_tf32 = precision != "float32"
-    pipeline = generator(name, chosen, device)
+    pipeline = generator(chosen, device)
     rows, ids = torch.randn(batch, pipeline.denoiser.policy.width), [*map(str, range(batch))]
     with FlopCounterMode(display=False) as counter:
         pipeline.sample(rows[:1], ids[:1], seed=0, sampler=pipeline.sampler_with(steps=1, batch=1))
@@ -334,8 +323,8 @@ class Bench:
                 chunk = 2 if self.small else 32
                 make = partial(encoder_steps, encoder_preset(chosen), batch, chunk)
             else:
-                batch, name = 4 if self.small else 32, what.removesuffix(ENCODED).split()[-1]
-                how = (name, self.preset(name), batch)
+                batch = 4 if self.small else 32
+                how = (self.preset(), batch)
                 make = partial(denoiser_steps, *how)
                 if what.endswith(ENCODED):
                     make = partial(encoded_steps, *how, self.device, mode)
@@ -345,31 +334,28 @@ class Bench:
 
             self.row(f"training, {what}", mode, batch, measure)
 
-    def preset(self, name):
+    def preset(self):
         """The preset, or in a try a tiny one in its place."""
-        return preset_named("tiny" if self.small else name)
+        return preset_named("tiny" if self.small else "paper")
 
-    def sample(self, name):
-        """One generator in the requested modes, and by the plain loop."""
-        chosen, batch, count = self.preset(name), 2 if self.small else 16, 4 if self.small else 10
+    def sample(self):
+        """The generator in the requested modes, and by the plain loop."""
+        chosen, batch, count = self.preset(), 2 if self.small else 16, 4 if self.small else 10
         for mode in (PLAIN, *self.modes):
 
             def measure(mode=mode):
-                one = sampling(name, chosen, self.device, mode, batch, count)
+                one = sampling(chosen, self.device, mode, batch, count)
                 step, decode, operations = one
                 whole = chosen.sampler.steps * step + decode
                 return step, operations, {"whole": whole, "decode": decode}
 
-            self.row(f"sampling, {name}", mode, batch, measure)
+            self.row("sampling, paper", mode, batch, measure)
 
 
 PARTS = {
     "train paper": lambda bench: bench.train("U-Net of paper"),
-    "train sd15": lambda bench: bench.train("U-Net of sd15"),
     "cached paper": lambda bench: bench.train(f"U-Net of paper{ENCODED}"),
-    "cached sd15": lambda bench: bench.train(f"U-Net of sd15{ENCODED}"),
-    "sample paper": lambda bench: bench.sample("paper"),
-    "sample sd15": lambda bench: bench.sample("sd15"),
+    "sample paper": lambda bench: bench.sample(),
     "train encoder": lambda bench: bench.train("encoder of paper"),
 }
 
@@ -392,7 +378,8 @@ def page(record):
     lines, first = [], {}
     modes = [PLAIN, *MODES]
     order = lambda r: (r["what"], r["day"], modes.index(r["mode"]))
-    for row in sorted(record["rows"], key=order):
+    shown = [r for r in record["rows"] if not r["what"].endswith(ENCODED)]
+    for row in sorted(shown, key=order):
         cells = [row["what"], row["mode"], row["batch"]]
         if "note" in row:
             cells += [row["note"]]
@@ -402,7 +389,7 @@ def page(record):
             share = f"{100 * row['share']:.0f} %" if "share" in row else ""
             memory = f"{row['GB']:.1f}" if "GB" in row else ""
             cells += [f"{1000 * row['seconds']:.0f}", f"{row['images']:.3g}", ratio]
-            cells += [f"{row['TFLOP/s']:.0f}", share, memory, f"{row['all']:.0f}", row["day"]]
+            cells += [f"{row['TFLOP/s']:.0f}", share, memory, row["day"]]
         lines.append(f"| {' | '.join(map(str, cells))} |")
     return f"""# On one GPU: speed
 
@@ -411,15 +398,11 @@ Made by a committed command; do not edit by hand. **{record["device"]}**,
 
     python benchmarks/gpu.py --write docs/studies/gpu.md
 
-Random weights in the published sizes: `paper` (406 M parameters; a `vq-f4`, with 256 codes; 256
-px), `sd15` (the geometry of Stable Diffusion 1.5, 860 M; its `kl-f8`; 256 px), and the encoder of
-tactile images of `paper` (ViT-Large) in chunks of 32. A training step has optimizer and moving
-average. A sampled image takes the preset's steps (`paper` 200, `sd15` 25), each of two passes; ten
-are timed, their median stands for all, and decoding comes on top. Compiling comes before what is
-timed, and is in the seconds in all. The ratio is to the first row of the same work and day, the
-share that of the device's peak by its data sheet, at that precision. Days may be of different hosts
-with this card: where the host's Python, not the card, sets the pace, they do not compare. Rows that
-are not there have not been measured.
+Random weights in the published sizes of `paper`: the U-Net (406 M parameters), a `vq-f4` with 256
+codes, 256 px, and the encoder of tactile images (ViT-Large) in chunks of 32. A training step has
+optimizer and moving average. A sampled image takes 200 steps, each of two passes; ten are timed,
+their median stands for all, and decoding comes on top. The ratio is to the first row of the same
+work and day, the share that of the device's peak by its data sheet, at that precision.
 
 | {" | ".join(COLUMNS)} |
 {"|---" * len(COLUMNS)}|
@@ -427,10 +410,8 @@ are not there have not been measured.
 
 ## Cached latents and conditions
 
-Seconds of a step that also encodes its images and texts (by the autoencoder, and by the text
-encoder of CLIP ViT-L/14; uint8 images in memory, so nothing is read), over those of a step with
-both cached, as `palpate train generator` has them (wanted: at least 1.4). What is encoded goes
-through the host's memory, as what is cached does; a loop of one's own could leave it on the device.
+Seconds of a step that also encodes its images and texts (uint8 images in memory), over those of a
+step with both cached, as `palpate train generator` has them (wanted: at least 1.4).
 
 {cached(record)}.
 """
