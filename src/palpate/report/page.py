@@ -35,8 +35,6 @@ from palpate.report.thumbnails import Album, Wanted, fit
 HERO_ROWS = 3
 #: Gallery rows and pairs of one list that show at once, and that the page holds at all.
 OPEN_ROWS, MAX_ROWS = 8, 160
-#: Rows of one method's images after several trainings.
-COMPARED = 4
 OPEN_PAIRS, MAX_PAIRS = 6, 24
 #: Claims that show at once.
 OPEN_CLAIMS = 6
@@ -127,7 +125,7 @@ def render_page(
     columns = first_screen.telling_columns(tables)
     controls = study_tables.controls_of(results)
     cards = first_screen.cards(results, columns, controls)
-    samples, compared = gallery_images(results.gallery), compared_images(results.gallery)
+    samples = gallery_images(results.gallery)
     hero_rows: dict[Hashable, list[Wanted]] = {
         id(item): images for item, images in samples[:HERO_ROWS]
     }
@@ -140,8 +138,7 @@ def render_page(
         "caution": first_screen.caution(results),
         "facts": list(results.facts) or ([] if cards else sentences.summary_lines(results)),
         "cards": cards,
-        "row_labels": _labels(samples),
-        "compared_labels": _labels(compared),
+        "row_labels": [wanted.label for wanted in samples[0][1]] if samples else [],
         "sheets": sheets(results),
         "tables": tables,
         "verdict": study_tables.lay(columns, controls),
@@ -175,11 +172,6 @@ def render_page(
                 images=album.rows,
                 gallery=(gallery[:OPEN_ROWS], gallery[OPEN_ROWS:]),
                 shown=len(hero) + len(gallery),
-                compared=[
-                    (item, album.rows[key])
-                    for item, _ in compared
-                    if (key := ("compared", id(item))) in album.rows
-                ],
                 strips=[(s, album.rows[id(s)]) for s in results.strips if id(s) in album.rows],
             )
         )
@@ -198,16 +190,11 @@ def render_page(
         budget -= excess + 1_000
 
 
-def _labels(rows: Sequence[tuple[GalleryItem, list[Wanted]]]) -> list[str]:
-    return [wanted.label for wanted in rows[0][1]] if rows else []
-
-
 def image_rows(results: Results) -> tuple[dict[Hashable, list[Wanted]], int]:
     """Return all rows of images by key, the most important first, and how many are essential.
 
     Pairs take turns: every list of every audit shows its strongest pair before any shows its
-    second. Keys are (audit, list, pair), ``id`` of a gallery item, and ("compared", ``id``) of its
-    images after several trainings.
+    second. Keys are (audit, list, pair) and ``id`` of a gallery item.
     """
     pairs: dict[Hashable, list[Wanted]] = {}
     folded_pairs: dict[Hashable, list[Wanted]] = {}
@@ -223,8 +210,7 @@ def image_rows(results: Results) -> tuple[dict[Hashable, list[Wanted]], int]:
                 target[a, k, rank] = pair_images(members[rank], head)
     gallery = [(id(i), w) for i, w in gallery_images(results.gallery)[HERO_ROWS:MAX_ROWS]]
     strips = [(id(strip), _strip_images(strip)) for strip in results.strips]
-    compared = [(("compared", id(i)), w) for i, w in compared_images(results.gallery)]
-    first = [*gallery[:OPEN_ROWS], *compared, *pairs.items(), *strips]
+    first = [*gallery[:OPEN_ROWS], *pairs.items(), *strips]
     return dict([*first, *gallery[OPEN_ROWS:], *folded_pairs.items()]), len(first)
 
 
@@ -272,18 +258,6 @@ def gallery_images(gallery: Sequence[GalleryItem]) -> list[tuple[GalleryItem, li
         any(image.path for image in column) for column in zip(*(w for _, w in rows), strict=True)
     ]
     return [(item, list(compress(images, known))) for item, images in rows]
-
-
-def compared_images(gallery: Sequence[GalleryItem]) -> list[tuple[GalleryItem, list[Wanted]]]:
-    """The samples that have other generated images, next to each other under their labels."""
-    rows: list[tuple[GalleryItem, list[Wanted]]] = []
-    labels = list(dict.fromkeys(label for item in gallery for label in item.others))
-    for item in in_turns([item for item in gallery if item.others]):
-        name = f"{item.sample.material or 'sample'}, {where(item.sample)}"
-        shown = [("Photo", item.sample.vision), ("Real", item.sample.tactile)]
-        shown += [(item.label, item.generated), *((n, item.others.get(n)) for n in labels)]
-        rows.append((item, [Wanted(path, f"{label}: {name}", label) for label, path in shown]))
-    return rows[:COMPARED]
 
 
 def _strip_images(strip: Strip) -> list[Wanted]:

@@ -300,16 +300,12 @@ class GalleryItem:
         generated: path of the generated image.
         background: that of the image without contact.
         method: what generated it.
-        others: label -> path of images of the same photo that stand next to it in a block of their
-            own, where ``label`` is that of ``generated``, e.g. "NoLeak" next to {"Orig": path}.
     """
 
     sample: SampleRef
     generated: str | None
     background: str | None = None
     method: str = ""
-    label: str = "Generated"
-    others: Mapping[str, str | None] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -540,8 +536,6 @@ def _with_paths(value: Any, change: Callable[[str], str | None]) -> Any:
     ):
         return value
     new = {field.name: _with_paths(getattr(value, field.name), change) for field in fields(value)}
-    if isinstance(value, GalleryItem):
-        new["others"] = {k: p and change(p) for k, p in value.others.items()}
     paths = {name: new[name] for name in _PATHS.get(type(value), ())}
     new |= {name: None if path is None else change(path) for name, path in paths.items()}
     return replace(value, **new)

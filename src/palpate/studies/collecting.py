@@ -13,7 +13,7 @@ from palpate.data.manifest import Manifest
 from palpate.diffusion.generation import Generated
 from palpate.evaluation.probing import results_of
 from palpate.report.notes import percent
-from palpate.report.results import Audit, GalleryItem, Results
+from palpate.report.results import Audit, Results
 from palpate.studies.claims import Names, differences_over_seeds, effect_table, paper_claims
 from palpate.studies.controls import FLOOR, NEAREST
 from palpate.studies.demo_page import gallery as gallery_of
@@ -41,14 +41,14 @@ def collect(
     methods: Sequence[str],
     judgments: Mapping[tuple[str, str], Sequence[str]],
     probes: Mapping[str, Sequence[str]],
-    gallery: Mapping[str, str],
+    gallery: str,
     people: Path | None = None,
     useful: bool = False,
 ) -> Facts:
     """Write ``results.json``: everything but the record of the run.
 
     ``judgments``: (split of the images, split of the judge) -> nodes, one a seed; ``probes``: split
-    -> nodes; ``gallery``: split -> node of the images that are shown; ``people``: results of a
+    -> nodes; ``gallery``: node of the images that are shown; ``people``: results of a
     human study, columns of table 3 and evidence of claims; ``useful``: whether there is the stage
     ``utility``.
     """
@@ -83,9 +83,10 @@ def collect(
         facts=[_leak(audits), *_distance(own), *_material(own), *probed.facts[:1]],
         audits=audits,
         scores=[s for (metric, _), s in own.by_name.items() if DIFFERENCE not in metric],
-        gallery=_gallery(
-            study.on_both[0], manifest, {s: after[node] / "images" for s, node in gallery.items()}
-        ),
+        gallery=[
+            replace(item, method=study.on_both[0])
+            for item in gallery_of(manifest, Generated.load(after[gallery] / "images"), 0)
+        ],
         settings={
             "split rule": {name: dict(s.rule) for name, s in splits.items()},
             "methods": {method.name: method.text for method in study.methods},
@@ -98,23 +99,6 @@ def collect(
     if people is not None:  # ``palpate verify`` reads it again
         shutil.copyfile(people, place / "people.json")
     return {"tables": len(tables), "claims": len(claims), "scores": len(results.scores)}
-
-
-def _gallery(method: str, manifest: Manifest, folders: Mapping[str, Path]) -> list[GalleryItem]:
-    """Samples of the split without leaks; next to them the images after training on the other."""
-    made = {split: Generated.load(folder) for split, folder in folders.items()}
-    both = {*made[ORIG].ids}
-    return [
-        replace(
-            item,
-            method=method,
-            label=NOLEAK,
-            others={ORIG: str(made[ORIG].path(item.sample.id).resolve())}
-            if item.sample.id in both
-            else {},
-        )
-        for item in gallery_of(manifest, made[NOLEAK], 0)
-    ]
 
 
 def _compares(difference: Score, methods: Sequence[str]) -> bool:

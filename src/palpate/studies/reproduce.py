@@ -196,7 +196,7 @@ def nodes_of(plan: Plan) -> list[Node]:
     nodes += useful
     judgments = {(s, j): [_scores(s, j, n) for n in plan.seeds] for s, j in product(SPLITS, SPLITS)}
     probes = {split: [f"probe-{split}-{seed}" for seed in plan.seeds] for split in SPLITS}
-    shown = {split: _images(study.on_both[0], split, plan.seeds[0]) for split in SPLITS}
+    shown = _images(study.on_both[0], NOLEAK, plan.seeds[0])
     build = partial(
         collect,
         study=study,
@@ -208,7 +208,7 @@ def nodes_of(plan: Plan) -> list[Node]:
         useful=bool(useful),
     )
     read = [node for of in (judgments, probes) for nodes in of.values() for node in nodes]
-    after = ["data", "split", *shown.values(), *read, *(node.name for node in useful)]
+    after = ["data", "split", shown, *read, *(node.name for node in useful)]
     inputs = {"study": study.name, "title": study.title, "tables": study.tables}
     inputs |= {"paper": study.paper, "methods": plan.methods, "controls": list(study.controls)}
     inputs |= {"people": plan.people and digest_file(plan.people)}
