@@ -301,11 +301,6 @@ def make_trajectory(
     ]
 
 
-def write_contacts(path: Path, rows: Sequence[Sequence[str]]) -> None:
-    """Write ``contact.json`` or ``not_contact.json`` of list rows."""
-    path.write_text(json.dumps({"vision": [r[0] for r in rows], "tactile": [r[1] for r in rows]}))
-
-
 def make_hct(folder: Path) -> Tree:
     """Two rigs of three trajectories with four frames, one of them in test, and two untouched."""
     root = folder / "hct"
@@ -320,8 +315,6 @@ def make_hct(folder: Path) -> Tree:
                 parts[part].append([*row, f"Hard, smooth{' ' * k}, Ridged."])
         for part, listed in parts.items():
             write_csv(rig / f"{part}.csv", TVL_COLUMNS, listed)
-        write_contacts(rig / "contact.json", [row for n, row in enumerate(rows) if n % 6 > 1])
-        write_contacts(rig / "not_contact.json", [row for n, row in enumerate(rows) if n % 6 < 2])
     return Tree(root, 24)
 
 

@@ -1,12 +1,10 @@
 """Trajectories of HCT: contacts and sessions, backgrounds, swapped folders, and bad input."""
 
-import json
 import shutil
 
 import pytest
-from PIL import Image
 
-from format_trees import PHOTO, gel, kinds, make_hct, name_of, photo, put, write_contacts, write_csv
+from format_trees import PHOTO, gel, kinds, make_hct, name_of, photo, put, write_csv
 from format_trees import TACTILE as SENSOR
 from format_trees import TVL_COLUMNS as COLUMNS
 from format_trees import make_trajectory as trajectory
@@ -22,71 +20,7 @@ def tree(tmp_path):
     return make_hct(tmp_path / "in").source
 
 
-# --- Contact.json, captions, contacts, sessions
-
-
-def test_frames_that_only_contact_json_names_are_counted(tree, tmp_path):
-    path = tree / "data1" / "test.csv"
-    path.write_text("\n".join(path.read_text().splitlines()[:-1]))
-    left = read(tree, tmp_path / "a")
-    (problem,) = left.suspicious
-    assert (problem.kind, problem.text.split(":")[0]) == ("unlisted-contact", "1 row")
-    for path in tree.glob("data*/*.csv"):
-        path.unlink()
-    with pytest.raises(PalpateError, match="at least one usable sample"):
-        read(tree, tmp_path / "none")
-
-
-def test_frames_of_not_contact_json_are_no_samples(tree, tmp_path):
-    rig = tree / "data1"
-    data, contact = (
-        json.loads((rig / f"{n}.json").read_text()) for n in ("not_contact", "contact")
-    )
-    for side in data:
-        data[side].append(contact[side][0])  # a listed frame
-    (rig / "not_contact.json").write_text(json.dumps(data))
-    both = f"data1/{contact['vision'][0]}"
-    result = read(tree, tmp_path / "a")
-    assert kinds(result.suspicious) == {"contact-and-not": 1}
-    assert both in result.manifest.column("vision")
-    for path in rig.glob("*.csv"):
-        path.unlink()
-    assert both not in read(tree, tmp_path / "b").manifest.column("vision")
-
-
-@pytest.mark.parametrize(
-    ("text", "kind"),
-    [
-        ('{"vision": ["a"], "tactile": []}', "unequal-lists"),
-        ('{"vision": []}', "bad-json"),
-        ("", "bad-json"),
-        ('{"vision": [1], "tactile": [2]}', "bad-json"),
-        ("[]", "bad-json"),
-        ('{"vision": [], "tactile": [], "background": ["x"]}', "unequal-lists"),
-    ],
-)
-def test_broken_json_is_reported_once_and_its_rows_stay_out(tree, tmp_path, text, kind):
-    path = tree / "data1" / "contact.json"
-    path.write_text(text)
-    result = read(tree, tmp_path / "out", skip_bad=True)
-    assert [(p.where, p.kind) for p in result.skipped] == [(str(path), kind)]
-    assert len(result.manifest) == 24
-
-
-def test_a_contact_runs_on_through_frames_that_only_contact_json_names(tmp_path):
-    rig = tmp_path / "hct" / "data1"
-    rows = trajectory(rig, "4-100.5", [5, 6, 7, 10])
-    write_csv(rig / "train.csv", COLUMNS, [[*rows[k], "soft"] for k in (0, 2, 3)])
-    runs = []
-    for name, pairs in (("contact", []), ("contact", rows), ("not_contact", rows[1:2])):
-        write_contacts(rig / f"{name}.json", pairs)
-        runs.append(
-            [
-                t[-1]
-                for t in read(tmp_path, tmp_path / "out", overwrite=True).manifest.column("contact")
-            ]
-        )
-    assert runs == [["1", "2", "3"], ["1", "1", "2"], ["1", "2", "3"]]
+# --- Contacts and sessions
 
 
 def test_a_row_in_both_lists_is_reported_and_is_in_no_part(tree, tmp_path):
@@ -120,44 +54,21 @@ def test_each_source_of_a_background_is_tried_in_turn_and_counted(tree, tmp_path
     for video in videos[1:]:
         (video / "background.png").unlink()
     shutil.copy(videos[0] / "background.png", tree / "data2" / "digit_background.png")
-    for frame in (8, 9):  # of data1: its untouched frames are gone too
-        (videos[2] / "tactile" / name_of(frame)).unlink()
     result = read(tree, tmp_path / "out")
-    counts = "as listed 4, digit_background.png 12, none 4, untouched frame 4"
+    counts = "as listed 4, digit_background.png 12, none 8"
     assert result.facts["backgrounds"] == counts
     backgrounds = dict(result.manifest.table.select("video", "background").rows())
     names = [v.relative_to(tree).as_posix() for v in videos]
     assert [backgrounds[name] for name in names] == [
         f"{names[0]}/background.png",
-        f"{names[1]}/tactile/{name_of(8)}",
+        None,
         None,
         *["data2/digit_background.png"] * 3,
     ]
-    assert [(p.kind, p.text[:6]) for p in result.suspicious] == [("no-background", "4 rows")]
+    assert [(p.kind, p.text[:6]) for p in result.suspicious] == [("no-background", "8 rows")]
     (tree / "data2" / "digit_background.png").rename(tree / "digit_background.png")
     above = read(tree, tmp_path / "above")
     assert above.facts["backgrounds"] == "as listed 4, digit_background.png 20"
-
-
-def test_the_untouched_frame_nearest_to_the_median_is_taken(tmp_path):
-    rig = tmp_path / "hct" / "data1"
-    light = [90, 92, 91, 200, 10]
-    gray = lambda k: Image.new("RGB", SENSOR, (light[k % 100],) * 3)
-    rows = trajectory(rig, "4-100.5", range(20, 26), background=False)
-    rest = trajectory(rig, "4-100.5", range(5), background=False, tactile=gray)
-    write_csv(rig / "train.csv", COLUMNS, [[*row, "soft"] for row in rows])
-    write_contacts(rig / "not_contact.json", rest)
-    tactile = rig / "4-100.5" / "tactile"
-
-    def background():
-        imported = read(tmp_path, tmp_path / "out", overwrite=True)
-        return set(imported.manifest.column("background"))
-
-    assert background() == {f"data1/4-100.5/tactile/{name_of(2)}"}
-    (tactile / name_of(3)).write_bytes(b"")  # a broken one does not count
-    assert background() == {f"data1/4-100.5/tactile/{name_of(0)}"}
-    put(tactile / name_of(2), gel(1, size=(32, 32)))  # sizes differ: no median
-    assert background() == {None}
 
 
 # --- Swapped folders

@@ -5,7 +5,7 @@
     hct/
       data1/ data2/ data3/                     one rig each: another gel, another framing (domain)
         train.csv  test.csv                    url,tactile,tactile_background,caption
-        contact.json  not_contact.json         {"tactile": [..], "vision": [..], "background": [..]}
+        contact.json  not_contact.json         not read: frames in contact, and others
         finetune.json                          not read: captions again, as talk
         4-1702596295.70/vision/160-0.0207.jpg  folder: number, start in Unix seconds;
         4-1702596295.70/tactile/160-0.0207.jpg file: frame, latency in seconds
@@ -15,16 +15,13 @@
 The source may be ``hct/``, one ``dataN/``, or the folder that holds ``hct/``. The paths of a list
 are relative to its ``dataN/``, or start at ``dataN/`` or ``hct/``.
 
-- **Samples** are the rows of the lists. Frames that are in ``contact.json`` alone are none, but a
-  contact goes on through them.
+- **Samples** are the rows of the lists.
 - **video** is a trajectory folder with its rig, ``data2/4-1702596295.70`` (numbers before the dash
   repeat). **frame** is the number at the start of the file name. **contact** is a run of
-  consecutive frames in contact. **session** joins folders of one rig that were started at most a
+  consecutive listed frames. **session** joins folders of one rig that were started at most a
   minute after each other: they may show the same object. No column ``object`` is made of captions,
   since frames of one folder are worded differently.
-- **background** is the first of these that exists: the image that the list names,
-  ``digit_background.png``, the most typical of up to 15 frames of the trajectory in
-  ``not_contact.json``.
+- **background** is the image that the list names, else ``digit_background.png``.
 - **Swapped folders**: in some trajectories ``vision/`` holds the tactile images and ``tactile/``
   the photos. They are recognized by their size, which is that of the sensor in ``vision/`` alone.
 - Photos of ``data3`` show the touched spot lower: TVL crops them 200 pixels further down.
@@ -34,20 +31,17 @@ from __future__ import annotations
 
 import re
 from collections import Counter, defaultdict
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from contextlib import suppress
 from functools import cache
 from pathlib import Path, PurePosixPath
 from typing import Literal
 
-import numpy as np
-
-from palpate.core import PalpateError, Progress, Split, inside, quiet, require_choice
+from palpate.core import PalpateError, Progress, Split, quiet, require_choice
 from palpate.data.formats import tvl
 from palpate.data.formats.base import WORLD, Cells, Facts, Format, Row, Scan, world_facts
-from palpate.data.formats.layout import read_json_file, report_missing_folders, subfolders
-from palpate.data.frames import MEDIAN_OF, nearest_to_median
-from palpate.data.images import BROKEN, check_image, in_threads, opened, read_image
+from palpate.data.formats.layout import report_missing_folders, subfolders
+from palpate.data.images import BROKEN, in_threads, opened
 from palpate.data.listing import contact_names
 from palpate.data.manifest import CLIMBS, Manifest
 
@@ -103,14 +97,14 @@ def scan(source: Path, *, swap: Swap = "report", progress: Progress = quiet) -> 
         must = f"{source} must be HCT: {LOOKS_FOR}"
         raise PalpateError(must, "none of these", f"Unpack it from {tvl.URL}")
     result = Scan(root, {"layout": f"hct: {', '.join(rigs)}"} | world_facts(root))
-    files, in_contact, untouched = _read_lists(result, rigs)
-    keys = sorted(in_contact)
+    files = _read_lists(result, rigs)
+    keys = sorted({_key(row) for _, row in result.rows})
     names = contact_names([video for video, _ in keys], [k for _, k in keys], None)
     contacts = dict(zip(keys, names, strict=True))
     sessions = sessions_of(row["video"] for _, row in result.rows)
     report_missing_folders(result)
     fixed = _swap(result, swap, progress)
-    _choose_backgrounds(result, untouched, fixed)
+    _choose_backgrounds(result, fixed)
     sensor = WORLD.sensor if "synthetic" in result.facts else FACTS.sensor
     for _, row in result.rows:
         row |= {"contact": contacts[_key(row)], "session": sessions[row["video"]], "sensor": sensor}
@@ -181,71 +175,23 @@ def _key(row: Cells) -> tuple[str, int]:
     return row["video"], row["frame"]
 
 
-def _read_lists(
-    result: Scan, rigs: Sequence[str]
-) -> tuple[list[str], set[tuple[str, int]], dict[str, list[Cells]]]:
-    """Add the rows of all lists, by video (in order of time) and number.
-
-    Returns:
-        The lists read; (video, number) of every frame known to be in contact; video -> its frames
-        in ``not_contact.json``.
-    """
-    samples, touched, untouched = list[Row](), list[Row](), list[Row]()
-    files: list[str] = []
+def _read_lists(result: Scan, rigs: Sequence[str]) -> list[str]:
+    """Add the rows of all lists, by video (in order of time) and number; return their names."""
+    samples, files = list[Row](), list[str]()
     for rig in rigs:
         for part, path in tvl.part_lists(result.base / rig).items():
             files.append(f"{rig}/{path.name}")
             samples += _frames(result, tvl.read_list(result, path), rig, part)
-        untouched += _frames(result, _json_rows(result, rig, "not_contact"), rig, None)
-        touched += _frames(result, _json_rows(result, rig, "contact"), rig, None)
-    known, resting = ({_key(row) for _, row in rows} for rows in (samples, untouched))
-    both = [where for where, row in [*samples, *touched] if _key(row) in resting]
-    text = "not_contact.json calls them untouched; samples only where a list has them"
-    tvl.suspect_rows(result, both, "contact-and-not", text)
-    unlisted = [where for where, row in touched if _key(row) not in known | resting]
-    text = "in contact.json but in no list, so no samples"
-    tvl.suspect_rows(result, unlisted, "unlisted-contact", text)
     partner = lambda row: f"{row['video']}/tactile/{PurePosixPath(row['vision']).name}"
     odd = [where for where, row in samples if row["tactile"] != partner(row)]
     text = "photo and tactile image differ in trajectory or file name"
     tvl.suspect_rows(result, odd, "unequal-names", text)
-    result.facts["not_contact"] = f"{len(resting)} frames, no samples"
     samples.sort(key=lambda sample: (_in_time(sample[1]["video"]), sample[1]["frame"]))
     result.rows = samples
-    in_contact = known | ({_key(row) for _, row in touched} - resting)
-    return files, in_contact, _by_video(untouched)
+    return files
 
 
-def _by_video(rows: Iterable[Row]) -> dict[str, list[Cells]]:
-    by_video: dict[str, list[Cells]] = defaultdict(list)
-    for _, row in rows:
-        by_video[row["video"]].append(row)
-    return by_video
-
-
-def _json_rows(result: Scan, rig: str, name: str) -> list[Row]:
-    """The rows of ``contact.json`` or ``not_contact.json``, with cells named as in the lists."""
-    path = result.base / rig / f"{name}.json"
-    data = read_json_file(result, path) if path.is_file() else {"vision": [], "tactile": []}
-    if data is None:
-        return []
-    names = {"vision": "url", "tactile": "tactile", "background": "tactile_background"}
-    lists = {names[k]: v for k, v in data.items() if k in names} if isinstance(data, dict) else {}
-    is_list = [isinstance(v, list) and all(isinstance(p, str) for p in v) for v in lists.values()]
-    if not {"url", "tactile"} <= set(lists) or not all(is_list):
-        text = "not an object with lists of paths under vision and tactile"
-        result.problem(path, "bad-json", text)
-        return []
-    if len({len(paths) for paths in lists.values()}) > 1:
-        lengths = ", ".join(f"{len(paths)} {name}" for name, paths in lists.items())
-        text = f"its lists differ in length ({lengths}), so what belongs together is unknown"
-        result.problem(path, "unequal-lists", text)
-        return []
-    rows = zip(*lists.values(), strict=True)
-    return [(f"{path}:{k}", dict(zip(lists, row, strict=True))) for k, row in enumerate(rows, 1)]
-
-
-def _frames(result: Scan, listed: Iterable[Row], rig: str, part: str | None) -> list[Row]:
+def _frames(result: Scan, listed: Iterable[Row], rig: str, part: str) -> list[Row]:
     """The frames of listed rows; bad rows become problems."""
     rows: list[Row] = []
     for where, cells in listed:
@@ -285,10 +231,10 @@ def _located(cell: str, rig: str) -> str:
 
 def _swap(result: Scan, swap: Swap, progress: Progress) -> set[str]:
     """Report swapped trajectories; with ``fix`` swap their paths back and return their names."""
-    of_video = _by_video(result.rows)
+    of_video = {row["video"]: row for _, row in reversed(result.rows)}
 
     def sizes(video: str) -> list[tuple[int, int] | None]:
-        return [_size(result.base / of_video[video][0][side]) for side in ("vision", "tactile")]
+        return [_size(result.base / of_video[video][side]) for side in ("vision", "tactile")]
 
     seen = dict(in_threads(sizes, of_video, "looking for swapped folders", progress))
     done = (
@@ -317,9 +263,7 @@ def _size(path: Path) -> tuple[int, int] | None:
     return None
 
 
-def _choose_backgrounds(
-    result: Scan, untouched: Mapping[str, Sequence[Cells]], fixed: Collection[str]
-) -> None:
+def _choose_backgrounds(result: Scan, fixed: Collection[str]) -> None:
     """The background of each row by the rule above; the facts count how often each source served.
 
     The listed image of a fixed trajectory does not count: it was made of its vision.
@@ -329,18 +273,12 @@ def _choose_backgrounds(
     def is_file(name: str) -> bool:
         return (result.base / name).is_file()
 
-    @cache
-    def typical(video: str) -> str | None:
-        side = "vision" if video in fixed else "tactile"
-        return _typical(result.base, [row[side] for row in untouched.get(video, [])])
-
     def choose(row: Cells) -> tuple[str, str | None]:
         video, rig, listed = row["video"], row["domain"], row["background"]
         sources = [("as listed", _located(listed, rig)), ("as listed", listed)] if listed else []
         sources = [] if video in fixed else sources
         sources += [(FALLBACK, f"{rig}/{FALLBACK}"), (FALLBACK, FALLBACK)]
-        default = "untouched frame" if typical(video) else "none"
-        return next((s for s in sources if is_file(s[1])), (default, typical(video)))
+        return next((s for s in sources if is_file(s[1])), ("none", None))
 
     kinds: Counter[str] = Counter()
     bare: dict[str, list[str]] = defaultdict(list)
@@ -353,14 +291,3 @@ def _choose_backgrounds(
         text = f"no image of the untouched gel, as none is listed and there is no {FALLBACK}"
         tvl.suspect_rows(result, places, "no-background", text)
     result.facts["backgrounds"] = ", ".join(f"{kind} {n}" for kind, n in sorted(kinds.items()))
-
-
-def _typical(root: Path, names: Sequence[str]) -> str | None:
-    """Of up to 15 evenly spaced whole images the one nearest to their median, or None."""
-    whole = [name for name in names if inside(root, name) and check_image(root / name) is None]
-    places = np.unique(np.linspace(0, len(whole) - 1, min(MEDIAN_OF, len(whole))).round())
-    some = [whole[int(k)] for k in places]
-    with suppress(PalpateError):  # of several sizes
-        images = [np.asarray(read_image(root / name)) for name in some]
-        return some[nearest_to_median(images, root)] if some else None
-    return None
