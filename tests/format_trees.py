@@ -140,12 +140,12 @@ def make_ycb_slide(folder: Path) -> Tree:
 
 
 def make_intervals(folder: Path) -> Tree:
-    """Two extracted recordings and a list with other column names; the last contact ends early."""
+    """Two extracted recordings and a list; the last contact ends early."""
     root = folder / "mine"
     for v, video in enumerate(("rec 1", "rec,2")):
         for k, side in product(range(22), ("video_frame", "gelsight_frame")):
             write_image(root / video / side / f"{k:010d}.jpg", 32 * v + k)
-    lines = ["Recording,First,Last,Label,Object", "rec 1,6,8,Wood,chair", "rec 1,12,13,,"]
+    lines = ["video,start,end,label,object", "rec 1,6,8,Wood,chair", "rec 1,12,13,,"]
     lines += ['"rec,2",7,8,Rock,wall', '"rec,2",18,19,Rock,wall']
     (root / "contacts.csv").write_text("\r\n".join(lines))
     return Tree(root / "contacts.csv", 9)

@@ -59,7 +59,7 @@ def test_import_with_maps_classes_and_what_is_suspicious(capsys, table, tmp_path
 
 
 def test_options_of_the_format_pass_through(capsys, tag, tmp_path):
-    options = ["--labels", tag / "train.txt", "--image-format", "png"]
+    options = ["--labels", tag / "train.txt", "--size", "16"]
     command = ["import", tag, "-o", tmp_path / "m", *options, "--max-per-contact", "1"]
     status, out, _ = call(capsys, *command, "--json")
     assert (status, json.loads(out)["samples"]) == (0, 2)
@@ -75,12 +75,11 @@ def test_options_of_the_format_pass_through(capsys, tag, tmp_path):
     ("args", "word"),
     [
         (["--size", "three"], "size"),
-        (["--image-format", "gif"], "gif"),
         (["--part", "sim"], "must be left out for the format touch-and-go"),
         (["--map", "video=a", "--map", "video=b"], "each column once"),
         (["--map", "video="], "as COLUMN=EXPRESSION"),
         (["--format", "zip"], "one of auto, touch-and-go"),
-        (["--as", "vision"], "takes labels, image_format"),
+        (["--as", "vision"], "takes labels, size"),
     ],
 )
 @pytest.mark.parametrize("verb", ["import", "validate"])
@@ -109,24 +108,6 @@ def test_validation_shows_facts_and_fails_on_what_is_requested(capsys, tag, tabl
     status, out, _ = call(capsys, "validate", table, *MAPS)
     assert (status, "Suspicious: 1" in out) == (0, True)
     assert call(capsys, "validate")[0] == 2
-
-
-def test_an_import_of_one_side_is_validated_as_it_lies_there(capsys, table, tmp_path):
-    template = ("--tactile", "t/{frame}.png")
-    for k in range(4):
-        write_image(tmp_path / "own" / "t" / f"{k}.png", k)
-    assert call(capsys, "import", tmp_path / "own", *template, "-o", tmp_path / "m")[0] == 0
-    for source in (tmp_path / "m", tmp_path / "m" / "manifest.parquet"):
-        status, out, _ = call(capsys, "validate", source)
-        assert (status, "Complete." in out, "t/{frame}.png" in out) == (0, True, True), out
-    assert call(capsys, "validate", tmp_path / "m", *template)[0] == 2
-    (tmp_path / "own" / "t" / "3.png").write_bytes(b"")
-    status, out, _ = call(capsys, "validate", tmp_path / "m")
-    assert (status, "Invalid: 1" in out) == (1, True)
-    (tmp_path / "rows.csv").write_text("tactile,vision\nown/t/0.png,\nown/t/1.png,\n")
-    assert call(capsys, "validate", tmp_path / "rows.csv")[0] == 0
-    status, out, _ = call(capsys, "validate", tmp_path / "own" / "t", "--tactile", "{frame}.png")
-    assert "example 1" in out
 
 
 def test_problems_of_one_kind_are_one_line_and_all_are_in_json(capsys, table):

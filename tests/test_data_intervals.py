@@ -56,9 +56,8 @@ FROM_FILE = {"video": "replace(split_part(file, '/', -1), '.mp4', '')", "materia
     ("text", "options"),
     [
         ("a,10,12,Wood\na,20,20,Rock", {}),  # no header
-        ("Clip;First;Last;Class\na;10;12;Wood\na;20;20;Rock", {}),
-        ("video,start,end,label\na,10,13,Wood\na,20,21,Rock", {"half_open": True}),
-        ("file,from,to,what\nx/a.mp4,10,12,Wood\nx/a.mp4,20,20,Rock", {"columns": FROM_FILE}),
+        ("video;start;end;material\na;10;12;Wood\na;20;20;Rock", {}),
+        ("file,start,end,what\nx/a.mp4,10,12,Wood\nx/a.mp4,20,20,Rock", {"columns": FROM_FILE}),
         ("label,end,start,video\nRock,20,20,a\nWood,12.0,10,a", {}),
     ],
 )

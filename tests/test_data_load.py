@@ -1,14 +1,11 @@
 """``palpate.load``: every kind of source, nothing written, errors that name the argument."""
 
-import re
 import subprocess
 import sys
-from pathlib import Path
 
 import polars as pl
 import pytest
 
-import palpate
 from data_fixtures import tree, write_image
 from format_trees import TREES
 from palpate import data
@@ -143,47 +140,3 @@ def test_results_print_themselves(images, tmp_path):
 def test_importing_the_room_loads_no_polars():
     code = "import sys, palpate.data; sys.exit('polars' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
-
-
-def test_a_list_of_image_files_is_a_set_of_images(tmp_path, small_manifest):
-    files = [str(path) for path in small_manifest.paths("tactile")]
-    loaded = data.load(files, side="tactile")
-    assert list(loaded.paths("tactile")) == [Path(file) for file in files]
-    assert data.load(files).facts["side_assumed"] == "vision"
-    assert str(loaded).splitlines()[2:] == [f"samples  {len(files)}", f"tactile  {len(files)}"]
-    with pytest.raises(ProblemsError, match=r"no file 'gone\.png'"):
-        data.load([*files, tmp_path / "gone.png"], skip_bad=False)
-
-
-@pytest.mark.parametrize(
-    ("more", "options", "text"),
-    [
-        (["notes.txt"], {}, "must hold image files alone. Got 'notes.txt'"),
-        ([3], {}, "must hold image files alone. Got '3'"),
-        ([], {"side": "background"}, "`side` must be one of vision, tactile"),
-        ([], {"format": "hct"}, "`format` must be left out for a list of images"),
-        ([], {"root": "x"}, "`root` must be left out for a list of images"),
-    ],
-)
-def test_what_a_list_of_image_files_cannot_be(small_manifest, more, options, text):
-    with pytest.raises(PalpateError, match=re.escape(text)):
-        data.load([*small_manifest.paths("tactile"), *more], **options)
-
-
-def test_paths_of_a_list_are_the_same_however_they_are_spelled(small_manifest, monkeypatch):
-    first, second = small_manifest.paths("tactile")[:2]
-    monkeypatch.chdir(first.parent)
-    spelled = [f"/{first}", Path("..") / second.parent.name / second.name]
-    loaded = data.load(spelled, side="tactile")
-    assert list(loaded.paths("tactile")) == [first, second]
-    with pytest.raises(ProblemsError, match="duplicate-id"):
-        data.load([first, f"../{first.parent.name}/{first.name}"])
-    with pytest.raises(PalpateError, match="Got an empty list"):
-        data.load([])
-
-
-def test_an_audit_takes_lists_of_image_files(tmp_path, small_manifest):
-    files = small_manifest.paths("tactile")
-    audit = palpate.audit(files[:10], files[9:20], reading={"side": "tactile"})
-    leaks = {signal.kind: signal.flagged for signal in audit.signals}
-    assert leaks["identical bytes"] == 1

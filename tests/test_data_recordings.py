@@ -70,7 +70,7 @@ def test_without_contact_frames_are_those_of_a_slow_search(tmp_path):
         for k in there:
             (root / "t").mkdir(parents=True, exist_ok=True)
             (root / "t" / f"{k}.jpg").write_bytes(b"")
-        work = recordings.Recordings(Scan(root), None, {}, {"a": contact}, "jpg", None)
+        work = recordings.Recordings(Scan(root), None, {}, {"a": contact}, None)
         work.frames["a"] = {"tactile": recordings.FolderFrames(root / "t", root)}
         far = [k for k in there if not any(abs(k - c) <= 4 for c in contact)]
         far = far or [k for k in there if k not in contact]

@@ -184,15 +184,15 @@ def test_interrupted_import_keeps_frames_and_goes_on(tmp_path):
 
 def test_cached_frames_of_other_settings_are_rejected(tmp_path):
     root = make_recordings(tmp_path / "tag", raw=("a",))
-    result = import_touch_and_go(root, tmp_path / "out", size=32, image_format="png")
+    result = import_touch_and_go(root, tmp_path / "out", size=32)
     assert read_image(result.manifest.paths("tactile")[0]).size == (32, 32)
-    assert result.manifest.column("tactile")[0].endswith("0000000010.png")
+    assert result.manifest.column("tactile")[0].endswith("0000000010.jpg")
     before = tree(tmp_path / "out")
     with pytest.raises(PalpateError, match="same settings"):
         import_touch_and_go(root, tmp_path / "out")
     write_video(root / "dataset" / "a" / "gelsight.mp4", 41)
     with pytest.raises(PalpateError, match="a/tactile"):
-        import_touch_and_go(root, tmp_path / "out", size=32, image_format="png")
+        import_touch_and_go(root, tmp_path / "out", size=32)
     assert tree(tmp_path / "out") == before
 
 

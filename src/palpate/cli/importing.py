@@ -68,8 +68,6 @@ class TableOptions(Reading):
 
     background: str | None = None
     """Where the tactile images without contact are, as a template."""
-    half_open: Switch = False
-    """The end of an interval is the first frame after the contact."""
     every: int | None = None
     """Take every N-th frame of an interval; of videos without a list: of whole videos, instead of
     the frames in contact.
@@ -92,12 +90,8 @@ class FormatOptions:
     """Report or fix trajectories whose vision and tactile folders are swapped (HCT)."""
     part: Literal["real", "sim"] | None = None
     """Real or simulated recordings (YCB-Slide)."""
-    prefix: str | None = None
-    """Start of the listed paths to remove (VisGel)."""
     min_contact: float | None = None
     """Skip frames of this contact energy or less; T3 takes 18 (VisGel)."""
-    image_format: Literal["jpg", "png"] | None = None
-    """Format of frames that are extracted from videos."""
     size: int | None = None
     """Shorter side of frames that are extracted from videos (default: as they are)."""
     max_per_contact: int | None = None

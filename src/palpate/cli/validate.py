@@ -26,7 +26,7 @@ class Options(SourceOptions):
     """
 
     source: Annotated[Path | None, tyro.conf.Positional] = None
-    """Root of the data set, a table, an import, or with `--format hf` a name on the hub."""
+    """Root of the data set, a table, or with `--format hf` a name on the hub."""
     show_list: ShowList = False
 
 

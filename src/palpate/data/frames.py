@@ -1,7 +1,7 @@
 """Frames of one modality of a recording: a folder, or a video or stack with a cache of images.
 
 A cached frame is ``<cache>/%010d.jpg`` (quality 95, no chroma subsampling, since the color of a gel
-carries the surface normal) or ``.png``, written whole or not at all, so an interrupted run goes on
+carries the surface normal), written whole or not at all, so an interrupted run goes on
 where it stopped.
 """
 
@@ -11,7 +11,6 @@ import os
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from threading import Event
-from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,8 +23,6 @@ from palpate.data.manifest import DIGITS
 from palpate.data.stacks import SUFFIX, StackReader
 from palpate.data.video import VideoReader
 
-ImageFormat = Literal["jpg", "png"]
-IMAGE_FORMATS: tuple[str, ...] = ("jpg", "png")
 #: The typical frame of a recording is chosen from at most so many frames.
 MEDIAN_OF = 15
 #: Files that hold many frames.
@@ -99,8 +96,8 @@ class VideoFrames:
     leaving: frozenset[int] = frozenset()
     duplicates: tuple[tuple[str, str], ...] = ()
 
-    def __init__(self, source: Path, cache: Path, suffix: ImageFormat, size: int | None) -> None:
-        self.source, self.cache, self.suffix, self.size = source, cache, suffix, size
+    def __init__(self, source: Path, cache: Path, size: int | None) -> None:
+        self.source, self.cache, self.size = source, cache, size
         with reader_of(source) as reader:
             self.numbers: Sequence[int] = range(len(reader))
 
@@ -114,7 +111,7 @@ class VideoFrames:
 
     def path(self, k: int) -> Path:
         """Where frame ``k`` is cached, whether it is there already or not."""
-        return self.cache / f"{k:010d}.{self.suffix}"
+        return self.cache / f"{k:010d}.jpg"
 
     def read(self, indices: Iterable[int]) -> Iterator[tuple[int, NDArray[np.uint8]]]:
         """Yield ``(k, (h, w, 3) image)``, decoding rising numbers in one pass."""
@@ -160,9 +157,8 @@ def save_frame(path: Path, image: NDArray[np.uint8], size: int | None) -> None:
         scale = size / min(frame.size)
         width, height = (max(size, round(side * scale)) for side in frame.size)
         frame = frame.resize((width, height), Image.Resampling.BICUBIC)
-    options = {} if path.suffix == ".png" else {"quality": 95, "subsampling": 0}
     with atomic_path(path) as part:
-        frame.save(part, format="JPEG" if options else "PNG", **options)
+        frame.save(part, format="JPEG", quality=95, subsampling=0)
 
 
 def nearest_to_median(images: Sequence[NDArray[np.uint8]], source: Path) -> int:

@@ -21,9 +21,7 @@ from palpate.data.formats import FORMATS, Format
 from palpate.data.formats.base import (
     MISSING,
     WORLD,
-    Facts,
     Into,
-    Scan,
     finished,
     imported_of,
     manifest_of,
@@ -33,7 +31,7 @@ from palpate.data.formats.videos import is_templated
 from palpate.data.images import Check
 from palpate.data.imported import Imported, Validation, removing_on_error, templates_of
 from palpate.data.listing import write_table
-from palpate.data.manifest import IMAGE_COLUMNS, SCHEMA, Manifest, is_manifest
+from palpate.data.manifest import IMAGE_COLUMNS, Manifest, is_manifest
 from palpate.data.texts import read_texts, reimported, with_texts
 
 #: All that an import writes.
@@ -117,7 +115,7 @@ def validate(
     """Check a data set without writing anything: what is missing, invalid or suspicious.
 
     Args:
-        source: folder or table, a name on the hub with ``format="hf"``, or an import.
+        source: folder or table, or a name on the hub with ``format="hf"``.
         format: as in :func:`import_dataset`.
         check: how images are checked.
         progress: progress callback.
@@ -130,14 +128,11 @@ def validate(
         must, fix = "must be a folder or a table on disk", "Write it, or see palpate.load"
         raise PalpateError(must, type(source).__name__, fix, argument="source")
     source, world = Path(source), world_facts(Path(source))
-    if format == "auto" and is_manifest(source) and not world:
-        name, (facts, scan) = "manifest", _of_import(source, options)
-    else:
-        name, form = recognized(source, format, options)
-        options = options | {"check": check, "progress": progress}
-        scan = form.scan(source, **scan_options(name, form, options))
-        # palpate's own world has the layouts of real sets and must not be shown as one of them.
-        facts = WORLD if world else form.facts
+    name, form = recognized(source, format, options)
+    options = options | {"check": check, "progress": progress}
+    scan = form.scan(source, **scan_options(name, form, options))
+    # palpate's own world has the layouts of real sets and must not be shown as one of them.
+    facts = WORLD if world else form.facts
     rows = finished(scan, check, progress)
     if not rows and not scan.problems:
         scan.problem(source, "empty", "no sample is usable")
@@ -146,24 +141,6 @@ def validate(
     templated = any(fact.startswith("template_") for fact in scan.facts)
     templates = templates_of(manifest_of(scan, rows, scan.facts)) if templated else {}
     return Validation(name, facts, len(rows), missing, invalid, scan.suspicious, templates)
-
-
-def _of_import(source: Path, options: Mapping[str, Any]) -> tuple[Facts, Scan]:
-    """The rows of a manifest, to be checked again."""
-    manifest = Manifest.load(source, options.get("root"))
-    given = {name: value for name, value in options.items() if value is not None} | {"root": None}
-    if wrong := [name for name, value in given.items() if value is not None]:
-        raise PalpateError("must be left out for a manifest", str(source), "", argument=wrong[0])
-    known: dict[str, Any] = {"name": manifest.facts.get("dataset", "an import")}
-    known |= {k: v for k, v in manifest.facts.items() if k in ("license", "citation", "url")}
-    group = f"the column {manifest.facts.get('group', 'video')}"
-    facts = Facts(samples=f"{len(manifest)} in the manifest", group=group, **known)
-    rows = [
-        (str(row["id"]), {c: cell for c, cell in row.items() if cell is not None})
-        for row in manifest.table.iter_rows(named=True)
-    ]
-    more = tuple(manifest.table.columns[len(SCHEMA) :])
-    return facts, Scan(manifest.root, dict(manifest.facts), rows, more=more)
 
 
 def write_lists(manifest: Manifest, split: Split, output: Path) -> list[Path]:

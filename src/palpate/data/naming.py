@@ -28,7 +28,6 @@ import polars as pl
 from palpate.core import PalpateError, Problem, Split
 from palpate.data.detection import ROLES, template_of
 from palpate.data.formats import hct
-from palpate.data.formats.intervals import NAMES as INTERVAL_NAMES
 from palpate.data.formats.intervals import NEEDED, ORDER
 from palpate.data.formats.pairs import name_apart
 from palpate.data.images import SUFFIXES
@@ -72,8 +71,7 @@ def read_names(path: Path, **options: Any) -> tuple[Manifest, list[Problem], Spl
         return _intervals(path) if _is_interval(path) else None
     records = _records(path)
     header = header_of(path) if records is None else list(records.names)
-    low = [name.lower() for name in header]
-    if all(set(INTERVAL_NAMES[name]) & set(low) for name in NEEDED):
+    if set(NEEDED) <= set(header):
         return _intervals(path) if not any(path.parent.glob("*/*")) else None
     names = options.get("names")
     table = records or open_table(path, names and [name.strip() for name in names.split(",")])
@@ -151,9 +149,9 @@ def _intervals(path: Path) -> tuple[Manifest, list[Problem], None]:
     lines, header = lines_of(decoded(path.read_bytes())), header_of(path)
     order = list(range(4))
     if header and not _is_interval(path):
-        low, lines[0] = [name.lower() for name in header], ""
-        words = [*NEEDED, "material"]
-        order = [next((k for k, n in enumerate(low) if n in INTERVAL_NAMES[w]), 9) for w in words]
+        lines[0] = ""
+        label = "material" if "material" in header else "label"
+        order = [header.index(name) if name in header else 9 for name in (*NEEDED, label)]
     rows: list[tuple[str, int, int, str | None]] = []
     problems: list[Problem] = []
     for number, line in enumerate(lines, 1):

@@ -2,20 +2,18 @@
 
 from __future__ import annotations
 
-import os
 import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from palpate.core import PalpateError, Problem, Progress, quiet, require_choice, require_regular
+from palpate.core import PalpateError, Problem, Progress, quiet, require_regular
 from palpate.data.formats import Format
 from palpate.data.formats.base import Scan, finished, manifest_of
-from palpate.data.images import SUFFIXES
 from palpate.data.imported import raise_if, require_some
 from palpate.data.importing import recognized, scan_options
 from palpate.data.listing import LINE, read_list
-from palpate.data.manifest import IMAGE_COLUMNS, MODALITIES, SCHEMA, Manifest, is_manifest
+from palpate.data.manifest import IMAGE_COLUMNS, SCHEMA, Manifest, is_manifest
 from palpate.data.mapping import compile_maps
 from palpate.data.rows import manifest_rows, read_classes
 from palpate.data.tables import TABLES, Table, decoded, header_of, lines_of, open_table, table_of
@@ -38,8 +36,8 @@ def load(
     Args:
         source: a manifest file or the folder of an import; a frame list (``video/frame.jpg,label``
             per line); a table file; a polars or pandas frame, or a list of dictionaries, with
-            manifest columns; the folder of a data set of any known format; or images of one
-            modality (``side``: ``vision`` or ``tactile``), as a folder or a list of files.
+            manifest columns; or the folder of a data set of any known format, or of images of one
+            modality (``side``: ``vision`` or ``tactile``).
         format: name of the format, or ``auto``.
         images: raise if samples have no image files because their frames are inside videos or
             tables. Frame lists and tables without image columns never have images.
@@ -81,11 +79,6 @@ def read_samples(
     options = {name: value for name, value in options.items() if value is not None}
     if isinstance(source, Manifest):
         return source, []
-    if is_image_files(source):
-        if format != "auto":
-            must = "must be left out for a list of images"
-            raise PalpateError(must, repr(format), "", argument="format")
-        return _of_images(source, skip_bad, options)
     if not isinstance(source, (str, Path)):
         return _of_table(table_of(source), Path(), skip_bad, options)
     path = Path(source)
@@ -107,17 +100,6 @@ def read_samples(
     scan = _scanned(form, path, scan_options(name, form, options | more))
     facts = {**form.facts.of_manifest(), "format": name, **scan.facts}
     return _of_scan(scan, path, facts, skip_bad, progress)
-
-
-def is_image_files(source: Any) -> bool:
-    """Whether this is a list of image files."""
-    if not isinstance(source, list | tuple):
-        return False
-    images = [isinstance(p, str | Path) and Path(p).suffix.lower() in SUFFIXES for p in source]
-    if any(images) and not all(images):
-        must, got = "A list of images must hold image files alone", source[images.index(False)]
-        raise PalpateError(must, repr(str(got)), "Leave it out")
-    return any(images)
 
 
 def is_list(path: Path) -> bool:
@@ -144,22 +126,6 @@ def _scanned(form: Format, path: Path, options: dict[str, Any]) -> Scan:
         scan = form.scan(path, **options, side="vision")
         scan.facts["side_assumed"] = "vision"
         return scan
-
-
-def _of_images(
-    files: Sequence[str | Path], skip_bad: bool, options: dict[str, Any]
-) -> tuple[Manifest, list[Problem]]:
-    """Samples of a list of image files: ids are paths, and declare nothing."""
-    _require_left_out(options, {"side", "names"}, "a list of images")
-    paths = [Path(file).parent.resolve() / Path(file).name for file in files]
-    root = Path(os.path.commonpath([path.parent for path in paths]))
-    side, facts = options.get("side"), {"format": "files", "dataset": root.name}
-    if side is None:
-        side = facts["side_assumed"] = "vision"
-    require_choice("side", side, MODALITIES)
-    names = [path.relative_to(root).as_posix() for path in paths]
-    rows = [(str(file), {"id": n, side: n}) for file, n in zip(files, names, strict=True)]
-    return _of_scan(Scan(root, rows=rows), root, facts, skip_bad, quiet)
 
 
 def _of_table(

@@ -14,8 +14,6 @@ _SPLIT = {part: part for part in PARTS} | {"training": "train", "testing": "test
 PART_NAMES = _SPLIT | dict.fromkeys(("validation", "valid", "dev"), "val")
 #: Columns that a split keeps whole; where only some rows have a value, a person should look.
 GROUPS = ("video", "object", "session")
-#: What other tools write for an empty cell, in lower case.
-NULL_WORDS = ("na", "nan", "none", "null")
 INTEGERS = ("frame", "start", "end")
 Row = dict[str, Any]
 
@@ -92,7 +90,7 @@ def read_classes(path: Path) -> dict[int, str]:
 
 
 def odd_groups(source: Path, rows: Sequence[tuple[str, Row]]) -> list[Problem]:
-    """Report group columns that only some rows have, and words in them that may mean null."""
+    """Report group columns that only some rows have, and contacts of one name in several groups."""
     problems: list[Problem] = []
     count = len(rows)
     for name in GROUPS:
@@ -101,11 +99,6 @@ def odd_groups(source: Path, rows: Sequence[tuple[str, Row]]) -> list[Problem]:
             text = f"{len(without)} of {count} rows have no {name}, so no split by {name} can place"
             text += f" them; the first is {without[0]}"
             problems.append(Problem(str(source), "null-group", text))
-        worded = [where for where, row in rows if str(row.get(name, "")).lower() in NULL_WORDS]
-        if worded:
-            text = f"{len(worded)} of {count} rows have the {name} NA, NaN, None or null, taken"
-            text += f" as a name; the first is {worded[0]}. For none, leave the cell empty"
-            problems.append(Problem(str(source), "word-for-null", text))
     return problems + _shared_contacts(source, rows)
 
 

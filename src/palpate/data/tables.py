@@ -113,7 +113,7 @@ def table_of(data: Any, name: str = "row") -> Table:
         data = data.to_dict("records")
     if isinstance(data, Sequence) and data and all(isinstance(row, Mapping) for row in data):
         return _of_objects(name, list(enumerate(data, 1)), [])
-    must = "must be a path, a polars or pandas frame, or a list of dictionaries or image files"
+    must = "must be a path, a polars or pandas frame, or a list of dictionaries"
     got = type(data).__name__
     if isinstance(data, Sequence):
         got = f"a {got} of {type(data[0]).__name__}" if data else f"an empty {got}"

@@ -20,7 +20,7 @@ from palpate.data.imported import splits_of
 from palpate.data.listing import categories_in, contact_names, read_lists
 from palpate.data.manifest import MODALITIES, SCHEMA, Manifest, is_manifest
 from palpate.data.naming import name_together, read_names
-from palpate.data.reading import is_image_files, is_list, read_samples
+from palpate.data.reading import is_list, read_samples
 
 #: A manifest, a path, several frame lists that are joined, or a polars or pandas frame.
 Data = Any
@@ -53,7 +53,7 @@ def read(
     """Read samples; ``root`` and ``reading`` as in :func:`palpate.leakage.audit`."""
     options = {name: value for name, value in (reading or {}).items() if value}
     root = options.pop("root", root)
-    several = data if isinstance(data, list | tuple) and not is_image_files(data) else ()
+    several = data if isinstance(data, list | tuple) else ()
     paths = [path for path in several if isinstance(path, str | Path)]
     if len(paths) == len(several) > 1:
         manifest, skipped = _join([Path(path) for path in paths], skip_bad, root, options)

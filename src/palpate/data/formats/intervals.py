@@ -7,10 +7,10 @@
       <video>/video.mp4  gelsight.mp4, or video_frame/ gelsight_frame/, as in Touch and Go, also
                                        under dataset/ or final_dataset/
 
-The columns may have other names (``NAMES``), or map expressions (:mod:`palpate.data.mapping`) name
-them; without a header the order is video, start, end, label. ``start`` and ``end`` are frame
-numbers from 0 that **both belong to the contact**; with ``half_open`` the end is the first frame
-after it. ``object``, ``text`` and ``session`` are optional. A label of -1 marks contact of unclear
+Columns of other names are given by map expressions (:mod:`palpate.data.mapping`); without a header
+the order is video, start, end, label. ``start`` and ``end`` are frame numbers from 0 that **both
+belong to the contact**. ``label`` (or ``material``), ``object``, ``text`` and ``session`` are
+optional. A label of -1 marks contact of unclear
 material: no samples, but no background is taken from there either.
 
 Each interval is a contact ``video#000k`` in the order of frames; each of its frames is a sample
@@ -29,11 +29,11 @@ from palpate.core import PalpateError, Problem, Progress, quiet, require
 from palpate.data.formats.base import Facts, Format, Into, Scan
 from palpate.data.formats.recordings import Recordings, Row
 from palpate.data.formats.touch_and_go import require_videos
-from palpate.data.frames import FolderFrames, ImageFormat
+from palpate.data.frames import FolderFrames
 from palpate.data.images import Check
 from palpate.data.listing import FrameTable
 from palpate.data.mapping import compile_maps
-from palpate.data.rows import manifest_rows, odd_groups, read_classes
+from palpate.data.rows import manifest_rows, read_classes
 from palpate.data.tables import header_of, open_table
 
 FACTS = Facts(
@@ -41,16 +41,6 @@ FACTS = Facts(
     samples="as many as the intervals have frames",
     group="the column video",
 )
-#: What the columns of an interval list are called.
-NAMES: Mapping[str, tuple[str, ...]] = {
-    "video": ("video", "recording", "clip", "sequence", "video_id"),
-    "start": ("start", "start_frame", "first", "first_frame", "begin", "from", "onset"),
-    "end": ("end", "end_frame", "last", "last_frame", "stop", "to", "offset"),
-    "material": ("material", "label", "class", "category"),
-    "object": ("object",),
-    "text": ("text", "caption", "description"),
-    "session": ("session",),
-}
 NEEDED = ("video", "start", "end")
 ORDER = ("video", "start", "end", "label")
 WORDS = ("material", "object", "text", "session")
@@ -71,22 +61,20 @@ class Interval:
 
 def detect(source: Path) -> bool:
     """Whether this is a table with video, start and end and without images, or bare lines."""
-    header = [name.lower() for name in header_of(source)] if source.is_file() else []
+    header = header_of(source) if source.is_file() else []
     if {"vision", "tactile"} & set(header):
         return False
-    return _is_bare(header) or all(set(NAMES[name]) & set(header) for name in NEEDED)
+    return _is_bare(header) or set(NEEDED) <= set(header)
 
 
-def scan(  # noqa: PLR0913 (a public verb)
+def scan(
     source: Path,
     *,
     root: Path | None = None,
     columns: Mapping[str, str] | None = None,
     classes: Path | None = None,
-    half_open: bool = False,
     every: int = 1,
     sensor: str | None = None,
-    image_format: ImageFormat = "jpg",
     size: int | None = None,
     check: Check = "decode",
     into: Into | None = None,
@@ -98,10 +86,8 @@ def scan(  # noqa: PLR0913 (a public verb)
         root: folder of the recordings (default: that of the list).
         columns: ``video``, ``start``, ``end``, ``material`` ... -> map expression.
         classes: table of classes, whose numbers are the labels.
-        half_open: ``end`` is the first frame after the contact.
         every: take every n-th frame of a contact, from its first.
         sensor: the tactile sensor.
-        image_format: of the extracted frames.
         size: their shorter side is reduced to so many pixels.
     """
     require(every >= 1, "every", "must be at least 1", every)
@@ -110,8 +96,8 @@ def scan(  # noqa: PLR0913 (a public verb)
         must = "must be the folder of the recordings"
         raise PalpateError(must, f"no folder {base}", "Check the path", argument="root")
     result = Scan(base, {"dataset": source.stem})
-    work = Recordings(result, into, require_videos(base), {}, image_format, size)
-    listed = _read(result, source, columns, classes, half_open)
+    work = Recordings(result, into, require_videos(base), {}, size)
+    listed = _read(result, source, columns, classes)
     result.inconclusive = sum(i.inconclusive for i in listed)
     contacts = _contacts(work, listed, progress)
     rows = [row for name in contacts for row in _frames(work, name, contacts[name], every)]
@@ -137,21 +123,15 @@ def _is_bare(header: list[str]) -> bool:
 
 
 def _read(
-    result: Scan,
-    path: Path,
-    columns: Mapping[str, str] | None,
-    classes: Path | None,
-    half_open: bool,
+    result: Scan, path: Path, columns: Mapping[str, str] | None, classes: Path | None
 ) -> list[Interval]:
     """The well-formed intervals of the list, in its order."""
     header = header_of(path)
     table = open_table(path, ORDER[: len(header)] if _is_bare(header) else None)
     maps = dict(columns or {})
-    for target, synonyms in NAMES.items():
-        name = next((name for name in table.names if name.lower() in synonyms), None)
-        if target not in maps and target not in table.names and name is not None:
-            maps[target] = name
-    compiled = compile_maps(maps, table.names, list(NAMES))
+    if "label" in table.names and "material" not in table.names:
+        maps.setdefault("material", "label")
+    compiled = compile_maps(maps, table.names, [*NEEDED, *WORDS])
     absent = [name for name in NEEDED if name not in compiled.expressions]
     if absent and not table.problems:
         got = f"no {', '.join(absent)} among {', '.join(table.names) or 'no columns'}"
@@ -164,26 +144,24 @@ def _read(
     labels = None if classes is None else read_classes(Path(classes))
     intervals: list[Interval] = []
     for k, row in rows:
-        interval = _interval(table.where(k), row, labels, half_open)
+        interval = _interval(table.where(k), row, labels)
         if isinstance(interval, Interval):
             intervals.append(interval)
         else:
             result.problem(table.where(k), *interval)
-    groups = [(i.where, {"video": i.video, **i.words}) for i in intervals]
-    result.suspicious += [p for p in odd_groups(path, groups) if p.kind == "word-for-null"]
     return intervals
 
 
 def _interval(
-    where: str, row: Mapping[str, object], labels: Mapping[int, str] | None, half_open: bool
+    where: str, row: Mapping[str, object], labels: Mapping[int, str] | None
 ) -> Interval | tuple[str, str]:
     """One interval, or what is wrong with it as (kind, text)."""
     if lacking := [name for name in NEEDED if name not in row]:
         return "empty-cell", f"no {' and no '.join(lacking)}"
-    video, start, end = (row[name] for name in NEEDED)
+    video, start, last = (row[name] for name in NEEDED)
     assert isinstance(start, int)
-    assert isinstance(end, int)
-    last, label = end - half_open, row.get("material")
+    assert isinstance(last, int)
+    label = row.get("material")
     if last < start:
         return "bad-interval", f"the contact ends at frame {last} before it starts at {start}"
     if labels is not None and label not in (None, "-1", *labels.values()):

@@ -17,10 +17,10 @@ from functools import cache
 from pathlib import Path, PurePosixPath
 from typing import Any, Generic, TypeGuard, TypeVar
 
-from palpate.core import PARTS, PalpateError, Split, few, inside, write_json
+from palpate.core import PARTS, PalpateError, Split, few, inside
 from palpate.data.formats.base import Facts, Row, Scan
 from palpate.data.images import SUFFIXES
-from palpate.data.manifest import CLIMBS, DIGITS, Manifest
+from palpate.data.manifest import CLIMBS, DIGITS
 
 NUMBER = r"([0-9]+)"
 K = TypeVar("K", int, str)
@@ -256,15 +256,3 @@ def _pairs(
                 scan.problem(where, "outside-root", f"{names!r} are not plain names")
             else:
                 yield where, part, names[0], names[1]
-
-
-def write_split(
-    manifest: Manifest, split: Split, file: Path, convert: Callable[[str], int | str] = str
-) -> list[Path]:
-    """Write ``{"train": [[folder, name], ..], ..}`` with the folder and stem of tactile images."""
-    lists: dict[str, list[list[int | str]]] = {part: [] for part in PARTS}
-    for part in split.counts():
-        paths = map(PurePosixPath, manifest.part(split, part).column("tactile"))
-        lists[part] = [[convert(path.parent.name), convert(path.stem)] for path in paths]
-    write_json(file, lists)
-    return [file]

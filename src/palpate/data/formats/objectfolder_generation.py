@@ -17,7 +17,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from palpate.core import Progress, Split, quiet
+from palpate.core import Progress, quiet
 from palpate.data.formats.base import Facts, Format, Scan
 from palpate.data.formats.layout import (
     is_split,
@@ -29,11 +29,9 @@ from palpate.data.formats.layout import (
     require_folder,
     require_layout,
     subfolders,
-    write_split,
 )
 from palpate.data.formats.objectfolder import CITATION, LICENSE, SENSOR
 from palpate.data.formats.objectfolder import FACTS as OBJECTFOLDER
-from palpate.data.manifest import Manifest
 
 FACTS = Facts(
     name="ObjectFolder-Real, visuo-tactile cross-generation",
@@ -93,13 +91,4 @@ def scan(source: Path, *, progress: Progress = quiet) -> Scan:
     return result
 
 
-def write_lists(manifest: Manifest, split: Split, folder: Path) -> list[Path]:
-    """Write ``split.json``, ``{"train": [[object, contact], ..], ..}``, integers as such."""
-
-    def convert(name: str) -> int | str:
-        return int(name) if name.isdecimal() and str(int(name)) == name else name
-
-    return write_split(manifest, split, Path(folder) / "split.json", convert)
-
-
-FORMAT = Format(FACTS, detect, LOOKS_FOR, scan, write_lists)
+FORMAT = Format(FACTS, detect, LOOKS_FOR, scan)

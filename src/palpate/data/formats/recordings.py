@@ -19,22 +19,12 @@ from typing import Any
 import numpy as np
 import polars as pl
 
-from palpate.core import (
-    PalpateError,
-    Progress,
-    inside,
-    read_json,
-    require,
-    require_choice,
-    write_json,
-)
+from palpate.core import PalpateError, Progress, inside, read_json, require, write_json
 from palpate.data.formats.base import Into, Scan
 from palpate.data.frames import (
-    IMAGE_FORMATS,
     MEDIAN_OF,
     FolderFrames,
     Frames,
-    ImageFormat,
     VideoFrames,
     nearest_to_median,
     save_frame,
@@ -105,8 +95,7 @@ class Recordings:
     into: Into | None  # where extracted frames go; None where nothing is written
     videos: Mapping[str, VideoFiles]  # recordings on disk, by name
     in_contact: Mapping[str, set[int]]  # frames of each recording in which the sensor is in contact
-    image_format: ImageFormat  # of extracted frames
-    size: int | None
+    size: int | None  # of extracted frames, the shorter side
     #: Recording -> modality -> frames, for those that could be opened.
     frames: dict[str, dict[str, Frames]] = field(default_factory=dict)
     backgrounds: dict[str, Path] = field(default_factory=dict)  # contact -> background image
@@ -119,7 +108,6 @@ class Recordings:
 
     def __post_init__(self) -> None:
         require(self.size is None or self.size >= 1, "size", "must be at least 1 pixel", self.size)
-        require_choice("image_format", self.image_format, IMAGE_FORMATS)
 
     @property
     def out(self) -> Path:
@@ -160,7 +148,7 @@ class Recordings:
                 continue
             cache = self.out / "images" / name / modality
             try:
-                opened[modality] = VideoFrames(source, cache, self.image_format, self.size)
+                opened[modality] = VideoFrames(source, cache, self.size)
             except PalpateError as error:
                 return "bad-video", f"{source}: {error.got}"
         return opened
@@ -419,7 +407,7 @@ class Recordings:
         if not videos:
             return
         path = into.out / "images" / "settings.json"
-        settings = {"format": self.image_format, "size": self.size}
+        settings = {"size": self.size}
         source = lambda video, m: self.frames[video][m].source
         sizes = {f"{v}/{m}": source(v, m).stat().st_size for v, m in sorted(videos)}
         if path.is_file():

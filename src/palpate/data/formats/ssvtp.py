@@ -26,11 +26,11 @@ from __future__ import annotations
 import re
 from pathlib import Path, PurePosixPath
 
-from palpate.core import PalpateError, Progress, Split, quiet
+from palpate.core import PalpateError, Progress, quiet
 from palpate.data.formats import tvl
 from palpate.data.formats.base import Facts, Format, Scan
 from palpate.data.formats.layout import Images, file_names, natural, paired
-from palpate.data.manifest import CLIMBS, Manifest
+from palpate.data.manifest import CLIMBS
 
 FACTS = Facts(
     name="SSVTP (Touch-Vision-Language)",
@@ -93,16 +93,7 @@ def scan(source: Path, *, progress: Progress = quiet) -> Scan:
     return result
 
 
-def write_lists(manifest: Manifest, split: Split, folder: Path) -> list[Path]:
-    """Write ``<part>.csv`` with ``url,tactile,caption``, paths relative to ``ssvtp/``."""
-    files: list[Path] = []
-    for part in split.counts():
-        rows = manifest.part(split, part).table.select("vision", "tactile", "text").rows()
-        files.append(tvl.write_list(Path(folder) / f"{part}.csv", COLUMNS, rows))
-    return files
-
-
-FORMAT = Format(FACTS, detect, LOOKS_FOR, scan, write_lists)
+FORMAT = Format(FACTS, detect, LOOKS_FOR, scan)
 
 
 def _images(result: Scan, side: str) -> Images[str]:

@@ -20,7 +20,7 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
-from palpate.core import PalpateError, Progress, Split, quiet
+from palpate.core import PalpateError, Progress, quiet
 from palpate.data.formats.base import Facts, Format, Scan
 from palpate.data.formats.layout import (
     is_split,
@@ -32,9 +32,7 @@ from palpate.data.formats.layout import (
     require_folder,
     require_layout,
     subfolders,
-    write_split,
 )
-from palpate.data.manifest import Manifest
 
 FACTS = Facts(
     name="TaRF",
@@ -97,12 +95,7 @@ def scan(source: Path, *, progress: Progress = quiet) -> Scan:
     return result
 
 
-def write_lists(manifest: Manifest, split: Split, folder: Path) -> list[Path]:
-    """Write ``split_interval.json`` with all three parts, which the public loader expects."""
-    return write_split(manifest, split, Path(folder) / LIST)
-
-
-FORMAT = Format(FACTS, detect, LOOKS_FOR, scan, write_lists)
+FORMAT = Format(FACTS, detect, LOOKS_FOR, scan)
 
 
 def _scenes(side: Path) -> dict[str, list[str]]:

@@ -27,7 +27,6 @@ from palpate.core import PalpateError, Progress, Split, quiet, write_text
 from palpate.data.formats.base import WORLD, Facts, Format, Into, Scan, world_facts
 from palpate.data.formats.layout import require_folder, subfolders
 from palpate.data.formats.recordings import Recordings, VideoFiles, first_frames, rows_of, thin
-from palpate.data.frames import ImageFormat
 from palpate.data.images import Check
 from palpate.data.listing import (
     INCONCLUSIVE,
@@ -90,7 +89,6 @@ def scan(
     root: Path,
     *,
     labels: Sequence[Path] | Path | None = None,
-    image_format: ImageFormat = "jpg",
     size: int | None = None,
     max_per_contact: int | None = None,
     check: Check = "decode",
@@ -105,7 +103,6 @@ def scan(
 
     Options:
         labels: frame lists; default ``label.txt``, else ``train.txt`` and ``test.txt``.
-        image_format: of the cached frames.
         size: shorter side of the cached frames in pixels, if they are larger; None keeps them.
         max_per_contact: import that many evenly spaced frames of a contact.
     """
@@ -113,7 +110,7 @@ def scan(
     result, videos = Scan(root, world_facts(root)), require_videos(root)
     sensor = WORLD.sensor if "synthetic" in result.facts else FACTS.sensor
     listed, official, words, in_contact = _read_lists(result, labels)
-    work = Recordings(result, into, videos, in_contact, image_format, size)
+    work = Recordings(result, into, videos, in_contact, size)
     every = rows_of(listed)
     rows = work.open(thin(every, max_per_contact) if into else every, progress)
     rows = [row for row in rows if work.has(row)]

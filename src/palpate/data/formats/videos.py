@@ -45,7 +45,7 @@ from palpate.data.formats.pairs import (
     walked,
 )
 from palpate.data.formats.recordings import Recordings, Row, thin
-from palpate.data.frames import MOVING, ImageFormat, streams_of
+from palpate.data.frames import MOVING, streams_of
 from palpate.data.images import SUFFIXES, Check, in_threads, read_image
 from palpate.data.rows import PART_NAMES
 from palpate.data.streams import Finding, findings
@@ -100,7 +100,6 @@ def scan(  # noqa: PLR0913 (a public verb)
     every: int | None = None,
     max_per_contact: int | None = None,
     sensor: str | None = None,
-    image_format: ImageFormat = "jpg",
     size: int | None = None,
     check: Check = "decode",
     into: Into | None = None,
@@ -117,14 +116,13 @@ def scan(  # noqa: PLR0913 (a public verb)
         every: take every n-th frame of whole videos, in contact or not.
         max_per_contact: keep that many evenly spaced frames of a contact.
         sensor: the tactile sensor.
-        image_format: of the extracted frames.
         size: their shorter side is reduced to so many pixels.
     """
     given = {"vision": vision, "tactile": tactile, "background": background}
     videos, result = _videos(require_folder(source, FACTS.name), given, side)
     decoded = check == "decode" or into is not None
     _require_amounts(videos, every if decoded else 1, max_per_contact)
-    work = _opened(result, into, videos, progress, image_format, size)
+    work = _opened(result, into, videos, progress, size)
     contacts = _contacts(work, videos, progress) if decoded else {}
     rows = _rows(work, videos, contacts, every if decoded else 1)
     rows = thin(rows, max_per_contact)

@@ -85,7 +85,6 @@ def scan(
     source: Path,
     *,
     root: Path | None = None,
-    prefix: str = "",
     min_contact: float | None = None,
     progress: Progress = quiet,
 ) -> Scan:
@@ -93,7 +92,6 @@ def scan(
 
     Options:
         root: where the paths of the lists start; default: the source.
-        prefix: start of the listed paths to remove, where they were written for another disk.
         min_contact: skip frames of this contact or less; T3 takes 18. Reads every frame.
     """
     source = require_folder(source, FACTS.name)
@@ -101,7 +99,7 @@ def scan(
     result = Scan(Path(root) if root and lists else source, {"text_source": "none"})
     result.facts["layout"] = "lists" if lists else "recordings"
     if lists:
-        _read_lists(result, lists, prefix, progress)
+        _read_lists(result, lists, progress)
     else:
         _read_recordings(result, progress)
     if min_contact is not None:
@@ -138,9 +136,9 @@ def _lines(path: Path) -> Iterator[tuple[int, str]]:
                 yield number, text
 
 
-def _row(fields: Sequence[str], way: str, prefix: str) -> Cells | None:
+def _row(fields: Sequence[str], way: str) -> Cells | None:
     """The cells of a line, or None if its tactile image is no numbered frame."""
-    names = [name.removeprefix(prefix).removeprefix("./") for name in fields[:4]]
+    names = [name.removeprefix("./") for name in fields[:4]]
     if way == "vision2touch":
         _, background, vision, tactile = names
     else:
@@ -172,9 +170,7 @@ def _recording(folder: str) -> str:
     return "/".join(part for part in folder.split("/") if part.lower() not in SIDES) or "."
 
 
-def _read_lists(
-    result: Scan, lists: dict[tuple[str, str], Path], prefix: str, progress: Progress
-) -> None:
+def _read_lists(result: Scan, lists: dict[tuple[str, str], Path], progress: Progress) -> None:
     """Rows of all lists, each sample once; the parts by direction, as one split if they agree."""
     rows: dict[str, Row] = {}
     parts: dict[str, dict[str, str]] = {}
@@ -184,7 +180,7 @@ def _read_lists(
         in_way = parts.setdefault(way, {})
         for number, text in _lines(path):
             where, fields = f"{path}:{number}", text.split()
-            row = _row(fields, way, prefix) if len(fields) == FIELDS else None
+            row = _row(fields, way) if len(fields) == FIELDS else None
             if "\ufffd" in text:
                 result.problem(where, "bad-encoding", f"the line {text[:80]!r} is not UTF-8")
             elif len(fields) != FIELDS:

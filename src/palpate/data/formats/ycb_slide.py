@@ -108,11 +108,7 @@ def _log(result: Scan, part: str, name: str, place: str, sparsh: str | None) -> 
     _, folder, pattern = LAYOUT[part]
     tactile = numbered(result, f"{place}/{folder}", pattern, steady=True)
     if not tactile.files:
-        text = f"no images in {folder}/"
-        if (result.base / place / f"{folder}.mp4").is_file():
-            fix = f"ffmpeg -i {folder}.mp4 -start_number 0 -qscale:v 2 {folder}/frame_%07d.jpg"
-            text = f"only {folder}.mp4; extract it here: mkdir -p {folder} && {fix}"
-        result.problem(place, "missing-frames", text)
+        result.problem(place, "missing-frames", f"no images in {folder}/")
         return
     vision = numbered(result, f"{place}/{WEBCAM}", pattern) if part == "real" else Images[int]("")
     if part == "real" and not vision.files:
