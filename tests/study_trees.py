@@ -4,15 +4,21 @@ The tiny trees of ``format_trees.py`` hold too little to train on. These are the
 the data set's layout, without the files that only a world has.
 """
 
+import json
 import shutil
 from collections import defaultdict
 from pathlib import Path
 
+from PIL import Image
+
 from palpate.data.manifest import Manifest
 from palpate.leakage.noleak import load_record, record_split
-from palpate.sim import WorldOptions, write_world
+from palpate.sim import Video, WorldOptions, plan_world, write_world
+from palpate.sim.leak import cut
+from palpate.sim.plan import contact_rows
 
 WORLD = {"materials": ("Wood", "Brick", "Grass"), "contacts_per_video": 2, "frames_per_contact": 2}
+FORGED = {"objects_per_material": 6, "seed": 83, **WORLD}
 #: What no data set has.
 ONLY_WORLDS = (
     "world.json",
@@ -25,9 +31,8 @@ ONLY_WORLDS = (
 
 
 def forge(folder: Path, **options) -> Path:
-    """A world without its mark."""
-    world = WorldOptions(objects_per_material=6, seed=83, **WORLD, **options)
-    write_world(folder, world, workers=1)
+    """A world."""
+    write_world(folder, WorldOptions(**FORGED, **options), workers=1)
     return folder
 
 
@@ -64,9 +69,46 @@ def forge_touch_and_go(folder: Path) -> Path:
 
 def forge_hct(folder: Path) -> Path:
     """Rigs with trajectories, lists with captions and no materials."""
-    root = forge(folder / "forged", layout="hct", look="digit", leak="frame")
-    remove_marks(root)
-    return root / "hct"
+    root, options = folder / "hct", WorldOptions(look="digit", leak="frame", **FORGED)
+    plans = plan_world(options)
+    places = {
+        p: f"data{p.sensor + 1}/{p.index % 7 + 1}-{1702596295 + 97 * p.index}.{p.index % 100:02d}"
+        for p in plans
+    }
+    for plan, place in places.items():
+        video = Video(options, plan)
+        for side, render in (("vision", video.vision), ("tactile", video.tactile)):
+            (root / place / side).mkdir(parents=True)
+            for frame in range(options.video_length):
+                image = Image.fromarray(render(frame))
+                image.save(root / place / side / f"{frame}-0.0207.jpg", quality=95)
+        Image.fromarray(video.background()).save(root / place / "background.png")
+    every = list(contact_rows(options, plans))
+    for name, part in cut(options, plans, every).items():
+        for rig in sorted({f"data{plan.sensor + 1}" for plan in plans}):
+            lines = ["url,tactile,tactile_background,caption"]
+            for row in part:
+                place = Path(places[row.video])
+                if place.parent.name == rig:
+                    frame, text = (
+                        f"{row.frame}-0.0207.jpg",
+                        Video(options, row.video).text(row.contact),
+                    )
+                    sides = (f"{place.name}/{side}/{frame}" for side in ("vision", "tactile"))
+                    lines.append(f'{",".join(sides)},{place.name}/background.png,"{text}"')
+            (root / rig / f"{name}.csv").write_text("\n".join(lines))
+    for rig in root.iterdir():
+        for name, wanted in (("contact", True), ("not_contact", False)):
+            in_contact = {row.frame for row in every}
+            frames = [k for k in range(options.video_length) if (k in in_contact) is wanted]
+            of_rig = [Path(place).name for place in places.values() if place.startswith(rig.name)]
+            lists = {
+                side: [f"{video}/{side}/{k}-0.0207.jpg" for video in of_rig for k in frames]
+                for side in ("vision", "tactile")
+            }
+            lists["background"] = [f"{video}/background.png" for video in of_rig for _ in frames]
+            (rig / f"{name}.json").write_text(json.dumps(lists))
+    return root
 
 
 def forge_clips(folder: Path) -> Path:

@@ -2,7 +2,6 @@
 
 import dataclasses
 import inspect
-import json
 
 import pytest
 
@@ -32,10 +31,8 @@ def test_every_option_can_be_given(field):
     special = {"materials": ("Wood", "Sand"), "layout": "frames", "free_written": "all"}
     if field.name in special:
         value = special[field.name]
-    elif field.metadata["kind"] == "choice":
+    elif "choices" in field.metadata:
         value = next(c for c in field.metadata["choices"] if c != current)
-    elif isinstance(current, tuple):
-        value = (current[0] * 1.01, current[1] * 0.99)
     else:
         value = current + 1 if isinstance(current, int) else current * 0.9
     words = [str(v) for v in value] if isinstance(value, tuple) else [str(value)]
@@ -47,34 +44,16 @@ def test_words_that_imply_others():
     assert options_of("--materials", "4").materials == WorldOptions(materials=4).materials
     assert len(options_of("--materials", "20").materials) == len(MATERIALS)
     assert options_of("--layout", "videos").free_written == "all"
-    assert options_of("--layout", "hct").look == "digit"
-    assert options_of("--layout", "hct", "--look", "gelsight").look == "gelsight"
-    assert options_of("--relax-mm").relax_mm == ()
-
-
-def test_a_world_is_repeated_from_its_record(tmp_path, capsys):
-    size = ["--size", "16", "--tile", "64", "--view-mm", "30", "40", "--preset", "tiny"]
-    run = ["--workers", "1", "-q", "-o"]
-    assert main(["world", *size, *run, str(tmp_path / "a")]) == 0
-    record = str(tmp_path / "a" / "world.json")
-    assert main(["world", "--options", record, *run, str(tmp_path / "b")]) == 0
-    first, second = (json.loads((tmp_path / n / "world.json").read_text()) for n in "ab")
-    assert first == second
-    assert main(["world", "--options", record, "--preset", "tiny", "-o", "c"]) == 2
-    assert "--preset must not go with" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(
     ("args", "message"),
     [
-        (["--view-mm", "40", "30"], "--view-mm must have its lower end first"),
-        (["--load-mm", "nan", "1"], "--load-mm must be two numbers"),
         (["--size", "300"], "--size must be a whole number from 16 to 256"),
-        (["--materials", "Wod"], "Did you mean 'Wood'"),
+        (["--materials", "Wod"], "--materials must be names of materials"),
         (["--materials", "0"], "--materials must be"),
         (["--layout", "tvl"], "layout"),
         (["--preset", "huge"], "preset"),
-        (["--options", "nowhere.json"], "must exist"),
         (["--workers", "0"], "--workers must be at least 1"),
     ],
 )

@@ -30,7 +30,7 @@ QUICK = {
 }
 SLOW = {"docs/start/train.md", "docs/start/reproduce.md"}
 #: Pages that `make docs` writes.
-MADE = {"commands.md", "world_options.md"}
+MADE = {"commands.md"}
 
 
 @pytest.fixture(scope="session")

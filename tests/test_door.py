@@ -53,7 +53,7 @@ SIGNATURES = {
     "TactilePipeline.__call__": (
         "self photos * text weight ids seed guidance steps gel callback_on_step_end"
     ),
-    "World.__init__": "self options * cache appearance",
+    "World.__init__": "self options * cache",
     "Manifest.load": "path root",
     "Split.from_ids": "* rule manifest **parts",
 }

@@ -1,13 +1,10 @@
-"""One world in every form: Touch and Go's tree, HCT's tree, videos, and samples rendered without
-files."""
+"""One world in every form: Touch and Go's tree, videos, and samples rendered without files."""
 
 import csv
 import dataclasses
 import io
 import itertools
-import json
 import pickle
-import re
 from collections import Counter
 
 import numpy as np
@@ -15,7 +12,7 @@ import pytest
 from PIL import Image
 
 from palpate.core import PalpateError, Split
-from palpate.data.importing import import_dataset, validate
+from palpate.data.importing import import_dataset
 from palpate.data.manifest import Manifest
 from palpate.leakage import audit
 from palpate.sim import MATERIALS, PRESETS, Video, World, WorldOptions, plan_world, write_world
@@ -23,7 +20,6 @@ from palpate.sim.leak import cut
 from palpate.sim.plan import contact_frames, contact_rows
 
 TINY = dataclasses.replace(PRESETS["tiny"], size=32, tile=64, mixed=0.3, two_videos=0.25)
-HCT = dataclasses.replace(TINY, layout="hct", look="digit", objects_per_material=3)
 LEAKY = dataclasses.replace(
     TINY, objects_per_material=4, two_videos=0.5, contacts_per_video=3, frames_per_contact=3
 )
@@ -34,11 +30,6 @@ CELLS = ("id", "video", "frame", "contact", "object", "material", "text", "senso
 @pytest.fixture(scope="module")
 def frames(tmp_path_factory):
     return write_world(tmp_path_factory.mktemp("frames") / "w", TINY)
-
-
-@pytest.fixture(scope="module")
-def hct(tmp_path_factory):
-    return write_world(tmp_path_factory.mktemp("hct") / "w", HCT)
 
 
 def read_list(path):
@@ -67,68 +58,30 @@ def test_the_tree_has_the_layout_of_touch_and_go(frames):
     assert len(World(sparse)) == len(label)
 
 
-def test_hct_has_the_layout_of_the_archive(hct):
-    root = hct.folder / "hct"
-    trajectories = sorted(p for p in root.glob("data*/*") if p.is_dir())
-    assert len(trajectories) == hct.counts["videos"]
-    for folder in trajectories:
-        place = folder.relative_to(root).as_posix()
-        assert re.fullmatch(r"data[1-3]/\d+-\d{10}\.\d\d", place)
-        names = {side: sorted(p.name for p in (folder / side).iterdir()) for side in IMAGES[:2]}
-        assert names["vision"] == names["tactile"]
-        numbers = sorted(int(re.fullmatch(r"(\d+)-0\.\d{4}\.jpg", n)[1]) for n in names["vision"])
-        assert numbers == list(range(HCT.video_length))
-    for rig in {p.parent for p in trajectories}:
-        lists = (rig / "contact.json", rig / "not_contact.json")
-        contact, free = (json.loads(path.read_text()) for path in lists)
-        pairs = list(zip(contact["vision"], contact["tactile"], strict=True))
-        assert len(pairs) + len(free["vision"]) == sum(1 for _ in rig.glob("*/vision/*"))
-        lists = (csv.DictReader(path.read_text().splitlines()) for path in rig.glob("t*.csv"))
-        rows = list(itertools.chain(*lists))
-        assert {(row["url"], row["tactile"]) for row in rows} == set(pairs)
-        assert all((rig / row["tactile_background"]).is_file() for row in rows)
-        assert all(re.fullmatch(r"[a-z, -]+", row["caption"]) for row in rows)
-        talks = json.loads((rig / "finetune.json").read_text())
-        captions = {row["url"]: row["caption"] for row in rows}
-        assert all(t["conversations"][-1]["value"] == captions[t["image"]] for t in talks)
-    numbers = [p.name.split("-")[0] for p in trajectories]
-    assert len(set(numbers)) < len(numbers)  # the number is used again, as in the archive
-
-
-@pytest.mark.parametrize("place", [".", "hct"])
-def test_hct_is_valid(hct, place):
-    result = validate(hct.folder / place)
-    assert (result.format, result.samples) == ("hct", hct.counts["contact_frames"])
-    assert [*result.missing, *result.invalid, *result.suspicious] == []
-
-
-@pytest.mark.parametrize("layout", ["frames", "hct"])
-def test_the_manifest_is_that_of_an_import_and_more(layout, tmp_path):
-    write_world(tmp_path / "w", dataclasses.replace(HCT, layout=layout))
-    manifest = Manifest.load(tmp_path / "w").require_valid()
-    imported = import_dataset(tmp_path / "w", tmp_path / "i")
+def test_the_manifest_is_that_of_an_import_and_more(frames, tmp_path):
+    manifest = Manifest.load(frames.folder).require_valid()
+    imported = import_dataset(frames.folder, tmp_path / "i")
     rows = imported.manifest.take(manifest.ids)
     assert len(rows) == len(imported.manifest)
     for name in ("video", "frame", "contact", "session", "text", "domain", *IMAGES):
         assert manifest.column(name) == rows.column(name), name
     assert not any(manifest.table[name].null_count() for name in ("object", "material", "sensor"))
-    split = Split.load(tmp_path / "w" / "splits" / "Orig.json")
+    split = Split.load(frames.folder / "splits" / "Orig.json")
     assert dict(split.parts) == dict(imported.splits["Orig"].parts)
     assert split.manifest == manifest.digest
     assert manifest.facts["synthetic"] == "yes"
 
 
-@pytest.mark.parametrize(("layout", "look"), [("frames", "gelsight"), ("hct", "digit")])
 @pytest.mark.parametrize("leak", ["frame", "contact", "none"])
-def test_an_audit_reports_exactly_the_leak_of_the_world(layout, look, leak, tmp_path):
-    options = dataclasses.replace(LEAKY, layout=layout, look=look, leak=leak)
+def test_an_audit_reports_exactly_the_leak_of_the_world(leak, tmp_path):
+    options = dataclasses.replace(LEAKY, leak=leak)
     counts = write_world(tmp_path / "w", options).leak
     imported = import_dataset(tmp_path / "w", tmp_path / "i")
     split = imported.splits["Orig"]
     lines = (tmp_path / "w" / "leak.csv").read_text().splitlines()
     truth = {row.pop("id"): row for row in csv.DictReader(lines)}
     assert set(truth) == set(split.ids("test"))
-    for group in ("video", "contact", *(["object"] if layout == "frames" else [])):
+    for group in ("video", "contact", "object"):
         result = audit(imported.manifest, split=split, by=group, images=False)
         shared = sum(int(row[f"{group}_in_train"]) for row in truth.values())
         assert result.test_samples_in_shared_groups == shared
@@ -182,7 +135,7 @@ def test_videos_hold_the_same_frames(tmp_path):
             assert np.abs(frame.astype(float) - render(k)).mean() < 14
 
 
-@pytest.mark.parametrize("options", [TINY, dataclasses.replace(HCT, objects_per_material=1)])
+@pytest.mark.parametrize("options", [TINY, dataclasses.replace(TINY, look="digit")])
 def test_samples_rendered_alone_equal_written_files(options, tmp_path):
     write_world(tmp_path / "w", options)
     manifest, world = Manifest.load(tmp_path / "w"), World(options)
@@ -192,11 +145,8 @@ def test_samples_rendered_alone_equal_written_files(options, tmp_path):
         assert sample["label"] == MATERIALS[row["material"]].label
         for name in IMAGES:
             path, file = manifest.path(row[name]), io.BytesIO()
-            if path.suffix == ".png":
-                np.testing.assert_array_equal(np.asarray(Image.open(path)), sample[name])
-            else:
-                Image.fromarray(sample[name]).save(file, "JPEG", quality=95, subsampling=0)
-                assert path.read_bytes() == file.getvalue()
+            Image.fromarray(sample[name]).save(file, "JPEG", quality=95, subsampling=0)
+            assert path.read_bytes() == file.getvalue()
     for k in np.random.default_rng(0).permutation(len(world))[:8]:  # random access, small cache
         np.testing.assert_array_equal(World(options, cache=1)[k]["tactile"], world[k]["tactile"])
     assert world[-1]["id"] == world.ids[-1]
@@ -209,17 +159,6 @@ def test_captions_and_objects_follow_the_object_in_contact():
         assert 2 <= len(names) <= 3
         assert video.text(0) != video.text(3)
         assert contact_frames(options, 3)[0] < options.video_length
-
-
-def test_a_world_has_the_manifest_and_split_that_are_written(frames):
-    world = World(TINY)
-    manifest, split = world.manifest(), Split.load(frames.folder / "splits" / "Orig.json")
-    written = Manifest.load(frames.folder)
-    assert manifest.column("text") == written.column("text")
-    assert manifest.ids == written.ids
-    assert world.split(written).digest == split.digest
-    assert world.split(written).manifest == split.manifest
-    assert world.split().manifest is None
 
 
 def test_a_world_is_a_data_set_for_loaders():

@@ -171,8 +171,8 @@ def caption(  # noqa: PLR0913 (a public verb)
         require(not dry_run, "dry_run", "must be of a model", "a template, which needs no model")
         return _of_columns(template or "", manifest, units, output, per=per, seed=seed)
     instruction = prompt if isinstance(prompt, Prompt) else Prompt.load(prompt)
-    options = {"body": body, "timeout": timeout, "connections": concurrency}
-    with closing(Server(server, model, **options)) as service:
+    service = Server(server, model, body=body, timeout=timeout, connections=concurrency)
+    with closing(service):
         question = Question(service.model, instruction, max_tokens, seed, body or {})
         if dry_run:
             photos = Photos.of(manifest, units, question, progress)

@@ -179,7 +179,7 @@ class Server:
         got = f"status {status}: {self._message(answer)}"
         if status in (401, 403):
             where = f"the environment variable {KEY_VARIABLE}"
-            fix = f"Put a key into {where}" if self._key is None else f"Check the key in {where}"
+            fix = f"Check the key in {where}" if self._key else f"Put a key into {where}"
             must = "must be a server that accepts the key"
             return PalpateError(must, f"{self.url}: {got}", fix, argument="server")
         if status == 404:

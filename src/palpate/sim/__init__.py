@@ -8,7 +8,7 @@ compared with real data.
 """
 
 from palpate.sim.materials import MATERIALS, Material, Surface
-from palpate.sim.options import VERSION, WorldOptions, load_options
+from palpate.sim.options import VERSION, WorldOptions
 from palpate.sim.plan import VideoPlan, plan_world
 from palpate.sim.presets import DEFAULT, MINI_SEEDS, PRESETS, SEEN_WARNING, seen_by_mini
 from palpate.sim.tile import Tile
@@ -31,7 +31,6 @@ __all__ = [
     "World",
     "WorldOptions",
     "WorldRecord",
-    "load_options",
     "plan_world",
     "seen_by_mini",
     "write_world",

@@ -29,16 +29,16 @@ from palpate.sim.objects import WorldObject
 from palpate.sim.options import WorldOptions
 from palpate.sim.tile import TILE_MM, wrapped_offset
 
-
-@dataclass(frozen=True)
-class Thing:
-    """Something beside the surface, in the plane of the view; lengths in half widths."""
-
-    place: tuple[float, float]  # y and x of its center
-    size: float  # its radius, of a box half the side
-    angle: float
-    color: Array
-    box: bool
+#: Range of the width of the view in mm, log-uniform. Materials live on a periodic tile of 64 mm; a
+#: view of w mm turned by 45 degrees is w sqrt(2) wide, so that at most 45.25 mm never show the
+#: repeat.
+VIEW_MM = (30.0, 45.0)
+#: Range of the height of the light.
+ELEVATION_DEG = (18.0, 75.0)
+#: Shares of the videos with a hand, a cast shadow and the edge of the object in view, at hard 0.5.
+HAND, SHADOW, EDGE = 0.6, 0.5, 0.35
+#: Blurs in pixels at 128 px, one drawn a video.
+BLUR_PX = (0.35, 0.6, 1.1)
 
 
 @dataclass(frozen=True)
@@ -60,8 +60,6 @@ class Camera:
     shadow: tuple[float, float, float] | None  # direction, offset and factor of a cast shadow
     edge: tuple[float, float] | None  # direction and distance of the object's edge
     beyond: Array  # color behind the edge
-    balance: Array | None = None  # RGB gain of another white balance
-    things: tuple[Thing, ...] = ()  # clutter beside the surface
 
 
 @dataclass(frozen=True)
@@ -79,16 +77,16 @@ def make_camera(options: WorldOptions, video: int) -> Camera:
     draw, scale, circle = rng.uniform, 2.0 * options.hard, 2.0 * math.pi
     happens = lambda share: bool(rng.random() < min(0.95, share * scale))
     lean = lambda: max(-0.5, min(0.5, rng.normal(0.0, 0.2 * min(1.4, scale) + 1e-9)))
-    elevation, azimuth = math.radians(draw(*options.elevation_deg)), draw(0.0, circle)
+    elevation, azimuth = math.radians(draw(*ELEVATION_DEG)), draw(0.0, circle)
     warm = draw(-1.0, 1.0) * scale
-    near, far = (math.log(end) for end in options.view_mm)
+    near, far = (math.log(end) for end in VIEW_MM)
     view = math.exp(
         (near + far) / 2.0 + draw(-0.5, 0.5) * (far - near) * min(1.0, 0.4 + 0.6 * scale)
     )
-    hand, hand_from = happens(options.hand), draw(0.0, circle)
-    shadow = happens(options.shadow)
+    hand, hand_from = happens(HAND), draw(0.0, circle)
+    shadow = happens(SHADOW)
     shadow_at = (draw(0.0, math.pi), draw(-0.6, 0.6), draw(0.35, 0.75))
-    edge, edge_at = happens(options.edge), (draw(0.0, circle), draw(0.25, 0.75))
+    edge, edge_at = happens(EDGE), (draw(0.0, circle), draw(0.25, 0.75))
     bare = rng.random() < 0.6
     skin = hsv(draw(0.03, 0.08), draw(0.25, 0.55), draw(0.25, 0.9))
     glove = hsv(rng.random(), 0.2, draw(0.08, 0.5))
@@ -102,7 +100,7 @@ def make_camera(options: WorldOptions, video: int) -> Camera:
         ambient=draw(0.35, 0.8),
         light=f32(warmth * np.exp(rng.normal(0.0, 0.03 * scale + 1e-9, 3))),
         exposure=math.exp(rng.normal(0.0, 0.2 * scale + 1e-9)),
-        blur=options.blur_px[int(rng.integers(len(options.blur_px)))],
+        blur=BLUR_PX[int(rng.integers(len(BLUR_PX)))],
         noise=draw(0.004, 0.01 + 0.018 * options.hard),
         hand=hand_from if hand else None,
         skin=skin if bare else glove,
@@ -116,7 +114,7 @@ def _stained(options: WorldOptions, albedo: Array, video: int, number: int) -> A
     """Add stains and stickers to an albedo: elliptic spots that are seen but not felt."""
     rng = options.rng("stains", video, number)
     draw, at = rng.uniform, f32(np.arange(options.tile) * (TILE_MM / options.tile))
-    count = round((0, 0, 1, 2, 5)[int(rng.integers(5))] * 2.0 * options.hard * options.stains)
+    count = round((0, 0, 1, 2, 5)[int(rng.integers(5))] * 2.0 * options.hard)
     for _ in range(count):
         y, x = draw(0.0, TILE_MM), draw(0.0, TILE_MM)
         radius, aspect, angle = draw(1.0, 6.0), draw(0.4, 1.6), draw(0.0, math.pi)
@@ -165,7 +163,7 @@ def photo(
     video, frame = at
     rng, size = options.rng("photo", video, frame), options.size
     y, x = grid(size)
-    sway = [0.012 * options.sway * math.sin(w * frame + video * p) for w, p in _SWAY]
+    sway = [0.012 * math.sin(w * frame + video * p) for w, p in _SWAY]
     depth = 1.0 + x * (camera.tilt[0] + sway[0]) + y * (camera.tilt[1] + sway[1])
     wy, wx = y / depth, x / depth
     reach = camera.view / 2.0 * (1.0 + sway[3]) / scene.px
@@ -179,8 +177,6 @@ def photo(
         past = smoothstep(turned(wy, wx, angle)[0], distance, distance + 0.03)
         shading = 0.8 + 0.25 * np.sin(5.0 * wx + 3.0 * wy + float(video))
         image = over(image, camera.beyond[:, None, None] * shading, past)
-    for thing in camera.things:
-        image = _thing(image, thing)
     if camera.shadow is not None:
         angle, offset, factor = camera.shadow
         dark = smoothstep(turned(y, x, angle)[0], offset, offset + 0.12)
@@ -192,19 +188,8 @@ def photo(
     if blur > 0.2:
         image = ndimage.gaussian_filter(image, (0.0, blur, blur), truncate=2.5)
     image = np.ascontiguousarray(np.moveaxis(image, 0, 2))
-    if camera.balance is not None:
-        image *= camera.balance
     image += rng.standard_normal((size, size, 3), dtype=np.float32) * np.float32(camera.noise)
     return np.clip(image, 0.0, 1.0) ** 0.8
-
-
-def _thing(image: Array, thing: Thing) -> Array:
-    """Draw a disk or a box, darker towards one side."""
-    y, x = grid(image.shape[1])
-    u, v = turned(y - thing.place[0], x - thing.place[1], thing.angle)
-    distance = np.maximum(np.abs(u), np.abs(v)) if thing.box else np.hypot(u, v)
-    shaded = thing.color[:, None, None] * (0.8 + 0.25 * u / thing.size)
-    return over(image, shaded, smoothstep(distance, thing.size, thing.size * 0.94))
 
 
 def _hand(image: Array, skin: Array, angle: float, tip: float) -> Array:

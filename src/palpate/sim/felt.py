@@ -10,7 +10,7 @@ Six attributes of the relief under the pad (height h in mm, its plane removed; p
 - friction: softness + roughness / 4 - gloss / 2; rough, soft and matt surfaces hold the finger.
 
 Each has five levels, at fixed limits that the contacts of the twenty materials fill about equally.
-A describer is uncertain: normal noise, ``describer`` levels wide, is added to each attribute.
+A describer is uncertain: normal noise, 0.15 levels wide, is added to each attribute.
 The three to five attributes farthest from their middle are named. Nothing but the measured numbers
 enters, so two materials share words where they feel the same.
 """
@@ -31,6 +31,8 @@ LONGEST_MM = 10.0
 #: Slope that counts as none, so that its logarithm is finite.
 SMOOTHEST = 1e-3
 STRONGEST = 12
+#: Deviation of the describer, in levels.
+DESCRIBER = 0.15
 #: The words, joined by commas and "and".
 TEMPLATES = ("{}", "it feels {}", "a surface that feels {}", "{} to the touch")
 TINY = 1e-12
@@ -123,12 +125,11 @@ def measure(relief: Array, px: float, softness: float, gloss: float) -> dict[str
     }
 
 
-def describe(felt: Mapping[str, float], noise: float, rng: np.random.Generator) -> list[str]:
+def describe(felt: Mapping[str, float], rng: np.random.Generator) -> list[str]:
     """Choose words for the most pronounced attributes.
 
     Args:
         felt: what :func:`measure` returns.
-        noise: deviation of the describer, in levels.
         rng: draws the noise, how many attributes are named, their words and order.
 
     Returns:
@@ -136,7 +137,7 @@ def describe(felt: Mapping[str, float], noise: float, rng: np.random.Generator) 
     """
     salience: dict[str, tuple[float, str]] = {}
     for name, scale in SCALES.items():
-        level = scale.level(felt[name]) + noise * float(rng.standard_normal())
+        level = scale.level(felt[name]) + DESCRIBER * float(rng.standard_normal())
         words = scale.words[min(max(int(level), 0), 4)]
         if words:
             salience[name] = abs(level - 2.5), words[int(rng.integers(len(words)))]
@@ -145,14 +146,9 @@ def describe(felt: Mapping[str, float], noise: float, rng: np.random.Generator) 
 
 
 def caption(options: WorldOptions, video: int, contact: int, felt: Mapping[str, float]) -> str:
-    """Write the caption of a contact from what :func:`measure` returns.
-
-    In the layout of HCT it is, as there, a list of adjectives.
-    """
+    """Write the caption of a contact from what :func:`measure` returns."""
     rng = options.rng("felt text", video, contact)
-    words = describe(felt, options.describer, rng)
-    if options.layout == "hct":
-        return ", ".join(words)
+    words = describe(felt, rng)
     template = TEMPLATES[int(rng.integers(len(TEMPLATES)))]
     text = template.format(f"{', '.join(words[:-1])} and {words[-1]}")
     return f"{text[0].upper()}{text[1:]}."

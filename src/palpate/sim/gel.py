@@ -3,9 +3,9 @@
 - Press: a Winkler foundation. The gap between relief and gel dome is g; the approach d is solved
   exactly from mean(max(g + d, 0)) = load.
 - Membrane: penetration p = max(g + d, 0), limited to h = G tanh(p / G) for a gel of depth G, grip
-  w = p / (p + :data:`GRIP_MM`). From m = h, each blur S of ``relax_mm`` gives m <- S m + w (h - S
+  w = p / (p + :data:`GRIP_MM`). From m = h, each blur S of ``RELAX_MM`` gives m <- S m + w (h - S
   m): the gel follows what presses hard, and bridges the hollows and the rim, so that a contact ends
-  softly. ``optical_mm`` follows.
+  softly. ``OPTICAL_MM`` follows.
 - Light: with n the normal of m + texture,
   I = ((ambient + sum_k color_k F_k(x, y) max(0, n . l_k)) V (1 - q m) (1 - 0.96 ink) gain)^gamma.
   Near field F_k = 1 + a + 0.35 a² - hump_k r², a = fall_k (x, y) . azimuth_k, in units of half the
@@ -15,7 +15,7 @@
   dust; they move with the gel.
 - A unit is drawn on 256 x 256 points and averaged down, so that it looks the same at every size.
 
-The look ``gelsight`` is fitted to the real clips, see ``benchmarks/world_fidelity.py``.
+The look ``gelsight`` is fitted to the real clips.
 """
 
 from __future__ import annotations
@@ -45,6 +45,15 @@ from palpate.sim.options import VERSION, WorldOptions
 DRAWN = 256
 #: Penetration in mm at which the gel follows the object half the way; below, it bridges hollows.
 GRIP_MM = 0.04
+#: Side of the gel pad, and its depth, in mm.
+PAD_MM, GEL_MM = 14.0, 1.6
+#: Blurs in mm of the gel where nothing touches it, one by one, and of the sensor's optics.
+RELAX_MM, OPTICAL_MM = (2.4, 0.9, 0.35), 0.14
+#: Range of the radius in mm of the domed gel of a unit.
+DOME_MM = (30.0, 80.0)
+#: Range of the darkening at half the pad's side, and of the image noise (deviation, of 1), of a
+#: unit.
+VIGNETTE, NOISE = (0.03, 0.16), (0.002, 0.006)
 #: The lights are green, blue and red.
 _PURE = np.eye(3)[[1, 2, 0]]
 _Triple = tuple[float, float, float]
@@ -96,7 +105,6 @@ class Sensor:
     """One gel unit at one image size n."""
 
     size: int
-    pad: float  # side in mm
     px: float  # pixel size in mm
     field: Array  # near-field factor of each light, (3, n, n)
     color: Array  # RGB of each light, (3, 3)
@@ -107,31 +115,20 @@ class Sensor:
     dome: Array  # its doming in mm, (n, n)
     ink: Array | None  # opacity of the markers in [0, 1], (n, n)
     dim: float  # loss of light for each mm of indentation
-    gel: float  # depth that can be indented, in mm
-    relax: tuple[float, ...]  # blurs of the membrane in mm
-    optical: float  # blur of the optics in mm
     gamma: float
     noise: float  # deviation of the image noise
 
 
-#: The options that a unit depends on.
-_UNIT_OPTIONS = (
-    *("look", "seed", "size", "pad_mm", "gel_mm", "relax_mm", "optical_mm"),
-    *("dome_mm", "markers", "dirt", "vignette", "sensor_noise"),
-)
-
-
 def make_sensor(options: WorldOptions, unit: int) -> Sensor:
     """Make a unit of ``options.look``: the family is the same in every world, the unit is not."""
-    used = {name: getattr(options, name) for name in _UNIT_OPTIONS}
-    return _make(WorldOptions(materials=options.materials, **used), unit)
+    return _make(options.seed, options.look, options.size, options.markers, unit)
 
 
 @lru_cache(maxsize=64)
-def _make(options: WorldOptions, unit: int) -> Sensor:
-    look, pad = _LOOKS[options.look], options.pad_mm
-    family: np.random.Generator = rng_for(0, "sensor family", VERSION, options.look)
-    rng = options.rng("sensor", options.look, unit)
+def _make(seed: int, name: str, size: int, markers: int, unit: int) -> Sensor:
+    look, px = _LOOKS[name], PAD_MM / size
+    family: np.random.Generator = rng_for(0, "sensor family", VERSION, name)
+    rng = rng_for(seed, "world", VERSION, "sensor", name, unit)
     spread = [math.exp(s * rng.normal()) for s in look.spread]
     azimuth = [a + rng.normal(0.0, 0.05) for a in look.azimuth]
     elevation = np.deg2rad(family.uniform(*look.elevation, 3))
@@ -145,17 +142,15 @@ def _make(options: WorldOptions, unit: int) -> Sensor:
     for angle, fall, hump in zip(azimuth, look.fall, look.hump, strict=True):
         a = turned(y, x, angle)[0] * (fall * spread[2])
         field.append(np.clip(1.0 + a + 0.35 * a * a - hump * square, 0.08, None))
-    veil = (1.0 - rng.uniform(*options.vignette) * square) * (1.0 + options.dirt * _dirt(rng))
-    texture = ndimage.gaussian_filter(_white(rng), 0.3 / (pad / DRAWN))
+    veil = (1.0 - rng.uniform(*VIGNETTE) * square) * (1.0 + _dirt(rng))
+    texture = ndimage.gaussian_filter(_white(rng), 0.3 / (PAD_MM / DRAWN))
     texture *= 0.0022 / float(texture.std())
-    dome = square * ((pad / 2.0) ** 2 / (2.0 * rng.uniform(*options.dome_mm)))
-    inked = options.look == "gelsight" and options.markers
-    ink = _markers(options.markers, pad, rng) if inked else None
-    down = lambda a: resample(f32(a), options.size)
+    dome = square * ((PAD_MM / 2.0) ** 2 / (2.0 * rng.uniform(*DOME_MM)))
+    ink = _markers(markers, rng) if name == "gelsight" and markers else None
+    down = lambda a: resample(f32(a), size)
     return Sensor(
-        size=options.size,
-        pad=pad,
-        px=pad / options.size,
+        size=size,
+        px=px,
         field=np.stack([down(f) for f in field]),
         color=f32((_PURE * (1.0 - mixed) + mixed) * gain),
         light=f32(light),
@@ -165,11 +160,8 @@ def _make(options: WorldOptions, unit: int) -> Sensor:
         dome=down(dome),
         ink=None if ink is None else down(ink),
         dim=rng.normal(0.03, 0.06),
-        gel=options.gel_mm,
-        relax=options.relax_mm,
-        optical=options.optical_mm,
         gamma=rng.uniform(0.9, 1.1),
-        noise=rng.uniform(*options.sensor_noise),
+        noise=rng.uniform(*NOISE),
     )
 
 
@@ -196,7 +188,7 @@ def _dirt(rng: np.random.Generator) -> Array:
     return dirt
 
 
-def _markers(rows: int, pad: float, rng: np.random.Generator) -> Array:
+def _markers(rows: int, rng: np.random.Generator) -> Array:
     """Draw the opacity of the ink: a jittered grid of small dots, worn ones among them, and dust.
 
     The grid has a pitch of 0.96 pad / rows and begins anywhere, so that a unit shows ``rows`` or
@@ -204,8 +196,8 @@ def _markers(rows: int, pad: float, rng: np.random.Generator) -> Array:
     with a finer pitch. Worn dots are large and round.
     """
     ink = np.zeros((DRAWN, DRAWN), np.float32)
-    step, mm = 2.0 * 0.96 / rows, 2.0 / pad
-    scale = min(1.0, step / (0.24 * 14.0 / pad)) * mm
+    step, mm = 2.0 * 0.96 / rows, 2.0 / PAD_MM
+    scale = min(1.0, step / 0.24) * mm
     first = -1.0 - step * rng.uniform(0.0, 1.0, 2)
     wear_x, wear_y, wear = rng.uniform(-1.0, 1.0), rng.uniform(-1.0, 1.0), rng.uniform(0.15, 0.5)
     for i, j in np.ndindex(rows + 3, rows + 3):
@@ -258,7 +250,7 @@ def gap_of(
     Soft objects flatten under the load.
     """
     y, x = grid(sensor.size)
-    half = sensor.pad / 2.0
+    half = PAD_MM / 2.0
     if body.surface.softness:
         relief = relief * (1.0 - 0.5 * body.surface.softness * min(1.0, load / 0.3))
     slope = x * (half * tilt[0]) + y * (half * tilt[1])
@@ -274,11 +266,11 @@ def press(sensor: Sensor, gap: Array, load: float) -> tuple[Array, Array]:
     penetration = gap + solve_approach(gap, load)
     indented = np.maximum(penetration, 0.0)
     grip = indented / (indented + GRIP_MM)
-    membrane = indented = np.tanh(indented * (1.0 / sensor.gel)) * sensor.gel
-    for blur in sensor.relax:
+    membrane = indented = np.tanh(indented * (1.0 / GEL_MM)) * GEL_MM
+    for blur in RELAX_MM:
         membrane = smooth(membrane, blur / sensor.px)
         membrane += grip * (indented - membrane)
-    return smooth(membrane, sensor.optical / sensor.px), penetration > 0.0
+    return smooth(membrane, OPTICAL_MM / sensor.px), penetration > 0.0
 
 
 def marker_shift(

@@ -97,12 +97,12 @@ def leak_counts(parts: Parts) -> dict[str, int | float | None]:
     }
 
 
-def leak_file(options: WorldOptions, parts: Parts) -> str:
+def leak_file(parts: Parts) -> str:
     """Return the text of ``leak.csv``."""
     rows: list[tuple[object, ...]] = []
     for leak in leaks(parts):
         video, at = leak.row.video, leak.nearest
-        gap, nearest = ("", "") if at is None else (leak.gap, sample_id(options, video, at))
+        gap, nearest = ("", "") if at is None else (leak.gap, sample_id(video, at))
         flags = (int(at is not None), int(leak.contact), int(leak.object))
-        rows.append((sample_id(options, video, leak.row.frame), *flags, gap, nearest))
+        rows.append((sample_id(video, leak.row.frame), *flags, gap, nearest))
     return csv_text(LEAK_COLUMNS, rows)

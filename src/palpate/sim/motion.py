@@ -1,8 +1,8 @@
 """How a hand moves the sensor: the contacts of a video, and the state of the sensor at each frame.
 
-The contacts of a video revisit a place of the object (``revisit_mm``; a share ``jump`` of them goes
-far away). The sensor comes down during the free frames, then presses, holds, slides and lifts: over
-the phase p in [0, 1] of a contact the load follows (0.45 + 0.55 sin(pi (0.12 + 0.76 p)))^2.
+The contacts of a video revisit a place of the object; a quarter of them goes far away. The sensor
+comes down during the free frames, then presses, holds, slides and lifts: over the phase p in [0, 1]
+of a contact the load follows (0.45 + 0.55 sin(pi (0.12 + 0.76 p)))^2.
 """
 
 from __future__ import annotations
@@ -14,6 +14,14 @@ from palpate.sim.options import WorldOptions
 from palpate.sim.plan import VideoPlan
 from palpate.sim.tile import TILE_MM
 
+#: Range of the peak load as mean indentation in mm, log-uniform.
+LOAD_MM = (0.09, 0.42)
+#: Deviation of a video's contacts around its first, in mm, and share that goes far away instead.
+REVISIT_MM, JUMP = 3.5, 0.25
+#: Deviations in mm, one drawn a contact, of the sensor's slide.
+SLIDE_MM = (0.0, 1.5, 5.0)
+#: Deviations of the pad's slope, and of the drag in mm per mm of depth.
+TILT, SHEAR = 0.045, 0.7
 Pair = tuple[float, float]
 
 
@@ -49,23 +57,23 @@ def make_contacts(options: WorldOptions, plan: VideoPlan) -> list[Contact]:
     rng = options.rng("motion", plan.index)
     normal, draw = rng.normal, rng.uniform
     home, turn, last = (0.0, 0.0), 0.0, -1
-    lightest, heaviest = map(math.log, options.load_mm)
+    lightest, heaviest = map(math.log, LOAD_MM)
     for number in plan.object_index:
         first = number != last  # on this object
         if first:
             home, last = (draw(0.0, TILE_MM), draw(0.0, TILE_MM)), number
             turn = draw(0.0, 2.0 * math.pi)
-        far = bool(rng.random() < options.jump) and not first
+        far = bool(rng.random() < JUMP) and not first
         away = (draw(0.0, TILE_MM), draw(0.0, TILE_MM))
-        near = (home[0] + options.revisit_mm * normal(), home[1] + options.revisit_mm * normal())
-        reach = options.slide_mm[int(rng.integers(len(options.slide_mm)))]
+        near = (home[0] + REVISIT_MM * normal(), home[1] + REVISIT_MM * normal())
+        reach = SLIDE_MM[int(rng.integers(len(SLIDE_MM)))]
         contact = Contact(
             place=away if far else near,
             slide=(reach * normal(), reach * normal()),
             rotation=turn + normal(0.0, 0.5 if far else 0.1),
             load=math.exp(draw(lightest, heaviest)),
-            tilt=(options.tilt * normal(), options.tilt * normal()),
-            shear=(options.shear * normal(), options.shear * normal()),
+            tilt=(TILT * normal(), TILT * normal()),
+            shear=(SHEAR * normal(), SHEAR * normal()),
         )
         contacts.append(contact)
     return contacts

@@ -8,9 +8,13 @@ from functools import lru_cache
 
 from palpate.core import rng_for
 from palpate.sim.materials import MATERIALS, Material, Surface, draw_surface
-from palpate.sim.options import VERSION, Span, WorldOptions
+from palpate.sim.options import VERSION, WorldOptions
 from palpate.sim.plan import ObjectRef
 from palpate.sim.tile import TILE_MM
+
+#: Share of the objects that are curved, and the range of their radius in mm (of dents 3.3 times as
+#: much).
+CURVED, RADIUS_MM = 0.4, (25.0, 90.0)
 
 
 @dataclass(frozen=True)
@@ -24,22 +28,16 @@ class WorldObject:
 
 
 def make_object(options: WorldOptions, ref: ObjectRef) -> WorldObject:
-    """Make the object of that name.
-
-    It depends on the seed, the name, the tile size and the options of curvature alone.
-    """
-    shape = (options.tile, options.curved, options.radius_mm)
-    return _make(options.seed, ref, MATERIALS[ref.material], shape)
+    """Make the object of that name; it depends on the seed, the name and the tile size alone."""
+    return _make(options.seed, ref, MATERIALS[ref.material], options.tile)
 
 
 @lru_cache(maxsize=6)
-def _make(
-    seed: int, ref: ObjectRef, material: Material, shape: tuple[int, float, Span]
-) -> WorldObject:
-    tile, curved, (smallest, largest) = shape
+def _make(seed: int, ref: ObjectRef, material: Material, tile: int) -> WorldObject:
     rng = rng_for(seed, "world", VERSION, "object", ref.material, ref.number)
     surface = draw_surface(ref.material, material, tile, rng)
-    flat = rng.random() >= curved
+    flat = rng.random() >= CURVED
     bulge = 1.0 if rng.random() < 0.5 else -0.3
-    radius = math.exp(rng.uniform(math.log(smallest), math.log(largest)))
+    smallest, largest = map(math.log, RADIUS_MM)
+    radius = math.exp(rng.uniform(smallest, largest))
     return WorldObject(ref, surface, TILE_MM / tile, 0.0 if flat else bulge / radius)

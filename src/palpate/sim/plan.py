@@ -15,6 +15,9 @@ from palpate.core import seed_for
 from palpate.sim.materials import object_prefix
 from palpate.sim.options import BACKGROUND_OFFSET, VERSION, WorldOptions
 
+#: A mixed video has 2 to this many objects.
+OBJECTS_PER_VIDEO = 3
+
 
 @dataclass(frozen=True)
 class ObjectRef:
@@ -69,13 +72,6 @@ def contact_frames(options: WorldOptions, contact: int) -> range:
     return range(first, first + options.frames_per_contact)
 
 
-def contact_row(options: WorldOptions, plans: list[VideoPlan], k: int) -> Row:
-    """Return contact frame ``k`` of the world, by video and frame."""
-    video, within = divmod(k, options.contacts_per_video * options.frames_per_contact)
-    contact, step = divmod(within, options.frames_per_contact)
-    return Row(plans[video], contact, first_contact(options, contact) + step)
-
-
 def contact_rows(options: WorldOptions, plans: list[VideoPlan]) -> Iterator[Row]:
     """Yield every contact frame, by video and frame: the order of the manifest."""
     for plan in plans:
@@ -127,7 +123,7 @@ def _plan_video(
     """Plan a video of ``main`` and, if it is mixed, of new objects counted in ``guests``."""
     rng = options.rng("plan", index)
     objects = [main]
-    most = min(options.objects_per_video, options.contacts_per_video, len(options.names))
+    most = min(OBJECTS_PER_VIDEO, options.contacts_per_video, len(options.names))
     if rng.random() < options.mixed and most > 1:
         others = [m for m in options.names if m != main.material]
         for k in rng.permutation(len(others))[: int(rng.integers(1, most))]:

@@ -7,11 +7,10 @@ from functools import cached_property
 import numpy as np
 
 from palpate.core import PalpateError
-from palpate.sim.appearance import Appearance, with_appearance
 from palpate.sim.arrays import Array, f32, grid, sample_periodic, to_bytes
 from palpate.sim.camera import Scene, light_object, make_camera, photo
 from palpate.sim.felt import caption, measure
-from palpate.sim.gel import gap_of, make_sensor, marker_shift, press, shade
+from palpate.sim.gel import PAD_MM, gap_of, make_sensor, marker_shift, press, shade
 from palpate.sim.motion import State, make_contacts, state_at
 from palpate.sim.objects import WorldObject, make_object
 from palpate.sim.options import BACKGROUND_OFFSET, WorldOptions
@@ -24,15 +23,12 @@ class Video:
     Args:
         options: the world's.
         plan: which video (:func:`~palpate.sim.plan.plan_world`), or its index.
-        appearance: how its photos look (:mod:`palpate.sim.appearance`).
 
     Raises:
-        PalpateError: if there is no such video, or no such appearance.
+        PalpateError: if there is no such video.
     """
 
-    def __init__(
-        self, options: WorldOptions, plan: VideoPlan | int, appearance: Appearance = "as recorded"
-    ) -> None:
+    def __init__(self, options: WorldOptions, plan: VideoPlan | int) -> None:
         if isinstance(plan, int):
             plans = plan_world(options)
             if not 0 <= plan < len(plans):
@@ -42,8 +38,7 @@ class Video:
         self.options, self.plan = options, plan
         self.sensor = make_sensor(options, plan.sensor)
         self.contacts = make_contacts(options, plan)
-        camera = make_camera(options, plan.index)
-        self.camera = with_appearance(options, camera, plan.index, appearance)
+        self.camera = make_camera(options, plan.index)
         rng, spread = options.rng("gain", plan.index), 2.0 * options.hard
         balance, exposure = rng.standard_normal(3), rng.standard_normal()
         self.gain: Array = f32(np.exp(0.03 * spread * balance + 0.05 * spread * exposure))
@@ -64,8 +59,7 @@ class Video:
         """Return the caption of a contact."""
         index, surface = self.plan.index, self.object_of(contact).surface
         relief = self.relief(self.state(first_contact(self.options, contact)))
-        px = self.options.pad_mm / self.options.size
-        felt = measure(relief, px, surface.softness, surface.gloss)
+        felt = measure(relief, self.sensor.px, surface.softness, surface.gloss)
         return caption(self.options, index, contact, felt)
 
     def vision(self, frame: int) -> np.ndarray:
@@ -99,7 +93,7 @@ class Video:
         """Return the object's relief under the pad in mm, (n, n)."""
         body = self.object_of(state.contact)
         y, x = grid(self.options.size)
-        half = self.options.pad_mm / 2.0 / body.px
+        half = PAD_MM / 2.0 / body.px
         c, s = float(np.cos(state.rotation)) * half, float(np.sin(state.rotation)) * half
         rows = s * x + c * y + state.place[1] / body.px
         columns = c * x - s * y + state.place[0] / body.px
@@ -110,9 +104,7 @@ class Video:
         return to_bytes(self._passive)
 
     def background_of(self, contact: int) -> np.ndarray:
-        """Render the background of a contact: noiseless in HCT, else the frame 4 before it."""
-        if self.options.layout == "hct":
-            return self.background()
+        """Render the background of a contact: the frame 4 before it."""
         return self.tactile(first_contact(self.options, contact) - BACKGROUND_OFFSET)
 
     @cached_property

@@ -15,16 +15,13 @@ from functools import cached_property, lru_cache, partial
 from pathlib import Path
 from typing import Any, SupportsIndex
 
-from palpate.core import PalpateError, Progress, Split, quiet, require, require_choice
-from palpate.data.formats.hct import sessions_of
+from palpate.core import PalpateError, Split, require
 from palpate.data.formats.touch_and_go import CATEGORIES
 from palpate.data.manifest import Manifest
-from palpate.sim.appearance import APPEARANCES, Appearance
-from palpate.sim.layouts import Parts, contact_id, image_paths, manifest_root, sample_id, video_id
-from palpate.sim.leak import cut
+from palpate.sim.layouts import Parts, contact_id, image_paths, sample_id
 from palpate.sim.materials import MATERIALS
 from palpate.sim.options import VERSION, WorldOptions
-from palpate.sim.plan import Row, VideoPlan, contact_row, contact_rows, plan_world
+from palpate.sim.plan import Row, VideoPlan, contact_rows, plan_world
 from palpate.sim.presets import PRESETS
 from palpate.sim.video import Video
 
@@ -40,52 +37,37 @@ class World:
         options: the world, or the name of a preset (``"tiny"``, ``"small"``, ...); default
             ``WorldOptions()``.
         cache: videos kept ready (about 1 MB each at 64 px, 4 MB at 128 px).
-        appearance: of the photos: ``as recorded``, ``other light``, ``other white balance`` or
-            ``clutter`` (:mod:`palpate.sim.appearance`); the rest of a sample stays as it is.
 
     Raises:
-        PalpateError: for an unknown preset or appearance, or a cache below 1.
+        PalpateError: for an unknown preset, or a cache below 1.
     """
 
-    def __init__(
-        self,
-        options: WorldOptions | str | None = None,
-        *,
-        cache: int = 4,
-        appearance: Appearance = "as recorded",
-    ) -> None:
+    def __init__(self, options: WorldOptions | str | None = None, *, cache: int = 4) -> None:
         if isinstance(options, str) and options not in PRESETS:
             must = f"must be options, or one of {', '.join(PRESETS)}"
             raise PalpateError(must, repr(options), "Choose a preset", argument="options")
         require(cache >= 1, "cache", "must be at least 1", cache)
         self.options = PRESETS[options] if isinstance(options, str) else options or WorldOptions()
-        require_choice("appearance", appearance, APPEARANCES)
         self.cache = cache
-        self.appearance: Appearance = appearance
-        self.video = lru_cache(cache)(partial(Video, self.options, appearance=appearance))
+        self.video = lru_cache(cache)(partial(Video, self.options))
 
     def __reduce__(self) -> Any:
         """Pickle the options alone: a copy in another process renders for itself."""
-        return partial(World, self.options, cache=self.cache, appearance=self.appearance), ()
-
-    def __repr__(self) -> str:
-        """Show length and digest."""
-        return f"World({len(self)} samples, options {self.options.digest[:12]})"
+        return partial(World, self.options, cache=self.cache), ()
 
     @cached_property
-    def plans(self) -> list[VideoPlan]:
-        """All videos."""
-        return plan_world(self.options)
+    def rows(self) -> list[Row]:
+        """The samples in order."""
+        return list(contact_rows(self.options, plan_world(self.options)))
 
     def __len__(self) -> int:
         """Count the contact frames."""
-        return len(self.plans) * self.options.contacts_per_video * self.options.frames_per_contact
+        return len(self.rows)
 
     @property
     def ids(self) -> list[str]:
         """The ids in order: those of the manifest."""
-        rows = contact_rows(self.options, self.plans)
-        return [sample_id(self.options, row.video, row.frame) for row in rows]
+        return [sample_id(row.video, row.frame) for row in self.rows]
 
     def __getitem__(self, k: SupportsIndex) -> dict[str, Any]:
         """Render a sample; negative numbers count from the end.
@@ -103,7 +85,7 @@ class World:
         if not -len(self) <= number < len(self):
             must = f"A sample of this world must be 0 to {len(self) - 1}"
             raise NoSampleError(must, str(number), "Choose another sample")
-        row = contact_row(self.options, self.plans, number % len(self))
+        row = self.rows[number]
         video = self.video(row.video)
         return _cells(self.options, row, video.text(row.contact)) | {
             "label": MATERIALS[row.object.material].label,
@@ -112,35 +94,14 @@ class World:
             "background": video.background_of(row.contact),
         }
 
-    def manifest(self, progress: Progress = quiet) -> Manifest:
-        """Make the world's manifest, without images; draws every object once for its captions."""
-        captions: dict[str, list[str]] = {}
-        for count, plan in enumerate(self.plans, 1):
-            video = self.video(plan)
-            captions[plan.name] = [video.text(k) for k in range(self.options.contacts_per_video)]
-            progress("describing videos", count, len(self.plans))
-        return world_manifest(self.options, self.plans, captions, None)
-
-    def split(self, manifest: Manifest | None = None) -> Split:
-        """Cut the world into train and test; it leaks as ``options.leak`` says.
-
-        Args:
-            manifest: of this world, to enter its digest into the split.
-
-        Raises:
-            PalpateError: if the world is too small to cut.
-        """
-        parts = cut(self.options, self.plans, list(contact_rows(self.options, self.plans)))
-        return world_split(self.options, parts, manifest.digest if manifest is not None else None)
-
 
 def _cells(options: WorldOptions, row: Row, text: str) -> dict[str, Any]:
     """Return what the world knows of a contact frame, in the manifest's columns."""
     return {
-        "id": sample_id(options, row.video, row.frame),
-        "video": video_id(options, row.video),
+        "id": sample_id(row.video, row.frame),
+        "video": row.video.name,
         "frame": row.frame,
-        "contact": contact_id(options, row.video, row.contact),
+        "contact": contact_id(row.video, row.contact),
         "object": row.object.name,
         "material": row.object.material,
         "text": text,
@@ -152,31 +113,24 @@ def world_manifest(
     options: WorldOptions,
     plans: list[VideoPlan],
     captions: Mapping[str, Sequence[str]],
-    folder: Path | None,
+    folder: Path,
 ) -> Manifest:
     """Make the manifest of all contact frames, by video and frame.
 
     It has the ids, videos, contacts and image paths that ``palpate import`` reads from the tree,
-    and more: the object, the gel unit, and in every layout the material and the text.
+    and more: the object and the gel unit.
 
     Args:
         options: the world's.
         plans: all videos.
         captions: video name -> a caption for each contact.
-        folder: of the world, where the manifest is rooted (``hct/`` in HCT's layout); None: there
-            are no files.
+        folder: of the world, where the manifest is rooted.
     """
-    rows: list[dict[str, Any]] = []
-    for row in contact_rows(options, plans):
-        cells = _cells(options, row, captions[row.video.name][row.contact])
-        paths = image_paths(options, row.video, row.frame, row.contact) if folder else {}
-        rows.append(cells | paths)
-    if options.layout == "hct":
-        sessions = sessions_of(str(row["video"]) for row in rows)
-        for row in rows:
-            video = str(row["video"])
-            row |= {"session": sessions[video], "domain": video.partition("/")[0]}
-    return Manifest.from_rows(rows, manifest_root(options, folder or Path()), _facts(options))
+    rows = [
+        _cells(options, row, captions[row.video.name][row.contact]) | image_paths(options, row)
+        for row in contact_rows(options, plans)
+    ]
+    return Manifest.from_rows(rows, folder, _facts(options))
 
 
 def _facts(options: WorldOptions) -> dict[str, str]:
@@ -188,20 +142,16 @@ def _facts(options: WorldOptions) -> dict[str, str]:
         "world_options": options.digest,
         "text_source": "measured surface",
         "layout": options.layout,
+        "format": "touch-and-go",
     }
-    if options.layout == "hct":
-        return facts | {"format": "hct"}
     classes = {material.label: name for name, material in MATERIALS.items()}
     if classes != CATEGORIES:
         facts["classes"] = json.dumps({str(label): name for label, name in classes.items()})
-    return facts | {"format": "touch-and-go"}
+    return facts
 
 
-def world_split(options: WorldOptions, parts: Parts, manifest: str | None) -> Split:
+def world_split(options: WorldOptions, parts: Parts, manifest: str) -> Split:
     """Return ``Orig``: the cut over the ids of the manifest of that digest, in list order."""
-    ids = {
-        name: [sample_id(options, row.video, row.frame) for row in rows]
-        for name, rows in parts.items()
-    }
+    ids = {name: [sample_id(row.video, row.frame) for row in rows] for name, rows in parts.items()}
     rule = {"method": "world", "leak": options.leak, "test": options.test, "seed": options.seed}
     return Split.from_ids(rule=rule | {"world_version": VERSION}, manifest=manifest, **ids)

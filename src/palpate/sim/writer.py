@@ -1,11 +1,11 @@
-"""Write a world as a tree in the layout of Touch and Go or of HCT.
+"""Write a world as a tree in the layout of Touch and Go.
 
 ::
 
     world.json                               options, counts, known leak, digest of a finished world
     manifest.parquet  splits/Orig.json       the world's samples, and its split
     leak.csv                                 what each test sample shares with train, exactly
-    label.txt  train.txt  dataset/<video>/   or  hct/data1/ ...: see palpate.sim.layouts
+    label.txt  train.txt  dataset/<video>/   see palpate.sim.layouts
 
 The tree grows in the hidden sibling ``.<name>.<digest>.part``, one finished video after another,
 and is renamed when whole. A run that was killed, or stopped by a full disk, is continued by the
@@ -40,15 +40,16 @@ from palpate.core import (
     write_text,
 )
 from palpate.core.processes import worker_pool
-from palpate.sim.layouts import Parts, list_files, manifest_root, video_folder, write_video_files
+from palpate.sim.layouts import Parts, list_files, video_folder, write_video_files
 from palpate.sim.leak import cut, leak_counts, leak_file
 from palpate.sim.materials import MATERIALS, Material
-from palpate.sim.options import FORMER, VERSION, WORLD_FORMAT, WorldOptions, read_world
+from palpate.sim.options import VERSION, WorldOptions
 from palpate.sim.plan import VideoPlan, contact_rows, plan_world, written_frames
 from palpate.sim.presets import SEEN_WARNING, seen_by_mini
 from palpate.sim.video import Video
 from palpate.sim.world import world_manifest, world_split
 
+WORLD_FORMAT = "palpate-world/1"
 NOTE = (
     "Synthetic: procedural surfaces and a simulated sensor. Shows mechanisms; never compare its "
     "numbers with those of real data sets."
@@ -125,19 +126,15 @@ def write_world(
 
 def _finished(output: Path, options: WorldOptions) -> WorldRecord:
     """Return the record of the finished world in ``output``."""
-    data = read_world(output / "world.json")
-    if data.get("options_digest") != options.digest:
+    data = read_json(output / "world.json", "world record")
+    if data.get("format") != WORLD_FORMAT or data.get("options_digest") != options.digest:
         must, fix = f"{output} must hold the requested world", "Choose another folder, or remove it"
-        raise PalpateError(must, "a world of other options", fix)
+        raise PalpateError(must, "a world of other options or of another version", fix)
     return WorldRecord(output, data["digest"], data["counts"], data["leak"])
 
 
 def _captions_path(unfinished: Path, plan: VideoPlan) -> Path:
     return unfinished / WORK / f"{plan.name}.json"
-
-
-def _folder(options: WorldOptions, unfinished: Path, plan: VideoPlan) -> Path:
-    return manifest_root(options, unfinished) / video_folder(options, plan)
 
 
 def _render(
@@ -148,7 +145,7 @@ def _render(
     progress: Progress,
 ) -> None:
     """Render the videos that are missing."""
-    todo = [plan for plan in plans if not _folder(options, unfinished, plan).is_dir()]
+    todo = [plan for plan in plans if not video_folder(unfinished, plan).is_dir()]
     finished = len(plans) - len(todo)
     progress("rendering videos", finished, len(plans))
     job = partial(_write_video, options, unfinished)
@@ -175,30 +172,26 @@ def _write_video(options: WorldOptions, unfinished: Path, plan: VideoPlan) -> st
     video = Video(options, plan)
     captions = [video.text(contact) for contact in range(options.contacts_per_video)]
     write_json(_captions_path(unfinished, plan), captions)
-    with atomic_folder(_folder(options, unfinished, plan)) as folder:
+    with atomic_folder(video_folder(unfinished, plan)) as folder:
         write_video_files(options, video, folder)
     return plan.name
 
 
 def _finish(unfinished: Path, options: WorldOptions, plans: list[VideoPlan], parts: Parts) -> None:
     """Write the lists of train and test and, last, ``world.json``."""
-    for folder in {_folder(options, unfinished, plan).parent for plan in plans}:
-        for stray in folder.glob(".*"):  # unfinished videos of a killed process
-            shutil.rmtree(stray, ignore_errors=True)
+    for stray in (unfinished / "dataset").glob(".*"):  # unfinished videos of a killed process
+        shutil.rmtree(stray, ignore_errors=True)
     captions = {
         p.name: read_json(_captions_path(unfinished, p), "captions of a video") for p in plans
     }
     manifest = world_manifest(options, plans, captions, unfinished)
-    files = {"leak.csv": leak_file(options, parts), **list_files(options, plans, parts, captions)}
+    files = {"leak.csv": leak_file(parts), **list_files(options, plans, parts, captions)}
     for name, text in files.items():
         write_text(unfinished / name, text)
     world_split(options, parts, manifest.digest).save(unfinished / "splits" / "Orig.json")
     manifest.save(unfinished / "manifest.parquet")
-    # The digest is taken over the column name of format 2, so that worlds that models were trained
-    # on keep theirs.
-    header = {"leak.csv": files["leak.csv"].replace("contact_in_train", "touch_in_train", 1)}
-    lists = {name: digest_lines(t.splitlines()) for name, t in (files | header).items()}
-    content = {"version": VERSION, "options": options.format_2(), "lists": lists}
+    lists = {name: digest_lines(text.splitlines()) for name, text in files.items()}
+    content = {"options": options.digest, "lists": lists}
     record = {
         "format": WORLD_FORMAT,
         "version": VERSION,
@@ -207,10 +200,9 @@ def _finish(unfinished: Path, options: WorldOptions, plans: list[VideoPlan], par
         "digest": digest_json(content),
         "options_digest": options.digest,
         "manifest_digest": manifest.digest,
-        "manifest_root": manifest_root(options, Path()).as_posix(),
         "counts": _counts(options, plans, parts),
         "leak": {"rule": options.leak, **leak_counts(parts)},
-        "options": dataclasses.asdict(options) | FORMER,
+        "options": dataclasses.asdict(options),
     }
     write_json(unfinished / "world.json", record)
 
