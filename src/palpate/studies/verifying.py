@@ -276,7 +276,8 @@ def _study_again(
     )
     stages = _measured(nodes_of(plan), folder, place, progress)
     made = Results.load(place / "results" / "results.json")
-    return replace(made, settings=settings_of(plan, stages, options["jobs"]))
+    stored = {name: replace(stage, folder=folder / name) for name, stage in stages.items()}
+    return replace(made, settings=settings_of(plan, stored, options["jobs"]))
 
 
 def _demo_again(
