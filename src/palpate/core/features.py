@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -131,9 +130,6 @@ class FeatureSet:
 
 
 def _array(features: Any) -> np.ndarray:
-    if str(getattr(features, "dtype", "")).endswith("bfloat16"):
-        message = "bfloat16 features were widened to float32; their rounding stays"
-        warnings.warn(message, stacklevel=4)
     try:
         return to_numpy(features)
     except (TypeError, ValueError, RuntimeError) as error:
