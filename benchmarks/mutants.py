@@ -1,0 +1,165 @@
+"""Whether the tests of a room notice a wrong operator, comparison or constant.
+
+    python benchmarks/mutants.py --write      # resumes; about an hour on one core
+
+Draws places from the sources by seed (40 in metrics, 20 each in leakage, data and training),
+changes one in a copy of the project, and runs the fast tests of the room that reach its line, up
+to the first failure and for at most 120 CPU seconds. Writes ``mutants.json``: each mutant with its
+fate, the share killed. A survivor is equivalent (say why in ``SURVIVORS``), or needs a test.
+"""
+
+from __future__ import annotations
+
+import argparse
+import ast
+import json
+import os
+import random
+import resource
+import shutil
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+
+import coverage
+
+TOP = Path(__file__).resolve().parents[1]
+RECORD = Path(__file__).with_suffix(".json")
+ROOMS = {"metrics": 40, "leakage": 20, "data": 20, "training": 20}
+LIMIT = 120
+FAST = ("-m", "not slow and not browser and not nightly", "-p", "no:cacheprovider", "-q")
+SWAPS = {
+    ast.Add: ast.Sub,
+    ast.Sub: ast.Add,
+    ast.Mult: ast.Div,
+    ast.Div: ast.Mult,
+    ast.FloorDiv: ast.Div,
+    ast.Mod: ast.Mult,
+    ast.Pow: ast.Mult,
+    ast.Lt: ast.LtE,
+    ast.LtE: ast.Lt,
+    ast.Gt: ast.GtE,
+    ast.GtE: ast.Gt,
+    ast.Eq: ast.NotEq,
+    ast.NotEq: ast.Eq,
+    ast.Is: ast.IsNot,
+    ast.IsNot: ast.Is,
+    ast.In: ast.NotIn,
+    ast.NotIn: ast.In,
+    ast.And: ast.Or,
+    ast.Or: ast.And,
+}
+
+
+def mutated(node: ast.AST) -> ast.AST | None:
+    """The node with its operator, first comparison or constant changed, or None."""
+    match node:
+        case ast.BinOp(op=op) | ast.BoolOp(op=op) if type(op) in SWAPS:
+            node.op = SWAPS[type(op)]()
+        case ast.Compare(ops=[op, *_]) if type(op) in SWAPS:
+            node.ops[0] = SWAPS[type(op)]()
+        case ast.Constant(value=bool(value)):
+            node.value = not value
+        case ast.Constant(value=int() | float() as value):
+            node.value = value + 1
+        case _:
+            return None
+    return node
+
+
+def places(room: str) -> list[tuple[Path, int]]:
+    """Files of a room, and the numbers of their nodes that can be changed; annotations left out."""
+    rows = []
+    for path in sorted((TOP / "src" / "palpate" / room).rglob("*.py")):
+        for k, node in enumerate(ast.walk(ast.parse(path.read_text(encoding="utf-8")))):
+            if mutated(node) is not None:
+                rows.append((path.relative_to(TOP), k))
+    return rows
+
+
+def mutant(path: Path, number: int) -> tuple[str, int, str]:
+    """The source of a file with a node changed, its line, and what became of it."""
+    source = (TOP / path).read_text(encoding="utf-8")
+    node = list(ast.walk(ast.parse(source)))[number]
+    before = ast.get_source_segment(source, node)
+    after = ast.unparse(mutated(node))
+    lines = source.encode().splitlines(keepends=True)
+    start = sum(map(len, lines[: node.lineno - 1])) + node.col_offset
+    end = sum(map(len, lines[: node.end_lineno - 1])) + node.end_col_offset
+    changed = source.encode()[:start] + f"({after})".encode() + source.encode()[end:]
+    return changed.decode(), node.lineno, f"{before} -> {after}"
+
+
+def run_tests(copy: Path, *words: str, limit: float = LIMIT) -> str:
+    """Run pytest on a copy of the project: "survived", "killed" or "killed (time)"."""
+    environment = os.environ | {"PYTHONPATH": str(copy / "src"), "OMP_NUM_THREADS": "1"}
+    environment["PALPATE_SHARED_DATA"] = str(TOP.parent / "shared" / "data")
+    command = [sys.executable, "-m", "pytest", *FAST, *words]
+    done = subprocess.run(
+        command,
+        cwd=copy,
+        env=environment,
+        capture_output=True,
+        preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_CPU, (int(limit), int(limit) + 5)),
+    )
+    if done.returncode in (0, 5):
+        return "survived"
+    return "killed" if done.returncode > 0 else "killed (time)"
+
+
+def reaching(copy: Path, room: str) -> coverage.CoverageData:
+    """Which test runs which line of a room."""
+    tests = sorted(f"tests/{t.name}" for t in (copy / "tests").glob(f"test_{room}*.py"))
+    options = (f"--cov=palpate.{room}", "--cov-context=test", "--cov-report=", *tests)
+    fate = run_tests(copy, *options, limit=3600)
+    assert fate == "survived", f"the tests of {room} fail without a mutant"
+    data = coverage.CoverageData(str(copy / ".coverage"))
+    data.read()
+    return data
+
+
+def main() -> None:
+    """Make, run and record the mutants that the record lacks."""
+    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser.add_argument("--write", action="store_true", help="keep the record next to the script")
+    parser.add_argument("--record", type=Path, default=RECORD)
+    parser.add_argument("--seed", type=int, default=0)
+    args = parser.parse_args()
+    fates = json.loads(args.record.read_text())["mutants"] if args.record.exists() else {}
+    with tempfile.TemporaryDirectory() as temporary:
+        copy = Path(temporary) / "project"
+        ignored = shutil.ignore_patterns(".git", ".venv", "runs", "site", "__pycache__", "docs")
+        shutil.copytree(TOP, copy, ignore=ignored)
+        for room, count in ROOMS.items():
+            drawn = random.Random(f"{args.seed} {room}").sample(places(room), count)
+            data = None
+            for path, number in drawn:
+                source, line, what = mutant(path, number)
+                name = f"{path.relative_to('src/palpate')}:{line}: {what}"
+                if name in fates:
+                    continue
+                data = data or reaching(copy, room)
+                contexts = data.contexts_by_lineno(str(copy / path)).get(line, [])
+                tests = sorted({c.partition("|")[0] for c in contexts} - {""})
+                if not tests and contexts:  # a line that runs when its module is imported
+                    tests = sorted(
+                        f"tests/{t.name}" for t in (copy / "tests").glob(f"test_{room}*")
+                    )
+                (copy / path).write_text(source, encoding="utf-8")
+                fates[name] = run_tests(copy, "-x", *tests) if tests else "survived (no test)"
+                shutil.copy(TOP / path, copy / path)
+                print(f"{fates[name]:20} {name}", flush=True)
+                if args.write:
+                    killed = sum(fate.startswith("killed") for fate in fates.values())
+                    record = {
+                        "seed": args.seed,
+                        "killed": killed,
+                        "of": len(fates),
+                        "mutants": fates,
+                    }
+                    args.record.write_text(json.dumps(record, indent=1, ensure_ascii=False) + "\n")
+
+
+if __name__ == "__main__":
+    main()
