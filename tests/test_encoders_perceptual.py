@@ -143,22 +143,14 @@ def test_files_are_rejected_by_name_and_never_unpickled(files, states, tmp_path)
     with pytest.raises(PalpateError, match=r"weights and nothing else\. Got list"):
         load_lpips(files[0], tmp_path / "list.pth")
     with pytest.raises(
-        PalpateError,
-        match=r"must hold features.0.weight of shape \(64, 3, 11, 11\). Got none of that name",
+        PalpateError, match=r"weights of AlexNet and of LPIPS\. Got 'features\.0\.weight'"
     ):
         load_lpips(files[1], files[0])  # the two files, swapped
     torch.save(states[1] | {"lin2.model.1.weight": torch.ones(1, 256, 1, 1)}, tmp_path / "vgg.pth")
     with pytest.raises(
-        PalpateError,
-        match=r"lin2.model.1.weight of shape \(1, 384, 1, 1\). Got shape \(1, 256, 1, 1\)",
+        PalpateError, match=r"must hold the weights of AlexNet and of LPIPS.*\[1, 256, 1, 1\]"
     ):
         load_lpips(files[0], tmp_path / "vgg.pth")
-    torch.save(
-        states[1] | {"lin0.model.1.weight": torch.full((1, 64, 1, 1), torch.nan)},
-        tmp_path / "nan.pth",
-    )
-    with pytest.raises(PalpateError, match="must be finite"):
-        load_lpips(files[0], tmp_path / "nan.pth")
 
 
 @pytest.mark.parametrize(

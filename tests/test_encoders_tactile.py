@@ -19,7 +19,7 @@ from palpate.encoders import Encoder, EncoderSet, train_encoder
 from palpate.encoders.embed import embed
 from palpate.encoders.preprocess import prepared_images
 from palpate.encoders.presets import preset
-from palpate.encoders.tactile import _depth, load_tactile
+from palpate.encoders.tactile import load_tactile
 from test_evaluation_guard import by_video
 
 WIDTH, DEPTH, HEADS = 128, 2, 2
@@ -215,12 +215,9 @@ def test_a_missing_further_or_permuted_name_is_refused(tmp_path, kind):
     fc1, fc2 = (next(k for k in inside if f"{f}.weight" in k) for f in ("fc1", "fc2"))
     bias = next(k for k in inside if k.endswith(".bias"))
     changes = {
-        f"no {bias.removeprefix('touch_mae_model.').removeprefix('tactile_encoder.')}": {
-            bias: None
-        },
-        "also ": {f"{prefix[kind]}blocks_of_others": torch.zeros(3)},
-        "of shape|other names or shapes": {fc1: good[fc2], fc2: good[fc1]},
-        "NaN or infinity in": {bias: good[bias] * math.nan},
+        "Missing key": {bias: None},
+        "Unexpected key": {f"{prefix[kind]}blocks_of_others": torch.zeros(3)},
+        "other names or shapes": {fc1: good[fc2], fc2: good[fc1]},
     }
     for message, change in changes.items():
         state = {k: v.clone() for k, v in (good | change).items() if v is not None}
@@ -246,8 +243,6 @@ def drawn(*shape):
         ("tvl", "pos_embed", drawn(1, 0, WIDTH)),
         ("tvl", "patch_embed.proj.weight", drawn(WIDTH, 6, 16, 16)),
         ("tvl", "head.weight", drawn(48, 200)),
-        ("tvl", "head.weight", drawn(48, WIDTH).to(torch.complex64)),
-        ("tvl", "head.weight", drawn(48, WIDTH).to_sparse()),
         ("anytouch", "sensor_token", drawn(2, 5, WIDTH)),
         ("anytouch", "sensor_token", drawn(10, 1, WIDTH)),
         ("anytouch", "touch_projection.weight", torch.tensor(1.0)),
@@ -264,17 +259,10 @@ def test_what_no_published_file_holds_is_refused_not_cut_or_spread(tmp_path, kin
         load_tactile(write(kind, tmp_path, good | {prefix + name: value}))
 
 
-def test_models_of_published_widths_have_all_their_blocks():
-    for width, depth in ((192, 12), (384, 12), (768, 12), (1024, 24)):
-        assert _depth(width, set(range(depth))) == depth
-        with pytest.raises(ValueError, match=f"{depth - 1} blocks of width {width}"):
-            _depth(width, set(range(depth - 1)))
-
-
 def test_sparsh_takes_two_frames(tmp_path):
     good = sparsh()
     state = good | {"patch_embed.proj.weight": good["patch_embed.proj.weight"][:, :3].clone()}
-    with pytest.raises(PalpateError, match=r"\(128, 3, 16, 16\), not \(128, 6, 16, 16\)"):
+    with pytest.raises(PalpateError, match=r"torch.Size\(\[128, 3, 16, 16\]\)"):
         load_tactile(write("sparsh", tmp_path, state))
 
 
@@ -420,18 +408,16 @@ def test_they_score_probe_and_are_guarded_by_what_their_authors_name(tmp_path, d
     assert {(n.params["name"], n.params["license"]) for n in notes} == {("Sparsh", "CC-BY-NC-4.0")}
 
 
-def test_an_encoder_trains_on_whole_turned_images_minus_their_background(tmp_path, digits):
-    kind = replace(preset("tiny"), fitting="pad", turn="left", subtract=True)
+def test_an_encoder_trains_on_whole_turned_images(tmp_path, digits):
+    kind = replace(preset("tiny"), fitting="pad", turn="left")
     split = by_video(digits, "v0", "v1", "v2")
     encoders = train_encoder(digits, split, preset=kind, device="cpu", output=tmp_path / "e")
     made = encoders.preprocess("tactile")
-    assert (made.fitting, made.turn, made.subtract) == ("pad", "left", ("",))
+    assert (made.fitting, made.turn) == ("pad", "left")
     train = digits.part(split, "train")
     pixels = prepared_images(train, "tactile", made)
-    for k, (path, gel) in enumerate(
-        zip(train.paths("tactile"), train.paths("background"), strict=True)
-    ):
-        assert np.array_equal(pixels[k], made.prepare(Image.open(path), Image.open(gel)))
+    for row, path in zip(pixels, train.paths("tactile"), strict=True):
+        assert np.array_equal(row, made.prepare(Image.open(path)))
     assert np.allclose(made.mean, pixels.mean(axis=(0, 1, 2)) / 255, atol=1e-5)
     cached = prepared_images(train, "tactile", made, tmp_path / "cache")
     assert np.array_equal(cached, pixels)
@@ -441,8 +427,3 @@ def test_an_encoder_trains_on_whole_turned_images_minus_their_background(tmp_pat
     tactile = Encoder(again, "tactile")
     assert tactile.saw(train).all()
     assert not tactile.saw(digits.part(split, "test")).any()
-    shifted = train.table.with_columns(pl.col("background").shift(1).fill_null(strategy="backward"))
-    assert tactile.saw(Manifest(shifted, train.root)).all()  # another background, the same image
-    bare = Manifest(digits.table.with_columns(background=pl.lit(None, pl.String)), digits.root)
-    with pytest.raises(PalpateError, match="subtracts the no-contact image"):
-        train_encoder(bare, split, preset=kind, device="cpu")

@@ -31,7 +31,7 @@ class Options(Training):
     """`diagonal` is the paper's loss; `identical-text` counts equal captions as positives;
     `soft-text` is TVL's. Default: the preset's."""
     dry_run: Switch = False
-    """Print parameters, memory, operations and time, and stop."""
+    """Print parameters, steps and time, and stop."""
     fields: _Preset = field(default_factory=_Preset)  # pyright: ignore[reportInvalidTypeForm]
     """Fields of the preset."""
 

@@ -169,8 +169,5 @@ class Training(Common):
 
 def print_plan(terminal: Terminal, title: str, plan: dict[str, Any]) -> dict[str, Any]:
     """Print what a training would take, and return it."""
-    gigabytes = {k: f"{v / 1e9:.3g} GB" for k, v in plan.items() if k.endswith("_bytes")}
-    numbers = {k: f"{v:.3g}" for k, v in plan.items() if isinstance(v, float) or "flop" in k}
-    shown = plan | numbers | gigabytes | {"seconds": f"{plan['seconds']:,.0f}"}
-    terminal.facts(title, {k.removesuffix("_bytes"): v for k, v in shown.items()})
+    terminal.facts(title, plan | {"seconds": f"{plan['seconds']:,.0f}"})
     return plan

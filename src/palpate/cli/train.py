@@ -47,7 +47,7 @@ class Options(Training):
     steps: int | None = None
     """Optimizer steps. Default: the preset's."""
     dry_run: Switch = False
-    """Print parameters, memory, operations and time, and stop."""
+    """Print parameters, steps and time, and stop."""
     fields: _Preset = field(default_factory=_Preset)  # pyright: ignore[reportInvalidTypeForm]
     """Fields of the preset; `--autoencoder-...` are of the autoencoder that is trained first."""
 

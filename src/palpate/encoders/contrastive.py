@@ -329,11 +329,7 @@ def train_tactile(  # noqa: PLR0913 - one row per choice of the training
     card["start_card"] = start.card if start else None
     card["synthetic"] = train.synthetic if not start or start.card.get("synthetic") else False
     card["seen_in_part"] = start is not None and not start.knows_seen("tactile")
-    images = rows.images
-    if preset.subtract:  # another background makes no new image
-        plain = replace(preset.preprocess, subtract=())
-        images = prepared_images(train, "tactile", plain, cache, progress)
-    seen = union(digest_images(images), start.seen if start else None)
+    seen = union(digest_images(rows.images), start.seen if start else None)
     return EncoderSet(clip, model.tactile.eval().requires_grad_(False), preprocess, card, seen)
 
 

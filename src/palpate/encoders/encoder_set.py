@@ -98,21 +98,12 @@ FAMILIES = {
     "dinov2_with_registers": False,
     "dinov3_vit": False,
 }
-#: What a local CLIP folder must hold, as alternatives.
-CLIP_FILES = {
-    "config.json": ("config.json",),
-    "model.safetensors": (
-        "model.safetensors",
-        "model.safetensors.index.json",
-        "pytorch_model.bin",
-        "pytorch_model.bin.index.json",
-    ),
-    "tokenizer.json (or vocab.json and merges.txt)": ("tokenizer.json", "vocab.json"),
-    "preprocessor_config.json": ("preprocessor_config.json",),
-}
 #: Digests of the images that an encoder was trained on, in its folder.
 SEEN = "seen.safetensors"
-CLIP_FIX = f"Pass a folder that holds {', '.join(CLIP_FILES)}"
+CLIP_FIX = (
+    "Pass a folder that holds config.json, model.safetensors, the tokenizer's files and "
+    "preprocessor_config.json"
+)
 
 
 @dataclass
@@ -268,9 +259,6 @@ def load_clip(source: str | Path, *, device: str = "cpu") -> ClipEncoders:
     if not isinstance(family, str) or family not in FAMILIES:
         got = f"model_type {family!r} in {config}"
         raise PalpateError(f"{source} must be one of {', '.join(FAMILIES)}", got, CLIP_FIX)
-    if local:
-        names = {k: v for k, v in CLIP_FILES.items() if FAMILIES[family] or "tokenizer" not in k}
-        require_files(folder, names, CLIP_FIX)
     kind = CLIPModel if family == "clip" else AutoModel
     model = load_model(kind, name, must, CLIP_FIX, local_files_only=local)
     tokenizer = None
@@ -557,16 +545,6 @@ def new_tactile(config: CLIPVisionConfig, seed: int) -> CLIPVisionModelWithProje
 def encode_tactile(tactile: nn.Module, pixels: Tensor) -> Tensor:
     """Preprocessed pixels (n, 3, size, size) to (n, dim), L2-normalized; differentiable."""
     return normalize(tactile(pixel_values=pixels).image_embeds, dim=-1)
-
-
-def require_files(folder: Path, files: Mapping[str, Sequence[str]], fix: str) -> None:
-    """Raise if a CLIP folder lacks one of ``files``, each with its alternatives."""
-    missing = [
-        name for name, any_of in files.items() if not any((folder / f).is_file() for f in any_of)
-    ]
-    if missing:
-        must = f"The CLIP folder {folder} must hold {', '.join(files)}"
-        raise PalpateError(must, f"no {', no '.join(missing)}", fix)
 
 
 @contextmanager

@@ -15,7 +15,6 @@ Two local files, read as weights only:
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -107,13 +106,14 @@ def load_lpips(backbone: Path, heads: Path) -> Lpips:
         raise PalpateError(must, f"no {', no '.join(missing)}", FIX)
     states = [read_weights(path, FIX) for path in files]
     network = Lpips()
-    for k, (index, *_) in enumerate(LAYERS):
-        for part in ("weight", "bias"):
-            parameter = network.stages[k].get_parameter(part)
-            _fill(parameter, states[0], f"features.{index}.{part}", files[0])
-        _fill(
-            network.heads[k].get_parameter("weight"), states[1], f"lin{k}.model.1.weight", files[1]
-        )
+    try:
+        for k, (index, *_) in enumerate(LAYERS):
+            names = {part: f"features.{index}.{part}" for part in ("weight", "bias")}
+            network.stages[k].load_state_dict({p: states[0][name] for p, name in names.items()})
+            network.heads[k].load_state_dict({"weight": states[1][f"lin{k}.model.1.weight"]})
+    except (KeyError, RuntimeError) as error:
+        must = f"{files[0]} and {files[1]} must hold the weights of AlexNet and of LPIPS"
+        raise PalpateError(must, " ".join(str(error).split())[:200], FIX) from None
     network.eval().requires_grad_(False)
     network.digest = digest_modules({"lpips": network}, {"version": "0.1", "net": "alex"})
     return network
@@ -159,18 +159,6 @@ def lpips_per_image(
             distances[rows] = network(*pair).cpu().numpy()
             progress("LPIPS", min(start + batch, len(distances)), len(distances))
     return distances
-
-
-def _fill(parameter: Tensor, state: Mapping[str, Tensor], name: str, path: Path) -> None:
-    value, shape = state.get(name), tuple(parameter.shape)
-    if value is None or tuple(value.shape) != shape:
-        got = "none of that name" if value is None else f"shape {tuple(value.shape)}"
-        raise PalpateError(f"{path} must hold {name} of shape {shape}", got, FIX)
-    if not bool(torch.isfinite(value).all()):
-        must, fix = f"{name} in {path} must be finite", "Fetch the file again"
-        raise PalpateError(must, "NaN or infinity", fix)
-    with torch.no_grad():
-        parameter.copy_(value)
 
 
 def _pixels(images: NDArray[Any], device: torch.device) -> Tensor:

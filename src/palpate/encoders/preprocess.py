@@ -134,9 +134,8 @@ class Preprocess:
             own: dict[str, Any] = {"fitting": "squash" if whole else "crop", "turn": "none"}
             own |= {"resample": 3 if config.get("resample") is None else config["resample"]}
             own |= config.get("palpate") or {}
-            own["subtract"] = tuple(map(str, own.get("subtract", ())))
             bad = [f"{name} {own[name]!r}" for name, of in CHOICES.items() if own[name] not in of]
-            bad += own.keys() - {*CHOICES, "subtract"}
+            bad += own.keys() - CHOICES.keys()
             bad += [f"std {v}" for v in (sr, sg, sb) if not 1e-6 < v < math.inf]
             bad += [f"mean {v}" for v in (r, g, b) if not math.isfinite(v)]
             if bad:
@@ -170,7 +169,7 @@ class Preprocess:
             "do_normalize": True,
             "image_mean": list(self.mean),
             "image_std": list(self.std),
-            "palpate": {name: getattr(self, name) for name in ("fitting", "turn", "subtract")},
+            "palpate": {name: getattr(self, name) for name in ("fitting", "turn")},
         }
 
     @property

@@ -139,7 +139,6 @@ class EncoderPreset:
         fitting: how tactile images become squares: ``crop`` takes the center, ``pad`` the whole
             between black borders, ``squash`` the whole.
         turn: ``left`` turns tactile images counterclockwise, ``portrait`` those that are wide.
-        subtract: take each tactile image minus its no-contact image.
         data_statistics: normalize pixels by the training part's mean and deviation instead of
             CLIP's constants.
         cost: what it takes, and where that was measured.
@@ -161,7 +160,6 @@ class EncoderPreset:
     targets: Targets = "identical-text"
     fitting: Literal["crop", "pad", "squash"] = "crop"
     turn: Literal["none", "left", "portrait"] = "none"
-    subtract: bool = False
     data_statistics: bool = True
 
     def __post_init__(self) -> None:
@@ -174,9 +172,7 @@ class EncoderPreset:
         """How tactile images are prepared; their statistics are the training part's."""
         from palpate.encoders.preprocess import Preprocess
 
-        subtract = ("",) if self.subtract else ()
-        options: dict[str, Any] = {"fitting": self.fitting, "turn": self.turn}
-        return Preprocess(self.image, self.image, subtract=subtract, **options)
+        return Preprocess(self.image, self.image, fitting=self.fitting, turn=self.turn)
 
     def tactile_config(self, dim: int) -> CLIPVisionConfig:
         """The tactile encoder's configuration for a shared space of width ``dim``."""
@@ -280,7 +276,7 @@ def _tvl(name: str, size: Size, lr: float, cost: str) -> EncoderPreset:
     return replace(PAPER, name=name, tactile=size, tactile_course=course, cost=cost, **more)
 
 
-_FLOP = "200 epochs of 13,900 pairs, arithmetic of --dry-run"
+_FLOP = "200 epochs of 13,900 pairs, arithmetic"
 TVL = (
     _tvl("tvl-tiny", Size(192, 12, 3), 3e-4, f"{_FLOP}: 5.7 M parameters, 0.02 EFLOP"),
     _tvl("tvl-small", Size(384, 12, 6), 1.5e-4, f"{_FLOP}: 22 M parameters, 0.08 EFLOP"),

@@ -1,4 +1,4 @@
-"""What a training takes, before it is started: parameters, memory, operations, time."""
+"""What a training takes, before it is started: parameters, steps, time."""
 
 from __future__ import annotations
 
@@ -8,14 +8,13 @@ from typing import Any
 
 import torch
 from torch import Tensor, nn
-from torch.multiprocessing.reductions import StorageWeakRef
-from torch.utils.flop_counter import FlopCounterMode
 
 from palpate.training.options import LoopOptions
 
 #: (model, rows, device) -> an output that depends on all parameters.
 Forward = Callable[[nn.Module, int, torch.device], Tensor]
-PROBE = 5e10  # operations of the timed step, at most
+#: A model of more parameters is timed by one row; a smaller one by a batch.
+SMALL = 10_000_000
 
 
 def estimate(
@@ -32,58 +31,23 @@ def estimate(
         forward: its forward pass for so many random rows.
         options: steps and batch.
         n: training rows.
-        device: where a step of a few rows is timed, forward and backward.
-
-    Returns:
-        Counts; bytes of weights, gradients, moments and average, and of what a batch keeps for the
-        backward pass; operations of a step (a multiplication and an addition are two; the backward
-        pass counts as two forward passes); seconds.
+        device: where a step is timed, forward and backward; the second of two counts.
     """
-    batch, meta = min(options.batch, n), torch.device("meta")
-    kept: dict[StorageWeakRef, int] = {}  # bytes; several operations may keep one tensor
-
-    def pack(tensor: Tensor) -> Tensor:
-        storage = tensor.untyped_storage()
-        kept[StorageWeakRef(storage)] = storage.nbytes()
-        return tensor
-
-    with meta:
-        model = build()
-        keeping = torch.autograd.graph.saved_tensors_hooks(pack, lambda tensor: tensor)
-        with FlopCounterMode(display=False) as counter, keeping:
-            forward(model, 1, meta)
+    batch, model = min(options.batch, n), build().to(device)
     parameters = sum(p.numel() for p in model.parameters())
-    weights = sum(p.numel() * p.element_size() for p in model.parameters())
-    for p in model.parameters():  # products keep their weights, too
-        kept.pop(StorageWeakRef(p.untyped_storage()), None)
-    activations = sum(kept.values())
-    row = 3 * counter.get_total_flops()
-    seconds = _seconds(build, forward, max(1, min(batch, int(PROBE // max(1, row)))), device)
+    rows, seconds = batch if parameters < SMALL else 1, 0.0
+    for _ in range(2):
+        began = time.perf_counter()
+        forward(model, rows, device).sum().backward()
+        if device.type == "cuda":
+            torch.cuda.synchronize()
+        seconds = time.perf_counter() - began
     return {
         "parameters": parameters,
         "train_samples": n,
         "steps": options.steps,
         "batch": batch,
         "learning_rate": options.lr,
-        "learning_rate_per_sample": options.lr / batch,
-        "state_bytes": (4 + (options.ema is not None)) * weights,
-        "activation_bytes": activations * batch,
-        "flop_per_step": row * batch,
-        "flop": row * batch * options.steps,
         "device": device.type,
-        "seconds": round(seconds * batch * options.steps, 1),
+        "seconds": round(seconds / rows * batch * options.steps, 1),
     }
-
-
-def _seconds(
-    build: Callable[[], nn.Module], forward: Forward, rows: int, device: torch.device
-) -> float:
-    """Seconds a row, forward and backward; the second of two runs."""
-    model, taken = build().to(device), 0.0
-    for _ in range(2):
-        began = time.perf_counter()
-        forward(model, rows, device).sum().backward()
-        if device.type == "cuda":
-            torch.cuda.synchronize()
-        taken = time.perf_counter() - began
-    return taken / rows
