@@ -98,7 +98,6 @@ def test_two_raters_are_told_from_people_before_the_study(capsys, folders, tmp_p
         (("--until", "soon"), "--until must be a date"),
         (("--title", "Is GVST good?"), "--title must not name a method"),
         (("--question", " "), "--question must not be blank"),
-        (("--design", "paper", "--comparisons", "all"), "--comparisons must be one of first"),
         (("--names", "a", "b", "image"), "--names must hold no word of the question"),
         (("--names", "a"), "--names must name every generator"),
     ],

@@ -8,7 +8,7 @@ from collections import Counter
 
 import numpy as np
 import pytest
-from PIL import Image, ImageFilter, ImageOps
+from PIL import Image, ImageFilter
 
 from palpate import preference
 from palpate.core import PalpateError
@@ -183,7 +183,6 @@ def test_folders_without_a_table_are_one_pile(folders):
     [
         ({"generated": 1}, "two methods"),
         ({"items": 1}, "2 .. 1000"),
-        ({"design": "paper", "comparisons": "all"}, "one of first"),
         ({"question": " "}, "blank"),
         ({"names": ["image", "b", "c"]}, "must hold no word of the question"),
         ({"names": ["tactile", "b", "c"]}, "must hold no word of the title"),
@@ -269,37 +268,6 @@ def test_an_image_looks_the_same_whatever_file_it_came_in(tmp_path):
     image.save(tmp_path / "a.jpg", quality=98, subsampling=0)
     png, jpg = (load_square(tmp_path / f"a.{s}", 64).astype(float) for s in ("png", "jpg"))
     assert np.abs(png - jpg).mean() < 0.5
-
-
-@pytest.mark.parametrize("mode", ["1", "L", "LA", "P", "RGB", "RGBA", "I;16"])
-def test_a_large_picture_of_any_mode_is_scaled_as_a_small_one(tmp_path, monkeypatch, mode):
-    from palpate.data import images as small
-    from palpate.preference import images as large
-
-    y, x = np.mgrid[:150, :200]
-    gray = Image.fromarray(np.uint8(127 + 60 * np.sin(x / 20) + 60 * np.cos(y / 15)))
-    image = Image.merge("RGBA", [gray, ImageOps.invert(gray), gray, gray.point(lambda v: v // 2)])
-    if mode == "I;16":
-        Image.fromarray(np.asarray(gray, np.uint16) * 257).save(tmp_path / "a.png")
-    else:
-        image.convert("RGB" if mode == "P" else "RGBA").convert(mode).save(tmp_path / "a.png")
-    direct = load_square(tmp_path / "a.png", 32).astype(float)
-    monkeypatch.setattr(small, "LARGEST", 10_000)
-    monkeypatch.setattr(large, "LARGEST", 10_000)
-    assert np.abs(direct - load_square(tmp_path / "a.png", 32)).mean() < 6
-
-
-@pytest.mark.parametrize("suffix", ["tif", "webp"])
-def test_a_picture_too_large_for_its_format_is_to_be_saved_as_another(
-    tmp_path, suffix, monkeypatch
-):
-    from palpate.data import images
-
-    monkeypatch.setattr(images, "LARGEST", 10_000)
-    path = tmp_path / f"large.{suffix}"
-    Image.new("L", (200, 150), 200).convert("RGB").save(path)
-    with pytest.raises(PalpateError, match=r"200 x 150 pixels.*Save it as PNG or JPEG"):
-        load_square(path, 32)
 
 
 def test_one_video_is_no_study(folders, tmp_path):

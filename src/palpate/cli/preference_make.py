@@ -39,10 +39,7 @@ class Options(Common):
     material-pattern; of --task sort material."""
     design: Literal["paper"] | None = None
     """The paper's study: 40 items of the 13 commonest materials, two raters, the first method
-    against each of the others."""
-    comparisons: Literal["all", "first"] | None = None
-    """Compare all pairs of methods, or the first with each of the others. Default: all; of --design
-    paper first, without a choice. With `first`, who reads the page can tell the first method."""
+    against each of the others. Who reads its page can tell the first method."""
     names: tuple[str, ...] = ()
     """Names of the methods, instead of those of their folders."""
     labels: Path | None = None
@@ -67,7 +64,7 @@ def run(options: Options, terminal: Terminal) -> dict[str, Any]:
     if options.output and any(p.resolve() == options.output.resolve() for p in inputs):
         got, fix = str(options.output), "Choose another folder"
         raise PalpateError("An output must not replace an input", got, fix)
-    names = "items raters task question design comparisons labels size title until seed dry_run"
+    names = "items raters task question design labels size title until seed dry_run"
     with terminal.progress() as progress:
         plan = make(
             options.reference,

@@ -24,11 +24,7 @@ class Options(Common):
     votes: Annotated[tuple[Path, ...], tyro.conf.Positional] = ()
     """What raters downloaded, or folders of that."""
     metrics: tuple[Path, ...] = ()
-    """Which of these agree with people? Tables of per-image values (id, method, and a column a
-    metric), and the JSON of `palpate score -o` of the same methods."""
-    lower: tuple[str, ...] = ()
-    """Columns of which lower is better, besides LPIPS, MSE, RMSE, MAE, L1, FID, KID, DISTS and the
-    MMD family."""
+    """Which of these agree with people? The JSON of `palpate score -o` of the same methods."""
     replicates: int = 1000
     """Resamplings of an interval."""
     seed: int = 0
@@ -57,7 +53,6 @@ def run(options: Options, terminal: Terminal) -> dict[str, Any]:
             options.study,
             options.votes,
             metrics=options.metrics,
-            lower=options.lower,
             replicates=options.replicates,
             seed=options.seed,
             progress=progress,

@@ -10,37 +10,22 @@ from __future__ import annotations
 
 import base64
 import io
-import re
-from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
 import numpy as np
 from PIL import Image
 
-from palpate.core import PalpateError, Progress, Score, read_json, require_choice, track
-from palpate.evaluation.inputs import without_suffix
+from palpate.core import PalpateError, Progress, Score, track
 from palpate.metrics.images import per_image
 from palpate.preference.arrays import FEWER, VoteArrays
 from palpate.preference.plan import REFERENCE, Plan
 from palpate.preference.statistics import Array, tau_b
-from palpate.report.results import RESULTS_FORMAT, Results
-
-if TYPE_CHECKING:
-    import polars as pl
+from palpate.report.results import Results
 
 BY_IMAGE, BY_METHOD = "Kendall's tau with people, by image", "Kendall's tau with people, by method"
-#: How the names of metrics begin of which lower is better, besides the MMD family.
-LOWER = "(lpips|r?mse|mae|l1|fid|kid|dists)(?![a-z])"
-#: Columns of a table that are no metric.
-WORDS = ("id", "method", "material", "video")
-
-
-def lower_is_better(name: str) -> bool:
-    """Whether it is, by a metric's name in lower case; ``i-tmmd`` is of the MMD family too."""
-    return re.match(LOWER, name) is not None or "mmd" in name
 
 
 @dataclass(frozen=True)
@@ -76,10 +61,11 @@ def shown_metrics(plan: Plan, progress: Progress) -> list[Metric]:
         pair = pixels(item, method)[None], pixels(item, REFERENCE)[None]
         for name, values in images.items():
             values[item, method] = float(per_image(name, *pair).values[0])
-    return [_of_images(f"{name} (shown images)", values) for name, values in images.items()]
+    return [of_images(f"{name} (shown images)", values) for name, values in images.items()]
 
 
-def _of_images(name: str, images: Mapping[tuple[str, str], float]) -> Metric:
+def of_images(name: str, images: Mapping[tuple[str, str], float]) -> Metric:
+    """A metric by image, and by method its mean over images where it is finite."""
     of_method: dict[str, list[float]] = {}
     for (_, method), value in images.items():
         if np.isfinite(value):
@@ -87,38 +73,20 @@ def _of_images(name: str, images: Mapping[tuple[str, str], float]) -> Metric:
     return Metric(name, images, {m: float(np.mean(values)) for m, values in of_method.items()})
 
 
-def table_metrics(plan: Plan, sources: Any, lower: Sequence[str]) -> list[Metric]:
-    """Metrics of tables of images and of files of ``palpate score``.
+def metrics_of_files(plan: Plan, paths: Sequence[str | Path]) -> list[Metric]:
+    """Metrics by method, of files of ``palpate score``.
 
     Raises:
-        PalpateError: if a source is neither, or knows none of the study's methods, or no metric
-            has a name of ``lower``.
+        PalpateError: if one is another file, or knows none of the study's methods.
     """
-    several = isinstance(sources, list | tuple) and not (
-        sources and isinstance(sources[0], Mapping)
-    )
-    metrics = [m for s in (sources if several else [sources]) for m in _metrics(plan, s, lower)]
-    names = list(dict.fromkeys(m.name for m in metrics))
-    for name in lower:
-        require_choice("lower", name, names)
-    return metrics
-
-
-def _metrics(plan: Plan, source: Any, lower: Sequence[str]) -> list[Metric]:
-    where = str(source) if isinstance(source, str | Path) else "the table of metrics"
-    if isinstance(source, str | Path):
-        path = Path(source)
-        source = read_json(path, "file of metrics") if path.suffix.lower() == ".json" else path
-        if isinstance(source, Mapping) and source.get("format") == RESULTS_FORMAT:
-            source = Results.load(path)
-    if isinstance(source, Results):
-        metrics = _of_results(plan, source)
-    else:
-        metrics = _of_table(plan, _table(source, where), where, lower)
-    if not metrics:
-        got, fix = f"none of {', '.join(plan.methods)}", "Name methods as the study does"
-        raise PalpateError(f"{where} must hold metrics of the study's methods", got, fix)
-    return metrics
+    found: list[Metric] = []
+    for path in paths:
+        metrics = _of_results(plan, Results.load(path))
+        if not metrics:
+            got, fix = f"none of {', '.join(plan.methods)}", "Name methods as the study does"
+            raise PalpateError(f"{path} must hold metrics of the study's methods", got, fix)
+        found += metrics
+    return found
 
 
 def _of_results(plan: Plan, results: Results) -> list[Metric]:
@@ -133,53 +101,6 @@ def _of_results(plan: Plan, results: Results) -> list[Metric]:
         elif s.floor is not None:
             values.setdefault(name, {})[s.subject] = -abs(s.value - s.floor)
     return [Metric(name, {}, of_method) for name, of_method in values.items()]
-
-
-def _table(source: Any, where: str) -> pl.DataFrame:
-    import polars as pl
-
-    try:
-        if isinstance(source, Path):
-            parquet = source.suffix.lower() == ".parquet"
-            if parquet:
-                return pl.read_parquet(source)
-            text: dict[str, Any] = {"id": pl.String, "method": pl.String}  # 000123 is an id
-            return pl.read_csv(source, glob=False, schema_overrides=text)
-        return source if isinstance(source, pl.DataFrame) else pl.DataFrame(source)
-    except Exception as error:  # polars raises many kinds
-        got, fix = str(error).splitlines()[0], "Write one with the columns id, method, SSIM ..."
-        raise PalpateError(
-            f"{where} must be a table or a file of palpate score", got, fix
-        ) from None
-
-
-def _of_table(plan: Plan, table: pl.DataFrame, where: str, lower: Sequence[str]) -> list[Metric]:
-    if not {"id", "method"} <= {*table.columns}:
-        got, fix = f"the columns {', '.join(table.columns)}", "Add the columns, or rename them"
-        raise PalpateError(f"{where} must have the columns id and method", got, fix)
-    known = {item.id for item in plan.items}
-    ids = [i if i in known else without_suffix(i) for i in map(str, table["id"])]
-    if table.height and known.isdisjoint(ids):
-        got, fix = f"none of them, but e.g. {ids[0]!r}", "Ids are those of the reference's images"
-        raise PalpateError(f"{where} must hold values of the study's items", got, fix)
-    keys = list(zip(ids, map(str, table["method"]), strict=True))
-    if len(keys) > len({*keys}):
-        item, method = Counter(keys).most_common(1)[0][0]
-        got, fix = f"{item} of {method} twice", "Keep one row"
-        raise PalpateError(f"{where} must have each image of a method once", got, fix)
-    metrics: list[Metric] = []
-    for name in table.columns:
-        if name in WORDS or not table[name].dtype.is_numeric():
-            continue
-        sign = -1 if name in lower or lower_is_better(name.lower()) else 1
-        cells = zip(keys, table[name].to_list(), strict=True)
-        values = {
-            (item, method): sign * float(v)
-            for (item, method), v in cells
-            if v is not None and item in known and method in plan.methods
-        }
-        metrics += [_of_images(name, values)] * bool(values)
-    return metrics
 
 
 def agreement_scores(

@@ -99,7 +99,6 @@ def make(  # noqa: PLR0913
     task: str = "pair",
     question: str | None = None,
     design: str | None = None,
-    comparisons: str | None = None,
     names: Sequence[str] | None = None,
     labels: Any = None,
     size: int = 256,
@@ -123,8 +122,6 @@ def make(  # noqa: PLR0913
         question: one of ``QUESTIONS``, or the text itself.
         design: ``paper``: 40 items of the 13 commonest materials, two raters, the first method
             against each of the others.
-        comparisons: ``all`` pairs of methods (the default), or the ``first`` against each of the
-            others (the default, and the only choice, of ``design="paper"``).
         names: of the methods, instead of those of their folders.
         labels: table with the columns id, material, video, for folders.
         size: side of all images, in pixels.
@@ -142,8 +139,6 @@ def make(  # noqa: PLR0913
     count = PAPER_ITEMS if items is None else items
     raters = (PAPER_RATERS if paper else 10) if raters is None else raters
     require_choice("task", task, ("pair", "sort"))
-    comparisons = comparisons or ("first" if paper else "all")
-    require_choice("comparisons", comparisons, ("first",) if paper else ("all", "first"))
     require(design in (None, "paper"), "design", "must be paper, if given", design)
     require(2 <= count <= 1000, "items", "must lie in 2 .. 1000", items, 40)
     require(1 <= raters <= 999, "raters", "must lie in 1 .. 999", raters, 10)
@@ -186,7 +181,7 @@ def make(  # noqa: PLR0913
         notes=[*sources.notes, *notes, *few],
     )
     codes = [f"r{k:0{max(2, len(str(raters)))}d}" for k in range(1, raters + 1)]
-    plan = replace(plan, trials=trials_of(plan, comparisons))
+    plan = replace(plan, trials=trials_of(plan, first=paper))
     plan = replace(plan, raters=[rater_of(plan, code) for code in codes])
     if task == "pair":
         width = expected_half_width(len(chosen), raters)
@@ -339,14 +334,16 @@ def _in_turn(piles: Piles, n: int, materials: int | None) -> list[Item]:
     return [item for each in rounds for item in each if item is not None][:n]
 
 
-def trials_of(plan: Plan, comparisons: str) -> list[Trial]:
-    """All questions: one a comparison and item, repeats of a tenth of them, and catches."""
+def trials_of(plan: Plan, *, first: bool) -> list[Trial]:
+    """All questions: one a comparison and item, repeats of a tenth of them, and catches.
+
+    ``first``: only comparisons with the first method.
+    """
     methods, rng = plan.methods, rng_for(plan.seed, plan.secret, "trials")
     if plan.task == "sort":  # real images show how much people can know
         pairs = [(name, "") for name in (REFERENCE, *methods)]
         kind, known, sides = "sort", plan.examples, (COPY, "")
     else:
-        first = comparisons == "first"
         pairs = [p for p in combinations(methods, 2) if p[0] == methods[0] or not first]
         kind, known, sides = "pair", plan.items, (COPY, GEL)
     each = ((pair, item) for pair in pairs for item in plan.items)

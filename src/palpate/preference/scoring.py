@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from palpate.core import Note, PalpateError, Progress, Score, few, plain, quiet, require
 from palpate.metrics.paired import holm
-from palpate.preference.agreement import agreement_scores, shown_metrics, table_metrics
+from palpate.preference.agreement import agreement_scores, metrics_of_files, shown_metrics
 from palpate.preference.arrays import VoteArrays
 from palpate.preference.plan import REFERENCE, Plan
 from palpate.preference.raters import RaterFacts, rater_facts
@@ -46,8 +46,7 @@ def score(
     study: str | Path,
     votes: str | Path | Iterable[str | Path] = (),
     *,
-    metrics: Any = (),
-    lower: Sequence[str] = (),
+    metrics: Sequence[str | Path] = (),
     replicates: int = REPLICATES,
     seed: int = 0,
     progress: Progress = quiet,
@@ -57,11 +56,8 @@ def score(
     Args:
         study: its folder, with ``plan.json`` and, of a served study, ``study.db``.
         votes: downloads of raters, or folders of them.
-        metrics: which of these agree with people? Tables of per-image values (CSV, Parquet, JSON, a
-            frame) with the columns id, method and one a metric, and files of ``palpate score``,
-            whose scores are of methods. SSIM and PSNR of the shown images are always compared.
-        lower: metrics of tables of which lower is better, besides LPIPS, MSE, RMSE, MAE, L1, FID,
-            KID, DISTS and the MMD family.
+        metrics: which of these agree with people? Files of ``palpate score`` of the same methods.
+            SSIM and PSNR of the shown images are always compared.
         replicates: resamplings of an interval.
         seed: of the resamplings.
         progress: progress callback.
@@ -102,12 +98,11 @@ def score(
         "raters": everyone,
     }
     if plan.task == "sort":
-        given = metrics if isinstance(metrics, list | tuple) else [metrics]
-        require(not given, "metrics", "must be left out where people sort", f"{len(given)} given")
+        require(not metrics, "metrics", "must be left out where people sort", metrics)
         scores = accuracy_scores(arrays)
     else:
         settings["comparisons"] = comparisons(arrays)
-        compared = [*shown_metrics(plan, progress), *table_metrics(plan, metrics, lower)]
+        compared = [*shown_metrics(plan, progress), *metrics_of_files(plan, metrics)]
         scores = [*preference_scores(arrays), *strength_scores(arrays)]
         scores += agreement_scores(compared, arrays, progress)
     return Results(

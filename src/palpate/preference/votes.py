@@ -11,7 +11,6 @@ import sqlite3
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass, field
-from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -95,12 +94,7 @@ def read_votes(plan: Plan, paths: Iterable[str | Path]) -> Votes:
         twice += earlier == vote
         differing += earlier not in (None, vote) and earlier.undone == vote.undone  # type: ignore[union-attr]
         kept[vote.rater][vote.trial.id] = vote
-    facts = {
-        "votes-twice": twice,
-        "votes-differ": differing,
-        "votes-late": late,
-        "clock-backwards": sum(_backwards(plan, rater, votes) for rater, votes in kept.items()),
-    }
+    facts = {"votes-twice": twice, "votes-differ": differing, "votes-late": late}
     return Votes(kept, [Note(code, {"count": n}) for code, n in facts.items() if n])
 
 
@@ -133,28 +127,17 @@ def _of_server(plan: Plan, path: Path) -> list[Vote]:
         uri = f"{path.absolute().as_uri()}?mode=ro"
         with closing(sqlite3.connect(uri, uri=True)) as disk:
             (study,) = disk.execute("SELECT name FROM study").fetchone() or ("",)
-            columns = f"rater, received, {', '.join(names)}"
-            rows = disk.execute(f"SELECT {columns} FROM votes").fetchall()
+            rows = disk.execute(f"SELECT rater, {', '.join(names)} FROM votes").fetchall()
     except sqlite3.Error as error:
         fix = "Name the file that the server wrote, with the files next to it"
         raise PalpateError(f"{path} must be a file of votes", str(error), fix) from None
     _require_study(plan, study, path)
     of_rater: dict[str, list[dict[str, Any]]] = {}
-    for rater, received, *values in rows:
-        row: dict[str, Any] = dict(zip(names, values, strict=True))
-        if not _is_time(row["at"]):  # servers once took times of no day
-            row["at"] = received
-        of_rater.setdefault(rater, []).append(row)
+    for rater, *values in rows:
+        of_rater.setdefault(rater, []).append(dict(zip(names, values, strict=True)))
     for rater in of_rater:
         require_rater(plan, rater)
     return [vote for rater, row in of_rater.items() for vote in _checked(plan, rater, row, path)]
-
-
-def _is_time(text: str) -> bool:
-    try:
-        return bool(datetime.datetime.fromisoformat(text))
-    except ValueError:
-        return False
 
 
 def _require_study(plan: Plan, study: Any, path: Path) -> None:
@@ -185,10 +168,3 @@ def _checked(plan: Plan, rater: str, rows: Sequence[Any], path: Path) -> list[Vo
             raise PalpateError(must, repr(row), AGAIN) from None
         votes.append(Vote(rater, trial, swapped, row["choice"], ms, at, undone))
     return votes
-
-
-def _backwards(plan: Plan, rater: str, votes: Mapping[str, Vote]) -> bool:
-    """Whether the clock of a rater ran back by more than a second between two first answers."""
-    trials = (trial.id for trial, _ in plan.shown(rater).values())
-    times = [votes[t].at for t in trials if t in votes and not votes[t].undone]
-    return any((b - a).total_seconds() < -1 for a, b in pairwise(times))

@@ -705,10 +705,6 @@ PREFERENCE: dict[str, Sentence] = {
     "votes-late": lambda p, _: (
         f"{plural(p['count'], 'vote')} after the end of the study are skipped"
     ),
-    "clock-backwards": lambda p, _: (
-        f"The clock of {plural(p['count'], 'rater')} ran backwards between two votes; how long a "
-        "vote took comes from another clock"
-    ),
     "items-left-out": lambda p, _: (
         f"{p['name']}: {plural(p['missing'], 'item')} of the reference without an image, and "
         f"{plural(p['unknown'], 'image')} without an item, are left out"
