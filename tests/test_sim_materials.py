@@ -1,5 +1,4 @@
-"""Custom materials: what their functions may return, what they may be called, how a world records
-them."""
+"""Custom materials: what their functions may return, and how a world records them."""
 
 import dataclasses
 
@@ -23,35 +22,25 @@ def piece(**changes):
     return draw
 
 
-def failing(tile, rng):
-    raise ZeroDivisionError("no grain")
-
-
 def springy(tile, rng):
     albedo = np.full((tile.n, tile.n, 3), 0.5, np.float32)
     return Surface(tile.noise(1.0, 8.0) * 0.1, albedo, "only")
 
 
 def add(monkeypatch, draw, label=20, name="Cork"):
-    monkeypatch.setitem(MATERIALS, name, Material(label, draw, ("only",)))
+    monkeypatch.setitem(MATERIALS, name, Material(label, draw))
 
 
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"height": [[0.0], [0.0, 1.0]]}, "draw a Surface without an error"),
         ({"height": FLAT[1:]}, "height and an albedo of shapes"),
         ({"height": FLAT * np.nan}, "finite numbers"),
-        ({"height": FLAT + 51.0}, "at most 50 mm. Got 51 to 51"),
         ({"albedo": FLAT}, "height and an albedo of shapes"),
-        ({"albedo": np.full((64, 64, 3), 255)}, r"an albedo in \[0, 1\]. Got 255 to 255"),
-        ({"gloss": 1.5}, "gloss and softness"),
-        ({"softness": float("nan")}, "gloss and softness"),
-        ({"subtype": "other"}, "one of its subtypes"),
     ],
 )
 def test_what_a_material_draws_is_checked(changes, message):
-    material = Material(20, piece(**changes), ("only",))
+    material = Material(20, piece(**changes))
     with pytest.raises(PalpateError, match=message) as error:
         draw_surface("Cork", material, 64, np.random.default_rng(0))
     assert "'Cork'" in error.value.must
@@ -65,35 +54,16 @@ def test_lists_and_whole_numbers_are_converted():
     assert float(surface.albedo.max()) == 1.0
 
 
-@pytest.mark.parametrize("workers", [1, pytest.param(2, marks=pytest.mark.slow)])
-def test_a_function_that_fails_is_named_with_its_error(workers, tmp_path, monkeypatch):
-    add(monkeypatch, failing)
-    options = dataclasses.replace(TINY, materials=("Cork",))
-    message = "'Cork' must draw a Surface without an error. Got ZeroDivisionError: no grain"
-    with pytest.raises(PalpateError, match=message):
-        write_world(tmp_path / "w", options, workers=workers)
-    assert not (tmp_path / "w").exists()
-
-
-@pytest.mark.parametrize(
-    ("entry", "message"),
-    [
-        ({"label": 3}, "Materials must differ in label"),
-        ({"label": -1}, "label of 'Cork' must be a whole number"),
-        ({"name": "../Cork"}, "name of a material must consist of"),
-        ({"name": "Cork,3"}, "name of a material must consist of"),
-        ({"name": "natural_fabric"}, "Objects of two materials must differ in name"),
-    ],
-)
-def test_names_and_labels_are_unique_and_safe(entry, message, monkeypatch):
-    add(monkeypatch, piece(), **entry)
-    with pytest.raises(PalpateError, match=message):
-        WorldOptions(materials=(entry.get("name", "Cork"), "Sand"))
+def test_labels_are_unique(monkeypatch):
+    add(monkeypatch, piece(), label=3)
+    with pytest.raises(PalpateError, match="label 3 of Wood, Cork"):
+        WorldOptions(materials=("Cork", "Sand"))
     WorldOptions(materials=("Sand",))  # a world without it is not affected
 
 
-def test_a_custom_material_enters_lists(tmp_path, monkeypatch):
+@pytest.mark.parametrize("workers", [1, pytest.param(2, marks=pytest.mark.slow)])
+def test_a_custom_material_enters_lists(workers, tmp_path, monkeypatch):
     add(monkeypatch, springy)
     options = dataclasses.replace(TINY, materials=("Wood", "Cork"))
-    write_world(tmp_path / "w", options)
+    write_world(tmp_path / "w", options, workers=workers)
     assert "Cork: 20" in (tmp_path / "w" / "category_reference.txt").read_text().splitlines()

@@ -35,7 +35,7 @@ LONGEST = 40
 #: which the text is a code of the label.
 COMMON, CODE = 0.05, 0.9
 FOLDS, PENALTY, WORDS = 5, 1e-2, 500
-EXAMPLES, SHOWN_WORDS = 5, 12
+SHOWN_WORDS = 12
 SHARE, FLAGGED, NAMING = "share of captions", "flagged", "naming a material"
 LABEL, VISUAL = "naming their label", "visual words"
 #: Shares whose words a note lists.
@@ -47,12 +47,11 @@ class _Rows:
     """Captions, one a contact and text.
 
     Attributes:
-        ids, texts, labels, groups: of each; ``""`` for no text or label.
+        texts, labels, groups: of each; ``""`` for no text or label.
         parts: part of the split, ``""`` without one.
         refused: marked as a refusal when they were made.
     """
 
-    ids: list[str]
     texts: list[str]
     labels: list[str]
     groups: list[str]
@@ -126,7 +125,6 @@ def _rows(manifest: Manifest, flags: dict[str, list[str]], split: Split | None) 
     ).unique(["unit", "text"], keep="first", maintain_order=True)
     ids = table["id"].to_list()
     return _Rows(
-        ids,
         table["text"].to_list(),
         table["material"].to_list(),
         table["group"].to_list(),
@@ -162,15 +160,13 @@ def _shares(rows: _Rows, vocabulary: Vocabulary) -> list[Score]:
 
 
 def _share(name: str, words: Sequence[Sequence[str]], rows: _Rows) -> Score:
-    """The share of captions with words of a kind, those words, and examples."""
+    """The share of captions with words of a kind, and those words."""
     hits = np.array([bool(row) for row in words])
     score = mean_of(SHARE, hits, rows.groups, estimator="mean", subject=name).score
     counts = Counter(word for row in words for word in set(row))
     listed = dict(counts.most_common(SHOWN_WORDS))
-    where = [k for k in np.flatnonzero(hits)[:EXAMPLES] if rows.texts[k]]
-    details = {"words": listed, "examples": {rows.ids[k]: rows.texts[k] for k in where}}
     notes = [Note("captions-words", {"words": listed})] if name in LISTED and listed else []
-    return replace(score, higher_is_better=False, details=details, notes=notes)
+    return replace(score, higher_is_better=False, details={"words": listed}, notes=notes)
 
 
 def _shared(rows: _Rows) -> Score:
@@ -181,7 +177,7 @@ def _shared(rows: _Rows) -> Score:
     if not train or not test:
         must, got = "must have captions in train and test", f"{len(train)} and {len(test)}"
         raise PalpateError(must, got, "Use the split of these samples", argument="split")
-    columns = (rows.ids, rows.texts, rows.labels, rows.groups, rows.parts, rows.refused)
+    columns = (rows.texts, rows.labels, rows.groups, rows.parts, rows.refused)
     part = _Rows(*([column[k] for k in test] for column in columns))  # type: ignore[arg-type]
     words = [[text] * (text.lower() in train) for text in part.texts]
     return _share("test captions that train has", words, part)

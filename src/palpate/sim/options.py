@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterator
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
@@ -97,8 +96,7 @@ class WorldOptions:
                 must = f"must be a {'whole ' * whole}number from {low:g} to {high:g}"
                 require(fits, name, must, value)
                 object.__setattr__(self, name, value if whole else float(value))
-        for error in _wrong_materials(self.materials):
-            raise error
+        _require_materials(self.materials)
         if self.layout == "videos":
             require(self.size % 2 == 0, "size", "must be even for the layout videos", self.size)
             must = "must be 'all' for the layout videos, which hold every frame"
@@ -134,13 +132,13 @@ def option_groups() -> dict[str, list[dataclasses.Field[Any]]]:
     return groups
 
 
-def _wrong_materials(names: Any) -> Iterator[PalpateError]:
-    """Yield what is wrong with names of materials, and with their entries."""
+def _require_materials(names: Any) -> None:
+    """Check names of materials, and their entries."""
     known = f"Known: {', '.join(MATERIALS)}"
     if not isinstance(names, tuple) or not names or len(set(names)) < len(names):
         must = f"must be different names, or a count from 1 to {len(MATERIALS)}"
-        yield PalpateError(must, repr(names), known, argument="materials")
+        raise PalpateError(must, repr(names), known, argument="materials")
     for name in names:
         if name not in MATERIALS:
-            yield PalpateError("must be names of materials", name, known, argument="materials")
-        yield from check_material(name)
+            raise PalpateError("must be names of materials", name, known, argument="materials")
+        check_material(name)
