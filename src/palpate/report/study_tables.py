@@ -293,21 +293,6 @@ def verdict_word(verdict: str, n: int) -> str:
     return verdict if n == 1 else words.get(verdict, verdict)
 
 
-def in_turns_by_source(claims: Sequence[Claim], most: int) -> tuple[list[Claim], list[Claim]]:
-    """Return at most ``most`` claims, and the others, both in their order.
-
-    Sources take turns: every one shows its first claim before any shows its second.
-    """
-    turns: Counter[str] = Counter()
-    ranks: list[tuple[int, int]] = []
-    for k, claim in enumerate(claims):
-        ranks.append((turns[claim.source], k))
-        turns[claim.source] += 1
-    chosen = {k for _, k in sorted(ranks)[:most]}
-    shown = [claim for k, claim in enumerate(claims) if k in chosen]
-    return shown, [claim for k, claim in enumerate(claims) if k not in chosen]
-
-
 def brief(text: str, most: int = 220) -> str:
     """Return the first clauses of a long reason; its evidence has all of it."""
     if len(text) <= most:
@@ -315,13 +300,6 @@ def brief(text: str, most: int = 220) -> str:
     ends = (text.rfind("; ", 0, most), text.rfind(" ", 0, most), most)
     cut = text[: next(end for end in ends if end > 0)]
     return f"{cut.rpartition(' [')[0] if cut.count('[') > cut.count(']') else cut} …"
-
-
-def says_more(claim: Claim) -> bool:
-    """Return whether the evidence of a claim says more than its reason."""
-    one = len(claim.evidence) == 1 and claim.evidence[0].value is not None
-    known = one and not claim.evidence[0].notes and brief(claim.why) == claim.why
-    return bool(claim.evidence) and not known
 
 
 def file_names(kind: str, titles: Sequence[str]) -> list[str]:
