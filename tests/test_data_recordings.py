@@ -1,12 +1,9 @@
 """Recordings: raw videos decoded by a validation, stray numbers, backgrounds, custom classes."""
 
-import numpy as np
 import pytest
 
-import palpate.data.formats.recordings as recordings
 from data_fixtures import tree, write_image
 from palpate.core import ProblemsError, Split
-from palpate.data.formats.base import Scan
 from palpate.data.importing import import_dataset, validate, write_lists
 from palpate.data.manifest import Manifest
 from palpate.data.reading import read_samples
@@ -56,28 +53,10 @@ def test_a_stray_number_costs_nothing_and_what_looks_wrong_reaches_the_user(tmp_
     assert sorted((p.kind, p.where.removeprefix(str(root))) for p in validation.suspicious) == [
         ("duplicate-frame", "/dataset/a/video_frame/000001.jpg"),
         ("duplicate-frame", "/dataset/a/video_frame/1.png"),
+        ("no-background", "a#0001"),
         ("unlisted-video", ""),
     ]
     assert imported.suspicious == list(validation.suspicious)
-
-
-def test_without_contact_frames_are_those_of_a_slow_search(tmp_path):
-    rng = np.random.default_rng(0)
-    for trial in range(20):
-        root = tmp_path / str(trial)
-        there = sorted(rng.choice(60, 25, replace=False).tolist())
-        contact = set(rng.choice(60, int(rng.integers(0, 30)), replace=False).tolist())
-        for k in there:
-            (root / "t").mkdir(parents=True, exist_ok=True)
-            (root / "t" / f"{k}.jpg").write_bytes(b"")
-        work = recordings.Recordings(Scan(root), None, {}, {"a": contact}, None)
-        work.frames["a"] = {"tactile": recordings.FolderFrames(root / "t", root)}
-        far = [k for k in there if not any(abs(k - c) <= 4 for c in contact)]
-        far = far or [k for k in there if k not in contact]
-        imported = work._without_contact("a")
-        assert set(imported) <= set(far)
-        assert len(imported) == min(len(far), 15)
-        assert imported[:1] == far[:1]
 
 
 def test_a_custom_table_of_classes_is_kept_for_the_lists_of_a_split(tmp_path):

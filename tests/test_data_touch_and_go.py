@@ -196,23 +196,6 @@ def test_cached_frames_of_other_settings_are_rejected(tmp_path):
     assert tree(tmp_path / "out") == before
 
 
-@pytest.mark.parametrize("layout", ["raw", "extracted"])
-def test_without_a_frame_before_the_contact_a_typical_one_is_the_background(tmp_path, layout):
-    lines = [*lines_of("a", range(8)), *lines_of("b", range(40))]
-    root = make_recordings(tmp_path / "tag", **{layout: ("a", "b")}, lines=lines)
-    result = import_touch_and_go(root, tmp_path / "out")
-    manifest = result.manifest.require_valid()
-    assert result.facts["backgrounds"] == "none 1, typical 1"
-    assert manifest.column("background")[8:] == [None] * 40
-    # from 5 behind the last frame of the contact to the end
-    frames = [round(x) for x in np.linspace(12, 39, 15)]
-    median = np.median([[k >> b & 1 for b in range(8)] for k in frames], axis=0)
-    distance = {k: sum(abs((k >> b & 1) - median[b]) for b in range(8)) for k in frames}
-    nearest = {k for k, d in distance.items() if d == min(distance.values())}
-    assert set(shown(Manifest(manifest.table[:8], manifest.root), "background")) <= nearest
-    assert len(nearest) < 5
-
-
 def test_inconclusive_frames_and_other_lists_count_as_contact(tmp_path):
     lines = ["a/0000000020.jpg,3", "a/0000000016.jpg,-1", "a/0000000015.jpg,-1"]
     root = make_recordings(tmp_path / "tag", extracted=("a",), lines=lines)

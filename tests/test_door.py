@@ -16,8 +16,8 @@ TOP = Path(__file__).resolve().parents[1]
 SIGNATURES = {
     "audit": (
         "train_or_data test * split pretrain by near_frames images modalities "
-        "false_positives encoder impact name worst cache root reading "
-        "skip_bad progress allow_seen"
+        "false_positives impact name worst cache root reading "
+        "skip_bad progress encoder allow_seen"
     ),
     "caption": (
         "data output * server model template prompt per concurrency timeout max_tokens seed body "

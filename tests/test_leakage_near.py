@@ -9,7 +9,6 @@ from PIL import Image
 from threadpoolctl import threadpool_limits
 
 from leakage_fixtures import MATERIALS, NoiseVideo, crop, make_leaky, save
-from palpate.core import PalpateError
 from palpate.data.manifest import Manifest
 from palpate.leakage.calibration import beyond_chance
 from palpate.leakage.descriptors import EditIndex, Whitened
@@ -233,22 +232,6 @@ def test_cache_and_processes_change_nothing(tmp_path, monkeypatch):
     for other in (cached, again, repaired):
         assert np.array_equal(other.row, plain.row)
         assert np.array_equal(other.pixels, plain.pixels)
-
-
-def test_embeddings_and_their_mistakes(tmp_path):
-    rng = np.random.default_rng(0)
-    train, test = rng.standard_normal((200, 32)), rng.standard_normal((80, 32))
-    test[:20] = train[:20] + 0.05 * rng.standard_normal((20, 32))
-    parts = [
-        Manifest.from_rows([{"id": f"{p}{k}", "video": f"{p}{k // 4}"} for k in range(n)], tmp_path)
-        for p, n in (("a", 200), ("b", 80))
-    ]
-    flags = near_duplicates(parts[0], parts[1], "vision", features=(train, test))
-    assert list(np.flatnonzero(flags.flag)) == list(range(20))
-    assert list(flags.nearest[:20]) == list(range(20))
-    for wrong in ((train[1:], test), (train, test[:, :3]), (np.full_like(train, np.nan), test)):
-        with pytest.raises(PalpateError):
-            near_duplicates(parts[0], parts[1], "vision", features=wrong)
 
 
 def test_many_rows_of_one_image_and_tiny_sets_are_answered(tmp_path):

@@ -43,7 +43,7 @@ class Comparison:
     false_positives: float = 0.001
     """Rate at which unrelated images may pass for near-duplicates."""
     encoder: str | None = None
-    """Trained encoders (a folder or an id) whose embeddings replace the images."""
+    """Trained encoders (a folder or an id), by which --impact is measured on embeddings."""
     impact: Switch = False
     """Also measure what leaking costs in material accuracy."""
     allow_seen: Switch = False

@@ -90,8 +90,6 @@ class FormatOptions:
     """Report or fix trajectories whose vision and tactile folders are swapped (HCT)."""
     part: Literal["real", "sim"] | None = None
     """Real or simulated recordings (YCB-Slide)."""
-    min_contact: float | None = None
-    """Skip frames of this contact energy or less; T3 takes 18 (VisGel)."""
     size: int | None = None
     """Shorter side of frames that are extracted from videos (default: as they are)."""
     max_per_contact: int | None = None

@@ -16,15 +16,13 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from palpate.core import PalpateError, atomic_path, inside, require_regular
+from palpate.core import atomic_path, inside, require_regular
 from palpate.data.contacts import SIZE, thumbnail
 from palpate.data.images import SUFFIXES, VIDEOS, read_image
 from palpate.data.manifest import DIGITS
 from palpate.data.stacks import SUFFIX, StackReader
 from palpate.data.video import VideoReader
 
-#: The typical frame of a recording is chosen from at most so many frames.
-MEDIAN_OF = 15
 #: Files that hold many frames.
 MOVING = (*VIDEOS, SUFFIX)
 
@@ -159,12 +157,3 @@ def save_frame(path: Path, image: NDArray[np.uint8], size: int | None) -> None:
         frame = frame.resize((width, height), Image.Resampling.BICUBIC)
     with atomic_path(path) as part:
         frame.save(part, format="JPEG", quality=95, subsampling=0)
-
-
-def nearest_to_median(images: Sequence[NDArray[np.uint8]], source: Path) -> int:
-    """Which of some frames (h, w, 3) has the least mean difference to their pixelwise median."""
-    if len({image.shape for image in images}) > 1:
-        must = f"The frames in {source} must have one size"
-        raise PalpateError(must, "several", "Extract them again from the video")
-    median = np.median(np.stack(images), axis=0).astype(np.float32)
-    return int(np.argmin([np.abs(image - median).mean() for image in images]))

@@ -8,7 +8,7 @@ from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from palpate.core import FeatureSet, Note, Progress, Split, quiet
+from palpate.core import FeatureSet, Note, Progress, Split, quiet, require
 from palpate.data.manifest import MODALITIES, Manifest
 from palpate.evaluation.inputs import guard, load_encoders
 from palpate.leakage.auditing import audit as audit_leakage
@@ -40,7 +40,7 @@ def audit(
             instead of it.
         images: compare image files and their content, not only tables.
         false_positives: rate at which unrelated images may pass for near-duplicates, in (0, 0.1].
-        encoder: an id, or a folder, of encoders whose embeddings replace the images.
+        encoder: an id or folder of encoders, by which the impact is measured in place of pixels.
         impact: measure what leaking costs in material accuracy, too; needs ``split``.
         allow_seen: measure it by embeddings of an encoder that was trained on some of the samples;
             every output says so.
@@ -54,6 +54,7 @@ def audit(
     Raises:
         PalpateError: as :func:`palpate.leakage.audit`, and if the encoders cannot be loaded.
     """
+    require(impact or encoder is None, "encoder", "must come with the impact", encoder)
     given = {"train_or_data": train_or_data, "test": test, "encoder": encoder, "impact": impact}
     call = Call.of("audit", audit, {**given, "allow_seen": allow_seen, **options})
     folder = None if cache is None else Path(cache)
@@ -92,7 +93,6 @@ def audit(
     result = audit_leakage(
         train_or_data,
         test,
-        encoder=None if encoder is None else lambda samples, m: embed(samples, m).features,
         impact=measure if impact else None,
         cache=cache,
         progress=progress,
@@ -101,10 +101,10 @@ def audit(
     return replace(result, call=call)
 
 
-# In the order of leakage.audit, with the types of the two that differ, and the one more.
+# In the order of leakage.audit, with the type of the one that differs, and the two more.
 _SIGNATURE = inspect.signature(audit_leakage)
 _TYPED = inspect.signature(audit).parameters
-_ALL = {**_SIGNATURE.parameters, "allow_seen": _TYPED["allow_seen"]}
+_ALL = {**_SIGNATURE.parameters, **{name: _TYPED[name] for name in ("encoder", "allow_seen")}}
 audit.__signature__ = _SIGNATURE.replace(  # type: ignore[attr-defined]
     parameters=[_TYPED.get(name, p) for name, p in _ALL.items()]
 )

@@ -44,8 +44,6 @@ NO_GROUP = "none"
 #: Right-open bins of the gap histogram, in frames; 30 frames are one second of Touch and Go.
 GAP_EDGES = (0, 1, 3, 10, 30, 60, 90, 150, 300, 600, 900, 1800, 3600)
 
-#: (samples, modality) -> (n, d) embeddings in their order.
-Embed = Callable[[Manifest, str], Any]
 #: (samples, split, group, name of the split) -> what the leak costs.
 MeasureImpact = Callable[[Manifest, Split, str, str], Impact]
 
@@ -59,7 +57,6 @@ class _Options:
     images: bool
     modalities: Sequence[str]
     false_positives: float
-    encoder: Embed | None
     worst: int
     cache: Path | None
     progress: Progress
@@ -76,7 +73,6 @@ def audit(  # noqa: PLR0913
     images: bool = True,
     modalities: Sequence[str] = ("vision", "tactile"),
     false_positives: float = 0.001,
-    encoder: Embed | None = None,
     impact: MeasureImpact | None = None,
     name: str | None = None,
     worst: int = 12,
@@ -102,7 +98,6 @@ def audit(  # noqa: PLR0913
         images: compare image files and their content, not only tables.
         modalities: the images to compare.
         false_positives: rate at which unrelated images may pass for near-duplicates, in (0, 0.1].
-        encoder: function (samples, modality) -> embeddings, to compare instead of the images.
         impact: function (samples, split, group, name) -> :class:`Impact`; needs ``split``.
         name: heading; default: the names of the inputs, or of the split.
         worst: how many of the strongest pairs to keep for each signal.
@@ -131,7 +126,6 @@ def audit(  # noqa: PLR0913
         images,
         modalities,
         false_positives,
-        encoder,
         worst,
         None if cache is None else Path(cache),
         progress,
@@ -329,7 +323,7 @@ def _reason(
 ) -> str:
     """Why a leak might not show; '' where it would. ``named``: equal names say something."""
     near = [f for f in flags if f.kind.startswith("near-duplicate")]
-    if near and options.encoder is None:
+    if near:
         column = near[-1].kind.split()[-1]  # tactile images decide where there are any
         if shows_nothing([train, test], column, options.progress):
             return "untouched" if column == "tactile" else "similar"
@@ -389,15 +383,11 @@ def _signals(
 def _near_duplicates(train: Manifest, test: Manifest, modality: str, options: _Options) -> Flags:
     from palpate.leakage.near import near_duplicates
 
-    features = None
-    if options.encoder is not None:
-        features = options.encoder(train, modality), options.encoder(test, modality)
     return near_duplicates(
         train,
         test,
         modality,
         false_positives=options.false_positives,
-        features=features,
         cache=options.cache,
         progress=options.progress,
     )

@@ -109,16 +109,6 @@ class VectorIndex:
         return _best(near, values, count)
 
 
-class Embeddings(Descriptors):
-    """Given vectors, compared as they are."""
-
-    shares = (1.0,)
-
-    def __init__(self, vectors: Floats) -> None:
-        vectors = unit(vectors)
-        self.ways = [(0, lambda rows: VectorIndex(vectors.__getitem__, rows))]
-
-
 class Whitener:
     """PCA whitening of (n, d) signals that are added in blocks."""
 

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from palpate.core import Progress, quiet, rng_for
-from palpate.leakage.descriptors import Descriptors, Embeddings, Whitened
+from palpate.leakage.descriptors import Descriptors, Whitened
 from palpate.leakage.neighbors import Apart, Floats, Ints
 from palpate.leakage.pool import Pool
 
@@ -41,10 +41,8 @@ class Unrelated:
 
 def image_views(images: Pool, base: Ints, queries: Ints) -> list[View]:
     """Log thumbnails without and with backgrounds, in color; in gray for gray queries, and for all
-    where train has gray images among others. Embeddings are compared as they are.
+    where train has gray images among others.
     """
-    if images.vectors is not None:
-        return [View(Embeddings(images.vectors), ~images.blank, ~images.blank, Embeddings.shares)]
     both = np.concatenate([base, queries])
     gray = images.colorless()
     kinds = [(bool(gray[base].any()) and not gray[both].all(), ~images.blank)]

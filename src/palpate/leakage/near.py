@@ -31,7 +31,7 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 from threadpoolctl import threadpool_limits
 
-from palpate.core import Note, PalpateError, Progress, quiet
+from palpate.core import Note, Progress, quiet
 from palpate.data.manifest import Manifest
 from palpate.leakage import calibration
 from palpate.leakage.calibration import Tail
@@ -45,7 +45,7 @@ from palpate.leakage.matching import (
     unrelated,
 )
 from palpate.leakage.neighbors import Floats, Ints
-from palpate.leakage.pool import Pool, codes, pool
+from palpate.leakage.pool import Pool, pool
 from palpate.leakage.signals import Flags
 
 #: Nearest images that an image may be linked to in a cluster.
@@ -74,7 +74,6 @@ def near_duplicates(
     modality: str,
     *,
     false_positives: float = RATE,
-    features: tuple[object, object] | None = None,
     cache: Path | None = None,
     progress: Progress = quiet,
 ) -> Flags:
@@ -85,17 +84,10 @@ def near_duplicates(
         test: the samples in question.
         modality: ``vision`` or ``tactile``.
         false_positives: share of unrelated samples that may be flagged, in (0, 0.1].
-        features: embeddings (n_train, d) and (n_test, d) to compare instead of the images.
         cache: folder for thumbnails, so that a rerun is quick; None keeps nothing.
         progress: callback.
-
-    Raises:
-        PalpateError: if the embeddings do not fit the samples.
     """
-    if features is None:
-        images = pool(train, test, modality, cache=cache, progress=progress)
-    else:
-        images = _embedded(features, train, test)
+    images = pool(train, test, modality, cache=cache, progress=progress)
     base, queries = _shown(images, slice(len(train))), _shown(images, slice(len(train), None))
     matches = _match(images, base, queries, false_positives, progress)
     cut = len(train)
@@ -287,34 +279,6 @@ def _null(images: Pool, base: Ints, views: list[View]) -> Unrelated | None:
     if null is None or (null.source == "order" and not ordered(views[0], base, null)):
         return None
     return null
-
-
-def _embedded(features: tuple[object, object], train: Manifest, test: Manifest) -> Pool:
-    """Embeddings of train and test as a pool."""
-    parts, counts = [np.asarray(f, np.float32) for f in features], (len(train), len(test))
-    shapes = [part.shape for part in parts]
-    if (
-        any(len(s) != 2 for s in shapes)
-        or shapes[0][1:] != shapes[1][1:]
-        or (len(parts[0]), len(parts[1])) != counts
-    ):
-        must = f"The embeddings must be (n, d): {counts[0]} of train, {counts[1]} of test"
-        got = " and ".join(map(str, shapes))
-        raise PalpateError(must, got, "Embed the same samples")
-    vectors = np.concatenate(parts)
-    if not np.isfinite(vectors).all():
-        must, got = "The embeddings must be finite", "a number that is not"
-        raise PalpateError(must, got, "Embed the images again")
-    rows = np.arange(len(vectors))
-    return Pool(
-        item=rows,
-        unit=codes((train, test), "video"),
-        pixels=np.zeros((0, 1, 1, 3), np.uint8),
-        images=rows,
-        backgrounds=np.full(len(rows), -1),
-        blank=np.zeros(len(rows), bool),
-        vectors=vectors,
-    )
 
 
 def _clusters(images: Pool, i: Ints, j: Ints) -> Ints:

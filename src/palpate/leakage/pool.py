@@ -45,7 +45,6 @@ class Pool:
     backgrounds: Ints
     blank: NDArray[np.bool_]  # (items,) whether an image shows nothing
     notes: list[Note] = field(default_factory=list)  # what a reader must know
-    vectors: Floats | None = None  # (items, d) embeddings in place of thumbnails
 
     def colorless(self) -> NDArray[np.bool_]:
         """(items,) whether an image has no color."""

@@ -42,12 +42,7 @@ class Images(Generic[K]):
 
 
 def numbered(
-    scan: Scan,
-    place: str,
-    pattern: str = NUMBER,
-    *,
-    steady: bool = False,
-    suffixes: Sequence[str] = SUFFIXES,
+    scan: Scan, place: str, pattern: str = NUMBER, *, suffixes: Sequence[str] = SUFFIXES
 ) -> Images[int]:
     """The images of a folder by number; an absent folder has none.
 
@@ -55,7 +50,6 @@ def numbered(
         scan: duplicate numbers become its problems, images without a number are suspicious.
         place: folder relative to the root; its subfolders are not read.
         pattern: of the whole stem, with one group: the number.
-        steady: report gaps in the numbers, unless more numbers are missing than there are.
         suffixes: of images, in lower case; other files are not images.
     """
     files: dict[int, str] = {}
@@ -67,11 +61,6 @@ def numbered(
         elif (before := files.setdefault(int(match[1]), name)) != name:
             scan.problem(f"{place}/{name}", "duplicate-frame", f"{before} has the same number")
     scan.suspect(place, "unknown-name", "images that carry no frame number", unnumbered)
-    if steady and files:
-        gaps = range(min(files), max(files) + 1)
-        if 0 < len(gaps) - len(files) < len(files):
-            text = f"numbers that are missing between {gaps[0]} and {gaps[-1]}"
-            scan.suspect(place, "frame-gap", text, (k for k in gaps if k not in files))
     return Images(place, {k: files[k] for k in sorted(files)})
 
 

@@ -87,7 +87,7 @@ def _object(result: Scan, name: str, material: str | None) -> None:
     single: list[str] = []
     for trial in trials:
         folder = f"{place}/{trial}/0/gelsight"
-        images = numbered(result, folder, steady=True, suffixes=(".png",))
+        images = numbered(result, folder, suffixes=(".png",))
         if not images.files:
             kind = "frames" if (result.base / folder).is_dir() else "folder"
             result.problem(folder, f"missing-{kind}", "the trial has no PNG images")

@@ -16,20 +16,11 @@ from pathlib import Path
 from threading import Event
 from typing import Any
 
-import numpy as np
 import polars as pl
 
 from palpate.core import PalpateError, Progress, inside, read_json, require, write_json
 from palpate.data.formats.base import Into, Scan
-from palpate.data.frames import (
-    MEDIAN_OF,
-    FolderFrames,
-    Frames,
-    VideoFrames,
-    nearest_to_median,
-    save_frame,
-    streams_of,
-)
+from palpate.data.frames import FolderFrames, Frames, VideoFrames, streams_of
 from palpate.data.images import Check, check_image, in_threads
 from palpate.data.imported import place_of, raise_if, require_some
 from palpate.data.listing import FrameList, FrameTable
@@ -56,7 +47,7 @@ class Row:
     material: str
 
 
-#: The needed frames of one modality of a recording; no frames: its typical frame.
+#: The needed frames of one modality of a recording.
 _Job = tuple[str, str, set[int]]
 
 
@@ -101,8 +92,6 @@ class Recordings:
     backgrounds: dict[str, Path] = field(default_factory=dict)  # contact -> background image
     #: Contact -> the frame before it that is its background, if there is one.
     background_frames: dict[str, int] = field(default_factory=dict)
-    #: Contacts without such a frame -> their recording.
-    typical_of: dict[str, str] = field(default_factory=dict)
     extracted: bool = False  # whether frames of videos are files by now
     modalities: tuple[str, ...] = MODALITIES  # those that every recording has
 
@@ -189,17 +178,15 @@ class Recordings:
         for video in sorted(set(self.videos) - listed):
             text = f"no usable contact of the recording {video!r} is listed"
             self.scan.suspect(self.scan.base, "unlisted-video", text)
-        with_background = {*self.background_frames, *self.typical_of}
-        for contact in sorted({row.contact for row in rows} - with_background):
-            text = "no frame of its recording shows the untouched gel"
+        for contact in sorted({row.contact for row in rows} - self.background_frames.keys()):
+            text = "no frame before it shows the untouched gel"
             self.scan.suspect(contact, "no-background", text)
         return rows
 
     def choose_backgrounds(self, rows: Sequence[Row], starts: Mapping[str, int]) -> None:
         """Choose the background of every contact.
 
-        It is the frame 4 before the contact; else the nearest earlier one without contact; else (in
-        ``extract``) a typical frame without contact; else none.
+        It is the frame 4 before the contact, else the nearest earlier one without contact.
         """
         for contact, video in {row.contact: row.video for row in rows}.items():
             frames = self.frames[video]["tactile"]
@@ -210,21 +197,6 @@ class Recordings:
             if k is not None:
                 self.background_frames[contact] = k
                 self.backgrounds[contact] = frames.path(k)
-            elif self._without_contact(video):
-                self.typical_of[contact] = video
-
-    def _without_contact(self, video: str) -> list[int]:
-        """Up to 15 evenly spaced frames without contact, if possible 4 frames away from any."""
-        numbers = np.asarray(self.frames[video]["tactile"].numbers, np.int64)
-        contact = np.array(sorted(self.in_contact.get(video, set())), np.int64)
-        for margin in (BACKGROUND_BEFORE, 0):
-            # A frame is near a contact if a frame in contact lies within the margin.
-            low = np.searchsorted(contact, numbers - margin, "left")
-            free = numbers[low == np.searchsorted(contact, numbers + margin, "right")]
-            if len(free):
-                places = np.linspace(0, len(free) - 1, min(MEDIAN_OF, len(free))).round()
-                return free[places.astype(int)].tolist()
-        return []
 
     def _whole(self, rows: list[Row], how: Check, progress: Progress) -> list[Row]:
         """Check every image of folders in use once; keep the rows whose images are whole."""
@@ -268,18 +240,15 @@ class Recordings:
             self.scan.facts |= self._facts(rows)
             self.scan.base = self._base(rows)
         else:
-            rows = self._decode(rows, progress, videos=check == "decode")
             if check == "decode":
+                rows = self._decode(rows, progress)
                 self._check_streams(progress)
             hidden = {} if check == "none" else dict.fromkeys((*MODALITIES, "background"))
         cells = self.cells(rows, self.scan.base.resolve(), sensor, words)
         self.scan.rows = [(r.where, cell | hidden) for r, cell in zip(rows, cells, strict=True)]
 
-    def _decode(self, rows: list[Row], progress: Progress, *, videos: bool) -> list[Row]:
-        """Decode what ``extract`` would; keep the rows whose images are whole.
-
-        Without ``videos`` only the typical frames of folders are determined, and every row stays.
-        """
+    def _decode(self, rows: list[Row], progress: Progress) -> list[Row]:
+        """Decode what ``extract`` would; keep the rows whose images are whole."""
         whole: set[tuple[str, str, int]] = set()
 
         def work(job: _Job, stop: Event) -> None:
@@ -289,10 +258,7 @@ class Recordings:
                     return
                 whole.add((video, modality, k))
 
-        jobs = [job for job in self._jobs(rows) if videos or not self._is_video(*job[:2])]
-        self._run("decoding frames", jobs, work, rows, progress)
-        if not videos:
-            return rows
+        self._run("decoding frames", self._jobs(rows), work, rows, progress)
         return [r for r in rows if all((r.video, m, r.frame) in whole for m in self._videos_of(r))]
 
     def _check_streams(self, progress: Progress) -> None:
@@ -328,7 +294,7 @@ class Recordings:
 
         jobs = self._jobs(rows)
         self._require_same_settings(jobs, into)
-        self._run("extracting frames", jobs, work, rows, progress, save_to=into.created)
+        self._run("extracting frames", jobs, work, rows, progress)
         self.extracted = True
         self.backgrounds = {c: path for c, path in self.backgrounds.items() if path.is_file()}
         there = lambda r, m: self.frames[r.video][m].path(r.frame).is_file()
@@ -348,7 +314,7 @@ class Recordings:
         return [m for m in self.modalities if self._is_video(row.video, m)]
 
     def _jobs(self, rows: Sequence[Row]) -> list[_Job]:
-        """The frames of videos that rows and backgrounds need, then the typical frames needed."""
+        """The frames of videos that rows and backgrounds need."""
         needed: dict[tuple[str, str], set[int]] = {}
         for row in rows:
             for modality in self._videos_of(row):
@@ -356,9 +322,7 @@ class Recordings:
                 frames.add(row.frame)
                 if modality == "tactile" and row.contact in self.background_frames:
                     frames.add(self.background_frames[row.contact])
-        typical = {self.typical_of[r.contact] for r in rows if r.contact in self.typical_of}
-        jobs = [(video, modality, frames) for (video, modality), frames in needed.items()]
-        return [*jobs, *((video, "tactile", set[int]()) for video in sorted(typical))]
+        return [(video, modality, frames) for (video, modality), frames in needed.items()]
 
     def _run(
         self,
@@ -367,30 +331,14 @@ class Recordings:
         work: Callable[[_Job, Event], None],
         rows: Sequence[Row],
         progress: Progress,
-        *,
-        save_to: list[Path] | None = None,
     ) -> None:
-        """Run jobs in threads; a video that breaks off becomes a problem.
-
-        Jobs without frames choose a typical frame; one that is no file is written where there is a
-        list of new files, ``save_to``.
-        """
+        """Run jobs in threads; a video that breaks off becomes a problem."""
         first = {row.video: row for row in reversed(rows)}
-        typical: dict[str, Path] = {}
         stop = Event()
-
-        def choose(video: str) -> None:
-            frames = self.frames[video]["tactile"]
-            numbers, images = zip(*frames.read(self._without_contact(video)), strict=True)
-            best = nearest_to_median(images, frames.source)
-            path = typical[video] = frames.path(numbers[best])
-            if save_to is not None and not path.is_file():
-                save_to.append(path)
-                save_frame(path, images[best], self.size)
 
         def attempt(job: _Job) -> str | None:
             try:
-                work(job, stop) if job[2] else choose(job[0])
+                work(job, stop)
             except PalpateError as error:
                 return f"{self.frames[job[0]][job[1]].source}: {error.got}"
             return None
@@ -398,12 +346,10 @@ class Recordings:
         for (video, _, _), text in in_threads(attempt, jobs, what, progress, stop=stop):
             if text:
                 self.scan.problem(first[video].where, "bad-video", text)
-        chosen = {c: typical[video] for c, video in self.typical_of.items() if video in typical}
-        self.backgrounds |= chosen
 
     def _require_same_settings(self, jobs: Sequence[_Job], into: Into) -> None:
         """Record the settings of extracted frames; reject a folder with others."""
-        videos = [job[:2] for job in jobs if self._is_video(*job[:2])]
+        videos = [job[:2] for job in jobs]
         if not videos:
             return
         path = into.out / "images" / "settings.json"
@@ -463,8 +409,7 @@ class Recordings:
         """How the frames are stored, and how many contacts have which background."""
         kinds: Counter[str] = Counter()
         for contact in {row.contact for row in rows}:
-            kind = "frame" if contact in self.background_frames else "typical"
-            kinds[kind if contact in self.backgrounds else "none"] += 1
+            kinds["frame" if contact in self.backgrounds else "none"] += 1
         backgrounds = ", ".join(f"{kind} {count}" for kind, count in sorted(kinds.items()))
         return {"layout": self._layout(rows), "backgrounds": backgrounds}
 

@@ -13,8 +13,7 @@
 The videos may also be under ``final_dataset/`` or in the root itself. The number of a frame is its
 position in both videos, so it is valid up to the shorter one. The background of a contact is the
 gel 4 frames before it begins; if the sensor is in contact there, the nearest earlier frame where it
-is not; if there is none, of up to 15 frames outside all contacts the one nearest to their median;
-else null.
+is not; else null.
 """
 
 from __future__ import annotations

@@ -20,9 +20,7 @@ In the tree that T3 reads (``<root>/<n>/<recording>/``) all is touch and ``visio
 A recording is a video, the group. Its name is its path without the side, ``data_seen/12/rec``;
 ``seen`` or ``unseen`` in it is the domain.
 
-Most frames touch nothing. The contact of a frame is the variance of the Laplacian of (frame -
-reference) in gray levels; T3 keeps contact > 18, which leaves 726,740 of 3,170,795 frames.
-``min_contact`` does so (on luma, while T3 swaps the weights of red and blue); by default all stay.
+Most frames touch nothing: T3 keeps 726,740 of 3,170,795.
 """
 
 from __future__ import annotations
@@ -34,9 +32,7 @@ from functools import lru_cache
 from itertools import islice
 from pathlib import Path
 
-import numpy as np
-
-from palpate.core import PalpateError, Progress, Split, few, inside, quiet
+from palpate.core import PalpateError, Progress, Split, few, quiet
 from palpate.data.formats.base import Cells, Facts, Format, Row, Scan
 from palpate.data.formats.layout import (
     Images,
@@ -46,7 +42,6 @@ from palpate.data.formats.layout import (
     report_missing_folders,
     require_folder,
 )
-from palpate.data.images import in_threads, read_image
 
 FACTS = Facts(
     name="VisGel",
@@ -81,18 +76,11 @@ def detect(source: Path) -> bool:
     return any(place != "." and "frame0000.jpg" in names for place, names in folders)
 
 
-def scan(
-    source: Path,
-    *,
-    root: Path | None = None,
-    min_contact: float | None = None,
-    progress: Progress = quiet,
-) -> Scan:
+def scan(source: Path, *, root: Path | None = None, progress: Progress = quiet) -> Scan:
     """Read the lists, or find the recordings where there are none.
 
     Options:
         root: where the paths of the lists start; default: the source.
-        min_contact: skip frames of this contact or less; T3 takes 18. Reads every frame.
     """
     source = require_folder(source, FACTS.name)
     lists = _lists(source)
@@ -102,20 +90,10 @@ def scan(
         _read_lists(result, lists, progress)
     else:
         _read_recordings(result, progress)
-    if min_contact is not None:
-        _skip_flat(result, min_contact, progress)
     return result
 
 
 FORMAT = Format(FACTS, detect, LOOKS_FOR, scan)
-
-
-def contact(frame: np.ndarray, reference: np.ndarray) -> float:
-    """Variance of the Laplacian of (frame - reference); both (h, w), gray, 0 to 255."""
-    from scipy.ndimage import laplace  # importing it takes an eighth of a second
-
-    difference = frame.astype(np.float64) - reference.astype(np.float64)
-    return float(laplace(difference, mode="mirror").var())
 
 
 def _lists(source: Path) -> dict[tuple[str, str], Path]:
@@ -224,7 +202,7 @@ def _read_recordings(result: Scan, progress: Progress) -> None:
     bare: list[str] = []
     for done, video in enumerate(videos):
         progress("reading recordings", done, len(videos))
-        tactile = numbered(result, places["touch"][video], FRAME, steady=True)
+        tactile = numbered(result, places["touch"][video], FRAME)
         reference = tactile.files.pop(0, None)
         background = f"{tactile.place}/{reference}" if reference else None
         bare += [] if reference else [video]
@@ -250,27 +228,3 @@ def _walk(root: Path) -> Iterator[tuple[str, list[str]]]:
         deeper = len(place.parts) < DEPTH
         below[:] = sorted((n for n in below if deeper and not n.startswith(".")), key=natural)
         yield place.as_posix(), names
-
-
-def _skip_flat(result: Scan, least: float, progress: Progress) -> None:
-    """Drop the frames of little contact; those that cannot be measured stay."""
-
-    def measure(k: int) -> float | None:
-        cells = result.rows[k][1]
-        names = [cells[name] for name in ("tactile", "background") if cells[name]]
-        paths = [inside(result.base, name) for name in names]
-        try:
-            images = [np.asarray(read_image(path).convert("L")) for path in paths if path]
-        except PalpateError:
-            return None
-        comparable = len(images) == 2 and images[0].shape == images[1].shape
-        return contact(*images) if comparable else None
-
-    count = len(result.rows)
-    values = dict(in_threads(measure, range(count), "measuring contact", progress))
-    unknown = [k for k, value in values.items() if value is None]
-    text = "frames that could not be compared with a reference"
-    result.suspect(result.base, "contact-unknown", text, unknown)
-    kept = [k for k in range(count) if (value := values[k]) is None or value > least]
-    result.facts["min_contact"] = f"{least:g}; {count - len(kept)} of {count} frames skipped"
-    result.rows = [result.rows[k] for k in kept]

@@ -106,7 +106,7 @@ def _logs(place: Path, part: str) -> list[tuple[str, int, str]]:
 def _log(result: Scan, part: str, name: str, place: str, sparsh: str | None) -> None:
     """Add the frames of one log."""
     _, folder, pattern = LAYOUT[part]
-    tactile = numbered(result, f"{place}/{folder}", pattern, steady=True)
+    tactile = numbered(result, f"{place}/{folder}", pattern)
     if not tactile.files:
         result.problem(place, "missing-frames", f"no images in {folder}/")
         return
