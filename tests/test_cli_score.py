@@ -136,7 +136,7 @@ def test_scores_of_pixels_need_no_torch(tmp_path):
 @pytest.mark.parametrize(
     ("args", "words"),
     [
-        ((*PAIR, "--sigma", "ten"), ("--sigma must be numbers", "'ten'", "--sigma 10")),
+        ((*PAIR, "--sigma", "ten"), ("--sigma must be positive", "'ten'", "--sigma 10")),
         ((*PAIR, "--names", "a", "b"), ("--names must name every generator",)),
         ((*PAIR, "--group", "contact"), ("--group must be known for every input",)),
         ((*PAIR, "--encoder", "palpate/mini"), ("--encoder must go with images",)),

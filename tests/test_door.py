@@ -29,7 +29,7 @@ SIGNATURES = {
     ),
     "load": "source * format images skip_bad progress **options",
     "probe": (
-        "data split * encoder modality label group neighbors top pool text_threshold seed "
+        "data split * encoder modality label group top pool text_threshold seed "
         "allow_seen cache progress"
     ),
     "score": (

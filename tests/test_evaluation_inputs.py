@@ -192,8 +192,6 @@ def test_files_of_labels_give_ids_to_rows_without(tmp_path):
         (X[:3], {"labels": TABLE}, "as many rows"),
         (sets(OWN, None, VIDEO), {"labels": CONTACTS, "group": "contact"}, "known for every"),
         (sets(OWN, None, VIDEO), {"labels": TABLE.select("id", group="contact")}, "one kind"),
-        (np.ones((3, 5)), {}, "one width. Got 5 and 3"),
-        (FeatureSet(ROWS, X, None, None, "f" * 64), {}, "one encoder"),
         (np.zeros((2, 8, 8, 3), np.uint8), {}, "both be images, or both embeddings"),
         ([sets(), sets()], {"names": ["a"]}, "`names` must name every generator. Got 1 for 2"),
         ([sets(), sets()], {"names": ["a", "a"]}, "must differ"),

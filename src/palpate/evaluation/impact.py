@@ -60,15 +60,7 @@ CELLS = 1 << 24
 #: Rounding of a float32 distance, relative to the squared lengths.
 TIE = 2e-6
 
-Codes = NDArray[np.int64]
-
-
-@dataclass(frozen=True)
-class _Parts:
-    """One split of the compared samples: numbers of its train and test samples."""
-
-    train: Rows
-    test: Rows
+Names = NDArray[np.str_]
 
 
 @dataclass(frozen=True)
@@ -77,19 +69,18 @@ class _Design:
 
     Attributes:
         ids: the samples.
-        material, group: codes into ``materials`` and ``groups``, one per sample.
-        splits: the given split, then the leak-free ones.
+        material, group: (n,) of each sample.
+        splits: numbers of the train and of the test samples, of the given split, then of the
+            leak-free ones.
         clean: digests of the latter.
         notes: what was excluded, and what qualifies the result.
         settings: sizes and baselines.
     """
 
     ids: list[str]
-    material: Codes
-    group: Codes
-    materials: list[str]
-    groups: list[str]
-    splits: list[_Parts]
+    material: Names
+    group: Names
+    splits: list[tuple[Rows, Rows]]
     clean: list[str]
     notes: list[Note]
     settings: dict[str, Any]
@@ -160,9 +151,9 @@ def _measure(
         for k, parts in enumerate(design.splits):
             done = number * len(design.splits) + k
             progress(f"classifying materials by {column}", done, total, source.name)
-            for c, mean in _classify(source, parts, design).items():
+            for c, mean in _classify(source, *parts, design).items():
                 means[c].append(mean)
-        chance = 1 / len(design.materials)
+        chance = 1 / len(design.settings["materials"])
         of_source = [_row(source.name, c, means[c], chance, column) for c in CLASSIFIERS]
         rows += [replace(row, seen=source.name in seen) for row in of_source]
     progress(f"classifying materials by {column}", total, total)
@@ -198,29 +189,29 @@ def _design(manifest: Manifest, split: Split, group: str, seeds: Sequence[int]) 
     rows, here, owners, *parts = _without(late, here, rows, here, owners, *parts)
     excluded |= late
     splits = [
-        _Parts(*(np.flatnonzero(np.array(p) == part) for part in ("train", "test"))) for p in parts
+        (np.flatnonzero(np.array(p) == "train"), np.flatnonzero(np.array(p) == "test"))
+        for p in parts
     ]
-    materials, material = code(here)
-    groups, owner = code(owners)
+    material, owner = np.array(here, dtype=str), np.array(owners, dtype=str)
+    test_groups = [len(np.unique(owner[test])) for _, test in splits]
     settings = {
         "given_split": split.digest,
         "group": group,
         "seeds": list(seeds),
-        "materials": materials,
+        "materials": sorted({*here}),
         "left_out": excluded,
-        "train_samples": min(len(s.train) for s in splits),
-        "test_samples": [len(s.test) for s in splits],
-        "test_groups": [len(np.unique(owner[s.test])) for s in splits],
-        "shared_groups": len(np.intersect1d(owner[splits[0].train], owner[splits[0].test])),
+        "train_samples": min(len(train) for train, _ in splits),
+        "test_samples": [len(test) for _, test in splits],
+        "test_groups": test_groups,
+        "shared_groups": len(np.intersect1d(*(owner[part] for part in splits[0]))),
     }
     if excluded:
-        total = len(excluded) + len(materials)
+        total = len(excluded) + len({*here})
         notes.append(Note("materials-excluded", {"materials": excluded, "total": total}))
-    if (fewest := min(settings["test_groups"])) < 5:
-        notes.append(Note("few-test-groups", {"count": fewest, "group": group}))
+    if min(test_groups) < 5:
+        notes.append(Note("few-test-groups", {"count": min(test_groups), "group": group}))
     clean = [p.digest for p in plans]
-    ids = [ids[k] for k in rows]
-    return _Design(ids, material, owner, materials, groups, splits, clean, notes, settings)
+    return _Design([ids[k] for k in rows], material, owner, splits, clean, notes, settings)
 
 
 def _owners(pool: Manifest, column: str) -> list[str]:
@@ -270,22 +261,18 @@ def _without(
     return [[column[k] for k in keep] for column in columns]
 
 
-def _classify(source: Source, parts: _Parts, design: _Design) -> dict[str, Mean]:
+def _classify(source: Source, train: Rows, test: Rows, design: _Design) -> dict[str, Mean]:
     """Accuracy of each classifier under one split."""
     size, seed = int(design.settings["train_samples"]), int(design.settings["seeds"][0])
-    group, material = design.group, design.material
-    train = thin(parts.train, size, seed)
+    train = rng_for(seed, "impact thin", size).permutation(train)[:size]
     reduction = fit_reduction(source, train, COMPONENTS, seed)
-    x, z = reduction.apply(source, train), reduction.apply(source, parts.test)
-    y, truth, owner = material[train], material[parts.test], group[parts.test]
-    few = train[:PROBE_ROWS]  # in a random order
-    labels = [design.materials[k] for k in material[few]]
-    groups = [design.groups[k] for k in group[few]]
+    x, z = reduction.apply(source, train), reduction.apply(source, test)
+    few, truth = train[:PROBE_ROWS], design.material[test]
+    labels, groups = design.material[few].tolist(), design.group[few].tolist()
     known = FeatureSet([design.ids[k] for k in few], x[: len(few)], labels, groups)
-    probe = fit_probe(known, seed=seed)
-    right = np.array(probe.predict(z)) == np.array(design.materials)[truth]
-    hits = {"1-NN": nearest_hits(z, x, truth, y), "linear probe": right}
-    groups = [design.groups[k] for k in owner]
+    right = np.array(fit_probe(known, seed=seed).predict(z)) == truth
+    hits = {"1-NN": nearest_hits(z, x, truth, design.material[train]), "linear probe": right}
+    groups = design.group[test].tolist()
     return {c: mean_of(c, hits[c], groups, subject=source.name) for c in CLASSIFIERS}
 
 
@@ -326,15 +313,14 @@ def _headline(row: ImpactRow, name: str, settings: Mapping[str, Any]) -> str:
 
 
 def nearest_hits(
-    queries: NDArray[np.float32], base: NDArray[np.float32], query_class: Codes, base_class: Codes
+    queries: NDArray[np.float32], base: NDArray[np.float32], truth: Names, labels: Names
 ) -> NDArray[np.float64]:
     """Probability (m,) that 1-NN gets each query right, ties being broken at random.
 
-    Queries (m, d) and base (n, d) have class numbers from 0.
+    Queries (m, d) and base (n, d) have classes by name.
     """
-    classes = int(max(query_class.max(), base_class.max())) + 1
-    one_hot = np.zeros((len(base), classes), np.float32)
-    one_hot[np.arange(len(base)), base_class] = 1
+    names, code = np.unique(labels, return_inverse=True)
+    one_hot = np.eye(len(names), dtype=np.float32)[code]
     length = np.einsum("ij,ij->i", base, base)
     out = np.empty(len(queries))
     step = max(1, CELLS // len(base))
@@ -347,17 +333,6 @@ def nearest_hits(
         tied = distance <= (distance.min(axis=1) + rounding)[:, None]
         # Sums of at most 2^24 ones are exact in float32.
         votes = tied.astype(np.float32) @ one_hot
-        right = votes[np.arange(len(x)), query_class[start : start + step]]
+        right = (votes * (names == truth[start : start + step, None])).sum(axis=1)
         out[start : start + step] = right / votes.sum(axis=1)
     return out
-
-
-def thin(rows: Codes, count: int, seed: int) -> Codes:
-    """At most ``count`` of the rows, at random."""
-    return rng_for(seed, "impact thin", count).permutation(rows)[:count]
-
-
-def code(names: Sequence[str]) -> tuple[list[str], Codes]:
-    """The distinct names, sorted, and the number of each."""
-    values, codes = np.unique(np.asarray(list(names), dtype=str), return_inverse=True)
-    return [str(v) for v in values], codes.astype(np.int64)

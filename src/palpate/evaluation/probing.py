@@ -259,11 +259,7 @@ def _classify(
     if without := values[1].count(""):
         result.notes.append(Note("probe-unlabeled", {"label": label, "count": without}))
     train, test = (replace(f, labels=v) for f, v in zip(features, values, strict=True))
-    means = class_accuracies(train, test, label=label, seed=plan.seed, **common)
-    if unseen := means[0].score.details["unseen_classes"]:
-        note = {"subject": common["subject"], "label": label, "classes": unseen}
-        result.notes.append(Note("probe-unseen-classes", note))
-    result.means += means
+    result.means += class_accuracies(train, test, label=label, seed=plan.seed, **common)
 
 
 def _retrieve(
@@ -345,8 +341,6 @@ def results_of(
     differences = [d for sets in by_metric.values() for d in differences_of_means(sets)]
     all_runs = [run for of in runs.values() for run in of]
     notes = list({canonical_json(note): note for run in all_runs for note in run.notes}.values())
-    if any("similar text" in metric for metric in by_metric):
-        notes.append(Note("probe-text-threshold", {"threshold": plan.text_threshold}))
     names = ("modality", "label", "group", "top", "pool", "text_threshold", "seed")
     digests = {"manifest": manifest.digest}
     digests |= {

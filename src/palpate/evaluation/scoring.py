@@ -19,17 +19,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
-from palpate.core import (
-    FeatureSet,
-    Note,
-    PalpateError,
-    Progress,
-    Score,
-    Split,
-    quiet,
-    require_choice,
-    rng_for,
-)
+from palpate.core import FeatureSet, Note, PalpateError, Progress, Score, Split, quiet, rng_for
 from palpate.evaluation.companions import (
     MANY,
     Chosen,
@@ -61,7 +51,7 @@ from palpate.evaluation.inputs import (
     read_inputs,
 )
 from palpate.evaluation.memorization import FEATURES, PIXELS, contact_rows, memorization
-from palpate.metrics import PRESETS, compare, compare_tmmd, require_same_ids, tmmd
+from palpate.metrics import compare, compare_tmmd, require_same_ids, tmmd
 from palpate.report.calls import OBJECT, PATH, Call
 from palpate.report.results import GalleryItem, Results
 
@@ -241,10 +231,10 @@ def score(  # noqa: PLR0913
     """
     call = Call.of("score", score, locals())
     split = None if split is None else Split.load(split)
-    requested: Any = [companions] if isinstance(companions, str) else companions
+    sigmas = (sigma,) if isinstance(sigma, int | float | str) else tuple(sigma or ())
     family = Family(
-        presets=_presets(presets),
-        sigmas=_sigmas(sigma),
+        presets=tuple(dict.fromkeys(presets or ())),
+        sigmas=tuple(dict.fromkeys(sigmas)),
         options={"permutations": permutations, "normalize": normalize},
         common={"seed": seed, "split": split.digest if split else None},
     )
@@ -262,14 +252,14 @@ def score(  # noqa: PLR0913
     weights = Weights(inception=inception, clip=clip, lpips=lpips)
     images = inputs.reference.features is None
     if images:
-        if encoder is None and not requested:
+        if encoder is None and not companions:
             fix = "Pass an encoder, or request only companions that compare pixels, e.g. ssim"
             example = {"encoder": "palpate/mini"}
             got, must = "none", "must be given for images"
             raise PalpateError(must, got, fix, argument="encoder", example=example)
     elif used := [n for n, v in {"encoder": encoder, "cache": cache, **vars(weights)}.items() if v]:
         raise PalpateError("must go with images", "embeddings", "Drop it", argument=used[0])
-    chosen, pairs = _companions(inputs, requested, weights, encoder)
+    chosen, pairs = _companions(inputs, companions, weights, encoder)
     encoders = load_encoders(encoder, progress) if images else None
     of_encoder: list[Note] = []
     if encoders is not None:
@@ -324,26 +314,6 @@ def _digests_read(settings: Mapping[str, Any]) -> dict[str, Any]:
     """Of everything that was read: images, or files of embeddings; encoder and split."""
     files: Mapping[str, Any] = settings.get("embeddings", {})
     return {**settings["digests"], **{f"rows of {n}": f["digest"] for n, f in files.items()}}
-
-
-def _presets(presets: str | Sequence[str] | None) -> tuple[str, ...]:
-    """One or several, without repeats; none for the default."""
-    unique = tuple(dict.fromkeys([presets] if isinstance(presets, str) else presets or ()))
-    for name in unique:
-        require_choice("presets", name, PRESETS)
-    return unique
-
-
-def _sigmas(sigma: float | str | Sequence[float | str] | None) -> tuple[float | str, ...]:
-    if sigma is None:
-        return ()
-    values = [sigma] if isinstance(sigma, int | float | str) else list(sigma)
-    for value in values or ["nothing"]:
-        word = isinstance(value, str)  # the square of a number must be finite
-        if not (value in ("median", "multi") if word else 1e-100 < value < 1e100):
-            must = "must be numbers from 1e-100 to 1e100, 'median' or 'multi'"
-            raise PalpateError(must, repr(value), "", argument="sigma", example={"sigma": 10})
-    return tuple(dict.fromkeys(values))
 
 
 def _companions(

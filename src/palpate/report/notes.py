@@ -452,20 +452,11 @@ EVALUATION: dict[str, Sentence] = {
     "probe-no-label": "The samples have no {label} in {part}: nothing was predicted from it",
     "probe-no-image": "{count} samples without a {modality} image are excluded",
     "probe-unlabeled": "{count} test samples without a {label} are excluded from its accuracy",
-    "probe-unseen-classes": lambda p, _: (
-        f"{p['subject']}: test samples whose {p['label']} train lacks count as wrong "
-        f"({few(p['classes'])})"
-    ),
     "probe-one-class": "All train samples have the {label} {only!r}: there is nothing to classify",
     "probe-no-encoder": "These encoders include none of {modality}: no retrieval with it",
     "probe-no-partner": "The test samples have no {modality}: no retrieval with it",
     "probe-some-partners": (
         "{count} test samples without {modality} are excluded from retrieval with it"
-    ),
-    "probe-text-threshold": (
-        "Similar texts: a key is right as well if its text has a cosine above {threshold:g} to the "
-        "query's. TVL derived 0.6356 for OpenCLIP ViT-L/14; the cosines of another text encoder "
-        "mean something else. The details say how many keys were right"
     ),
     "no-material": "{count} samples without a material are excluded",
     "below-floor": (
