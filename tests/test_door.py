@@ -33,8 +33,8 @@ SIGNATURES = {
         "allow_seen cache progress"
     ),
     "score": (
-        "generated reference * encoder split names labels groups group background train presets "
-        "sigma estimator backend normalize companions controls inception clip lpips "
+        "generated reference * encoder split names labels group background train presets "
+        "sigma normalize companions controls inception clip lpips "
         "permutations seed allow_seen cache progress"
     ),
     "split": ("data * by train val seed folds near noleak cache reading skip_bad progress"),
