@@ -41,7 +41,6 @@ def test_numbers_have_a_range(name):
         ({"materials": ("Wod",)}, "must be names of materials. Got Wod. Known: Concrete"),
         ({"materials": ("Wood", "Wood")}, "must be different names"),
         ({"layout": "videos", "size": 33}, "must be even"),
-        ({"layout": "videos", "free_written": "background"}, "`free_written` must be 'all'"),
         ({"size": 64.4}, "whole number"),
     ],
 )
@@ -109,6 +108,7 @@ def test_frames_are_numbered_as_in_a_recording():
     sparse = dataclasses.replace(options, free_written="background")
     assert written_frames(sparse) == [2, 6, 7, 8, 11, 15, 16, 17]
     assert first_contact(sparse, 0) - 4 == 2
+    assert written_frames(dataclasses.replace(sparse, layout="videos")) == list(range(18))
 
 
 def test_worlds_of_different_seeds_share_nothing():

@@ -10,13 +10,12 @@ import tyro
 
 from palpate.cli.terminal import Common, OutPath, Terminal
 from palpate.sim import DEFAULT, PRESETS, SEEN_WARNING, WorldOptions, seen_by_mini, write_world
-from palpate.sim.options import option_groups
 
 
-def _group(name: str) -> Any:
-    """Return the class of a group of options, each None unless given."""
+def _fields() -> list[tuple[str, Any, Any]]:
+    """Return the options of a world, each None unless given."""
     fields: list[tuple[str, Any, Any]] = []
-    for option in option_groups()[name]:
+    for option in dataclasses.fields(WorldOptions):
         limits = option.metadata
         text = f"{limits['help'][0].upper()}{limits['help'][1:]}."
         if "choices" in limits:
@@ -30,12 +29,10 @@ def _group(name: str) -> Any:
         default = f"(default: the preset's; {DEFAULT}: {value})"
         argument = tyro.conf.arg(help=text, metavar=metavar, help_behavior_hint=default)
         fields.append((option.name, Annotated[of | None, argument], field(default=None)))
-    return make_dataclass(name.title(), fields, frozen=True, kw_only=True)
+    return fields
 
 
-_World = _group("world")
-_Amounts = _group("amounts")
-_Images = _group("images")
+_World = make_dataclass("World", _fields(), frozen=True, kw_only=True)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -54,10 +51,6 @@ class Options(Common):
     """Processes; the files do not depend on it."""
     world: _World = field(default_factory=_World)  # pyright: ignore[reportInvalidTypeForm]
     """What is simulated, and the train and test lists."""
-    amounts: _Amounts = field(default_factory=_Amounts)  # pyright: ignore[reportInvalidTypeForm]
-    """How many objects, videos, contacts and frames there are."""
-    images: _Images = field(default_factory=_Images)  # pyright: ignore[reportInvalidTypeForm]
-    """What the gels and the photos look like."""
 
 
 def run(options: Options, terminal: Terminal) -> dict[str, Any]:
@@ -80,10 +73,7 @@ def world_options(options: Options) -> WorldOptions:
     Raises:
         PalpateError: if an option is out of range.
     """
-    groups = (options.world, options.amounts, options.images)
-    given = {k: v for group in groups for k, v in vars(group).items() if v is not None}
+    given = {k: v for k, v in vars(options.world).items() if v is not None}
     if (names := given.get("materials")) and len(names) == 1 and names[0].lstrip("-").isdecimal():
         given["materials"] = int(names[0])
-    if given.get("layout") == "videos":  # a video holds every frame
-        given.setdefault("free_written", "all")
     return dataclasses.replace(PRESETS[options.preset], **given)

@@ -78,16 +78,15 @@ def leaks(parts: Parts) -> list[Leak]:
 
 def leak_counts(parts: Parts) -> dict[str, int | float | None]:
     """Count the test frames that share a video, contact or object with train, and the gaps."""
-    rows, test = leaks(parts), len(parts["test"])
+    rows = leaks(parts)
     gaps = [leak.gap for leak in rows if leak.gap is not None]
     in_contacts = [(leak.row.video.index, leak.row.contact) for leak in rows if leak.contact]
     in_objects = [leak.row.object for leak in rows if leak.object]
     return {
-        "test_frames": test,
+        "test_frames": len(parts["test"]),
         "test_frames_in_shared_videos": len(gaps),
         "test_frames_in_shared_contacts": len(in_contacts),
         "test_frames_of_shared_objects": len(in_objects),
-        "leaked_fraction": len(gaps) / test,
         "videos_shared": len({leak.row.video.index for leak in rows if leak.nearest is not None}),
         "contacts_shared": len(set(in_contacts)),
         "objects_shared": len(set(in_objects)),

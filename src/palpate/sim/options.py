@@ -15,8 +15,6 @@ from palpate.sim.materials import MATERIALS, check_material
 VERSION = 2
 #: The background of a contact is the frame this many before its first.
 BACKGROUND_OFFSET = 4
-#: The first option of each group.
-_FIRST = {"seed": "world", "objects_per_material": "amounts", "markers": "images"}
 
 
 def _number(default: float, low: float, high: float, meaning: str) -> Any:
@@ -44,7 +42,6 @@ class WorldOptions:
         PalpateError: if an option is out of range.
     """
 
-    # world
     seed: int = _number(0, 0, 2**31 - 1, "worlds of different seeds share no object, video, text")
     size: int = _number(64, 16, 256, "side of the images in pixels; even for the layout videos")
     materials: tuple[str, ...] | int = field(
@@ -62,7 +59,6 @@ class WorldOptions:
     )
     test: float = _number(0.25, 0.01, 0.99, "share of the contact frames in the test list")
     tile: int = _number(256, 64, 1024, "pixels along the 64 mm of a surface; 512 for images of 128")
-    # amounts
     objects_per_material: int = _number(5, 1, 10_000, "objects of each material that have videos")
     videos_per_object: int = _number(1, 1, 100, "videos of each object")
     two_videos: float = _share(0.0, "share of the objects with an additional video")
@@ -72,11 +68,10 @@ class WorldOptions:
         5, BACKGROUND_OFFSET + 1, 200, "frames without contact before each contact"
     )
     free_written: Literal["all", "background"] = _choice(
-        "frames without contact to write: all, or one background", "all", "background"
+        "frames without contact to write as JPEG: all, or one background", *("all", "background")
     )
     mixed: float = _share(0.12, "share of the videos with two or three objects")
     sensors: int = _number(3, 1, 100, "gel units; each video uses one of them")
-    # images
     markers: int = _number(8, 0, 40, "rows of markers a side of a gelsight pad; 0 for none")
     hard: float = _share(0.5, "how much photos vary in what cannot be felt (light, hands ...)")
 
@@ -99,8 +94,6 @@ class WorldOptions:
         _require_materials(self.materials)
         if self.layout == "videos":
             require(self.size % 2 == 0, "size", "must be even for the layout videos", self.size)
-            must = "must be 'all' for the layout videos, which hold every frame"
-            require(self.free_written == "all", "free_written", must, self.free_written)
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -120,16 +113,6 @@ class WorldOptions:
     def rng(self, purpose: str, *ids: str | int) -> np.random.Generator:
         """Return a generator that depends on VERSION, the seed, the purpose and the ids alone."""
         return rng_for(self.seed, "world", VERSION, purpose, *ids)
-
-
-def option_groups() -> dict[str, list[dataclasses.Field[Any]]]:
-    """Return the options of each group: world, amounts, images."""
-    groups: dict[str, list[dataclasses.Field[Any]]] = {}
-    for option in dataclasses.fields(WorldOptions):
-        if option.name in _FIRST:
-            groups[_FIRST[option.name]] = []
-        list(groups.values())[-1].append(option)
-    return groups
 
 
 def _require_materials(names: Any) -> None:

@@ -82,7 +82,7 @@ def contact_rows(options: WorldOptions, plans: list[VideoPlan]) -> Iterator[Row]
 
 def written_frames(options: WorldOptions) -> list[int]:
     """Return the frame numbers that are written, the same in every video."""
-    if options.free_written == "all":
+    if options.free_written == "all" or options.layout == "videos":
         return list(range(options.video_length))
     contacts = [contact_frames(options, k) for k in range(options.contacts_per_video)]
     return [frame for c in contacts for frame in (c.start - BACKGROUND_OFFSET, *c)]
