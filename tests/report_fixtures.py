@@ -438,7 +438,7 @@ def study_results(folder, n=12, side=64):
     text = "Encoder and generator are trained once per split; both encoders judge both generators."
     compute = [[name, "random weights", f"{k + 2} min"] for k, name in enumerate(methods)]
     tables = [
-        StudyTable("Table 4: generators", text, columns, rows, True, controls, False),
+        StudyTable("Table 4: generators", text, columns, rows, True, controls),
         StudyTable("Compute", "On two cores.", ["method", "starts from", "time"], compute),
     ]
 

@@ -21,8 +21,6 @@ CUT = """[...document.querySelectorAll('#claims, #study')]
     .filter(e => e.checkVisibility() && !e.closest('.hidden')
         && e.getBoundingClientRect().right > (e.closest('.wide') ? 1e9 : innerWidth))
     .map(e => e.textContent.slice(0, 80))"""
-SHOWN = """[...document.querySelectorAll('h3')]
-    .filter(e => e.checkVisibility()).map(e => e.textContent)"""
 HEADS = "getComputedStyle(document.querySelector('.claims thead')).position"
 
 
@@ -30,9 +28,7 @@ def long_study(folder):
     """A study whose every name is too long, with 20 rows."""
     results = study_results(folder, 12)
     rows = [[f"{LONG} {k}", score(value=k / 7), LONG, score(value=None)] for k in range(20)]
-    table = StudyTable(
-        LONG, f"On {LONG}.", ["method", LONG, "words", "none"], rows, True, [], False
-    )
+    table = StudyTable(LONG, f"On {LONG}.", ["method", LONG, "words", "none"], rows, True, [])
     claims = [Claim(f"{LONG} {k}", LONG, "undecided", LONG, [score()]) for k in range(12)]
     return dataclasses.replace(
         results, tables=[*results.tables, table], claims=[*results.claims, *claims]
@@ -73,5 +69,4 @@ def test_a_study_keeps_the_limits_of_a_page_and_prints_its_tables(chromium, page
     assert facts["print pages"] <= 8
     with opened(chromium, pages["study"], 800, "dark") as page:
         page.emulate_media(media="print")
-        assert "Table 4: generators" in page.evaluate(SHOWN)
         screenshot(page, "study-print")

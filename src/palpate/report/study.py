@@ -27,7 +27,6 @@ class StudyTable:
         best: mark the best score of each column, by its direction, among the rows that are no
             controls.
         controls: labels (first cells) of the rows that are controls.
-        folded: whether a page shows it closed.
     """
 
     title: str
@@ -36,7 +35,6 @@ class StudyTable:
     rows: Sequence[Sequence[Score | str | None]]
     best: bool = False
     controls: Sequence[str] = ()
-    folded: bool = True
 
 
 @dataclass(frozen=True)

@@ -8,7 +8,6 @@ that are no controls; a dagger marks the one that paired differences decide for.
 from __future__ import annotations
 
 import re
-from collections import Counter
 from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass, replace
 from itertools import count
@@ -90,8 +89,8 @@ class Sheet:
     """A table as it is written.
 
     Attributes:
-        title, text, folded: of the table.
-        heads: one a column; labels differ.
+        title, text: of the table.
+        heads: one a column.
         rows: as many entries each as there are heads.
         notes: the footnotes.
         made: (what, how) the scores were made.
@@ -100,7 +99,6 @@ class Sheet:
 
     title: str
     text: str
-    folded: bool
     heads: Sequence[Head]
     rows: Sequence[Row]
     notes: Sequence[Note]
@@ -162,10 +160,10 @@ def sheet(table: StudyTable) -> Sheet:
         laid.append(Row(cells, control, r > 0 and control != controls[r - 1]))
     heads = [
         _head(label, column, table.best or bool(table.controls))
-        for label, column in zip(_different(table.columns), columns, strict=True)
+        for label, column in zip(table.columns, columns, strict=True)
     ]
     made = _made([value for row in rows for value in row if isinstance(value, Score)])
-    return Sheet(table.title, table.text, table.folded, heads, laid, footnotes.notes, made)
+    return Sheet(table.title, table.text, heads, laid, footnotes.notes, made)
 
 
 def lay(columns: Sequence[Column], controls: Collection[str] = ()) -> Sheet:
@@ -209,7 +207,7 @@ def lay(columns: Sequence[Column], controls: Collection[str] = ()) -> Sheet:
         ]
         rule = bool(rows) and rows[-1].control
         rows.append(Row([Entry("real images (floor)"), *cells], REAL in controls, rule))
-    return Sheet("The verdict", "", False, heads, rows, footnotes.notes)
+    return Sheet("The verdict", "", heads, rows, footnotes.notes)
 
 
 def _entry(cell: Cell | None, column: Column, footnotes: Footnotes, best: bool) -> Entry:
@@ -270,7 +268,7 @@ def difference_sheet(table: Table) -> Sheet:
         rows.append(Row([*names, score, *map(Entry, words)], False, False))
     text = "a - b; where the interval excludes 0 the difference is more than chance."
     title = f"Paired differences: {table.title}"
-    return Sheet(title, text, False, heads, rows, footnotes.notes)
+    return Sheet(title, text, heads, rows, footnotes.notes)
 
 
 def tally(claims: Sequence[Claim]) -> str:
@@ -311,16 +309,6 @@ def file_names(kind: str, titles: Sequence[str]) -> list[str]:
         same = (f"{name}-{k}" for k in count(2))
         names.append(name if name not in names else next(n for n in same if n not in names))
     return names
-
-
-def _different(labels: Sequence[str]) -> list[str]:
-    """Labels of which none is another's; a repeated one is numbered."""
-    seen: Counter[str] = Counter()
-    result: list[str] = []
-    for label in labels:
-        seen[label] += 1
-        result.append(label if seen[label] == 1 else f"{label} ({seen[label]})")
-    return result
 
 
 def _digits(column: Sequence[Score | str | None]) -> list[int]:
