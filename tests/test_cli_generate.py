@@ -87,7 +87,6 @@ def test_mistakes_are_one_line_and_write_nothing(place, capsys):
     (place / "full").mkdir()
     (place / "full" / "mine.png").write_bytes((place / "photos" / "b.png").read_bytes())
     (place / "folder.png").mkdir()
-    model = str(place.parent / "root" / "mini" / "generator")
     before = {p: p.read_bytes() for p in place.rglob("*") if p.is_file()}
     for args, words in (
         (["gone.jpg", "-o", "t.png"], "gone.jpg: no such file"),
@@ -95,7 +94,6 @@ def test_mistakes_are_one_line_and_write_nothing(place, capsys):
         (["cut.jpg", "-o", "t.png"], "cut.jpg"),
         (["huge.png", "-o", "t.png"], "huge.png: more than 50,000,000 pixels"),
         (["photo.jpg", "photos/../photo.jpg", "-o", "t"], "PATH must differ in name"),
-        ([model, "-o", "t"], "a saved model"),
         (["photo.jpg", "-o", "t.jpg"], "--output must be a .png or a folder"),
         (["photo.jpg", "photos/a.jpg", "-o", "t.png"], "2 photos"),
         (["photo.jpg", "-o", "folder.png"], "the folder folder.png"),

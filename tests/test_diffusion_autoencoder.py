@@ -9,7 +9,7 @@ import torch
 from diffusers import VQModel
 
 from palpate.core import PalpateError
-from palpate.diffusion.autoencoder import Autoencoder, LatentStats, to_bytes
+from palpate.diffusion.autoencoder import Autoencoder, LatentStats, load_autoencoder, to_bytes
 from palpate.diffusion.autoencoder_training import (
     build_autoencoder,
     k_means,
@@ -84,7 +84,6 @@ def test_encode_is_before_quantization_and_decode_quantizes():
     codes = model.net.quantize.embedding.weight.detach()
     flat = z.permute(0, 2, 3, 1).reshape(-1, 3)
     nearest = ((flat[:, None] - codes[None]) ** 2).sum(-1).argmin(1)
-    assert torch.equal(model.codes(z).flatten(), nearest)
     snapped = codes[nearest].reshape(3, 4, 4, 3).permute(0, 3, 1, 2)
     # z + (q - z) of the straight-through form is q up to rounding.
     assert np.abs(model.decode(z).astype(int) - model.decode(snapped)).max() <= 1
@@ -109,7 +108,7 @@ def test_odd_sizes_are_rejected():
 def test_saved_model_is_the_same_and_tampering_is_noticed(tmp_path):
     model = random_model()
     model.save(tmp_path / "ae")
-    again = Autoencoder.load(tmp_path / "ae")
+    again = load_autoencoder(tmp_path / "ae")
     assert again.digest == model.digest
     assert again.patch == 4
     images = make_images(2)
@@ -119,7 +118,7 @@ def test_saved_model_is_the_same_and_tampering_is_noticed(tmp_path):
     card["digest"] = "0" * 64
     (tmp_path / "ae" / "palpate.json").write_text(json.dumps(card))
     with pytest.raises(PalpateError, match="must match"):
-        Autoencoder.load(tmp_path / "ae")
+        load_autoencoder(tmp_path / "ae")
 
 
 def test_a_plain_vqmodel_folder_loads_with_patch_1(tmp_path):
@@ -136,7 +135,7 @@ def test_a_plain_vqmodel_folder_loads_with_patch_1(tmp_path):
         **blocks,
     )
     vq.save_pretrained(tmp_path / "vq")
-    model = Autoencoder.load(tmp_path / "vq")
+    model = load_autoencoder(tmp_path / "vq")
     assert (model.patch, model.factor, model.channels) == (1, 4, 3)
     images = make_images(2)
     with torch.no_grad():
@@ -149,11 +148,11 @@ def test_an_old_bin_loads_as_weights_only(tmp_path):
     model.save(tmp_path / "vq")
     (tmp_path / "vq" / "diffusion_pytorch_model.safetensors").unlink()
     torch.save(model.net.state_dict(), tmp_path / "vq" / "diffusion_pytorch_model.bin")
-    assert Autoencoder.load(tmp_path / "vq").digest == model.digest
+    assert load_autoencoder(tmp_path / "vq").digest == model.digest
     marker = tmp_path / "ran"
     torch.save({"x": Evil(str(marker))}, tmp_path / "vq" / "diffusion_pytorch_model.bin")
     with pytest.raises(PalpateError, match="diffusers VQModel"):
-        Autoencoder.load(tmp_path / "vq")
+        load_autoencoder(tmp_path / "vq")
     assert not marker.exists()
 
 
@@ -177,7 +176,7 @@ def test_other_options_in_the_same_folder_train_anew(tmp_path):
 
 def test_folders_that_are_none_are_rejected(tmp_path):
     with pytest.raises(PalpateError, match="diffusers VQModel"):
-        Autoencoder.load(tmp_path)
+        load_autoencoder(tmp_path)
 
 
 def test_k_means_finds_separate_heaps_and_leaves_no_center_unused():
@@ -194,11 +193,11 @@ def test_k_means_finds_separate_heaps_and_leaves_no_center_unused():
 
 def test_training_learns_and_uses_its_codes(tmp_path):
     train, test = make_images(64), make_images(16, seed=1)
-    model = train_autoencoder(train, SMALL, tmp_path / "a", shown=test[:8])
+    model = train_autoencoder(train, SMALL, tmp_path / "a")
     result = measure_reconstruction(model, test)
     untrained = measure_reconstruction(random_model(), test)
     assert result.psnr > untrained.psnr + 4
-    assert result.perplexity > 8 > untrained.perplexity
+    assert len(model.net.quantize(model.encode(test))[2][2].unique()) > 8
 
 
 def test_latent_statistics_by_hand():
@@ -260,9 +259,9 @@ def test_a_card_that_cannot_be_used_is_reported(tmp_path):
     for content, word in cases:
         file.write_text(json.dumps(content))
         with pytest.raises(PalpateError, match=word):
-            Autoencoder.load(tmp_path / "ae")
+            load_autoencoder(tmp_path / "ae")
     file.write_text(json.dumps(about))
     weights = next((tmp_path / "ae").glob("*.safetensors"))
     weights.write_bytes(weights.read_bytes()[:50])
     with pytest.raises(PalpateError, match="must be a diffusers VQModel"):
-        Autoencoder.load(tmp_path / "ae")
+        load_autoencoder(tmp_path / "ae")

@@ -63,16 +63,15 @@ def test_what_loses_nothing_scores_as_real_images_do(world, split):
     assert found["n"] == len(split.ids("test"))
     assert found["psnr"] > 90
     assert found["tmmd"] == pytest.approx(0, abs=1e-3)
-    assert found["accuracy_frozen"] == found["accuracy_refitted"] == found["accuracy_real"] > 0.5
+    assert found["accuracy"] == found["accuracy_real"] > 0.5
 
 
-def test_a_refitted_probe_tells_what_is_gone_from_what_looks_otherwise(world, split):
+def test_what_is_gone_or_looks_otherwise_is_seen(world, split):
     real = measured(world, split, lambda x: x)["accuracy_real"]
     other = measured(world, split, lambda x: 255 - x)  # all is there, in other colors
-    assert other["accuracy_frozen"] < real - 0.1
-    assert other["accuracy_refitted"] > other["accuracy_frozen"] + 0.1
+    assert other["accuracy"] < real - 0.1
     gone = measured(world, split, lambda x: np.full_like(x, 128))
-    assert gone["accuracy_refitted"] < 0.5
+    assert gone["accuracy"] < 0.5
     assert gone["tmmd"] > other["tmmd"] > 1
 
 
@@ -86,7 +85,7 @@ def test_what_the_data_cannot_give_is_left_out(world, split):
     parts = Split.from_ids(train=same.ids[:9], test=same.ids[9:], manifest=same.digest)
     found = measured(same, parts, lambda x: x)
     assert {"psnr", "judge"} <= set(found)
-    assert not {"accuracy_real", "accuracy_frozen", "accuracy_refitted"} & set(found)
+    assert not {"accuracy_real", "accuracy"} & set(found)
 
 
 def test_a_training_is_not_lost_for_a_file_outside_of_it(world, split, tmp_path):
@@ -107,7 +106,7 @@ def test_a_training_is_not_lost_for_a_file_outside_of_it(world, split, tmp_path)
 def test_a_background_autoencoder_is_given_gels_or_the_stock_gel(world, split):
     code, judge = load_autoencoder("palpate/mini"), EncoderSet.load("palpate/mini")
     given = measure_ceiling(code, world, split, SIZE, judge=judge)
-    assert abs(given["accuracy_frozen"] - given["accuracy_real"]) < 0.1
+    assert abs(given["accuracy"] - given["accuracy_real"]) < 0.1
     without = replace(world, table=world.table.with_columns(background=None))
     known = Split.from_ids(**{p: split.ids(p) for p in ("train", "test")}, manifest=without.digest)
     assert given["psnr"] > measure_ceiling(code, without, known, SIZE)["psnr"] > 15
@@ -134,7 +133,7 @@ def test_a_judge_without_touch_is_rejected_before_the_training(world, split):
     clip = EncoderSet(EncoderSet.load("palpate/mini").clip)
     with pytest.raises(PalpateError, match="`judge` must have a tactile encoder"):
         train_autoencoder(world, split, judge=clip)
-    with pytest.raises(PalpateError, match=r"`judge` must be encoders that judge.*or none"):
+    with pytest.raises(PalpateError, match="no folder nowhere"):
         train_autoencoder(world, split, judge="nowhere")
 
 
@@ -149,13 +148,13 @@ def test_a_judge_that_was_trained_on_the_images_does_not_judge_them(world, split
     rest = Split.from_ids(train=split.ids("train"), test=test.ids[3:], manifest=world.digest)
     alone = measure_ceiling(Through(lambda x: x), world, rest, SIZE, judge=judge)
     assert "not_judged" not in alone
-    for name in ("tmmd", "accuracy_real", "accuracy_frozen"):
+    for name in ("tmmd", "accuracy_real", "accuracy"):
         assert found[name] == pytest.approx(alone[name], abs=1e-9)
     judge.seen = digest_images(load_frames(preprocess.frames(test, "tactile").files, preprocess))
     found = measure_ceiling(Through(lambda x: x), world, split, SIZE, judge=judge)
     assert (found["not_judged"], found["judge"]) == (len(test), judge.digest("tactile"))
     assert found["psnr"] > 90
-    assert not {"tmmd", "accuracy_frozen"} & set(found)
+    assert not {"tmmd", "accuracy"} & set(found)
 
 
 def test_none_is_no_judge():
@@ -195,7 +194,7 @@ def test_trainings_print_the_ceiling_of_the_data_that_they_are_given(
     assert main(["train", "autoencoder", folder, *common, *start, "-o", str(tmp_path / "a")]) == 0
     found = json.loads(capsys.readouterr().out)
     assert found["ceiling_n"] == len(split.ids("test"))
-    assert 0 < found["ceiling_accuracy_frozen"] <= 1
+    assert 0 < found["ceiling_accuracy"] <= 1
     assert load_autoencoder(tmp_path / "a").card["ceiling"]["tmmd"] == found["ceiling_tmmd"]
     assert "| psnr |" in (tmp_path / "a" / "README.md").read_text()
     (drawn,) = (tmp_path / "a" / "samples" / "autoencoder").iterdir()  # images, reconstructions
@@ -206,4 +205,4 @@ def test_trainings_print_the_ceiling_of_the_data_that_they_are_given(
     assert main(["train", "generator", folder, *common, *given, "-o", str(tmp_path / "g")]) == 0
     again = json.loads(capsys.readouterr().out)
     assert again["ceiling_psnr"] == pytest.approx(found["ceiling_psnr"], abs=0.01)
-    assert "accuracy_refitted" in (tmp_path / "g" / "README.md").read_text()
+    assert "accuracy_real" in (tmp_path / "g" / "README.md").read_text()

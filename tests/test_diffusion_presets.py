@@ -12,7 +12,7 @@ from safetensors import safe_open
 from palpate.cli import main
 from palpate.core import PalpateError, Split
 from palpate.diffusion.autoencoder import LatentStats
-from palpate.diffusion.denoiser import Denoiser, load_unet
+from palpate.diffusion.denoiser import load_unet
 from palpate.diffusion.options import ConditionPolicy
 from palpate.diffusion.pipeline import TactilePipeline, sample
 from palpate.diffusion.presets import PAPER, SMALL
@@ -44,7 +44,6 @@ def write_unet(folder, **changes):
     unet = UNet2DConditionModel(**UNET | widths | shape | changes)
     unet.save_pretrained(folder / "unet")
     (folder / "model_index.json").write_text("{}")
-    (folder / "README.md").write_text("---\nlicense: creativeml-openrail-m\n---\n")
     return unet
 
 
@@ -102,35 +101,15 @@ def test_a_trained_unet_goes_on_from_its_folder(tag, tmp_path, capsys):
     start = write_unet(tmp_path / "ldm")
     command = ["train", "generator", "tag", "--split", "split.json", "--preset", "tiny"]
     small = ["--size", "64", "--clip", "palpate/mini", "--unet", "ldm", "--warmup", "500"]
-    assert main([*command, *small, "--dry-run", "--json", "-o", "no"]) == 0
-    plan = json.loads(capsys.readouterr().out)
-    assert plan["parameters"] == sum(p.numel() for p in start.parameters())
     assert main([*command, *small, "--steps", "1", "-o", "model", "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["steps"] == 1
     pipeline = TactilePipeline.from_pretrained(tmp_path / "model", device="cpu")
-    known = {"source": "ldm", "license": "creativeml-openrail-m"}
-    assert pipeline.training["unet"] == known
+    assert pipeline.training["unet"] == {"source": "ldm"}
     # It has gone on from these weights, a first step of the warm-up far.
     weights = start.requires_grad_(False).parameters()
     pairs = [*zip(weights, pipeline.unet.parameters(), strict=True)]
     assert max(float((a - b).abs().max()) for a, b in pairs) < 1e-5
     assert any(not torch.equal(a, b) for a, b in pairs)
-
-
-def test_a_trained_unet_sees_the_gel_without_effect_at_first(tmp_path):
-    write_unet(tmp_path / "ldm")
-    policy = ConditionPolicy(width=128)
-    plain, wide = (
-        Denoiser(load_unet(tmp_path / "ldm", policy, channels=3, background=n), policy).eval()
-        for n in (0, 3)
-    )
-    assert (plain.background, wide.background) == (False, True)
-    x, t = torch.randn(1, 3, 8, 8), torch.tensor([500])
-    tokens = plain.tokens(torch.randn(1, 128), "text")
-    with torch.no_grad():
-        made = [plain(x, t, tokens), wide(x, t, tokens, torch.randn(1, 3, 8, 8))]
-    assert torch.allclose(*made, atol=1e-5)
-    assert all(p.requires_grad for p in wide.unet.parameters())
 
 
 @pytest.mark.parametrize(

@@ -17,7 +17,7 @@ from safetensors.torch import load_file
 from diffusion_fixtures import arrays, make_pipeline, photos
 from mini_fixtures import make_encoders, write_shipped
 from palpate.core import PalpateError, digest_folder
-from palpate.diffusion.autoencoder import Autoencoder
+from palpate.diffusion.autoencoder import load_autoencoder
 from palpate.diffusion.pipeline import TactilePipeline
 from palpate.encoders import models as shipped
 from palpate.encoders.encoder_set import EncoderSet, load_clip
@@ -32,7 +32,7 @@ from palpate.encoders.models import (
 from palpate.training.cards import model_card, write_model_cards
 
 MINI = shipped_root() / "mini"
-LOADERS = [load_clip, EncoderSet.load, Autoencoder.load, TactilePipeline.from_pretrained]
+LOADERS = [load_clip, EncoderSet.load, load_autoencoder, TactilePipeline.from_pretrained]
 
 
 @pytest.fixture
@@ -62,7 +62,7 @@ def test_every_loader_takes_the_shipped_name_without_a_network(mini, no_network)
     clip, encoders, autoencoder = (
         load_clip("palpate/mini"),
         EncoderSet.load("palpate/mini"),
-        Autoencoder.load("palpate/mini"),
+        load_autoencoder("palpate/mini"),
     )
     pipeline = TactilePipeline.from_pretrained("palpate/mini")
     assert clip.name == encoders.clip.name == "palpate/mini"
@@ -184,7 +184,7 @@ def test_half_is_rounded_first_and_read_back_to_the_same_digest(tmp_path):
     model = make_pipeline().autoencoder
     full = model.digest
     model.save(tmp_path / "a", half=True)
-    assert Autoencoder.load(tmp_path / "a").digest == model.digest != full
+    assert load_autoencoder(tmp_path / "a").digest == model.digest != full
     stored = weights(tmp_path / "a")
     assert stored["quantize.embedding.weight"].dtype == torch.float16
     assert torch.equal(

@@ -56,20 +56,15 @@ def test_encoders_and_a_generator_from_the_command_line(data, tmp_path, capsys, 
     assert (facts["digest"], facts["steps"], facts["source"]) == (pipeline.digest, 2, "text")
     assert pipeline.encoders.digest("vision") == encoders.digest("vision")
     assert pipeline.training["ceiling"]["n"] == len(data[1].ids("test"))
-    # Of eight test samples: photo, real and generated; image and reconstruction.
-    for stage, rows in (("denoiser", 3), ("free", 2), ("quantized", 2)):
-        (drawn,) = (tmp_path / "model" / "samples" / stage).iterdir()
-        assert Image.open(drawn).size == (8 * 32, rows * 32)
+    # Of eight test samples: photo, real and generated.
+    (drawn,) = (tmp_path / "model" / "samples" / "denoiser").iterdir()
+    assert Image.open(drawn).size == (8 * 32, 3 * 32)
     photo = data[0].paths("vision")[0]
     assert main(["generate", str(photo), "--model", "model", "-o", "t.png"]) == 0
     assert not [p.name for p in tmp_path.iterdir() if p.name.endswith(".work")]
     # From the command's own model: its encoders and autoencoder, and its record goes with it.
     capsys.readouterr()
-    started = ["train", "generator", *common, "--start", "model", "--dry-run", "-o", "on"]
-    assert main(started) == 0
-    assert json.loads(capsys.readouterr().out)["parameters"] == facts["parameters"]
-    assert main([*started, "--lr", "1e-4", "--batch-size", "4"]) == 0
-    capsys.readouterr()
+    started = ["train", "generator", *common, "--start", "model", "-o", "on"]
     for idle in (["--sampler-guidance", "2"], ["--unet-layers", "3"]):  # one is as in the preset
         assert main([*started, *idle]) == 2
         error = " ".join(capsys.readouterr().err.split())

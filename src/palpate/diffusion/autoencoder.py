@@ -55,9 +55,6 @@ FIX = (
     "Name a shipped model, a .ckpt of latent diffusion, a folder with config.json and plain "
     "weights, or a hub id within reach"
 )
-FILES = (".ckpt", ".safetensors")
-#: Where the autoencoder lies in the folders of whole generators.
-WITHIN = ("vqvae", "autoencoder")
 
 # diffusers announces its fallbacks (no accelerate here) at each load.
 diffusers_logging.set_verbosity(logging.ERROR)
@@ -93,11 +90,6 @@ class Autoencoder(nn.Module):
         return int(config["vq_embed_dim"] or config["latent_channels"])
 
     @property
-    def codebook(self) -> int:
-        """Entries of the codebook."""
-        return int(self.net.config["num_vq_embeddings"])
-
-    @property
     def digest(self) -> str:
         """SHA-256 of patch, architecture and weights."""
         weights = digest_tensors(self.net.state_dict())
@@ -113,11 +105,6 @@ class Autoencoder(nn.Module):
         decode: Any = self.net.decode
         made, loss = decode(latents, force_not_quantize=not quantize, return_dict=False)
         return pixel_shuffle(made, self.patch), loss
-
-    def codes(self, latents: Tensor) -> Tensor:
-        """Return the index of the nearest code at each position, int64 (n, h, w)."""
-        _, _, (_, _, index) = self.net.quantize(latents)
-        return index.reshape(latents.shape[0], *latents.shape[2:])
 
     @torch.no_grad()
     def encode(self, images: NDArray[np.uint8], batch: int = 32) -> Tensor:
@@ -170,52 +157,6 @@ class Autoencoder(nn.Module):
         about = {"format": FORMAT, "patch": self.patch, "digest": self.digest, "card": self.card}
         write_json(Path(folder) / "palpate.json", about)
         write_model_cards(Path(folder))
-
-    @classmethod
-    def load(cls, source: str | Path) -> Autoencoder:
-        """Load a shipped autoencoder (``palpate/mini``), a folder, a hub id, or a file.
-
-        A folder (a hub id) is that of a VQModel, or holds one as ``vqvae`` or ``autoencoder``;
-        safetensors are preferred, an old ``.bin`` is read as weights
-        only. For a file see :func:`~palpate.diffusion.compvis.read_compvis`. Weights are float32 in
-        memory.
-
-        Raises:
-            PalpateError: if there is no such model, it does not match its ``palpate.json``, or the
-                hub is out of reach.
-        """
-        if not is_shipped(source) and Path(source).is_file():
-            path = Path(source)
-            origin = {"file": path.name, "sha256": digest_file(path)}
-            return cls(read_compvis(path), card=_foreign(path.name, origin, "unknown")).eval()
-        if Path(source).suffix in FILES:  # `weights/vq-f4.ckpt` has the form of a hub id
-            raise PalpateError(f"The file {source} must exist", "no such file", "Check the path")
-        name, root = find_single(source, "autoencoder", "autoencoder", FIX, WITHIN)
-        places = ("", *WITHIN)
-        inside = next((p for p in places if (root / p / "config.json").is_file()), "")
-        folder = root / inside
-        config = folder / "config.json"
-        about = read_json(config, "configuration of a model") if config.is_file() else {}
-        kind = about.get("_class_name") if isinstance(about, dict) else None
-        must = f"The autoencoder {source} must be a diffusers VQModel"
-        if kind != "VQModel":
-            raise PalpateError(must, f"{kind or 'no'} model in {config.name}", FIX)
-        options = {"low_cpu_mem_usage": False, "local_files_only": name == str(root)}
-        net = load_model(VQModel, name, must, FIX, subfolder=inside or None, **options)
-        note = folder / "palpate.json"
-        if not note.is_file():
-            called = str(source) if is_hub_id(source) else root.resolve().name
-            return cls(net, card=_foreign(called, called, stated(root)["license"])).eval()
-        keys = ("patch", "digest", "card")
-        about = read_record(note, "autoencoder card", form=FORMAT, keys=keys)
-        if not isinstance(about["patch"], int) or about["patch"] < 1:
-            must, fix = f"patch in {note} must be a whole number from 1", "Copy the folder again"
-            raise PalpateError(must, repr(about["patch"]), fix)
-        model = cls(net, about["patch"], about["card"]).eval()
-        if model.digest != about["digest"]:
-            must, fix = f"The weights in {source} must match palpate.json", "Copy the folder again"
-            raise PalpateError(must, "other weights", fix)
-        return model
 
 
 def _foreign(name: str, source: Any, terms: str) -> dict[str, Any]:
@@ -397,29 +338,49 @@ def _gray(images: NDArray[np.uint8], device: torch.device) -> Tensor:
 
 
 AnyAutoencoder = Autoencoder | BackgroundAutoencoder
+KINDS: dict[str, Any] = {"VQModel": VQModel, "BackgroundAutoencoder": BackgroundAutoencoder}
 
 
 def load_autoencoder(source: str | Path) -> AnyAutoencoder:
-    """Load an autoencoder of any kind: a shipped name, a folder, a file or a hub id.
+    """Load a shipped autoencoder (``palpate/mini``), a folder, a hub id, or a file.
+
+    A folder (a hub id) is that of a model of palpate or of a VQModel of diffusers; safetensors are
+    preferred, an old ``.bin`` is read as weights only. For a file see
+    :func:`~palpate.diffusion.compvis.read_compvis`. Weights are float32 in memory.
 
     Raises:
-        PalpateError: if it is none, or does not match its ``palpate.json``.
+        PalpateError: if there is no such model, it does not match its ``palpate.json``, or the hub
+            is out of reach.
     """
-    if Path(source).is_file():
-        return Autoencoder.load(source)
-    name, folder = find_single(source, "autoencoder", "autoencoder", FIX)
-    config = folder / "config.json"
-    kind = read_json(config, "configuration").get("_class_name") if config.is_file() else None
-    if kind != BackgroundAutoencoder.__name__:
-        return Autoencoder.load(source)
-    must = f"The autoencoder {source} must be as palpate writes it"
-    options = {"low_cpu_mem_usage": False, "local_files_only": name == str(folder)}
-    model = load_model(BackgroundAutoencoder, name, must, FIX, strict=True, **options)
-    about = read_record(folder / "palpate.json", "autoencoder card", form=FORMAT, keys=("digest",))
+    if not is_shipped(source) and Path(source).is_file():
+        path = Path(source)
+        origin = {"file": path.name, "sha256": digest_file(path)}
+        return Autoencoder(read_compvis(path), card=_foreign(path.name, origin, "unknown")).eval()
+    name, root = find_single(source, "autoencoder", "autoencoder", FIX)
+    config, note = root / "config.json", root / "palpate.json"
+    about = read_json(config, "configuration of a model") if config.is_file() else {}
+    kind = about.get("_class_name") if isinstance(about, dict) else None
+    must = f"The autoencoder {source} must be a diffusers VQModel, or of palpate"
+    if kind not in KINDS:
+        raise PalpateError(must, f"{kind or 'no'} model in {config.name}", FIX)
+    options = {"low_cpu_mem_usage": False, "local_files_only": name == str(root)}
+    net = load_model(KINDS[kind], name, must, FIX, **options)
+    if not note.is_file():
+        called = str(source) if is_hub_id(source) else root.resolve().name
+        return Autoencoder(net, card=_foreign(called, called, stated(root)["license"])).eval()
+    own = isinstance(net, BackgroundAutoencoder)
+    keys = ("digest", "card") if own else ("patch", "digest", "card")
+    about = read_record(note, "autoencoder card", form=FORMAT, keys=keys)
+    if own:
+        model, net.card = net, about["card"]
+    elif isinstance(about["patch"], int) and about["patch"] > 0:
+        model = Autoencoder(net, about["patch"], about["card"]).eval()
+    else:
+        must, fix = f"patch in {note} must be a whole number from 1", "Copy the folder again"
+        raise PalpateError(must, repr(about["patch"]), fix)
     if model.digest != about["digest"]:
         must, fix = f"The weights in {source} must match palpate.json", "Copy the folder again"
         raise PalpateError(must, "other weights", fix)
-    model.card = about.get("card", {})
     return model
 
 

@@ -8,7 +8,7 @@ farthest from
    its center) becomes the codebook, so that every code starts in use.
 3. *Quantized*: everything together with straight-through gradients (van den Oord et al. 2017).
 
-Loss: ``l1 * L1 + l2 * L2 + edge * L2 of the first differences`` (+ the codebook loss of VQModel in
+Loss: ``0.25 L1 + 10 L2 + 10 L2 of the first differences`` (+ 0.25 the codebook loss of VQModel in
 stage 3). Squares where the texture is: where a pattern is not yet known, an absolute error is least
 for none at all. Stage 1 sees random crops: the network is convolutional, and crops give it more
 steps a second. Stage 3 sees whole images, because group normalization takes its statistics over the
@@ -29,13 +29,11 @@ from numpy.typing import NDArray
 from scipy.spatial import KDTree
 from torch import Tensor, nn
 
-from palpate.core import PalpateError, Progress, Split, digest_json, quiet, rng_for
+from palpate.core import PalpateError, Progress, digest_json, quiet, rng_for
 from palpate.data.manifest import Manifest
-from palpate.diffusion.autoencoder import Autoencoder, BackgroundAutoencoder, to_bytes
-from palpate.diffusion.no_contact import has_gels
+from palpate.diffusion.autoencoder import Autoencoder, BackgroundAutoencoder
 from palpate.diffusion.options import AutoencoderOptions
 from palpate.encoders.encoder_set import seeded
-from palpate.encoders.preprocess import to_unit
 from palpate.encoders.rows import evenly
 from palpate.metrics.images import per_image
 from palpate.training.engine import Batch, Losses, Task, fit
@@ -43,7 +41,8 @@ from palpate.training.options import Compute, LoopOptions
 from palpate.training.processes import gather_rows
 from palpate.training.steps import Step
 
-SHOWN = 8  # held-out samples that are drawn while a model trains
+#: Of the latents in stage 1, as a share of their spread.
+NOISE = 0.02
 
 
 def build_autoencoder(options: AutoencoderOptions) -> Autoencoder:
@@ -59,7 +58,7 @@ def build_autoencoder(options: AutoencoderOptions) -> Autoencoder:
         latent_channels=options.channels,
         num_vq_embeddings=options.codes,
         norm_num_groups=options.groups,
-        mid_block_add_attention=options.attention,
+        mid_block_add_attention=False,
     )
     return Autoencoder(vq, options.patch)
 
@@ -70,7 +69,6 @@ def train_autoencoder(
     folder: Path,
     *,
     start: Autoencoder | None = None,
-    shown: NDArray[np.uint8] | None = None,
     seed: int = 0,
     key: str = "",
     device: str | torch.device = "cpu",
@@ -84,7 +82,6 @@ def train_autoencoder(
         options: see :class:`AutoencoderOptions`.
         folder: for checkpoints.
         start: fine-tune a copy of this one, in its own shape: the last stage alone.
-        shown: bytes (m, h, w, 3) of other videos, drawn with each checkpoint.
         seed: of weights, order, crops and noise.
         key: digest of the images.
         device: where to train.
@@ -107,15 +104,8 @@ def train_autoencoder(
     last = replace(free, steps=options.steps_quantized, lr=options.lr / 2)
 
     def run(what: str, course: LoopOptions, stage: str, *, quantize: bool) -> None:
-        def samples(module: nn.Module) -> NDArray[np.uint8]:
-            assert isinstance(module, Autoencoder)
-            assert shown is not None
-            latents = module.latents(to_unit(shown, device, signed=True))
-            return sheet(shown, to_bytes(module.image(latents, quantize=quantize)[0]))
-
         loss = _Loss(images, options, quantize=quantize)
-        draw = None if shown is None else samples
-        task = Task(what, len(images), loss.load, loss, key, samples=draw)
+        task = Task(what, len(images), loss.load, loss, key)
         fit(model, task, course, folder / stage, compute=compute, progress=progress)
 
     if start is None:
@@ -132,21 +122,6 @@ def some_whole(part: Manifest, columns: Sequence[str], n: int) -> Manifest:
     cells = zip(part.ids, *(part.column(name) for name in columns), strict=True)
     whole = [name for name, *images in cells if all(images)]
     return part.take([whole[k] for k in evenly(len(whole), n)])
-
-
-def shown_of(manifest: Manifest, split: Split, *columns: str, gels: bool) -> Manifest:
-    """The samples that a training draws: of val, or of test where there is no val.
-
-    With ``gels`` those that have one, if any has.
-    """
-    held = manifest.part(split, "val")
-    held = held if len(held) else manifest.part(split, "test")
-    return some_whole(held, [*columns, *(["background"] * (gels and has_gels(held)))], SHOWN)
-
-
-def sheet(*rows: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """Images of one size, (n, h, w, 3) a row, as one image."""
-    return np.vstack([np.hstack(list(row)) for row in rows])
 
 
 class _Loss:
@@ -170,18 +145,17 @@ class _Loss:
 
     def __call__(self, module: nn.Module, batch: Batch) -> Losses:
         assert isinstance(module, Autoencoder)
-        options = self.options
         x = batch["images"].float() / 127.5 - 1
         z = module.latents(x)
-        if not self.quantize and options.noise:
-            z = z + options.noise * gather_rows(z.detach()).std() * batch["noise"]
+        if not self.quantize:
+            z = z + NOISE * gather_rows(z.detach()).std() * batch["noise"]
         y, codebook = module.image(z, quantize=self.quantize)
         error = y.float() - x
         edges = torch.diff(error, dim=3).square().mean() + torch.diff(error, dim=2).square().mean()
         square = error.square().mean()
-        loss = options.l1 * error.abs().mean() + options.l2 * square + options.edge * edges
+        loss = 0.25 * error.abs().mean() + 10 * square + 10 * edges
         if self.quantize:
-            loss = loss + options.codebook * codebook
+            loss = loss + 0.25 * codebook
         errors = error.detach().square().mean((1, 2, 3))
         return Losses(loss, {"psnr": (10 * torch.log10(4 / errors)).mean()}, errors)
 
@@ -246,13 +220,11 @@ class Reconstruction:
         psnr: mean over images of 10 log10(1 / MSE), values in [0, 1].
         ssim: mean structural similarity (Wang et al. 2004: Gaussian window of 11, sigma 1.5, range
             1).
-        perplexity: exp of the entropy of the codes used, at most their number; None without codes.
     """
 
     n: int
     psnr: float
     ssim: float
-    perplexity: float | None = None
 
 
 @torch.no_grad()
@@ -266,8 +238,6 @@ def measure_reconstruction(
 
     ``background`` holds the gel of each image, for an autoencoder that is given them.
     """
-    vq = autoencoder if isinstance(autoencoder, Autoencoder) else None
-    counts = np.zeros(vq.codebook if vq else 0, dtype=np.int64)
     rows: list[NDArray[np.float64]] = []
     for start in range(0, len(images), batch):
         part = slice(start, start + batch)
@@ -277,13 +247,6 @@ def measure_reconstruction(
         # Rounded to bytes first: what is scored is the image that a user gets.
         made = autoencoder.decode(z, *gels, batch=batch)
         scored = [per_image("PSNR", made, pixels), per_image("SSIM", made, pixels)]
-        if vq is not None:
-            index = vq.codes(z.to(next(vq.parameters()).device)).flatten()
-            counts += np.bincount(index.cpu().numpy(), minlength=len(counts))
         rows.append(np.stack([score.values for score in scored]))
     psnr, ssim = map(float, np.concatenate(rows, axis=1).mean(axis=1))
-    if vq is None:
-        return Reconstruction(len(images), psnr, ssim)
-    share = counts[counts > 0] / counts.sum()
-    perplexity = float(np.exp(-(share * np.log(share)).sum()))
-    return Reconstruction(len(images), psnr, ssim, perplexity)
+    return Reconstruction(len(images), psnr, ssim)

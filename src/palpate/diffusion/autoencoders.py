@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +15,6 @@ from palpate.diffusion.autoencoder import (
     BackgroundAutoencoder,
     load_autoencoder,
 )
-from palpate.diffusion.autoencoder_training import shown_of
 from palpate.diffusion.autoencoder_training import train_autoencoder as train_vq
 from palpate.diffusion.background_training import train_background_autoencoder
 from palpate.diffusion.ceiling import judge_of, measure_ceiling
@@ -122,26 +120,15 @@ def autoencoder_of(  # noqa: PLR0913 - one row per choice of the training
         images = cached_images(train, "tactile", size, cache, progress)
     how: dict[str, Any] = {"seed": seed, "device": pick_device(device)}
     how |= {"compute": compute, "progress": progress}
-    key = image_stamp(train, "tactile")
+    kind = Autoencoder if isinstance(options, AutoencoderOptions) else BackgroundAutoencoder
+    if start is not None and not isinstance(start, kind):
+        raise PalpateError("must be of the preset's kind", "another kind", "", argument="start")
+    begin: Any = start
     if isinstance(options, AutoencoderOptions):
-        if isinstance(start, BackgroundAutoencoder):
-            raise _other_kind("a VQ autoencoder")
-        shown = shown_of(manifest, split, "tactile", gels=False)
-        with first_alone(), suppress(PalpateError):  # a file: no reason to lose the training
-            how["shown"] = cached_images(shown, "tactile", size, cache) if len(shown) else None
-        return train_vq(images, options, folder, start=start, key=key, **how)
-    if isinstance(start, Autoencoder):
-        raise _other_kind("one that is given the gel")
+        key = image_stamp(train, "tactile")
+        return train_vq(images, options, folder, start=begin, key=key, **how)
     with first_alone():
         gels = gels_of(train, size, cache, progress)
     columns = ("tactile", "background") if has_gels(train) else ("tactile",)
     how["key"] = digest_json([image_stamp(train, c) for c in columns])
-    shown = shown_of(manifest, split, "tactile", gels=True)
-    with first_alone(), suppress(PalpateError):
-        drawn = cached_images(shown, "tactile", size, cache)
-        how["shown"] = (drawn, gels_of(shown, size, cache, like=gels)) if len(shown) else None
-    return train_background_autoencoder(images, gels, options, folder, start=start, **how)
-
-
-def _other_kind(kind: str) -> PalpateError:
-    return PalpateError(f"must be {kind}, as the preset's", "another kind", "", argument="start")
+    return train_background_autoencoder(images, gels, options, folder, start=begin, **how)

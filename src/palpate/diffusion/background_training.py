@@ -14,22 +14,27 @@ from torch.nn.functional import avg_pool2d, interpolate
 
 from palpate.core import PalpateError, Progress, digest_json, quiet
 from palpate.diffusion.autoencoder import BackgroundAutoencoder
-from palpate.diffusion.autoencoder_training import sheet
 from palpate.diffusion.options import BackgroundOptions
 from palpate.encoders.encoder_set import seeded
 from palpate.training.engine import Batch, Losses, Task, fit
 from palpate.training.options import Compute, LoopOptions
 from palpate.training.steps import Step
 
+#: Largest random change of each color's gain, so that other gels are no surprise.
+COLORS = 0.2
+#: The noise on the latents is a random share of their spread up to this.
+NOISE = 0.5
+#: Weight of what a 2 x 2 average of the latents loses.
+SMOOTH = 0.1
 
-def train_background_autoencoder(  # noqa: PLR0913 - one row per choice of the training
+
+def train_background_autoencoder(
     images: NDArray[np.uint8],
     background: NDArray[np.uint8],
     options: BackgroundOptions,
     folder: Path,
     *,
     start: BackgroundAutoencoder | None = None,
-    shown: tuple[NDArray[np.uint8], NDArray[np.uint8]] | None = None,
     seed: int = 0,
     key: str = "",
     device: str | torch.device = "cpu",
@@ -44,8 +49,6 @@ def train_background_autoencoder(  # noqa: PLR0913 - one row per choice of the t
         options: see :class:`BackgroundOptions`.
         folder: for checkpoints.
         start: go on from a copy of this one, in its own shape, instead of random weights.
-        shown: images of other videos and their gels, bytes (m, h, w, 3) both, drawn with each
-            checkpoint.
         seed: of weights, order, crops, colors and noise.
         key: digest of both.
         device: where to train.
@@ -81,14 +84,7 @@ def train_background_autoencoder(  # noqa: PLR0913 - one row per choice of the t
     loss = _Loss(images, background, options)
     key = digest_json([key, asdict(options), begin])
 
-    def samples(module: nn.Module) -> NDArray[np.uint8]:
-        assert isinstance(module, BackgroundAutoencoder)
-        assert shown is not None
-        drawn, gels = shown
-        return sheet(drawn, module.decode(module.encode(drawn, gels), gels))
-
-    draw = None if shown is None else samples
-    task = Task("autoencoder", len(images), loss.load, loss, key, samples=draw)
+    task = Task("autoencoder", len(images), loss.load, loss, key)
     nn.Module.to(model, device)
     fit(model, task, loop, folder, compute=compute, progress=progress)
     model.card = {"options": asdict(options), "seed": seed, "images": len(images), "start": begin}
@@ -109,8 +105,8 @@ class _Loss:
         height, width = self.images.shape[1:3]
         top, left = (4 * step.randint((n - side) // 4 + 1) for n in (height, width))
         flip = step.rand(2) < 0.5
-        gain = 1 + self.options.colors * (2 * step.rand(3, 1, 1) - 1)
-        shift = 64 * self.options.colors * (2 * step.rand(3, 1, 1) - 1)
+        gain = 1 + COLORS * (2 * step.rand(3, 1, 1) - 1)
+        shift = 64 * COLORS * (2 * step.rand(3, 1, 1) - 1)
         pairs = zip(step.rows, top.tolist(), left.tolist(), flip.tolist(), strict=True)
         crops: list[Tensor] = []
         for row, t, c, (down, across) in pairs:
@@ -120,7 +116,7 @@ class _Loss:
             crops.append(torch.from_numpy(both.copy()))
         both = torch.stack(crops).permute(1, 0, 4, 2, 3)
         x, b = (gain * (gray - 128.0) + 128.0 + shift for gray in both)
-        share = self.options.noise * step.rand(1, 1, 1)
+        share = NOISE * step.rand(1, 1, 1)
         noise = share * step.randn(self.options.channels, side // 4, side // 4)
         return {"images": x, "background": b, "noise": noise}
 
@@ -137,7 +133,7 @@ class _Loss:
         image = image + fine.abs().mean() + 6 * fine.square().mean()
         scale = (std - 1).square().mean() + z.mean((0, 2, 3)).square().mean()
         smooth = (_fine(z) / std).square().mean()
-        total = image + 0.01 * scale + self.options.smooth * smooth
+        total = image + 0.01 * scale + SMOOTH * smooth
         return Losses(total, {"error": rows.detach().mean()}, rows.detach())
 
 

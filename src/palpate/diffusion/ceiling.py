@@ -2,9 +2,7 @@
 
 PSNR and SSIM see pixels, most of them the gel's. Two judges see touch, both in the features of one
 tactile encoder: TMMD between reconstructions and the real images, and a linear probe of the
-material. The *frozen* probe is fitted to real images of train, as the judge of generated images is;
-the *refitted* one to reconstructions of train, and tells whether what the frozen one misses is gone
-or only looks otherwise.
+material, which is fitted to real images of train, as the judge of generated images is.
 """
 
 from __future__ import annotations
@@ -44,13 +42,9 @@ def judge_of(judge: EncoderSet | str | Path | None, device: str = "cpu") -> Enco
     """
     if judge is None or judge == "none":
         return None
-    fix = "Choose others, palpate/mini, or none"
-    try:
-        judge = judge if isinstance(judge, EncoderSet) else EncoderSet.load(judge)
-    except PalpateError as error:
-        must = "must be encoders that judge"
-        raise PalpateError(must, str(error), fix, argument="judge") from None
+    judge = judge if isinstance(judge, EncoderSet) else EncoderSet.load(judge)
     if "tactile" not in judge.modalities:
+        fix = "Choose others, palpate/mini, or none"
         raise PalpateError("must have a tactile encoder", "none", fix, argument="judge")
     return judge.to(pick_device(device))
 
@@ -78,16 +72,14 @@ def measure_ceiling(
         progress: called while the work goes on.
 
     Returns:
-        The fields of :class:`~palpate.diffusion.autoencoder_training.Reconstruction` that are not
-        None; with a judge its digest, ``tmmd`` with its 95 % interval, and ``accuracy_real``,
-        ``accuracy_frozen`` and ``accuracy_refitted`` of the material. What the data cannot give,
-        for want of materials or of samples, is left out. ``not_judged`` counts the images that the
-        judge was trained on, which it leaves out, and ``not_measured`` says what was wrong with
-        a file. None also on all processes but the first.
+        The fields of :class:`~palpate.diffusion.autoencoder_training.Reconstruction`; with a judge
+        its digest, ``tmmd`` with its 95 % interval, and ``accuracy_real`` and ``accuracy`` of the
+        material. What the data cannot give, for want of materials or of samples, is left out.
+        ``not_judged`` counts the images that the judge was trained on, which it leaves out, and
+        ``not_measured`` says what was wrong with a file. None also on all processes but the first.
     """
     given = isinstance(autoencoder, BackgroundAutoencoder)
-    train = manifest.part(split, "train")
-    others = manifest.part(split, "val", "test")
+    train, others = manifest.part(split, "train"), manifest.part(split, "val", "test")
     needed = ["tactile", "background"] if given and has_gels(others) else ["tactile"]
     others = some_whole(others, needed, SCORED)
     if not len(others) or place()[0]:
@@ -107,13 +99,12 @@ def _measured(  # noqa: PLR0917 - the arguments of measure_ceiling
     cache: Path | None,
     progress: Progress,
 ) -> dict[str, Any]:
-    some, gels, held = evenly(len(train), FITTED), None, None
+    held = None
     if isinstance(autoencoder, BackgroundAutoencoder):
         gels = gels_of(train, size, cache, progress)  # the stock gel is that of the training
         held = gels_of(others, size, cache, progress, like=gels)
     images = np.asarray(cached_images(others, "tactile", size, cache, progress))
-    pixels = asdict(measure_reconstruction(autoencoder, images, held))
-    found = {name: value for name, value in pixels.items() if value is not None}
+    found: dict[str, Any] = asdict(measure_reconstruction(autoencoder, images, held))
     if judge is None:
         return found
     found["judge"] = judge.digest("tactile")
@@ -131,24 +122,20 @@ def _measured(  # noqa: PLR0917 - the arguments of measure_ceiling
         rows = embed_images(pixels, judge, progress=progress)
         return FeatureSet(part.ids, rows, labels, groups, found["judge"])
 
-    def through(pixels: NDArray[np.uint8], gels: NDArray[np.uint8] | None) -> NDArray[np.uint8]:
-        given: tuple[Any, ...] = () if gels is None else (gels,)
-        return autoencoder.decode(autoencoder.encode(pixels, *given), *given)
-
-    real, ours = features(others, images), features(others, through(images, held))
+    given: tuple[Any, ...] = () if held is None else (held,)
+    made = autoencoder.decode(autoencoder.encode(images, *given), *given)
+    real, ours = features(others, images), features(others, made)
     with suppress(PalpateError):  # too few samples or videos
         score = tmmd(ours, real)
         found |= {"tmmd": score.value, "tmmd_interval": score.interval}
     if len({*train.column("material")} - {None}) > 1:
+        some = evenly(len(train), FITTED)
         known = np.asarray(cached_images(train, "tactile", size, cache, progress)[some])
-        fitted = train.take([train.ids[k] for k in some])
-        frozen = features(fitted, known)
-        refitted = features(fitted, through(known, None if gels is None else gels[some]))
         with suppress(PalpateError):  # no material outside of train
-            probe = fit_probe(frozen)
-            found["accuracy_real"] = material_accuracy(frozen, real, probe=probe).value
-            found["accuracy_frozen"] = material_accuracy(frozen, ours, probe=probe).value
-            found["accuracy_refitted"] = material_accuracy(refitted, ours).value
+            fitted = features(train.take([train.ids[k] for k in some]), known)
+            probe = fit_probe(fitted)
+            found["accuracy_real"] = material_accuracy(fitted, real, probe=probe).value
+            found["accuracy"] = material_accuracy(fitted, ours, probe=probe).value
     return {name: value for name, value in found.items() if value is not None}
 
 

@@ -119,32 +119,24 @@ def find_unet(source: str | Path) -> tuple[str, Path, str]:
 def load_unet(
     source: str | Path, policy: ConditionPolicy, *, channels: int, background: int = 0
 ) -> UNet2DConditionModel:
-    """Load a trained U-Net to go on from; channels of the no-contact image begin with no effect.
+    """Load a trained U-Net to go on from.
 
     Raises:
         PalpateError: if it is none of diffusers, or made for other latents or tokens.
     """
     name, root, inside = find_unet(source)
     must = f"{source} must hold a UNet2DConditionModel of diffusers"
-    options: dict[str, Any] = {
-        "subfolder": inside or None,
-        "local_files_only": not is_hub_id(source),
-    }
-    options |= {"low_cpu_mem_usage": False, "strict": True}
+    options: dict[str, Any] = {"strict": True, "low_cpu_mem_usage": False}
+    options["subfolder"] = inside or None
+    options["local_files_only"] = not is_hub_id(source)
     unet = load_model(UNet2DConditionModel, name, must, FIX_UNET, **options)
-    known, config = channels + background, unet.config
+    config = unet.config
     must = f"must have {config['out_channels']} latent channels, as the U-Net"
     require(channels == config["out_channels"], "autoencoder", must, channels)
     must = f"must give embeddings of width {config['cross_attention_dim']}, as the U-Net knows"
     require(policy.width == config["cross_attention_dim"], "clip", must, policy.width)
-    plain = config["class_embed_type"] is None and config["in_channels"] == channels
-    require(plain, "unet", "must see latents and tokens alone", root.name)
-    if background:
-        first, wide = unet.conv_in, nn.Conv2d(known, unet.conv_in.out_channels, 3, padding=1)
-        nn.init.zeros_(wide.weight)
-        wide.weight.data[:, :channels], wide.bias = first.weight.data, first.bias
-        unet.conv_in = wide
-        unet.register_to_config(in_channels=known)
+    known = config["class_embed_type"] is None and config["in_channels"] == channels + background
+    require(known, "unet", "must see latents and tokens alone", root.name)
     return unet.requires_grad_(True)
 
 

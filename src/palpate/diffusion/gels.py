@@ -9,12 +9,6 @@
 - *It is of another sensor.* The lights of another one come from other sides: the relative opponent
   colors of 4 x 4 cells, their mean left out, differ from those of the stock gel. GelSights of the
   world differ by up to 3, the real ones by up to 7.4 from the world's, DIGITs by more than 12.
-- *Its red and blue are exchanged*, as of an image that OpenCV read and another library wrote: it
-  is much nearer to the stock gel with them exchanged again (real gels: half as far; as they are,
-  at least 1.5 times as far).
-- *It has no lights*: one color all over, or gray. The light of a gel differs over its cells by at
-  least 4.3 (root mean square), that of the real clips by 5.6 (``benchmarks/gel_contacts.py``).
-- *Dark spots are all over it*, where markers leave most of a gel free.
 """
 
 from __future__ import annotations
@@ -34,38 +28,22 @@ from palpate.metrics.contact import marker_mask
 SMOOTH = 4.0
 #: Difference of the light, on the scale of 0 to 128, from which it is another sensor.
 OTHER_LIGHT = 10.0
-#: Differences of the light over an image, on that scale, below which it has none.
-UNLIT = 2.0
-#: Share of that difference that is left once red and blue are exchanged, below which they were.
-EXCHANGED = 0.75
 _SIZE, _CELLS, _DEGREE = 64, 4, 4
 
 
-def gel_notes(file: Path, size: int, stock: NDArray[np.uint8] | None) -> list[Note]:
+def gel_notes(file: Path, stock: NDArray[np.uint8] | None) -> list[Note]:
     """What speaks against the no-contact image of a user.
 
     Args:
         file: the image.
-        size: side of the images that are made on it, in pixels.
         stock: the no-contact image (h, w, 3) of the generator's own sensor, or None.
     """
-    image, name, notes = read_image(file), file.name, list[Note]()
-    pixels = square(image, _SIZE)
-    if (left := unevenness(pixels)) == float("inf"):
-        notes.append(Note("gel-spotted", {"gel": name}))
-    elif left > SMOOTH:
-        notes.append(Note("gel-contact", {"gel": name, "left": left}))
-    if light_spread(pixels) < UNLIT:
-        notes.append(Note("gel-unlit", {"gel": name}))
-    elif stock is not None:
-        light = light_difference(pixels, stock)
-        if light_difference(pixels[..., ::-1].copy(), stock) < EXCHANGED * light:
-            notes.append(Note("gel-exchanged", {"gel": name}))
-        elif light > OTHER_LIGHT:
-            notes.append(Note("gel-sensor", {"gel": name}))
-    if (side := min(image.size)) < size:
-        notes.append(Note("gel-small", {"gel": name, "side": side, "size": size}))
-    return notes
+    pixels = square(read_image(file), _SIZE)
+    if (left := unevenness(pixels)) > SMOOTH:
+        return [Note("gel-contact", {"gel": file.name, "left": left})]
+    if stock is not None and light_difference(pixels, stock) > OTHER_LIGHT:
+        return [Note("gel-sensor", {"gel": file.name})]
+    return []
 
 
 def unevenness(gel: NDArray[np.uint8]) -> float:
@@ -73,7 +51,7 @@ def unevenness(gel: NDArray[np.uint8]) -> float:
     image = gel / 255.0
     away = ~np.asarray(ndimage.binary_dilation(marker_mask(image)), bool)
     if away.mean() < 0.5:  # no gel is mostly markers
-        return float("inf")
+        away[:] = True
     y, x = np.mgrid[-1 : 1 : image.shape[0] * 1j, -1 : 1 : image.shape[1] * 1j]
     powers = [(i, j) for i in range(_DEGREE + 1) for j in range(_DEGREE + 1 - i)]
     smooth = np.stack([x[away] ** i * y[away] ** j for i, j in powers], axis=1)
@@ -85,11 +63,6 @@ def unevenness(gel: NDArray[np.uint8]) -> float:
 def light_difference(gel: NDArray[np.uint8], other: NDArray[np.uint8]) -> float:
     """How differently two gels are lit: 0 for the same lights, of whatever brightness."""
     return float(np.sqrt(((_light(gel) - _light(other)) ** 2).mean()))
-
-
-def light_spread(gel: NDArray[np.uint8]) -> float:
-    """How much the light differs over a gel (h, w, 3), 0 to 128: 0 for one color."""
-    return float(np.sqrt((_light(gel) ** 2).mean()))
 
 
 def _light(gel: NDArray[np.uint8]) -> NDArray[np.float64]:

@@ -17,7 +17,6 @@ from __future__ import annotations
 import hashlib
 import os
 import re
-import tempfile
 from collections import deque
 from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -52,7 +51,7 @@ from palpate.core import (
 )
 from palpate.core.digest import canonical_json
 from palpate.core.records import from_plain
-from palpate.data.images import BROKEN, SUFFIXES, VIDEOS, check_image, read_image, square
+from palpate.data.images import BROKEN, SUFFIXES, check_image, read_image, square
 from palpate.encoders.models import FIX_MODEL, find_model
 
 if TYPE_CHECKING:  # torch takes seconds to import, and what is checked first needs none of it
@@ -182,7 +181,6 @@ def generate(  # noqa: PLR0913 - a public verb, step by step
     split: Split | str | Path | None = None,
     part: str = "test",
     seed: int = 0,
-    noise: str | None = None,
     guidance: float | None = None,
     steps: int | None = None,
     batch: int | None = None,
@@ -193,12 +191,10 @@ def generate(  # noqa: PLR0913 - a public verb, step by step
     """Make a tactile image for each photo; running it again continues a half-done folder.
 
     Args:
-        photos: a photo, a folder of them, a list, id -> file, PIL images, a uint8 array
-            (n, h, w, 3), a tensor (n, 3, h, w), or a manifest (or its file, folder or frame), whose
-            columns ``vision`` and, for a pipeline w/ BG, ``background`` are used.
+        photos: a photo, a folder of them, a list, id -> file, or a manifest (or its file, folder or
+            frame), whose columns ``vision`` and, for a pipeline w/ BG, ``background`` are used.
             The ids, which with ``seed`` decide the noise, are paths below a folder, file names, or
-            those of the manifest. A video gives an image a frame, all of one noise, and in a folder
-            as output also ``tactile.mp4``. None: one image of ``text`` alone, whose id is the text.
+            those of the manifest. None: one image of ``text`` alone, whose id is the text.
         text: what is felt, e.g. ``"rough, porous stone"``; next to photos, for all of them.
         weight: with photos and a text, the share of the photo where both take one place.
         gel: an image of the gel without contact, on which the images are made; default: the
@@ -209,7 +205,6 @@ def generate(  # noqa: PLR0913 - a public verb, step by step
         split: with a manifest: only one part of this split (or split file).
         part: which part.
         seed: of the noise of each sample.
-        noise: an id whose noise all images get: they then differ by their photos alone.
         guidance: scale of classifier-free guidance, 1 is none; default: the pipeline's.
         steps: of the solver; default: the pipeline's.
         batch: images at once, which they do not depend on; default: the pipeline's.
@@ -226,41 +221,7 @@ def generate(  # noqa: PLR0913 - a public verb, step by step
             any image is made.
     """
     _require_condition(photos, text, weight)
-    options: dict[str, Any] = {"text": text, "weight": weight, "gel": gel, "seed": seed}
-    options |= {"guidance": guidance, "steps": steps, "batch": batch}
-    options |= {"noise": noise, "progress": progress}
-    if photos is not None and in_memory(photos):
-        with tempfile.TemporaryDirectory() as folder:
-            options |= {"model": model, "device": device}
-            return generate(as_files(photos, Path(folder)), output=output, **options)
     output = None if output is None else Path(output)
-    if (video := video_of(photos)) is not None:
-        model = loaded(model, _connected(device), progress)
-        return _of_video(video, output, model, **options)
-    options |= {"split": split, "part": part, "skip_bad": skip_bad, "device": device}
-    return prepare(photos, model=model, output=output, **options).make(progress)
-
-
-def prepare(  # noqa: PLR0913 - as the verb
-    photos: Manifest | Photos | None,
-    *,
-    text: str | None = None,
-    weight: float = 0.5,
-    gel: str | Path | None = None,
-    model: TactilePipeline | str | Path = "palpate/mini",
-    output: Path | None = None,
-    split: Split | str | Path | None = None,
-    part: str = "test",
-    seed: int = 0,
-    noise: str | None = None,
-    guidance: float | None = None,
-    steps: int | None = None,
-    batch: int | None = None,
-    skip_bad: bool = False,
-    device: str = "auto",
-    progress: Progress = quiet,
-) -> Run:
-    """Check the arguments of :func:`generate`, for photos in files, and load what it needs."""
     device = _connected(device)
     manifest, table = _photos(photos, split, part)
     paths = [*table.values()] if manifest is None else manifest.paths("vision")
@@ -274,12 +235,11 @@ def prepare(  # noqa: PLR0913 - as the verb
     words = None if text is None else model.embed_text(text)
     settings = _settings(model, sampler, seed)
     settings |= {"text": text, "weight": None if photos is None else weight} if text else {}
-    settings |= {} if noise is None else {"noise": noise}
     target = _Target(output, single, settings, model.notice)
     inputs = _inputs(model, manifest, table or {str(text): None}, gel)
-    how: dict[str, Any] = {"weight": weight, "seed": seed, "sampler": sampler}
+    how: dict[str, Any] = {"weight": weight, "seed": seed, "sampler": sampler, "texts": words}
     notes = [*_text_notes(model, text), *_gel_notes(model, gel)]
-    return Run(model, inputs, target, words, noise, how, skip_bad, notes)
+    return _Run(model, inputs, target, how, skip_bad, notes).make(progress)
 
 
 def _text_notes(model: TactilePipeline, text: str | None) -> list[Note]:
@@ -294,19 +254,17 @@ def _gel_notes(model: TactilePipeline, gel: str | Path | None) -> list[Note]:
         return []
     from palpate.diffusion.gels import gel_notes
 
-    return gel_notes(Path(gel), model.size, model.gel)
+    return gel_notes(Path(gel), model.gel)
 
 
 @dataclass(frozen=True)
-class Run:
+class _Run:
     """A call of :func:`generate` that has been checked.
 
     Attributes:
         model: the pipeline.
         inputs: one an image.
         target: where the images go.
-        words: embedding (1, d) of the text, or None.
-        noise: the id whose noise all have, or None.
         how: the other arguments of :meth:`TactilePipeline.sample`.
         skip_bad: whether unreadable photos are skipped.
         notes: what the caller must know.
@@ -315,25 +273,15 @@ class Run:
     model: TactilePipeline
     inputs: Sequence[_Input]
     target: _Target
-    words: Tensor | None
-    noise: str | None
     how: Mapping[str, Any]
     skip_bad: bool
     notes: Sequence[Note] = ()
 
-    @property
-    def sampler(self) -> SamplerOptions:
-        """How to sample."""
-        return self.how["sampler"]
-
-    def reader(self) -> _Reader:
-        """Reads the inputs of this process."""
-        rank, size = self.target.place
-        return _Reader(self.model, self.inputs[rank::size], self.target, skip_bad=self.skip_bad)
-
     def make(self, progress: Progress) -> Generated:
         """Make the images that are not there."""
-        target, reader = self.target, self.reader()
+        target, batch = self.target, self.how["sampler"].batch
+        rank, size = target.place
+        reader = _Reader(self.model, self.inputs[rank::size], target, skip_bad=self.skip_bad)
         ready = iter(reader)
         first = next(ready, None)  # few photos are all read before anything is written
         bad = target.gathered(reader.bad)
@@ -341,7 +289,7 @@ class Run:
         made: dict[str, bool] = {}
         with target.writing():
             rows = self._sampled(ready if first is None else chain([first], ready))
-            for one in _ahead(lambda row: target.keep(*row), rows, self.sampler.batch, 1):
+            for one in _ahead(lambda row: target.keep(*row), rows, batch, 1):
                 made[one.item.id] = True
                 done = len(made) + reader.found + len(reader.bad)
                 progress("generating", done, len(reader.inputs))
@@ -352,22 +300,16 @@ class Run:
         return replace(result, notes=self.notes)
 
     def _sampled(self, ready: Iterator[_Ready]) -> Generator[tuple[_Ready, NDArray[np.uint8]]]:
-        while chunk := [*islice(ready, self.sampler.batch)]:
-            yield from zip(chunk, self.sample(chunk, **self.how), strict=True)
-
-    def sample(self, chunk: Sequence[_Ready], **how: Any) -> NDArray[np.uint8]:
-        """The images (n, size, size, 3) of a batch."""
-        rows: list[Any] = [one.condition for one in chunk if one.condition is not None]
-        photos = None if not rows else cast("Tensor", rows[0].new_tensor(np.stack(rows)))
-        grounds = [one.ground for one in chunk if one.ground is not None]
-        names = [one.item.id if self.noise is None else self.noise for one in chunk]
-        return self.model.sample(
-            photos,
-            names,
-            texts=self.words,
-            background=np.stack(grounds) if grounds else None,
-            **how,
-        )
+        while chunk := [*islice(ready, self.how["sampler"].batch)]:
+            rows: list[Any] = [one.condition for one in chunk if one.condition is not None]
+            grounds = [one.ground for one in chunk if one.ground is not None]
+            images = self.model.sample(
+                None if not rows else cast("Tensor", rows[0].new_tensor(np.stack(rows))),
+                [one.item.id for one in chunk],
+                background=np.stack(grounds) if grounds else None,
+                **self.how,
+            )
+            yield from zip(chunk, images, strict=True)
 
     def _require_none(self, bad: Mapping[str, Problem]) -> None:
         if bad and not self.skip_bad:
@@ -412,48 +354,12 @@ def loaded(model: TactilePipeline | str | Path, device: str, progress: Progress)
     return TactilePipeline.from_pretrained(model, device=device)
 
 
-def video_of(photos: Any) -> Path | None:
-    """The file, if the photos are the frames of one video."""
-    one = [photos] if isinstance(photos, str | Path) else photos
-    if not isinstance(one, list | tuple) or len(one) != 1 or not isinstance(one[0], str | Path):
-        return None
-    return Path(one[0]) if Path(one[0]).suffix.lower() in VIDEOS else None
-
-
 def _require_condition(photos: object, text: str | None, weight: float) -> None:
     if photos is None and text is None:
         must, fix = "There must be at least one photo, or a text", "Pass one of them"
         raise PalpateError(must, "none", fix)
     if not 0 <= weight <= 1:
         raise PalpateError("must lie in [0, 1]", f"{weight:g}", "1 is the photo", argument="weight")
-
-
-def frames_of(
-    video: Path, folder: Path, model: TactilePipeline, options: dict[str, Any], progress: Progress
-) -> tuple[dict[str, Path], float]:
-    """The frames of a video, by id, and their rate; ``options`` come to give all of them one noise.
-
-    So the touch stays where it is.
-    """
-    from palpate.diffusion.video import save_frames
-
-    frames, rate = save_frames(video, folder, model.vision_size, progress)
-    options["noise"] = video.name
-    return frames, rate
-
-
-def _of_video(
-    video: Path, output: Path | None, model: TactilePipeline, **options: Any
-) -> Generated:
-    """An image a frame, and their video."""
-    from palpate.diffusion.video import write_video
-
-    with tempfile.TemporaryDirectory() as folder:
-        frames, rate = frames_of(video, Path(folder), model, options, options["progress"])
-        made = generate(frames, output=output, model=model, **options)
-    if made.folder is not None:
-        write_video(made.folder / "tactile.mp4", made.images, rate)
-    return made
 
 
 def _photos(
@@ -466,7 +372,7 @@ def _photos(
     table = {} if manifest is not None else photo_ids(cast("Photos", photos))
     if not (manifest.ids if manifest is not None else table):
         must, fix = "There must be at least one photo", "Check the folder, the split or the names"
-        raise PalpateError(must, "none", f"{fix}; a video is passed by itself")
+        raise PalpateError(must, "none", fix)
     return manifest, table
 
 
@@ -504,14 +410,6 @@ class _Target:
             head = {"format": FORMAT, "complete": False, "settings": settings}
             new = head | {"digest": self.digest, "images": {}, "skipped": []}
             self.index = (index or new) | {"notice": notice}
-
-    def at(self, folder: Path) -> _Target:
-        """The same images in another folder."""
-        return _Target(folder, False, self.settings, self.notice)
-
-    def written(self, sample_id: str) -> bool:
-        """Whether there is a file of an image, of whatever settings."""
-        return (path := self.path(sample_id)) is not None and path.exists()
 
     def path(self, sample_id: str) -> Path | None:
         """The file of an image; None in memory."""
@@ -588,15 +486,13 @@ def photo_ids(photos: Photos) -> dict[str, Path]:
         return {i: Path(p) for i, p in photos.items()}
     if isinstance(photos, str | Path) and Path(photos).is_dir():
         folder = Path(photos)
-        if (folder / "palpate.json").is_file():
-            fix = "Pass models as the model"
-            raise PalpateError("must be images", f"{folder}, a saved model", fix, argument="photos")
         files = sorted(p for p in folder.rglob("*") if p.suffix.lower() in SUFFIXES and p.is_file())
         return {p.relative_to(folder).as_posix(): p for p in files}
-    paths = [Path(p) for p in ([photos] if isinstance(photos, str | Path) else photos)]
-    if videos := [path.name for path in paths if path.suffix.lower() in VIDEOS]:
-        must, fix = "must be photos, or one video by itself", "Pass each video by itself"
-        raise PalpateError(must, ", ".join(videos), fix, argument="photos")
+    listed: Sequence[Any] = [photos] if isinstance(photos, str | Path) else list(photos)
+    if not all(isinstance(photo, str | Path) for photo in listed):
+        must, fix = "must be files", "Pass images in memory to a TactilePipeline"
+        raise PalpateError(must, "images in memory", fix, argument="photos")
+    paths = [Path(photo) for photo in listed]
     if len(paths) == 1 and paths[0].is_dir():
         return photo_ids(paths[0])
     table = {path.name: path for path in paths}
@@ -612,26 +508,6 @@ def file_name(sample_id: str) -> str:
     """Return a safe file name: the plain characters of the id and a part of its SHA-256."""
     plain = re.sub(r"[^A-Za-z0-9_-]+", "_", sample_id).strip("_")[:80]
     return f"{plain or 'sample'}-{short(hashlib.sha256(sample_id.encode()).hexdigest())}.png"
-
-
-def in_memory(photos: Any) -> bool:
-    """Return whether photos are images, arrays or tensors instead of files."""
-    first = photos[0] if isinstance(photos, list | tuple) and photos else photos
-    return isinstance(first, Image.Image | np.ndarray) or hasattr(first, "detach")
-
-
-def as_files(photos: Any, folder: Path) -> dict[str, Path]:
-    """Write images in memory to ``folder`` without loss; their ids are their numbers."""
-    from palpate.encoders.encoder import list_images
-
-    files: dict[str, Path] = {}
-    for k, image in enumerate(list_images(photos)):
-        if not isinstance(image, Image.Image):
-            must, fix = "must be all files, or all images in memory", "Open the files"
-            raise PalpateError(must, str(image), fix, argument="photos")
-        files[str(k)] = folder / f"{k}.png"
-        image.save(files[str(k)])
-    return files
 
 
 def _manifest(photos: Any, split: Split | str | Path | None, part: str) -> Manifest | None:

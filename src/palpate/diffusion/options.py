@@ -27,12 +27,9 @@ class AutoencoderOptions:
         codes: entries of the codebook.
         channels: latent channels.
         groups: of the group normalization.
-        attention: whether the middle block attends.
         steps_free, steps_quantized: optimizer steps of the two stages.
         batch, lr: of both stages; the last starts at half the rate.
         crop: side of the random crops of stage 1 in pixels (0: whole images).
-        noise: standard deviation of the noise of stage 1, as a share of the latents'.
-        l1, l2, edge, codebook: weights in the loss.
     """
 
     patch: int = 4
@@ -41,17 +38,11 @@ class AutoencoderOptions:
     codes: int = 4096
     channels: int = 3
     groups: int = 16
-    attention: bool = False
     steps_free: int = 1700
     steps_quantized: int = 200
     batch: int = 8
     lr: float = 2e-3
     crop: int = 32
-    noise: float = 0.02
-    l1: float = 0.25
-    l2: float = 10.0
-    edge: float = 10.0
-    codebook: float = 0.25
 
 
 @dataclass(frozen=True)
@@ -63,9 +54,6 @@ class BackgroundOptions:
         narrow, wide: channels of the networks at half and at a quarter of the size.
         steps, batch, lr: of the training.
         crop: side of the random crops in pixels, a multiple of 4 (0: whole images).
-        colors: largest random change of each color's gain, so that other gels are no surprise.
-        noise: the noise on the latents in training is a random share of their spread up to this.
-        smooth: weight of what a 2 x 2 average of the latents loses.
     """
 
     channels: int = 8
@@ -75,9 +63,6 @@ class BackgroundOptions:
     batch: int = 16
     lr: float = 2e-3
     crop: int = 48
-    colors: float = 0.2
-    noise: float = 0.5
-    smooth: float = 0.1
 
 
 @dataclass(frozen=True)

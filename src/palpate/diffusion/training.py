@@ -28,16 +28,7 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from palpate import __version__
-from palpate.core import (
-    PalpateError,
-    Progress,
-    Split,
-    digest_json,
-    digest_lines,
-    quiet,
-    read_json,
-    short,
-)
+from palpate.core import PalpateError, Progress, Split, digest_json, digest_lines, quiet, short
 from palpate.data.images import cached_images, image_stamp
 from palpate.data.manifest import Manifest
 from palpate.data.reading import load
@@ -47,7 +38,7 @@ from palpate.diffusion.autoencoder import (
     LatentStats,
     load_autoencoder,
 )
-from palpate.diffusion.autoencoder_training import sheet, shown_of
+from palpate.diffusion.autoencoder_training import some_whole
 from palpate.diffusion.autoencoders import autoencoder_of
 from palpate.diffusion.ceiling import judge_of, measure_ceiling
 from palpate.diffusion.denoiser import (
@@ -63,8 +54,6 @@ from palpate.diffusion.encoding import encode_latents, encode_patches
 from palpate.diffusion.no_contact import gels_of, has_gels
 from palpate.diffusion.options import (
     SOURCES,
-    AutoencoderOptions,
-    BackgroundOptions,
     ConditionPolicy,
     Schedule,
     Source,
@@ -76,9 +65,8 @@ from palpate.diffusion.presets import DiffusionPreset, preset_named
 from palpate.encoders.contrastive import load_split, train_part
 from palpate.encoders.embed import embed, texts_of
 from palpate.encoders.encoder_set import EncoderSet, load_clip, seeded
-from palpate.encoders.models import digest_tensors, is_hub_id, pick_device, stated
+from palpate.encoders.models import digest_tensors, is_hub_id, pick_device
 from palpate.training.engine import Batch, Losses, Task, fit
-from palpate.training.estimate import estimate
 from palpate.training.options import Compute, LoopOptions
 from palpate.training.processes import connect, first_alone, keep_logs, place, work_folder
 from palpate.training.steps import Step
@@ -88,6 +76,7 @@ from palpate.training.steps import Step
 DROP_PATCHES = 0.5
 #: Mean of the logit of the time of flow matching.
 TIME_MEAN = 0.5
+SHOWN = 8  # samples outside of train that are drawn while the denoiser trains
 Backgrounds = Callable[[NDArray[np.int64]], Tensor]
 
 
@@ -250,59 +239,6 @@ def _chosen(
     return replace(chosen, unet=str(unet))
 
 
-def plan_generator(
-    data: Manifest | str | Path,
-    split: Split | str | Path | None = None,
-    *,
-    preset: str | DiffusionPreset = "mini",
-    unet: str | Path | None = None,
-    source: Sources | None = None,
-    steps: int | None = None,
-    background: bool = False,
-    device: str = "auto",
-) -> dict[str, Any]:
-    """What training the denoiser would take; only the manifest is read.
-
-    Latents are taken as those of the preset's autoencoder, or of an f4 of three channels; with a
-    trained U-Net as those that it knows.
-
-    Returns:
-        see :func:`palpate.training.estimate.estimate`.
-
-    Raises:
-        PalpateError: if the train part is empty.
-    """
-    chosen = _chosen(preset, unet)
-    train = train_part(load(data), load_split(data, split))
-    loop = chosen.loop_for(len(train))
-    loop = loop if steps is None else replace(loop, steps=steps)
-    options, policy = chosen.autoencoder, _policy(chosen, None, source)
-    vq = options if isinstance(options, AutoencoderOptions) else None
-    factor = vq.patch * 2 ** (len(vq.widths) - 1) if vq else 4
-    channels = options.channels if options else 3
-    wide = 0 if not background else 48 if isinstance(options, BackgroundOptions) else channels
-
-    def build() -> nn.Module:
-        if isinstance(chosen.unet, UNetOptions):
-            size = {"channels": channels, "size": chosen.size // factor}
-            return build_unet(chosen.unet, policy, **size, background=wide)
-        config = read_json(find_unet(chosen.unet)[1] / "config.json", "configuration")
-        return cast("nn.Module", UNet2DConditionModel.from_config(config))
-
-    def forward(model: nn.Module, rows: int, where: torch.device) -> Tensor:
-        known: Any = model.config
-        zeros = partial(torch.zeros, device=where)
-        z = zeros(rows, known["in_channels"], known["sample_size"], known["sample_size"])
-        tokens = zeros(rows, sum(lengths_of(policy)), known["cross_attention_dim"])
-        width = known["projection_class_embeddings_input_dim"]
-        first = None if width is None else zeros(rows, width)
-        t = zeros(rows, dtype=torch.long)
-        how: Any = {"encoder_hidden_states": tokens, "class_labels": first, "return_dict": False}
-        return model(z, t, **how)[0]
-
-    return estimate(build, forward, loop, len(train), pick_device(device))
-
-
 def train_pipeline(  # noqa: PLR0913, PLR0917 - one row per choice of the training
     manifest: Manifest,
     split: Split,
@@ -399,7 +335,7 @@ def train_pipeline(  # noqa: PLR0913, PLR0917 - one row per choice of the traini
         names, photos, tactile, given = shown
         drawn = pipeline(module)
         made = drawn.sample(drawn.embed(photos), names, seed=seed, background=given)
-        return sheet(photos, tactile, made)
+        return np.vstack([np.hstack(list(row)) for row in (photos, tactile, made)])
 
     def pipeline(denoiser: Denoiser, record: dict[str, Any] | None = None) -> TactilePipeline:
         return TactilePipeline(
@@ -468,10 +404,7 @@ def _geometry(unet: UNetOptions | str) -> dict[str, Any]:
     """The geometry of a U-Net, or whose it was."""
     if isinstance(unet, UNetOptions):
         return asdict(unet)
-    _, root, inside = find_unet(unet)
-    root = root.parent if inside else root
-    name = unet if is_hub_id(unet) else root.resolve().name
-    return {"source": name, "license": stated(root)["license"]}
+    return {"source": unet if is_hub_id(unet) else Path(unet).resolve().name}
 
 
 def _digests(encoders: EncoderSet | None) -> dict[str, str | None]:
@@ -542,8 +475,11 @@ def _encoded(
 def _shown(
     manifest: Manifest, split: Split, size: int, like: NDArray[np.uint8] | None
 ) -> tuple[Sequence[str], NDArray[np.uint8], NDArray[np.uint8], NDArray[np.uint8] | None] | None:
-    """Ids of some samples outside of train, their photos, tactile images and gels."""
-    some = shown_of(manifest, split, "vision", "tactile", gels=like is not None)
+    """Ids of samples of val, or of test, their photos, tactile images and gels, to be drawn."""
+    held = manifest.part(split, "val")
+    held = held if len(held) else manifest.part(split, "test")
+    gel = ["background"] if like is not None and has_gels(held) else []
+    some = some_whole(held, ["vision", "tactile", *gel], SHOWN)
     if not len(some):
         return None
     try:

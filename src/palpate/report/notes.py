@@ -490,20 +490,10 @@ EVALUATION: dict[str, Sentence] = {
         "gray levels of its colors, and under 4 of a gel that nothing touches. The images are made "
         "on it all the same"
     ),
-    "gel-spotted": "{gel} looks like no image of a gel: dark spots, as of markers, are all over it",
-    "gel-unlit": (
-        "{gel} looks like no image of a gel: the colored lights that fall on one from its sides "
-        "are missing"
-    ),
     "gel-sensor": (
         "{gel} is lit from other sides than the gels that the generator knows: a sensor of another "
         "kind, on which its contacts are implausible"
     ),
-    "gel-exchanged": (
-        "{gel} looks like a gel whose red and blue are exchanged, as OpenCV reads images: its "
-        "light comes from the wrong sides for the contacts that are made on it"
-    ),
-    "gel-small": "{gel} is {side} px wide and was enlarged to {size}",
     "encoder-license": lambda p, _: (
         f"The {p['modality']} encoder is {p['name']}, whose license is "
         + ("not stated: see its page" if p["license"] == "unknown" else p["license"])

@@ -1,4 +1,4 @@
-"""Videos and several processes: the same images as one photo at a time in one process."""
+"""Several processes, and one that is killed: the same images as those of one process."""
 
 from __future__ import annotations
 
@@ -12,62 +12,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from diffusion_fixtures import make_pipeline, photos
-from palpate.core import PalpateError
-from palpate.diffusion.generation import Generated, generate
-
-av = pytest.importorskip("av")
-
-
-@pytest.fixture
-def clip(tmp_path):
-    """Six frames of changing color, without loss."""
-    path = tmp_path / "clip.mkv"
-    with av.open(str(path), "w") as container:
-        stream = container.add_stream("ffv1", 5)
-        stream.width = stream.height = 16
-        stream.pix_fmt = "bgr0"
-        for k in range(6):
-            image = np.full((16, 16, 3), 40 * k, np.uint8)
-            container.mux(stream.encode(av.VideoFrame.from_ndarray(image)))
-        container.mux(stream.encode(None))
-    return path
-
-
-def test_a_video_gives_an_image_a_frame_of_one_noise_and_a_video(clip, tmp_path):
-    pipeline = make_pipeline()
-    made = generate(clip, model=pipeline, output=tmp_path / "out")
-    assert made.ids == [f"{k:06d}" for k in range(6)]
-    with av.open(str(tmp_path / "out" / "tactile.mp4")) as container:
-        stream = container.streams.video[0]
-        assert stream.frames == 6
-        assert float(stream.average_rate) == pytest.approx(5, rel=0.01)
-    # Equal frames give equal images: the noise is one.
-    frame = Image.fromarray(np.full((16, 16, 3), 80, np.uint8))
-    frame.save(tmp_path / "a.png")
-    frame.save(tmp_path / "b.png")
-    alone = generate([tmp_path / "a.png", tmp_path / "b.png"], model=pipeline, noise=clip.name)
-    first, second = (np.asarray(image, int) for image in alone.images)
-    assert np.array_equal(first, second)
-    assert np.abs(first - np.asarray(made.images[2], int)).max() <= 1
-    # A second run finds all frames.
-    assert generate(clip, model=pipeline, output=tmp_path / "out").made == 0
-
-
-def test_videos_beside_photos_are_not_left_out_in_silence(clip, tmp_path):
-    with pytest.raises(PalpateError, match=r"one video by itself.* clip\.mkv"):
-        generate([clip, tmp_path / "photo.png"], model=make_pipeline())
-    folder = tmp_path / "videos"
-    folder.mkdir()
-    clip.rename(folder / clip.name)
-    with pytest.raises(PalpateError, match="a video is passed by itself"):
-        generate(folder, model=make_pipeline())
-
-
-def test_a_cut_video_is_named(clip, tmp_path):
-    (tmp_path / "cut.mkv").write_bytes(clip.read_bytes()[:200])
-    with pytest.raises(PalpateError, match=r"cut\.mkv must be whole"):
-        generate(tmp_path / "cut.mkv", model=make_pipeline())
+from diffusion_fixtures import photos
+from palpate.diffusion.generation import Generated
 
 
 @pytest.mark.nightly
