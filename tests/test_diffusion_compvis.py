@@ -203,7 +203,7 @@ def test_folders_of_other_models_are_rejected(tmp_path):
     (tmp_path / "text").mkdir()
     (tmp_path / "text" / "config.json").write_text("{")
     for name, message in (
-        ("kl", "diffusers VQModel. Got AutoencoderKL"),
+        ("kl", "diffusers VQModel, or of palpate. Got AutoencoderKL"),
         ("pointer", r"pointer of Git LFS .* git lfs pull"),
         ("cut", "diffusers VQModel"),
         ("gray", "3 channels in and out. Got 1 and 1"),

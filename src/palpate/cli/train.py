@@ -24,9 +24,8 @@ class Options(Training):
     """Encoders that condition the generator: folder of `palpate train encoder` or of a CLIP, hub
     id, or palpate/mini. `--source resnet` needs none."""
     autoencoder: str | None = None
-    """Pretrained autoencoder: folder or hub id of a diffusers VQModel or AutoencoderKL, a .ckpt of
-    latent diffusion (vq-f4), or palpate/mini. Default: a small one, trained first on the
-    train part."""
+    """Pretrained autoencoder: folder or hub id of a diffusers VQModel, a .ckpt of latent diffusion
+    (vq-f4), or palpate/mini. Default: a small one, trained first on the train part."""
     unet: str | None = None
     """Trained U-Net of diffusers to go on from: folder or hub id of it or of its generator.
     Default: random weights."""
