@@ -197,10 +197,6 @@ def test_trainings_print_the_ceiling_of_the_data_that_they_are_given(
     assert 0 < found["ceiling_accuracy"] <= 1
     assert load_autoencoder(tmp_path / "a").card["ceiling"]["tmmd"] == found["ceiling_tmmd"]
     assert "| psnr |" in (tmp_path / "a" / "README.md").read_text()
-    (drawn,) = (tmp_path / "a" / "samples" / "autoencoder").iterdir()  # images, reconstructions
-    images, made = np.split(np.asarray(Image.open(drawn), float), 2)
-    assert images.shape == (64, 8 * 64, 3)
-    assert 0 < np.abs(images - made).mean() < 0.3 * images.std()
     given = ["--autoencoder", str(tmp_path / "a"), "--clip", "palpate/mini"]
     assert main(["train", "generator", folder, *common, *given, "-o", str(tmp_path / "g")]) == 0
     again = json.loads(capsys.readouterr().out)

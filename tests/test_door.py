@@ -24,7 +24,7 @@ SIGNATURES = {
         "dry_run progress"
     ),
     "generate": (
-        "photos * text weight gel model output split part seed noise guidance steps batch"
+        "photos * text weight gel model output split part seed guidance steps batch"
         " skip_bad device progress"
     ),
     "load": "source * format images skip_bad progress **options",
