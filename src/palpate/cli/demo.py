@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
-from palpate.cli.terminal import Common, OutPath, Switch, Terminal, require_extra
+from palpate.cli.terminal import Common, OutPath, Terminal, require_extra
 from palpate.core import PalpateError
 
 
@@ -23,24 +23,9 @@ class Options(Common):
     output: OutPath = Path("runs/demo")
     """Run folder."""
     preset: Literal["mini", "tiny"] = "mini"
-    """`mini` takes minutes on two cores; `tiny` only shows that everything runs, and trains all its
-    models itself."""
-    clip: str | None = None
-    """Hub id or folder of a pretrained CLIP, instead of the small one that ships with palpate."""
-    autoencoder: str | None = None
-    """A pretrained autoencoder (see `palpate train generator`), instead of the small one that
-    ships."""
-    from_scratch: Switch = False
-    """Use nothing that ships: train the small models in the run, on another world and the train
-    part."""
-    by: Literal["auto", "video", "contact", "object"] = "auto"
-    """What the split keeps whole; `auto` takes the video, or the contact if videos are too few."""
-    background: Switch = False
-    """Train the variant that also sees the no-contact image."""
+    """`mini` takes minutes on two cores; `tiny` only shows that everything runs."""
     seed: int = 0
     """Of the split, the weights, the order of training and the noise."""
-    skip_bad: Switch = False
-    """Skip bad rows and files of --data, and list them."""
     device: str = "auto"
     """auto, cpu, cuda, mps."""
 
@@ -57,13 +42,11 @@ def run(options: Options, terminal: Terminal) -> dict[str, Any]:
     if output.is_dir() and any(output.iterdir()) and not kept:
         must, got = "must be new, empty, or a run folder of the demo", f"{output}, with other files"
         raise PalpateError(must, got, "Choose another folder", argument="output")
-    names = ("preset", "clip", "autoencoder", "from_scratch", "by", "seed", "skip_bad")
-    chosen = {name: getattr(options, name) for name in (*names, "background", "device")}
     data = options.data and options.data.resolve()
     try:
         with terminal.progress() as progress:
             demo = run_demo(
-                DemoOptions(data=data, **chosen),
+                DemoOptions(options.preset, data, options.seed, options.device),
                 output,
                 print_line=terminal.print_line,
                 progress=progress,

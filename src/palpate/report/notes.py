@@ -531,13 +531,6 @@ EVALUATION: dict[str, Sentence] = {
 }
 
 
-def _stand_in(style: Style) -> str:
-    return (
-        "They replace the pretrained models of the paper; "
-        f"{style:clip} and {style:autoencoder} take those"
-    )
-
-
 CAPTIONS: dict[str, Sentence] = {
     "captions-alone": (
         "{count} of {of} samples have no {per}: each is described, and counted, by itself"
@@ -572,13 +565,10 @@ OTHER: dict[str, Sentence] = {
         "The data are synthetic: palpate's procedural world. It shows mechanisms (leaks, guidance, "
         "what the metrics reward); never compare its numbers with those of real data"
     ),
-    "models-of-this-run": lambda p, style: (
-        f"Small and trained in this run, on another synthetic world and the train part: "
-        f"{' and '.join(p['models'])}. {_stand_in(style)}"
-    ),
-    "models-shipped": lambda p, style: (
-        f"Small, shipped with palpate ({p['name']}) and trained on synthetic worlds of reserved "
-        f"seeds, none of them this data: {', '.join(p['models'])}. {_stand_in(style)}"
+    "models-shipped": (
+        "The models that training goes on from are small, ship with palpate ({name}), and were "
+        "trained on synthetic worlds of reserved seeds, none of them this data. They replace the "
+        "pretrained models of the paper"
     ),
     "template-texts": (
         "This data set has no texts: training used template texts made from the material, so text "
@@ -589,9 +579,6 @@ OTHER: dict[str, Sentence] = {
         "The no-contact image alone predicts the material of {share:.0%} of the test samples, far "
         "above chance: each video has its gel look, and the probe has learned that. Material "
         "accuracy under this split measures the video, not the contact"
-    ),
-    "files-skipped": lambda p, _: (
-        f"{len(p['problems'])} bad rows or files were skipped: {few(p['problems'])}"
     ),
     "text": "{text}",
     "excluded-classes": _excluded_classes,

@@ -2,15 +2,12 @@
 
 ::
 
-    world -> data -> split -> (pretraining world -> clip -> autoencoder) -> encoders -> generator
-          -> generated -> scores
+    world -> data -> split -> encoders -> generator -> generated -> scores
 
 Each stage is kept in the run folder under the digest of what it read
 (:mod:`palpate.studies.graph`): a killed run resumes from its last finished stage, and a
-changed option rebuilds only what depends on it. ``world`` is skipped where data is given. The
-stages in brackets train small stand-ins for pretrained models; they are skipped where such models
-are given, or ship with the package and the preset takes them. What each model saw is in its card,
-which the next model's card contains.
+changed option rebuilds only what depends on it. ``world`` is skipped where data is given. Training
+goes on from the models that ship.
 """
 
 from __future__ import annotations
@@ -39,16 +36,13 @@ from palpate.core import (
 from palpate.data.images import cached_images
 from palpate.data.importing import import_dataset
 from palpate.data.manifest import Manifest
-from palpate.diffusion.autoencoders import autoencoder_of, load_autoencoder
-from palpate.diffusion.ceiling import measure_ceiling
+from palpate.diffusion.autoencoders import load_autoencoder
 from palpate.diffusion.generation import Generated, generate
 from palpate.diffusion.pipeline import TactilePipeline
-from palpate.diffusion.presets import preset_named as diffusion_preset
 from palpate.diffusion.training import train_pipeline
-from palpate.encoders.contrastive import train_clip, train_tactile
+from palpate.encoders.contrastive import train_tactile
 from palpate.encoders.encoder_set import EncoderSet, load_clip
-from palpate.encoders.models import Part, is_shipped, shipped_folder
-from palpate.encoders.presets import preset as encoder_preset
+from palpate.encoders.models import Part, shipped_folder
 from palpate.evaluation.scoring import score
 from palpate.leakage.auditing import audit
 from palpate.leakage.splitting import split as leak_free_split
@@ -57,6 +51,7 @@ from palpate.sim.presets import MINI_SEEDS
 from palpate.studies.controls import NEAREST, nearest_rows
 from palpate.studies.graph import Node, run_graph
 from palpate.studies.making import After, cache_of, fresh, make_world, write_images
+from palpate.studies.methods import SHIPPED
 from palpate.studies.presets import PRESETS
 from palpate.studies.stages import Stage
 
@@ -68,25 +63,13 @@ class DemoOptions:
     Attributes:
         preset: see :data:`palpate.studies.presets.PRESETS`.
         data: a data set on disk, or None for the embedded world.
-        clip: shipped name, hub id or folder of a pretrained CLIP; None: the preset's choice.
-        autoencoder: the same for a pretrained autoencoder, or its ``.ckpt``.
-        from_scratch: train small models where none are given, and take nothing that ships.
-        by: what the split keeps whole; ``auto`` falls back to contacts where videos are too few.
         seed: of the split, the weights, the order of training and the noise.
-        skip_bad: skip bad rows and images of ``data`` and list them.
-        background: train the variant that sees the no-contact image.
         device: ``auto``, ``cpu``, ``cuda`` ...
     """
 
     preset: str = "mini"
     data: Path | None = None
-    clip: str | None = None
-    autoencoder: str | None = None
-    from_scratch: bool = False
-    by: str = "auto"
     seed: int = 0
-    skip_bad: bool = False
-    background: bool = False
     device: str = "auto"
 
 
@@ -101,7 +84,6 @@ class DemoRun:
         scores: see :func:`palpate.evaluation.score`.
         stages: by name, with digests, facts and times.
         options: what was requested.
-        models: the pretrained models used, by role (``clip``, ``autoencoder``); None: trained here.
     """
 
     manifest: Manifest
@@ -111,7 +93,6 @@ class DemoRun:
     scores: list[Score]
     stages: Mapping[str, Stage]
     options: DemoOptions
-    models: Mapping[str, str | None]
 
     def settings(self) -> dict[str, Any]:
         """Options, digests, versions and times, for the page."""
@@ -119,7 +100,7 @@ class DemoRun:
         digests = {n: s.facts["digest"] for n, s in self.stages.items() if "digest" in s.facts}
         return {
             "dataset": self.stages["data"].facts["dataset"],
-            "models": dict(self.models),
+            "models": SHIPPED,
             "options": {k: str(v) if isinstance(v, Path) else v for k, v in options.items()},
             "digests": {"manifest": self.manifest.digest, "split": self.split.digest} | digests,
             "split rule": dict(self.split.rule),
@@ -170,8 +151,7 @@ def demo_of(options: DemoOptions, stages: Mapping[str, Stage]) -> DemoRun:
     audits = [Audit.from_json(a) for a in read_json(after["split"] / "audits.json", "audits")]
     generated = Generated.load(after["generated"] / "generated")
     scores = [Score.from_json(s) for s in read_json(after["scores"] / "scores.json", "scores")]
-    models = _Demo(options).models
-    return DemoRun(manifest, split, audits, generated, scores, stages, options, models)
+    return DemoRun(manifest, split, audits, generated, scores, stages, options)
 
 
 class _Demo:
@@ -184,61 +164,27 @@ class _Demo:
         self.options = options
         require_choice("preset", options.preset, PRESETS)
         self.preset = PRESETS[options.preset]
-        self.encoder = encoder_preset(self.preset.encoder)
-        self.diffusion = diffusion_preset(self.preset.diffusion)
-        shipped = None if options.from_scratch else self.preset.models
-        self.models = {
-            "clip": options.clip or shipped,
-            "autoencoder": options.autoencoder or shipped,
-        }
-        all_shipped = shipped is not None and {*self.models.values()} == {shipped}
-        # What the trainings of the tactile encoder and of the generator start from.
-        self.ready = self.models["clip"] if is_shipped(self.models["clip"] or "") else None
-        self.start = (
-            shipped if all_shipped and self.preset.start and not options.background else None
-        )
-        self.judged = any(map(is_shipped, filter(None, self.models.values())))
         parts: tuple[Part, ...] = ("clip", "encoders", "autoencoder", "generator")
-        for part in parts:  # an unknown or absent model is reported before any work
-            for name in filter(None, self.models.values()):
-                shipped_folder(name, part)
+        self.models = {part: model_stamp(part, SHIPPED) for part in parts}
 
     def nodes(self) -> list[Node]:
-        """The graph; what is given, or ships, has no node."""
-        options, preset, seed = self.options, self.preset, {"seed": self.options.seed}
-        clip, autoencoder = self.models["clip"], self.models["autoencoder"]
-        here = [name for name, model in self.models.items() if model is None]  # trained in the run
-        data, train = self.options.data, ("data", "split")
-        nodes: list[Node] = []
+        """The graph; data that is given has no node."""
+        preset, seed, models = self.preset, {"seed": self.options.seed}, self.models
+        data, nodes = self.options.data, list[Node]()
         if data is None:
             build = partial(make_world, options=preset.world)
             nodes.append(Node("world", build, {"options": preset.world}))
-        inputs = {"skip_bad": options.skip_bad, "judged": self.judged, "size": self.diffusion.size}
+        inputs: dict[str, Any] = {"size": preset.diffusion.size}
         inputs |= {"source": data and str(data.resolve()), "stamp": data and stamp(data)}
         nodes.append(Node("data", self.data, inputs, ("world",) if data is None else ()))
-        inputs = seed | {"train": preset.train, "by": options.by}
+        inputs = seed | {"train": preset.train}
         nodes.append(Node("split", self.split, inputs, ("data",), measures=True))
-        if here:
-            build, inputs = (
-                partial(make_world, options=preset.pretraining),
-                {"options": preset.pretraining},
-            )
-            nodes.append(Node("pretraining", build, inputs))
-            nodes.append(Node("pretraining-data", self.other_data, {}, ("pretraining",)))
-            train = (*train, "pretraining-data")
-        if clip is None:
-            nodes.append(Node("clip", self.clip, seed | {"preset": self.encoder}, train))
-        if autoencoder is None:
-            inputs = {"options": self.diffusion.autoencoder, "size": self.diffusion.size}
-            nodes.append(Node("autoencoder", self.autoencoder, seed | inputs, train))
-        inputs = {"preset": self.encoder, "epochs": preset.tactile_epochs}
-        inputs |= {"clip": model_stamp("clip", clip), "start": model_stamp("encoders", self.ready)}
-        after = [*train, *({"clip"} & {*here})]
-        nodes.append(Node("encoders", self.encoders, seed | inputs, after))
-        inputs = {"preset": self.diffusion, "background": options.background}
-        inputs |= {"autoencoder": model_stamp("autoencoder", autoencoder)}
-        inputs |= {"start": model_stamp("generator", self.start)}
-        after = ["data", "split", "encoders", *({"autoencoder"} & {*here})]
+        inputs = {"preset": preset.encoder, "epochs": preset.tactile_epochs}
+        inputs |= {"clip": models["clip"], "start": models["encoders"]}
+        nodes.append(Node("encoders", self.encoders, seed | inputs, ("data", "split")))
+        inputs = {"preset": preset.diffusion, "start": models["generator"]}
+        inputs |= {"autoencoder": models["autoencoder"]}
+        after = ["data", "split", "encoders"]
         nodes.append(Node("generator", self.generator, seed | inputs, after))
         nodes.append(Node("generated", self.generated, seed, ("data", "split", "generator")))
         after = ["data", "split", "generated", "encoders"]
@@ -254,18 +200,15 @@ class _Demo:
     def data(self, place: Path, after: After, progress: Progress) -> dict[str, Any]:
         """The manifest of the given data, or of the embedded world."""
         source = self.options.data or after["world"] / "tree"
-        size = None if self.options.data is None else 4 * self.diffusion.size
-        options: dict[str, Any] = {"size": size, "overwrite": True, "progress": progress}
-        if self.judged:
-            require_unseen(source)
-        imported = import_dataset(source, place, skip_bad=self.options.skip_bad, **options)
-        if self.judged:  # images may lie elsewhere than the source
-            require_unseen(imported.manifest.root, imported.manifest.facts)
+        size = None if self.options.data is None else 4 * self.preset.diffusion.size
+        require_unseen(source)
+        imported = import_dataset(source, place, size=size, overwrite=True, progress=progress)
+        # Images may lie elsewhere than the source.
+        require_unseen(imported.manifest.root, imported.manifest.facts)
         return {
             "digest": imported.manifest.digest,
             "dataset": imported.facts.get("dataset", source.name),
             "samples": len(imported.manifest),
-            "skipped": [str(p) for p in imported.skipped],
             "inconclusive": imported.inconclusive,
             "facts": dict(imported.facts),
         }
@@ -273,7 +216,7 @@ class _Demo:
     def split(self, place: Path, after: After, progress: Progress) -> dict[str, Any]:
         """The leak-free split, and the audits of it and of the data set's own splits."""
         manifest, options = Manifest.load(after["data"]), self.options
-        clean = leak_free_split(manifest, train=self.preset.train, by=options.by, seed=options.seed)
+        clean = leak_free_split(manifest, train=self.preset.train, by="auto", seed=options.seed)
         clean.save(place / "noleak.json")
         how: dict[str, Any] = {"cache": cache_of(place), "progress": progress}
         audits = [
@@ -290,61 +233,17 @@ class _Demo:
         write_json(place / "audits.json", [a.to_json() for a in audits])
         return {"digest": clean.digest, "counts": clean.counts(), "rule": dict(clean.rule)}
 
-    def other_data(self, place: Path, after: After, progress: Progress) -> dict[str, Any]:
-        """The manifest of the other world."""
-        tree = after["pretraining"] / "tree"
-        imported = import_dataset(tree, place, overwrite=True, progress=progress)
-        return {"digest": imported.manifest.digest, "samples": len(imported.manifest)}
-
-    def clip(self, place: Path, after: After, progress: Progress) -> dict[str, Any]:
-        """A small CLIP trained on photos and texts."""
-        everything, how = _pretraining(after), self.how(place, progress)
-        clip = train_clip(
-            everything, _all_train(everything), self.encoder, place / "training", **how
-        )
-        clip.save(fresh(place / "clip"))
-        digests = {"digest": clip.digest("vision"), "text": clip.digest("text")}
-        return {**digests, "samples": len(everything)}
-
-    def autoencoder(self, place: Path, after: After, progress: Progress) -> dict[str, Any]:
-        """A small autoencoder of tactile images."""
-        options, everything, (manifest, split) = (
-            self.diffusion.autoencoder,
-            _pretraining(after),
-            _data(after),
-        )
-        if options is None:
-            must = f"must be given for the preset {self.diffusion.name}"
-            raise PalpateError(must, "none", "Pass a hub id or a folder", argument="autoencoder")
-        test = manifest.part(split, "test")
-        both = Manifest.join(everything, test)  # the first holds the train part
-        parts = Split.from_ids(
-            train=everything.ids, test=test.ids, rule={"name": "pretraining"}, manifest=both.digest
-        )
-        size, how = self.diffusion.size, self.how(place, progress)
-        model = autoencoder_of(both, parts, options, size, place / "training", **how)
-        ceiling = measure_ceiling(model, both, parts, size, cache=how["cache"], progress=progress)
-        model.card["ceiling"] = ceiling
-        model.save(fresh(place / "autoencoder"))
-        return {"digest": model.digest, "images": len(everything), "ceiling": ceiling}
-
     def encoders(self, place: Path, after: After, progress: Progress) -> dict[str, Any]:
-        """The frozen CLIP with a tactile encoder trained on the train part.
-
-        The training starts from the shipped tactile encoder of a shipped CLIP, from one trained on
-        the pretraining samples first, or from random weights.
-        """
-        clip = self.models["clip"] or str(after["clip"] / "clip")
-        common = (load_clip(clip, device=self.options.device), self.encoder)
-        first, epochs = self.preset.tactile_epochs
-        how = self.how(place, progress)
-        if self.ready:
-            how |= {"start": EncoderSet.load(self.ready), "epochs": epochs}
-        elif "pretraining-data" in after:
-            other, folder = _pretraining(after), place / "pretraining"
-            start = train_tactile(other, _all_train(other), *common, folder, epochs=first, **how)
-            how |= {"start": start, "epochs": epochs}
-        encoders = train_tactile(*_data(after), *common, place / "training", **how)
+        """The frozen CLIP with a tactile encoder that goes on from the shipped one."""
+        encoders = train_tactile(
+            *_data(after),
+            load_clip(SHIPPED, device=self.options.device),
+            self.preset.encoder,
+            place / "training",
+            start=EncoderSet.load(SHIPPED),
+            epochs=self.preset.tactile_epochs,
+            **self.how(place, progress),
+        )
         encoders.save(fresh(place / "encoders"))
         source = encoders.card.get("text_source")
         return {"digest": encoders.digest("tactile"), "text_source": source}
@@ -352,16 +251,14 @@ class _Demo:
     def generator(self, place: Path, after: After, progress: Progress) -> dict[str, Any]:
         """The trained pipeline."""
         manifest, split = _data(after)
-        autoencoder = self.models["autoencoder"] or after["autoencoder"] / "autoencoder"
         pipeline = train_pipeline(
             manifest,
             split,
             EncoderSet.load(after["encoders"] / "encoders"),
-            load_autoencoder(autoencoder),
-            self.diffusion,
+            load_autoencoder(SHIPPED),
+            self.preset.diffusion,
             place / "training",
-            background=self.options.background,
-            start=TactilePipeline.from_pretrained(self.start) if self.start else None,
+            start=TactilePipeline.from_pretrained(SHIPPED),
             **self.how(place, progress),
         )
         pipeline.save(fresh(place / "model"))
@@ -392,7 +289,7 @@ class _Demo:
         encoders, cache = EncoderSet.load(after["encoders"] / "encoders"), cache_of(place)
         train, test = manifest.part(split, "train"), manifest.part(split, "test")
         rows = nearest_rows(train, test, encoders, cache=cache, progress=progress)
-        images = cached_images(train, "tactile", self.diffusion.size, cache)
+        images = cached_images(train, "tactile", self.preset.diffusion.size, cache)
         write_images(place / "nearest", test.ids, images[rows])
         results = score(
             [after["generated"] / "generated", place / "nearest"],
@@ -405,7 +302,7 @@ class _Demo:
             seed=self.options.seed,
             cache=cache,
             progress=progress,
-            allow_seen=True,  # data may be a copy of the pretraining world; the scores say so
+            allow_seen=True,  # an image may be in two videos; the scores say so
         )
         write_json(place / "scores.json", [s.to_json() for s in results])
         return {"scores": len(results)}
@@ -414,13 +311,6 @@ class _Demo:
 def _data(after: After) -> tuple[Manifest, Split]:
     """The manifest and the leak-free split."""
     return Manifest.load(after["data"]), Split.load(after["split"] / "noleak.json")
-
-
-def _pretraining(after: After) -> Manifest:
-    """Another world's samples and the train part: what the frozen models may see."""
-    other, (manifest, split) = Manifest.load(after["pretraining-data"]), _data(after)
-    # Prefixed, so that a user's copy of this world does not collide with it.
-    return Manifest.join(other.prefixed("pretraining/"), manifest.part(split, "train"))
 
 
 def model_stamp(part: Part, source: str | None) -> str | None:
@@ -454,15 +344,7 @@ def require_unseen(source: Path, facts: Mapping[str, str] | None = None) -> None
     seed = (facts or {}).get("world_seed", "")
     if seen or (seed.isdecimal() and int(seed) in MINI_SEEDS):
         must = "The shipped models must not have been trained on the data that they are judged on"
-        fix = "Write a world of another seed, or train from scratch"
-        example = {"from_scratch": True}
-        raise PalpateError(must, f"{source}", fix, example=example)
-
-
-def _all_train(manifest: Manifest) -> Split:
-    """A split whose train part is everything."""
-    rule = {"name": "pretraining"}
-    return Split.from_ids(train=manifest.ids, rule=rule, manifest=manifest.digest)
+        raise PalpateError(must, f"{source}", "Write a world of another seed")
 
 
 def stamp(source: Path) -> str:

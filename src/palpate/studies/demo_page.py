@@ -8,12 +8,12 @@ from pathlib import Path
 from palpate.core import Note, Score, rng_for
 from palpate.data.manifest import Manifest
 from palpate.diffusion.generation import Generated
-from palpate.encoders.models import is_shipped
 from palpate.evaluation.controls import BACKGROUND
 from palpate.report.notes import number, percent
 from palpate.report.results import GalleryItem, Results
 from palpate.report.tables import score_tables
 from palpate.studies.demo import NEAREST, DemoRun
+from palpate.studies.methods import SHIPPED
 
 #: Rows of the gallery; further ones would be collapsed.
 GALLERY = 40
@@ -126,22 +126,13 @@ def gallery(manifest: Manifest, generated: Generated, seed: int) -> list[Gallery
 
 def _notes(run: DemoRun) -> list[Note]:
     notes = [Note("synthetic-data")] if run.manifest.facts.get("synthetic") else []
-    roles = {"clip": "the frozen vision and text encoders", "autoencoder": "the frozen autoencoder"}
-    if trained := [what for role, what in roles.items() if run.models[role] is None]:
-        notes.append(Note("models-of-this-run", {"models": trained}))
-    for name in dict.fromkeys(n for n in run.models.values() if n and is_shipped(n)):
-        models = [what for role, what in roles.items() if run.models[role] == name]
-        if run.models["clip"] == name:
-            models.append("the starting weights of the tactile encoder")
-        notes.append(Note("models-shipped", {"name": name, "models": models}))
+    notes.append(Note("models-shipped", {"name": SHIPPED}))
     notes += run.split.notes
     if run.manifest.table["text"].null_count():
         notes.append(Note("template-texts"))
     background = _score(run, "material accuracy", BACKGROUND)
     if background is not None and float(background) > 2 * background.details["chance"]:
         notes.append(Note("background-predicts-material", {"share": background.value}))
-    if skipped := run.stages["data"].facts.get("skipped"):
-        notes.append(Note("files-skipped", {"problems": skipped}))
     return notes
 
 

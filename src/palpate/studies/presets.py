@@ -1,9 +1,12 @@
-"""Presets of the demo, one row each: worlds, encoders, generator, and what a run costs."""
+"""Presets of the demo, one row each: world, encoder and generator."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
+from palpate.diffusion.presets import MINI, DiffusionPreset
+from palpate.encoders.presets import PRESETS as ENCODERS
+from palpate.encoders.presets import EncoderPreset
 from palpate.sim import PRESETS as WORLDS
 from palpate.sim import WorldOptions
 
@@ -15,26 +18,17 @@ class DemoPreset:
     Attributes:
         name: of the preset.
         world: the embedded data set, used where no data is given.
-        pretraining: another world, of other objects, on which encoders and autoencoder are trained
-            where no ready ones are taken.
-        encoder, diffusion: names of the presets of those rooms.
-        models: shipped models that stand for the pretrained ones: the frozen CLIP and autoencoder,
-            and the tactile encoder that training goes on from; None: all are trained in the run.
-        start: whether the generator goes on from that of ``models`` instead of from random weights.
+        encoder, diffusion: how the training of the shipped models goes on.
         train: share of the train part.
-        tactile_epochs: passes of the tactile encoder over the pretraining samples, then over the
-            train part (the first are left out where it goes on from a ready one).
+        tactile_epochs: passes of the tactile encoder over the train part.
     """
 
     name: str
     world: WorldOptions
-    pretraining: WorldOptions
-    encoder: str
-    diffusion: str
-    models: str | None = None
-    start: bool = False
-    train: float = 0.75
-    tactile_epochs: tuple[float, float] = (5, 6)
+    encoder: EncoderPreset
+    diffusion: DiffusionPreset
+    train: float
+    tactile_epochs: float
 
 
 #: Materials that feel different: with all twenty, minutes of training stay close to chance.
@@ -49,23 +43,21 @@ _MINI = replace(
     frames_per_contact=2,
     free_written="background",
 )
-_MINI_BEFORE = replace(WORLDS["pretrain"], materials=_TEN, objects_per_material=40)
-
-
 PRESETS = {
-    p.name: p
-    for p in (
-        #              name    world   pretraining                encoder diffusion
-        DemoPreset("tiny", _TINY, replace(_TINY, seed=1000), "tiny", "tiny", train=0.75),
+    preset.name: preset
+    for preset in (
         DemoPreset(
-            "mini",
-            _MINI,
-            _MINI_BEFORE,
-            "mini",
-            "mini",
-            models="palpate/mini",
-            start=True,
-            train=0.85,
+            "tiny",  # for tests
+            _TINY,
+            ENCODERS["mini"],
+            replace(
+                MINI,
+                loop=replace(MINI.loop, steps=4, batch=8),
+                sampler=replace(MINI.sampler, steps=2),
+            ),
+            train=0.75,
+            tactile_epochs=0.5,
         ),
+        DemoPreset("mini", _MINI, ENCODERS["mini"], MINI, train=0.85, tactile_epochs=6),
     )
 }
