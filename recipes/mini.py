@@ -20,7 +20,7 @@ new digit      900051    scores of the autoencoder
 =============  ========  =========================================================================
 
 Weights are rounded to 16 bits before anything is scored, so the scores are those of the shipped
-files; what rounding costs is in the cards.
+files.
 """
 
 from __future__ import annotations
@@ -37,6 +37,7 @@ from typing import Any
 import numpy as np
 from mini_cards import ship, write_page
 from mini_scores import score_all
+from numpy.typing import NDArray
 
 from palpate.core import PalpateError, Split, digest_json, read_json, write_json
 from palpate.data.images import cached_images
@@ -82,12 +83,6 @@ GENERATOR_STEPS, GENERATOR_ROUNDS = 8_000, 2
 #: Half the time, on CPUs that have it; the weights then depend on the kind of CPU.
 COMPUTE = Compute(precision="bf16")
 PARTS = ("worlds", "clip", "encoders", "autoencoder", "generator", "scores")
-LIMITS = (
-    "Knows only the procedural world of palpate: 20 simulated materials and a simulated gel. "
-    "Real photos and real tactile images are out of its range.",
-    "Made to show mechanisms and to test code offline; never compare its numbers with those of "
-    "real data sets.",
-)
 
 
 def main() -> int:
@@ -95,33 +90,12 @@ def main() -> int:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument(
-        "--work",
-        type=Path,
-        default=Path("runs/mini"),
-        help="folder for worlds, checkpoints and results",
-    )
+    parser.add_argument("--work", type=Path, default=Path("runs/mini"))
     parser.add_argument("--only", choices=PARTS, default="scores", help="the last part to make")
-    parser.add_argument(
-        "--ship", action="store_true", help="write src/palpate/mini of this checkout"
-    )
-    parser.add_argument(
-        "--verify", action="store_true", help="score the shipped models again instead of training"
-    )
-    parser.add_argument(
-        "--share",
-        type=float,
-        default=1.0,
-        help="share of all training lengths, to try the recipe out (not for shipping)",
-    )
-    parser.add_argument(
-        "--before",
-        type=Path,
-        help="folder of formerly shipped models whose text and tactile encoder and autoencoder "
-        "stay, and whose vision encoder goes on, instead of training these",
-    )
+    parser.add_argument("--ship", action="store_true", help="write src/palpate/mini")
+    parser.add_argument("--verify", action="store_true", help="score the shipped models again")
     options = parser.parse_args()
-    recipe = Recipe(options.work, options.share, options.before)
+    recipe = Recipe(options.work)
     try:
         if options.verify:
             return recipe.verify()
@@ -131,9 +105,6 @@ def main() -> int:
     except PalpateError as error:
         sys.stderr.write(f"{error}\n")
         return 2
-    except KeyboardInterrupt:
-        sys.stderr.write("Stopped; the same command goes on.\n")
-        return 130
     return 0
 
 
@@ -170,162 +141,101 @@ def train_round(
 class Recipe:
     """The parts, each a stage of a run folder; a finished stage is read, not made again."""
 
-    def __init__(self, work: Path, share: float, before: Path | None = None) -> None:
-        self.run, self.share, self.before = Run(work, print_line), share, before
-        self.cache = work / "cache"
-        self.shown = 0.0
+    def __init__(self, work: Path) -> None:
+        self.run, self.cache = Run(work, print_line), work / "cache"
+        self.common: dict[str, Any] = {"cache": self.cache, "progress": self.progress}
 
-    def progress(self, what: str, done: int, total: int, remark: str = "") -> None:
+    @staticmethod
+    def progress(what: str, done: int, total: int, remark: str = "") -> None:
         """A line every twentieth of the way."""
-        at = done / total if total else 0.0
-        if at >= self.shown + 0.05 or at in (0.0, 1.0) or at < self.shown:
-            self.shown = at
+        if done % max(1, total // 20) == 0:
             print_line(f"  {what}: {done} of {total} {remark}")
 
     def make(self, last: str) -> None:
-        """Makes the parts up to ``last``, leaving out those that it does not need."""
+        """Make the part ``last`` and what it needs."""
         for name in WORLDS:
             self.world(name)
-        wanted = {
-            "worlds": (),
-            "clip": (self.clip,),
-            "encoders": (self.encoders,),
-            "autoencoder": (self.autoencoder,),
-            "generator": (self.generator,),
-            "scores": (self.scores,),
-        }[last]
-        for part in wanted:
-            part()
+        if last != "worlds":
+            getattr(self, last)()
 
     def world(self, name: str) -> Manifest:
         """The samples of a world."""
-        options = WORLDS[name]
 
         def build(folder: Path) -> Mapping[str, Any]:
-            record = write_world(
-                folder / "tree",
-                options,
-                workers=len(os.sched_getaffinity(0)),
-                progress=self.progress,
-            )
-            return {
-                "digest": record.digest,
-                "frames": record.counts["contact_frames"],
-                "videos": record.counts["videos"],
-            }
+            workers = len(os.sched_getaffinity(0))
+            tree, options = folder / "tree", WORLDS[name]
+            record = write_world(tree, options, workers=workers, progress=self.progress)
+            facts = {"frames": record.counts["contact_frames"], "videos": record.counts["videos"]}
+            return {"digest": record.digest, **facts}
 
-        stage = self.run.stage(f"world {name}", {"options": options.digest}, build)
+        stage = self.run.stage(f"world {name}", {"options": WORLDS[name].digest}, build)
         return Manifest.load(stage.folder / "tree")
 
     def clip(self) -> Path:
         """Vision and text, by contrast of photos and captions."""
         train = self.world("gelsight")
-        epochs = CLIP_EPOCHS * self.share
 
         def build(folder: Path) -> Mapping[str, Any]:
-            clip = self._pair(train, ENCODER, folder, epochs)
+            clip = self._pair(train, ENCODER, folder, CLIP_EPOCHS)
             clip.save(fresh(folder / "clip"))
             return {"vision": clip.digest("vision"), "text": clip.digest("text")}
 
-        stage = self.run.stage(
-            "clip",
-            {"preset": ENCODER, "epochs": epochs, "seed": SEED, "train": train.digest},
-            build,
-        )
-        return stage.folder / "clip"
+        inputs = {"preset": ENCODER, "epochs": CLIP_EPOCHS, "seed": SEED, "train": train.digest}
+        return self.run.stage("clip", inputs, build).folder / "clip"
 
     def _pair(
         self, train: Manifest, preset: EncoderPreset, folder: Path, epochs: float, **how: Any
     ) -> ClipEncoders:
-        how |= {"seed": SEED, "cache": self.cache, "progress": self.progress}
-        part = everything(train)
-        return train_clip(train, part, preset, folder / "training", epochs=epochs, **how)
+        how |= {"seed": SEED, "epochs": epochs, **self.common}
+        return train_clip(train, everything(train), preset, folder / "training", **how)
 
     def tactile(self) -> EncoderSet:
         """The pair and a tactile encoder that learns from it."""
-        if self.before:
-            return EncoderSet.load(self.before / "encoders")
         clip, train = self.clip(), self.world("gelsight")
-        epochs = TACTILE_EPOCHS * self.share
+        how: dict[str, Any] = {"epochs": TACTILE_EPOCHS, "seed": SEED}
 
         def build(folder: Path) -> Mapping[str, Any]:
-            encoders = train_tactile(
-                train,
-                everything(train),
-                load_clip(clip),
-                ENCODER,
-                folder / "training",
-                epochs=epochs,
-                seed=SEED,
-                cache=self.cache,
-                progress=self.progress,
-            )
+            parts = train, everything(train), load_clip(clip), ENCODER, folder / "training"
+            encoders = train_tactile(*parts, **how, **self.common)
             encoders.save(fresh(folder / "encoders"))
             return {"tactile": encoders.digest("tactile"), "text": encoders.digest("text")}
 
-        stage = self.run.stage(
-            "tactile",
-            {
-                "preset": ENCODER,
-                "epochs": epochs,
-                "seed": SEED,
-                "clip": self.run.stages["clip"].digest,
-            },
-            build,
-        )
-        return EncoderSet.load(stage.folder / "encoders")
+        inputs = {"preset": ENCODER, **how, "clip": self.run.stages["clip"].digest}
+        return EncoderSet.load(self.run.stage("tactile", inputs, build).folder / "encoders")
 
     def encoders(self) -> EncoderSet:
-        """The three encoders; vision goes on with one photo of each of many more objects.
-
-        Text and tactile encoder stay: so do all scores that are made with these.
-        """
+        """The three encoders; vision goes on with one photo each of many more objects."""
         encoders = self.tactile()
         parts = [self.world(name).prefixed(f"{name}/") for name in ("gelsight", "photos")]
-        train, epochs = Manifest.join(*parts), VISION_EPOCHS * self.share
+        train = Manifest.join(*parts)
 
         def build(folder: Path) -> Mapping[str, Any]:
             how = {"start": encoders.clip, "compute": COMPUTE}
-            clip = self._pair(train, VISION, folder, epochs, **how)
+            clip = self._pair(train, VISION, folder, VISION_EPOCHS, **how)
             replace(encoders, clip=clip).save(fresh(folder / "encoders"))
             return {"vision": clip.digest("vision")}
 
-        inputs = {"preset": VISION, "epochs": epochs, "seed": SEED, "train": train.digest}
+        inputs = {"preset": VISION, "epochs": VISION_EPOCHS, "seed": SEED, "train": train.digest}
         inputs |= {m: encoders.digest(m) for m in encoders.modalities}
-        stage = self.run.stage("encoders", inputs, build)
-        return EncoderSet.load(stage.folder / "encoders")
+        return EncoderSet.load(self.run.stage("encoders", inputs, build).folder / "encoders")
 
     def autoencoder(self) -> AnyAutoencoder:
         """The background autoencoder, of tactile images of both looks."""
-        if self.before:
-            return load_autoencoder(self.before / "autoencoder")
         parts = [self.world(name) for name in ("gelsight", "digit")]
-        options = replace(AUTOENCODER, steps=max(1, round(AUTOENCODER.steps * self.share)))
+        digests = [part.digest for part in parts]
+
+        def images(column: str) -> NDArray[np.uint8]:
+            how = DIFFUSION.size, self.cache, self.progress
+            return np.concatenate([cached_images(part, column, *how) for part in parts])
 
         def build(folder: Path) -> Mapping[str, Any]:
-            images, gels = (
-                np.concatenate(
-                    [
-                        cached_images(part, column, DIFFUSION.size, self.cache, self.progress)
-                        for part in parts
-                    ]
-                )
-                for column in ("tactile", "background")
-            )
-            model = train_background_autoencoder(
-                images,
-                gels,
-                options,
-                folder / "training",
-                seed=SEED,
-                key=digest_json([p.digest for p in parts]),
-                compute=COMPUTE,
-                progress=self.progress,
-            )
+            data = images("tactile"), images("background"), AUTOENCODER, folder / "training"
+            how: dict[str, Any] = {"seed": SEED, "key": digest_json(digests), "compute": COMPUTE}
+            model = train_background_autoencoder(*data, **how, progress=self.progress)
             model.save(fresh(folder / "autoencoder"))
             return {"digest": model.digest}
 
-        inputs = {"options": options, "seed": SEED, "train": [p.digest for p in parts]}
+        inputs = {"options": AUTOENCODER, "seed": SEED, "train": digests}
         stage = self.run.stage("autoencoder", inputs, build)
         return load_autoencoder(stage.folder / "autoencoder")
 
@@ -348,10 +258,10 @@ class Recipe:
         train: Manifest,
     ) -> TactilePipeline:
         """A round of the generator's training; it goes on from the rounded weights of the last."""
-        steps, seed = max(1, math.ceil(GENERATOR_STEPS * self.share)), SEED + number
+        seed = SEED + number
         inputs = {
             "preset": replace(GENERATOR, sampler=SamplerOptions()),  # no part of the training
-            "steps": steps,
+            "steps": GENERATOR_STEPS,
             "seed": seed,
             "vision": encoders.digest("vision"),
             "text": encoders.digest("text"),
@@ -363,9 +273,8 @@ class Recipe:
             inputs["start"] = start.digest
 
         def build(folder: Path) -> Mapping[str, Any]:
-            how = {"cache": self.cache, "progress": self.progress}
-            parts = train, encoders, autoencoder
-            pipeline = train_round(*parts, folder / "training", seed, start, steps, **how)
+            parts = train, encoders, autoencoder, folder / "training"
+            pipeline = train_round(*parts, seed, start, GENERATOR_STEPS, **self.common)
             pipeline.save(fresh(folder / "model"))
             return {"digest": pipeline.digest, "train": len(train)}
 
@@ -374,28 +283,18 @@ class Recipe:
         return TactilePipeline.from_pretrained(folder / "model")
 
     def scores(self) -> dict[str, Any]:
-        """Scores of the full and of the rounded models on the new worlds, as rows for the cards."""
-        full = self.encoders(), self.autoencoder(), self.generator()
-        digests = [
-            full[0].digest("tactile"),
-            full[0].digest("vision"),
-            full[1].digest,
-            full[2].digest,
-        ]
+        """Scores of the rounded models on the new worlds, as rows for the cards."""
+        models = self.encoders(), self.autoencoder(), self.generator()
+        self._halve(*models)
+        digests = [models[0].digest("tactile"), models[0].digest("vision"), models[1].digest]
 
         def build(folder: Path) -> Mapping[str, Any]:
-            exact = score_all(*full, self._samples(), self.cache, None, self.progress)
-            rounding = self._halve(*full)
-            rounded = score_all(
-                *full, self._samples(), self.cache, folder / "generated", self.progress
-            )
-            write_json(
-                folder / "scores.json", {"rounded": rounded, "exact": exact, "rounding": rounding}
-            )
-            return {"rounding": rounding}
+            rows = score_all(*models, self._samples(), self.cache, self.progress)
+            write_json(folder / "scores.json", rows)
+            return {}
 
         inputs = {
-            "models": digests,
+            "models": [*digests, models[2].digest],
             "sampler": GENERATOR.sampler,
             "worlds": [self.world(name).digest for name in WORLDS],
         }
@@ -408,86 +307,50 @@ class Recipe:
     @staticmethod
     def _halve(
         encoders: EncoderSet, autoencoder: AnyAutoencoder, pipeline: TactilePipeline
-    ) -> dict[str, float]:
-        """Rounds all weights to 16 bits, in place; the largest relative change of a tensor of each
-        model.
-        """
-        changes = {
-            "encoders": encoders.halve(),
-            "autoencoder": autoencoder.halve(),
-            "generator": pipeline.denoiser.halve(),
-        }
+    ) -> None:
+        """Round all weights to 16 bits, in place."""
+        encoders.halve()
+        autoencoder.halve()
+        pipeline.denoiser.halve()
         vars(pipeline).pop("digest", None)  # cached before the weights changed
-        return changes
 
     def ship(self) -> None:
-        """Writes ``src/palpate/mini``: weights in 16 bits, and cards."""
-        if self.share != 1.0:
-            raise PalpateError(
-                "Shipped models must have been trained in full",
-                f"--share {self.share:g}",
-                "Leave out --share",
-            )
-        scores, encoders, autoencoder, pipeline = (
-            self.scores(),
-            self.encoders(),
-            self.autoencoder(),
-            self.generator(),
-        )
-        self._halve(encoders, autoencoder, pipeline)
+        """Write ``src/palpate/mini``: weights in 16 bits, and cards."""
+        scores = self.scores()
+        models = self.encoders(), self.autoencoder(), self.generator()
+        self._halve(*models)
         target = shipped_root() / SHIPPED[NAME]
-        ship(target, encoders, autoencoder, pipeline, scores, self._worlds(), LIMITS)
+        ship(target, *models, scores, self._worlds())
         if PAGE.is_file():
             write_page(PAGE, target)
         print_line(f"Shipped in {target}")
 
     def _worlds(self) -> list[dict[str, Any]]:
-        stages = {name: self.run.stages[f"world {name}"].facts for name in WORLDS}
-        return [
-            {
-                "world": name,
-                "seed": o.seed,
-                "look": o.look,
-                "version": VERSION,
-                "frames": stages[name]["frames"],
-                "videos": stages[name]["videos"],
-                "digest": stages[name]["digest"],
-            }
-            for name, o in WORLDS.items()
-        ]
+        rows: list[dict[str, Any]] = []
+        for name, o in WORLDS.items():
+            made = self.run.stages[f"world {name}"].facts
+            row = {"world": name, "seed": o.seed, "look": o.look, "version": VERSION}
+            rows.append(row | {key: made[key] for key in ("frames", "videos", "digest")})
+        return rows
 
     def verify(self) -> int:
-        """Scores the shipped models again; every score must come out as its card says, within 0.002
-        of its scale.
-        """
-        encoders, autoencoder, pipeline = (
-            EncoderSet.load(NAME),
-            load_autoencoder(NAME),
-            TactilePipeline.from_pretrained(NAME),
-        )
-        rows = score_all(
-            encoders, autoencoder, pipeline, self._samples(), self.cache, None, self.progress
-        )
-        cards = {
-            "encoders": encoders.card,
-            "autoencoder": autoencoder.card,
-            "generator": dict(pipeline.training),
-        }
+        """Score the shipped models again: as the cards say, within 0.002 of the scale."""
+        encoders, autoencoder = EncoderSet.load(NAME), load_autoencoder(NAME)
+        pipeline = TactilePipeline.from_pretrained(NAME)
+        models = encoders, autoencoder, pipeline
+        rows = score_all(*models, self._samples(), self.cache, self.progress)
+        cards = {"encoders": encoders.card, "autoencoder": autoencoder.card}
+        cards["generator"] = dict(pipeline.training)
         bad = 0
         for part, scored in rows.items():
             said = {row["score"]: row["value"] for row in cards[part]["scores"]}
-            if missing := sorted(set(said) - {row["score"] for row in scored}):
-                bad += len(missing)
-                print_line(f"{part}: the card has former scores: {', '.join(missing)}  DIFFERS")
-            for row in scored:
-                value, card = row["value"], said.get(row["score"])
-                same = card is not None and abs(value - card) <= 0.002 * max(1.0, abs(card))
+            now = {row["score"]: row["value"] for row in scored}
+            for name in said | now:
+                both = said.get(name, math.nan), now.get(name, math.nan)
+                same = abs(both[1] - both[0]) <= 0.002 * max(1.0, abs(both[0]))
                 bad += not same
-                known = "nothing" if card is None else f"{card:.4g}"
-                print_line(
-                    f"{part}: {row['score']}: {value:.4g}, the card says {known}"
-                    f"{'' if same else '  DIFFERS'}"
-                )
+                mark = "" if same else "  DIFFERS"
+                print_line(f"{part}: {name}: {both[1]:.4g}, the card says {both[0]:.4g}{mark}")
         return 1 if bad else 0
 
 

@@ -16,7 +16,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from zero_shot import zero_shot_accuracy
 
 from palpate.core import FeatureSet, Progress, Score, Split, digest_json
 from palpate.data.images import cached_images
@@ -31,6 +30,7 @@ from palpate.encoders.embed import embed, embed_images, embed_texts, texts_of
 from palpate.encoders.encoder_set import EncoderSet
 from palpate.evaluation.scoring import score
 from palpate.metrics import tmmd
+from palpate.metrics.means import mean_of
 from palpate.metrics.probe import material_accuracy
 from palpate.metrics.retrieval import retrieval
 
@@ -52,7 +52,6 @@ def score_all(
     pipeline: TactilePipeline,
     worlds: Mapping[str, Manifest],
     cache: Path,
-    folder: Path | None,
     progress: Progress,
 ) -> dict[str, Rows]:
     """Rows of scores by model: ``encoders``, ``autoencoder``, ``generator``.
@@ -63,23 +62,13 @@ def score_all(
         pipeline: the generator.
         worlds: ``gelsight``, ``new gelsight``, ``digit`` and ``new digit``.
         cache: folder for decoded pixels and embeddings.
-        folder: for the generated images; None puts them into ``cache``.
         progress: called while the work goes on.
     """
+    both = worlds["gelsight"], worlds["new gelsight"]
     return {
-        "encoders": score_encoders(
-            encoders, worlds["gelsight"], worlds["new gelsight"], cache, progress
-        ),
+        "encoders": score_encoders(encoders, *both, cache, progress),
         "autoencoder": score_autoencoder(autoencoder, worlds, cache, progress),
-        "generator": score_generator(
-            pipeline,
-            encoders,
-            worlds["gelsight"],
-            worlds["new gelsight"],
-            folder or cache,
-            cache,
-            progress,
-        ),
+        "generator": score_generator(pipeline, encoders, *both, cache, progress),
     }
 
 
@@ -92,6 +81,32 @@ def prompts(manifest: Manifest) -> dict[str, list[str]]:
         material: list(texts)[:: math.ceil(len(texts) / PROMPTS)]
         for material, texts in captions.items()
     }
+
+
+def zero_shot_accuracy(
+    images: FeatureSet, prompts: Mapping[str, Sequence[str]], encoders: EncoderSet
+) -> Score:
+    """Accuracy of naming the class of images by text alone (Radford et al. 2021, 3.1).
+
+    The embeddings t of a class's texts, each of length 1, make its prototype
+    ``p_c = mean(t) / ||mean(t)||``; the image embedding v gets the class with the largest v.p_c.
+
+    Args:
+        images: embeddings of one encoder (n, d) with labels and groups.
+        prompts: class -> at least one text; every label must be a class.
+        encoders: whose text encoder embeds the prompts.
+    """
+    classes = sorted(prompts)
+    embedded = (embed_texts(prompts[c], encoders).astype(np.float64) for c in classes)
+    means = np.stack([rows.mean(axis=0) for rows in embedded])
+    prototypes = means / np.linalg.norm(means, axis=1, keepdims=True)
+    chosen = (images.features.astype(np.float64) @ prototypes.T).argmax(axis=1)
+    labels = images.labels or ()
+    hit = np.array([classes[k] == label for k, label in zip(chosen, labels, strict=True)], float)
+    units = list(images.groups if images.groups is not None else images.ids)
+    details = {"chance": 1 / len(classes)}
+    name = "zero-shot accuracy"
+    return mean_of(name, hit, units, subject="real", encoder=images.encoder, details=details).score
 
 
 def score_encoders(
@@ -147,7 +162,6 @@ def score_generator(
     encoders: EncoderSet,
     old: Manifest,
     new: Manifest,
-    folder: Path,
     cache: Path,
     progress: Progress,
 ) -> Rows:
@@ -166,7 +180,7 @@ def score_generator(
     generated = generate(
         joined.part(split, "test"),
         model=pipeline,
-        output=folder / f"generated-{digest_json([pipeline.digest, pipeline.sampler])[:12]}",
+        output=cache / f"generated-{digest_json([pipeline.digest, pipeline.sampler])[:12]}",
         seed=0,
         progress=progress,
     )
@@ -224,8 +238,3 @@ def _row(name: str, score: Score, n: int) -> dict[str, Any]:
     if "chance" in score.details:
         row["chance"] = score.details["chance"]
     return row
-
-
-def table(rows: Sequence[Mapping[str, Any]]) -> dict[str, float]:
-    """Value by score."""
-    return {str(row["score"]): float(row["value"]) for row in rows}

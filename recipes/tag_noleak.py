@@ -1,11 +1,10 @@
-"""Checks the record TaG-NoLeak against Touch and Go's two official lists, or writes a new one.
+"""Checks the record TaG-NoLeak against Touch and Go's two official lists.
 
-    python recipes/tag_noleak.py LISTS/train.txt LISTS/test.txt [-o record.json]
+    python recipes/tag_noleak.py LISTS/train.txt LISTS/test.txt
 
 The lists are in the data set's repository (fredfyyang/Touch-and-Go, "Visuo-tactile contrastive
 learning/dataset/"). Each split of the record must keep whole videos, reach the deviation that it
-states, and be optimal: no smaller one exists, by HiGHS. Exit status 1 if one does not. With -o the
-record is made anew instead; another solver finds other splits of the same deviations.
+states, and be optimal: no smaller one exists, by HiGHS. Exit status 1 if one does not.
 """
 
 from __future__ import annotations
@@ -13,22 +12,13 @@ from __future__ import annotations
 import argparse
 import sys
 from pathlib import Path
-from typing import Any
 
 import polars as pl
 
-from palpate.core import digest_file, digest_json, write_text
-from palpate.core.digest import canonical_json
 from palpate.data.listing import read_lists
 from palpate.data.manifest import Manifest
 from palpate.leakage import audit, split
-from palpate.leakage.noleak import FORMAT, RATIOS, SEEDS, load_record, record_split
-
-CITE = (
-    "Videos of Touch and Go (Yang et al., NeurIPS 2022 Datasets and Benchmarks; CC BY 4.0),"
-    " ids alone."
-)
-METHOD = "whole videos, smallest largest deviation of any class's share of frames"
+from palpate.leakage.noleak import RATIOS, SEEDS, load_record, record_split
 
 
 def check(manifest: Manifest) -> int:
@@ -67,55 +57,14 @@ def deviation(manifest: Manifest, parts: dict[str, str], shares: dict[str, float
     )
 
 
-def make(manifest: Manifest, lists: list[Path]) -> dict[str, Any]:
-    """A new record."""
-    splits: dict[str, dict[str, Any]] = {}
-    for ratio, (train, val) in RATIOS.items():
-        splits[ratio] = {}
-        for made in (split(manifest, by="video", train=train, val=val, seed=k) for k in SEEDS):
-            columns = zip(manifest.ids, manifest.column("video"), strict=True)
-            videos = {v: made.parts[i] for i, v in columns}
-            facts = {k: made.rule[k] for k in ("deviation", "bound", "status", "limiting")}
-            by_part = {
-                p: sorted(v for v, part in videos.items() if part == p) for p in made.counts()
-            }
-            splits[ratio][str(made.rule["seed"])] = {
-                "digest": type(made)(videos).digest,
-                **facts,
-                "samples": made.counts(),
-                "videos": by_part,
-            }
-    record: dict[str, Any] = {
-        "format": FORMAT,
-        "name": "TaG-NoLeak",
-        "dataset": "touch-and-go",
-        "source": CITE,
-        "rule": {"method": METHOD, "version": 3, "group": "video"},
-        "lists": {p.name: digest_file(p) for p in lists},
-        "frames": len(manifest),
-        "videos": manifest.table["video"].n_unique(),
-        "classes": manifest.table["material"].n_unique(),
-        "splits": splits,
-    }
-    return record | {"sha256": digest_json(record)}
-
-
 def main() -> int:
-    """Check or write."""
+    """Check the record; exit with 1 if a split does not hold."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("lists", nargs=2, type=Path, metavar="LIST")
-    parser.add_argument("-o", "--output", type=Path)
-    options = parser.parse_args()
-    manifest = read_lists(options.lists, root=options.lists[0].parent).manifest
-    if options.output:
-        text = canonical_json(make(manifest, options.lists))
-        for mark in ('"splits":', '{"bound"'):
-            text = text.replace(mark, f"\n{mark}")
-        write_text(options.output, text + "\n")
-        return 0
-    failed = check(manifest)
+    lists = parser.parse_args().lists
+    failed = check(read_lists(lists, root=lists[0].parent).manifest)
     total = len(RATIOS) * len(SEEDS)
     sys.stdout.write(f"{total - failed} splits hold, {failed} do not.\n")
     return 1 if failed else 0

@@ -175,7 +175,7 @@ def test_photos_may_be_missing_and_videos_held_out(world, clip, tmp_path):
     assert encoders.card["without_photo"] == 5
     assert encoders.card["train_samples"] == 18
     lines = (tmp_path / "log.jsonl").read_text()
-    assert lines.count("held_out") == lines.count("probe") > 1
+    assert lines.count("held_out") > 1
 
 
 def with_val(manifest, rows):

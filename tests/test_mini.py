@@ -190,17 +190,16 @@ def test_half_is_rounded_first_and_read_back_to_the_same_digest(tmp_path):
     assert torch.equal(
         stored["quantize.embedding.weight"].float(), model.net.quantize.embedding.weight
     )
-    assert model.halve() == 0  # rounded once is rounded for good
+    rounded = model.digest
+    model.halve()
+    assert model.digest == rounded  # rounded once is rounded for good
 
 
-def test_rounding_is_measured_and_refused_where_it_makes_infinity():
+def test_rounding_is_refused_where_it_makes_infinity():
     module = torch.nn.Linear(3, 1, bias=False)
     module.weight.data = torch.tensor([[1.0, 1.0 + 2**-11 + 2**-20, 1e-9]])
-    done = round_to_half({"m": module})
+    round_to_half({"m": module})
     assert module.weight.tolist() == [[1.0, 1.0 + 2**-10, 0.0]]
-    assert done == pytest.approx(
-        np.linalg.norm([2**-11 - 2**-20, 1e-9]) / np.linalg.norm([1, 1 + 2**-11 + 2**-20]), rel=1e-3
-    )
     for bad in (70000.0, float("nan"), float("inf")):
         other = torch.nn.Linear(2, 1, bias=False)
         other.weight.data = torch.tensor([[0.1, 0.2]])

@@ -137,9 +137,9 @@ class Autoencoder(nn.Module):
             parts.append(to_bytes(self.image(latents[start : start + batch].to(device))[0]))
         return np.concatenate(parts)
 
-    def halve(self) -> float:
+    def halve(self) -> None:
         """Round all weights to 16 bits in place; see ``models.round_to_half``."""
-        return round_to_half({"net": self.net})
+        round_to_half({"net": self.net})
 
     def save(self, folder: Path, *, half: bool = False) -> None:
         """Write the diffusers model, ``palpate.json`` and ``README.md``.
@@ -307,9 +307,9 @@ class BackgroundAutoencoder(ModelMixin, ConfigMixin):
         gray = _gray(background, self.device)
         return pixel_unshuffle(self.inputs(gray, gray)[1], self.factor).cpu()
 
-    def halve(self) -> float:
+    def halve(self) -> None:
         """Round all weights to 16 bits in place; see ``models.round_to_half``."""
-        return round_to_half({"autoencoder": self})
+        round_to_half({"autoencoder": self})
 
     def save(self, folder: Path, *, half: bool = False) -> None:
         """Write the model in diffusers' format, ``palpate.json`` and ``README.md``."""

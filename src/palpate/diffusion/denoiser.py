@@ -345,11 +345,11 @@ class Denoiser(nn.Module):
         options["class_labels"] = None if first is None else first.to(kind)
         return cast("Tensor", self.unet(x.to(kind), t, return_dict=False, **options)[0]).float()
 
-    def halve(self) -> float:
+    def halve(self) -> None:
         """Round the U-Net's weights and the memory to 16 bits in place."""
         for kept in (b for name, b in self.named_buffers(recurse=False) if name in MEMORY):
             kept.copy_(kept.half())
-        return round_to_half({"unet": self.unet})
+        round_to_half({"unet": self.unet})
 
     def save(self, folder: Path, *, half: bool = False) -> None:
         """Write the U-Net and ``condition.safetensors`` (means, memory, trained maps).

@@ -616,7 +616,7 @@ def train_denoiser(  # noqa: PLR0913 - one row per part of the model
     trained = start is not None or isinstance(unet, str)
     begin = [digest_tensors(model.state_dict())] if trained else []
     key = digest_json([key, background is not None, *settings, *begin])
-    task = Task("generator", len(latents), loss.load, loss, key, names, others, None, samples)
+    task = Task("generator", len(latents), loss.load, loss, key, names, others, samples)
     fit(model, task, loop, folder, compute=compute, progress=progress)
     return model.eval().requires_grad_(False)
 

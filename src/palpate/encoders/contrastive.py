@@ -87,7 +87,7 @@ def train_encoder(  # noqa: PLR0913 - a public verb
 ) -> EncoderSet:
     """Train a tactile encoder on the train part of a split, against vision and text.
 
-    Loss and probe of the part ``val``, where the split has one, are measured while it trains.
+    The loss of the part ``val``, where the split has one, is measured while it trains.
 
     The accuracy of a linear material probe on the test part goes into the card
     (``card["scores"]``). Run again with the same ``output`` to resume. Under ``torchrun`` every
@@ -236,15 +236,6 @@ class TactileLoss:
         total, logs = three_way(whole, *partners, **how)
         return Losses(total, {**logs, "scale": scale.detach()}, tactile.sum(dim=1))
 
-    def probe(self, others: Rows, module: nn.Module) -> dict[str, float]:
-        """Accuracy on the held-out part of a linear material probe of the train part."""
-        device = next(module.parameters()).device
-        encode = partial(self.encode, module)
-        train, test = (part.features(encode, device) for part in (self.rows, others))
-        if any(len(set(part.labels or ()) - {""}) < 2 for part in (train, test)):
-            return {}
-        return {"probe": float(material_accuracy(train, test))}
-
 
 def train_tactile(  # noqa: PLR0913 - one row per choice of the training
     manifest: Manifest,
@@ -322,7 +313,6 @@ def train_tactile(  # noqa: PLR0913 - one row per choice of the training
         digest_json([facts, _stamps(train)]),
         train.ids,
         None if others is None else (len(held), others.load),
-        None if others is None else partial(loss.probe, others),
     )
     log = fit(model, task, options, folder, compute=compute, progress=progress)
     card = _card(facts, options, log, where) | {"clip": clip.name, "clip_card": clip.card}

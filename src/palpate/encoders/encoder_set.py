@@ -431,9 +431,9 @@ class EncoderSet:
             return None
         return Origin(clip.name, clip.card["license"], tuple(clip.card["trained_on"]))
 
-    def halve(self) -> float:
+    def halve(self) -> None:
         """Round all weights to 16 bits in place; see ``models.round_to_half``."""
-        return round_to_half(self._modules())
+        round_to_half(self._modules())
 
     def save(self, folder: Path, *, half: bool = False) -> None:
         """Write the folder described in the module's docstring; whole or not at all.

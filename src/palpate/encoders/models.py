@@ -334,11 +334,8 @@ def save_model(model: Any, folder: Path, *, half: bool) -> None:
         path.write_text(json.dumps(config, indent=2, sort_keys=True) + "\n", encoding="utf-8")
 
 
-def round_to_half(modules: Mapping[str, nn.Module]) -> float:
+def round_to_half(modules: Mapping[str, nn.Module]) -> None:
     """Round the floating-point weights of modules to float16 values, in place; their type stays.
-
-    Returns:
-        The largest ``||after - before|| / ||before||`` of a tensor.
 
     Raises:
         PalpateError: if a weight is not finite in 16 bits; nothing is changed then.
@@ -351,12 +348,8 @@ def round_to_half(modules: Mapping[str, nn.Module]) -> float:
             got = f"{name} with values up to {float(before[name].abs().max()):.3g}"
             must = "Weights saved in 16 bits must be finite and below 65,520 in size"
             raise PalpateError(must, got, "Save them in 32 bits")
-    change = 0.0
     for name, value in before.items():
-        norm = float(value.double().norm())
-        change = max(change, float((after[name] - value).double().norm()) / (norm or 1.0))
         value.copy_(after[name])  # the tensors of state_dict are the module's, without gradients
-    return change
 
 
 def architecture(config: Any) -> dict[str, Any]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn.functional import affine_grid, grid_sample
 
-from palpate.core import FeatureSet, Progress, quiet
+from palpate.core import Progress, quiet
 from palpate.data.manifest import Manifest
 from palpate.encoders.embed import embed, texts_of
 from palpate.encoders.encoder_set import ClipEncoders, EncoderSet
@@ -19,8 +19,6 @@ from palpate.encoders.preprocess import Preprocess, prepared_images
 from palpate.encoders.presets import Augment
 from palpate.training.engine import Batch
 from palpate.training.steps import Step
-
-PROBED = 2000  # rows that the probe in training sees, at most
 
 
 class Rows:
@@ -78,18 +76,6 @@ class Rows:
         if self.vision is not None:
             batch["vision"] = self.vision[photo.clamp(min=0)]
         return batch
-
-    def features(self, encode: Callable[[Tensor], Tensor], device: torch.device) -> FeatureSet:
-        """Embeddings of at most :data:`PROBED` evenly spaced tactile images, with materials."""
-        some = evenly(len(self.images), PROBED)
-        parts: list[Tensor] = []
-        for start in range(0, len(some), 128):
-            pixels = torch.from_numpy(np.array(self.images[some[start : start + 128]])).to(device)
-            parts.append(encode(unit(pixels)).float().cpu())
-        columns = (self.manifest.column("material"), self.manifest.column("video"))
-        labels, groups = ([str(c[k] or "") for k in some] for c in columns)
-        ids = [self.manifest.ids[k] for k in some]
-        return FeatureSet(ids, torch.cat(parts).numpy(), labels, groups)
 
 
 def draw(augment: Augment, step: Step) -> dict[str, Tensor]:

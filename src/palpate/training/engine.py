@@ -83,7 +83,6 @@ class Task:
         key: digest of the data and of settings outside :class:`LoopOptions`.
         names: of the rows, for errors.
         held_out: rows of the held-out part, and ``load`` of it.
-        probe: numbers to log at each evaluation, of the module in evaluation mode.
         samples: an image, bytes (h, w, 3), of what the module makes of a few samples; drawn with
             each checkpoint.
     """
@@ -95,7 +94,6 @@ class Task:
     key: str = ""
     names: Sequence[str] | None = None
     held_out: tuple[int, Load] | None = None
-    probe: Callable[[nn.Module], dict[str, float]] | None = None
     samples: Callable[[nn.Module], NDArray[np.uint8]] | None = None
 
 
@@ -123,7 +121,7 @@ def fit(
 
     Returns:
         The log: dictionaries with ``step``, ``loss``, ``lr``, ``seconds`` (of a step) and what the
-        loss logged; ``held_out`` and the probe's numbers where the held-out part was evaluated.
+        loss logged; ``held_out`` where the held-out part was evaluated.
 
     Raises:
         PalpateError: without rows or parameters to train, if the batch cannot be shared by the
@@ -324,28 +322,25 @@ class _Run:
 
     def evaluation_steps(self) -> set[int]:
         """After how many steps the held-out part is evaluated."""
-        if self.task.held_out is None and self.task.probe is None:
+        if self.task.held_out is None:
             return set()
         k, steps = self.options.evaluations, self.options.steps
         return {math.ceil(steps * i / k) for i in range(1, k + 1)} if k else set()
 
     def evaluate(self, step: int) -> None:
-        """Log the held-out loss and the probe of the weights that would be the result now."""
+        """Log the held-out loss of the weights that would be the result now."""
         self.check()
-        values: dict[str, float] = {}
+        assert self.task.held_out is not None
         with self.evaluating():
-            if self.task.held_out is not None:
-                values["held_out"] = self.held_out_loss(*self.task.held_out)
-                if not math.isfinite(values["held_out"]):
-                    must = f"The held-out loss of {self.task.what} must be finite"
-                    got = f"{values['held_out']} after step {step - 1}"
-                    self.busy = True
-                    raise shared(PalpateError(must, got, "Lower the learning rate"))
-            if self.task.probe is not None:
-                values |= self.task.probe(self.module)
-            if "held_out" in values and values["held_out"] < self.best[0] and not self.part[0]:
+            loss = self.held_out_loss(*self.task.held_out)
+            if not math.isfinite(loss):
+                must = f"The held-out loss of {self.task.what} must be finite"
+                self.busy = True
+                fix = "Lower the learning rate"
+                raise shared(PalpateError(must, f"{loss} after step {step - 1}", fix))
+            if loss < self.best[0] and not self.part[0]:
                 _save(_copies(self.module.state_dict()), self.best_file)
-        self.write_log({"step": step - 1} | values)
+        self.write_log({"step": step - 1, "held_out": loss})
 
     def held_out_loss(self, n: int, load: Load) -> float:
         """The mean loss over all held-out rows, with the same batches and draws always.
