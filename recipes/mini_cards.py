@@ -73,14 +73,6 @@ def ship(
 ) -> None:
     """Replaces what is shipped; the models must be rounded to 16 bits already, since the scores are
     theirs.
-
-    Args:
-        target: the folder of the package.
-        encoders: vision, text and tactile.
-        autoencoder: of tactile images.
-        pipeline: the generator, in the space of the other two.
-        scores: rows by model.
-        worlds: rows that describe the worlds.
     """
 
     def card(part: str) -> dict[str, Any]:

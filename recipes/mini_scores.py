@@ -56,13 +56,7 @@ def score_all(
 ) -> dict[str, Rows]:
     """Rows of scores by model: ``encoders``, ``autoencoder``, ``generator``.
 
-    Args:
-        encoders: vision, text and tactile.
-        autoencoder: of tactile images.
-        pipeline: the generator.
-        worlds: ``gelsight``, ``new gelsight``, ``digit`` and ``new digit``.
-        cache: folder for decoded pixels and embeddings.
-        progress: called while the work goes on.
+    ``worlds`` are ``gelsight``, ``new gelsight``, ``digit`` and ``new digit``.
     """
     both = worlds["gelsight"], worlds["new gelsight"]
     return {

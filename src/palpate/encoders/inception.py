@@ -2,8 +2,7 @@
 
 It maps 8-bit images (n, 3, h, w), 0 to 255, to features (n, d). The widely used file is
 ``inception-2015-12-05.pt``: it resizes to 299 px itself (bilinear, as TensorFlow did in 2015) and
-gives the 2048 pool features when called with ``return_features=True``; that keyword is passed
-wherever the module's ``forward`` has it.
+gives the 2048 pool features when called with ``return_features=True``.
 
 **Trust.** A TorchScript file is a program: loading it unpickles no Python object, but running it
 runs any torch operation that its author chose, with the rights of this process. Take such a file
@@ -13,7 +12,6 @@ from its publisher alone.
 from __future__ import annotations
 
 import warnings
-from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -38,13 +36,11 @@ class Inception:
     Attributes:
         path: the file.
         module: the TorchScript module.
-        options: keywords that it is called with.
-        digest: SHA-256 of the file and the keywords.
+        digest: SHA-256 of the file.
     """
 
     path: Path
     module: Any
-    options: Mapping[str, bool]
     digest: str
 
     def embed(
@@ -68,13 +64,11 @@ class Inception:
         n = len(images)
         must = f"The module {self.path} must map {n} uint8 images to floats ({n}, d)"
         try:
-            features: Any = self.module(pixels, **self.options)
+            features: Any = self.module(pixels, return_features=True)
         except RuntimeError as error:
             got = (str(error).strip().splitlines() or ["an error of torch"])[-1][:200]
             raise PalpateError(must, got, FIX) from None
         shape = tuple(getattr(features, "shape", ()))
-        if shape[2:] == (1, 1):
-            features, shape = features.flatten(1), shape[:2]
         if len(shape) != 2 or shape[0] != n or not features.is_floating_point():
             raise PalpateError(must, f"{type(features).__name__} of shape {shape}", FIX)
         return features.float().numpy()
@@ -93,11 +87,8 @@ def load_inception(path: str | Path) -> Inception:
         with warnings.catch_warnings():  # torch deprecates TorchScript; published weights stay
             warnings.simplefilter("ignore", DeprecationWarning)
             module: Any = torch.jit.load(str(path), map_location="cpu")
-        arguments = [argument.name for argument in module.forward.schema.arguments]
-    except (RuntimeError, OSError, ValueError, AttributeError) as error:
+    except (RuntimeError, OSError, ValueError) as error:
         got = f"another file ({first_line(error)[:120]}); pickles are never loaded"
         raise PalpateError(f"{path} must be a TorchScript module", got, FIX) from None
     module.eval()
-    options = {"return_features": True} if "return_features" in arguments else {}
-    digest = digest_json({"kind": "torchscript", "file": digest_file(path), **options})
-    return Inception(path, module, options, digest)
+    return Inception(path, module, digest_json({"kind": "torchscript", "file": digest_file(path)}))
