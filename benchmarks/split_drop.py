@@ -3,8 +3,7 @@
     python benchmarks/split_drop.py --write docs/studies/split_drop.md
     python benchmarks/split_drop.py --small          # two looks of a tiny world, one seed, under two minutes
 
-Two worlds: `gelsight` in the layout and with the leak of Touch and Go (whole contacts of one video on both sides; materials), `digit` in those of HCT (single
-frames; no materials). On each, one tactile encoder is trained from scratch for the world's own split (Orig) and for one by whole videos (NoLeak) with each
+Two worlds: `gelsight` with the leak of Touch and Go (whole contacts of one video on both sides), `digit` with that of HCT (single frames). On each, one tactile encoder is trained from scratch for the world's own split (Orig) and for one by whole videos (NoLeak) with each
 seed, against the frozen vision and text encoders of palpate/mini, and scored on the test part of its own split. It is
 `palpate probe DATA --splits Orig.json NoLeak.json --train --clip palpate/mini`; the same command runs on Touch and Go and HCT. Stopped, it goes on where it was.
 """
@@ -24,10 +23,7 @@ from palpate.leakage import split as leak_free_split
 from palpate.sim import PRESETS, write_world
 from palpate.studies.split_study import compare_splits
 
-LOOKS = {
-    "gelsight": {"layout": "frames", "leak": "contact"},
-    "digit": {"layout": "hct", "leak": "frame"},
-}
+LOOKS = {"gelsight": {"leak": "contact"}, "digit": {"leak": "frame"}}
 #: Scores in the tables of the page; the others are in the run's own page.
 SHOWN = r"material accuracy(, balanced)?|top-[15] of \d+ \((text|vision) by tactile\)"
 WORLD = {"objects_per_material": 6, "contacts_per_video": 4, "two_videos": 0.0, "seed": 7}
