@@ -315,10 +315,9 @@ def test_mistakes_are_one_line_each(tmp_path, small_manifest, capsys):
         ([one, one, "--split", split], "TRAIN and TEST"),
         ([lines, tmp_path / "gone.txt"], "nothing at"),
         ([lines, lines, "--impact"], "--impact needs all samples and a split"),
-        ([lines, lines, "--group", "video"], "--by"),
         ([one, "--split", split, "--false-positives", "0.7"], "--false-positives"),
         ([one, "--split", split, "--near-frames", "-1"], "--near-frames"),
-        ([one, "--split", split, "--encoder", tmp_path / "none"], "no folder"),
+        ([one, "--split", split, "--encoder", tmp_path / "none"], "must come with the impact"),
         ([lines, tmp_path / "bad.txt"], "1 problem"),
         ([one, "--split", split, "--by", "object", "--no-images"], "object"),
     ]:
