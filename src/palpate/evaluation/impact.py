@@ -203,7 +203,7 @@ def _design(manifest: Manifest, split: Split, group: str, seeds: Sequence[int]) 
         "train_samples": min(len(train) for train, _ in splits),
         "test_samples": [len(test) for _, test in splits],
         "test_groups": test_groups,
-        "shared_groups": len(np.intersect1d(*(owner[part] for part in splits[0]))),
+        "shared_groups": len(np.intersect1d(owner[splits[0][0]], owner[splits[0][1]])),
     }
     if excluded:
         total = len(excluded) + len({*here})
