@@ -1,6 +1,5 @@
 """The graph of stages: order, reuse, several processes, errors, and kill -9."""
 
-import json
 import os
 import shutil
 import signal
@@ -187,19 +186,6 @@ def test_work_within_a_node_is_reported_under_its_name(tmp_path, jobs):
     reports = []
     run_graph([node("a")], tmp_path, jobs=jobs, progress=lambda *args: reports.append(args))
     assert ("a: writing", 1, 1, "") in reports
-
-
-def hold(megabytes, folder, before, progress):
-    return {"bytes": len(b"x" * (megabytes << 20))}
-
-
-@pytest.mark.skipif(not Path("/proc/self/clear_refs").exists(), reason="Linux alone resets it")
-def test_peak_memory_is_that_of_the_stage(tmp_path):
-    run_graph([Node(f"s{n}", partial(hold, n), {}) for n in (300, 1)], tmp_path)
-    peak = [
-        json.loads((tmp_path / n / "stage.json").read_text())["peak_mb"] for n in ("s300", "s1")
-    ]
-    assert 250 < peak[0] - peak[1] < 350
 
 
 SCRIPT = """

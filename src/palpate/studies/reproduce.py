@@ -406,7 +406,7 @@ def _source(function: Callable[..., Any]) -> str:
 def settings_of(plan: Plan, stages: Mapping[str, Stage], jobs: int) -> dict[str, Any]:
     """The record of a run: what was chosen, digests, versions, machine, and every stage."""
     records = {n: read_json(s.folder / "stage.json", "stage record") for n, s in stages.items()}
-    kept = ("digest", "outputs", "seconds", "peak_mb", "date")
+    kept = ("digest", "outputs", "seconds", "date")
     digests: dict[str, Any] = {"manifest": stages["data"].facts["digest"]}
     digests |= {f"split {s}": stages["split"].facts[s]["digest"] for s in SPLITS}
     for seed, split in product(plan.seeds, SPLITS):

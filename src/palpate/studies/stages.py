@@ -1,7 +1,7 @@
 """Run folders: a pipeline as named stages, each kept under the digest of what it read.
 
 ``run/NAME/stage.json`` marks a finished stage and holds its inputs, the digests of the files of
-earlier stages that it read, its facts, the digest of its own files, time, peak memory, date and
+earlier stages that it read, its facts, the digest of its own files, time, date and
 versions. A stage is built in ``run/NAME.partial``, with what it reads in ``run/NAME.partial.json``,
 and renamed when complete. Running again with the same inputs and the same files of earlier stages
 reuses it; with others the stage, and so every stage that read it, is built again. A killed
@@ -17,7 +17,6 @@ import json
 import os
 import platform
 import shutil
-import sys
 import time
 from collections.abc import Callable, Mapping
 from contextlib import suppress
@@ -133,7 +132,6 @@ def _build(
         raise PalpateError(must, str(error), "Choose another folder") from None
     record = json.loads(canonical_json(known))
     write_json(partial_record, record)
-    per_stage = _reset_peak()
     start = time.monotonic()
     try:
         facts = dict(build(partial) or {})
@@ -144,7 +142,6 @@ def _build(
         raise
     record |= {"facts": facts, "outputs": stage_outputs(partial)}
     record["seconds"] = round(time.monotonic() - start, 2)
-    record |= {"peak_mb": _peak_mb(per_stage)} | _gpu_peak()
     record["date"] = datetime.datetime.now(datetime.UTC).date().isoformat()
     record |= _made_with()
     write_json(partial / "stage.json", record)
@@ -173,39 +170,6 @@ def _made_with() -> dict[str, Any]:
         with suppress(metadata.PackageNotFoundError):
             versions[package] = metadata.version(package)
     return {"versions": versions, "machine": f"{platform.machine()}, {os.cpu_count()} cores"}
-
-
-def _reset_peak() -> bool:
-    """Let the peak memory of this process begin anew; only Linux can. That of its GPU always."""
-    if (torch := sys.modules.get("torch")) is not None and torch.cuda.is_initialized():
-        torch.cuda.reset_peak_memory_stats()
-    try:
-        Path("/proc/self/clear_refs").write_text("5")
-    except OSError:
-        return False
-    return True
-
-
-def _peak_mb(since_reset: bool) -> int | None:
-    """Peak memory of this process in MiB, without its children: since :func:`_reset_peak`, else
-    since it began; None where the system does not say (Windows).
-    """
-    if since_reset:
-        status = Path("/proc/self/status").read_text()
-        return round(int(status.partition("VmHWM:")[2].split()[0]) / 1024)  # kB
-    try:
-        import resource
-    except ImportError:  # Windows
-        return None
-    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    return round(peak / (1 << 20 if sys.platform == "darwin" else 1 << 10))
-
-
-def _gpu_peak() -> dict[str, int]:
-    """Peak memory of torch on this process's GPU in MiB, if it has used one."""
-    if (torch := sys.modules.get("torch")) is None or not torch.cuda.is_initialized():
-        return {}
-    return {"peak_gpu_mb": round(torch.cuda.max_memory_allocated() / (1 << 20))}
 
 
 def _record(path: Path) -> dict[str, Any]:
