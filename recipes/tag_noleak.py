@@ -51,7 +51,7 @@ def deviation(manifest: Manifest, parts: dict[str, str], shares: dict[str, float
     table = manifest.table.with_columns(part=pl.Series([parts[i] for i in manifest.ids]))
     classes = [t for t in table.partition_by("material") if t["video"].n_unique() >= len(shares)]
     return max(
-        abs((some["part"] == part).sum() / some.height - share)
+        abs(int((some["part"] == part).sum()) / some.height - share)
         for some in [table, *classes]
         for part, share in shares.items()
     )
