@@ -103,6 +103,8 @@ def test_equal_file_names_of_two_roots_are_no_leak_and_a_copied_file_is(layout, 
     assert (status, counts) == (0, (0, 0, 0))
     (note,) = [note["params"] for note in data["notes"] if note["code"] == "equal-names"]
     assert note["equal"]["id"] == 12
+    status, data, _ = run(capsys, *sources(), "--identity", "names")
+    assert (status, data["leaking_samples"], data["identical_samples"]) == (1, 12, 12)
     if layout == "lists":
         return  # they have no images
     shutil.copy(a / "video1" / "0001.jpg", b / "video2" / "0011.jpg")

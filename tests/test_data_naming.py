@@ -32,6 +32,7 @@ def rows_of(kind, numbers):
 
 KINDS = {
     # suffix, options, video and frame of the first test sample, leaking samples of how many
+    "ssvtp": (".csv", ("--ids-in-time", "--near-frames", "1"), (None, 35), (1, 10)),
     "intervals": (".txt", (), ("video3", 3500), (50, 100)),
     "interval table": (".csv", (), ("video3", 3500), (50, 100)),
     "nested": (".json", (), ("data1/3-17003.70", 35), (5, 10)),

@@ -15,8 +15,8 @@ TOP = Path(__file__).resolve().parents[1]
 #: Public function -> its parameters in order; keywords behind the star.
 SIGNATURES = {
     "audit": (
-        "train_or_data test * split pretrain by near_frames images modalities "
-        "false_positives impact name worst cache root reading "
+        "train_or_data test * split pretrain by near_frames identity images modalities "
+        "false_positives impact name worst cache root reading ids_in_time "
         "skip_bad progress encoder allow_seen"
     ),
     "caption": (

@@ -147,14 +147,16 @@ def test_names_count_where_they_are_declared_or_the_roots_are_one_data_set(tmp_p
         (world, world | {"digest": "b"}, ()),
     ):
         parts = [Manifest.from_rows([row], tmp_path / r, f) for r, f in (("1", a), ("2", b))]
-        assert shared_names(*parts) == expected, (a, b)
-        assert shared_names(parts[0], replace(parts[1], root=parts[0].root)) == NAMES
+        assert shared_names(*parts, "auto") == expected, (a, b)
+        assert shared_names(parts[0], replace(parts[1], root=parts[0].root), "auto") == NAMES
         result = audit(*parts, images=False)
         assert (result.groups_shared, result.leaked_fraction) == (
             (1, 1.0) if expected else (0, 0.0)
         )
     declared = Manifest.from_rows([row | {"id": "press 7"}], tmp_path / "1")
-    assert "id" in shared_names(declared, replace(declared, root=tmp_path / "2"))
+    assert "id" in shared_names(declared, replace(declared, root=tmp_path / "2"), "auto")
+    with pytest.raises(PalpateError, match="`identity` must be one of auto, names, images"):
+        audit(declared, declared, identity="paths")
 
 
 @pytest.mark.parametrize("kind", ["polars", "pandas"])

@@ -53,6 +53,7 @@ COMMANDS: dict[str, int] = {
     "--every 4 -o OUT/m": 3,
     "validate IN/video/dataset --tactile {video}/gelsight.mp4": 2,
     "caption check IN/captions/captions.csv --data IN/manifest -o OUT/s.json --page OUT/p.html": 2,
+    "audit IN/lists/train.txt IN/lists/test.txt --ids-in-time": 1,
     "audit IN/pairs/tactile IN/manifest --as tactile --table OUT/a.csv": 1,
     "validate IN/touch-and-go": 2,
     "validate IN/hct": 1,

@@ -36,6 +36,13 @@ class Comparison:
     """What train and test must not share; `auto`: the video, or what is known instead of it."""
     near_frames: int = 30
     """A gap of up to this many frames within a video is a leak by itself."""
+    ids_in_time: Switch = False
+    """The last number of an id or path is a time: samples without a video and frame are as near as
+    these numbers."""
+    identity: Literal["auto", "names", "images"] = "auto"
+    """What equal names in train and test mean: `names` the same thing, `images` nothing, so that
+    bytes and images decide; `auto`: names where both have one root, are of one published data set,
+    or have them from columns of tables."""
     images: bool = True
     """Compare image files and their content, not only tables."""
     modalities: tuple[Modality, ...] = ("vision", "tactile")

@@ -20,17 +20,25 @@ import numpy as np
 import polars as pl
 from numpy.typing import NDArray
 
-from palpate.core import Note, PalpateError, Progress, Split, few, quiet, require
+from palpate.core import Note, PalpateError, Progress, Split, few, quiet, require, require_choice
 from palpate.data.manifest import MODALITIES, Manifest
 from palpate.leakage.content import shows_nothing
 from palpate.leakage.groups import GROUPS, shared_groups
-from palpate.leakage.inputs import Data, number_contacts, read_all, rename_unrelated, shared_names
+from palpate.leakage.inputs import (
+    Data,
+    Identity,
+    number_contacts,
+    read_all,
+    rename_unrelated,
+    shared_names,
+)
 from palpate.leakage.signals import (
     Flags,
     Gaps,
     by_contact,
     identical_bytes,
     identical_samples,
+    in_time,
     leaking,
     nearest_in_video,
     shared_group,
@@ -54,10 +62,12 @@ class _Options:
 
     by: str
     near_frames: int
+    identity: Identity
     images: bool
     modalities: Sequence[str]
     false_positives: float
     worst: int
+    ids_in_time: bool
     cache: Path | None
     progress: Progress
 
@@ -70,6 +80,7 @@ def audit(  # noqa: PLR0913
     pretrain: Data = None,
     by: str = "auto",
     near_frames: int = 30,
+    identity: Identity = "auto",
     images: bool = True,
     modalities: Sequence[str] = ("vision", "tactile"),
     false_positives: float = 0.001,
@@ -79,6 +90,7 @@ def audit(  # noqa: PLR0913
     cache: str | Path | None = None,
     root: str | Path | None = None,
     reading: Mapping[str, Any] | None = None,
+    ids_in_time: bool = False,
     skip_bad: bool = False,
     progress: Progress = quiet,
 ) -> Audit:
@@ -95,6 +107,9 @@ def audit(  # noqa: PLR0913
         by: what train and test must not share: a column, or ``auto`` for the video or what is known
             instead of it.
         near_frames: a gap of up to this many frames within a video is a leak by itself.
+        identity: what equal names in train and test mean: ``names`` the same thing, ``images``
+            nothing, so that bytes and images decide; ``auto`` names where both have one root, are
+            of one published data set, or have the names from columns of tables.
         images: compare image files and their content, not only tables.
         modalities: the images to compare.
         false_positives: rate at which unrelated images may pass for near-duplicates, in (0, 0.1].
@@ -106,6 +121,8 @@ def audit(  # noqa: PLR0913
         reading: how sources are read, as in :func:`palpate.load`: ``columns``, ``names``,
             ``classes``, ``side``, and the templates ``vision`` and ``tactile``, also of paths in
             lists whose images are not at hand.
+        ids_in_time: the last number of an id or path is a time: gaps of samples without a video and
+            frame are differences of these.
         skip_bad: skip bad rows of lists and tables, and note them.
         progress: callback.
 
@@ -123,10 +140,12 @@ def audit(  # noqa: PLR0913
     options = _Options(
         by,
         near_frames,
+        identity,
         images,
         modalities,
         false_positives,
         worst,
+        ids_in_time,
         None if cache is None else Path(cache),
         progress,
     )
@@ -174,6 +193,7 @@ def _check(options: _Options) -> None:
     frames, worst = options.near_frames, options.worst
     require(frames >= 0, "near_frames", "must be at least 0", frames, 30)
     require(worst >= 0, "worst", "must be at least 0", worst, 12)
+    require_choice("identity", options.identity, ("auto", "names", "images"))
     known = set(options.modalities) <= set(MODALITIES)
     must = "must be among vision, tactile"
     require(known, "modalities", must, list(options.modalities), ["vision"])
@@ -241,7 +261,7 @@ def _group(train: Manifest, test: Manifest, options: _Options) -> str:
     group = known_group(train, test) if options.by == "auto" else options.by
     listed = all("path" in part.table.columns for part in (train, test))
     images = options.images and _with_images(train, test)
-    if group == NO_GROUP and (images or listed):
+    if group == NO_GROUP and (images or listed or options.ids_in_time):
         return group
     if group == NO_GROUP or not (_known(train, group) and _known(test, group)):
         raise PalpateError(
@@ -264,13 +284,14 @@ def _compare(
 ) -> Audit:
     """Audit one part against another."""
     group = _group(train, test, options)
-    shared = shared_names(train, test)
+    shared = shared_names(train, test, options.identity)
     train, test, equal = rename_unrelated(train, test, shared, (against, "test"))
     a, b = train.table, test.table
     groups = [set(t[group].drop_nulls()) if group != NO_GROUP else set[str]() for t in (a, b)]
     in_both = sorted(groups[0] & groups[1])
     in_shared = int(b[group].is_in(in_both).fill_null(False).sum()) if in_both else 0
-    gaps = nearest_in_video(*by_contact(a, b))
+    timed_tables = [in_time(t) if options.ids_in_time else t for t in (a, b)]
+    gaps = nearest_in_video(*by_contact(*timed_tables))
     flags = _signals(train, test, group, gaps, options, named=shared)
     leaks = leaking(flags, len(test))
     reason = _reason(train, test, group, flags, options, named=not equal)

@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import polars as pl
 
@@ -27,6 +27,8 @@ Data = Any
 FIX = "Correct the lines, or skip the bad ones"
 #: Problems that a note names.
 SHOWN = 40
+#: What equal names mean: the same thing, or nothing, or (auto) what the sources say.
+Identity = Literal["auto", "names", "images"]
 #: Columns of names; those of several samples, which are renamed where they mean nothing.
 NAMES = ("id", "video", "contact", "object", "session")
 PLACE = ["video", "frame"]
@@ -150,13 +152,15 @@ def number_contacts(manifests: list[Manifest]) -> list[Manifest]:
     return numbered
 
 
-def shared_names(train: Manifest, test: Manifest) -> tuple[str, ...]:
+def shared_names(train: Manifest, test: Manifest, identity: Identity) -> tuple[str, ...]:
     """The columns in which equal values of both parts mean the same thing."""
     facts = [[m.facts.get(fact) for fact in ("format", "dataset", "digest")] for m in (train, test)]
     published = {form.facts.name for form in FORMATS.values()}
     same = train.root.resolve() == test.root.resolve() or (
         facts[0] == facts[1] and (facts[0][1] in published or facts[0][2] is not None)
     )
+    if identity != "auto":
+        return NAMES if identity == "names" else ()
     return NAMES if same else tuple(c for c in NAMES if _declares(train, c) and _declares(test, c))
 
 

@@ -76,6 +76,18 @@ def by_contact(*tables: pl.DataFrame) -> list[pl.DataFrame]:
     return [t.with_columns(video=pl.coalesce(contact, "video")) for t in tables]
 
 
+def in_time(table: pl.DataFrame) -> pl.DataFrame:
+    """The table where the last number of an id is the frame, and the others are the video."""
+    number = r"^(.*?)(\d{1,18})(\D*)$"
+    both = pl.col("video").is_not_null() & pl.col("frame").is_not_null()
+    frame = pl.col("id").str.extract(number, 2).cast(pl.Int64)
+    video = pl.col("id").str.replace(number, "${1}#${3}")
+    return table.with_columns(
+        video=pl.when(both).then("video").otherwise(video),
+        frame=pl.when(both).then("frame").otherwise(frame),
+    )
+
+
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Flags(Signal):
     """A signal with what it says of every test sample, in their order."""

@@ -266,12 +266,12 @@ def _blank_images(params: Mapping[str, Any], _: Style) -> str:
     )
 
 
-def _equal_names(p: Mapping[str, Any], _: Style) -> str:
+def _equal_names(p: Mapping[str, Any], style: Style) -> str:
     equal = " and ".join(plural(n, f"equal {column}") for column, n in p["equal"].items())
     decided = "bytes and images decide" if p["images"] else "there are no images to compare"
     return (
         f"{p['roots'][0]} and {p['roots'][1]} have {equal}, which mean nothing by themselves: "
-        f"{decided}. If both are one data set, put both lists into one folder"
+        f"{decided}. If both are one data set: {style:identity=names}"
     )
 
 
