@@ -16,7 +16,9 @@ from palpate.data.manifest import Manifest
 from palpate.evaluation import companions, inputs, score, scoring
 from palpate.evaluation.controls import matched_features
 from palpate.metrics import Polynomial, compare, contact_scores, distance, i_tmmd, ssim
-from score_calls import DIM, GROUPS, IDS, by_key, codes, feature_sets, paint, unit
+from palpate.metrics.intervals import spread_of_values
+from palpate.metrics.neighbors import prdc_rows
+from score_calls import DIM, FRAMES, GROUPS, IDS, by_key, codes, feature_sets, paint, unit
 
 SETS = feature_sets()
 TEST, TRAIN = IDS[:24], IDS[24:]
@@ -61,12 +63,12 @@ def test_embeddings_agree_with_loops_and_with_the_library():
     for s in [*library.scores, *library.differences]:
         got = scores[s.metric, s.subject, "grouped"]
         assert (got.value, got.interval, got.floor) == (s.value, s.interval, s.floor), s.metric
-    for metric in ("FID", "KID"):
+    for metric in ("FID", "KID", "Precision", "Recall", "Density", "Coverage"):
         assert f"{metric} (embeddings)" in {m for m, _, _ in scores}
     assert results.settings["digests"] == {"encoder": "e" * 64, "reference": SETS["real"].digest}
 
 
-@pytest.mark.parametrize("companion", ["kid", "fid", "cmmd"])
+@pytest.mark.parametrize("companion", ["kid", "prdc", "fid", "cmmd"])
 def test_companions_on_features_have_paired_differences(companion):
     made = {name: SETS[name] for name in ("near", "far")}
     results = score(made, SETS["real"], companions=[companion], permutations=0)
@@ -84,6 +86,29 @@ def test_companions_on_features_have_paired_differences(companion):
         direct = distance(SETS["near"].features, SETS["real"].features, **options).value
         assert near.value == pytest.approx(direct, abs=1e-6)
         assert "kid-interval" in [n.code for n in near.notes]
+
+
+def test_differences_of_precision_take_the_groups_of_the_rows_they_average():
+    order = np.random.default_rng(0).permutation(IDS)
+    made = {"a": SETS["near"], "b": SETS["far"].take([*order])}
+    few = 6 * FRAMES
+    videos = [f"w{v}" for v in range(6) for _ in range(FRAMES)]
+    names = [f"r{k}" for k in range(few)]
+    real = FeatureSet(names, SETS["real"].features[:few], None, videos, "e" * 64)
+    scores = by_key(score(made, real, companions=["prdc"], permutations=0))
+    rows = [prdc_rows(SETS[name], real)[1] for name in ("near", "far")]
+    for metric, groups in (
+        ("Precision", GROUPS),
+        ("Density", GROUPS),
+        ("Recall", videos),
+        ("Coverage", videos),
+    ):
+        delta = rows[0][metric] - rows[1][metric]
+        got = scores[f"{metric} (embeddings) difference", "a - b", None]
+        assert got.value == pytest.approx(delta.mean(), abs=1e-12)
+        interval = spread_of_values(delta, groups).interval()
+        assert (got.interval is None) == (interval is None)
+        assert interval is None or got.interval == pytest.approx(interval, abs=1e-9)
 
 
 def test_bare_arrays_have_no_groups_and_pair_by_row():
@@ -180,7 +205,7 @@ def test_of_many_rows_only_fid_is_computed_by_default(monkeypatch):
     monkeypatch.setattr(scoring, "MANY", 10)
     results = score({"g": SETS["far"]}, SETS["real"], permutations=0)
     assert {m for m, _, _ in by_key(results) if "(embeddings)" in m} == {"FID (embeddings)"}
-    assert [n.params.get("name") for n in results.notes] == [None, "kid"]
+    assert [n.params.get("name") for n in results.notes] == [None, "kid", "prdc"]
     assert codes(results)[0] == "wide-sigma-alone"
     results = score({"g": SETS["far"]}, SETS["real"], companions=["kid"], permutations=0)
     assert "KID (embeddings)" in {m for m, _, _ in by_key(results)}
@@ -190,7 +215,7 @@ def test_a_default_companion_that_cannot_be_computed_becomes_a_note():
     few = {name: s.take([IDS[0]]) for name, s in SETS.items()}
     results = score({"g": few["far"]}, few["real"], presets=["cmmd"], sigma=10, permutations=0)
     skipped = [n.params["name"] for n in results.notes if n.code == "companion-skipped"]
-    assert skipped == ["fid"]
+    assert skipped == ["fid", "prdc"]
     with pytest.raises(PalpateError):
         score({"g": few["far"]}, few["real"], presets=["cmmd"], sigma=10, companions=["fid"])
 
@@ -407,7 +432,13 @@ def test_images_are_embedded_and_scored_as_their_features(tmp_path, small_manife
         got = scores[s.metric, "a", "grouped"].value
         assert got == pytest.approx(s.value, rel=1e-6, abs=1e-6), s.metric
     metrics = {m for m, _, _ in scores}
-    for metric in ("FID (tactile) difference", "SSIM", "MS-SSIM", "contact residual"):
+    for metric in (
+        "FID (tactile) difference",
+        "SSIM",
+        "MS-SSIM",
+        "contact residual",
+        "Precision (tactile)",
+    ):
         assert metric in metrics
     assert not [m for m in metrics if m.startswith(("CMMD", "LPIPS", "material"))]
     assert results.settings["digests"]["tactile encoder"] == mini.digest("tactile")

@@ -9,7 +9,7 @@ import pytest
 
 from palpate import metrics
 from palpate.core import FeatureSet, PalpateError
-from palpate.metrics import cmmd, fid, kid, tmmd
+from palpate.metrics import cmmd, fid, kid, prdc, tmmd
 from palpate.report.notes import SENTENCES
 
 ROWS = "ids=None, groups=None, reference_ids=None, reference_groups=None, encoder=None"
@@ -41,6 +41,7 @@ FUNCTIONS = {
     ),
     "ms_ssim": f"{IMAGES}, **options",
     "per_image": f"metric, {IMAGES}",
+    "prdc": f"generated, reference, k=5, *, {ROWS}, **options",
     "psnr": f"{IMAGES}, **options",
     "require_same_ids": "generated_ids, reference_ids",
     "ssim": f"{IMAGES}, **options",
@@ -74,7 +75,7 @@ def sets(n=60, m=50, d=6):
     return [v / np.linalg.norm(v, axis=1, keepdims=True) for v in (x, y)]
 
 
-@pytest.mark.parametrize("metric", [tmmd, kid, cmmd, fid])
+@pytest.mark.parametrize("metric", [tmmd, kid, cmmd, fid, prdc])
 def test_arrays_tensors_lists_and_feature_sets_give_the_same_scores(metric):
     torch = pytest.importorskip("torch")
     x, y = sets()

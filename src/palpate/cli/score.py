@@ -12,7 +12,9 @@ import tyro
 from palpate.cli.terminal import Common, OptionalOutPath, Switch, Terminal, guard_output
 from palpate.core import PalpateError, is_stream
 
-Companion = Literal["fid", "kid", "cmmd", "ssim", "psnr", "ms-ssim", "contact", "lpips", "none"]
+Companion = Literal[
+    "fid", "kid", "cmmd", "prdc", "ssim", "psnr", "ms-ssim", "contact", "lpips", "none"
+]
 
 
 @dataclass(frozen=True, kw_only=True)

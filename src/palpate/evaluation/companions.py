@@ -5,6 +5,7 @@ name           needs      score
 =============  =========  ================================================================
 ``fid``        features   Frechet distance, of Inception's features if its weights are given
 ``kid``        features   MMD^2 with the kernel (x.y / d + 1)^3, as ``fid``
+``prdc``       features   precision, recall, density and coverage of nearest neighbors
 ``cmmd``       features   biased MMD^2, of CLIP's features if a CLIP is given
 ``ssim``       pairs      structural similarity
 ``psnr``       pairs      peak signal-to-noise ratio
@@ -30,10 +31,11 @@ from numpy.typing import NDArray
 from palpate.core import FeatureSet, Note, PalpateError, Progress, Score
 from palpate.metrics import Polynomial, compare_fid, compare_tmmd, mean_score, per_image
 from palpate.metrics.contact import contacts_of_each
+from palpate.metrics.neighbors import prdc_rows
 from palpate.metrics.paired import mean_differences
 
 Images = NDArray[np.uint8]
-Name = Literal["fid", "kid", "cmmd", "ssim", "psnr", "ms-ssim", "contact", "lpips"]
+Name = Literal["fid", "kid", "prdc", "cmmd", "ssim", "psnr", "ms-ssim", "contact", "lpips"]
 #: With more rows the companions that form all pairs must be requested by name.
 MANY = 50_000
 #: The CLIP of published CMMD (arXiv 2401.09603).
@@ -159,7 +161,7 @@ def choose(
     Raises:
         PalpateError: for an unknown name, or a companion whose inputs are not there.
     """
-    has = {name: weights.for_features(name)[1] is not None for name in FEATURES}
+    has = {name: weights.for_features(name)[1] is not None for name in FEATURES if name != "prdc"}
     able = {name: encoder or has.get(name, False) for name in FEATURES}
     able |= dict.fromkeys(PAIRS, images)
     able |= {"contact": images and background, "lpips": images and weights.lpips is not None}
@@ -190,11 +192,13 @@ def _lacking(name: str, weights: Weights, *, images: bool) -> PalpateError:
         from palpate.encoders.perceptual import FIX
 
         return PalpateError("must hold the two files of LPIPS", "none", FIX, argument="lpips")
-    from palpate.encoders.inception import FIX
+    fix = "Pass an encoder"
+    if name != "prdc":
+        from palpate.encoders.inception import FIX
 
-    kind = weights.for_features(name)[0]
-    where = {"inception": FIX, "clip": f"Fetch one with: hf download {CMMD_CLIP}"}
-    fix = f"Pass an encoder, or weights of {kind}. {where[kind]}"
+        kind = weights.for_features(name)[0]
+        where = {"inception": FIX, "clip": f"Fetch one with: hf download {CMMD_CLIP}"}
+        fix = f"{fix}, or weights of {kind}. {where[kind]}"
     must = "must need no features of images without an encoder"
     return PalpateError(must, name, fix, example={"encoder": "palpate/mini"}, **argument)
 
@@ -269,6 +273,30 @@ def _kid(features: Features) -> Outcome:
     return outcome
 
 
+def _prdc(features: Features) -> Outcome:
+    outcome = Outcome()
+    for sets in features.batches():
+        first = next(iter(sets.values()))
+        split = features.common["split"]
+        results = {
+            name: prdc_rows(s.take(list(first.ids)), features.reference, subject=name, split=split)
+            for name, s in sets.items()
+        }
+        # Precision and density average over generated rows, recall and coverage over real ones.
+        groups = (first.groups, features.reference.groups) * 2
+        for k, metric_groups in enumerate(groups):
+            scores = {name: s[k] for name, (s, _) in results.items()}
+            if len(sets) > 1:
+                values = {name: rows[s[k].metric] for name, (s, rows) in results.items()}
+                one = next(iter(scores.values()))
+                units = metric_groups if one.settings["grouped"] else None
+                between = mean_differences(scores, values, units)
+                outcome.differences += _renamed(between, one.metric, features)
+            for s in scores.values():
+                outcome.scores += _renamed([s], s.metric, features)
+    return outcome
+
+
 def _renamed(
     scores: Sequence[Score], old: str, features: Features, new: str | None = None
 ) -> list[Score]:
@@ -325,7 +353,12 @@ def _lpips(pairs: Pairs) -> Outcome:
     return _with_differences(pairs, scores, lambda name: values[name])
 
 
-FEATURES: Mapping[str, Callable[[Features], Outcome]] = {"fid": _fid, "kid": _kid, "cmmd": _cmmd}
+FEATURES: Mapping[str, Callable[[Features], Outcome]] = {
+    "fid": _fid,
+    "kid": _kid,
+    "prdc": _prdc,
+    "cmmd": _cmmd,
+}
 PAIRS: Mapping[str, Callable[[Pairs], Outcome]] = {
     "ssim": partial(_mean_of_pairs, metric="SSIM"),
     "psnr": partial(_mean_of_pairs, metric="PSNR"),

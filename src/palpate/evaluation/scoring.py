@@ -341,7 +341,7 @@ def _companions(
             require_same_ids(samples.ids, real.ids)
         except PalpateError as error:
             fix = "Score the same samples on both sides, or request companions without pairs"
-            example = {"companions": ["fid", "kid"]}
+            example = {"companions": ["fid", "kid", "prdc"]}
             raise PalpateError(f"{name}: {error.must}", error.got, fix, example=example) from None
     return chosen, True
 
@@ -476,7 +476,7 @@ class _Run:
         if len(set(sizes.values())) > 1:
             got = ", ".join(f"{name} {size}" for name, size in sizes.items())
             fix = "Resize them, or request companions without pixels"
-            example = {"companions": ["fid", "kid"]}
+            example = {"companions": ["fid", "kid", "prdc"]}
             must = "Generators must have images of one size for scores of pixels"
             raise PalpateError(must, got, fix, example=example)
         return next(iter(sizes.values()))

@@ -1,6 +1,6 @@
 """Metrics of generated tactile images: arrays or tensors in, :class:`palpate.core.Score` out.
 
-On features of an encoder: the TMMD family, KID, CMMD and FID.
+On features of an encoder: the TMMD family, KID, CMMD, FID, precision, recall, density and coverage.
 On pairs of images: SSIM, PSNR and MS-SSIM; residual, SSIM and IoU of the contact alone.
 """
 
@@ -9,6 +9,7 @@ from palpate.metrics.distributions import compare_fid, fid
 from palpate.metrics.images import mean_score, ms_ssim, per_image, psnr, require_same_ids, ssim
 from palpate.metrics.kernels import Gaussian, Polynomial
 from palpate.metrics.mmd import PRESETS, Distance, Options, distance
+from palpate.metrics.neighbors import prdc
 from palpate.metrics.paired import Comparison, compare, compare_tmmd
 from palpate.metrics.streaming import TMMD
 from palpate.metrics.tactile import ci_tmmd, cmmd, d_tmmd, four_scores, i_tmmd, kid, tmmd
@@ -38,6 +39,7 @@ __all__ = [
     "mean_score",
     "ms_ssim",
     "per_image",
+    "prdc",
     "psnr",
     "require_same_ids",
     "ssim",

@@ -236,12 +236,14 @@ METRICS: dict[str, Sentence] = {
     "no-interval-over-images": (
         "No interval: one image or one group, or no variation between them"
     ),
+    "no-interval-over-groups": "No interval: one group, or no variation between them",
     "no-interval-few-units": "No interval: too few groups or samples to leave some out",
     "fewer-scales": (
         "{scales} of the 5 scales (five need {least} pixels a side), weights divided by their sum: "
         "not comparable with MS-SSIM of 5"
     ),
     "no-contact": "{count} of {n} real images show no contact, excluded from the mean",
+    "empty-balls": "{count} of {n} {of} rows occur more than k times: their balls hold nothing",
     "fid-mostly-bias": (
         "Not meaningful: {n} samples do not span the {d} dimensions, so the value is mostly bias"
     ),
