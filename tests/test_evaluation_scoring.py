@@ -523,6 +523,29 @@ def test_one_background_stands_for_all_images_of_a_folder(tmp_path, small_manife
         score(SETS["far"], SETS["real"], background=gel)
 
 
+def test_clusters_stand_in_for_materials_and_say_so(tmp_path, small_manifest, mini):
+    bare = {k: dataclasses.replace(SETS[k], labels=None) for k in ("near", "far", "real")}
+    results = score({"a": bare["near"], "b": bare["far"]}, bare["real"], labels="cluster:3", **FAST)
+    for metric, marked in {"TMMD": False, "I-TMMD": False, "CI-TMMD": True, "D-TMMD": True}.items():
+        for s in [*results[metric], *results[f"{metric} difference"]]:
+            assert ("pseudo-labels" in {n.code for n in s.notes}) == marked
+            assert (s.settings.get("labels") == "cluster:3 of the reference's features") == marked
+    assert {*results["CI-TMMD"][0].details["classes"]} <= {f"cluster {k}" for k in (1, 2, 3)}
+    again = score(bare["near"], bare["real"], labels="cluster:3", **FAST)
+    assert again["D-TMMD", "generated"].value == results["D-TMMD", "a"].value
+    paint(tmp_path / "g", small_manifest.ids, 1)
+    options = {"encoder": mini, "labels": "cluster:2", **FAST}
+    of_photos = score(tmp_path / "g", small_manifest, **options)["CI-TMMD", "g"]
+    assert of_photos.settings["labels"] == "cluster:2 of photos"
+    for labels, made, words in (
+        ("cluster:x", bare["far"], "cluster: and a number"),
+        ("cluster:40", bare["far"], "four samples a cluster"),
+        ("cluster:3", bare["far"].features, "share no ids"),
+    ):
+        with pytest.raises(PalpateError, match=words):
+            score(made, bare["real"], labels=labels, **FAST)
+
+
 def test_tactile_images_without_photos_are_scored(tmp_path, small_manifest, mini):
     paint(tmp_path / "g", small_manifest.ids, 1)
     table = small_manifest.table.with_columns(vision=pl.lit(None, pl.String))
@@ -533,6 +556,8 @@ def test_tactile_images_without_photos_are_scored(tmp_path, small_manifest, mini
     subjects = {s.subject for s in results["TMMD"]}
     assert subjects == {"g", "background only", "real, same material"}
     results.to_html(tmp_path / "page.html")
+    labels = score(tmp_path / "g", reference, encoder=mini, labels="cluster:2", **FAST)
+    assert labels["CI-TMMD", "g"].settings["labels"] == "cluster:2 of the reference's features"
 
 
 def test_an_interrupted_run_goes_on_from_its_embeddings(

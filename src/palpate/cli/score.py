@@ -23,8 +23,9 @@ class Samples:
 
     names: tuple[str, ...] = ()
     """Names of the generators in the tables, instead of those of their folders and files."""
-    labels: Path | None = None
-    """CSV or Parquet file with the columns id, material, video: instead of the inputs' own."""
+    labels: str | None = None
+    """CSV or Parquet file with the columns id, material, video: instead of the inputs' own; or
+    `cluster:8`, eight clusters of the reference's photos (else features) for materials."""
     group: Literal["auto", "video", "contact", "object"] = "auto"
     """What stays together in halves and intervals; `auto` takes what the split kept whole, else the
     video."""
@@ -132,7 +133,8 @@ def _check_outputs(options: Options) -> None:
     """Raise before anything is computed if an output cannot be written."""
     samples = options.samples
     given = (options.split, options.train)
-    read = (options.reference, *given, samples.labels, *options.generated)
+    labels = Path(samples.labels) if samples.labels else None
+    read = (options.reference, *given, labels, *options.generated)
     inputs = [path for path in read if path]
     if options.output:
         guard_output(options.output, inputs)

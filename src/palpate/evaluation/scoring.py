@@ -45,6 +45,7 @@ from palpate.evaluation.inputs import (
     Inputs,
     Samples,
     Source,
+    from_reference,
     guard,
     load_encoders,
     read,
@@ -186,7 +187,9 @@ def score(  # noqa: PLR0913
             (train videos matched by material), a material probe and the controls.
         names: of the generators, in the tables.
         labels: materials, and possibly groups, by id: a CSV or Parquet file with the columns id,
-            material, video; id -> material; or one material per row.
+            material, video; id -> material; or one material per row. ``"cluster:8"`` takes eight
+            clusters of the reference's photos (without photos or encoder: of its features) for
+            materials, by id; a note of CI- and D-TMMD says so.
         group: the column whose values stay together in halves and intervals; ``auto`` takes what
             the split kept whole, else the video.
         background: one image (or its file) of the sensor without contact, for all real images: what
@@ -231,6 +234,7 @@ def score(  # noqa: PLR0913
     """
     call = Call.of("score", score, locals())
     split = None if split is None else Split.load(split)
+    labels, clusters = _clusters(labels)
     sigmas = (sigma,) if isinstance(sigma, int | float | str) else tuple(sigma or ())
     family = Family(
         presets=tuple(dict.fromkeys(presets or ())),
@@ -271,7 +275,9 @@ def score(  # noqa: PLR0913
         run = _Run(
             inputs, family, encoders, weights, Path(folder), cache is not None, progress, seen
         )
+        run, of = run.clustered(clusters) if clusters else (run, "")
         outcome = run.score(chosen, pairs=pairs, controls=controls)
+        outcome = _with_clusters(outcome, clusters, of) if clusters else outcome
     outcome.scores = with_warnings(outcome.scores, inputs, split, digest, of_encoder)
     settings = _settings(inputs, family, outcome, encoders, seen)
     settings |= {"split rule": dict(split.rule)} if split is not None else {}
@@ -314,6 +320,35 @@ def _digests_read(settings: Mapping[str, Any]) -> dict[str, Any]:
     """Of everything that was read: images, or files of embeddings; encoder and split."""
     files: Mapping[str, Any] = settings.get("embeddings", {})
     return {**settings["digests"], **{f"rows of {n}": f["digest"] for n, f in files.items()}}
+
+
+def _clusters(labels: Source) -> tuple[Source, int]:
+    """Labels, and how many clusters stand in for them: ``cluster:8`` -> (None, 8)."""
+    word, _, count = str(labels).partition(":") if isinstance(labels, str | Path) else ("", "", "")
+    if word != "cluster":
+        return labels, 0
+    if not count.isdecimal() or int(count) < 2:
+        must = "must be a file, or cluster: and a number of at least 2"
+        example = {"labels": "cluster:8"}
+        raise PalpateError(must, repr(str(labels)), "", argument="labels", example=example)
+    return None, int(count)
+
+
+def _with_clusters(outcome: Outcome, clusters: int, of: str) -> Outcome:
+    """Scores that looked at classes, and their differences, say that these are clusters."""
+    of_classes = {s.metric for s in outcome.scores if "classes" in s.details}
+    for scores in (outcome.scores, outcome.differences):
+        scores[:] = [
+            replace(
+                s,
+                settings={**s.settings, "labels": f"cluster:{clusters} of {of}"},
+                notes=[*s.notes, Note("pseudo-labels", {"clusters": clusters, "of": of})],
+            )
+            if s.metric.removesuffix(" difference") in of_classes
+            else s
+            for s in scores
+        ]
+    return outcome
 
 
 def _companions(
@@ -401,6 +436,50 @@ class _Run:
             for scores in (outcome.scores, outcome.differences):
                 scores[:] = [replace(s, reference=digest) if s.m else s for s in scores]
         return outcome
+
+    def clustered(self, count: int) -> tuple[_Run, str]:
+        """The same samples with clusters of the reference for labels, and what was clustered.
+
+        Photos say more of a material than touch does, and no generator is judged by its own.
+
+        Raises:
+            PalpateError: with too few samples, or generators of other ids.
+        """
+        from scipy.cluster.vq import kmeans2
+
+        real, seed = self.inputs.reference, self.family.common["seed"]
+        manifest = real.manifest
+        photos = manifest is not None and not manifest.table["vision"].null_count()
+        if self.encoders is not None and manifest is not None and photos:
+            from palpate.encoders.embed import embed
+
+            options: dict[str, Any] = {"progress": self.progress}
+            x, of = embed(manifest, self.encoders, "vision", **options).features, "photos"
+        elif self.encoders is not None or real.features is not None:
+            x, of = self._features(real).features, "the reference's features"
+        else:
+            fix, example = "Pass an encoder", {"encoder": "palpate/mini"}
+            must, got = "must be a file where there are no features", "clusters"
+            raise PalpateError(must, got, fix, argument="labels", example=example)
+        rows = np.asarray(x, np.float64)
+        distinct = np.unique(rows, axis=0)
+        if len(distinct) < 4 * count:
+            got = f"{count} of {len(distinct)} different samples"
+            must = "must leave four samples a cluster"
+            raise PalpateError(must, got, "Choose fewer", argument="labels")
+        first = distinct[rng_for(seed, "clusters").choice(len(distinct), count, replace=False)]
+        number = kmeans2(rows, first, iter=100, minit="matrix")[1]
+        real = replace(real, labels=[f"cluster {k + 1}" for k in number])
+        made = {
+            name: from_reference(replace(s, labels=None), real)
+            for name, s in self.inputs.generators.items()
+        }
+        if other := next((s for s in made.values() if s.labels is None), None):
+            must = "must be a file where generated and real images share no ids"
+            raise PalpateError(must, f"clusters for {other.source}", "", argument="labels")
+        train = self.inputs.train and replace(self.inputs.train, labels=None)
+        inputs = replace(self.inputs, generators=made, reference=real, train=train)
+        return replace(self, inputs=inputs), of
 
     def _memorization(self, train: Samples) -> list[Score]:
         """How near each generator's images lie to its train images, in every space there is."""

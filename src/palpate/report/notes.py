@@ -466,6 +466,10 @@ EVALUATION: dict[str, Sentence] = {
         "ones do; that is not better"
     ),
     "companion-skipped": "{name} skipped: {must}; got {got}",
+    "pseudo-labels": (
+        "The classes are {clusters} clusters of {of}, not materials: not comparable with scores "
+        "over materials"
+    ),
     "synthetic-encoder": lambda p, _: (
         "The encoder was trained on simulated tactile images alone, and "
         + ("these are real" if p["real"] else "nothing says whether these are real")
