@@ -49,6 +49,20 @@ def test_a_photo_becomes_an_image_with_a_notice(place, capsys):
     assert not [p.name for p in place.rglob(".*")]
 
 
+def test_a_dry_run_is_one_line_and_writes_nothing(place, capsys):
+    dry = ("photos", "-o", "a", "--guidance", "1", "--steps", "3", "--dry-run")
+    status, out, _ = call(capsys, *dry)
+    assert (status, out) == (0, "2 images to make, 6 network evaluations\n")
+    assert not (place / "a").exists()
+    assert call(capsys, *dry[:-1], "-q")[0] == 0
+    for path in (place / "a" / "images").glob("a_*"):
+        path.unlink()
+    before = sorted(place.rglob("*"))
+    status, out, _ = call(capsys, *dry, "--json")
+    assert (status, json.loads(out)) == (0, {"missing": 1, "evaluations": 3})
+    assert sorted(place.rglob("*")) == before
+
+
 def test_several_photos_and_folders_become_folders(place, capsys):
     assert call(capsys, "photos", "-o", "a", "-q")[0] == 0
     assert call(capsys, "photos/a.jpg", "photo.jpg", "-o", "b", "-q")[0] == 0

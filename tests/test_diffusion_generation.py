@@ -91,6 +91,21 @@ def test_a_resumed_folder_equals_an_uninterrupted_one(pipeline, tmp_path):
     assert generate(tmp_path / "in", output=tmp_path / "b", model=pipeline).made == 0
 
 
+@pytest.mark.parametrize("change", [{}, {"guidance": 1.0}, {"high": 0.8}])
+@pytest.mark.parametrize("method", ["dpm", "ddim"])
+def test_evaluations_of_a_dry_run_are_those_of_the_call(tmp_path, change, method):
+    files, base = write_photos(tmp_path / "photos", 20), make_pipeline()
+    chosen = {"method": method, "steps": 6, "guidance": 2.0, "batch": 10} | change
+    pipeline = replace(base, sampler=replace(base.sampler, **chosen))
+    planned = generate(files, model=pipeline, dry_run=True)
+    counts, forward = [], pipeline.unet.forward
+    pipeline.unet.forward = lambda x, *args, **how: (
+        counts.append(len(x)) or forward(x, *args, **how)
+    )
+    generate(files, model=pipeline)
+    assert (planned.missing, planned.made, planned.evaluations) == (20, 0, sum(counts))
+
+
 def test_more_photos_extend_the_folder_and_a_changed_one_is_made_again(pipeline, tmp_path):
     paths = write_photos(tmp_path / "in", 4)
     common = {"model": pipeline, "output": tmp_path / "out"}

@@ -145,6 +145,7 @@ def test_the_background_variant_uses_its_background():
         (lambda p: p(photos(1), steps=1001), "`steps` must lie in 1 to 1000"),
         (lambda p: p.sampler_with(batch=0), "`batch` must be at least 1"),
         (lambda p: p(photos(2), ids=["a"]), "Every id needs one condition"),
+        (lambda p: p(photos(2), generator=[torch.Generator()]), r"`generator` .*Got 1 for 2"),
         (lambda p: p(photos(1) / 255), "`images` must be uint8"),
         (lambda p: p(7), "`images` must be files, PIL images"),
         (lambda p: p("nowhere.jpg"), "nowhere.jpg: no such file"),
@@ -200,6 +201,22 @@ def test_a_changed_folder_is_rejected(tmp_path):
             TactilePipeline.from_pretrained(tmp_path / "p")
     with pytest.raises(PalpateError, match="no folder"):
         TactilePipeline.from_pretrained(tmp_path / "nowhere")
+
+
+@pytest.mark.parametrize("many", [False, True], ids=["one generator", "one each"])
+def test_generators_decide_the_noise_instead_of_seed_and_ids(many):
+    pipeline = make_pipeline()
+
+    def images(seed=3, batch=4, **options):
+        one = torch.Generator().manual_seed(seed)
+        each = [torch.Generator().manual_seed(seed + k) for k in range(6)]
+        made = replace(pipeline, sampler=replace(pipeline.sampler, batch=batch))
+        return arrays(made(photos(6), generator=each if many else one, **options)).astype(int)
+
+    base = images()
+    assert np.array_equal(images(seed=3, ids=list("abcdef")), base)
+    assert np.abs(images(batch=6) - base).max() <= 1
+    assert not np.array_equal(images(seed=4), base)
 
 
 def test_batches_of_1_and_16_give_the_same_images():
@@ -273,6 +290,25 @@ def test_pushed_to_the_hub_with_its_own_card_it_comes_back(tmp_path, monkeypatch
     assert pipeline.digest in card
     monkeypatch.setattr(huggingface_hub, "snapshot_download", lambda *_, **__: str(hub))
     assert TactilePipeline.from_pretrained("me/touch", device="cpu").digest == pipeline.digest
+
+
+def test_another_scheduler_samples_and_belongs_to_the_settings(tmp_path):
+    pipeline = without_encoders(make_pipeline())
+    c, base = torch.randn(5, 6), pipeline.digest
+    first = pipeline.sample(c, list("abcde"), seed=0)
+    config = pipeline.scheduler.config
+    for kind in (diffusers.UniPCMultistepScheduler, diffusers.EulerAncestralDiscreteScheduler):
+        pipeline.scheduler = kind.from_config(config)
+        made = pipeline.sample(c, list("abcde"), seed=0)
+        assert not np.array_equal(made, first)
+        # Noise that the scheduler adds belongs to the sample, too.
+        alone = pipeline.sample(c[2:4], ["c", "d"], seed=0)
+        assert np.abs(alone.astype(int) - made[2:4]).max() <= 1
+        assert pipeline.other_scheduler["_class_name"] == kind.__name__
+        with pytest.raises(PalpateError, match="sampler's scheduler"):
+            pipeline.save(tmp_path / "p")
+    assert pipeline.digest == base
+    assert replace(pipeline).other_scheduler is None
 
 
 def test_the_unet_computes_in_another_type_and_is_saved_in_32_bits(tmp_path):

@@ -25,7 +25,7 @@ SIGNATURES = {
     ),
     "generate": (
         "photos * text weight gel model output split part seed guidance steps batch"
-        " skip_bad device progress"
+        " skip_bad dry_run device progress"
     ),
     "load": "source * format images skip_bad progress **options",
     "probe": (
@@ -51,7 +51,7 @@ SIGNATURES = {
     "Encoder.encode": "self inputs * batch progress",
     "TactilePipeline.from_pretrained": "source * device",
     "TactilePipeline.__call__": (
-        "self photos * text weight ids seed guidance steps gel callback_on_step_end"
+        "self photos * text weight ids seed guidance steps gel generator callback_on_step_end"
     ),
     "World.__init__": "self options * cache",
     "Manifest.load": "path root",

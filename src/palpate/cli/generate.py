@@ -44,6 +44,8 @@ class Options(Common):
     """Images at a time; the images do not depend on it."""
     skip_bad: Switch = False
     """Skip unreadable photos and list them."""
+    dry_run: Switch = False
+    """Write nothing; print how many images are missing, and network evaluations."""
     device: str = "auto"
     """auto, cpu, cuda, mps."""
 
@@ -61,6 +63,9 @@ def run(options: Options, terminal: Terminal) -> dict[str, Any]:
         made = generate(photos, progress=progress, **arguments)
     for note in made.notes:
         terminal.note(note)
+    if options.dry_run:
+        terminal.print(f"{made.missing:,} images to make, {made.evaluations:,} network evaluations")
+        return {"missing": made.missing, "evaluations": made.evaluations}
     facts: dict[str, Any] = {
         "image" if made.folder is None else "folder": str(options.output),
         "images": len(made.ids),

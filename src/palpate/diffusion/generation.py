@@ -87,6 +87,8 @@ class Generated:
         notice: what everyone who looks at the images must know; often empty.
         notes: what the caller must know: of the gel and the text that were given.
         memory: id -> image, where no output was given.
+        missing: images that a dry run would make.
+        evaluations: of the network, for these.
     """
 
     folder: Path | None
@@ -97,6 +99,8 @@ class Generated:
     notice: str = ""
     notes: Sequence[Note] = ()
     memory: Mapping[str, Image.Image] = field(default_factory=dict[str, Image.Image], repr=False)
+    missing: int = 0
+    evaluations: int = 0
 
     @property
     def ids(self) -> list[str]:
@@ -185,6 +189,7 @@ def generate(  # noqa: PLR0913 - a public verb, step by step
     steps: int | None = None,
     batch: int | None = None,
     skip_bad: bool = False,
+    dry_run: bool = False,
     device: str = "auto",
     progress: Progress = quiet,
 ) -> Generated:
@@ -209,6 +214,7 @@ def generate(  # noqa: PLR0913 - a public verb, step by step
         steps: of the solver; default: the pipeline's.
         batch: images at once, which they do not depend on; default: the pipeline's.
         skip_bad: list unreadable photos in the result instead of raising.
+        dry_run: write nothing; the result says what is missing, and has no images.
         device: ``auto``, ``cpu``, ``cuda`` or ``mps``.
         progress: called while the work goes on.
 
@@ -239,7 +245,8 @@ def generate(  # noqa: PLR0913 - a public verb, step by step
     inputs = _inputs(model, manifest, table or {str(text): None}, gel)
     how: dict[str, Any] = {"weight": weight, "seed": seed, "sampler": sampler, "texts": words}
     notes = [*_text_notes(model, text), *_gel_notes(model, gel)]
-    return _Run(model, inputs, target, how, skip_bad, notes).make(progress)
+    run = _Run(model, inputs, target, how, skip_bad, notes)
+    return run.plan() if dry_run else run.make(progress)
 
 
 def _text_notes(model: TactilePipeline, text: str | None) -> list[Note]:
@@ -298,6 +305,19 @@ class _Run:
             ids = [i.id for i in self.inputs if i.id not in bad]
             result = target.finish(ids, [*bad.values()], len(made))
         return replace(result, notes=self.notes)
+
+    def plan(self) -> Generated:
+        """Count what :meth:`make` would make; guidance takes two evaluations a step."""
+        target, sampler, scheduler = self.target, self.how["sampler"], self.model.scheduler
+        paths = [target.path(i.id) for i in self.inputs]
+        there = [i for i, path in zip(self.inputs, paths, strict=True) if path and path.is_file()]
+        missing = len(self.inputs) - sum(target.has(i.id, i.digest()) for i in there)
+        scheduler.set_timesteps(sampler.steps)
+        times = [float(t) / self.model.schedule.steps for t in scheduler.timesteps]
+        guided = sampler.guidance not in (0.0, 1.0)
+        count = len(times) + sum(t <= sampler.high for t in times if guided)
+        how: dict[str, Any] = {"missing": missing, "evaluations": missing * count}
+        return Generated(target.folder, {}, target.settings, notes=self.notes, **how)
 
     def _sampled(self, ready: Iterator[_Ready]) -> Generator[tuple[_Ready, NDArray[np.uint8]]]:
         while chunk := [*islice(ready, self.how["sampler"].batch)]:
@@ -575,8 +595,9 @@ def _require_readable(paths: Sequence[Path], argument: str = "photos") -> None:
 
 def _settings(pipeline: TactilePipeline, sampler: SamplerOptions, seed: int) -> dict[str, Any]:
     """All that an image depends on next to its photo; the batch is no part of it."""
-    dtype = str(pipeline.dtype)
+    dtype, scheduler = str(pipeline.dtype), pipeline.other_scheduler
     return {
+        **({"scheduler": scheduler} if scheduler else {}),
         **({} if dtype == "torch.float32" else {"dtype": dtype}),
         **({"earlier_splits": pipeline.earlier_splits} if pipeline.earlier_splits else {}),
         "pipeline": pipeline.digest,

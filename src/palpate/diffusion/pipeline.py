@@ -28,6 +28,7 @@ either case and checked on loading.
 
 from __future__ import annotations
 
+import inspect
 import json
 import math
 from collections.abc import Callable, Mapping, Sequence
@@ -111,7 +112,8 @@ class TactilePipeline(DiffusionPipeline):
         pipeline = TactilePipeline.from_pretrained("palpate/mini")
         image = pipeline("photo.jpg", seed=0).images[0]
 
-    ``dataclasses.replace`` makes a pipeline with other parts.
+    ``scheduler`` may be replaced as in any pipeline of diffusers; by default it is that of the
+    sampler's method. ``dataclasses.replace`` makes a pipeline with other parts.
 
     Attributes:
         autoencoder, denoiser: frozen, on one device.
@@ -190,6 +192,7 @@ class TactilePipeline(DiffusionPipeline):
         guidance: float | None = None,
         steps: int | None = None,
         gel: Any = None,
+        generator: torch.Generator | Sequence[torch.Generator] | None = None,
         callback_on_step_end: Callable[[Any, int, Tensor, dict[str, Any]], Any] | None = None,
     ) -> TactileImages:
         """Tactile images for photos.
@@ -205,6 +208,7 @@ class TactilePipeline(DiffusionPipeline):
             guidance: s; default: the sampler's.
             steps: of the solver; default: the sampler's.
             gel: no-contact image of the gel, one for all or one per photo; default: the stock gel.
+            generator: of the starting noise instead of seed and ids; one for all, or one per image.
             callback_on_step_end: called as ``(pipeline, step, timestep, {"latents": ...})`` after
                 each step of each batch; ``latents`` of the dictionary that it returns replace them.
 
@@ -230,9 +234,12 @@ class TactilePipeline(DiffusionPipeline):
             ground = np.broadcast_to(ground, (len(ids), *ground.shape[1:]))
         embedded = self.embed(squares(images, self.vision_size)) if images else None
         words = None if text is None else self.embed_text(text)
+        noise = None if generator is None else self._noise(generator, len(ids))
+        self.scheduler.set_timesteps(sampler.steps)
+        total = math.ceil(len(ids) / sampler.batch) * len(self.scheduler.timesteps)
         made: list[Image.Image] = []
         bars: Any = self.progress_bar  # wrongly typed in diffusers
-        with bars(total=math.ceil(len(ids) / sampler.batch) * sampler.steps) as bar:
+        with bars(total=total) as bar:
             for start in range(0, len(ids), sampler.batch):
                 rows = slice(start, start + sampler.batch)
                 arrays = self.sample(
@@ -243,6 +250,7 @@ class TactilePipeline(DiffusionPipeline):
                     seed=seed,
                     sampler=sampler,
                     background=None if ground is None else ground[rows],
+                    noise=None if noise is None else noise[rows],
                     on_step=partial(self._on_step, bar, callback_on_step_end),
                 )
                 made += map(Image.fromarray, arrays)
@@ -252,6 +260,22 @@ class TactilePipeline(DiffusionPipeline):
         bar.update()
         given = callback(self, step, t, {"latents": latents}) if callback else None
         return (given or {}).get("latents", latents)
+
+    def _noise(self, generator: torch.Generator | Sequence[torch.Generator], n: int) -> Tensor:
+        """The starting noise of n images, drawn on the generators' own device."""
+        each = [generator] * n if isinstance(generator, torch.Generator) else generator
+        if len(each) != n:
+            must, fix = "must be one per image", "Pass one generator, or one per image"
+            raise PalpateError(must, f"{len(each)} for {n} images", fix, argument="generator")
+        draws = [torch.randn(self._latent, generator=g, device=g.device) for g in each]
+        return torch.stack([draw.cpu() for draw in draws])
+
+    @property
+    def other_scheduler(self) -> dict[str, Any] | None:
+        """Class and settings of the scheduler, if it is not the one of the sampler."""
+        own = build_scheduler(self.schedule, self.sampler.method)
+        shown = [json.loads(s.to_json_string()) for s in (own, self.scheduler)]
+        return None if shown[0] == shown[1] else shown[1]
 
     @property
     def _latent(self) -> tuple[int, int, int]:
@@ -398,6 +422,7 @@ class TactilePipeline(DiffusionPipeline):
         weight: float = 0.5,
         sampler: SamplerOptions | None = None,
         background: NDArray[np.uint8] | None = None,
+        noise: Tensor | None = None,
         on_step: OnStep | None = None,
     ) -> NDArray[np.uint8]:
         """Tactile images (n, size, size, 3), uint8, from embeddings (n, d) of photos or texts.
@@ -411,6 +436,7 @@ class TactilePipeline(DiffusionPipeline):
             sampler: default: the pipeline's.
             background: bytes (n, size, size, 3) of the gel without contact; default: the stock gel,
                 which a pipeline w/ BG and a VQ autoencoder lacks.
+            noise: the starting noise (n, c, h, w) instead of that of seed and ids.
             on_step: called after each step of each batch.
 
         Raises:
@@ -451,6 +477,8 @@ class TactilePipeline(DiffusionPipeline):
             options=options,
             seed=seed,
             background=ground,
+            scheduler=self.scheduler if options.method == self.sampler.method else None,
+            noise=noise,
             on_step=on_step,
         )
         latents = self.stats.restore(latents)
@@ -498,9 +526,12 @@ class TactilePipeline(DiffusionPipeline):
                 referred to, not written.
 
         Raises:
-            PalpateError: if the folder is not empty, a weight is too large for 16 bits, or the
-                shared model differs.
+            PalpateError: if the folder is not empty, a weight is too large for 16 bits, the shared
+                model differs, or the scheduler is not the sampler's.
         """
+        if self.other_scheduler is not None:
+            must, fix = "A saved pipeline must have its sampler's scheduler", "Set it back"
+            raise PalpateError(must, type(self.scheduler).__name__, fix)
         if shared is not None and self._digests() != _digests(*_shared_parts(shared)):
             must = f"A pipeline that refers to {shared} must use its autoencoder and vision encoder"
             raise PalpateError(must, "others", "Leave out shared, or train on these")
@@ -669,8 +700,13 @@ def starting_noise(ids: Sequence[str], shape: tuple[int, int, int], seed: int) -
     return torch.from_numpy(np.stack(draws))
 
 
+def _generator(seed: int, sample_id: str) -> torch.Generator:
+    """The noise that a scheduler adds while it samples."""
+    return torch.Generator().manual_seed(int(rng_for(seed, "steps", sample_id).integers(2**62)))
+
+
 @torch.no_grad()
-def sample(
+def sample(  # noqa: PLR0913 - one row per part
     predict: Predictor,
     tokens: Tensor,
     null: Tensor,
@@ -681,6 +717,8 @@ def sample(
     options: SamplerOptions,
     seed: int,
     background: Tensor | None = None,
+    scheduler: Any = None,
+    noise: Tensor | None = None,
     on_step: OnStep | None = None,
 ) -> Tensor:
     """Normalized latents (n, c, h, w) of ``ids``, on the CPU.
@@ -695,21 +733,29 @@ def sample(
         options: see :class:`SamplerOptions`.
         seed: of the starting noise.
         background: normalized background latents (n, c, h, w), or None.
+        scheduler: diffusers' scheduler; default: that of the method.
+        noise: starting noise (n, c, h, w); default: that of seed and ids.
         on_step: called after each step of each batch.
     """
     parts = [torch.empty(0, *shape)]
-    scheduler = build_scheduler(schedule, options.method)
+    scheduler = scheduler or build_scheduler(schedule, options.method)
+    scales = hasattr(scheduler, "scale_model_input")  # not those of flows
+    draws = "generator" in inspect.signature(scheduler.step).parameters
     for rows, count in _batches(len(ids), options.batch):
-        z = starting_noise([ids[k] for k in rows], shape, seed).to(tokens.device)
+        names = [ids[k] for k in rows]
+        z = starting_noise(names, shape, seed) if noise is None else noise[rows]
+        more = {"generator": [_generator(seed, i) for i in names]} if draws else {}
         ground = None if background is None else background[rows].to(tokens.device)
         given = tokens[rows]
         scheduler.set_timesteps(options.steps, device=tokens.device)
+        z = z.to(tokens.device) * getattr(scheduler, "init_noise_sigma", 1.0)
         for k, t in enumerate(scheduler.timesteps):
             times, empty = t.expand(len(z)), null.expand(given.shape)
             inside = float(t) / schedule.steps <= options.high
             here = options if inside else replace(options, guidance=1.0)
-            prediction = guided(predict, z, times, given, empty, ground, here)
-            z = scheduler.step(prediction, t, z, return_dict=False)[0]
+            scaled = scheduler.scale_model_input(z, t) if scales else z
+            prediction = guided(predict, scaled, times, given, empty, ground, here)
+            z = scheduler.step(prediction, t, z, return_dict=False, **more)[0]
             z = z if on_step is None else on_step(k, t, z)
         parts.append(z[:count].cpu())
     return torch.cat(parts)
