@@ -50,10 +50,14 @@ def test_encoders_and_a_generator_from_the_command_line(data, tmp_path, capsys, 
     assert row["value"] >= 0
     assert "linear probe of material" in (tmp_path / "encoders" / "README.md").read_text()
     options = ["--clip", "encoders", "--steps", "2", "-o", "model"]
+    assert main(["train", "generator", *common, *options, "--dry-run"]) == 0
+    plan = json.loads(capsys.readouterr().out)
+    assert not (tmp_path / "model").exists()
     assert main(["train", "generator", *common, *options]) == 0
     facts = json.loads(capsys.readouterr().out)
     pipeline = TactilePipeline.from_pretrained(tmp_path / "model")
     assert (facts["digest"], facts["steps"], facts["source"]) == (pipeline.digest, 2, "text")
+    assert (plan["parameters"], plan["steps"]) == (facts["parameters"], 2)
     assert pipeline.encoders.digest("vision") == encoders.digest("vision")
     assert pipeline.training["ceiling"]["n"] == len(data[1].ids("test"))
     # Of eight test samples: photo, real and generated.

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
-from palpate.cli.presets import Training, fields_given, preset_flags, with_flags
+from palpate.cli.presets import Training, fields_given, preset_flags, print_plan, with_flags
 from palpate.cli.terminal import Switch, Terminal, require_extra
 from palpate.core import PalpateError
 from palpate.diffusion.options import Sources
@@ -45,6 +45,8 @@ class Options(Training):
     train survives the autoencoder; or none."""
     steps: int | None = None
     """Optimizer steps. Default: the preset's."""
+    dry_run: Switch = False
+    """Print parameters, steps and time, and stop."""
     fields: _Preset = field(default_factory=_Preset)  # pyright: ignore[reportInvalidTypeForm]
     """Fields of the preset; `--autoencoder-...` are of the autoencoder that is trained first."""
 
@@ -59,9 +61,15 @@ def run(options: Options, terminal: Terminal) -> dict[str, Any]:
             raise PalpateError(must, got, "Leave one out", argument=each.flag)
     preset = with_flags(PRESETS[options.preset], options.fields, *_FLAGS)
     options.require_data()
-    from palpate.diffusion.training import train_generator
+    from palpate.diffusion.training import plan_generator, train_generator
 
     data, machine = (options.data, options.split), options.machine
+    if options.dry_run:
+        how: dict[str, Any] = {"autoencoder": options.autoencoder, "unet": options.unet}
+        how |= {"start": options.start, "source": options.source, "device": machine.device}
+        how |= {"background": options.background, "steps": options.steps}
+        plan = plan_generator(*data, options.clip, preset=preset, **how)
+        return print_plan(terminal, f"Plan of {options.output}", plan)
     with terminal.progress() as progress:
         pipeline = train_generator(
             *data,

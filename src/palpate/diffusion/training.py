@@ -38,7 +38,7 @@ from palpate.diffusion.autoencoder import (
     LatentStats,
     load_autoencoder,
 )
-from palpate.diffusion.autoencoder_training import some_whole
+from palpate.diffusion.autoencoder_training import build_autoencoder, some_whole
 from palpate.diffusion.autoencoders import autoencoder_of
 from palpate.diffusion.ceiling import judge_of, measure_ceiling
 from palpate.diffusion.denoiser import (
@@ -54,6 +54,7 @@ from palpate.diffusion.encoding import encode_latents, encode_patches
 from palpate.diffusion.no_contact import gels_of, has_gels
 from palpate.diffusion.options import (
     SOURCES,
+    AutoencoderOptions,
     ConditionPolicy,
     Schedule,
     Source,
@@ -67,6 +68,7 @@ from palpate.encoders.embed import embed, texts_of
 from palpate.encoders.encoder_set import EncoderSet, load_clip, seeded
 from palpate.encoders.models import digest_tensors, is_hub_id, pick_device
 from palpate.training.engine import Batch, Losses, Task, fit
+from palpate.training.estimate import estimate
 from palpate.training.options import Compute, LoopOptions
 from palpate.training.processes import connect, first_alone, keep_logs, place, work_folder
 from palpate.training.steps import Step
@@ -237,6 +239,56 @@ def _chosen(
         return chosen
     find_unet(unet)
     return replace(chosen, unet=str(unet))
+
+
+def plan_generator(  # noqa: PLR0913 - one row per choice
+    data: Manifest | str | Path,
+    split: Split | str | Path | None = None,
+    clip: str | Path | None = None,
+    *,
+    preset: str | DiffusionPreset = "mini",
+    autoencoder: str | Path | None = None,
+    unet: str | Path | None = None,
+    start: str | Path | None = None,
+    source: Sources | None = None,
+    background: bool = False,
+    steps: int | None = None,
+    device: str = "auto",
+) -> dict[str, Any]:
+    """What training the denoiser would take; of the data only the manifest is read.
+
+    Without an autoencoder latents are those of the preset's, or of an f4 of three channels.
+
+    Returns:
+        see :func:`palpate.training.estimate.estimate`.
+    """
+    begin = None if start is None else TactilePipeline.from_pretrained(start)
+    chosen = _chosen(preset, unet, begin)
+    train = train_part(load(data), load_split(data, split))
+    loop = chosen.loop_for(len(train))
+    loop = loop if steps is None else replace(loop, steps=steps)
+    encoders = None if clip is None else EncoderSet(load_clip(clip))
+    options, policy = chosen.autoencoder or AutoencoderOptions(), _policy(chosen, encoders, source)
+    if autoencoder is not None:
+        code = load_autoencoder(autoencoder)
+    elif isinstance(options, AutoencoderOptions):
+        code = build_autoencoder(options)
+    else:
+        code = BackgroundAutoencoder(options.channels, options.narrow, options.wide)
+    gel = 3 * code.factor**2 if isinstance(code, BackgroundAutoencoder) else code.channels
+    how = {"channels": code.channels, "background": gel if background else 0}
+    side = chosen.size // code.factor
+
+    def build() -> nn.Module:
+        known = None if begin is None else begin.denoiser
+        return Denoiser(_new_unet(known, chosen.unet, policy, side, **how), policy)
+
+    def forward(model: nn.Module, rows: int, where: torch.device) -> Tensor:
+        assert isinstance(model, Denoiser)
+        z = torch.zeros(rows, model.unet.config["in_channels"], side, side, device=where)
+        return model(z, torch.zeros(rows, device=where).long(), model.null_tokens(rows))
+
+    return estimate(build, forward, loop, len(train), pick_device(device))
 
 
 def train_pipeline(  # noqa: PLR0913, PLR0917 - one row per choice of the training
@@ -577,13 +629,7 @@ def train_denoiser(  # noqa: PLR0913 - one row per part of the model
     }
     with seeded(loop.seed, "denoiser"):
         wide = 0 if background is None else background(np.arange(1)).shape[1]
-        how: dict[str, Any] = {"channels": channels, "background": wide}
-        if start is not None:
-            net = cast("Any", UNet2DConditionModel.from_config(start.unet.config))
-        elif isinstance(unet, str):
-            net = load_unet(unet, policy, **how)
-        else:
-            net = build_unet(unet, policy, size=size, **how)
+        net = _new_unet(start, unet, policy, size, channels=channels, background=wide)
         memory = _memory(tables) if policy.gap == "pairs" else None
         width = conditions["patches"].shape[2] if "patches" in inputs_of(policy) else None
         model = Denoiser(net, policy, means, memory, width)
@@ -619,6 +665,17 @@ def train_denoiser(  # noqa: PLR0913 - one row per part of the model
     task = Task("generator", len(latents), loss.load, loss, key, names, others, samples)
     fit(model, task, loop, folder, compute=compute, progress=progress)
     return model.eval().requires_grad_(False)
+
+
+def _new_unet(
+    start: Denoiser | None, unet: UNetOptions | str, policy: ConditionPolicy, size: int, **how: int
+) -> UNet2DConditionModel:
+    """The network that trains: of the shape of ``start``, a trained one, or one of new weights."""
+    if start is not None:
+        return cast("Any", UNet2DConditionModel.from_config(start.unet.config))
+    if isinstance(unet, str):
+        return load_unet(unet, policy, **how)
+    return build_unet(unet, policy, size=size, **how)
 
 
 def _require_conditions(policy: ConditionPolicy, conditions: Mapping[str, Any]) -> None:
