@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from palpate.core import PalpateError, locked
-from palpate.studies.graph import Node, run_graph
+from palpate.studies.graph import Node, plan_graph, run_graph
 
 
 def write(text, folder, before, progress):
@@ -74,7 +74,8 @@ def test_one_process_and_two_write_the_same_stages(tmp_path):
 def test_a_changed_node_builds_itself_and_what_reads_it(tmp_path, changed, names):
     run_graph(DIAMOND, tmp_path)
     nodes = [changed if n.name == "b" else n for n in DIAMOND]
-    lines = []
+    planned, lines = plan_graph(nodes, tmp_path), []
+    assert {name for name, done in planned.items() if not done} == names
     run_graph(nodes, tmp_path, print_line=lines.append)
     assert built(lines) == names
 
@@ -91,6 +92,12 @@ def test_what_reads_a_stage_is_built_again_where_that_has_other_files(tmp_path, 
     run_graph(nodes, tmp_path, jobs=jobs, print_line=lines.append)
     assert built(lines) == names
     assert texts(tmp_path)["d"] == f"{text}b{text}cd"
+
+
+def test_a_plan_writes_nothing_and_is_in_order(tmp_path):
+    nodes = [node("b", "a"), node("a")]
+    assert [*plan_graph(nodes, tmp_path / "run").items()] == [("a", False), ("b", False)]
+    assert not (tmp_path / "run").exists()
 
 
 @pytest.mark.parametrize(

@@ -6,8 +6,13 @@ import numpy as np
 import polars as pl
 
 from palpate.core import Split
+from palpate.data.images import read_image
+from palpate.data.manifest import Manifest
 from palpate.diffusion.autoencoders import load_autoencoder
+from palpate.encoders.embed import texts_of
 from palpate.studies import making
+from palpate.studies.methods import METHODS
+from palpate.studies.study import PRESETS
 
 
 def test_the_stock_gel_is_of_the_train_part(small_manifest, tmp_path):
@@ -21,6 +26,40 @@ def test_the_stock_gel_is_of_the_train_part(small_manifest, tmp_path):
     gels = np.asarray(setting.pixels(setting.test, "background"))
     assert gels.shape == (len(setting.test), 32, 32, 3)
     assert (gels == stock).all()
+
+
+class Pipeline:
+    """Makes of each text an image of its length, on the gel that it is given."""
+
+    background, size, digest = True, 32, "d"
+
+    def to(self, device):
+        return self
+
+    def embed_text(self, text):
+        return np.array([[len(text)]])
+
+    def sample(self, photos, ids, *, texts, seed, background):
+        assert photos is None
+        return (0 * background + texts[:, :, None, None]).astype(np.uint8)
+
+
+def test_by_text_each_image_is_that_of_its_sample_s_text(small_manifest, tmp_path, monkeypatch):
+    split = Split({i: "train" if i[1] in "03" else "test" for i in small_manifest.ids})
+    monkeypatch.setattr(making, "data_of", lambda after, name: (small_manifest, split))
+    fake = type("Fake", (), {"from_pretrained": lambda folder: Pipeline()})
+    monkeypatch.setattr(making, "TactilePipeline", fake)
+    how = {"split": "NoLeak", "method": METHODS["Ours, by text"], "preset": PRESETS["smoke"]}
+    how |= {"generator": "g", "seed": 0, "device": "cpu"}
+    after, place = {"g": tmp_path}, tmp_path / "stage"
+    place.mkdir()
+    facts = making.make_images(place, after, lambda *_: None, **how)
+    test = small_manifest.part(split, "test")
+    made = Manifest.load(place / "images")
+    assert facts["images"] == len(test)
+    assert made.ids == test.ids
+    for path, text in zip(made.paths("tactile"), texts_of(test)[0], strict=True):
+        assert (np.asarray(read_image(path)) == len(text)).all()
 
 
 def test_a_given_autoencoder_is_taken_and_measured(small_manifest, tmp_path, monkeypatch):

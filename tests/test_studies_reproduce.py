@@ -41,7 +41,7 @@ def test_no_two_names_share_a_folder():
 
 
 def test_compared_methods_differ_in_what_their_row_says():
-    rows = [(m.condition, m.background, m.vq) for m in TRAINED]
+    rows = [(m.condition, m.background, m.vq) for m in TRAINED if not m.text_of]
     assert all(a != b for a, b in combinations(rows, 2))
     for preset in WORLD.presets.values():
         made = {m.name: m.preset(preset.diffusion) for m in TRAINED}
@@ -69,6 +69,8 @@ def test_nodes_train_once_for_each_split_and_seed():
             after = nodes[f"scores-{split}-by-{judge}-{seed}"].after
             assert {f"encoder-{judge}-{seed}", f"images-ours-{split}-{seed}"} <= {*after}
     assert "gvst-Orig-0" not in nodes
+    assert "ours-by-text-NoLeak-0" not in nodes
+    assert "ours-NoLeak-0" in nodes["images-ours-by-text-NoLeak-0"].after
     judged = nodes["scores-NoLeak-by-NoLeak-1"]
     assert {*judged.inputs["methods"]} == {*METHODS}
     assert judged.inputs["controls"] == [*CONTROLS]
@@ -184,6 +186,16 @@ def test_a_method_of_your_own_trains_nothing():
     assert "images-mine-NoLeak-0" in nodes
     assert "mine-NoLeak-0" not in nodes
     assert "mine" in nodes["scores-NoLeak-by-NoLeak-0"].inputs["methods"]
+
+
+def test_a_dry_run_writes_nothing(tmp_path, capsys):
+    run = tmp_path / "run"
+    assert main(["reproduce", "world-digit", "-o", str(run), "--dry-run", "--json"]) == 0
+    stages = json.loads(capsys.readouterr().out)["stages"]
+    assert not run.exists()
+    assert [*stages][:2] == ["world", "data"]
+    assert [*stages][-1] == "results"
+    assert not any(stages.values())
 
 
 def test_a_human_study_must_be_one(tmp_path):

@@ -8,7 +8,7 @@ from typing import Annotated, Any, Literal
 
 import tyro
 
-from palpate.cli.terminal import Common, OutPath, Terminal, require_extra
+from palpate.cli.terminal import Common, OutPath, Switch, Terminal, require_extra
 from palpate.core import PalpateError
 
 #: Names of ``palpate.studies.study.STUDIES``, without its imports.
@@ -56,6 +56,8 @@ class Options(Common):
     """Processes that run stages at the same time."""
     device: str = "auto"
     """auto, cpu, cuda, mps."""
+    dry_run: Switch = False
+    """Print the stages and which are done; write nothing."""
 
 
 def run(options: Options, terminal: Terminal) -> dict[str, Any]:
@@ -65,7 +67,8 @@ def run(options: Options, terminal: Terminal) -> dict[str, Any]:
     from palpate.core import write_text
     from palpate.evaluation.companions import Weights
     from palpate.report import summary_lines
-    from palpate.studies.reproduce import plan_of, run_study
+    from palpate.studies.graph import plan_graph
+    from palpate.studies.reproduce import nodes_of, plan_of, run_study
     from palpate.studies.study import STUDIES
 
     output = options.output
@@ -81,6 +84,11 @@ def run(options: Options, terminal: Terminal) -> dict[str, Any]:
         vq=options.vq,
         weights=Weights(inception=options.inception, clip=options.clip, lpips=options.lpips),
     )
+    if options.dry_run:
+        stages = plan_graph(nodes_of(plan), output)
+        for name, done in stages.items():
+            terminal.print(f"{'done' if done else 'to do':>5}  {name}")
+        return {"stages": stages}
     kept = any(output.glob("*.partial")) or any(output.glob("*/stage.json"))
     if output.is_dir() and any(output.iterdir()) and not kept:
         must, got = "must be new, empty, or a run folder", f"{output}, with other files"

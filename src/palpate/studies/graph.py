@@ -100,6 +100,17 @@ def run_graph(
     return {node.name: whole.stages[node.name] for node in nodes}
 
 
+def plan_graph(nodes: Sequence[Node], folder: Path) -> dict[str, bool]:
+    """Whether each stage is done, by name, in the order of :func:`run_graph`; nothing is written.
+
+    What comes after a stage that is not done may turn out to be, if that is made again with the
+    same files.
+    """
+    whole = _Whole(in_order(nodes), Path(folder), 1, lambda line: None, quiet)
+    whole.take_finished()
+    return {node.name: node.name in whole.stages for node in whole.ordered}
+
+
 def in_order(nodes: Sequence[Node]) -> list[Node]:
     """Return the nodes so that each comes after those it reads, otherwise in the order given.
 

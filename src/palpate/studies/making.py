@@ -27,6 +27,7 @@ from palpate.diffusion.options import AutoencoderOptions, BackgroundOptions
 from palpate.diffusion.pipeline import TactilePipeline
 from palpate.diffusion.training import train_pipeline
 from palpate.encoders import train_encoder
+from palpate.encoders.embed import texts_of
 from palpate.encoders.encoder_set import EncoderSet, load_clip
 from palpate.encoders.models import pick_device
 from palpate.evaluation.inputs import read as read_samples
@@ -229,9 +230,20 @@ def make_images(
         write_images(output, setting.test.ids, made)
         return {"images": len(setting.test)}
     pipeline = TactilePipeline.from_pretrained(after[generator] / "model").to(pick_device(device))
-    how: Facts = {"seed": seed, "device": device, "progress": progress}
-    images = generate(manifest, split=parts, model=pipeline, output=output, **how)
-    return {"images": len(images.ids), "pipeline": pipeline.digest}
+    test = manifest.part(parts, "test")
+    if method.text_of:
+        texts, gels = texts_of(test)[0], None
+        if pipeline.background:
+            given = setting_of(manifest, parts, place, size=pipeline.size, progress=progress)
+            gels = given.pixels(test, "background")
+        each = {text: np.asarray(pipeline.embed_text(text)) for text in dict.fromkeys(texts)}
+        words = np.concatenate([each[text] for text in texts])
+        images = pipeline.sample(None, test.ids, texts=words, seed=seed, background=gels)
+        write_images(output, test.ids, images)
+    else:
+        how: Facts = {"seed": seed, "device": device, "progress": progress}
+        generate(test, model=pipeline, output=output, **how)
+    return {"images": len(test), "pipeline": pipeline.digest}
 
 
 def make_controls(

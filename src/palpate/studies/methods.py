@@ -93,6 +93,7 @@ class Method:
         background: the denoiser sees the no-contact image.
         vq: behind the paper's kind of autoencoder, which codes the gel with the touch, instead of
             the one that is given the no-contact image.
+        text_of: the method whose training it shares, driven by each sample's own text.
         make: makes the images in place of a diffusion model, in any way.
     """
 
@@ -101,6 +102,7 @@ class Method:
     condition: Mapping[str, Any] = field(default_factory=dict[str, Any])
     background: bool = False
     vq: bool = False
+    text_of: str = ""
     make: Make | None = None
 
     def preset(self, base: DiffusionPreset) -> DiffusionPreset:
@@ -120,6 +122,7 @@ METHODS: Mapping[str, Method] = {
     method.name: method
     for method in (
         Method(OURS, "Trained on texts, driven by the photo's embedding in their place.", BARE),
+        Method("Ours, by text", "Ours, driven by each sample's own text.", BARE, text_of=OURS),
         Method(
             GVST,
             "The same token from photos in training, too: no text.",

@@ -319,20 +319,21 @@ def _scores(split: str, judge: str, seed: int) -> str:
 
 
 def _method_nodes(plan: Plan, method: Method, split: str, seed: int) -> list[Node]:
-    """Training, unless it makes its images itself, and images."""
+    """Training, unless it shares that of another or makes its images itself, and images."""
     preset = plan.preset
     how: dict[str, Any] = {"split": split, "seed": seed, "preset": preset, "device": plan.device}
     nodes, generator = list[Node](), ""
     autoencoder = f"autoencoder-vq-{split}" if method.vq else f"autoencoder-{split}"
     if method.make is None:
-        generator = f"{slug(method.name)}-{split}-{seed}"
+        generator = f"{slug(method.text_of or method.name)}-{split}-{seed}"
+    if generator and not method.text_of:
         inputs = {"diffusion": method.preset(preset.diffusion), "background": method.background}
         inputs |= {"steps": preset.steps, **_clip(preset), "seed": seed}
         inputs |= {"precision": preset.precision}
         build = partial(making.make_generator, method=method, autoencoder=autoencoder, **how)
         nodes.append(Node(generator, build, inputs, ["data", "split", autoencoder]))
     build = partial(making.make_images, method=method, generator=generator, **how)
-    inputs = {"seed": seed}
+    inputs = {"seed": seed, **({"text": True} if method.text_of else {})}
     if method.make is not None:
         inputs |= {"make": _source(method.make), "size": preset.diffusion.size}
         inputs |= {"steps": preset.steps, **_clip(preset)}
