@@ -229,6 +229,7 @@ def test_probe_scores_material_and_retrieval(capsys, tmp_path, small_manifest):
     results = Results.load(tmp_path / "p.json")
     assert [s.metric for s in results.scores] == [
         *("material accuracy", "material accuracy, balanced"),
+        *("material accuracy, 20-NN", "material accuracy, 20-NN, balanced"),
         *(f"top-{k} of 24 (vision by tactile)" for k in (1, 5, 10)),
         *(f"top-{k} of 24 (tactile by vision)" for k in (1, 5, 10)),
     ]

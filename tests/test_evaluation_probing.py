@@ -51,11 +51,12 @@ def encoders():
     return make_encoders()
 
 
-def test_one_call_gives_the_classifier_and_retrieval_in_all_directions(
+def test_one_call_gives_both_classifiers_and_retrieval_in_all_directions(
     manifest, split, encoders, tmp_path
 ):
     results = probe(manifest, split, encoder=encoders, cache=tmp_path / "cache")
     names = ["material accuracy", "material accuracy, balanced"]
+    names += ["material accuracy, 20-NN", "material accuracy, 20-NN, balanced"]
     for direction in DIRECTIONS:
         names += [f"top-{k} of 24 ({direction})" for k in (1, 5, 10)]
     assert [s.metric for s in results] == names

@@ -1,11 +1,12 @@
-"""The linear probe against hand counts and slow loops."""
+"""The linear probe and k-NN against hand counts and slow loops."""
 
 import numpy as np
 import pytest
 from scipy.special import logsumexp
 
 from palpate.core import FeatureSet, PalpateError
-from palpate.metrics.probe import class_accuracies, fit_probe, material_accuracy
+from palpate.metrics import probe as module
+from palpate.metrics.probe import class_accuracies, fit_probe, material_accuracy, neighbor_hits
 
 
 def features(x, labels=None, groups=None, encoder="e", start=0):
@@ -105,7 +106,8 @@ def test_the_probe_rejects_sets_it_cannot_use(train, test, match):
         material_accuracy(train, test)
 
 
-def test_the_probe_gives_plain_and_balanced_accuracy_next_to_their_baselines():
+def test_both_classifiers_give_plain_and_balanced_accuracy_next_to_their_baselines(monkeypatch):
+    monkeypatch.setattr(module, "NEIGHBORS", 3)
     x = [[0.0, 1.0], [0.1, 1.0], [1.0, 0.0], [1.0, 0.1]] * 3
     train = features(
         [*x, [1.0, 0.0]], ["a", "a", "b", "b"] * 3 + ["b"], [f"v{k}" for k in range(13)]
@@ -114,7 +116,12 @@ def test_the_probe_gives_plain_and_balanced_accuracy_next_to_their_baselines():
     test = features(x, ["a", "b", "b", "b", "zinc"], ["v", "v", "w", "w", "w"])
     means = class_accuracies(train, test, label="metal", subject="e")
     assert {m.score.metric: m.score.value for m in means} == pytest.approx(
-        {"metal accuracy": 3 / 5, "metal accuracy, balanced": (1 + 2 / 3 + 0) / 3}
+        {
+            "metal accuracy": 3 / 5,
+            "metal accuracy, balanced": (1 + 2 / 3 + 0) / 3,
+            "metal accuracy, 3-NN": 3 / 5,
+            "metal accuracy, 3-NN, balanced": (1 + 2 / 3 + 0) / 3,
+        }
     )
     plain, balanced = (m.score.details for m in means[:2])
     assert (plain["chance"], plain["majority"]) == (0.5, 3 / 5)
@@ -123,3 +130,38 @@ def test_the_probe_gives_plain_and_balanced_accuracy_next_to_their_baselines():
     assert plain["matrix"][0] == [1, 0, 0]
     assert plain["matrix"][1] == pytest.approx([1 / 3, 2 / 3, 0], abs=1e-4)
     assert plain["matrix"][2] == [0, 1, 0]
+
+
+def slow_neighbors(train, labels, query, truth, k):
+    """Probability of a right vote over all orders of equally similar train rows."""
+    unit = lambda v: v / np.linalg.norm(v, axis=-1, keepdims=True)
+    similar = (unit(train) @ unit(query)).round(6)
+    order = np.argsort(-similar, kind="stable")
+    last = similar[order[k - 1]]
+    weight = np.where(similar > last, 1.0, 0.0)
+    tied = similar == last
+    weight[tied] = (k - weight.sum()) / tied.sum()
+    votes = dict.fromkeys(labels, 0.0)
+    for w, s, name in zip(weight, similar, labels, strict=True):
+        votes[name] += w * np.exp(s / 0.07)
+    best = [name for name, v in votes.items() if v >= max(votes.values()) * (1 - 1e-5)]
+    return (truth in best) / len(best)
+
+
+@pytest.mark.parametrize("k", [1, 4, 9])
+@pytest.mark.parametrize("ties", [False, True])
+def test_neighbors_vote_as_in_a_slow_loop(k, ties):
+    rng = np.random.default_rng(k)
+    train, test = rng.normal(size=(30, 3)), rng.normal(size=(12, 3))
+    if ties:
+        train[5:15] = train[4]
+    labels, truth = [f"m{j % 3}" for j in range(30)], [f"m{j % 4}" for j in range(12)]
+    hits = neighbor_hits(train, labels, test, truth, k)
+    slow = [slow_neighbors(train, labels, q, t, k) for q, t in zip(test, truth, strict=True)]
+    assert hits == pytest.approx(slow)
+
+
+def test_more_neighbors_than_train_rows_are_all_of_them():
+    train, test = clusters(9), clusters(6, seed=1)
+    args = train.features, train.labels, test.features, test.labels
+    assert neighbor_hits(*args, 500) == pytest.approx(neighbor_hits(*args, 9))

@@ -42,7 +42,7 @@ class Training:
 
 @dataclass(frozen=True, kw_only=True)
 class Options(Common):
-    """Score what an encoder's embeddings know: classes, by a linear probe fitted to the
+    """Score what an encoder's embeddings know: classes, by a linear probe and k-NN fitted to the
     train part, and which text and image belong to a sample, by retrieval within the test part.
 
     Several encoders, or several splits, are compared with paired differences.

@@ -1,4 +1,4 @@
-"""What an encoder's embeddings know: classes by a linear probe, and retrieval.
+"""What an encoder's embeddings know: classes by a linear probe and k-NN, and retrieval.
 
 A classifier is trained on the train part of a split and scored on its test part; retrieval is
 within the test part. Several encoders, or several splits, become columns next to each other with
@@ -119,8 +119,8 @@ def probe(  # noqa: PLR0913 - one argument a choice
         progress: called with what is done.
 
     Returns:
-        Accuracy and balanced accuracy by a linear probe, next to chance and the commonest class;
-        retrieval in both directions within the test part; and paired differences.
+        Accuracy and balanced accuracy by a linear probe and k-NN, next to chance and the commonest
+        class; retrieval in both directions within the test part; and paired differences.
 
     Raises:
         PalpateError: if nothing can be measured, images are missing or unreadable, or the encoder

@@ -1,8 +1,11 @@
-"""What embeddings encode: class accuracy of a linear probe.
+"""What embeddings encode: class accuracy of a linear probe and of the nearest neighbors.
 
 Probe: multinomial logistic regression on standardized features,
 ``min_W -1/n sum_i log softmax(W x_i)_{y_i} + l2 ||W||^2``, solved by L-BFGS. l2 is chosen by
 cross-validation over whole groups: with rows left out, frames of one video would pick it.
+
+k-NN: the k train rows of highest cosine s vote with weight exp(s / 0.07) (Wu et al. 2018, as DINO);
+rows tied with the k-th share the places that are left, so the order of rows does not matter.
 
 Balanced accuracy is the mean over classes of their recall, of the same classifier.
 """
@@ -22,11 +25,16 @@ from scipy.special import log_softmax
 from palpate.core import FeatureSet, PalpateError, Score, rng_for
 from palpate.metrics.inputs import Array, require_one_encoder
 from palpate.metrics.means import Mean, mean_of
+from palpate.metrics.retrieval import TIE, blocks, unit_rows
 
 #: Penalties that cross-validation chooses from.
 GRID = (1e-4, 1e-3, 1e-2, 1e-1)
 #: Folds of the cross-validation.
 FOLDS = 3
+#: Train rows that vote in k-NN.
+NEIGHBORS = 20
+#: Temperature of the votes of k-NN.
+VOTE = 0.07
 
 
 @dataclass(frozen=True)
@@ -107,7 +115,7 @@ def material_accuracy(
 def class_accuracies(
     train: FeatureSet, test: FeatureSet, *, label: str = "material", seed: int = 0, **fields: Any
 ) -> list[Mean]:
-    """Accuracy and balanced accuracy of a linear probe, on new samples.
+    """Accuracy and balanced accuracy of a linear probe and of k-NN, on new samples.
 
     Args:
         train: features with labels, and groups to choose the probe's penalty.
@@ -117,15 +125,51 @@ def class_accuracies(
         **fields: further fields of the scores.
 
     Returns:
-        Two means; ``details`` holds chance and what always naming the commonest class of train
-        scores, the first also the confusion matrix (rows: the true class; shares).
+        Four means; ``details`` holds chance and what always naming the commonest class of train
+        scores, for the linear probe also the confusion matrix (rows: the true class; shares).
 
     Raises:
         PalpateError: as :func:`material_accuracy`.
     """
     require_one_encoder(train, test, "Train and test")
     probe = fit_probe(train, seed=seed)
-    return _linear(probe, train, test, label, seed=seed, **fields)
+    means = _linear(probe, train, test, label, seed=seed, **fields)
+    x, labels, _ = _labeled(train, "train")
+    z, truth, _ = _labeled(test, "test")
+    hits = neighbor_hits(x, labels, z, truth, NEIGHBORS)
+    return [
+        *means,
+        *_accuracies(f"{label} accuracy, {NEIGHBORS}-NN", hits, train, test, {}, **fields),
+    ]
+
+
+def neighbor_hits(
+    train: NDArray[Any],
+    train_labels: Sequence[str],
+    test: NDArray[Any],
+    test_labels: Sequence[str],
+    neighbors: int,
+) -> Array:
+    """(m,) probability that weighted k-NN names each test row correctly, votes being tied or not.
+
+    Of ``neighbors`` at most n count. A class that train lacks is never named.
+    """
+    names, code = np.unique(np.array(train_labels), return_inverse=True)
+    one_hot = np.eye(len(names), dtype=np.float32)[code]
+    base, queries = unit_rows(train), unit_rows(test)
+    k, hits = min(neighbors, len(base)), np.zeros(len(queries))
+    truth = np.array(test_labels)
+    for rows in blocks(len(queries), len(base)):
+        similar = queries[rows] @ base.T
+        last = np.partition(similar, len(base) - k, axis=1)[:, len(base) - k, None]
+        inside, tied = similar > last + TIE, np.abs(similar - last) <= TIE
+        share = (k - inside.sum(axis=1)) / tied.sum(axis=1)
+        counted = np.where(inside, 1, np.where(tied, share[:, None], 0))
+        votes = (counted * np.exp((similar - 1) / VOTE)) @ one_hot
+        best = votes >= votes.max(axis=1, keepdims=True) * (1 - 1e-5)
+        right = best & (names == truth[rows, None])
+        hits[rows] = right.any(axis=1) / best.sum(axis=1)
+    return hits
 
 
 def recall_by_class(hits: NDArray[Any], labels: Sequence[str]) -> dict[str, float]:
