@@ -131,7 +131,7 @@ def score_encoders(
         result, _ = retrieval(queries, keys, top=(1, 5), pool=POOL, texts=texts)
         scores += [
             (f"{name}, top-{k} of {POOL}", mean.score)
-            for k, mean in zip((1, 5), result, strict=True)
+            for k, mean in zip((1, 5), result.top, strict=True)
         ]
     return [_row(name, score, len(new)) for name, score in scores]
 

@@ -232,6 +232,8 @@ def test_probe_scores_material_and_retrieval(capsys, tmp_path, small_manifest):
         *("material accuracy, 20-NN", "material accuracy, 20-NN, balanced"),
         *(f"top-{k} of 24 (vision by tactile)" for k in (1, 5, 10)),
         *(f"top-{k} of 24 (tactile by vision)" for k in (1, 5, 10)),
+        "median rank of 24 (vision by tactile)",
+        "median rank of 24 (tactile by vision)",
     ]
     assert results.scores[0].details["chance"] == pytest.approx(1 / 3)
     assert results.settings["options"]["group"] == "video"

@@ -59,7 +59,8 @@ def test_one_call_gives_both_classifiers_and_retrieval_in_all_directions(
     names += ["material accuracy, 20-NN", "material accuracy, 20-NN, balanced"]
     for direction in DIRECTIONS:
         names += [f"top-{k} of 24 ({direction})" for k in (1, 5, 10)]
-    assert [s.metric for s in results] == names
+    medians = [f"median rank of 24 ({direction})" for direction in DIRECTIONS]
+    assert [s.metric for s in results] == names + medians
     assert {s.subject for s in results} == {"real"}
     assert all(s.details["chance"] > 0 for s in results)
     accuracy = results["material accuracy", "real"]
@@ -177,6 +178,8 @@ def test_samples_without_a_partner_are_left_out_and_counted(manifest, split, enc
     assert [s.metric for s in results] == [
         "top-1 of 18 (vision by tactile)",
         "top-1 of 18 (tactile by vision)",
+        "median rank of 18 (vision by tactile)",
+        "median rank of 18 (tactile by vision)",
     ]
     codes = [note.code for note in results.notes]
     assert codes == ["probe-no-label", "probe-no-partner", "probe-some-partners"]

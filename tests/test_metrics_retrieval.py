@@ -47,6 +47,8 @@ def test_ranks_equal_all_orders_in_both_directions(ties, many):
         for k in (1, 2, 5, 6):
             slow = all_orders(matrix, good, lambda order, k=k: order[:k].any())
             assert ranks.within(k) == pytest.approx(slow)
+        first = all_orders(matrix, good, lambda order: 1 + np.argmax(order))
+        assert ranks.expected == pytest.approx(first)
         assert (ranks.right == good.sum(axis=1)).all()
 
 
@@ -65,12 +67,14 @@ def test_blocks_of_any_size_give_the_same_ranks(many, monkeypatch):
 def test_equal_keys_score_chance():
     same = features(np.ones((10, 4)))
     forth, _ = retrieval(same, same, names=("tactile", "text"), top=(1, 5))
-    assert [m.score.metric for m in forth] == [
+    scores = [*(mean.score for mean in forth.top), forth.median]
+    assert [s.metric for s in scores] == [
         "top-1 of 10 (text by tactile)",
         "top-5 of 10 (text by tactile)",
+        "median rank of 10 (text by tactile)",
     ]
-    assert [m.score.value for m in forth] == pytest.approx([0.1, 0.5])
-    assert [m.score.details["chance"] for m in forth] == pytest.approx([0.1, 0.5])
+    assert [s.value for s in scores] == pytest.approx([0.1, 0.5, 5.5])
+    assert [s.details["chance"] for s in scores] == pytest.approx([0.1, 0.5, 5.5])
 
 
 def test_equal_texts_count_with_a_threshold_and_chance_follows():
@@ -79,34 +83,46 @@ def test_equal_texts_count_with_a_threshold_and_chance_follows():
     texts = np.eye(3)[[0, 0, 1, 2]]  # and have one text
     strict, _ = retrieval(features(queries), features(keys), top=(1,))
     similar, _ = retrieval(features(queries), features(keys), top=(1,), texts=texts)
-    assert strict[0].score.value == 0.5
-    assert similar[0].score.value == 1.0
-    assert similar[0].score.details["chance"] == pytest.approx((2 / 4 + 2 / 4 + 1 / 4 + 1 / 4) / 4)
-    assert similar[0].score.details["right_keys"] == 1.5
-    assert strict[0].score.settings != similar[0].score.settings
+    assert strict.top[0].score.value == 0.5
+    assert similar.top[0].score.value == 1.0
+    assert similar.top[0].score.details["chance"] == pytest.approx(
+        (2 / 4 + 2 / 4 + 1 / 4 + 1 / 4) / 4
+    )
+    assert similar.top[0].score.details["right_keys"] == 1.5
+    assert strict.top[0].score.settings != similar.top[0].score.settings
 
 
 @pytest.mark.parametrize("n", [40, 160])
 def test_chance_of_a_pool_does_not_depend_on_n(n):
     rng = np.random.default_rng(0)
     a, b = (features(rng.normal(size=(n, 5))) for _ in range(2))
-    top5 = retrieval(a, b, top=(5,), pool=20)[0][0].score
+    top5 = retrieval(a, b, top=(5,), pool=20)[0].top[0].score
     assert top5.metric.startswith("top-5 of 20")
     assert top5.details["chance"] == pytest.approx(0.25)
     assert top5.value == pytest.approx(0.25, abs=0.12)
-    assert retrieval(a, b, top=(5,), pool=20)[0][0].score == top5
-    assert retrieval(a, a, pool=20)[0][0].score.value == 1.0
+    assert retrieval(a, b, top=(5,), pool=20)[0].top[0].score == top5
+    assert retrieval(a, a, pool=20)[0].top[0].score.value == 1.0
 
 
 def test_a_pool_of_all_is_no_pool_and_ranks_over_the_pool_are_skipped():
     a, b = (features(rows) for rows in random_rows(False))
-    assert [m.score.value for m in retrieval(a, b, pool=6)[0]] == [
-        m.score.value for m in retrieval(a, b)[0]
+    assert [m.score.value for m in retrieval(a, b, pool=6)[0].top] == [
+        m.score.value for m in retrieval(a, b)[0].top
     ]
-    assert [m.score.metric for m in retrieval(a, b, top=(1, 5, 6, 10))[0]] == [
+    assert [m.score.metric for m in retrieval(a, b, top=(1, 5, 6, 10))[0].top] == [
         "top-1 of 6 (b by a)",
         "top-5 of 6 (b by a)",
     ]
+
+
+def test_the_interval_of_the_median_rank_holds_it_as_often_as_promised():
+    rng, hits = np.random.default_rng(1), []
+    for _ in range(150):  # ranks of 20 videos of 8 frames; a video shifts all of its own
+        groups = np.repeat([f"v{k}" for k in range(20)], 8)
+        ranks = np.exp(2 + np.repeat(0.7 * rng.normal(size=20), 8) + rng.normal(size=160))
+        score = module._median("median", ranks, groups.tolist(), {}, {"subject": "x"})
+        hits.append(score.interval[0] <= np.exp(2) <= score.interval[1])
+    assert 0.88 <= np.mean(hits) <= 1
 
 
 @pytest.mark.parametrize(
@@ -142,3 +158,4 @@ def test_rows_that_are_all_equal_tie_whatever_their_width(d):
         a = unit_rows(np.ones((n, d)))
         for ranks in (both_ranks(a, a)[0], both_ranks(a, a, texts[:n], 0.6)[0]):
             assert ranks.within(1) == pytest.approx(ranks.right / n, rel=1e-6)
+            assert ranks.expected.max() <= (n + 1) / 2

@@ -71,9 +71,10 @@ class Plan:
 
 @dataclass
 class Probed:
-    """What one encoder scores under one split: means, retrieved keys, notes."""
+    """What one encoder scores under one split: means, median ranks, retrieved keys, notes."""
 
     means: list[Mean] = field(default_factory=list[Mean])
+    medians: list[Score] = field(default_factory=list[Score])
     strips: list[Strip] = field(default_factory=list[Strip])
     notes: list[Note] = field(default_factory=list[Note])
 
@@ -234,6 +235,7 @@ def measure(
         raise PalpateError(must, "neither", fix, example={"label": "material"})
     noted = lambda score: replace(score, notes=[*score.notes, *notes])
     result.means = [replace(mean, score=noted(mean.score)) for mean in result.means]
+    result.medians = [noted(score) for score in result.medians]
     return result
 
 
@@ -281,7 +283,8 @@ def _retrieve(
         options |= {"texts": keys.features, "threshold": plan.text_threshold}
         ways += retrieval(queries, keys, names=names, **options)
     for way in ways:
-        result.means += way
+        result.means += way.top
+        result.medians.append(way.median)
     subject = str(common["subject"]) if plan.axis else ""
     for x, y, names in (
         (queries, keys, (plan.modality, other)),
@@ -338,6 +341,7 @@ def results_of(
                 by_metric.setdefault(mean.score.metric, {}).setdefault(subject, []).append(mean)
         for means in (sets.get(subject) for sets in by_metric.values()):
             scores += [means[0].score if single else over_seeds(means)] if means else []
+        scores += [median for run in of if single for median in run.medians]
     differences = [d for sets in by_metric.values() for d in differences_of_means(sets)]
     all_runs = [run for of in runs.values() for run in of]
     notes = list({canonical_json(note): note for run in all_runs for note in run.notes}.values())

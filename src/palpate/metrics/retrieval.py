@@ -9,20 +9,24 @@ is found first; then one product gives both directions, since a rank needs only 
 a column.
 
 With a above the best right key, t tied with it (itself included) and w of these wrong,
-``P(top k) = 1 - C(w, s) / C(t, s)`` with ``s = min(max(k - a, 0), t)`` places that the ties share.
+``P(top k) = 1 - C(w, s) / C(t, s)`` with ``s = min(max(k - a, 0), t)`` places that the ties share,
+and the expected rank is ``a + (t + 1) / (t - w + 1)``.
+
+The interval of the median rank is Woodruff's (1952): that of the share of ranks up to the median,
+by jackknife over groups, turned back into ranks.
 """
 
 from __future__ import annotations
 
 from collections.abc import Generator, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.special import gammaln
 
-from palpate.core import FeatureSet, PalpateError, rng_for
+from palpate.core import FeatureSet, PalpateError, Score, rng_for
 from palpate.metrics.inputs import rows_text
 from palpate.metrics.means import Array, Mean, mean_of
 
@@ -53,6 +57,11 @@ class Ranks:
     right: Array
     pool: int
 
+    @property
+    def expected(self) -> Array:
+        """(n,) expected rank, from 1."""
+        return self.above + (self.ties + 1) / (self.ties - self.wrong + 1)
+
     def within(self, k: int) -> Array:
         """(n,) probability that a right key is among the first k."""
         slots = np.clip(k - self.above, 0, self.ties)
@@ -65,6 +74,13 @@ class Ranks:
         return Ranks(
             np.zeros(len(all_tied)), all_tied, all_tied - self.right, self.right, self.pool
         )
+
+
+class Retrieved(NamedTuple):
+    """One direction: a mean for each k, and the median rank."""
+
+    top: list[Mean]
+    median: Score
 
 
 def retrieval(  # noqa: PLR0913 - one argument a choice
@@ -80,8 +96,8 @@ def retrieval(  # noqa: PLR0913 - one argument a choice
     subject: str = "real",
     split: str | None = None,
     settings: dict[str, Any] | None = None,
-) -> tuple[list[Mean], list[Mean]]:
-    """How often the right key is among the k most similar ones.
+) -> tuple[Retrieved, Retrieved]:
+    """How often the right key is among the k most similar ones, and the median of its rank.
 
     Args:
         a: n rows, e.g. tactile embeddings of the test samples.
@@ -99,8 +115,8 @@ def retrieval(  # noqa: PLR0913 - one argument a choice
         settings: more to keep in the scores.
 
     Returns:
-        A mean for each k: of b found by a (``"top-1 of 356 (text by tactile)"``), and of a found by
-        b; ``details`` holds the chance level, and the mean number of right keys.
+        b found by a (``"top-1 of 356 (text by tactile)"``), and a found by b; ``details`` holds the
+        chance level, and the mean number of right keys.
 
     Raises:
         PalpateError: if ids differ, the pool is larger than the set, n < 2, or on texts that are
@@ -230,7 +246,7 @@ def _retrieved(
     *,
     top: Sequence[int],
     fields: dict[str, Any],
-) -> list[Mean]:
+) -> Retrieved:
     """Scores of one direction, averaged over the pools that a query was in."""
     seen, chance = np.zeros(len(groups)), [ranks.shuffled() for ranks in by_draw]
     for rows in draws:
@@ -246,7 +262,7 @@ def _retrieved(
     size, queries = by_draw[0].pool, groups[used].tolist()
     details = {"pools": len(draws)}
     details |= {"right_keys": float(np.mean([ranks.right.mean() for ranks in by_draw]))}
-    return [
+    means = [
         mean_of(
             f"top-{k} of {size} ({name})",
             averaged([ranks.within(k) for ranks in by_draw]),
@@ -258,6 +274,27 @@ def _retrieved(
         for k in top
         if k < size
     ]
+    ranks = averaged([r.expected for r in by_draw])
+    details["chance"] = float(np.median(averaged([c.expected for c in chance])))
+    median = _median(f"median rank of {size} ({name})", ranks, queries, details, fields)
+    return Retrieved(means, median)
+
+
+def _median(
+    metric: str, ranks: Array, groups: Sequence[str], details: dict[str, Any], fields: Any
+) -> Score:
+    value = float(np.median(ranks))
+    share = mean_of("share", ranks <= value, groups, subject="").score
+    interval, method = None, ""
+    if share.interval is not None:
+        half = (share.interval[1] - share.interval[0]) / 2
+        bounds = np.clip([0.5 - half, 0.5 + half], 0, 1)
+        low, high = np.quantile(ranks, bounds, method="inverted_cdf").tolist()
+        interval, method = (low, high), f"Woodruff, from the {share.interval_method}"
+    fields |= {"estimator": "median", "interval": interval, "interval_method": method}
+    return Score(
+        metric, value=value, n=len(ranks), higher_is_better=False, details=details, **fields
+    )
 
 
 def _check(a: FeatureSet, b: FeatureSet, pool: int | None) -> None:
