@@ -456,12 +456,19 @@ def test_lists_become_a_split_with_lists(capsys, lists, tmp_path):
     assert call(capsys, "audit", made / "train.txt", made / "test.txt", "--fail-over", "0")[0] == 0
 
 
-def test_folds_make_a_folder(capsys, lists, tmp_path):
+def test_seeds_and_folds_make_folders(capsys, lists, tmp_path):
+    many = tmp_path / "many"
+    status, text, _ = call(capsys, "split", *lists, "--seeds", "3", "-o", many, "--json")
+    assert status == 0
+    assert json.loads(text)["splits"][2]["digest"] == Split.load(many / "seed-2.json").digest
+    alone = tmp_path / "alone.json"
+    assert call(capsys, "split", *lists, "--seed", "2", "-o", alone)[0] == 0
+    assert Split.load(alone).digest == Split.load(many / "seed-2.json").digest
     options = ("--folds", "4", "--val", "0.25", "-o", tmp_path / "folds")
     assert call(capsys, "split", *lists, *options)[0] == 0
     folds = [Split.load(tmp_path / "folds" / f"fold-{k}.json") for k in range(4)]
     assert [f.counts() for f in folds] == [{"train": 40, "val": 20, "test": 20}] * 4
-    assert call(capsys, "split", *lists, *options)[0] == 2
+    assert call(capsys, "split", *lists, "--seeds", "2", "-o", tmp_path / "folds")[0] == 2
 
 
 def test_the_published_split_by_command(capsys, tmp_path, real_data):
@@ -481,6 +488,8 @@ def test_the_published_split_by_command(capsys, tmp_path, real_data):
     [
         (["LISTS"], "--output"),
         (["LISTS", "-o", "x", "--noleak", "hct", "--folds", "3"], "has its rule"),
+        (["LISTS", "-o", "x", "--seeds", "2", "--folds", "3"], "must go without --folds"),
+        (["LISTS", "-o", "x", "--seeds", "0"], "--seeds must be at least 1"),
         (["LISTS", "-o", "x", "--folds", "1"], "--folds must be at least 2"),
         (["LISTS", "-o", "x", "--by", "object"], "80 of 80 samples without"),
         (["LISTS", "-o", "x", "--near", "tactile"], "need tactile images"),
