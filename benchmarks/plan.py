@@ -95,19 +95,17 @@ def counted() -> dict[str, float]:
 def stages() -> dict[str, float]:
     """How often the study of one seed does each duty; a training that is shorter is a part of one.
 
-    Images are in sets of the test part, those of the sampling curve single ones a sampler step.
+    Images are counted in sets of the test part.
     """
     with tempfile.TemporaryDirectory() as empty:
         plan = plan_of(STUDIES["tag"], preset="paper", root=empty, vq=VQ)
         nodes = nodes_of(plan)
     named = lambda start: [n for n in nodes if n.name.startswith(start)]
     judged = [len(n.inputs["methods"]) + len(n.inputs["controls"]) for n in named("scores-")]
-    curves = [n.inputs["samples"] * sum(n.inputs["steps"]) for n in named("sampled-")]
     return {
         "generators": sum(n.inputs["steps"] for n in nodes if "diffusion" in n.inputs)
         / plan.preset.steps,
         "sets of images": sum("make" not in n.inputs for n in named("images-")),
-        "steps for the curves": sum(curves),
         "encoders": len(named("encoder-")),
         "background autoencoders": sum("-vq-" not in n.name for n in named("autoencoder-")),
         "sets of features": sum(judged),
@@ -136,7 +134,6 @@ def duties(
         latents
         + times["generators"] * generator
         + times["sets of images"] * images
-        + times["steps for the curves"] * 2 * of["U-Net"]
         + times["background autoencoders"] * autoencoder
         + times["encoders"] * (encoder + features)
         + times["sets of features"] * test * of["tactile encoder"]

@@ -67,13 +67,13 @@ def test_a_narrow_terminal_cuts_no_number(results, width):
 
 def test_arguments_are_options_on_the_command_line_and_keywords_in_python(capsys):
     shown = Results("T", scores=[score(notes=(Note("planted", {}),))])
-    notes.SENTENCES["planted"] = "Pass {arg:backend=blocked}"
+    notes.SENTENCES["planted"] = "Pass {arg:sigma=multi}"
     try:
-        assert "Pass backend='blocked'" in str(shown)
+        assert "Pass sigma='multi'" in str(shown)
         print_result(shown, Console(width=100))
     finally:
         del notes.SENTENCES["planted"]
-    assert "Pass --backend blocked" in capsys.readouterr().out
+    assert "Pass --sigma multi" in capsys.readouterr().out
 
 
 def test_every_note_that_a_room_makes_has_a_sentence():

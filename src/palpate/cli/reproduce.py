@@ -47,11 +47,11 @@ class Options(Common):
     people: Path | None = None
     """Results of `palpate preference score -o`: columns of table 3, and what claims follow from."""
     inception: Path | None = None
-    """TorchScript file of Inception: FID as published, beside that of the frozen photo encoder."""
+    """TorchScript file of Inception: FID as published; without it the column is missing."""
     clip: str | None = None
-    """Folder or hub id of a CLIP: CMMD as published."""
+    """Folder or hub id of a CLIP: CMMD as published; without it the column is missing."""
     lpips: Annotated[tuple[Path, Path] | None, tyro.conf.arg(metavar="BACKBONE HEADS")] = None
-    """The two files of LPIPS: AlexNet's weights and the heads."""
+    """The two files of LPIPS: AlexNet's weights and the heads; else the column is missing."""
     jobs: int = 1
     """Processes that run stages at the same time."""
     device: str = "auto"

@@ -2,8 +2,8 @@
 
 Sentences are in the wording of Python or of the command line.
 
-A template is filled with the note's parameters. ``{arg:backend=blocked}`` in it becomes
-``backend='blocked'`` in Python and ``--backend blocked`` on the command line. Where one
+A template is filled with the note's parameters. ``{arg:sigma=multi}`` in it becomes
+``sigma='multi'`` in Python and ``--sigma multi`` on the command line. Where one
 template cannot do (plurals, optional parts), the entry is a function of parameters and style.
 """
 

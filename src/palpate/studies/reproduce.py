@@ -53,8 +53,8 @@ class Plan:
             system made.
         device: ``auto``, ``cpu``, ``cuda`` or ``mps``.
         people: results of ``palpate preference score`` on images of the methods, or None.
-        weights: of FID, CMMD and LPIPS as published; without them stand-ins of the frozen vision
-            encoder are all there is.
+        weights: of FID, CMMD and LPIPS as published; without them their columns
+            are missing.
     """
 
     study: Study
