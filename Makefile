@@ -48,11 +48,12 @@ nightly: $(DEV)  ## what takes longer: tests of minutes, what must not change, t
 coverage: $(DEV)  ## line and branch coverage of the fast tests
 	$(PYTEST) -m "not slow and not browser and not nightly" --cov --cov-report=term --cov-report=xml
 
-lint: $(DEV)     ## style, types, and the direction of imports
+lint: $(DEV)     ## style, types, the direction of imports, and the size of the house
 	$(BIN)/ruff format --check .
 	$(BIN)/ruff check .
 	$(BIN)/lint-imports
 	$(BIN)/basedpyright
+	$(BIN)/python .ci/budget.py
 
 format: $(DEV)   ## rewrite the sources in the project's style
 	$(BIN)/ruff format .
