@@ -8,6 +8,7 @@ KEY    := $(shell cat pyproject.toml constraints.txt | sha256sum | cut -c1-16)
 READY  := $(VENV)/.ready-$(KEY)
 DEV    := $(VENV)/.dev-$(KEY)
 OUT    ?= runs/demo
+RUN    ?= runs/study
 # Processes that run tests; each uses one thread.
 WORKERS ?= auto
 PYTEST = OMP_NUM_THREADS=1 HF_HUB_OFFLINE=1 $(BIN)/python -m pytest -q -n $(WORKERS) --dist worksteal

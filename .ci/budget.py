@@ -187,9 +187,14 @@ def main() -> int:
             more = f"  {lines[name]} lines" if table == "tokens" and name in lines else ""
             print(f"  {name:22} {now:9} {most:7}{more}{'  ABOVE' * bad}")
             if args.lower and table != "documented":
-                pattern = rf"(?m)^({re.escape(json.dumps(name))}|{re.escape(name)}) = \d+"
-                text = BUDGET.read_text(encoding="utf-8")
-                BUDGET.write_text(re.sub(pattern, rf"\1 = {min(now, most)}", text))
+                budget[table][name] = min(now, most)
+    if args.lower:
+        head = BUDGET.read_text(encoding="utf-8").partition("[")[0]
+        tables = (
+            "\n".join([f"[{table}]", *(f"{json.dumps(n)} = {v}" for n, v in values.items())])
+            for table, values in budget.items()
+        )
+        BUDGET.write_text(head + "\n\n".join(tables) + "\n", encoding="utf-8")
     if above:
         print("Above budget.toml: delete, or raise the line there with its reason in the diff.")
     return int(above > 0)

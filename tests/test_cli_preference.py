@@ -139,6 +139,7 @@ def test_serve_prints_each_link_once_and_stops_by_ctrl_c(study):
     assert links[0].partition("=")[2] not in (study / "study.db").read_bytes().decode("latin-1")
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_three_methods_on_the_world_and_50_raters(capsys, tmp_path):
     """From folders to a LaTeX row, with the planted preferences in their intervals."""

@@ -28,7 +28,7 @@ QUICK = {
     "score": ["--permutations", "19"],
     "world": ["--preset", "tiny"],
 }
-SLOW = {"docs/start/train.md", "docs/start/reproduce.md"}
+SLOW = {"docs/start/train.md": pytest.mark.slow, "docs/start/reproduce.md": pytest.mark.nightly}
 #: Pages that `make docs` writes.
 MADE = {"commands.md"}
 
@@ -73,9 +73,7 @@ def run_command(line):
     assert main([*words[1:], *QUICK.get(verb, [])]) in (0, 1), line
 
 
-@pytest.mark.parametrize(
-    "page", [pytest.param(p, marks=pytest.mark.slow if p in SLOW else ()) for p in PAGES]
-)
+@pytest.mark.parametrize("page", [pytest.param(p, marks=SLOW.get(p, ())) for p in PAGES])
 def test_the_blocks_of_a_page_run(page, examples, tmp_path, monkeypatch):
     shutil.copytree(examples, tmp_path / "work")
     monkeypatch.chdir(tmp_path / "work")

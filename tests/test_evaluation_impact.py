@@ -19,7 +19,7 @@ from palpate.data.importing import import_dataset
 from palpate.data.manifest import Manifest
 from palpate.evaluation import impact as module
 from palpate.evaluation import impact_features
-from palpate.evaluation.impact import nearest_hits
+from palpate.evaluation.impact import nearest_hits, thin
 from palpate.evaluation.impact_features import Source, fit_reduction
 from palpate.leakage.splitting import split as leak_free_split
 from palpate.report.results import Impact
@@ -65,6 +65,25 @@ def impact(manifest: Manifest, split: Split, features: Any = "pixels", **options
 def one_hot(names: list[str]) -> np.ndarray:
     distinct = sorted(set(names))
     return np.eye(len(distinct), dtype=np.float32)[[distinct.index(n) for n in names]]
+
+
+def test_thinning_keeps_every_class_and_the_shares_of_groups() -> None:
+    classes = np.repeat([0, 1, 2], [600, 299, 1])
+    groups = np.concatenate([np.arange(600) % 4, 4 + np.arange(299) % 2, [6]])
+    rows = np.arange(900) + 1000
+    kept = thin(rows, groups, classes, 90, seed=3)
+    assert len(kept) == 90 == len(set(kept.tolist()))
+    assert set(kept.tolist()) <= set(rows.tolist())
+    assert np.bincount(classes[kept - 1000])[2] == 1
+    assert np.abs(np.bincount(classes[kept - 1000]) - [60, 29.9, 0.1]).max() <= 1
+    assert np.abs(np.bincount(groups[kept - 1000])[:4] - 15).max() <= 1
+    assert (
+        kept.tolist()
+        == thin(rows, groups, classes, 90, seed=3).tolist()
+        != thin(rows, groups, classes, 90, seed=4).tolist()
+    )
+    assert sorted(thin(rows, groups, classes, 900, seed=3).tolist()) == rows.tolist()
+    assert sorted(classes[thin(rows, groups, classes, 3, seed=3) - 1000].tolist()) == [0, 1, 2]
 
 
 def test_nearest_hits_are_those_of_brute_force(monkeypatch: pytest.MonkeyPatch) -> None:

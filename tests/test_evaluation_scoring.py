@@ -16,8 +16,8 @@ from palpate.data.manifest import Manifest
 from palpate.evaluation import companions, inputs, score, scoring
 from palpate.evaluation.controls import matched_features
 from palpate.metrics import Polynomial, compare, contact_scores, distance, i_tmmd, ssim
+from palpate.metrics.distributions import prdc_rows
 from palpate.metrics.intervals import spread_of_values
-from palpate.metrics.neighbors import prdc_rows
 from score_calls import DIM, FRAMES, GROUPS, IDS, by_key, codes, feature_sets, paint, unit
 
 SETS = feature_sets()

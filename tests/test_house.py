@@ -158,7 +158,10 @@ def test_no_module_imports_itself_in_a_circle():
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("words", "files"),
-    [("score a --reference b --encoder palpate/mini", 30), ("generate b/0.png -o t.png", 14)],
+    [
+        ("score --generated a --reference b --encoder palpate/mini", 30),
+        ("generate b/0.png -o t.png", 14),
+    ],
 )
 def test_the_main_paths_stay_short(tmp_path, words, files):
     """Files of palpate in which a function runs; before the house was made simple, 51 and 24."""

@@ -398,6 +398,7 @@ def test_a_changed_record_and_unknown_videos_are_errors():
         split(manifest_of([(known[0], 1, "Wood"), ("mine", 1, "Wood")]), noleak="touch-and-go")
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_the_recipe_checks_the_shipped_record(real_data):
     lists = real_data / "touch_and_go" / "lists"

@@ -275,14 +275,3 @@ def test_one_video_is_no_study(folders, tmp_path):
     labels.write_text(re.sub(r"v\d\d$", "v00", folders.labels.read_text(), flags=re.MULTILINE))
     with pytest.raises(PalpateError, match="two items"):
         preference.make(folders.reference, folders.methods, labels=labels, dry_run=True)
-
-
-@pytest.mark.slow
-def test_a_picture_of_20000_by_15000_is_scaled(tmp_path):
-    ids = ["a", "b", "c"]
-    folders = [write_folder(tmp_path / name, k, ids) for k, name in enumerate(("real", "x", "y"))]
-    Image.new("L", (20_000, 15_000), 200).save(tmp_path / "x" / "a.png")
-    Image.new("L", (20_000, 15_000), 200).save(tmp_path / "y" / "a.jpg")
-    (tmp_path / "y" / "a.png").unlink()
-    plan = preference.make(folders[0], folders[1:], tmp_path / "study", raters=1)
-    assert plan.images[plan.name("a", "x")] == plan.images[plan.name("a", "y")]

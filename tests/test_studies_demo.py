@@ -216,6 +216,7 @@ def test_unreadable_photos_stop_generating_unless_skipped(whole, tmp_path):
     assert len(list((tmp_path / "a" / "images").iterdir())) == 3
 
 
+@pytest.mark.nightly
 def test_real_clips_become_a_page(real_data, tmp_path):
     finished(tmp_path / "run", "--data", str(real_data / "touch_and_go" / "clips"))
     results = Results.load(tmp_path / "run" / "page.json")

@@ -23,7 +23,9 @@ def reproduced(study, root, run):
     ("study", "forge", "rule", "tables"),
     [
         ("tag", forge_touch_and_go, "TaG-NoLeak", ["Table 1", "Table 3", "Table 4"]),
-        ("hct", forge_hct, "HCT-NoLeak", ["Table 2", "Table 4"]),
+        pytest.param(
+            "hct", forge_hct, "HCT-NoLeak", ["Table 2", "Table 4"], marks=pytest.mark.nightly
+        ),
     ],
 )
 def test_the_papers_data_sets_reach_the_page(study, forge, rule, tables, tmp_path):

@@ -101,7 +101,7 @@ def inception(path, seed=0):
             super().__init__()
             self.conv = torch.nn.Conv2d(3, 4, 3)
 
-        def forward(self, img: torch.Tensor) -> torch.Tensor:
+        def forward(self, img: torch.Tensor, return_features: bool = False) -> torch.Tensor:
             return self.conv(img.to(torch.float32) / 127.5 - 1).relu().mean(dim=[2, 3])
 
     torch.jit.script(Pooled().eval()).save(str(path))
@@ -268,6 +268,7 @@ def test_a_study_killed_in_each_kind_of_stage_ends_as_one_that_was_not(whole, tm
     assert differing(whole, tmp_path / "run") == []
 
 
+@pytest.mark.nightly
 @slow
 def test_published_weights_come_on_top_of_a_run(whole, tmp_path):
     run, file = tmp_path / "run", inception(tmp_path / "inception.pt")

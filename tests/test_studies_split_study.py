@@ -65,7 +65,8 @@ ARGS = [
 @pytest.mark.slow
 def test_a_planted_leak_costs_what_it_is_worth(data, tmp_path, capsys, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    assert main(["probe", *ARGS, "--work", "run", "--neighbors", "1", "--json"]) == 0
+    monkeypatch.setattr("palpate.metrics.probe.NEIGHBORS", 1)
+    assert main(["probe", *ARGS, "--work", "run", "--json"]) == 0
     made = json.loads(capsys.readouterr().out)
     values = {(s["metric"], s["subject"]): s for s in made["scores"]}
     orig, clean = (values["material accuracy, 1-NN", name] for name in ("orig", "noleak"))

@@ -690,7 +690,7 @@ def test_wandb_has_the_settings_and_the_log(tmp_path, monkeypatch):
 @pytest.mark.parametrize(
     ("change", "apart"),
     [
-        pytest.param({"compile": True}, 1e-5, marks=pytest.mark.slow),
+        pytest.param({"compile": True}, 1e-5, marks=pytest.mark.nightly),
         ({"channels_last": True}, 1e-6),
         ({"gradient_checkpointing": True}, 0),
         ({"tf32": False}, 0),

@@ -36,6 +36,10 @@ def split(small_manifest):
     return Split.from_ids(train=train, test=test, manifest=small_manifest.digest)
 
 
+#: Take a minute or 15 GB; `paper` of the generator takes its step in test_diffusion_presets.
+HEAVY = [pytest.param(name, marks=pytest.mark.nightly) for name in ("tvl-base", "paper")]
+
+
 @contextmanager
 def memory(needed):
     """Skip without so much of it available; tests of other processes that need as much wait."""
@@ -46,7 +50,7 @@ def memory(needed):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["mini", "tvl-tiny", "tvl-small", "tvl-base", "paper"])
+@pytest.mark.parametrize("name", ["mini", "tvl-tiny", "tvl-small", *HEAVY])
 def test_a_preset_takes_a_real_step_of_what_its_plan_says(name, small_manifest, split, tmp_path):
     """With all its layers and pixels, on two samples, one at a time (cached gradients)."""
     chosen = preset(name)

@@ -321,12 +321,23 @@ def test_a_strangers_layout_reaches_every_verb_with_one_import(name, tmp_path, m
     run("train", "encoder", *encoder)
     if len(sides) == 1:
         (generated, *_) = [*source.glob("touch/thing1"), *Path("m/images").glob("thing1/*/*")]
-        run("score", generated, "--reference", "m", "--encoder", "e", "--allow-seen")
+        run("score", "--generated", generated, "--reference", "m", "--encoder", "e", "--allow-seen")
         return
     generator = ("m", "--split", "s.json", "--clip", "e", "--preset", "tiny", "--steps", "2")
     run("train", "generator", *generator, "--device", "cpu", "-o", "g")
     run("generate", "m", "--model", "g", "--split", "s.json", "--device", "cpu", "-o", "made")
-    score = ("made", "--reference", "m", "--split", "s.json", "--encoder", "e", "-o", "score.json")
+    score = (
+        "--generated",
+        "made",
+        "--reference",
+        "m",
+        "--split",
+        "s.json",
+        "--encoder",
+        "e",
+        "-o",
+        "score.json",
+    )
     run("score", *score)
     run("report", "score.json", "-o", "page.html")
     assert (tmp_path / "page.html").stat().st_size > 10_000

@@ -40,7 +40,7 @@ COMMANDS: dict[str, int] = {
     "import IN/video -o OUT/m": 5,
     "import IN/videos --every 2 -o OUT/m": 3,
     "import IN/videos --tactile {video}/gel.npy --every 2 -o OUT/m": 2,
-    "background IN/manifest --replace -o OUT/m": 2,
+    "background IN/manifest -o OUT/m": 2,
     "validate IN/videos": 1,
     "import IN/table/rows.csv -o OUT/m": 4,
     "import IN/table/rows.tsv -o OUT/m --map frame=frame": 2,
@@ -80,7 +80,6 @@ COMMANDS: dict[str, int] = {
     "verify IN/results/scores.json --json": 4,
     "report IN/results/audit.json IN/results/scores.json -o OUT/page.html": 8,
     "world -o OUT/w --preset tiny --size 16 --materials 2 --workers 1": 1,
-    "world -o OUT/w --options IN/world/world.json --workers 1": 1,
     "probe IN/manifest --split IN/split/split.json --encoder IN/models/encoders -o OUT/s.json": 1,
     "generate IN/pairs/vision/rec0/0.jpg -o OUT/t.png --model IN/models/generator --steps 1": 1,
     "generate IN/manifest -o OUT/g --model IN/models/generator --steps 1 "

@@ -96,7 +96,7 @@ def embed(
         frames = encoders.preprocess(modality).frames(manifest, modality, still=still)
         inputs = [image_stamp(manifest, modality), *frames.stamps(manifest.root)]
     label, group = _column(manifest, "material"), _column(manifest, groups)
-    key = digest_json(["palpate-embedding/2", digest, manifest.ids, inputs, label, group])
+    key = digest_json(["palpate-embedding/1", digest, manifest.ids, inputs, label, group])
     file = Path(cache) / f"{modality}-{short(key)}.npz" if cache else None
     if file is not None and (cached := _cached(file)) is not None:
         progress(f"embedding {modality}", len(manifest), len(manifest), "cached")

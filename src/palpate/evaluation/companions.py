@@ -31,7 +31,7 @@ from numpy.typing import NDArray
 from palpate.core import FeatureSet, Note, PalpateError, Progress, Score
 from palpate.metrics import Polynomial, compare_fid, compare_tmmd, mean_score, per_image
 from palpate.metrics.contact import contacts_of_each
-from palpate.metrics.neighbors import prdc_rows
+from palpate.metrics.distributions import prdc_rows
 from palpate.metrics.paired import mean_differences
 
 Images = NDArray[np.uint8]

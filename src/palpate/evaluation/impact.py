@@ -11,7 +11,7 @@ hit is the share of them with the right label: what a random choice among them w
 average. Equally near means within the rounding of float32, ``TIE (||x||^2 + max ||z||^2)``.
 
 What is held equal: the samples (train and test of the given split, of materials that can be
-compared), the shares, the number of train samples (larger train parts are thinned at random), the
+compared), the shares, the number of train samples (larger train parts are thinned evenly), the
 features and their reduction (fitted to each train part alone), the classifiers, and how the probe's
 penalty is chosen (on the train part, leaving out groups).
 
@@ -177,6 +177,9 @@ def _design(manifest: Manifest, split: Split, group: str, seeds: Sequence[int]) 
     notes: list[Note] = []
     if len(rows) < len(inside):
         notes.append(Note("no-material", {"count": len(inside) - len(rows)}))
+    videos = pool.table["video"].drop_nulls().n_unique()
+    if group == "contact" and videos not in (0, pool.table["contact"].n_unique()):
+        notes.append(Note("shared-videos"))
     owners = _owners(pool, group)
     here, given = [labels[k] for k in rows], [str(part_of[k]) for k in rows]
     excluded = _incomparable(here, owners, [given], group)
@@ -264,14 +267,15 @@ def _without(
 def _classify(source: Source, train: Rows, test: Rows, design: _Design) -> dict[str, Mean]:
     """Accuracy of each classifier under one split."""
     size, seed = int(design.settings["train_samples"]), int(design.settings["seeds"][0])
-    train = rng_for(seed, "impact thin", size).permutation(train)[:size]
+    train = thin(train, design.group[train], design.material[train], size, seed)
     reduction = fit_reduction(source, train, COMPONENTS, seed)
     x, z = reduction.apply(source, train), reduction.apply(source, test)
-    few, truth = train[:PROBE_ROWS], design.material[test]
-    labels, groups = design.material[few].tolist(), design.group[few].tolist()
-    known = FeatureSet([design.ids[k] for k in few], x[: len(few)], labels, groups)
+    owners, material = design.group[train], design.material[train]
+    few = thin(np.arange(len(train)), owners, material, min(size, PROBE_ROWS), seed)
+    ids, truth = [design.ids[k] for k in train[few]], design.material[test]
+    known = FeatureSet(ids, x[few], material[few].tolist(), owners[few].tolist())
     right = np.array(fit_probe(known, seed=seed).predict(z)) == truth
-    hits = {"1-NN": nearest_hits(z, x, truth, design.material[train]), "linear probe": right}
+    hits = {"1-NN": nearest_hits(z, x, truth, material), "linear probe": right}
     groups = design.group[test].tolist()
     return {c: mean_of(c, hits[c], groups, subject=source.name) for c in CLASSIFIERS}
 
@@ -336,3 +340,31 @@ def nearest_hits(
         right = (votes * (names == truth[start : start + step, None])).sum(axis=1)
         out[start : start + step] = right / votes.sum(axis=1)
     return out
+
+
+def thin(rows: Rows, groups: Rows, classes: Rows, count: int, seed: int) -> Rows:
+    """Choose rows evenly: every class keeps its share (at least one row), and so every group.
+
+    Each class gets ``count * n_c / n`` rows, rounded so that the sum is ``count``; within a class
+    the rows, sorted by group and at random within it, are taken at equal steps from a random start,
+    so a group keeps its share to within one row. ``count`` is at least the number of classes. The
+    rows come in a random order.
+    """
+    rng = rng_for(seed, "impact thin", count)
+    order = rng.permutation(len(rows))
+    if len(rows) <= count:
+        return rows[order]
+    names, sizes = np.unique(classes, return_counts=True)
+    exact = count * sizes / len(rows)
+    quota = np.maximum(np.floor(exact), 1).astype(np.int64)
+    while (off := count - int(quota.sum())) != 0:
+        room = (quota < sizes) if off > 0 else (quota > 1)
+        gap = np.where(room, (exact - quota) * np.sign(off), -np.inf)
+        quota[int(gap.argmax())] += np.sign(off)
+    chosen: list[Rows] = []
+    for name, share in zip(names, quota, strict=True):
+        of_class = order[classes[order] == name]
+        line = of_class[np.argsort(groups[of_class], kind="stable")]
+        at = (np.arange(share) + rng.random()) * len(line) / share
+        chosen.append(line[at.astype(np.int64)])
+    return rows[rng.permutation(np.concatenate(chosen))]

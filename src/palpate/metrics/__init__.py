@@ -5,11 +5,10 @@ On pairs of images: SSIM, PSNR and MS-SSIM; residual, SSIM and IoU of the contac
 """
 
 from palpate.metrics.contact import background_digest, contact_mask, contact_scores
-from palpate.metrics.distributions import compare_fid, fid
+from palpate.metrics.distributions import compare_fid, fid, prdc
 from palpate.metrics.images import mean_score, ms_ssim, per_image, psnr, require_same_ids, ssim
 from palpate.metrics.kernels import Gaussian, Polynomial
 from palpate.metrics.mmd import PRESETS, Distance, Options, distance
-from palpate.metrics.neighbors import prdc
 from palpate.metrics.paired import Comparison, compare, compare_tmmd
 from palpate.metrics.streaming import TMMD
 from palpate.metrics.tactile import ci_tmmd, cmmd, d_tmmd, four_scores, i_tmmd, kid, tmmd

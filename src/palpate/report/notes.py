@@ -384,6 +384,11 @@ LEAKAGE: dict[str, Sentence] = {
         f"{p['count']} {p['modality']} images cannot be read and were not "
         f"compared ({few(p['files'])})"
     ),
+    "shared-videos": (
+        "Whole contacts are kept together, but train and test share videos: what a shared video is "
+        "worth is not in this number, and contacts of one video are less independent than the "
+        "intervals take them to be"
+    ),
     "impact-of-nothing": (
         "What leaking costs was not measured: without contact, or with images that are similar, "
         "a classifier recognizes recordings by the drift of the sensor, not materials"

@@ -30,7 +30,7 @@ from palpate.core.digest import canonical_json, digest_folder, digest_json
 from palpate.core.errors import PalpateError
 from palpate.core.files import read_json, write_json
 
-FORMAT = "palpate-stage/2"
+FORMAT = "palpate-stage/1"
 
 
 @dataclass(frozen=True)

@@ -186,7 +186,7 @@ class _Run:
         averaged = self.parameters if options.ema is not None else {}
         self.average = {name: p.detach().clone() for name, p in averaged.items()}
         shapes = {name: list(p.shape) for name, p in self.parameters.items()}
-        self.key = digest_json(["palpate-checkpoint/2", task.key, task.n, shapes, options.facts])
+        self.key = digest_json(["palpate-checkpoint/1", task.key, task.n, shapes, options.facts])
         self.best_file = folder / f"best-{short(self.key)}.safetensors"  # not of another run
         self.order = RowOrder(task.n, batch, options.seed)
         self.loss = torch.compile(task.loss) if compute.compile else task.loss
