@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from palpate.core import FeatureSet, Note, PalpateError, Score
-from palpate.metrics import neighbors, prdc
+from palpate.metrics import distributions, prdc
 from palpate.metrics.intervals import spread_of_values
 
 NAMES = ["Precision", "Recall", "Density", "Coverage"]
@@ -52,11 +52,11 @@ def by_matrices(generated, real, k, unit_g=None, unit_r=None):
 def test_all_four_are_those_of_the_matrices(n, m, d, k, seed, block, far):
     rng = np.random.default_rng(seed)
     x, y = 1.3 * rng.normal(size=(n, d)) + far, rng.normal(size=(m, d)) + far
-    old, neighbors.BLOCK = neighbors.BLOCK, block
+    old, distributions.BLOCK = distributions.BLOCK, block
     try:
         scores = prdc(features(x), features(y), k)
     finally:
-        neighbors.BLOCK = old
+        distributions.BLOCK = old
     assert [s.metric for s in scores] == NAMES
     for score, rows in zip(scores, by_matrices(x, y, k), strict=True):
         assert score.value == pytest.approx(rows.mean(), abs=1e-12)
@@ -92,7 +92,7 @@ def test_the_values_of_the_package_prdc():
 
 @pytest.mark.parametrize("block", [100, 1 << 23])
 def test_grouped_radii_skip_the_same_group(block, monkeypatch):
-    monkeypatch.setattr(neighbors, "BLOCK", block)
+    monkeypatch.setattr(distributions, "BLOCK", block)
     rng = np.random.default_rng(2)
     a, b = [f"v{i // 5}" for i in range(40)], [f"w{i // 6}" for i in range(48)]
     centers = rng.normal(size=(8, 3))
@@ -144,7 +144,7 @@ def test_equal_rows_are_ties_whatever_the_block(monkeypatch):
     base = rng.normal(size=(6, 7)).astype(np.float32)
     y = np.repeat(base, 4, axis=0)  # 4 copies: the third neighbor is at 0
     for block in [1, 60, 1 << 23]:
-        monkeypatch.setattr(neighbors, "BLOCK", block)
+        monkeypatch.setattr(distributions, "BLOCK", block)
         scores = prdc(features(y), features(y), 3)
         assert [s.value for s in scores] == [0, 0, 0, 0]
         assert scores[0].details["empty_balls"] == 24

@@ -342,7 +342,7 @@ def nearest_hits(
     return out
 
 
-def thin(rows: Rows, groups: Rows, classes: Rows, count: int, seed: int) -> Rows:
+def thin(rows: Rows, groups: NDArray[Any], classes: NDArray[Any], count: int, seed: int) -> Rows:
     """Choose rows evenly: every class keeps its share (at least one row), and so every group.
 
     Each class gets ``count * n_c / n`` rows, rounded so that the sum is ``count``; within a class
