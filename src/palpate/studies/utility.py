@@ -276,7 +276,7 @@ def material_utility(
     for name in generated:
         pairs = ((means.get((f"{REAL} + {name}", k)), means.get((REAL, k))) for k in draws.shots)
         rows.append([f"{GAIN}{name}", *(_gain(a, b) if a and b else None for a, b in pairs)])
-    beside = {label for name in controls for label in _rows_of(name)}
+    control_rows = {label for name in controls for label in _rows_of(name)}
     return StudyTable(
         "Material accuracy by training data",
         "Accuracy on real images of new videos, of a linear probe trained on k real videos a "
@@ -286,7 +286,7 @@ def material_utility(
         "generator would add is real touch, and of more videos than k.",
         ["trained on", *(f"k = {k}" for k in draws.shots)],
         rows,
-        controls=[str(row[0]) for row in rows if row[0] in beside],
+        controls=[str(row[0]) for row in rows if row[0] in control_rows],
     )
 
 
