@@ -4,7 +4,7 @@
     python benchmarks/leakage_planted.py --seeds 20 --flat        # with Glass: prints without any
     texture among the unrelated touches
 
-Each seed makes a train and a test part (tests/leakage_fixtures.py: 60 videos of 9 kinds of surface,
+Each seed makes a train and a test part (tests/forge/leaks.py: 60 videos of 9 kinds of surface,
 128 px, 4 samples each) and plants near-duplicates (brightness +-5 %, JPEG quality 60, shifts up to
 4 px, and combinations) across videos, the same sample, the same bytes, shared videos and frames 3
 apart. Near-duplicates are judged twice: with videos known, and with all metadata dropped. The same
@@ -25,7 +25,7 @@ import polars as pl
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
 
-from leakage_fixtures import MATERIALS, make_leaky
+from forge.leaks import MATERIALS, make_leaky
 from palpate.data.manifest import Manifest
 from palpate.leakage import audit
 from palpate.leakage.near import near_duplicates

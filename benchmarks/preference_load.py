@@ -28,8 +28,8 @@ from pathlib import Path
 import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
-from preference_fixtures import pair_study
-from preference_serving import Serving
+from forge.people import pair_study
+from forge.servers import Serving
 
 MOST_MS = 50.0
 

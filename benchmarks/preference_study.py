@@ -44,8 +44,7 @@ from palpate.sim import WorldOptions
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
 from conftest import ARGS, CHROMIUM
-from preference_crowd import Crowd
-from preference_person import Person, rate
+from forge.people import Crowd, Person, rate
 
 METHODS = ("near", "blurred", "other")
 CROWD = Crowd(

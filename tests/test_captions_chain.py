@@ -5,7 +5,7 @@ import shlex
 
 import pytest
 
-from caption_server import FakeServer
+from forge.servers import FakeServer
 from palpate.cli import main
 from palpate.sim import WorldOptions, write_world
 

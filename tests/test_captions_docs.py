@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from caption_server import FakeServer
+from forge.servers import FakeServer
 from palpate.cli import main
 from palpate.core import Split
 from palpate.sim import WorldOptions, write_world

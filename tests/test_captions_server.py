@@ -12,7 +12,7 @@ from pathlib import Path
 import polars as pl
 import pytest
 
-from caption_server import FakeServer
+from forge.servers import FakeServer
 from palpate.captions import StoppedError, caption, check_captions
 from palpate.captions.server import Server
 from palpate.cli import main

@@ -11,7 +11,7 @@ import polars as pl
 import pytest
 from PIL import Image
 
-from format_trees import TREES
+from forge.formats import TREES
 from palpate.cli import main
 from palpate.core import Split
 from palpate.data.manifest import Manifest

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from mini_fixtures import write_shipped
+from forge.models import write_shipped
 from palpate.cli import main
 
 

@@ -10,8 +10,8 @@ from pathlib import Path
 
 import pytest
 
-from data_fixtures import write_image
-from format_trees import TREES
+from forge.formats import TREES
+from forge.pictures import write_image
 from palpate.cli import main
 from palpate.cli.importing import FormatOptions, TableOptions
 from palpate.data.formats import FORMATS

@@ -13,12 +13,12 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from forge.people import Crowd, write_folders
 from palpate.cli import main
 from palpate.data.manifest import Manifest
 from palpate.preference import Plan
 from palpate.report.results import Results
 from palpate.sim import WorldOptions, write_world
-from preference_crowd import Crowd, write_folders
 
 
 @pytest.fixture(scope="module")

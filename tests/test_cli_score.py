@@ -12,11 +12,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from forge.pictures import paint
+from forge.scores import IDS, LABELS, by_key, feature_sets
 from palpate.cli import main
 from palpate.core import Split
 from palpate.evaluation import scoring
 from palpate.report.results import Results
-from score_calls import IDS, LABELS, by_key, feature_sets, paint
 
 PAIR = (
     "--generated",

@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from data_fixtures import Tree, tree
-from format_trees import TREES
+from forge.formats import TREES, Tree
+from forge.pictures import tree
 from palpate.core import ProblemsError, Split
 from palpate.data.formats import FORMATS
 from palpate.data.formats.base import finished

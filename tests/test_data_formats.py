@@ -5,8 +5,7 @@ import shutil
 
 import pytest
 
-from data_fixtures import write_image
-from format_trees import (
+from forge.formats import (
     drawn,
     imported,
     kinds,
@@ -17,6 +16,7 @@ from format_trees import (
     of_kind,
     row,
 )
+from forge.pictures import write_image
 from palpate.core import PalpateError, Split, few
 from palpate.data.formats.base import Scan
 from palpate.data.formats.layout import natural, numbered

@@ -6,9 +6,9 @@ import sys
 
 import pytest
 
-from format_trees import HF_MAPS as MAPS
-from format_trees import hf_kinds as kinds
-from format_trees import hf_rows, save_hf
+from forge.formats import HF_MAPS as MAPS
+from forge.formats import hf_kinds as kinds
+from forge.formats import hf_rows, save_hf
 from palpate.core import MissingExtraError, PalpateError, ProblemsError
 from palpate.data.importing import import_dataset, validate
 from palpate.data.manifest import Manifest

@@ -8,7 +8,7 @@ import pytest
 from PIL import Image
 
 import palpate.data.images as images
-from data_fixtures import number, tree, write_image
+from forge.pictures import number, tree, write_image
 from palpate.core import PalpateError, ProblemsError
 from palpate.data.images import (
     cached_images,

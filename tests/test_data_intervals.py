@@ -4,7 +4,7 @@ import numpy as np
 import polars as pl
 import pytest
 
-from data_fixtures import number, tree, write_frames, write_video
+from forge.pictures import number, tree, write_frames, write_video
 from palpate.core import PalpateError, ProblemsError
 from palpate.data.images import read_image
 from palpate.data.importing import import_dataset, validate

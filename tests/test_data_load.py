@@ -6,8 +6,8 @@ import sys
 import polars as pl
 import pytest
 
-from data_fixtures import tree, write_image
-from format_trees import TREES
+from forge.formats import TREES
+from forge.pictures import tree, write_image
 from palpate import data
 from palpate.core import PalpateError, ProblemsError
 

@@ -6,7 +6,7 @@ from functools import partial
 import polars as pl
 import pytest
 
-from data_fixtures import tree, write_frames, write_image
+from forge.pictures import tree, write_frames, write_image
 from palpate.core import PalpateError, ProblemsError
 from palpate.data.formats import FORMATS
 from palpate.data.importing import import_dataset, validate

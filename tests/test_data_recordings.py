@@ -2,7 +2,7 @@
 
 import pytest
 
-from data_fixtures import tree, write_image
+from forge.pictures import tree, write_image
 from palpate.core import ProblemsError, Split
 from palpate.data.importing import import_dataset, validate, write_lists
 from palpate.data.manifest import Manifest

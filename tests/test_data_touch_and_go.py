@@ -6,7 +6,7 @@ import pytest
 from PIL import Image
 
 import palpate.data.formats.recordings as recordings
-from data_fixtures import number, tree, write_frames, write_image, write_video
+from forge.pictures import number, tree, write_frames, write_image, write_video
 from palpate.core import PalpateError, ProblemsError, Split
 from palpate.data.formats.touch_and_go import find_videos, write_lists
 from palpate.data.images import read_image

@@ -10,8 +10,9 @@ import numpy as np
 import polars as pl
 import pytest
 
-from format_trees import TVL_COLUMNS as COLUMNS
-from format_trees import gel, kinds, make_hct, make_ssvtp, photo, put, write_csv
+from forge.formats import TVL_COLUMNS as COLUMNS
+from forge.formats import kinds, make_hct, make_ssvtp
+from forge.pictures import gel, photo, put, write_csv
 from palpate.core import PalpateError, ProblemsError, Split
 from palpate.data.formats import ssvtp, tvl
 from palpate.data.formats.base import Scan

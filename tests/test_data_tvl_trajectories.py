@@ -4,10 +4,11 @@ import shutil
 
 import pytest
 
-from format_trees import PHOTO, gel, kinds, make_hct, name_of, photo, put, write_csv
-from format_trees import TACTILE as SENSOR
-from format_trees import TVL_COLUMNS as COLUMNS
-from format_trees import make_trajectory as trajectory
+from forge.formats import TVL_COLUMNS as COLUMNS
+from forge.formats import kinds, make_hct, name_of
+from forge.formats import make_trajectory as trajectory
+from forge.pictures import PHOTO, gel, photo, put, write_csv
+from forge.pictures import TACTILE as SENSOR
 from palpate.core import PalpateError, ProblemsError, Split
 from palpate.data.formats import hct
 from palpate.data.formats.hct import TRAJECTORY

@@ -5,7 +5,7 @@ import sys
 import numpy as np
 import pytest
 
-from data_fixtures import number, write_video
+from forge.pictures import number, write_video
 from palpate.core import MissingExtraError, PalpateError
 from palpate.data.video import VideoReader
 

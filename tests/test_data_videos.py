@@ -5,7 +5,7 @@ import pytest
 from PIL import Image
 
 import palpate.data.frames as frames
-from data_fixtures import write_image
+from forge.pictures import write_image
 from palpate.cli import main
 from palpate.core import PalpateError, ProblemsError
 from palpate.data.importing import import_dataset, validate

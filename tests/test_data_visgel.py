@@ -1,6 +1,6 @@
 """VisGel: both kinds of lists, recordings without lists, the contact of a frame, all problems."""
 
-from format_trees import (
+from forge.formats import (
     drawn,
     imported,
     kinds,

@@ -10,7 +10,8 @@ import pytest
 import torch
 from PIL import Image
 
-from diffusion_fixtures import StandInEncoders, arrays, photos
+from forge.models import StandInEncoders, arrays
+from forge.pictures import photos
 from palpate.core import PalpateError, Split
 from palpate.data.manifest import Manifest
 from palpate.diffusion.autoencoder import BackgroundAutoencoder, LatentStats

@@ -12,9 +12,7 @@ from diffusers import AutoencoderKL, VQModel
 from safetensors.torch import save_file
 
 import palpate as pp
-from compvis_fixtures import VQ_F4, decode, encode, make_state
-from diffusion_fixtures import make_pipeline
-from mini_fixtures import make_encoders
+from forge.models import VQ_F4, decode, encode, make_encoders, make_pipeline, make_state
 from palpate.cli import main
 from palpate.core import PalpateError, Split
 from palpate.diffusion.autoencoder import Autoencoder, load_autoencoder, to_bytes

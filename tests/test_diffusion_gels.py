@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from diffusion_fixtures import make_pipeline
-from mini_fixtures import make_encoders, write_shipped
+from forge.models import make_encoders, make_pipeline, write_shipped
 from palpate.cli import main
 from palpate.data.images import square
 from palpate.data.video import VideoReader

@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from PIL import Image
 
-from diffusion_fixtures import make_pipeline
+from forge.models import make_pipeline
 from palpate.core import PalpateError, ProblemsError, Split, inside
 from palpate.data.manifest import Manifest
 from palpate.diffusion.generation import Generated, file_name, generate, photo_ids

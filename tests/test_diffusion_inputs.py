@@ -11,8 +11,8 @@ import pytest
 import torch
 from PIL import Image
 
-from diffusion_fixtures import arrays, make_pipeline, photos
-from mini_fixtures import make_encoders
+from forge.models import arrays, make_encoders, make_pipeline
+from forge.pictures import photos
 from palpate.cli import main
 from palpate.core import PalpateError, Split
 from palpate.diffusion.autoencoder import LatentStats

@@ -16,7 +16,8 @@ from huggingface_hub import ModelCard
 from PIL import Image
 from safetensors.torch import load_file, save_file
 
-from diffusion_fixtures import arrays, make_pipeline, photos
+from forge.models import arrays, make_pipeline
+from forge.pictures import photos
 from palpate.core import PalpateError
 from palpate.diffusion.autoencoder import BackgroundAutoencoder, LatentStats
 from palpate.diffusion.autoencoder_training import build_autoencoder

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from diffusion_fixtures import photos
+from forge.pictures import photos
 from palpate.diffusion.generation import Generated
 
 

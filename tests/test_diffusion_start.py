@@ -6,8 +6,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from diffusion_fixtures import make_pipeline
-from mini_fixtures import make_encoders
+from forge.models import make_encoders, make_pipeline
 from palpate.core import PalpateError, Split
 from palpate.data.manifest import Manifest
 from palpate.diffusion.autoencoder import LatentStats

@@ -9,7 +9,7 @@ import torch
 from PIL import Image
 
 import palpate as pp
-from mini_fixtures import make_encoders
+from forge.models import make_encoders
 from palpate.core import PalpateError
 from palpate.data.manifest import Manifest
 from palpate.encoders.encoder import Encoder

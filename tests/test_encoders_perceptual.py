@@ -5,7 +5,7 @@ import pytest
 import torch
 from safetensors.torch import save_file
 
-from lpips_files import SHAPES, random_states, save_states
+from forge.models import SHAPES, random_states, save_states
 from palpate.core import PalpateError
 from palpate.encoders.perceptual import Lpips, load_lpips, lpips_per_image
 

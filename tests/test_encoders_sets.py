@@ -12,7 +12,7 @@ from PIL import Image
 from safetensors.torch import load_file, save_file
 from transformers import AutoTokenizer, CLIPModel
 
-from mini_fixtures import make_encoders
+from forge.models import make_encoders
 from palpate.core import PalpateError
 from palpate.encoders import encoder_set as module
 from palpate.encoders.contrastive import new_clip

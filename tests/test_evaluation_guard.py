@@ -9,7 +9,7 @@ import pytest
 from PIL import Image
 from safetensors.numpy import save_file
 
-from mini_fixtures import make_encoders
+from forge.models import make_encoders
 from palpate import audit, probe, score
 from palpate.core import PalpateError, Split
 from palpate.data.manifest import Manifest

@@ -10,11 +10,11 @@ import polars as pl
 import pytest
 from PIL import Image
 
+from forge.pictures import paint
 from palpate.core import FeatureSet, PalpateError, Split
 from palpate.data.manifest import Manifest
 from palpate.evaluation.embedding_files import read_embeddings
 from palpate.evaluation.inputs import read, read_inputs
-from score_calls import paint
 
 N = 4
 ROWS = ["v0/1", "007", 'odd "name", [x]', "grün"]

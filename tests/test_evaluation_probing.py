@@ -12,7 +12,7 @@ from palpate.core import PalpateError, Split
 from palpate.report.results import Results
 
 pytest.importorskip("torch")
-from mini_fixtures import make_encoders
+from forge.models import make_encoders
 
 DIRECTIONS = [
     "text by tactile",

@@ -10,6 +10,8 @@ import pytest
 from PIL import Image
 from scipy import stats
 
+from forge.pictures import paint
+from forge.scores import DIM, FRAMES, GROUPS, IDS, by_key, codes, feature_sets, unit
 from palpate.core import FeatureSet, PalpateError, Score, Split
 from palpate.core.score import require_comparable
 from palpate.data.manifest import Manifest
@@ -18,7 +20,6 @@ from palpate.evaluation.controls import matched_features
 from palpate.metrics import Polynomial, compare, contact_scores, distance, i_tmmd, ssim
 from palpate.metrics.distributions import prdc_rows
 from palpate.metrics.intervals import spread_of_values
-from score_calls import DIM, FRAMES, GROUPS, IDS, by_key, codes, feature_sets, paint, unit
 
 SETS = feature_sets()
 TEST, TRAIN = IDS[:24], IDS[24:]
@@ -331,7 +332,7 @@ def test_images_in_memory_pair_by_position_on_request():
 
 def test_lpips_is_the_mean_over_pairs(tmp_path, small_manifest):
     pytest.importorskip("torch")
-    from lpips_files import random_states, save_states
+    from forge.models import random_states, save_states
     from palpate.encoders.perceptual import load_lpips, lpips_per_image
 
     made = {n: paint(tmp_path / n, small_manifest.ids, seed) for seed, n in enumerate("ab", 5)}

@@ -15,7 +15,7 @@ import numpy as np
 import polars as pl
 import pytest
 
-from data_fixtures import write_image
+from forge.pictures import write_image
 from palpate.cli import main
 from palpate.core import PalpateError, atomic_folder, atomic_path, locked
 from palpate.data.manifest import Manifest

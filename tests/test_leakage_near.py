@@ -8,7 +8,7 @@ import pytest
 from PIL import Image
 from threadpoolctl import threadpool_limits
 
-from leakage_fixtures import MATERIALS, NoiseVideo, crop, make_leaky, save
+from forge.leaks import MATERIALS, NoiseVideo, crop, make_leaky, save
 from palpate.data.manifest import Manifest
 from palpate.leakage.calibration import beyond_chance
 from palpate.leakage.descriptors import EditIndex, Whitened

@@ -14,8 +14,8 @@ import pytest
 import torch
 from safetensors.torch import load_file
 
-from diffusion_fixtures import arrays, make_pipeline, photos
-from mini_fixtures import make_encoders, write_shipped
+from forge.models import arrays, make_encoders, make_pipeline, write_shipped
+from forge.pictures import photos
 from palpate.core import PalpateError, digest_folder
 from palpate.diffusion.autoencoder import load_autoencoder
 from palpate.diffusion.pipeline import TactilePipeline

@@ -11,10 +11,9 @@ from pathlib import Path
 import pytest
 
 from conftest import ARGS, CHROMIUM
+from forge.people import READY, Person, opened, pair_study, sort_study
 from palpate.core import digest_json
 from palpate.preference.page import study_page
-from preference_fixtures import pair_study, sort_study
-from preference_person import READY, Person, opened
 
 sync_api = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
 pytestmark = pytest.mark.browser

@@ -7,8 +7,8 @@ import re
 
 import pytest
 
+from forge.people import pair_study, sort_study
 from palpate.preference.page import policy, study_page
-from preference_fixtures import pair_study, sort_study
 
 STUDIES = {"pair": pair_study(3, 2)[0], "sort": sort_study()}
 

@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 from PIL import Image, ImageFilter
 
+from forge.people import write_folder, write_folders
 from palpate import preference
 from palpate.core import PalpateError
 from palpate.preference import Plan
 from palpate.preference.images import QUALITY, data_uri, load_square
-from preference_crowd import write_folder, write_folders
 
 
 @pytest.fixture(scope="module")

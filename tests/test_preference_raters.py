@@ -11,12 +11,10 @@ import resource
 
 import pytest
 
+from forge.people import Crowd, Person, opened, pair_study, planted, rate, write_folders
+from forge.servers import Serving
 from palpate import preference
 from palpate.preference import Plan
-from preference_crowd import Crowd, write_folders
-from preference_fixtures import pair_study
-from preference_person import Person, opened, planted, rate
-from preference_serving import Serving
 
 pytest.importorskip("uvicorn", reason="uvicorn is not installed")
 pytestmark = pytest.mark.browser

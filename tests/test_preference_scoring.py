@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
+from forge.people import Crowd, signed, write_folders
 from palpate import preference
 from palpate.core import Note, PalpateError, quiet
 from palpate.preference.agreement import agreement_scores, of_images
@@ -19,7 +20,6 @@ from palpate.preference.plan import Plan
 from palpate.preference.raters import rater_facts
 from palpate.preference.votes import read_votes
 from palpate.report.results import Results
-from preference_crowd import Crowd, signed, write_folders
 
 CROWD = Crowd({"ours": 2.0, "gvst": 0.5, "wbg": -1.0})
 

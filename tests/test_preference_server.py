@@ -10,9 +10,9 @@ from pathlib import Path
 import pytest
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "benchmarks"))
+from forge.people import pair_study
+from forge.servers import Serving
 from palpate.core import PalpateError
-from preference_fixtures import pair_study
-from preference_serving import Serving
 
 pytest.importorskip("uvicorn", reason="uvicorn is not installed")
 

@@ -10,7 +10,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "recipes"))
 
 from mini_scores import zero_shot_accuracy
 
-from mini_fixtures import make_encoders
+from forge.models import make_encoders
 from palpate.core import FeatureSet
 
 PROMPTS = {

@@ -15,10 +15,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from palpate.core import SampleRef
-from palpate.report import write_report
-from palpate.report.results import GalleryItem, LeakPair, Results
-from report_fixtures import (
+from forge.results import (
     clean_audit,
     difference,
     full_audit,
@@ -29,6 +26,9 @@ from report_fixtures import (
     small_audit,
     text_note,
 )
+from palpate.core import SampleRef
+from palpate.report import write_report
+from palpate.report.results import GalleryItem, LeakPair, Results
 
 LONG = "a_recording_with_a_name_that_no_line_of_a_phone_can_hold_2024_11_21_rig_b"
 

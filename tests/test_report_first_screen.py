@@ -4,6 +4,7 @@ import re
 
 import pytest
 
+from forge.results import Tree, clean_audit, full_audit, full_results, gallery, score
 from palpate.core import Note
 from palpate.report.first_screen import about, annotated, cards, caution, telling_columns
 from palpate.report.page import render_page
@@ -11,7 +12,6 @@ from palpate.report.results import Results
 from palpate.report.study import Claim, StudyTable
 from palpate.report.study_tables import lay
 from palpate.report.tables import score_tables
-from report_fixtures import Tree, clean_audit, full_audit, full_results, gallery, score
 
 
 def measured():

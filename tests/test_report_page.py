@@ -10,6 +10,18 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from forge.results import (
+    Tree,
+    difference,
+    full_audit,
+    full_results,
+    gallery,
+    images,
+    pretraining_audit,
+    score,
+    small_audit,
+    text_note,
+)
 from palpate.core import PalpateError, SampleRef
 from palpate.report import summary_lines, write_report
 from palpate.report.page import in_turns
@@ -23,18 +35,6 @@ from palpate.report.plots import (
     score_histogram,
 )
 from palpate.report.results import GalleryItem, LeakPair, Results, Signal
-from report_fixtures import (
-    Tree,
-    difference,
-    full_audit,
-    full_results,
-    gallery,
-    images,
-    pretraining_audit,
-    score,
-    small_audit,
-    text_note,
-)
 
 NASTY = "<script>alert(\"x\")</script> & 'quotes'"
 

@@ -6,10 +6,10 @@ from pathlib import Path
 
 import pytest
 
+from forge.results import full_audit, full_results, images, score, small_audit
 from palpate.cli import main
 from palpate.core import PalpateError
 from palpate.report.results import Audit, LeakPair, Results
-from report_fixtures import full_audit, full_results, images, score, small_audit
 
 
 def test_results_are_a_table_of_scores():

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from forge.results import Tree, images, score, study_results, text_note
 from palpate.cli import main
 from palpate.core import SampleRef
 from palpate.report import drawing, write_report
@@ -24,7 +25,6 @@ from palpate.report.study_tables import brief, file_names, lay, sheet, tally
 from palpate.report.tables import score_tables
 from palpate.report.terminal import as_text
 from palpate.studies.evidence import in_words
-from report_fixtures import Tree, images, score, study_results, text_note
 
 NASTY = "<script>alert(1)</script> & \"q\" 'q' 100% $x_1$ \\input{a} | `c` [d]"
 LONG = "a_method_with_a_name_that_no_line_of_a_phone_can_hold_2024_11_21_rig_b_second_run"

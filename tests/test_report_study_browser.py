@@ -6,9 +6,9 @@ from pathlib import Path
 
 import pytest
 
+from forge.results import score, study_results
 from palpate.report import write_report
 from palpate.report.study import Claim, StudyTable
-from report_fixtures import score, study_results
 from test_report_browser import OVERFLOW, UNFOLD, opened, screenshot
 
 LONG = "a_method_with_a_name_that_no_line_of_a_phone_can_hold_2024_11_21_rig_b_second_run"

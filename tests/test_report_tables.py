@@ -4,12 +4,12 @@ from dataclasses import replace
 
 import pytest
 
+from forge.results import difference, score, text_note
 from palpate.core import Note, PalpateError
 from palpate.report.notes import decimals, number, percent, plural, score_text
 from palpate.report.results import Results
 from palpate.report.study_tables import score_sheets
 from palpate.report.tables import family_of, heat_tables, rankings, score_tables
-from report_fixtures import difference, score, text_note
 
 
 @pytest.mark.parametrize(

@@ -10,13 +10,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 from rich.console import Console
 
+from forge.results import difference, full_audit, full_results, score, small_audit, text_note
 from palpate.core import Note, SampleRef
 from palpate.report import notes
 from palpate.report.audits import pair_lists
 from palpate.report.latex import escape
 from palpate.report.results import LeakPair, Results, Signal
 from palpate.report.terminal import as_text, audit_text, print_result
-from report_fixtures import difference, full_audit, full_results, score, small_audit, text_note
 
 NASTY = r"100% & {x} $_#^~ <b> \input{a} | `c` [d]"
 

@@ -3,10 +3,10 @@
 import pytest
 
 from conftest import shared_data
+from forge.studies import forge_clips, forge_hct, forge_touch_and_go
 from palpate.cli import main
 from palpate.report.results import Results
 from palpate.studies.study import NOLEAK, ORIG
-from study_trees import forge_clips, forge_hct, forge_touch_and_go
 
 
 def reproduced(study, root, run):

@@ -16,7 +16,7 @@ import torch
 from PIL import Image
 from safetensors.numpy import load_file
 
-import small_study
+from forge import studies as small_study
 from palpate.core import PalpateError, Score, Split, digest_file, digest_json, short
 from palpate.evaluation.companions import Weights
 from palpate.report.results import Results

@@ -222,7 +222,7 @@ def test_an_encoder_that_saw_test_videos_is_rejected(tmp_path):
     """On files: features, keys and generated images come together by id; the guard stands first."""
     from PIL import Image
 
-    from mini_fixtures import make_encoders
+    from forge.models import make_encoders
     from palpate.core import Split
     from palpate.data.manifest import Manifest
     from palpate.sim import WorldOptions, write_world

@@ -7,7 +7,7 @@ import pytest
 import torch
 from PIL import Image
 
-from mini_fixtures import make_encoders
+from forge.models import make_encoders
 from palpate.cli import main
 from palpate.core import PalpateError, Split
 from palpate.data.manifest import Manifest

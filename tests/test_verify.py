@@ -10,11 +10,12 @@ import pytest
 from PIL import Image
 
 import palpate as pp
+from forge.pictures import paint
+from forge.scores import GROUPS, IDS, LABELS, feature_sets
 from palpate.core import FeatureSet, PalpateError, Score, Split, plain
 from palpate.data.manifest import Manifest
 from palpate.report.results import Audit, Results
 from palpate.studies.verifying import TOLERANCE, difference, verify
-from score_calls import GROUPS, IDS, LABELS, feature_sets, paint
 
 
 @pytest.fixture

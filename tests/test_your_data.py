@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from PIL import Image
 
-from data_fixtures import write_image
+from forge.pictures import write_image
 from palpate.cli import main
 from palpate.core import PalpateError
 from palpate.data import Manifest, import_dataset, load

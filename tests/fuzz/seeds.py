@@ -14,12 +14,12 @@ import numpy as np
 import polars as pl
 
 import palpate
-from data_fixtures import write_video
-from format_trees import TREES, gel, photo, put, write_csv
+from forge.formats import TREES
+from forge.people import Crowd
+from forge.pictures import gel, photo, put, write_csv, write_video
 from palpate import preference
 from palpate.cli import main
 from palpate.data.manifest import Manifest
-from preference_crowd import Crowd
 
 MINI = Path(palpate.__file__).parent / "mini"
 #: Command -> how often it is drawn next to the others; those that load models are slow. ``demo``

@@ -7,28 +7,54 @@ its tactile image alone. Then ``pytest tests/test_data_contract.py -k <name>`` s
 format keeps the contract.
 """
 
-import csv
 import json
 import shutil
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
 from itertools import count, product
 from pathlib import Path
 
 import numpy as np
 from PIL import Image
 
-from data_fixtures import Tree, number, picture, write_image
+from forge.pictures import (
+    encoded,
+    gel,
+    number,
+    photo,
+    picture,
+    put,
+    write_csv,
+    write_image,
+    write_images,
+)
 from palpate.data.importing import import_dataset
 from palpate.data.listing import write_list
 
+
+@dataclass(frozen=True)
+class Tree:
+    """A small data set, all of it below the folder that its maker was given.
+
+    Attributes:
+        source: what a user would name: a folder or a table.
+        samples: how many samples an import must give.
+        options: options of the import that it needs; paths below the folder follow a copied tree.
+        remove: removes what one sample needs, given the source; default: deletes the tactile image
+            of the last sample.
+        cut: damages it instead; default: cuts that file in half.
+    """
+
+    source: Path
+    samples: int
+    options: Mapping[str, object] = field(default_factory=dict)
+    remove: Callable[[Path], None] | None = None
+    cut: Callable[[Path], None] | None = None
+
+
 METADATA = "Index,Name,Material\n1,Soup_Spoon,Ceramic\n2,Bowl,Ceramic\n10,Soup_Bowl,Ceramic\n"
 METADATA += "17,8Inch_Skillet,Iron\n"
-
-
-def write_images(root: Path, names: Sequence[str], start: int = 1) -> None:
-    for k, name in enumerate(names, start):
-        write_image(root / name, k)
 
 
 def make_touch_and_go(folder: Path) -> Tree:
@@ -204,14 +230,6 @@ def hf_rows() -> list[dict]:
     return rows
 
 
-def encoded(image: Image.Image, suffix: str) -> bytes:
-    import io
-
-    stream = io.BytesIO()
-    image.save(stream, {".png": "PNG", ".jpg": "JPEG"}[suffix])
-    return stream.getvalue()
-
-
 def make_hf(folder: Path) -> Tree:
     """A folder of ``save_to_disk`` with two images a row, class labels and parts."""
     rows = hf_rows()
@@ -234,40 +252,7 @@ def make_hf(folder: Path) -> Tree:
 
 # --- TVL: a gel that looks similar everywhere, photos that do not
 
-#: (width, height) of a tactile image, upright as a DIGIT's; and of a photo.
-TACTILE, PHOTO = (48, 64), (64, 48)
 TVL_COLUMNS = ("url", "tactile", "tactile_background", "caption")
-
-
-def gel(
-    seed: int, size: tuple[int, int] = TACTILE, rig: int = 0, pressed: bool = True
-) -> Image.Image:
-    """A gel's shading, similar within a rig, with a round print somewhere if it is pressed."""
-    width, height = size
-    y, x = np.mgrid[:height, :width] / height
-    image = np.stack([0.25 + 0.2 * y, 0.3 + 0.1 * x + 0.05 * rig, 0.5 - 0.2 * y], axis=2)
-    if pressed:
-        cx, cy = np.random.default_rng([1, seed]).uniform(0.25, 0.55, 2)
-        image += 0.15 * (((x - cx) ** 2 + (y - cy) ** 2) < 0.02)[:, :, None]
-    return Image.fromarray((255 * image.clip(0, 1)).astype(np.uint8))
-
-
-def photo(seed: int, size: tuple[int, int] = PHOTO) -> Image.Image:
-    """Coarse patches of any color."""
-    small = np.random.default_rng([2, seed]).integers(0, 256, (4, 4, 3)).astype(np.uint8)
-    return Image.fromarray(small).resize(size, Image.Resampling.BICUBIC)
-
-
-def put(path: Path, image: Image.Image) -> Path:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    image.save(path, quality=90)
-    return path
-
-
-def write_csv(path: Path, columns: Sequence[str] | None, rows: Sequence[Sequence[str]]) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with path.open("w", newline="", encoding="utf-8") as file:
-        csv.writer(file).writerows([*([columns] if columns else []), *rows])
 
 
 def name_of(frame: int) -> str:

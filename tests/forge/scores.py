@@ -1,9 +1,6 @@
 """Sets and images that the tests of scoring share."""
 
-from pathlib import Path
-
 import numpy as np
-from PIL import Image
 
 from palpate.core import FeatureSet
 
@@ -31,18 +28,6 @@ def feature_sets() -> dict[str, FeatureSet]:
     """``real``, ``near`` and ``far``, with labels, groups and an encoder."""
     settings = {"real": (1, 0.1, 0), "near": (2, 0.2, 0.1), "far": (3, 0.5, 1.5)}
     return {n: FeatureSet(IDS, features(*s), LABELS, GROUPS, "e" * 64) for n, s in settings.items()}
-
-
-def paint(folder: Path, names, seed: int, suffix: str = ".png", side: int = 32):
-    """Random images, one file a name; returns their arrays by name."""
-    rng = np.random.default_rng(seed)
-    images = {}
-    for name in names:
-        path = folder / f"{name}{suffix}"
-        path.parent.mkdir(parents=True, exist_ok=True)
-        images[name] = rng.integers(90, 160, (side, side, 3)).astype(np.uint8)
-        Image.fromarray(images[name]).save(path)
-    return images
 
 
 def by_key(results) -> dict:

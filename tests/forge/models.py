@@ -1,15 +1,160 @@
-"""Tiny autoencoders by the names of latent diffusion, and their forward pass in a few lines.
-
-Written from the published architecture (latent-diffusion, ldm/modules/diffusionmodules/model.py):
-GroupNorm of 32 groups (eps 1e-6), swish, residual blocks, one attention of one head in the middle,
-downsampling with padding (0, 1, 0, 1), nearest upsampling; `decoder.up.0` is the finest level.
-"""
+"""Untrained models: pipelines, encoders, and weights in the formats that others publish."""
 
 from __future__ import annotations
 
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
 import torch
 from torch import Tensor
 from torch.nn.functional import conv2d, group_norm, interpolate, pad, silu
+
+from palpate.diffusion.autoencoder import LatentStats
+from palpate.diffusion.autoencoder_training import build_autoencoder
+from palpate.diffusion.denoiser import Denoiser, build_unet
+from palpate.diffusion.options import ConditionPolicy
+from palpate.diffusion.pipeline import TactilePipeline
+from palpate.diffusion.presets import TINY
+from palpate.encoders import models
+from palpate.encoders.contrastive import new_clip
+from palpate.encoders.encoder_set import EncoderSet, Preprocess, new_tactile
+from palpate.encoders.presets import TINY as TINY_ENCODERS
+from palpate.training.cards import write_model_cards
+
+# --- a pipeline whose vision encoder is a few lines of arithmetic
+
+
+class StandInEncoders:
+    """A vision encoder that embeds a photo's mean color and contrast: 6 numbers, normalized."""
+
+    dim, device = 6, torch.device("cpu")
+
+    class _Preprocess:
+        resize = 16
+
+        def fit(self, images):
+            return images
+
+        def __call__(self, x):
+            return x - 0.5
+
+    def preprocess(self, modality):
+        assert modality == "vision"
+        return self._Preprocess()
+
+    def encode(self, modality, pixels):
+        values = torch.cat([pixels.mean((2, 3)), pixels.std((2, 3))], dim=1)
+        return torch.nn.functional.normalize(values, dim=1)
+
+    def digest(self, modality):
+        return f"stand-in {modality}"
+
+    def to(self, device):
+        return self
+
+
+def make_pipeline(
+    *, background: bool = False, policy: ConditionPolicy | None = None, width: int = 6
+) -> TactilePipeline:
+    """An untrained pipeline of 32 px tactile images."""
+    torch.manual_seed(0)
+    assert TINY.autoencoder is not None
+    policy = policy or TINY.condition_for(width)
+    unet = build_unet(TINY.unet, policy, channels=3, size=8, background=3 if background else 0)
+    # Make the condition matter in an untrained network.
+    for name, p in unet.named_parameters():
+        if "attn2" in name:
+            p.data.mul_(4)
+    return TactilePipeline(
+        build_autoencoder(TINY.autoencoder).eval(),
+        Denoiser(unet, policy).eval(),
+        LatentStats((0.1, 0.0, -0.1), (0.5, 0.6, 0.7)),
+        TINY.schedule,
+        TINY.sampler,
+        32,
+        encoders=StandInEncoders(),
+        preset="tiny",
+        training={"steps": 0, "split": None},
+    )
+
+
+def arrays(images) -> np.ndarray:
+    """The images of a pipeline's output as one array."""
+    return np.stack([np.asarray(image) for image in images.images])
+
+
+# --- models in the layout of the shipped ones
+
+
+WORLD = [{"world": "made up", "seeds": "900000-900003", "version": 2, "frames": 12}]
+
+
+def make_encoders(seed: int = 0) -> EncoderSet:
+    """Untrained encoders of the preset tiny."""
+    clip = new_clip(TINY_ENCODERS, ["a rough wall", "a soft cloth", "smooth cold metal"], seed=seed)
+    tactile = new_tactile(TINY_ENCODERS.tactile_config(clip.dim), seed + 1).eval()
+    preprocess = Preprocess(16, 16, (0.5, 0.4, 0.3), (0.2, 0.3, 0.4))
+    return EncoderSet(clip, tactile, preprocess, {"title": "Encoders", "data": WORLD})
+
+
+def write_shipped(root: Path, monkeypatch) -> TactilePipeline:
+    """Write ``root/mini``, make ``palpate/mini`` refer to it, and return the generator."""
+    monkeypatch.setattr(models, "shipped_root", lambda: root)
+    encoders = make_encoders()
+    encoders.save(root / "mini" / "encoders", half=True)
+    made = make_pipeline(width=encoders.dim)
+    made.autoencoder.card = {"data": WORLD, "scores": [{"score": "PSNR", "value": 12.5}]}
+    made.autoencoder.save(root / "mini" / "autoencoder", half=True)
+    training = {"synthetic": True, "materials": ["Wood", "Brick"], "data": WORLD, "split": None}
+    pipeline = replace(made, encoders=EncoderSet(encoders.clip), training=training)
+    pipeline.save(root / "mini" / "generator", half=True, shared="palpate/mini")
+    write_model_cards(root / "mini")
+    return pipeline
+
+
+# --- LPIPS in its published files
+
+
+SHAPES = {
+    0: (64, 3, 11, 11),
+    3: (192, 64, 5, 5),
+    6: (384, 192, 3, 3),
+    8: (256, 384, 3, 3),
+    10: (256, 256, 3, 3),
+}
+
+
+def random_states() -> tuple[dict[str, torch.Tensor], dict[str, torch.Tensor]]:
+    """Weights of backbone and heads by the names that torchvision and LPIPS v0.1 give them."""
+    draw = torch.Generator().manual_seed(0)
+    backbone = {"classifier.1.weight": torch.zeros(2, 2)}
+    heads = {}
+    for k, (place, shape) in enumerate(SHAPES.items()):
+        fan = shape[1] * shape[2] * shape[3]
+        backbone[f"features.{place}.weight"] = torch.randn(shape, generator=draw) * (2 / fan) ** 0.5
+        backbone[f"features.{place}.bias"] = 0.1 * torch.randn(shape[0], generator=draw)
+        heads[f"lin{k}.model.1.weight"] = torch.rand((1, shape[0], 1, 1), generator=draw)
+    return backbone, heads
+
+
+def save_states(
+    states: tuple[dict[str, torch.Tensor], dict[str, torch.Tensor]], folder: Path
+) -> tuple[Path, Path]:
+    """Backbone and heads as files."""
+    places = folder / "alexnet-owt-7be5be79.pth", folder / "alex.pth"
+    torch.save(states[0], places[0])
+    torch.save(
+        states[1], places[1], _use_new_zipfile_serialization=False
+    )  # the published file is of the old format
+    return places
+
+
+# --- autoencoders by the names of latent diffusion, and their forward pass in a few lines
+# Written from the published architecture (ldm/modules/diffusionmodules/model.py): GroupNorm of 32
+# groups (eps 1e-6), swish, residual blocks, one attention of one head in the middle, downsampling
+# with padding (0, 1, 0, 1), nearest upsampling; `decoder.up.0` is the finest level.
+
 
 State = dict[str, Tensor]
 VQ_F4 = {"mult": (1, 2, 4), "z": 3, "codes": 64}

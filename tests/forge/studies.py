@@ -1,21 +1,31 @@
-"""Trees of Touch and Go and of HCT for studies: true layouts and names, rendered pictures.
+"""Studies that tests run: a world in the layout of a data set, and a plan of the smallest size.
 
-The tiny trees of ``format_trees.py`` hold too little to train on. These are the procedural world in
-the data set's layout, without the files that only a world has.
+``python tests/forge/studies.py FOLDER`` runs the small study.
 """
 
 import json
 import shutil
+import sys
 from collections import defaultdict
+from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 from PIL import Image
 
 from palpate.data.manifest import Manifest
 from palpate.leakage.noleak import load_record, record_split
+from palpate.report.results import Results
+from palpate.sim import PRESETS as WORLDS
 from palpate.sim import Video, WorldOptions, plan_world, write_world
 from palpate.sim.leak import cut
 from palpate.sim.plan import contact_rows
+from palpate.studies.methods import METHODS, OURS
+from palpate.studies.reproduce import Plan, plan_of, run_study
+from palpate.studies.study import PRESETS, Study
+
+# --- the procedural world in a data set's layout, without the files that only a world has
+
 
 WORLD = {"materials": ("Wood", "Brick", "Grass"), "contacts_per_video": 2, "frames_per_contact": 2}
 FORGED = {"objects_per_material": 6, "seed": 83, **WORLD}
@@ -118,3 +128,38 @@ def forge_clips(folder: Path) -> Path:
     for name in ("train.txt", "test.txt"):
         (root / name).unlink()
     return root
+
+
+# --- a study of the smallest size
+
+
+SMOKE = PRESETS["smoke"]
+TINY = replace(
+    SMOKE,
+    name="tiny",
+    world=replace(WORLDS["tiny"], materials=("Wood", "Brick"), objects_per_material=6, test=0.4),
+    steps=4,
+    autoencoder=replace(SMOKE.autoencoder, steps=12),
+    permutations=19,
+)
+STUDY = Study(
+    "small",
+    "A small study",
+    (1, 3),
+    {"leak": "contact", "seed": 71},
+    methods=(METHODS[OURS], METHODS["GVST"], METHODS["Ours w/ BG"]),
+    presets={"tiny": TINY},
+)
+
+
+def plan() -> Plan:
+    return plan_of(STUDY, preset="tiny", device="cpu")
+
+
+def run(folder: Path, **options) -> Results:
+    return run_study(plan(), folder, **options)
+
+
+if __name__ == "__main__":
+    show = partial(print, flush=True)
+    run(Path(sys.argv[1]), print_line=show, progress=lambda *args: show("progress", *args))

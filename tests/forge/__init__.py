@@ -1,0 +1,1 @@
+"""What tests are made of: pictures, data sets, models, scores, pages, people and servers."""
