@@ -6,6 +6,7 @@ import json
 import os
 import traceback
 from collections.abc import Callable
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +15,7 @@ import pytest
 from hypothesis import settings
 from PIL import Image
 
+from forge.pictures import put
 from palpate.data.manifest import Manifest
 
 # A busy machine is no failure: how long an example takes is not tested.
@@ -49,32 +51,17 @@ def real_data() -> Path:
 @pytest.fixture
 def small_manifest(tmp_path: Path) -> Manifest:
     """Six videos of three materials, two touches of four frames each, with 32-pixel pictures."""
-    rows = []
-    rng = np.random.default_rng(0)
-    for v in range(6):
-        material = ["Wood", "Grass", "Brick"][v % 3]
-        for touch in range(2):
-            for k in range(4):
-                frame = 100 * touch + k
-                paths = {}
-                for kind in ("vision", "tactile", "background"):
-                    path = tmp_path / "root" / f"v{v}" / kind / f"{frame}.png"
-                    path.parent.mkdir(parents=True, exist_ok=True)
-                    base = 40 * (v % 3) + 20 if kind != "background" else 100
-                    Image.fromarray(
-                        (base + rng.integers(0, 30, (32, 32, 3))).astype(np.uint8)
-                    ).save(path)
-                    paths[kind] = path.relative_to(tmp_path / "root").as_posix()
-                rows.append(
-                    {
-                        "id": f"v{v}/{frame}",
-                        "video": f"v{v}",
-                        "frame": frame,
-                        "contact": f"v{v}#{touch}",
-                        "material": material,
-                        **paths,
-                    }
-                )
+    rng, rows = np.random.default_rng(0), []
+    for v, touch, k in product(range(6), range(2), range(4)):
+        frame, material = 100 * touch + k, ("Wood", "Grass", "Brick")[v % 3]
+        row = {"id": f"v{v}/{frame}", "video": f"v{v}", "frame": frame, "material": material}
+        row["contact"] = f"v{v}#{touch}"
+        for side in ("vision", "tactile", "background"):
+            row[side] = f"v{v}/{side}/{frame}.png"
+            base = 100 if side == "background" else 40 * (v % 3) + 20
+            image = (base + rng.integers(0, 30, (32, 32, 3))).astype(np.uint8)
+            put(tmp_path / "root" / row[side], Image.fromarray(image))
+        rows.append(row)
     return Manifest.from_rows(rows, tmp_path / "root")
 
 

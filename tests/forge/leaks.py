@@ -39,9 +39,8 @@ class Leaky:
 
 def changed(picture: np.ndarray, how: str, rng: np.random.Generator) -> np.ndarray:
     """A crop of an image with margin: brightness times 0.95 to 1.05, moved by up to 4 pixels."""
-    moves = [
-        (y, x) for y in range(-MARGIN, MARGIN + 1) for x in range(-MARGIN, MARGIN + 1) if y or x
-    ]
+    steps = range(-MARGIN, MARGIN + 1)
+    moves = [(y, x) for y in steps for x in steps if y or x]
     down, right = moves[int(rng.integers(len(moves)))] if "shift" in how else (0, 0)
     out = crop(picture, down, right).astype(np.float32)
     if "brightness" in how:
@@ -56,9 +55,8 @@ def crop(picture: np.ndarray, down: int = 0, right: int = 0) -> np.ndarray:
 
 def save(path: Path, picture: np.ndarray, quality: int = 95) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
-    Image.fromarray(picture).save(
-        path, "JPEG", quality=quality, subsampling=0 if quality == 95 else 2
-    )
+    chroma = 0 if quality == 95 else 2
+    Image.fromarray(picture).save(path, "JPEG", quality=quality, subsampling=chroma)
 
 
 class NoiseVideo:
@@ -71,9 +69,8 @@ class NoiseVideo:
         self.frames: dict[int, tuple[np.ndarray, np.ndarray]] = {}
 
     def _field(self, sigma: float) -> np.ndarray:
-        x = ndimage.gaussian_filter(
-            self.rng.standard_normal((self.size, self.size)), sigma, mode="wrap"
-        )
+        white = self.rng.standard_normal((self.size, self.size))
+        x = ndimage.gaussian_filter(white, sigma, mode="wrap")
         return x / x.std()
 
     def render(self, touch: int) -> tuple[np.ndarray, np.ndarray]:
@@ -133,68 +130,36 @@ def make_leaky(
     samples: list[dict] = []
     pictures: dict[str, tuple[np.ndarray, np.ndarray]] = {}
     worlds = [Video(options, plan) for plan in plan_world(options)]
-    noises = [
-        NoiseVideo(np.random.default_rng([seed, k]), size + 2 * MARGIN)
-        for k in range(len(worlds) // 4)
-    ]
+    side = size + 2 * MARGIN
+    noises = [NoiseVideo(np.random.default_rng([seed, k]), side) for k in range(len(worlds) // 4)]
 
-    def add(
-        name: str,
-        touch: int,
-        frame: int,
-        photo: np.ndarray,
-        tactile: np.ndarray,
-        background: np.ndarray,
-        material: str,
-    ) -> dict:
-        row = {
-            "id": f"{name}/{frame}",
-            "video": name,
-            "frame": frame,
-            "contact": f"{name}#{touch}",
-            "material": material,
-            "sensor": "gel",
-        }
-        for kind, picture in (("vision", photo), ("tactile", tactile), ("background", background)):
+    def add(name: str, touch: int, frame: int, images: tuple, material: str) -> dict:
+        """The row of a sample whose photo, tactile image and background are written."""
+        row = {"id": f"{name}/{frame}", "video": name, "frame": frame, "material": material}
+        row |= {"contact": f"{name}#{touch}", "sensor": "gel"}
+        for kind, picture in zip(("vision", "tactile", "background"), images, strict=True):
             row[kind] = f"{name}/{kind}/{frame}.jpg"
             save(root / row[kind], crop(picture))
-        pictures[row["id"]] = photo, tactile
+        pictures[row["id"]] = images[:2]
         return row
 
     for world in worlds:
         for t in range(4):
             first = t * (options.free_frames + 4) + options.free_frames
             background = world.tactile(first - 4)
-            row = add(
-                world.plan.name,
-                t,
-                first,
-                world.vision(first),
-                world.tactile(first),
-                background,
-                world.plan.objects[0].material,
-            )
+            images = world.vision(first), world.tactile(first), background
+            row = add(world.plan.name, t, first, images, world.plan.objects[0].material)
             samples.append({**row, "later": (world, first + 3, background)})
     for k, noise in enumerate(noises):
         for t in range(4):
-            samples.append(
-                add(
-                    f"noise{k:03d}",
-                    t,
-                    10 * t,
-                    noise.photo(t),
-                    noise.touch(t),
-                    noise.background(),
-                    "noise",
-                )
-            )
+            images = noise.photo(t), noise.touch(t), noise.background()
+            samples.append(add(f"noise{k:03d}", t, 10 * t, images, "noise"))
     videos = sorted({s["video"] for s in samples})
     in_test = {videos[k] for k in rng.permutation(len(videos))[: round(0.4 * len(videos))]}
     train = [s for s in samples if s["video"] not in in_test]
     test = [s for s in samples if s["video"] in in_test]
-    out = Leaky(
-        Manifest.from_rows([], root), Manifest.from_rows([], root), {kind: {} for kind in KINDS}
-    )
+    leaks: dict[str, dict[str, str]] = {kind: {} for kind in KINDS}
+    change: dict[str, str] = {}
     count = round(planted * len(test))
     free = [int(k) for k in rng.permutation(len(test))]
     sources = [train[int(k)] for k in rng.permutation(len(train))]
@@ -204,14 +169,13 @@ def make_leaky(
             row[kind] = f"{row['video']}/{kind}/copy{row['frame']}.jpg"
             save(root / row[kind], changed(picture, how, rng), 60 if "jpeg" in how else 95)
         row["background"] = source["background"]
-        out.planted["near-duplicate"][row["id"]], out.change[row["id"]] = source["id"], how
+        leaks["near-duplicate"][row["id"]], change[row["id"]] = source["id"], how
     for kind in [k for k in KINDS[1:] if k in kinds]:
         for _ in range(max(2, count // 6)):
-            source = (
-                sources.pop()
-                if kind != "time gap"
-                else sources.pop(next(k for k, s in enumerate(sources) if "later" in s))
-            )
+            at = -1
+            if kind == "time gap":
+                at = next(k for k, s in enumerate(sources) if "later" in s)
+            source = sources.pop(at)
             if kind == "identical sample":
                 row = dict(source)
             elif kind == "identical bytes":
@@ -221,36 +185,20 @@ def make_leaky(
                     (root / row[column]).write_bytes((root / source[column]).read_bytes())
                 row["background"] = source["background"]
             elif kind == "shared video":
-                row = {
-                    **test[free.pop()],
-                    "video": source["video"],
-                    "frame": source["frame"] + 5000,
-                }
+                moved = {"video": source["video"], "frame": source["frame"] + 5000}
+                row = {**test[free.pop()], **moved}
                 test.remove(next(s for s in test if s["id"] == row["id"]))
-                free = [
-                    k
-                    for k in range(len(test))
-                    if test[k]["id"] not in {i for p in out.planted.values() for i in p}
-                ]
+                used = {i for pairs in leaks.values() for i in pairs}
+                free = [k for k in range(len(test)) if test[k]["id"] not in used]
                 free = [int(k) for k in rng.permutation(free)]
             else:
                 world, frame, background = source["later"]
-                row = add(
-                    source["video"],
-                    0,
-                    frame,
-                    world.vision(frame),
-                    world.tactile(frame),
-                    background,
-                    source["material"],
-                )
+                images = world.vision(frame), world.tactile(frame), background
+                row = add(source["video"], 0, frame, images, source["material"])
             if kind != "identical bytes":
                 test.append(row)
                 free = [k for k in free if k != len(test) - 1]
-            out.planted[kind][row["id"]] = source["id"]
-    clean = lambda rows: [{k: v for k, v in r.items() if k != "later"} for r in rows]
-    out.train, out.test = (
-        Manifest.from_rows(clean(train), root),
-        Manifest.from_rows(clean(test), root),
-    )
-    return out
+            leaks[kind][row["id"]] = source["id"]
+    for row in (*train, *test):
+        row.pop("later", None)
+    return Leaky(Manifest.from_rows(train, root), Manifest.from_rows(test, root), leaks, change)

@@ -50,22 +50,15 @@ def pair_study(trials=6, raters=2, **changes):
     items = [(k, slot) for k in range(trials) for slot in (*METHODS, "reference")]
     orders, ours = {}, {}
     for r in range(raters):
-        code = f"r{r + 1:02}"
-        rng = np.random.default_rng(r)
+        code, rng = f"r{r + 1:02}", np.random.default_rng(r)
         orders[code] = []
         for k in rng.permutation(trials).tolist():
             swapped = bool(rng.integers(2))
-            first, second = METHODS[::-1] if swapped else METHODS
-            trial = name_of("trial", k)
-            ours[code, trial] = "right" if swapped else "left"
-            orders[code].append(
-                {
-                    "trial": trial,
-                    "reference": name_of(k, "reference"),
-                    "left": name_of(k, first),
-                    "right": name_of(k, second),
-                }
-            )
+            sides = METHODS[::-1] if swapped else METHODS
+            names = [name_of(k, slot) for slot in ("reference", *sides)]
+            row = dict(zip(("reference", "left", "right"), names, strict=True))
+            orders[code].append({"trial": name_of("trial", k)} | row)
+            ours[code, name_of("trial", k)] = "right" if swapped else "left"
     public = {
         "format": "palpate/preference-page@1",
         "study": name_of("study", trials, raters)[:12],
@@ -88,20 +81,16 @@ def sort_study(trials=4, raters=1, materials=MATERIALS, **changes):
     images = {name_of(m, k): picture(m, k) for m in materials for k in range(3)}
     images |= {name_of("sorted", k): picture("sorted", k) for k in range(trials)}
     rows = [{"trial": name_of("sort", k), "image": name_of("sorted", k)} for k in range(trials)]
-    public, _ = pair_study(1, 1)
-    return (
-        public
-        | {
-            "study": name_of("sorting", trials)[:12],
-            "task": "sort",
-            "question": "Which material is this?",
-            "images": images,
-            "raters": {f"r{r + 1:02}": rows for r in range(raters)},
-            "strips": strips,
-            "choices": list(materials),
-        }
-        | changes
-    )
+    public = {
+        "study": name_of("sorting", trials)[:12],
+        "task": "sort",
+        "question": "Which material is this?",
+        "images": images,
+        "raters": {f"r{r + 1:02}": rows for r in range(raters)},
+        "strips": strips,
+        "choices": list(materials),
+    }
+    return pair_study(1, 1)[0] | public | changes
 
 
 # --- raters who answer with planted preferences
@@ -124,11 +113,8 @@ class Folders:
 
 def write_folders(top, videos=30, frames=2, materials=("brick", "grass", "wood")):
     """``videos`` videos of ``frames`` images each, materials in turn."""
-    rows = [
-        (f"v{v:02d}/f{f}", materials[v % len(materials)], f"v{v:02d}")
-        for v in range(videos)
-        for f in range(frames)
-    ]
+    of_video = [(f"v{v:02d}", materials[v % len(materials)]) for v in range(videos)]
+    rows = [(f"{v}/f{f}", material, v) for v, material in of_video for f in range(frames)]
     ids = [row[0] for row in rows]
     labels = top / "labels.csv"
     reference = write_folder(top / "real", 0, ids)
@@ -226,15 +212,8 @@ class Crowd:
             }
             for k, (name, (trial, swapped)) in enumerate(plan.shown(rater).items())
         ]
-        return signed(
-            {
-                "format": "palpate/preference-votes@1",
-                "study": plan.study,
-                "rater": rater,
-                "viewport": [1280, 800],
-                "votes": rows,
-            }
-        )
+        head = {"format": "palpate/preference-votes@1", "study": plan.study, "rater": rater}
+        return signed(head | {"viewport": [1280, 800], "votes": rows})
 
     def write(self, plan, folder, raters=None):
         """Downloads of all raters, or of some, in a folder."""
@@ -376,9 +355,7 @@ def rate(chromium, crowd, plan, url_of, at_once=8):
     """All raters, ``at_once`` at a time, in turns; what they download."""
     downloads, codes = [], [rater.code for rater in plan.raters]
     for start in range(0, len(codes), at_once):
-        ways = [
-            (code, *WAYS[k % 3]) for k, code in enumerate(codes) if code in codes[start:][:at_once]
-        ]
+        ways = [(c, *WAYS[k % 3]) for k, c in enumerate(codes) if c in codes[start:][:at_once]]
         contexts = [
             chromium.new_context(viewport=size, has_touch=way == "tap") for _, size, way in ways
         ]

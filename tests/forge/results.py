@@ -1,6 +1,7 @@
 """Results and audits with everything that they can hold, for tests of the report."""
 
 import dataclasses
+from functools import partial
 from html.parser import HTMLParser
 
 import numpy as np
@@ -24,24 +25,16 @@ def text_note(text):
     return Note("text", {"text": text})
 
 
-def relief(rng, side):
-    """A gel picture; (side, side, 3) uint8."""
-    y, x = np.mgrid[0:side, 0:side] / side
-    a, b, phase = rng.uniform(5, 45), rng.uniform(5, 45), rng.uniform(0, 6)
-    wave = np.sin(a * x + b * y + phase) * np.sin(b * x - a * y)
-    light = np.stack([0.6 - 0.3 * y, 0.5 + 0.1 * x, 0.45 + 0.3 * y], axis=-1)
-    return (
-        (255 * (light + 0.1 * wave[..., None] * np.array([1, -0.4, -1])))
-        .clip(0, 255)
-        .astype(np.uint8)
-    )
-
-
 def images(folder, n, side=128):
-    """Write ``n`` images to ``folder``; return their names."""
+    """Write ``n`` gel pictures to ``folder``; return their names."""
     rng = np.random.default_rng(7)
+    y, x = np.mgrid[0:side, 0:side] / side
+    light = np.stack([0.6 - 0.3 * y, 0.5 + 0.1 * x, 0.45 + 0.3 * y], axis=-1)
     for k in range(n):
-        Image.fromarray(relief(rng, side)).save(folder / f"p{k}.png")
+        a, b, phase = rng.uniform(5, 45), rng.uniform(5, 45), rng.uniform(0, 6)
+        wave = 0.1 * np.sin(a * x + b * y + phase) * np.sin(b * x - a * y)
+        relief = 255 * (light + wave[..., None] * np.array([1, -0.4, -1]))
+        Image.fromarray(relief.clip(0, 255).astype(np.uint8)).save(folder / f"p{k}.png")
     return [f"p{k}.png" for k in range(n)]
 
 
@@ -49,180 +42,86 @@ def pairs(names, n, *, start=0, gap=True, score=0.97, causes=("",), prefix="2022
     """``n`` pairs over the images ``names`` from ``start`` on, gaps growing, scores falling."""
     out = []
     for k in range(n):
-        pick = lambda j, k=k: names[(start + 4 * k + j) % len(names)] if names else None
+        files = [names[(start + 4 * k + j) % len(names)] if names else None for j in range(4)]
         video = f"{prefix}{k % 7:02}_1137"
         other = video if gap else f"{prefix}{k % 7 + 8:02}_0842"
-        test = SampleRef(f"{video}/{30 * k}", video, 30 * k, "wood", pick(0), pick(1))
-        train = SampleRef(
-            f"{other}/{30 * k + 31 + k}", other, 31 * k + 31, "wood", pick(2), pick(3)
-        )
-        out.append(
-            LeakPair(
-                test,
-                train,
-                31 + k if gap else None,
-                round(score - 0.002 * k, 4),
-                causes[k % len(causes)],
-            )
-        )
+        test = SampleRef(f"{video}/{30 * k}", video, 30 * k, "wood", *files[:2])
+        train = SampleRef(f"{other}/{30 * k + 31 + k}", other, 31 * k + 31, "wood", *files[2:])
+        frames, likeness = 31 + k if gap else None, round(score - 0.002 * k, 4)
+        out.append(LeakPair(test, train, frames, likeness, causes[k % len(causes)]))
     return out
 
 
 def histograms(rng, low, high, n=29879, bins=80):
     """Edges, counts of unrelated pairs and of test samples: two humps."""
-    edges = np.linspace(0, 1, bins + 1)
+    edges, few = np.linspace(0, 1, bins + 1), int(0.8 * n)
     unrelated = np.histogram(rng.beta(low * 40, (1 - low) * 40, 12000), edges)[0]
-    found = np.histogram(
-        np.concatenate(
-            [
-                rng.beta(low * 30, (1 - low) * 30, int(0.8 * n)),
-                rng.beta(high * 60, (1 - high) * 60, n - int(0.8 * n)),
-            ]
-        ),
-        edges,
-    )[0]
-    return edges.round(6).tolist(), unrelated.tolist(), found.tolist()
+    humps = [(low * 30, (1 - low) * 30, few), (high * 60, (1 - high) * 60, n - few)]
+    counts = np.histogram(np.concatenate([rng.beta(*hump) for hump in humps]), edges)[0]
+    return edges.round(6).tolist(), unrelated.tolist(), counts.tolist()
 
 
 def signals(names=(), worst=8):
     """Every kind of signal."""
-    rng = np.random.default_rng(0)
+    rng, n = np.random.default_rng(0), 29879
     vision, touch = histograms(rng, 0.45, 0.93), histograms(rng, 0.62, 0.95)
-    n = 29879
+    drifts = {"content": 3601, "nothing touched": 1204, "sensor drift": 88}
+    causes = ("content", "content", "nothing touched", "sensor drift")
+    near = partial(pairs, names, worst, gap=False)
+    same = partial(pairs, names, score=1.0)
+    late = pairs(names, worst, start=100, score=0.49)
+    bytes_alike = same(min(worst, 4), start=400, gap=False)
+    unread, within = "4 images could not be read.", "Flagged within 30 frames of a train frame."
+    calibrated = [text_note("Calibrated on 12,000 pairs of different videos.")]
+    seen, felt = near(start=200, causes=("content",)), near(start=300, causes=causes)
+    content = {"content": 5210}
     return [
-        Signal("identical sample", n, 12, 1.0, worst=pairs(names, min(worst, 3), score=1.0)),
-        Signal(
-            "identical bytes",
-            n - 4,
-            40,
-            1.0,
-            worst=pairs(names, min(worst, 4), start=400, gap=False, score=1.0),
-            notes=[text_note("4 images could not be read.")],
-        ),
+        Signal("identical sample", n, 12, 1.0, worst=same(min(worst, 3))),
+        Signal("identical bytes", n - 4, 40, 1.0, worst=bytes_alike, notes=[text_note(unread)]),
         Signal("shared video", n, 29597, 1.0),
-        Signal(
-            "time gap",
-            29597,
-            4610,
-            0.5,
-            worst=pairs(names, worst, start=100, score=0.49),
-            notes=[text_note("Flagged within 30 frames of a train frame.")],
-        ),
-        Signal(
-            "near-duplicate vision",
-            n,
-            5210,
-            0.8125,
-            0.001,
-            *vision,
-            {"content": 5210},
-            pairs(names, worst, start=200, gap=False, causes=("content",)),
-        ),
-        Signal(
-            "near-duplicate tactile",
-            n,
-            3601,
-            0.872,
-            0.001,
-            *touch,
-            {"content": 3601, "nothing touched": 1204, "sensor drift": 88},
-            pairs(
-                names,
-                worst,
-                start=300,
-                gap=False,
-                causes=("content", "content", "nothing touched", "sensor drift"),
-            ),
-            [text_note("Calibrated on 12,000 pairs of different videos.")],
-        ),
+        Signal("time gap", 29597, 4610, 0.5, worst=late, notes=[text_note(within)]),
+        Signal("near-duplicate vision", n, 5210, 0.8125, 0.001, *vision, content, seen),
+        Signal("near-duplicate tactile", n, 3601, 0.872, 0.001, *touch, drifts, felt, calibrated),
     ]
 
 
 def impact():
     """Two kinds of features, two classifiers; the last row has no intervals."""
-    rows = [
-        ImpactRow(
-            "tactile pixels",
-            "1-NN",
-            0.714,
-            0.382,
-            0.332,
-            (0.66, 0.765),
-            (0.31, 0.455),
-            (0.262, 0.401),
-            0.0526,
-            "video",
-        ),
-        ImpactRow(
-            "tactile pixels",
-            "linear probe",
-            0.522,
-            0.347,
-            0.175,
-            (0.47, 0.574),
-            (0.283, 0.41),
-            (0.102, 0.25),
-            0.0526,
-            "video",
-        ),
-        ImpactRow(
-            "tactile minus background",
-            "1-NN",
-            0.61,
-            0.401,
-            0.209,
-            None,
-            None,
-            None,
-            0.0526,
-            "video",
-        ),
+    intervals = [
+        [(0.66, 0.765), (0.31, 0.455), (0.262, 0.401)],
+        [(0.47, 0.574), (0.283, 0.41), (0.102, 0.25)],
+        [None, None, None],
+    ]
+    values = [
+        ("tactile pixels", "1-NN", 0.714, 0.382, 0.332),
+        ("tactile pixels", "linear probe", 0.522, 0.347, 0.175),
+        ("tactile minus background", "1-NN", 0.61, 0.401, 0.209),
     ]
     headline = (
         "A 1-NN on tactile pixels reaches 71.4 % under this split and 38.2 % without the leak: it "
         "costs 33.2 points [26.2, 40.1]."
     )
-    return Impact(
-        rows,
-        headline,
-        "video",
-        ["c0" * 32, "c1" * 32],
-        {"size": 32, "seeds": [0, 1]},
-        [text_note("Nothing is whitened.")],
-    )
+    rows = zip(values, intervals, strict=True)
+    rows = [ImpactRow(*value, *interval, 0.0526, "video") for value, interval in rows]
+    settings, notes = {"size": 32, "seeds": [0, 1]}, [text_note("Nothing is whitened.")]
+    return Impact(rows, headline, "video", ["c0" * 32, "c1" * 32], settings, notes)
 
 
 def matrix(n=60):
     """``n`` groups: shared ones first."""
     rows = []
     for k in range(n):
-        shared = k < 0.8 * n
-        test = 610 - 9 * k if shared else 0
-        rows.append(
-            {
-                "group": f"20220607_13{k:04}",
-                "train": 1800 - 20 * k if k % 10 else 90,
-                "val": 0,
-                "test": test,
-                "leaking": test,
-            }
-        )
+        test = 610 - 9 * k if k < 0.8 * n else 0
+        train = 1800 - 20 * k if k % 10 else 90
+        group = f"20220607_13{k:04}"
+        rows.append({"group": group, "train": train, "val": 0, "test": test, "leaking": test})
     return rows
 
 
 def full_audit(names=(), **changes):
     """Touch and Go's own split with every signal, an impact and a matrix."""
     audit = Audit(
-        "Orig",
-        "video",
-        91982,
-        29879,
-        120,
-        106,
-        100,
-        29597,
-        0.99056,
-        12,
+        *("Orig", "video", 91982, 29879, 120, 106, 100, 29597, 0.99056, 12),
         **GAPS,
         worst=pairs(names, 8),
         materials=[
@@ -246,53 +145,19 @@ def full_audit(names=(), **changes):
 
 def clean_audit(**changes):
     """A split in which nothing was found."""
-    found = [Signal("identical sample", 24000, 0, 1.0), Signal("shared video", 24000, 0, 1.0)]
-    audit = Audit(
-        "NoLeak",
-        "video",
-        97000,
-        24000,
-        101,
-        25,
-        0,
-        0,
-        0.0,
-        0,
-        split="5b" * 32,
-        signals=found,
-        groups_in_all=126,
-        matrix=matrix(4)[:1],
-    )
-    return dataclasses.replace(audit, **changes)
+    counts = ("NoLeak", "video", 97000, 24000, 101, 25, 0, 0, 0.0, 0)
+    signals = [Signal("identical sample", 24000, 0, 1.0), Signal("shared video", 24000, 0, 1.0)]
+    facts = {"split": "5b" * 32, "signals": signals, "groups_in_all": 126, "matrix": matrix(4)[:1]}
+    return Audit(*counts, **(facts | changes))
 
 
 def pretraining_audit(names=()):
     """The test part against data that an encoder has seen."""
-    found = [
-        Signal(
-            "identical bytes",
-            24000,
-            310,
-            1.0,
-            worst=pairs(names, 3, gap=False, score=1.0, prefix="ssvtp_"),
-        ),
-        Signal("shared video", 0, 0, 1.0),
-    ]
-    return Audit(
-        "pretrain.csv / test",
-        "none",
-        4500,
-        24000,
-        0,
-        0,
-        0,
-        0,
-        0.0,
-        0,
-        against="pretraining",
-        signals=found,
-        leaking_samples=310,
-    )
+    counts = ("pretrain.csv / test", "none", 4500, 24000, 0, 0, 0, 0, 0.0, 0)
+    worst = pairs(names, 3, gap=False, score=1.0, prefix="ssvtp_")
+    signals = [Signal("identical bytes", 24000, 310, 1.0, worst=worst)]
+    signals += [Signal("shared video", 0, 0, 1.0)]
+    return Audit(*counts, against="pretraining", signals=signals, leaking_samples=310)
 
 
 def gallery(folder, n, side=64, materials=("wood", "rock", "grass")):
@@ -301,9 +166,8 @@ def gallery(folder, n, side=64, materials=("wood", "rock", "grass")):
     for k in range(n):
         names = [f"{kind}{k}.png" for kind in ("photo", "real", "generated")]
         for name in names:
-            Image.fromarray(rng.integers(0, 256, (side, side, 3), dtype=np.uint8)).save(
-                folder / name
-            )
+            noise = rng.integers(0, 256, (side, side, 3), dtype=np.uint8)
+            Image.fromarray(noise).save(folder / name)
         material = materials[k % len(materials)]
         sample = SampleRef(f"vid{k % 4}/{k}", f"vid{k % 4}", k, material, names[0], names[1])
         items.append(GalleryItem(sample, names[2]))
@@ -426,13 +290,8 @@ def study_results(folder, n=12, side=64):
         lpips = None if k == 6 else measure("LPIPS", name, 0.3 + 0.01 * k, interval=None)
         gap = measure("D-TMMD", name, 0.2 * k - 0.3, None, 0.4, floor=0.1)
         if name == "GVST":
-            gap = score(
-                "D-TMMD",
-                name,
-                None,
-                higher_is_better=None,
-                notes=(text_note("One video a class."),),
-            )
+            note = text_note("One video a class.")
+            gap = score("D-TMMD", name, None, higher_is_better=None, notes=(note,))
         rows.append([name, measure("TMMD", name, 1.2 + 0.7 * k), accuracy, gap, lpips])
     columns = ["method", "TMMD", "material accuracy", "D-TMMD", "LPIPS"]
     text = "Encoder and generator are trained once per split; both encoders judge both generators."
@@ -443,14 +302,9 @@ def study_results(folder, n=12, side=64):
     ]
 
     accuracy = [measure("accuracy", s, v, True) for s, v in (("Orig", 0.8), ("NoLeak", 0.5))]
+    drop = "0.300 [0.200, 0.400] on average over 4 tasks and 3 seeds."
     claims = [
-        Claim(
-            "Leakage inflates every task",
-            "paper, table 1",
-            "holds",
-            "0.300 [0.200, 0.400] on average over 4 tasks and 3 seeds.",
-            accuracy,
-        ),
+        Claim("Leakage inflates every task", "paper, table 1", "holds", drop, accuracy),
         Claim(
             "Text as a bridge beats images",
             "paper, table 4",
