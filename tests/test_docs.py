@@ -1,20 +1,31 @@
-"""The documentation is true: its commands and Python lines run, its links resolve."""
+"""The documentation is true: what it shows runs, its links resolve, its figures are the code's."""
 
+import importlib
 import linecache
 import re
 import shlex
 import shutil
+import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
 from PIL import Image
 
-from palpate.cli import main
-from palpate.sim import WorldOptions, write_world
+from palpate.cli import VERBS, main
+from palpate.metrics import PRESETS as METRIC_PRESETS
+from palpate.sim import MATERIALS, VERSION, WorldOptions, plan_world, write_world
+from palpate.sim import PRESETS as WORLD_PRESETS
+from palpate.sim.felt import SCALES
+from palpate.sim.plan import written_frames
 
 TOP = Path(__file__).resolve().parents[1]
-#: Pages whose blocks run here; those of concepts/ have tests of their own.
+CONCEPTS = TOP / "docs" / "concepts"
+METRICS, WORLD = ((CONCEPTS / f"{name}.md").read_text("utf-8") for name in ("metrics", "world"))
+COVERAGE = (TOP / "docs" / "studies" / "metric_coverage.md").read_text("utf-8")
+PICTURES = {path.name: path for path in sorted((TOP / "docs" / "images").glob("world_*.png"))}
+QUICK_PICTURE = "world_steps.png"
+#: Pages whose blocks run here; those of concepts/ run in tests of their own.
 PAGES = [
     "README.md",
     "docs/index.md",
@@ -58,12 +69,6 @@ def examples(tmp_path_factory):
     return folder
 
 
-def blocks(page):
-    """(language, text) of the blocks of a page that run."""
-    text = (TOP / page).read_text(encoding="utf-8")
-    return re.findall(r"^```(sh|python)\n(.*?)^```", text, re.DOTALL | re.MULTILINE)
-
-
 def run_command(line):
     words = shlex.split(line, comments=True)
     if not words:
@@ -73,19 +78,28 @@ def run_command(line):
     assert main([*words[1:], *QUICK.get(verb, [])]) in (0, 1), line
 
 
+def run_page(page):
+    """Run the blocks of a page in order; one that begins with a file's name becomes the file."""
+    names, text = {}, (TOP / page).read_text(encoding="utf-8")
+    for language, block in re.findall(
+        r"^```(sh|python)\n(.*?)^```", text, re.DOTALL | re.MULTILINE
+    ):
+        if language == "sh":
+            for line in block.splitlines():
+                run_command(line)
+        elif name := re.match(r"# (\w+\.py)\n", block):
+            Path(name[1]).write_text(block, encoding="utf-8")
+        else:
+            lines = block.splitlines(keepends=True)
+            linecache.cache[page] = (len(block), None, lines, page)  # the source of its functions
+            exec(compile(block, page, "exec"), names)
+
+
 @pytest.mark.parametrize("page", [pytest.param(p, marks=SLOW.get(p, ())) for p in PAGES])
 def test_the_blocks_of_a_page_run(page, examples, tmp_path, monkeypatch):
     shutil.copytree(examples, tmp_path / "work")
     monkeypatch.chdir(tmp_path / "work")
-    names = {}
-    for language, text in blocks(page):
-        if language == "python":
-            lines = text.splitlines(keepends=True)
-            linecache.cache[page] = (len(text), None, lines, page)  # the source of its functions
-            exec(compile(text, page, "exec"), names)
-        else:
-            for line in text.splitlines():
-                run_command(line)
+    run_page(page)
 
 
 def test_links_resolve():
@@ -98,3 +112,118 @@ def test_links_resolve():
             if not re.match(r"https?:", link) and not exists:
                 broken.append(f"{page.relative_to(TOP)}: {link}")
     assert not broken
+
+
+def test_the_page_of_commands_holds_every_verb(tmp_path, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "96")
+    importlib.import_module("reference_pages").write(tmp_path)
+    commands = (tmp_path / "commands.md").read_text(encoding="utf-8")
+    assert commands.count("usage: palpate ") == len(VERBS)
+
+
+# --- concepts/metrics.md
+
+
+def percents(*names):
+    """Shares of the rows of these names in the study of coverage."""
+    rows = [line.strip("| ").split(" | ") for line in COVERAGE.splitlines()]
+    cells = [cell for name, *cells in rows for cell in cells if name in names]
+    assert len(cells) == 3 * len(names), names
+    return [float(cell.split(" %")[0]) for cell in cells]
+
+
+def test_the_page_of_metrics_runs(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    run_page("docs/concepts/metrics.md")
+    printed = capsys.readouterr().out
+    for metric in ("TMMD", "I-TMMD", "CI-TMMD", "D-TMMD"):
+        assert re.search(rf"^{metric} -?[\d.]+ \(", printed, re.MULTILINE), metric
+    assert re.search(r"^TMMD difference -.* ours$", printed, re.MULTILINE)
+
+
+def test_ranges_of_coverage_match_the_study():
+    covered = [
+        percents("TMMD, unpaired", "TMMD, paired"),
+        percents("I-TMMD: E", "CI-TMMD: E"),
+        percents("D: inter"),
+        percents("difference of TMMD, paired"),
+    ]
+    rejected = [f"true null rejected at 5 %, videos, {kind}" for kind in ("unpaired", "paired")]
+    for values in (*covered, percents(*rejected), percents("TMMD null, paired")):
+        assert f"{min(values):.1f} to {max(values):.1f} %" in METRICS
+    assert all(92 <= value <= 99 for values in covered for value in values)
+    assert all(3 <= value <= 8 for value in percents(*rejected))
+    # over frames both fail
+    assert max(percents("TMMD, frames, unpaired", "TMMD null, frames, unpaired")) < 92
+    assert min(percents(*(name.replace("videos", "frames") for name in rejected))) > 8
+
+
+def test_the_table_of_presets_matches_the_code():
+    rows = dict(re.findall(r"^\| `([\w-]+)` \| (.*) \|$", METRICS, re.MULTILINE))
+    assert set(rows) == set(METRIC_PRESETS)
+    estimators = {"grouped": "different videos", "unbiased": '"unbiased"', "biased": '"biased"'}
+    splits = {"group": "whole videos", "random": "random", "ordered": "order"}
+    for name, plan in METRIC_PRESETS.items():
+        pairs, halves, ratio, *_ = rows[name].split(" | ")
+        assert estimators[plan.estimator] in pairs
+        assert splits[plan.halves] in halves
+        assert plan.aggregate.replace("_", " ").replace("the ", "") in ratio
+
+
+# --- concepts/world.md
+
+
+def test_the_page_of_the_world_runs(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.syspath_prepend(str(tmp_path))
+    before = dict(MATERIALS)
+    try:
+        run_page("docs/concepts/world.md")
+        said = capsys.readouterr().out
+        assert "8000" in said
+        assert re.search(r"^\d test frames share a video with train$", said, re.MULTILINE)
+        assert "(64, 64, 3)" in said.splitlines()[-1]
+    finally:
+        MATERIALS.clear()
+        MATERIALS.update(before)
+        sys.modules.pop("cork", None)
+
+
+def test_the_numbers_of_the_world_are_those_of_the_code():
+    felt = {word for scale in SCALES.values() for level in scale.words for word in level}
+    assert f"from a list of {len(felt)}," in WORLD
+    assert f"(now {VERSION})" in WORLD
+    costs = re.search(r"^## Costs\n(.*?)(?=^## |\Z)", WORLD, re.DOTALL | re.MULTILINE)[1]
+    rows = re.findall(r"^\| `(\w+)` \| (\d+) \| (\d+) \| ([\d,]+) \| ([\d,]+)", costs, re.MULTILINE)
+    expected = []
+    for name, options in WORLD_PRESETS.items():
+        videos = len(plan_world(options))
+        contact = videos * options.contacts_per_video * options.frames_per_contact
+        written = videos * len(written_frames(options))
+        sizes = (str(options.size), str(options.objects_per_material))
+        expected.append((name, *sizes, f"{contact:,}", f"{written:,}"))
+    assert rows == expected
+
+
+def test_every_picture_is_small_and_shown_and_drawn_by_the_recipe():
+    drawn = importlib.import_module("world_pictures").PICTURES
+    assert {*PICTURES} == {*drawn} == {*re.findall(r"images/(world_\w+\.png)", WORLD)}
+    for name, path in PICTURES.items():
+        assert path.stat().st_size < 250_000, name
+
+
+@pytest.mark.parametrize(
+    "name", [pytest.param(n, marks=[pytest.mark.slow] * (n != QUICK_PICTURE)) for n in PICTURES]
+)
+def test_pictures_are_redrawn_alike(name):
+    recipe = importlib.import_module("world_pictures")
+    board = recipe.PICTURES[name]()
+    with Image.open(PICTURES[name]) as image:
+        assert image.size == board.image().size
+        stored = np.asarray(image.convert("RGB")).astype(int)
+    assert board.panels
+    for x, y, pixels in board.panels:  # not the letters, which depend on the version of FreeType
+        height, width = pixels.shape[:2]
+        difference = np.abs(stored[y : y + height, x : x + width] - pixels)
+        colored = (pixels != pixels[..., :1]).any()
+        assert difference.max() <= 2 + (recipe.STEP // 2 if colored else 0)

@@ -2,22 +2,17 @@
 
 import json
 import math
-import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
 from scipy import ndimage, stats
+from world_statistics import change, contact_area
 
 from palpate.core import Note, PalpateError, require_comparable
 from palpate.metrics import background_digest, contact, contact_mask, contact_scores
 from palpate.metrics.contact import contacts_of_each
 from palpate.sim import Video, World, WorldOptions
 from palpate.sim.plan import first_contact, plan_world
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "benchmarks"))
-
-from world_statistics import change, contact_area
 
 RESIDUAL, SSIM, IOU = (f"contact {name}" for name in ("residual", "SSIM", "IoU"))
 

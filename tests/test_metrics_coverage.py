@@ -6,15 +6,9 @@ same at full length is ``benchmarks/metric_coverage.py``, its tables
 ``docs/studies/metric_coverage.md``.
 """
 
-import sys
-from pathlib import Path
-
+import metric_coverage as study
 import numpy as np
 import pytest
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "benchmarks"))
-
-import metric_coverage as study
 
 VIDEOS, EACH, FLAT = (
     (12, 24, 40),

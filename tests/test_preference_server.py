@@ -4,12 +4,9 @@ import json
 import resource
 import socket
 import sqlite3
-import sys
-from pathlib import Path
 
 import pytest
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "benchmarks"))
 from forge.people import pair_study
 from forge.servers import Serving
 from palpate.core import PalpateError

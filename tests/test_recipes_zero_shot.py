@@ -1,13 +1,7 @@
 """Zero-shot classification against a class-by-class loop."""
 
-import sys
-from pathlib import Path
-
 import numpy as np
 import pytest
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "recipes"))
-
 from mini_scores import zero_shot_accuracy
 
 from forge.models import make_encoders

@@ -1,14 +1,9 @@
 """Statistics of tactile images with known answers, and the world against the real clips."""
 
 import math
-import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "benchmarks"))
-
 from world_statistics import change, contact_area, contrast, difference, marker_count, marker_mask
 
 from palpate.sim import Video, WorldOptions, plan_world
