@@ -511,12 +511,7 @@ def test_a_dry_run_sends_and_writes_nothing(data, tmp_path, quick):
     assert str(estimate) == "12 photos need 8 requests; no photo was sent"
 
 
-def test_the_client_is_loaded_when_a_server_is_asked_and_missed_in_one_line(
-    data, tmp_path, monkeypatch, capsys
-):
-    code = "import sys, palpate.captions.captioning, palpate.captions.checking; "
-    code += "assert not {'httpx2', 'torch', 'transformers'} & set(sys.modules)"
-    assert subprocess.run([sys.executable, "-c", code]).returncode == 0
+def test_a_missing_client_is_one_line(data, tmp_path, monkeypatch, capsys):
     monkeypatch.setitem(sys.modules, "httpx2", None)
     args = ["caption", str(data), "-o", str(tmp_path / "c"), "--server", "http://localhost:1/v1"]
     assert main(args) == 2
