@@ -7,7 +7,6 @@ from pathlib import Path
 import pytest
 
 import palpate as pp
-from palpate.cli import VERBS, main
 
 TOP = Path(__file__).resolve().parents[1]
 #: Public function -> its parameters in order; keywords behind the star.
@@ -88,13 +87,6 @@ def test_public_signatures(name):
     for part in name.split("."):
         function = getattr(function, part)
     assert parameters(function) == SIGNATURES[name]
-
-
-@pytest.mark.parametrize("verb", VERBS)
-def test_no_help_says_tower(verb, capsys):
-    with pytest.raises(SystemExit):
-        main([*verb.split(), "--help"])
-    assert "tower" not in capsys.readouterr().out.lower()
 
 
 def test_tower_is_no_word_of_palpate():

@@ -32,20 +32,18 @@ def blocks(text, kind):
 
 
 def make_tree(paths, table=""):
-    for k, path in enumerate(paths):
-        if path.endswith(".csv"):
-            Path(path).parent.mkdir(parents=True, exist_ok=True)
-            Path(path).write_text(table)
-        elif path.endswith(MOVING):
-            save(Path(path), gel_video(70, ((20, 30), (45, 55)), seed=k))
+    for k, path in enumerate(map(Path, paths)):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        if path.suffix == ".csv":
+            path.write_text(table)
+        elif path.suffix in MOVING:
+            save(path, gel_video(70, ((20, 30), (45, 55)), seed=k))
         else:
-            write_image(Path(path), k)
+            write_image(path, k)
 
 
 @pytest.mark.parametrize(("title", "text"), SECTIONS, ids=[title for title, _ in SECTIONS])
-def test_the_commands_of_the_page_run_and_use_every_file(
-    title, text, tmp_path, monkeypatch, capsys
-):
+def test_a_command_of_the_page_uses_every_file(title, text, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     (tree,), (command,) = blocks(text, "text"), blocks(text, "sh")
     paths = tree.split()
@@ -130,6 +128,9 @@ def test_fields_beyond_the_columns_are_kept_with_the_digest(tmp_path):
     assert "finger" in Manifest.join(again, again.prefixed("x/")).table.columns
 
 
+SESSIONS, NESTED = ["mon/cup/0", "mon/mug/0", "tue/cup/0"], ["bark/0/0", "wool/0/0"]
+
+
 @pytest.mark.parametrize(
     ("column", "template", "places", "names"),
     [
@@ -140,15 +141,11 @@ def test_fields_beyond_the_columns_are_kept_with_the_digest(tmp_path):
         (
             "contact",
             "{session}/{object}/{contact}_{frame}",
-            ["mon/cup/0", "mon/mug/0", "tue/cup/0"],
+            SESSIONS,
             ["cup/mon/0", "cup/tue/0", "mug/mon/0"],
         ),
-        (
-            "contact",
-            "{material}/{video}/{contact}_{frame}",
-            ["bark/0/0", "wool/0/0"],
-            ["bark/0/0", "wool/0/0"],  # the video has the name of its material
-        ),
+        # the video has the name of its material
+        ("contact", "{material}/{video}/{contact}_{frame}", NESTED, NESTED),
         ("contact", "{split}/{contact}_{frame}", ["train/0", "test/0"], ["0"]),
     ],
 )
@@ -311,33 +308,19 @@ def test_a_strangers_layout_reaches_every_verb_with_one_import(name, tmp_path, m
     source = write_stranger(tmp_path / "own", sides, name == "table")
     monkeypatch.chdir(tmp_path)
 
-    def run(*words):
-        assert main([*map(str, words), "-q"]) == 0, capsys.readouterr().err
+    def run(words, *more):
+        assert main([*words.split(), *more, "-q"]) == 0, capsys.readouterr().err
 
-    run("import", source, "-o", "m", *options)
-    run("split", "m", "-o", "s.json")
-    run("audit", "m", "--split", "s.json")
-    encoder = ("m", "--split", "s.json", "--preset", "tiny", "--device", "cpu", "-o", "e")
-    run("train", "encoder", *encoder)
+    run(f"import {source} -o m", *options)
+    run("split m -o s.json")
+    run("audit m --split s.json")
+    run("train encoder m --split s.json --preset tiny --device cpu -o e")
     if len(sides) == 1:
         (generated, *_) = [*source.glob("touch/thing1"), *Path("m/images").glob("thing1/*/*")]
-        run("score", "--generated", generated, "--reference", "m", "--encoder", "e", "--allow-seen")
+        run(f"score --generated {generated} --reference m --encoder e --allow-seen")
         return
-    generator = ("m", "--split", "s.json", "--clip", "e", "--preset", "tiny", "--steps", "2")
-    run("train", "generator", *generator, "--device", "cpu", "-o", "g")
-    run("generate", "m", "--model", "g", "--split", "s.json", "--device", "cpu", "-o", "made")
-    score = (
-        "--generated",
-        "made",
-        "--reference",
-        "m",
-        "--split",
-        "s.json",
-        "--encoder",
-        "e",
-        "-o",
-        "score.json",
-    )
-    run("score", *score)
-    run("report", "score.json", "-o", "page.html")
+    run("train generator m --split s.json --clip e --preset tiny --steps 2 --device cpu -o g")
+    run("generate m --model g --split s.json --device cpu -o made")
+    run("score --generated made --reference m --split s.json --encoder e -o score.json")
+    run("report score.json -o page.html")
     assert (tmp_path / "page.html").stat().st_size > 10_000
