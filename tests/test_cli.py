@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 
+from forge.commands import call
 from palpate.cli import VERBS, main, terminal
 from palpate.cli.terminal import error_line, join_help_lines
 from palpate.core import PalpateError, Split
@@ -18,12 +19,6 @@ def lists(tmp_path: Path) -> tuple[str, str]:
     (tmp_path / "train.txt").write_text("a/0000000001.jpg,3\nb/0000000001.jpg,4")
     (tmp_path / "test.txt").write_text("a/0000000005.jpg,3\nc/0000000001.jpg,4")
     return str(tmp_path / "train.txt"), str(tmp_path / "test.txt")
-
-
-def call(capsys, *args):
-    status = main([str(a) for a in args])
-    streams = capsys.readouterr()
-    return status, streams.out, streams.err
 
 
 def test_official_lists_give_the_published_facts(capsys, real_data):

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from forge import commands
 from forge.models import write_shipped
-from palpate.cli import main
 
 
 @pytest.fixture
@@ -27,9 +27,7 @@ def place(tmp_path, monkeypatch):
 
 
 def call(capsys, *args):
-    status = main(["generate", *map(str, args)])
-    printed = capsys.readouterr()
-    return status, printed.out, printed.err
+    return commands.call(capsys, "generate", *args)
 
 
 def test_a_photo_becomes_an_image_with_a_notice(place, capsys):

@@ -10,18 +10,12 @@ from pathlib import Path
 
 import pytest
 
+from forge.commands import call
 from forge.formats import TREES
 from forge.pictures import write_image
-from palpate.cli import main
 from palpate.cli.importing import FormatOptions, TableOptions
 from palpate.data.formats import FORMATS
 from palpate.data.manifest import Manifest
-
-
-def call(capsys, *args):
-    status = main([str(a) for a in args])
-    output = capsys.readouterr()
-    return status, output.out, output.err
 
 
 @pytest.fixture

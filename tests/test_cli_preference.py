@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from forge import commands
 from forge.people import Crowd, write_folders
 from palpate.cli import main
 from palpate.data.manifest import Manifest
@@ -27,9 +28,7 @@ def folders(tmp_path_factory):
 
 
 def call(capsys, *args):
-    status = main(["preference", *map(str, args)])
-    streams = capsys.readouterr()
-    return status, streams.out, streams.err
+    return commands.call(capsys, "preference", *args)
 
 
 def make(folders, output, *more):

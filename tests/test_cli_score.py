@@ -12,9 +12,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from forge import commands
 from forge.pictures import paint
 from forge.scores import IDS, LABELS, by_key, feature_sets
-from palpate.cli import main
 from palpate.core import Split
 from palpate.evaluation import scoring
 from palpate.report.results import Results
@@ -43,9 +43,7 @@ def sets(tmp_path, monkeypatch):
 
 
 def call(capsys, *args, verb="score"):
-    status = main([verb, *map(str, args)])
-    streams = capsys.readouterr()
-    return status, streams.out, streams.err
+    return commands.call(capsys, verb, *args)
 
 
 def run(*args, **options):

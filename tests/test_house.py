@@ -11,17 +11,11 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from forge.commands import python
 from palpate.cli import VERBS
 
 TOP = Path(__file__).resolve().parents[1]
 LINT = Path(sys.executable).parent / "lint-imports"
-
-
-def python(code, **options):
-    command = [sys.executable, "-c", code]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=120, **options)
-    assert done.returncode == 0, done.stderr
-    return done.stdout
 
 
 #: What runs -> libraries that it loads none of.

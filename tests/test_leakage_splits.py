@@ -12,7 +12,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from palpate.cli import main
+from forge.commands import call
 from palpate.core import PalpateError, Split
 from palpate.data.listing import read_lists
 from palpate.data.manifest import Manifest
@@ -425,12 +425,6 @@ def test_hct_noleak_keeps_sittings_whole():
     assert [made.rule[name] for name in ("name", "by")] == ["HCT-NoLeak", ["video", "session"]]
     with pytest.raises(PalpateError, match="Every sample needs a session"):
         split(manifest_of([("a", 1, "Wood"), ("b", 1, "Wood")]), noleak="hct")
-
-
-def call(capsys, *args):
-    status = main([str(a) for a in args])
-    out, err = capsys.readouterr()
-    return status, out, err
 
 
 @pytest.fixture

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from palpate.cli import main
+from forge import commands
 from palpate.core import FeatureSet, PalpateError
 from palpate.evaluation.memorization import contact_rows, memorization, nearest
 from palpate.metrics.intervals import jackknife_errors
@@ -129,9 +129,7 @@ def world(tmp_path_factory):
 
 
 def call(capsys, *args):
-    status = main(["score", *map(str, args), "--companions", "none", "--permutations", "0"])
-    streams = capsys.readouterr()
-    return status, streams.out, streams.err
+    return commands.call(capsys, "score", *args, "--companions", "none", "--permutations", "0")
 
 
 def test_the_command_reports_planted_copies(capsys, world, tmp_path):
