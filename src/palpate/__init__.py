@@ -18,8 +18,7 @@ from functools import partial
 from typing import TYPE_CHECKING
 
 from palpate._lazy import import_name
-
-__version__ = "0.1.0.dev0"
+from palpate._version import __version__ as __version__
 
 if TYPE_CHECKING:
     from palpate.captions import caption

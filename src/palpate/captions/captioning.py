@@ -17,7 +17,7 @@ from typing import Any
 
 import polars as pl
 
-from palpate import __version__
+from palpate._version import __version__
 from palpate.captions.columns import template_texts
 from palpate.captions.prompts import Description, Prompt
 from palpate.captions.querying import Photos, Question, query_all

@@ -13,7 +13,7 @@ from palpate.cli.verbs import INTERRUPTED, OK, USER_ERROR, VERBS
 
 def usage(group: str = "") -> str:
     """Return the text of ``palpate --help``, or of one group of verbs (``"train"``)."""
-    from palpate import __version__
+    from palpate._version import __version__
 
     verbs = {name: verb for name, verb in VERBS.items() if name.startswith(group)}
     width = max(map(len, verbs))
@@ -64,7 +64,7 @@ def _run(args: list[str]) -> int:
         sys.stdout.write(usage())
         return OK if args else USER_ERROR
     if args[0] == "--version":
-        from palpate import __version__
+        from palpate._version import __version__
 
         sys.stdout.write(f"palpate {__version__}\n")
         return OK

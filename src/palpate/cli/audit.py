@@ -10,7 +10,7 @@ from typing import Annotated, Any, Literal
 
 import tyro
 
-from palpate import __version__
+from palpate._version import __version__
 from palpate.cli.importing import Reading
 from palpate.cli.terminal import (
     FAILED_CHECK,

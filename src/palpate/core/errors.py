@@ -98,20 +98,30 @@ def require_choice(argument: str, value: Any, choices: Iterable[str]) -> None:
         PalpateError: if it is not.
     """
     choices = list(choices)
-    if value not in choices:
-        must = f"must be one of {', '.join(choices)}"
-        raise PalpateError(must, repr(value), "Choose one of these", argument=argument)
+    must = f"must be one of {', '.join(choices)}"
+    require(value in choices, argument, must, repr(value), fix="Choose one of these")
 
 
-def require(holds: bool, argument: str, must: str, got: Any, example: Any = None) -> None:
+def require(
+    holds: bool, argument: str | None, must: str, got: Any, example: Any = None, *, fix: str = ""
+) -> None:
     """Check an argument: ``require(0 < share < 1, "share", "must lie in (0, 1)", share, 0.5)``.
+
+    Args:
+        holds: what has to be true.
+        argument: name of the argument; None if ``must`` is a whole clause.
+        must: as in :class:`PalpateError`.
+        got: what was given: a text as it is, anything else by its ``repr``.
+        example: a value of the argument that would work.
+        fix: as in :class:`PalpateError`.
 
     Raises:
         PalpateError: unless it ``holds``.
     """
     if not holds:
-        shown = {} if example is None else {argument: example}
-        raise PalpateError(must, repr(got), "", argument=argument, example=shown)
+        shown = {} if argument is None or example is None else {argument: example}
+        text = got if isinstance(got, str) else repr(got)
+        raise PalpateError(must, text, fix, argument=argument, example=shown)
 
 
 def require_rows(ids: Iterable[str], wanted: Sequence[str], must: str, fix: str) -> list[int]:

@@ -136,7 +136,7 @@ def load_unet(
     must = f"must give embeddings of width {config['cross_attention_dim']}, as the U-Net knows"
     require(policy.width == config["cross_attention_dim"], "clip", must, policy.width)
     known = config["class_embed_type"] is None and config["in_channels"] == channels + background
-    require(known, "unet", "must see latents and tokens alone", root.name)
+    require(known, "unet", "must see latents and tokens alone", repr(root.name))
     return unet.requires_grad_(True)
 
 

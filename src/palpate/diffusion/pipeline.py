@@ -47,7 +47,7 @@ from numpy.typing import NDArray
 from PIL import Image
 from torch import Tensor, nn
 
-from palpate import __version__
+from palpate._version import __version__
 from palpate.core import PalpateError, atomic_folder, digest_json, read_record, rng_for, write_json
 from palpate.data.images import read_image, square
 from palpate.diffusion.autoencoder import (

@@ -27,7 +27,7 @@ from diffusers.models.unets.unet_2d_condition import UNet2DConditionModel
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from palpate import __version__
+from palpate._version import __version__
 from palpate.core import PalpateError, Progress, Split, digest_json, digest_lines, quiet, short
 from palpate.data.images import cached_images, image_stamp
 from palpate.data.manifest import Manifest

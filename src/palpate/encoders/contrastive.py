@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 from transformers import CLIPModel, CLIPVisionModelWithProjection
 
-from palpate import __version__
+from palpate._version import __version__
 from palpate.core import PalpateError, Progress, Split, digest_json, digest_lines, quiet
 from palpate.data.images import image_stamp
 from palpate.data.manifest import Manifest

@@ -219,7 +219,7 @@ def _design(manifest: Manifest, split: Split, group: str, seeds: Sequence[int]) 
 
 def _owners(pool: Manifest, column: str) -> list[str]:
     """The group of each sample."""
-    require(column in GROUPS, "group", f"must be one of {', '.join(GROUPS)}", column, "video")
+    require(column in GROUPS, "group", f"must be one of {', '.join(GROUPS)}", repr(column), "video")
     if nulls := pool.table[column].null_count():
         must = f"Every sample that is compared needs a {column}"
         fix, example = "Fill the column, or choose another group", {"group": "contact"}

@@ -189,7 +189,7 @@ def audit(  # noqa: PLR0913
 
 def _check(options: _Options) -> None:
     by, rate = options.by, options.false_positives
-    require(by in (*GROUPS, "auto"), "by", f"must be auto or one of {', '.join(GROUPS)}", by)
+    require(by in (*GROUPS, "auto"), "by", f"must be auto or one of {', '.join(GROUPS)}", repr(by))
     frames, worst = options.near_frames, options.worst
     require(frames >= 0, "near_frames", "must be at least 0", frames, 30)
     require(worst >= 0, "worst", "must be at least 0", worst, 12)

@@ -110,7 +110,7 @@ def components(manifest: Manifest, by: Sequence[str], links: Sequence[Ints] = ()
     """
     table, n = manifest.table, len(manifest)
     for column in by:
-        require(column in GROUPS, "by", f"must be among {', '.join(GROUPS)}", column, "video")
+        require(column in GROUPS, "by", f"must be among {', '.join(GROUPS)}", repr(column), "video")
         empty = table[column].null_count()
         if empty:
             raise PalpateError(

@@ -133,7 +133,7 @@ def _check(train: float, val: float, folds: int | None, noleak: str | None) -> N
     least = 2 + (val > 0)
     require(folds is None or folds >= least, "folds", f"must be at least {least}", folds, 5)
     known = noleak in (None, "touch-and-go", "hct")
-    require(known, "noleak", "must be touch-and-go or hct", noleak, "touch-and-go")
+    require(known, "noleak", "must be touch-and-go or hct", repr(noleak), "touch-and-go")
 
 
 def _near_links(
@@ -143,7 +143,7 @@ def _near_links(
     if near is None:
         return [], None
     known = near in (*MODALITIES, "both")
-    require(known, "near", "must be vision, tactile or both", near, "both")
+    require(known, "near", "must be vision, tactile or both", repr(near), "both")
     from palpate.leakage.near import near_groups
 
     modalities = [m for m in MODALITIES if near in (m, "both") and manifest.table[m].count()]

@@ -47,7 +47,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy import linalg
 
-from palpate import __version__
+from palpate._version import __version__
 from palpate.core import FeatureSet, Note, PalpateError, Score, rng_for
 from palpate.metrics.inputs import (
     Array,

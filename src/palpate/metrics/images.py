@@ -26,7 +26,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from palpate import __version__
+from palpate._version import __version__
 from palpate.core import Note, PalpateError, Score, few
 from palpate.metrics.inputs import Array, as_array, checked_names, to_host
 from palpate.metrics.intervals import LEVEL, spread_of_values

@@ -155,7 +155,7 @@ def checked_features(name: str, x: Any, *, normalize: Normalize = "check", least
             un-normalized rows (their numbers are given).
     """
     known = normalize in (True, False, "check")
-    require(known, "normalize", 'must be "check", True or False', normalize)
+    require(known, "normalize", 'must be "check", True or False', repr(normalize))
     x = as_array(name, x)
     kind = str(x.dtype).rsplit(".", maxsplit=1)[-1]
     if not kind.startswith(("float", "bfloat", "longdouble", ">f", "<f")):

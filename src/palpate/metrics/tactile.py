@@ -30,7 +30,7 @@ from typing import Any
 
 import numpy as np
 
-from palpate import __version__
+from palpate._version import __version__
 from palpate.core import FeatureSet, Note, PalpateError, Score
 from palpate.core.digest import plain
 from palpate.core.features import is_missing

@@ -139,7 +139,7 @@ def make(  # noqa: PLR0913
     count = PAPER_ITEMS if items is None else items
     raters = (PAPER_RATERS if paper else 10) if raters is None else raters
     require_choice("task", task, ("pair", "sort"))
-    require(design in (None, "paper"), "design", "must be paper, if given", design)
+    require(design in (None, "paper"), "design", "must be paper, if given", repr(design))
     require(2 <= count <= 1000, "items", "must lie in 2 .. 1000", items, 40)
     require(1 <= raters <= 999, "raters", "must lie in 1 .. 999", raters, 10)
     require(32 <= size <= 1024, "size", "must lie in 32 .. 1024", size, 256)
@@ -203,13 +203,13 @@ def _question(
     question = question or ("material" if task == "sort" else "material-pattern")
     text = QUESTIONS.get(question, question)
     for argument, words in (("title", title), ("question", text)):
-        require(bool(words.strip()), argument, "must not be blank", words)
+        require(bool(words.strip()), argument, "must not be blank", repr(words))
         forms = {m: rf"(?<!\w){re.escape(m)}(?!\w)" for m in methods}
         named = [m for m, form in forms.items() if re.search(form, words, re.IGNORECASE)]
         if named and words in (*QUESTIONS.values(), TITLE):
             must, got = f"must hold no word of the {argument} {words!r}", f"{named[0]!r}"
             raise PalpateError(must, got, "Pass other names", argument="names")
-        require(not named, argument, "must not name a method", words)
+        require(not named, argument, "must not name a method", repr(words))
     return (question if question in QUESTIONS else ""), text
 
 

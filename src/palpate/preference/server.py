@@ -118,7 +118,7 @@ class VoteStore:
         require(count >= 0, "invite", "must be 0 or more", count, 10)
         for rater in again:
             must = f"must be raters of the study, {raters[0]} to {raters[-1]}"
-            require(rater in raters, "reinvite", must, rater, raters[0])
+            require(rater in raters, "reinvite", must, repr(rater), raters[0])
         taken = {*self.raters().values(), *again}
         free = [rater for rater in raters if rater not in taken]
         if count > len(free):

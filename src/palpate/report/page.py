@@ -22,7 +22,7 @@ from typing import Any, NamedTuple
 from jinja2 import Environment, FunctionLoader, StrictUndefined
 from markupsafe import Markup, escape
 
-from palpate import __version__
+from palpate._version import __version__
 from palpate.core import PalpateError, Progress, SampleRef, plain, quiet, write_json, write_text
 from palpate.report import audits, first_screen, plots, sentences, study_tables
 from palpate.report.notes import count, digits_of, number, percent, plural, sentence, where

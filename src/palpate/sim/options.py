@@ -89,7 +89,7 @@ class WorldOptions:
                 whole = isinstance(low, int)
                 fits = isinstance(value, int if whole else (int, float)) and low <= value <= high
                 must = f"must be a {'whole ' * whole}number from {low:g} to {high:g}"
-                require(fits, name, must, value)
+                require(fits, name, must, repr(value))
                 object.__setattr__(self, name, value if whole else float(value))
         _require_materials(self.materials)
         if self.layout == "videos":

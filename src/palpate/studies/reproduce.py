@@ -95,7 +95,7 @@ def plan_of(
         must, got = "must have a name of its own", f"another {study.name}"
         raise PalpateError(must, got, 'Use replace(study, name="mine", ...)', argument="study")
     names = ", ".join(study.presets)
-    require(preset in study.presets, "preset", f"must be one of {names}", preset)
+    require(preset in study.presets, "preset", f"must be one of {names}", repr(preset))
     once = 0 < len(seeds) == len({*seeds})
     require(once, "seeds", "must hold at least one seed, each once", list(seeds), (0, 1, 2))
     if (root is None) == (study.world is None):

@@ -25,7 +25,7 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any
 
-from palpate import __version__
+from palpate._version import __version__
 from palpate.core.digest import canonical_json, digest_folder, digest_json
 from palpate.core.errors import PalpateError
 from palpate.core.files import read_json, write_json

@@ -72,7 +72,7 @@ def detect(source: Path) -> bool:
 def scan(source: Path, *, part: Part | None = None, progress: Progress = quiet) -> Scan:
     """List the frames of ``part`` (default: ``real`` if it is there), with those of the webcam."""
     root = require_folder(source, FACTS.name)
-    require(part is None or part in LAYOUT, "part", "must be real or sim", part)
+    require(part is None or part in LAYOUT, "part", "must be real or sim", repr(part))
     part = part or ("real" if _logs(root / "real", "real") else "sim")
     logs = _logs(root / part, part)
     require_layout(root, LOOKS_FOR, FACTS, complete=logs)
