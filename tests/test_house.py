@@ -1,5 +1,7 @@
 """The house: imports go one way without effects, help is quick, sources hold nothing personal."""
 
+import ast
+import functools
 import json
 import re
 import shutil
@@ -157,6 +159,44 @@ def test_no_module_imports_itself_in_a_circle():
     count, label = connected_components(matrix, directed=True, connection="strong")
     circles = [[m for m in modules if label[index[m]] == k] for k in range(count)]
     assert not [circle for circle in circles if len(circle) > 1]
+
+
+def imported(tree):
+    """What a module's own statements import, as (name, module that may hold it)."""
+    statements = list(tree.body)
+    while statements:
+        match statements.pop():
+            case ast.ImportFrom(module=str(module), names=names):
+                yield from ((f"{module}.{name.name}", module) for name in names)
+            case ast.Import(names=names):
+                yield from ((name.name, None) for name in names)
+            case ast.If(test=test, body=body, orelse=orelse):
+                statements += orelse + body * ("TYPE_CHECKING" not in ast.unparse(test))
+            case (
+                ast.Try(body=body, orelse=orelse, finalbody=final)
+                | ast.TryStar(body=body, orelse=orelse, finalbody=final)
+            ):
+                statements += body + orelse + final
+
+
+def test_chains_of_imports_are_short_and_none_runs_back_to_the_door():
+    """The longest way down through what modules import at once; before the rooms were cut, 25."""
+    trees = {}
+    for path in (TOP / "src" / "palpate").rglob("*.py"):
+        name = ".".join(path.relative_to(TOP / "src").with_suffix("").parts)
+        trees[name.removesuffix(".__init__")] = ast.parse(path.read_text(encoding="utf-8"))
+    below = {}
+    for name, tree in trees.items():
+        pairs = ((n if n in trees else module) for n, module in imported(tree))
+        below[name] = {n for n in pairs if n in trees and n != name}
+
+    @functools.cache
+    def chain(name):
+        return [name, *max((chain(n) for n in below[name]), key=len, default=[])]
+
+    assert not [name for name, names in below.items() if "palpate" in names]
+    longest = max(map(chain, trees), key=len)
+    assert len(longest) <= 24, "\n".join(longest)
 
 
 @pytest.mark.slow

@@ -1,0 +1,49 @@
+"""Finds bags of keyword arguments: a name bound in a function and splatted into a call there.
+
+    .venv/bin/python .ci/bags.py
+
+What is bound once and splatted once hides the arguments of a call from readers and type checkers;
+what many calls share is a record. ``**kwargs`` of the function itself are handed on as they are.
+"""
+
+from __future__ import annotations
+
+import ast
+from collections.abc import Iterator
+from pathlib import Path
+
+SOURCE = Path(__file__).resolve().parents[1] / "src" / "palpate"
+FUNCTIONS = (ast.FunctionDef, ast.AsyncFunctionDef)
+
+
+def body(function: ast.AST) -> Iterator[ast.AST]:
+    """The nodes of a function without those of functions inside it."""
+    for child in ast.iter_child_nodes(function):
+        yield child
+        if not isinstance(child, FUNCTIONS):
+            yield from body(child)
+
+
+def bags(tree: ast.AST) -> Iterator[tuple[int, str]]:
+    """Line and name of each bag in a file."""
+    for function in (node for node in ast.walk(tree) if isinstance(node, FUNCTIONS)):
+        nodes = list(body(function))
+        bound = {n.id for n in nodes if isinstance(n, ast.Name) and isinstance(n.ctx, ast.Store)}
+        for call in (node for node in nodes if isinstance(node, ast.Call)):
+            for keyword in call.keywords:
+                name = keyword.value
+                if keyword.arg is None and isinstance(name, ast.Name) and name.id in bound:
+                    yield call.lineno, name.id
+
+
+def found() -> list[str]:
+    """Each bag of the package as ``file:line: **name``."""
+    return [
+        f"{path.relative_to(SOURCE.parent)}:{line}: **{name}"
+        for path in sorted(SOURCE.rglob("*.py"))
+        for line, name in bags(ast.parse(path.read_text(encoding="utf-8")))
+    ]
+
+
+if __name__ == "__main__":
+    print(*found(), sep="\n")
