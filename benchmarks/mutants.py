@@ -5,7 +5,8 @@
 Draws places from the sources by seed (40 in metrics, 20 each in leakage, data and training),
 changes one in a copy of the project, and runs the fast tests of the room that reach its line, up
 to the first failure and for at most 120 CPU seconds. Writes ``mutants.json``: each mutant with its
-fate, the share killed. A survivor is equivalent (say why in ``SURVIVORS``), or needs a test.
+fate, the share killed. A survivor is equivalent (say why in ``SURVIVORS``), or needs a test: others
+are printed at the end, with exit status 1.
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ import ast
 import json
 import os
 import random
+import re
 import resource
 import shutil
 import subprocess
@@ -29,6 +31,34 @@ RECORD = Path(__file__).with_suffix(".json")
 ROOMS = {"metrics": 40, "leakage": 20, "data": 20, "training": 20}
 LIMIT = 120
 FAST = ("-m", "not slow and not browser and not nightly", "-p", "no:cacheprovider", "-q")
+#: Survivors that change nothing a caller sees, by name without the line, and why.
+# Of those at 3e0af63 four lines are gone: metrics/tactile.py:231 (a default for a set without rows,
+# which is rejected before), 283 (p_value and z are None already where the value is) and 822, and
+# metrics/mmd.py:446 (bounds of halves and of D-TMMD).
+SURVIVORS = {
+    "metrics/intervals.py: False -> True in"
+    " design: Array = field(default_factory=lambda: np.zeros(0), repr=False)": (
+        "whether repr prints a field; no result"
+    ),
+    "metrics/distributions.py: False -> True in"
+    " values, vectors = linalg.eigh(cov, check_finite=False)": "the matrix is finite",
+    "metrics/distributions.py: (n := len(x) - int(sizes[b])) <= x.shape[1]"
+    " -> (n := (len(x) - int(sizes[b]))) < x.shape[1]": (
+        "with as many rows as columns both branches factor one covariance; they differ by rounding"
+    ),
+    "metrics/streaming.py: 1 -> 2 in"
+    " for other in [*before[-1:], *[b for b in before if b.real == batch.real][-1:]]:": (
+        "compares a batch with two before it, which agree, as they were accepted one by one"
+    ),
+    "leakage/program.py: relaxed.reshape(-1, parts) > 1 - EXACT"
+    " -> relaxed.reshape(-1, parts) >= 1 - EXACT": (
+        "values of a relaxed program are never 1 - EXACT to the last bit"
+    ),
+    "leakage/calibration.py: min(poisson.sf(len(lumps) - 1, by_chance), bound) < CHANCE"
+    " -> min(poisson.sf(len(lumps) - 1, by_chance), bound) <= CHANCE": (
+        "a probability is never CHANCE to the last bit"
+    ),
+}
 SWAPS = {
     ast.Add: ast.Sub,
     ast.Sub: ast.Add,
@@ -79,16 +109,22 @@ def places(room: str) -> list[tuple[Path, int]]:
 
 
 def mutant(path: Path, number: int) -> tuple[str, int, str]:
-    """The source of a file with a node changed, its line, and what became of it."""
+    """The source of a file with a node changed, its line, and what became of it.
+
+    Constants are named with their line of code: there are many equal ones.
+    """
     source = (TOP / path).read_text(encoding="utf-8")
     node = list(ast.walk(ast.parse(source)))[number]
     before = ast.get_source_segment(source, node)
     after = ast.unparse(mutated(node))
     lines = source.encode().splitlines(keepends=True)
+    what = f"{before} -> {after}"
+    if isinstance(node, ast.Constant):
+        what += f" in {lines[node.lineno - 1].decode().strip()}"
     start = sum(map(len, lines[: node.lineno - 1])) + node.col_offset
     end = sum(map(len, lines[: node.end_lineno - 1])) + node.end_col_offset
     changed = source.encode()[:start] + f"({after})".encode() + source.encode()[end:]
-    return changed.decode(), node.lineno, f"{before} -> {after}"
+    return changed.decode(), node.lineno, what
 
 
 def run_tests(copy: Path, *words: str, limit: float = LIMIT) -> str:
@@ -119,8 +155,14 @@ def reaching(copy: Path, room: str) -> coverage.CoverageData:
     return data
 
 
-def main() -> None:
-    """Make, run and record the mutants that the record lacks."""
+def unexplained(fates: dict[str, str]) -> list[str]:
+    """Mutants that survived and are not in ``SURVIVORS``; ``path:line: before -> after`` each."""
+    rows = [name for name, fate in fates.items() if fate.startswith("survived")]
+    return [name for name in rows if re.sub(r":\d+: ", ": ", name, count=1) not in SURVIVORS]
+
+
+def main() -> int:
+    """Make, run and record the mutants that the record lacks; 1 if one survived unexplained."""
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("--write", action="store_true", help="keep the record next to the script")
     parser.add_argument("--record", type=Path, default=RECORD)
@@ -159,7 +201,10 @@ def main() -> None:
                         "mutants": fates,
                     }
                     args.record.write_text(json.dumps(record, indent=1, ensure_ascii=False) + "\n")
+    for name in (names := unexplained(fates)):
+        print(f"{'needs a test':20} {name}", flush=True)
+    return int(bool(names))
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(main())

@@ -105,6 +105,34 @@ def test_noise_is_estimated_away_from_the_markers():
         assert contact._noise(noisy, keep) == 0
 
 
+def test_noise_equals_a_loop_over_pixels_whose_neighbors_are_all_kept():
+    rng = np.random.default_rng(15)
+    image, keep = rng.random((30, 31, 3)), rng.random((30, 31)) > 0.03
+    wide, pad = (
+        np.pad(image, ((1, 1), (1, 1), (0, 0)), mode="reflect"),
+        np.pad(keep, 1, mode="edge"),
+    )
+    weights = np.outer([1, -2, 1], [1, -2, 1])[..., None]
+    changes = [
+        np.abs((weights * wide[i : i + 3, j : j + 3]).sum(axis=(0, 1)))
+        for i, j in np.ndindex(keep.shape)
+        if pad[i : i + 3, j : j + 3].all()
+    ]
+    expected = 1.4826 * np.median(changes) / 6
+    assert contact._noise(image, keep) == pytest.approx(expected, rel=1e-12)
+
+
+@pytest.mark.parametrize(("shape", "step"), [((40, 50), 1), ((100, 90), 1), ((130, 140), 2)])
+def test_markers_are_darker_than_the_median_around_on_a_coarse_grid(shape, step):
+    gray = ndimage.gaussian_filter(np.random.default_rng(16).random(shape), 1)
+    small = gray[::step, ::step]
+    around = ndimage.median_filter(small, min(small.shape) // 6 | 1, mode="reflect")
+    around = np.kron(around, np.ones((step, step)))[: shape[0], : shape[1]]
+    expected = gray < 0.82 * around
+    assert 0 < expected.mean() < 0.5
+    np.testing.assert_array_equal(contact.marker_mask(gray[..., None]), expected)
+
+
 def test_the_digest_of_backgrounds_ignores_order_and_dtype():
     gels = np.concatenate([gel(1, 16, level) for level in (0.2, 0.5, 0.6, 0.7, 0.8, 0.9)])
     assert background_digest(gels) == background_digest(gels[::-1]) == "988fd396bc9f00be"

@@ -292,7 +292,9 @@ def test_the_bound_is_h_of_rho_times_the_pairs_of_different_samples(rho, sigma):
     sums, bound = moments.products()
     np.testing.assert_allclose(bound, slow, rtol=1e-9)
     assert (np.abs(sums - exact) <= bound + 1e-10).all()
-    moments.rho = 1.01 * WIDEST
+    moments.rho = WIDEST
+    assert moments.products()[1].max() < 1e20
+    moments.rho = np.nextafter(WIDEST, np.inf)
     assert (moments.products()[1] > 1e20 * (exact != 0)).all()
     assert remainder_factor(1e-9) == pytest.approx(1e-9 / 6, rel=1e-6)
     assert remainder_factor(0) == 0

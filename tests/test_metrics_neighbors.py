@@ -169,6 +169,15 @@ def test_the_same_set_is_inside_itself_and_a_far_one_is_not():
     assert Score.from_json(far[2].to_json()) == far[2]
 
 
+@pytest.mark.parametrize("factor", [2.0**-24, 2.0**24])
+def test_the_scale_of_the_features_changes_nothing(factor):
+    """Ties are a share of the squared norms; a power of two is no rounding."""
+    x, y = np.random.default_rng(6).normal(size=(2, 40, 3))
+    scaled = prdc(features(factor * x), features(factor * y))
+    assert [s.value for s in scaled] == [s.value for s in prdc(features(x), features(y))]
+    assert [s.details["empty_balls"] for s in scaled] == [0] * 4
+
+
 def test_bad_input_is_rejected_by_name():
     rng = np.random.default_rng(7)
     good = rng.normal(size=(9, 3))

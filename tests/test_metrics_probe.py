@@ -86,6 +86,14 @@ def test_the_penalty_is_chosen_by_groups():
     assert by_video > by_row
 
 
+def test_folds_are_three_of_whole_groups_of_about_equal_number():
+    groups = [f"v{k // 5}" for k in range(50)]
+    fold = module._folds(groups, 0)
+    assert len({(g, f) for g, f in zip(groups, fold, strict=True)}) == 10
+    assert sorted(np.bincount(fold)) == [15, 15, 20]
+    assert module._folds(groups[:25], 0) is None  # two groups a fold at least
+
+
 def test_rows_without_a_label_are_skipped():
     train = clusters(30)
     some = FeatureSet(train.ids, train.features, [*train.labels[:-1], ""], train.groups)

@@ -64,6 +64,15 @@ def test_blocks_of_any_size_give_the_same_ranks(many, monkeypatch):
             assert (getattr(x, name) == getattr(y, name)).all()
 
 
+def test_keys_at_the_reach_of_a_tie_are_tied_above_and_not_below():
+    """The right key of row 0 has a cosine of 0; of 128 numbers a tie reaches 128 * 2^-26 far."""
+    reach = np.float32(2.0**-19)
+    queries, keys = np.zeros((2, 3, 128), np.float32)
+    queries[0, 0], keys[1:, 0] = 1, (reach, -reach)
+    for ranks in (both_ranks(queries, keys)[0], both_ranks(keys, queries)[1]):
+        assert (ranks.above[0], ranks.ties[0]) == (0, 2)
+
+
 def test_equal_keys_score_chance():
     same = features(np.ones((10, 4)))
     forth, _ = retrieval(same, same, names=("tactile", "text"), top=(1, 5))
@@ -93,7 +102,7 @@ def test_equal_texts_count_with_a_threshold_and_chance_follows():
 
 
 @pytest.mark.parametrize("n", [40, 160])
-def test_chance_of_a_pool_does_not_depend_on_n(n):
+def test_chance_of_a_pool_does_not_depend_on_n(n, monkeypatch):
     rng = np.random.default_rng(0)
     a, b = (features(rng.normal(size=(n, 5))) for _ in range(2))
     top5 = retrieval(a, b, top=(5,), pool=20)[0].top[0].score
@@ -102,6 +111,9 @@ def test_chance_of_a_pool_does_not_depend_on_n(n):
     assert top5.value == pytest.approx(0.25, abs=0.12)
     assert retrieval(a, b, top=(5,), pool=20)[0].top[0].score == top5
     assert retrieval(a, a, pool=20)[0].top[0].score.value == 1.0
+    assert top5.details["pools"] == 20
+    monkeypatch.setattr(module, "POOLED", 3 * 20**2)  # of all cells of three pools
+    assert retrieval(a, b, top=(5,), pool=20)[0].top[0].score.details["pools"] == 3
 
 
 def test_a_pool_of_all_is_no_pool_and_ranks_over_the_pool_are_skipped():

@@ -500,6 +500,8 @@ def test_undefined_scores_have_a_reason():
         (tmmd(s.features[:1], s.features), "one-sample", "two samples"),
     ):
         assert (score.value, codes(score)[0]) == (None, f"undefined:{reason}")
+        assert (score.interval, score.null) == (None, None)
+        assert {score.details.get(name) for name in ("p_value", "z")} == {None}
         assert re.match(f"Undefined: .*{text}", sentence(score.notes[0]))
 
 

@@ -216,4 +216,6 @@ def test_what_is_rejected():
     bad[2] = np.inf
     with pytest.raises(PalpateError, match=r"1 row \(2\)"):
         metric.update(bad, ids=g.ids[:4], groups=g.groups[:4])
+    with pytest.raises(PalpateError, match="Give each always, or never"):  # the last were real
+        metric.update(g.features[:4], ids=g.ids[:4])
     assert close(metric.score().to_json(), tmmd(g, r).to_json() | {"encoder": None})

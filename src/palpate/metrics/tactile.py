@@ -220,7 +220,7 @@ def _segments(generated: FeatureSet, plan: Options) -> tuple[list[str], Index]:
     if generated.labels is not None:
         labels = ["" if is_missing(v) else str(v) for v in generated.labels]
     classes = sorted(set(labels))
-    label = np.searchsorted(classes, labels) if labels else np.zeros(0, dtype=np.intp)
+    label = np.searchsorted(classes, labels)
     whole = np.zeros_like(label)
     return classes, 4 * label + 2 * half_of(ids, label, plan) + half_of(ids, whole, plan)
 
@@ -262,7 +262,6 @@ def scored(
     interval = estimate.interval(0) if estimate and value is not None else None
     if value is None:
         fields["null"] = None
-        details |= {name: None for name in ("p_value", "z") if name in details}
         notes = notes or [Note("undefined", {"reason": "no-pairs"})]
     elif interval is None:
         notes.append(Note("no-interval", {"reason": "too-few"}))
