@@ -347,7 +347,7 @@ def test_a_bound_that_overflows_is_no_bound(small_moments, sigma, scale):
 
 
 def test_arrays_on_disk_are_streamed(tmp_path, monkeypatch, small_moments):
-    monkeypatch.setattr(kernels, "STREAM", 64)
+    monkeypatch.setattr("palpate.metrics.moments.STREAM", 64)
     monkeypatch.setattr("palpate.metrics.inputs.SLAB", 70)
     x, y = spread_rows(0, 300, 8).astype(np.float32), spread_rows(1, 200, 8).astype(np.float32)
     for name, rows in (("x", x), ("y", y)):

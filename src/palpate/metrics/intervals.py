@@ -72,6 +72,7 @@ class PairSums:
 
     Attributes:
         n: (P,) samples of an item.
+        squares: (P,) sum of squared weights of these; ``n`` where they weigh 1.
         rows: (P, S) sum over pairs of a sample of the item and another sample of a segment.
         same: (P, S) the part of ``rows`` from pairs inside one unit.
         diagonal: (P,) sum of k(x_i, x_i).
@@ -80,13 +81,13 @@ class PairSums:
         block: (P, P) sums of items with items, or None where there would be too many.
         backend: ``"blocked"`` or ``"moments"``.
         bound: what the remainders of ``rows`` and ``same`` by moments cannot exceed; None if exact.
-        squares: (P,) sum of squared weights of the samples of an item.
         weighings: the same sums with weights on the samples; see :meth:`weighed`.
         even: the one of ``weighings``, chosen by :meth:`merge`, in which every unit weighs the
             same, whatever its number of samples.
     """
 
     n: Array
+    squares: Array
     rows: Array
     same: Array
     diagonal: Array
@@ -94,23 +95,17 @@ class PairSums:
     unit: Index
     block: Array | None = None
     backend: str = "blocked"
-    bound: PairSums | None = field(default=None, repr=False)
-    squares: Array = field(default_factory=lambda: np.zeros(0), repr=False)
-    weighings: Sequence[PairSums] = field(default=(), repr=False)
-    even: PairSums | None = field(default=None, repr=False)
-
-    def __post_init__(self) -> None:
-        if len(self.squares) != len(self.n):  # weights of 1
-            object.__setattr__(self, "squares", self.n)
+    bound: PairSums | None = None
+    weighings: Sequence[PairSums] = ()
+    even: PairSums | None = None
 
     @classmethod
     def from_block(
-        cls, block: Array, n: Array, diagonal: Array, segment: Index, unit: Index, **more: Any
+        cls, block: Array, n: Array, diagonal: Array, cells: Index, segments: int
     ) -> PairSums:
-        """From sums of items with items; ``more``: ``segments`` (S), ``backend``, ``bound``."""
-        m = one_hot(segment, more.pop("segments"))
-        same = np.where(unit[:, None] == unit, block, 0.0)
-        return cls(n, block @ m, same @ m, diagonal, segment, unit, block, **more)
+        """From sums of items with items; ``cells`` (2, P) are the segment and unit of each item."""
+        m, same = one_hot(cells[0], segments), np.where(cells[1][:, None] == cells[1], block, 0.0)
+        return cls(n, n, block @ m, same @ m, diagonal, *cells, block)
 
     @property
     def segments(self) -> int:
@@ -131,6 +126,7 @@ class PairSums:
         m, keep = one_hot(to, segments), to[self.segment] >= 0
         return PairSums(
             self.n[keep],
+            self.squares[keep],
             self.rows[keep] @ m,
             self.same[keep] @ m,
             self.diagonal[keep],
@@ -139,7 +135,6 @@ class PairSums:
             None if self.block is None else self.block[np.ix_(keep, keep)],
             self.backend,
             self.bound and self.bound.merge(to, segments),
-            self.squares[keep],
             even=chosen and chosen.merge(to, segments),
         )
 
@@ -164,7 +159,7 @@ class PairSums:
             diagonal=weight * self.diagonal,
             squares=weight**2 * self.n,
             block=None,
-            bound=self.bound and self.bound.weighed(weight),
+            bound=None,
         )
 
     def _part(self, at: Index | slice) -> tuple[Array, Array, Array, Array, Array]:
@@ -371,31 +366,17 @@ class Scored:
     groups: Sequence[str] = ()
 
 
-@dataclass(frozen=True)
-class Permuted:
-    """A permutation test.
-
-    Attributes:
-        p: (1 + relabelings with at least the observed studentized value) / (1 + relabelings).
-        null: (B,) studentized values of the relabelings, times the observed standard error: on the
-            scale of TMMD.
-        swapped: units that both sets have.
-        dealt: units of one set alone.
-    """
-
-    p: float
-    null: Array
-    swapped: int
-    dealt: int
-
-
 def permutation_test(
     sums: PairSums, estimator: str, scale: float, *, count: int = 999, seed: int = 0
-) -> Permuted | None:
+) -> tuple[float, Array, dict[str, int]] | None:
     """Exchange units between segments 0 and 1, in ``count`` random relabelings.
 
     Returns:
-        The test, or None without sums of items with items, or where there is nothing to exchange.
+        The p-value, (1 + relabelings with at least the observed studentized value) / (1 +
+        relabelings); (B,) studentized values of the relabelings, times the observed standard error:
+        on the scale of TMMD; their number ``count``, the number of units that both sets have
+        (``swapped``) and of one set alone (``dealt``), and the seed. None without sums of items
+        with items, or where there is nothing to exchange.
     """
     if sums.block is None or count < 1:
         return None
@@ -428,8 +409,8 @@ def permutation_test(
         return None
     # Equal labelings differ in the last bits.
     hits = int((null >= t[0] - 1e-9 * max(abs(float(t[0])), 1e-9)).sum())
-    p = (1 + hits) / (1 + len(null))
-    return Permuted(p, scale * errors[0] * null, int(both.sum()), len(alone))
+    counts = {"count": len(null), "swapped": int(both.sum()), "dealt": len(alone), "seed": seed}
+    return (1 + hits) / (1 + len(null)), scale * errors[0] * null, counts
 
 
 def _studentized(second: Array, sums: PairSums, unit: Any, estimator: str) -> tuple[Array, Array]:

@@ -28,12 +28,13 @@ import math
 import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from itertools import repeat
 from typing import Any, ClassVar, Literal
 
 import numpy as np
 from array_api_compat import array_namespace
 
-from palpate.core import PalpateError, PalpateWarning, rng_for
+from palpate.core import PalpateError, PalpateWarning, require, rng_for
 from palpate.metrics.inputs import (
     Array,
     Index,
@@ -46,7 +47,7 @@ from palpate.metrics.inputs import (
     rows_at,
 )
 from palpate.metrics.intervals import PairSums, one_hot, split_by
-from palpate.metrics.moments import Moments, center_of
+from palpate.metrics.moments import moments_of
 
 #: Factors on the median distance that make the bandwidths of ``"multi"``: two octaves around it.
 FACTORS = (0.25, 0.5, 1.0, 2.0, 4.0)
@@ -62,7 +63,7 @@ class Kernel:
     Attributes:
         stationary: whether it depends on x - y alone. Rows are then centered and computed in
             float32 where that is exact enough; other kernels are computed in float64.
-        bandwidth: sigma, where there is one.
+        bandwidth: sigma of a kernel that is one Gaussian, which moments can sum; else None.
     """
 
     stationary: ClassVar[bool] = False
@@ -223,10 +224,10 @@ ROWS_A_WIDTH, LEAST_ROWS = 8, 4096
 #: Bytes of the moments of all items: at most, and four times that where pairs would take hours; up
 #: to the second number in any case, beyond it no more than the features.
 MOMENT_BYTES, STATE_BYTES = 512 << 20, 64 << 20
+#: What to do where moments cannot be taken.
+BLOCKED = "Choose the blocked back end, which forms all pairs"
 #: From so many rows on a fall back to blocks warns: it takes hours.
 LONG = 300_000
-#: Rows of an array on disk that are added to moments together.
-STREAM = 1 << 15
 #: Largest ``||z||^2`` in float32: an exponent is then rounded by less than 1e-7, so that MMD^2 at
 #: scale 1000 keeps 1e-4 even where all errors have one direction.
 FLOAT32_RADIUS = 0.25
@@ -240,14 +241,12 @@ SPREAD_ROWS = 1000
 
 def kernel_sums(
     parts: Sequence[Any],
-    segment: Index,
-    unit: Index,
-    *,
+    cells: Index,
     segments: int,
     kernel: Kernel,
     bound: Callable[[PairSums], float],
+    *,
     backend: Backend = "auto",
-    scale: float = 1000.0,
     block: int = 1024,
     weights: Sequence[Array] = (),
 ) -> PairSums:
@@ -256,13 +255,13 @@ def kernel_sums(
     Args:
         parts: feature arrays (n_k, d), checked, of one type and library; arrays on disk
             (``np.memmap``) are streamed by moments.
-        segment: (N,) in [0, segments) over all parts, one after the other.
-        unit: (N,).
+        cells: (2, N) segment, in [0, segments), and unit of each row of all parts, one after the
+            other.
         segments: S.
         kernel: what is summed.
-        bound: what the remainders of moments can change in the statistic that matters.
+        bound: what the remainders of moments can change in the statistic that matters, at scale
+            1000, where it is at most 2000.
         backend: see the module.
-        scale: of the statistic, which is at most twice as large.
         block: most rows of a block.
         weights: (N,) each, the same for samples of one (segment, unit): of
             ``PairSums.weighings``.
@@ -271,80 +270,65 @@ def kernel_sums(
         PalpateError: if moments are requested for another kernel, a bandwidth that is too narrow,
             or too many items.
     """
-    width, rows = int(parts[0].shape[1]), len(segment)
-    items, number = np.unique(np.stack([segment, unit]), axis=1, return_inverse=True)
+    width, rows = int(parts[0].shape[1]), cells.shape[1]
+    items, first, item = np.unique(cells, axis=1, return_index=True, return_inverse=True)
     size = items.shape[1] * width**2 * 4
     room = MOMENT_BYTES if rows <= LONG else 4 * MOMENT_BYTES
     reason = ""
-    if not isinstance(kernel, Gaussian) or kernel.bandwidth is None:
+    if kernel.bandwidth is None:
         reason = f"the kernel is {kernel.settings()}, not one Gaussian"
     elif size > room:
-        cells = f"{items.shape[1]} (unit, segment) cells of width {width}"
-        reason = f"second moments of {cells} take more than {room >> 20} MiB"
-    if backend == "moments" and reason:
-        must = "The moments back end needs one Gaussian bandwidth and few groups"
-        raise PalpateError(must, reason, "Sum blocks", example={"backend": "blocked"})
+        count = f"{items.shape[1]} (unit, segment) cells of width {width}"
+        reason = f"second moments of {count} take more than {room >> 20} MiB"
+    requested = backend == "moments"
+    must = "The moments back end needs one Gaussian bandwidth and few groups"
+    require(not (requested and reason), None, must, reason, fix=BLOCKED)
     cheap = size <= max(STATE_BYTES, rows * width * 4)
     many = rows >= max(LEAST_ROWS, ROWS_A_WIDTH * width)
-    if backend == "moments" or (backend == "auto" and not reason and cheap and many):
-        sigma = float(kernel.bandwidth or 0)
-        number = number.reshape(-1)
-        sums = _moments(parts, number, items.shape[1], sigma).sums(items[0], items[1], segments)
-        one_of = np.unique(number, return_index=True)[1]
-        sums = replace(sums, weighings=[sums.weighed(w[one_of]) for w in weights])
+    if requested or (backend == "auto" and not reason and cheap and many):
+        moments = moments_of(parts, item.reshape(-1), items.shape[1], kernel.bandwidth or 0.0)
+        sums = moments.sums(items, segments)
+        sums = replace(sums, weighings=[sums.weighed(w[first]) for w in weights])
         remainder = bound(sums)
-        if backend == "moments" and not remainder <= 2 * scale:
-            must = "must be wide against the features for the moments back end"
-            got = f"a bound of {remainder:.2g}"
-            raise invalid("sigma", must, got, "Sum blocks", backend="blocked")
-        if backend == "moments" or remainder <= TOLERANCE * scale / 1000:
-            return sums
         reason = f"their bound is {remainder:.2g}"
+        must = "must be wide against the features for the moments back end"
+        fits = not requested or remainder <= 2000
+        require(fits, "sigma", must, reason, fix=BLOCKED)
+        if requested or remainder <= TOLERANCE:
+            return sums
     if rows > LONG:
         why = f" Moments were not taken: {reason}." if backend == "auto" and reason else ""
         text = f"All {rows**2 / 2:.2g} pairs are formed, which takes long.{why}"
         warnings.warn(text, PalpateWarning, stacklevel=4)
     x = parts[0] if len(parts) == 1 else array_namespace(parts[0]).concat(list(parts), axis=0)
-    options: dict[str, Any] = {"segments": segments, "kernel": kernel, "weights": weights}
-    return blocked_sums(x, segment, unit, block=block, **options)
-
-
-def _moments(parts: Sequence[Any], number: Index, items: int, sigma: float) -> Moments:
-    moments, first = Moments.empty(center_of(parts), sigma, items), 0
-    for part in parts:
-        for k in range(0, len(part), STREAM):
-            slab = part[k : k + STREAM]
-            moments.add(slab, number[first : first + len(slab)])
-            release(part)
-            first += len(slab)
-    return moments
+    return blocked_sums(x, *cells, segments, kernel, block=block, weights=weights)
 
 
 def blocked_sums(
     x: Any,
     segment: Index,
     unit: Index,
-    *,
     segments: int,
     kernel: Kernel,
+    *,
     block: int = 1024,
     weights: Sequence[Array] = (),
 ) -> PairSums:
     """As :func:`kernel_sums` by blocks, of the rows ``x`` (N, d)."""
-    order = np.lexsort((unit, segment))
-    segment, unit = segment[order].astype(np.intp), unit[order].astype(np.intp)
-    weights = [w[order] for w in weights]
-    new = (np.diff(segment, prepend=-1) != 0) | (np.diff(unit, prepend=unit[:1]) != 0)
-    item, first, n = np.cumsum(new) - 1, np.flatnonzero(new), len(order)
+    cells = np.stack([segment, unit])
+    items, first, item = np.unique(cells, axis=1, return_index=True, return_inverse=True)
+    order = np.argsort(item.reshape(-1), kind="stable")
+    item, (segment, unit), n = item.reshape(-1)[order], cells[:, order], len(order)
     pairs = _Pairs(x, order, kernel)
     blocks = _slices(n, max(1, min(block, max(SMALL_BLOCK, -(-n // 8)))))
     rows = columns = [_indicators(item[b], pairs.z) for b in blocks]
-    width = len(first)
-    if not (joined := width <= MOST_ITEMS):  # sums with weighted segments instead of items
-        weighed = [one_hot(segment, segments) * w[:, None] for w in (np.ones(n), *weights)]
-        dense, width = np.hstack(weighed), segments * len(weighed)
+    count = width = items.shape[1]
+    if not (joined := count <= MOST_ITEMS):  # sums with weighted segments instead of items
+        each = (np.ones(n), *(w[order] for w in weights))
+        dense = np.hstack([one_hot(segment, segments) * w[:, None] for w in each])
+        width = dense.shape[1]
         columns = [(np.arange(width), _wide(dense[b], pairs.z)) for b in blocks]
-    total = np.zeros((len(first), width))
+    total = np.zeros((count, width))
 
     def sums_of(pair: tuple[int, int]) -> list[Array]:
         i, j = pair
@@ -356,21 +340,19 @@ def blocked_sums(
     for (i, j), sums in zip(todo, in_threads(sums_of, todo, x), strict=True):
         for values, a, b in zip(sums, (i, j), (j, i), strict=False):
             total[np.ix_(rows[a][0], columns[b][0])] += values
-    each = (np.ones(n), pairs.diagonal())
-    size, diagonal = (np.bincount(item, v, len(first)).astype(np.float64) for v in each)
-    of_item = (size, diagonal, segment[first], unit[first])
+    size, diagonal = (np.bincount(item, v, count) for v in (np.ones(n), pairs.diagonal()))
     if joined:
-        sums = PairSums.from_block(total, *of_item, segments=segments)
-        return replace(sums, weighings=[sums.weighed(w[first]) for w in weights])
-    with_segments, *weighed = np.hsplit(total, len(weights) + 1)
-    same = np.zeros((len(first), segments))
-    for at in split_by(unit):
-        for part in _slices(len(at), block):
-            k = pairs.block(at[part], at, diagonal=part.start)
-            inside = host(k @ _wide(one_hot(segment[at], segments), pairs.z))
-            np.add.at(same, item[at[part]], inside)
-    sums = PairSums(size, with_segments, same, *of_item[1:])
-    each = zip(weights, weighed, strict=True)
+        sums, weighed = PairSums.from_block(total, size, diagonal, items, segments), repeat(None)
+    else:
+        with_segments, *weighed = np.hsplit(total, len(weights) + 1)
+        same = np.zeros((count, segments))
+        for at in split_by(unit):
+            for part in _slices(len(at), block):
+                k = pairs.block(at[part], at, diagonal=part.start)
+                inside = host(k @ _wide(one_hot(segment[at], segments), pairs.z))
+                np.add.at(same, item[at[part]], inside)
+        sums = PairSums(size, size, with_segments, same, diagonal, *items)
+    each = zip(weights, weighed, strict=False)
     return replace(sums, weighings=[sums.weighed(w[first], v) for w, v in each])
 
 

@@ -234,14 +234,12 @@ def distance(  # noqa: PLR0913
     kernel = gaussian(sigma, y, gy) if kernel is None else kernel
     sums = kernel_sums(
         [x, y],
-        segment,
-        unit,
-        segments=2,
-        kernel=kernel,
+        np.stack([segment, unit]),
+        2,
+        kernel,
+        lambda sums: largest_bound(sums, estimator, 1000.0),
         backend=backend,
-        scale=scale,
         block=block,
-        bound=lambda sums: largest_bound(sums, estimator, scale),
     )
     value = float(mmd_matrix(sums.totals, estimator, scale)[0, 1])
     bound = largest_bound(sums, estimator, scale)

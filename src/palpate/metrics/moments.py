@@ -20,17 +20,18 @@ some 1e-5 where it is 10, and far less near 0.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from dataclasses import dataclass
-from itertools import pairwise
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from scipy import special
 
 from palpate.metrics.inputs import Array, Index, host, in_threads, like, release, row_norms, rows_at
-from palpate.metrics.intervals import PairSums
+from palpate.metrics.intervals import PairSums, split_by
 
+#: Rows of an array on disk that are added together.
+STREAM = 1 << 15
 #: Rows that are multiplied together.
 CHUNK = 2048
 #: Second moments of all items are float64 up to this many bytes, else float32.
@@ -78,15 +79,12 @@ class Moments:
         n, zeroth, fourth, diagonal = np.zeros((4, items))
         return cls(center, float(sigma), n, zeroth, np.zeros((items, d)), second, fourth, diagonal)
 
-    def add(self, x: Any, item: Index | int = 0) -> None:
-        """Add rows (n, d); ``item`` (n,) of each, or one for all."""
-        items = np.full(len(x), item) if np.ndim(item) == 0 else np.asarray(item)
-        order = np.argsort(items, kind="stable")
-        cuts = np.r_[0, np.flatnonzero(np.diff(items[order])) + 1, len(x)]
+    def add(self, x: Any, item: Index) -> None:
+        """Add rows (n, d); ``item`` (n,) of each."""
         jobs = [
-            (int(items[order[a]]), order[i : min(i + CHUNK, b)])
-            for a, b in pairwise(cuts)
-            for i in range(a, b, CHUNK)
+            (int(item[at[0]]), at[k : k + CHUNK])
+            for at in split_by(item)
+            for k in range(0, len(at), CHUNK)
         ]
         parts = in_threads(lambda job: self._part(x, job[1]), jobs, x)
         for (p, at), (*sums, rho) in zip(jobs, parts, strict=True):
@@ -127,13 +125,25 @@ class Moments:
         pairs[at] -= self.n
         return sums, NO_BOUND * pairs
 
-    def sums(self, segment: Index, unit: Index, segments: int) -> PairSums:
-        """As by blocks, with ``bound``; item p lies in one segment and one unit."""
-        block, remainder = self.products()
-        n, none = self.n.copy(), np.zeros(len(self.n))
-        fixed: dict[str, Any] = {"segments": segments, "backend": "moments"}
-        bound = PairSums.from_block(remainder, n, none, segment, unit, **fixed)
-        return PairSums.from_block(block, n, none, segment, unit, **fixed, bound=bound)
+    def sums(self, cells: Index, segments: int) -> PairSums:
+        """As by blocks, with ``bound``; ``cells`` (2, P) are the segment and unit of each item."""
+        none = np.zeros(len(self.n))
+        sums, bound = (
+            PairSums.from_block(block, self.n, none, cells, segments) for block in self.products()
+        )
+        return replace(sums, backend="moments", bound=bound)
+
+
+def moments_of(parts: Sequence[Any], item: Index, items: int, sigma: float) -> Moments:
+    """Moments of all rows of the parts, read in slabs; ``item`` (N,) over one after the other."""
+    moments, first = Moments.empty(center_of(parts), sigma, items), 0
+    for part in parts:
+        for k in range(0, len(part), STREAM):
+            slab = part[k : k + STREAM]
+            moments.add(slab, item[first : first + len(slab)])
+            release(part)
+            first += len(slab)
+    return moments
 
 
 def remainder_factor(rho: float) -> float:

@@ -189,13 +189,11 @@ def build_table(
 
     sums = kernel_sums(
         parts,
-        segment,
-        units,
-        segments=reference_segment + 1,
-        kernel=kernel,
+        np.stack([segment, units]),
+        reference_segment + 1,
+        kernel,
+        lambda sums: _bound(table_of(sums), plan),
         backend=plan.backend,
-        scale=plan.scale,
-        bound=lambda sums: _bound(table_of(sums), plan),
         weights=_even_weights(units, segment, len(generated.ids)) if grouped else (),
     )
     copies = copies_across(*parts) if reference is not None else 0
@@ -226,13 +224,15 @@ def _segments(generated: FeatureSet, plan: Options) -> tuple[list[str], Index]:
 
 
 def _bound(table: Table, plan: Options) -> float:
-    """What moments may change in TMMD, or between classes; of one set alone in any distance."""
-    of_classes = largest_bound(table.whole_classes(), plan.estimator, plan.scale)
+    """What moments may change, at scale 1000, in TMMD, or between classes; of one set alone in any
+    distance.
+    """
+    of_classes = largest_bound(table.whole_classes(), plan.estimator, 1000.0)
     tmmd = table.tmmd()
     if tmmd.segment.any():
-        return max(of_classes, largest_bound(tmmd, plan.estimator, plan.scale))
+        return max(of_classes, largest_bound(tmmd, plan.estimator, 1000.0))
     assert tmmd.bound is not None  # moments have one
-    return max(of_classes, float(mmd_bound(tmmd.bound.totals, "biased", plan.scale)[0, 0]))
+    return max(of_classes, float(mmd_bound(tmmd.bound.totals, "biased", 1000.0)[0, 0]))
 
 
 #: Designs that differ by less have one floor: the change is far below the noise of any floor.
@@ -428,11 +428,13 @@ def tmmd_of(table: Table, generated: FeatureSet, reference: FeatureSet, plan: Op
         notes.append(Note("within-bound", {"bound": bound}))
     details: dict[str, Any] = {"units": len(sums.units), "copies": table.copies, "bound": bound}
     details |= {"p_value": None, "permutations": None}
-    null, draw = None, {"count": plan.permutations, "seed": plan.seed}
-    if test := permutation_test(sums, plan.estimator, plan.scale, **draw):
-        null = (float(np.quantile(test.null, 0.025)), float(np.quantile(test.null, 0.975)))
-        exchanged = {"count": len(test.null), "swapped": test.swapped, "dealt": test.dealt}
-        details |= {"p_value": test.p, "permutations": exchanged | {"seed": plan.seed}}
+    test = permutation_test(
+        sums, plan.estimator, plan.scale, count=plan.permutations, seed=plan.seed
+    )
+    null = None
+    if test:
+        details["p_value"], values, details["permutations"] = test
+        null = (float(np.quantile(values, 0.025)), float(np.quantile(values, 0.975)))
     return scored(
         "TMMD",
         table,
