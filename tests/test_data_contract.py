@@ -11,9 +11,9 @@ from forge.formats import TREES, Tree
 from forge.pictures import tree
 from palpate.core import ProblemsError, Split
 from palpate.data.formats import FORMATS
-from palpate.data.formats.base import finished
 from palpate.data.importing import import_dataset, validate, write_lists
 from palpate.data.manifest import IMAGE_COLUMNS, Manifest
+from palpate.data.scanning import finished
 
 #: Takes what no other format recognized, so it may recognize trees of others too; it must be last.
 CATCH_ALL = "pairs"

@@ -18,9 +18,9 @@ from forge.formats import (
 )
 from forge.pictures import write_image
 from palpate.core import PalpateError, Split, few
-from palpate.data.formats.base import Scan
 from palpate.data.formats.layout import natural, numbered
 from palpate.data.importing import import_dataset, validate, write_lists
+from palpate.data.scanning import Scan
 
 BOM = b"\xef\xbb\xbf"
 

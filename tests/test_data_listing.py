@@ -6,15 +6,9 @@ import numpy as np
 import pytest
 
 from palpate.core import PalpateError, ProblemsError
-from palpate.data.listing import (
-    contact_names,
-    read_categories,
-    read_frame_table,
-    read_list,
-    read_lists,
-    write_list,
-)
+from palpate.data.listing import contact_names, read_frame_table, read_list, read_lists, write_list
 from palpate.data.reading import is_list
+from palpate.data.tables import read_categories
 
 
 def write(path, text):

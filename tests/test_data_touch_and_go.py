@@ -8,7 +8,8 @@ from PIL import Image
 import palpate.data.formats.recordings as recordings
 from forge.pictures import number, tree, write_frames, write_image, write_video
 from palpate.core import PalpateError, ProblemsError, Split
-from palpate.data.formats.touch_and_go import find_videos, write_lists
+from palpate.data.formats.layout import find_videos
+from palpate.data.formats.touch_and_go import write_lists
 from palpate.data.images import read_image
 from palpate.data.importing import import_dataset
 from palpate.data.listing import read_list

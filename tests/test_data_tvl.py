@@ -15,9 +15,9 @@ from forge.formats import kinds, make_hct, make_ssvtp
 from forge.pictures import gel, photo, put, write_csv
 from palpate.core import PalpateError, ProblemsError, Split
 from palpate.data.formats import ssvtp, tvl
-from palpate.data.formats.base import Scan
 from palpate.data.importing import import_dataset as read
 from palpate.data.importing import write_lists
+from palpate.data.scanning import Scan
 
 SSVTP_COLUMNS = ("url", "tactile", "caption")
 

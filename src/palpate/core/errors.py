@@ -9,10 +9,8 @@ from __future__ import annotations
 import re
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import Any
-
-from palpate.core.digest import plain
 
 #: Names that a list in a sentence has.
 FEW = 5
@@ -158,6 +156,11 @@ class Problem:
     def __str__(self) -> str:
         return f"{self.where}: {self.text}"
 
+    def sort_key(self) -> tuple[str, int]:
+        """File and line."""
+        name, _, line = self.where.rpartition(":")
+        return (name, int(line)) if line.isdecimal() else (self.where, 0)
+
 
 def problem_lines(problems: Sequence[Problem]) -> list[str]:
     """Return problems as lines of text: of more than a few of one kind the first and their number.
@@ -209,7 +212,7 @@ class ProblemsError(PalpateError):
 
     def to_json(self) -> dict[str, Any]:
         """Return the error as a JSON object, with the list ``problems``."""
-        return super().to_json() | {"problems": plain(self.problems)}
+        return super().to_json() | {"problems": [asdict(problem) for problem in self.problems]}
 
 
 class MissingExtraError(PalpateError):

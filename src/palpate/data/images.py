@@ -19,7 +19,7 @@ from itertools import islice
 from pathlib import Path
 from queue import SimpleQueue
 from threading import Event
-from typing import BinaryIO, Literal, TypeVar
+from typing import TYPE_CHECKING, BinaryIO, Literal, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -37,7 +37,9 @@ from palpate.core import (
     require,
     short,
 )
-from palpate.data.manifest import Manifest
+
+if TYPE_CHECKING:
+    from palpate.data.manifest import Manifest
 
 Check = Literal["decode", "header", "none"]
 SUFFIXES = (".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".webp")

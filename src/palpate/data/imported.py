@@ -10,22 +10,13 @@ from typing import TYPE_CHECKING, Any
 
 import polars as pl
 
-from palpate.core import (
-    PalpateError,
-    Problem,
-    ProblemsError,
-    Split,
-    fact_lines,
-    plain,
-    problem_lines,
-)
+from palpate.core import Problem, Split, fact_lines, plain, problem_lines
 from palpate.data.captions import NAMED
 from palpate.data.manifest import IMAGE_COLUMNS, Manifest
 
 if TYPE_CHECKING:
     from palpate.data.formats import Facts
 
-FIX = "Correct these, or skip the bad rows and list them"
 #: Rows that an import shows of a folder.
 EXAMPLES = 3
 #: Manifest column -> what its distinct values are called in a summary.
@@ -169,27 +160,6 @@ def readable(facts: Facts) -> dict[str, Any]:
 def splits_of(folder: Path) -> dict[str, Split]:
     """The splits in the folder of an import, by name."""
     return {path.stem: Split.load(path) for path in sorted(folder.glob("splits/*.json"))}
-
-
-def raise_if(problems: Sequence[Problem], skip_bad: bool) -> None:
-    """Raise all problems at once unless they are to be skipped."""
-    if problems and not skip_bad:
-        raise ProblemsError(problems, FIX, example={"skip_bad": True})
-
-
-def require_some(samples: int, source: object, skipped: Sequence[Problem]) -> None:
-    """Reject an import without samples."""
-    if samples == 0 and skipped:
-        raise ProblemsError(skipped, "No sample is left without these: correct the data set")
-    if samples == 0:
-        must = f"{source} must hold at least one usable sample"
-        raise PalpateError(must, "none", "Check the labels and the folder")
-
-
-def place_of(problem: Problem) -> tuple[str, int]:
-    """``file:line`` to sort problems by."""
-    name, _, line = problem.where.rpartition(":")
-    return (name, int(line)) if line.isdecimal() else (problem.where, 0)
 
 
 @contextmanager

@@ -2,36 +2,27 @@
 
 from __future__ import annotations
 
-import inspect
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from palpate.core import (
-    PalpateError,
-    Progress,
-    Split,
-    few,
-    locked,
-    quiet,
-    require_choice,
-    require_regular,
-)
-from palpate.data.formats import FORMATS, Format
-from palpate.data.formats.base import (
-    MISSING,
-    WORLD,
-    Into,
-    finished,
-    imported_of,
-    manifest_of,
-    world_facts,
-)
-from palpate.data.formats.videos import is_templated
+from palpate.core import PalpateError, Progress, Split, locked, quiet
+from palpate.data.formats import FORMATS, recognized, scan_options
 from palpate.data.images import Check
 from palpate.data.imported import Imported, Validation, removing_on_error, templates_of
 from palpate.data.listing import write_table
-from palpate.data.manifest import IMAGE_COLUMNS, Manifest, is_manifest
+from palpate.data.manifest import Manifest, is_manifest
+from palpate.data.scanning import (
+    MISSING,
+    WORLD,
+    Into,
+    Scan,
+    finished,
+    manifest_of,
+    raise_if,
+    require_some,
+    world_facts,
+)
 from palpate.data.texts import read_texts, reimported, with_texts
 
 #: All that an import writes.
@@ -161,55 +152,28 @@ def write_lists(manifest: Manifest, split: Split, output: Path) -> list[Path]:
     return [write_table(Path(output) / f"{part}.csv", rows) for part, rows in parts.items()]
 
 
-def require_source(source: Path) -> None:
-    """Raise ``PalpateError`` if there is nothing at the path of a data set."""
-    if not source.exists():
-        fix = "Check the path; a data set on the hub needs the format hf"
-        raise PalpateError("must exist", f"nothing at {source}", fix, argument="source")
-
-
-def recognized(
-    source: Path, name: str = "auto", options: Mapping[str, Any] | None = None
-) -> tuple[str, Format]:
-    """The named format, or the first that the source looks like; templates give pairs or videos."""
-    require_choice("format", name, ("auto", *FORMATS))
-    require_regular(source)
-    if name == "auto" or not FORMATS[name].remote:
-        require_source(source)
-    if name == "auto":
-        given = {c: text for c in IMAGE_COLUMNS if (text := (options or {}).get(c))}
-        looks = (n for n, form in FORMATS.items() if form.detect(source))
-        templated = "videos" if given and is_templated(source, given) else "pairs"
-        name = templated if given else next(looks, "")
-    if not name:
-        must = f"must hold images, videos, a table or a known data set ({', '.join(FORMATS)})"
-        fix = "Check the path, or write a table of its images"
-        if source.is_dir() and (source / "manifest.parquet").is_file():
-            fix = "This is an import: name the data set that it was made from"
-        raise PalpateError(must, _contents(source), fix, argument="source")
-    return name, FORMATS[name]
-
-
-def scan_options(name: str, form: Format, options: dict[str, Any]) -> dict[str, Any]:
-    """The given options that the scan of a format takes; some matter to an import alone.
+def imported_of(
+    scan: Scan,
+    source: Path,
+    facts: Mapping[str, str],
+    *,
+    skip_bad: bool,
+    check: Check,
+    progress: Progress = quiet,
+) -> Imported:
+    """A scan as an import that is not written yet.
 
     Raises:
-        PalpateError: if an option does not belong to the format.
+        ProblemsError: with every bad row and file, unless ``skip_bad``.
+        PalpateError: if no usable row is left.
     """
-    given = {key: value for key, value in options.items() if value is not None}
-    known = {*form.options, "size"}  # which may be without use
-    if unknown := sorted(set(given) - known):
-        takes = ", ".join(k for k in form.options if k not in ("skip_bad", "check", "progress"))
-        must, got = f"must be left out for the format {name}", repr(given[unknown[0]])
-        fix = f"This format takes {takes or 'no options'}"
-        raise PalpateError(must, got, fix, argument=unknown[0])
-    names = inspect.signature(form.scan).parameters
-    return {key: value for key, value in given.items() if key in names}
-
-
-def _contents(source: Path) -> str:
-    """What a source holds, in short."""
-    if source.is_file():
-        return f"the file {source.name}"
-    names = sorted(p.name + "/" * p.is_dir() for p in source.iterdir())
-    return f"a folder with {few(names)}" if names else "an empty folder"
+    rows = finished(scan, check, progress)
+    raise_if(scan.problems, skip_bad)
+    require_some(len(rows), source, scan.problems)
+    manifest = manifest_of(scan, rows, {**facts, **scan.facts})
+    ids = set(manifest.ids)
+    splits: dict[str, Split] = {}
+    for name, split in scan.splits.items():
+        if parts := {i: part for i, part in split.parts.items() if i in ids}:
+            splits[name] = Split(parts, split.rule, manifest.digest)
+    return Imported(manifest, scan.problems, splits, scan.inconclusive, scan.suspicious)

@@ -19,12 +19,10 @@ from pathlib import Path
 
 import polars as pl
 
-from palpate.core import PalpateError, Problem, ProblemsError, write_text
-from palpate.data.imported import place_of
+from palpate.core import Problem, ProblemsError, write_text
 from palpate.data.manifest import CLIMBS, SCHEMA, Manifest
-from palpate.data.tables import decoded, delimiter_of, lines_of
+from palpate.data.tables import INCONCLUSIVE, lines_of, read_categories, text_in
 
-INCONCLUSIVE = -1
 PATH = r"^(?P<video>[^/\\]+)/(?P<stem>[^/\\]+)\.(?P<suffix>[A-Za-z0-9]+)$"
 #: A good line; the video takes all commas before the slash.
 LINE = (
@@ -33,8 +31,6 @@ LINE = (
 #: Paths that leave the data set, and those that begin with "./".
 LEAVES = CLIMBS + r"|^\.[/\\]"
 FIX = "Correct the lines, or skip the bad ones"
-#: Names that the published category table misspells.
-SPELLING = {"Ruber": "Rubber"}
 
 
 @dataclass(frozen=True)
@@ -85,7 +81,7 @@ def read_lists(
     every = pl.concat([_parse(Path(path), problems) for path in paths])
     conclusive = every.filter(pl.col("label") != INCONCLUSIVE)
     rows = _without_duplicates(_with_known_labels(conclusive, categories, problems), problems)
-    problems.sort(key=place_of)
+    problems.sort(key=Problem.sort_key)
     if problems and not skip_bad:
         raise ProblemsError(problems, FIX, example={"skip_bad": True})
     names = contact_names(rows["video"], rows["frame"], rows["label"])
@@ -156,51 +152,6 @@ def categories_in(folder: Path) -> dict[int, str] | None:
     return read_categories(table) if table.is_file() else None
 
 
-def read_categories(path: Path) -> dict[int, str]:
-    """Read a table of classes: ``Name: id`` lines, or CSV of id and name in either order.
-
-    Quotes and remarks in brackets after a ``Name: id`` are ignored; a CSV may have a header.
-
-    Returns:
-        id -> name, the inconclusive class (-1) included if it is listed; known misspellings are
-        corrected.
-    """
-    text = _text(path)
-    names: dict[int, str] = {}
-    problems: list[Problem] = []
-    sign = delimiter_of(Path(path), text)
-    for number, line in enumerate(text.splitlines(), 1):
-        bare = re.sub(r"\([^)]*\)|[\"'“”‘’]", "", line).strip().rstrip(",").strip()
-        name, colon, label = (part.strip() for part in bare.rpartition(":"))
-        if not colon:
-            cells = [cell.strip() for cell in next(csv.reader([line], delimiter=sign), [])]
-            cells.sort(key=lambda cell: whole(cell) is not None)  # the name goes first
-            name, label = cells if len(cells) == 2 else ("", "")
-        k = whole(label)
-        if k is None or not name:
-            if bare and (number > 1 or sign not in line):  # the first line may be a header
-                text = f"{line!r} is neither 'Name: id' nor 'id,name'"
-                problems.append(Problem(f"{path}:{number}", "bad-line", text))
-        elif k in names:
-            text = f"the id {k} names {names[k]!r} already"
-            problems.append(Problem(f"{path}:{number}", "duplicate-id", text))
-        else:
-            name = " ".join(name.split())
-            names[k] = SPELLING.get(name, name)
-    fix = "Write one 'Name: id' or 'id,name' a line"
-    if problems:
-        raise ProblemsError(problems, fix)
-    if not names:
-        raise PalpateError(f"{path} must list classes", "none; is it empty?", fix)
-    return names
-
-
-def whole(text: str) -> int | None:
-    """The integer that a text is (``7``, ``007``, ``7.0``), or None."""
-    match = re.fullmatch(r"([+-]?[0-9]{1,18})(?:\.0+)?", text)
-    return int(match[1]) if match else None
-
-
 @dataclass(frozen=True)
 class FrameTable:
     """Words for frames, by (video, frame), and the lines that could not be read."""
@@ -213,7 +164,7 @@ def read_frame_table(path: Path) -> FrameTable:
     """Read ``video/frame.jpg,words`` lines; the header ``frame,...`` is optional, so are quotes."""
     values: dict[tuple[str, int], str] = {}
     skipped: list[Problem] = []
-    for number, line in enumerate(lines_of(_text(path)), 1):
+    for number, line in enumerate(lines_of(text_in(path)), 1):
         if not line.strip() or (number == 1 and line.lower().startswith("frame,")):
             continue
         name, *fields = next(csv.reader([line]))  # line by line: an open quote costs one line
@@ -238,19 +189,10 @@ def _frame_of(name: str) -> tuple[str, int] | None:
     return match["video"], int(match["stem"])
 
 
-def _text(path: Path) -> str:
-    """The file as text; what is neither UTF-8 nor UTF-16 becomes U+FFFD."""
-    path = Path(path)
-    if not path.is_file():
-        got = f"the folder {path}" if path.is_dir() else f"no file {path}"
-        raise PalpateError("The list must be a file", got, "Check the path")
-    return decoded(path.read_bytes())
-
-
 def _parse(path: Path, problems: list[Problem]) -> pl.DataFrame:
     """The well-formed rows of one list; every other line is a problem."""
     text = pl.col("text")
-    lines = pl.DataFrame({"text": lines_of(_text(path))}).with_row_index("line", offset=1)
+    lines = pl.DataFrame({"text": lines_of(text_in(path))}).with_row_index("line", offset=1)
     lines = lines.with_columns(text.str.strip_chars()).filter(text != "")
     if not lines.height:
         problems.append(Problem(str(path), "empty-list", "the list has no lines"))

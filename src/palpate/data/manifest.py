@@ -37,6 +37,7 @@ from typing import Any
 import polars as pl
 
 from palpate.core import (
+    PARTS,
     PalpateError,
     Problem,
     ProblemsError,
@@ -62,6 +63,9 @@ FORMAT = "palpate-manifest/1"
 FACT = "palpate.fact."
 #: Digits of a frame number, which has 64 bits; a longer one is none.
 DIGITS = 18
+#: What tools call the parts of a split.
+_SPLIT = {part: part for part in PARTS} | {"training": "train", "testing": "test"}
+PART_NAMES = _SPLIT | dict.fromkeys(("validation", "valid", "dev"), "val")
 #: Absolute paths, drive letters, and ``..`` as a component.
 CLIMBS = r"^[/\\]|^[A-Za-z]:[/\\]|(?:^|[/\\])\.\.(?:[/\\]|$)"
 

@@ -26,15 +26,14 @@ from typing import Any
 import polars as pl
 
 from palpate.core import PalpateError, Problem, Split
-from palpate.data.detection import ROLES, template_of
+from palpate.data.detection import ROLES, name_apart, template_of
 from palpate.data.formats import hct
 from palpate.data.formats.intervals import NEEDED, ORDER
-from palpate.data.formats.pairs import name_apart
 from palpate.data.images import SUFFIXES
-from palpate.data.imported import require_some
-from palpate.data.manifest import SCHEMA, Manifest
+from palpate.data.manifest import PART_NAMES, SCHEMA, Manifest
 from palpate.data.mapping import compile_maps
-from palpate.data.rows import PART_NAMES, manifest_rows, read_classes
+from palpate.data.rows import manifest_rows, read_classes
+from palpate.data.scanning import require_some
 from palpate.data.tables import TABLES, Table, decoded, header_of, lines_of, open_table, table_of
 from palpate.data.templates import Fields, Template
 

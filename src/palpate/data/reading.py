@@ -8,14 +8,12 @@ from pathlib import Path
 from typing import Any
 
 from palpate.core import PalpateError, Problem, Progress, quiet, require_regular
-from palpate.data.formats import Format
-from palpate.data.formats.base import Scan, finished, manifest_of
-from palpate.data.imported import raise_if, require_some
-from palpate.data.importing import recognized, scan_options
+from palpate.data.formats import Format, recognized, scan_options
 from palpate.data.listing import LINE, read_list
 from palpate.data.manifest import IMAGE_COLUMNS, SCHEMA, Manifest, is_manifest
 from palpate.data.mapping import compile_maps
 from palpate.data.rows import manifest_rows, read_classes
+from palpate.data.scanning import Scan, finished, manifest_of, raise_if, require_some
 from palpate.data.tables import TABLES, Table, decoded, header_of, lines_of, open_table, table_of
 
 #: Columns of which a table needs at least one.

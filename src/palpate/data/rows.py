@@ -7,11 +7,9 @@ from pathlib import Path
 from typing import Any
 
 from palpate.core import PARTS, PalpateError, Problem
-from palpate.data.listing import INCONCLUSIVE, read_categories, whole
+from palpate.data.manifest import PART_NAMES
+from palpate.data.tables import INCONCLUSIVE, read_categories, whole
 
-#: What tools call the parts of a split.
-_SPLIT = {part: part for part in PARTS} | {"training": "train", "testing": "test"}
-PART_NAMES = _SPLIT | dict.fromkeys(("validation", "valid", "dev"), "val")
 #: Columns that a split keeps whole; where only some rows have a value, a person should look.
 GROUPS = ("video", "object", "session")
 INTEGERS = ("frame", "start", "end")

@@ -22,12 +22,16 @@ from typing import Any
 
 import polars as pl
 
-from palpate.core import PalpateError, Problem
+from palpate.core import PalpateError, Problem, ProblemsError
 from palpate.data.manifest import reading_parquet
 from palpate.data.mapping import text_of
 
 csv.field_size_limit(1 << 30)  # by default a long text is an error, for the whole process
 TABLES = (".csv", ".tsv", ".jsonl", ".json", ".parquet")
+#: Number of the class of contact whose material is unclear.
+INCONCLUSIVE = -1
+#: Names that the published category table misspells.
+SPELLING = {"Ruber": "Rubber"}
 #: A column of every table that was read: the line of each row.
 LINE = "palpate_line"
 #: Signs that no cell can hold: bytes that were not UTF-8, the zero character, halves of characters.
@@ -290,3 +294,57 @@ def _of_frame(
         yield from enumerate(read(columns).iter_rows(), 1)
 
     return Table(name, list(schema), [], records)
+
+
+def read_categories(path: Path) -> dict[int, str]:
+    """Read a table of classes: ``Name: id`` lines, or CSV of id and name in either order.
+
+    Quotes and remarks in brackets after a ``Name: id`` are ignored; a CSV may have a header.
+
+    Returns:
+        id -> name, the inconclusive class (-1) included if it is listed; known misspellings are
+        corrected.
+    """
+    text = text_in(path)
+    names: dict[int, str] = {}
+    problems: list[Problem] = []
+    sign = delimiter_of(Path(path), text)
+    for number, line in enumerate(text.splitlines(), 1):
+        bare = re.sub(r"\([^)]*\)|[\"'“”‘’]", "", line).strip().rstrip(",").strip()
+        name, colon, label = (part.strip() for part in bare.rpartition(":"))
+        if not colon:
+            cells = [cell.strip() for cell in next(csv.reader([line], delimiter=sign), [])]
+            cells.sort(key=lambda cell: whole(cell) is not None)  # the name goes first
+            name, label = cells if len(cells) == 2 else ("", "")
+        k = whole(label)
+        if k is None or not name:
+            if bare and (number > 1 or sign not in line):  # the first line may be a header
+                text = f"{line!r} is neither 'Name: id' nor 'id,name'"
+                problems.append(Problem(f"{path}:{number}", "bad-line", text))
+        elif k in names:
+            text = f"the id {k} names {names[k]!r} already"
+            problems.append(Problem(f"{path}:{number}", "duplicate-id", text))
+        else:
+            name = " ".join(name.split())
+            names[k] = SPELLING.get(name, name)
+    fix = "Write one 'Name: id' or 'id,name' a line"
+    if problems:
+        raise ProblemsError(problems, fix)
+    if not names:
+        raise PalpateError(f"{path} must list classes", "none; is it empty?", fix)
+    return names
+
+
+def whole(text: str) -> int | None:
+    """The integer that a text is (``7``, ``007``, ``7.0``), or None."""
+    match = re.fullmatch(r"([+-]?[0-9]{1,18})(?:\.0+)?", text)
+    return int(match[1]) if match else None
+
+
+def text_in(path: Path) -> str:
+    """The file as text; what is neither UTF-8 nor UTF-16 becomes U+FFFD."""
+    path = Path(path)
+    if not path.is_file():
+        got = f"the folder {path}" if path.is_dir() else f"no file {path}"
+        raise PalpateError("The list must be a file", got, "Check the path")
+    return decoded(path.read_bytes())

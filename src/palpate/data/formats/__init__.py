@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+import inspect
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from palpate.core import PalpateError, few, require_choice, require_regular
 from palpate.data.formats import (
     hct,
     huggingface,
     intervals,
     objectfolder,
-    objectfolder_generation,
     pairs,
     ssvtp,
     tarf,
@@ -16,14 +21,16 @@ from palpate.data.formats import (
     visgel,
     ycb_slide,
 )
-from palpate.data.formats.base import Facts, Format, Row, Scan
+from palpate.data.formats.videos import is_templated
+from palpate.data.manifest import IMAGE_COLUMNS
+from palpate.data.scanning import Facts, Format, Row, Scan
 
 FORMATS: dict[str, Format] = {
     "touch-and-go": touch_and_go.FORMAT,
     "hct": hct.FORMAT,
     "ssvtp": ssvtp.FORMAT,
     "tarf": tarf.FORMAT,
-    "objectfolder-generation": objectfolder_generation.FORMAT,
+    "objectfolder-generation": objectfolder.GENERATION,
     "objectfolder": objectfolder.FORMAT,
     "ycb-slide": ycb_slide.FORMAT,
     "visgel": visgel.FORMAT,
@@ -33,4 +40,67 @@ FORMATS: dict[str, Format] = {
     "pairs": pairs.FORMAT,
 }
 
-__all__ = ["FORMATS", "Facts", "Format", "Row", "Scan"]
+__all__ = [
+    "FORMATS",
+    "Facts",
+    "Format",
+    "Row",
+    "Scan",
+    "recognized",
+    "require_source",
+    "scan_options",
+]
+
+
+def require_source(source: Path) -> None:
+    """Raise ``PalpateError`` if there is nothing at the path of a data set."""
+    if not source.exists():
+        fix = "Check the path; a data set on the hub needs the format hf"
+        raise PalpateError("must exist", f"nothing at {source}", fix, argument="source")
+
+
+def recognized(
+    source: Path, name: str = "auto", options: Mapping[str, Any] | None = None
+) -> tuple[str, Format]:
+    """The named format, or the first that the source looks like; templates give pairs or videos."""
+    require_choice("format", name, ("auto", *FORMATS))
+    require_regular(source)
+    if name == "auto" or not FORMATS[name].remote:
+        require_source(source)
+    if name == "auto":
+        given = {c: text for c in IMAGE_COLUMNS if (text := (options or {}).get(c))}
+        looks = (n for n, form in FORMATS.items() if form.detect(source))
+        templated = "videos" if given and is_templated(source, given) else "pairs"
+        name = templated if given else next(looks, "")
+    if not name:
+        must = f"must hold images, videos, a table or a known data set ({', '.join(FORMATS)})"
+        fix = "Check the path, or write a table of its images"
+        if source.is_dir() and (source / "manifest.parquet").is_file():
+            fix = "This is an import: name the data set that it was made from"
+        raise PalpateError(must, _contents(source), fix, argument="source")
+    return name, FORMATS[name]
+
+
+def scan_options(name: str, form: Format, options: dict[str, Any]) -> dict[str, Any]:
+    """The given options that the scan of a format takes; some matter to an import alone.
+
+    Raises:
+        PalpateError: if an option does not belong to the format.
+    """
+    given = {key: value for key, value in options.items() if value is not None}
+    known = {*form.options, "size"}  # which may be without use
+    if unknown := sorted(set(given) - known):
+        takes = ", ".join(k for k in form.options if k not in ("skip_bad", "check", "progress"))
+        must, got = f"must be left out for the format {name}", repr(given[unknown[0]])
+        fix = f"This format takes {takes or 'no options'}"
+        raise PalpateError(must, got, fix, argument=unknown[0])
+    names = inspect.signature(form.scan).parameters
+    return {key: value for key, value in given.items() if key in names}
+
+
+def _contents(source: Path) -> str:
+    """What a source holds, in short."""
+    if source.is_file():
+        return f"the file {source.name}"
+    names = sorted(p.name + "/" * p.is_dir() for p in source.iterdir())
+    return f"a folder with {few(names)}" if names else "an empty folder"

@@ -39,11 +39,11 @@ from typing import Literal
 
 from palpate.core import PalpateError, Progress, Split, quiet, require_choice
 from palpate.data.formats import tvl
-from palpate.data.formats.base import WORLD, Cells, Facts, Format, Row, Scan, world_facts
-from palpate.data.formats.layout import report_missing_folders, subfolders
+from palpate.data.formats.layout import report_missing_folders, subfolders, suspect_rows
 from palpate.data.images import BROKEN, in_threads, opened
 from palpate.data.listing import contact_names
 from palpate.data.manifest import CLIMBS, Manifest
+from palpate.data.scanning import WORLD, Cells, Facts, Format, Row, Scan, world_facts
 
 FACTS = Facts(
     name="HCT (Touch-Vision-Language)",
@@ -185,7 +185,7 @@ def _read_lists(result: Scan, rigs: Sequence[str]) -> list[str]:
     partner = lambda row: f"{row['video']}/tactile/{PurePosixPath(row['vision']).name}"
     odd = [where for where, row in samples if row["tactile"] != partner(row)]
     text = "photo and tactile image differ in trajectory or file name"
-    tvl.suspect_rows(result, odd, "unequal-names", text)
+    suspect_rows(result, odd, "unequal-names", text)
     samples.sort(key=lambda sample: (_in_time(sample[1]["video"]), sample[1]["frame"]))
     result.rows = samples
     return files
@@ -289,5 +289,5 @@ def _choose_backgrounds(result: Scan, fixed: Collection[str]) -> None:
             bare[row["domain"]].append(where)
     for places in bare.values():
         text = f"no image of the untouched gel, as none is listed and there is no {FALLBACK}"
-        tvl.suspect_rows(result, places, "no-background", text)
+        suspect_rows(result, places, "no-background", text)
     result.facts["backgrounds"] = ", ".join(f"{kind} {n}" for kind, n in sorted(kinds.items()))

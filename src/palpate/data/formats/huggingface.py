@@ -25,12 +25,12 @@ import polars as pl
 from PIL import Image
 
 from palpate.core import PalpateError, Progress, atomic_path, inside, quiet
-from palpate.data.formats.base import Cells, Facts, Format, Into, Scan
 from palpate.data.formats.huggingface_source import Source, first_line, open_source
 from palpate.data.images import BROKEN, Check, form_of
-from palpate.data.manifest import IMAGE_COLUMNS, SCHEMA
+from palpate.data.manifest import IMAGE_COLUMNS, PART_NAMES, SCHEMA
 from palpate.data.mapping import ColumnMaps, compile_maps, text_of
-from palpate.data.rows import PART_NAMES, manifest_rows, odd_groups, read_classes
+from palpate.data.rows import manifest_rows, odd_groups, read_classes
+from palpate.data.scanning import Cells, Facts, Format, Into, Scan
 from palpate.data.tables import LINE
 
 LOOKS_FOR = (

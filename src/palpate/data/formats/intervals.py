@@ -26,14 +26,14 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from palpate.core import PalpateError, Problem, Progress, quiet, require
-from palpate.data.formats.base import Facts, Format, Into, Scan
+from palpate.data.formats.layout import require_videos
 from palpate.data.formats.recordings import Recordings, Row
-from palpate.data.formats.touch_and_go import require_videos
 from palpate.data.frames import FolderFrames
 from palpate.data.images import Check
 from palpate.data.listing import FrameTable
 from palpate.data.mapping import compile_maps
 from palpate.data.rows import manifest_rows, read_classes
+from palpate.data.scanning import Facts, Format, Into, Scan
 from palpate.data.tables import header_of, open_table
 
 FACTS = Facts(

@@ -18,11 +18,17 @@ from pathlib import Path, PurePosixPath
 from typing import Any, Generic, TypeGuard, TypeVar
 
 from palpate.core import PARTS, PalpateError, Split, few, inside
-from palpate.data.formats.base import Facts, Row, Scan
 from palpate.data.images import SUFFIXES
 from palpate.data.manifest import CLIMBS, DIGITS
+from palpate.data.scanning import Facts, Row, Scan
 
 NUMBER = r"([0-9]+)"
+#: Frame lists of Touch and Go: all labeled frames, and its split.
+LISTS = ("label.txt", "train.txt", "test.txt")
+#: Where its recordings are, below the root.
+PLACES = ("dataset", "final_dataset", ".")
+#: Modality -> its folder of frames and its video in the folder of a recording.
+RECORDED = {"vision": ("video_frame", "video.mp4"), "tactile": ("gelsight_frame", "gelsight.mp4")}
 K = TypeVar("K", int, str)
 #: (folder, name or number): what a JSON list calls a sample.
 Key = tuple[str, int] | tuple[str, str]
@@ -245,3 +251,39 @@ def _pairs(
                 scan.problem(where, "outside-root", f"{names!r} are not plain names")
             else:
                 yield where, part, names[0], names[1]
+
+
+def has_listed_videos(source: Path) -> bool:
+    """Whether a folder has a frame list and a recording."""
+    return any((source / name).is_file() for name in LISTS) and bool(find_videos(source))
+
+
+def find_videos(root: Path) -> dict[str, Mapping[str, Path | None]]:
+    """Recordings by name; extracted frames go before the raw video."""
+    videos: dict[str, Mapping[str, Path | None]] = {}
+    for place in PLACES:
+        for name in subfolders(root / place):
+            paths: dict[str, Path | None] = {}
+            for modality, (frames, video) in RECORDED.items():
+                folder, file = (root / place / name / part for part in (frames, video))
+                paths[modality] = folder if folder.is_dir() else file if file.is_file() else None
+            if any(paths.values()):
+                videos.setdefault(name, paths)
+    return videos
+
+
+def require_videos(root: Path) -> dict[str, Mapping[str, Path | None]]:
+    """The recordings."""
+    videos = find_videos(root)
+    if not videos:
+        must = f"{root} must hold recordings: folders with video.mp4 and gelsight.mp4, or "
+        must += "video_frame/ and gelsight_frame/"
+        got = "none there, nor in dataset/ or final_dataset/"
+        raise PalpateError(must, got, "Check the folder")
+    return videos
+
+
+def suspect_rows(scan: Scan, places: Sequence[str], kind: str, text: str) -> None:
+    """Report similar rows at the first of them, with their number; nothing for no rows."""
+    if places:
+        scan.suspect(places[0], kind, f"{count_rows(places)}: {text}")

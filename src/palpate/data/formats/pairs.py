@@ -21,34 +21,34 @@ Map expressions may use the fields and ``path``, the path of the tactile (or vis
 
 from __future__ import annotations
 
-import contextlib
 import os
 import posixpath
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping
 from itertools import islice
 from pathlib import Path
-from typing import Literal
 
 import polars as pl
 
 from palpate.core import PalpateError, Progress, few, quiet
-from palpate.data.detection import ROLES, detect_layout, template_of
-from palpate.data.formats.base import Cells, Facts, Format, Scan
+from palpate.data.detection import (
+    SIDES,
+    TARGETS,
+    Side,
+    joined,
+    name_apart,
+    parsed,
+    templates_of,
+    walked,
+)
 from palpate.data.formats.layout import require_folder
 from palpate.data.frames import VIDEOS
 from palpate.data.images import SUFFIXES
-from palpate.data.manifest import SCHEMA
 from palpate.data.mapping import compile_maps
 from palpate.data.rows import manifest_rows, odd_groups, read_classes
+from palpate.data.scanning import Facts, Format, Scan
 from palpate.data.tables import TABLES, header_of, open_table
-from palpate.data.templates import FIX, Fields, Matches, Template, assign, join, walk
+from palpate.data.templates import FIX, Fields, Matches, assign
 
-Side = Literal["vision", "tactile"]
-SIDES = ("vision", "tactile")
-#: Columns of files; the first one that is there decides the order of rows.
-ORDER = ("tactile", "vision", "background")
-#: What may be mapped.
-TARGETS = (*SCHEMA, "split")
 LOOKS_FOR = (
     f"a table ({', '.join(TABLES)}) with the columns vision and tactile, or a folder of images"
 )
@@ -213,76 +213,6 @@ def _read_folder(
     result.rows += [(places[k], row) for k, row in numbered]
 
 
-def walked(result: Scan, suffixes: tuple[str, ...]) -> list[str]:
-    """The files of these suffixes below the root.
-
-    Links that leave it and names that are not UTF-8, which no table can hold, are reported.
-    """
-    files, outside = walk(result.base, suffixes)
-    for name in (odd := [f for f in files if any("\ud800" <= c <= "\udfff" for c in f)]):
-        result.problem(ascii(name), "bad-encoding", "the name of the file is not UTF-8")
-    files = [name for name in files if name not in odd]
-    text = "links to folders outside the root, which are not followed"
-    result.suspect(result.base, "outside-root", text, outside)
-    return files
-
-
-def parsed(texts: Mapping[str, str]) -> dict[str, Template]:
-    """Templates by column, in the order in which their files give rows."""
-    return {column: Template.parse(texts[column], column) for column in ORDER if column in texts}
-
-
-def joined(
-    result: Scan,
-    files: Sequence[str],
-    templates: Mapping[str, Template],
-    matches: Mapping[str, Matches],
-    what: str,
-) -> tuple[list[Fields], tuple[str, ...]]:
-    """Rows of the files of all templates, and their fields; what is odd is reported.
-
-    ``files`` should all be of a template; ``what`` they are is for messages.
-    """
-    rows, problems = join({column: matches[column] for column in templates})
-    result.problems += problems
-    used = {path for found in matches.values() for path, _ in found}
-    unmatched = [path for path in files if path not in used]
-    result.suspect(result.base, "unmatched", f"{what} of no template", unmatched)
-    result.facts |= {f"template_{column}": template.text for column, template in templates.items()}
-    fields = tuple(dict.fromkeys(name for t in templates.values() for name in t.fields))
-    result.more = tuple(name for name in fields if name not in TARGETS)
-    return rows, fields
-
-
-def templates_of(
-    files: Sequence[str],
-    folder: Path,
-    side: Side | None,
-    what: str = "images",
-    renamed: Callable[[Mapping[str, str]], dict[str, str]] = dict,
-) -> dict[str, str]:
-    """The templates that the names of files below a folder suggest; ``side`` if all show one thing.
-
-    ``what`` the files are is for errors; ``renamed`` changes the names of fields.
-    """
-    if not files:
-        raise PalpateError(f"{folder} must hold {what}", "none", "Check the path")
-    if side is not None:
-        return renamed({side: template_of(files)})
-    templates = detect_layout(files, folder.resolve().name)
-    if templates and _fit(files, templates):
-        return renamed(templates)
-    if templates:
-        choices = [templates, *({side: text} for side, text in templates.items())]
-        got = f"{few(files)}, of which few share their names"
-    else:
-        every = template_of(files)
-        choices = [{"tactile": every}, {"vision": every}]
-        got = f"{few(files)}, without a word like {ROLES['vision'][0]} or {ROLES['tactile'][0]}"
-    must = f"The names of the {what} in {folder} must say what they show"
-    raise PalpateError(must, got, "Choose one of these", choices=[*map(renamed, choices)])
-
-
 def _distinct(result: Scan, matches: Matches) -> Matches:
     """The files of one side without those that differ from an earlier one by the suffix alone."""
     first: dict[str, tuple[str, Fields]] = {}
@@ -290,27 +220,3 @@ def _distinct(result: Scan, matches: Matches) -> Matches:
         if (before := first.setdefault(posixpath.splitext(path)[0], (path, fields)))[0] != path:
             result.problem(path, "duplicate-id", f"{before[0]} has the same stem")
     return list(first.values())
-
-
-def _fit(files: Sequence[str], templates: Mapping[str, str]) -> bool:
-    """Whether templates join most of the files that they match."""
-    matches = assign(files, {side: Template.parse(text) for side, text in templates.items()})
-    with contextlib.suppress(PalpateError):
-        rows, _ = join(matches)
-        return 2 * len(rows) >= max(map(len, matches.values()))
-    return False
-
-
-def name_apart(rows: Sequence[Cells], fields: Sequence[str]) -> None:
-    """Name a video or contact by the fields before it, too, where its name alone means several."""
-    outer = ("object", "session", "material")
-    for column, around in (("video", outer), ("contact", ("video", *outer))):
-        before = fields[: fields.index(column)] if column in fields else ()
-        named = [row for row in rows if column in row]
-        names: list[str] = []  # those that distinguish what earlier ones do not
-        count = len({row[column] for row in named})
-        for name in (name for name in around if name in before):
-            several = len({tuple(map(row.get, (column, *names, name))) for row in named})
-            names, count = ([*names, name], several) if several > count else (names, count)
-        for row in named:
-            row[column] = "/".join([*(row[name] for name in names if name in row), row[column]])

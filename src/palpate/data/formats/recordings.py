@@ -14,17 +14,18 @@ from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
 from threading import Event
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import polars as pl
 
-from palpate.core import PalpateError, Progress, inside, read_json, require, write_json
-from palpate.data.formats.base import Into, Scan
+from palpate.core import PalpateError, Problem, Progress, inside, read_json, require, write_json
 from palpate.data.frames import FolderFrames, Frames, VideoFrames, streams_of
 from palpate.data.images import Check, check_image, in_threads
-from palpate.data.imported import place_of, raise_if, require_some
-from palpate.data.listing import FrameList, FrameTable
+from palpate.data.scanning import Into, Scan, raise_if, require_some
 from palpate.data.streams import Finding, findings
+
+if TYPE_CHECKING:
+    from palpate.data.listing import FrameList, FrameTable
 
 #: The background is this many frames before the contact.
 BACKGROUND_BEFORE = 4
@@ -283,7 +284,7 @@ class Recordings:
         """
         into = self.into
         assert into is not None
-        self.scan.problems.sort(key=place_of)
+        self.scan.problems.sort(key=Problem.sort_key)
         raise_if(self.scan.problems, into.skip_bad)
         require_some(len(rows), self.scan.base, self.scan.problems)
 

@@ -28,9 +28,9 @@ from pathlib import Path, PurePosixPath
 
 from palpate.core import PalpateError, Progress, quiet
 from palpate.data.formats import tvl
-from palpate.data.formats.base import Facts, Format, Scan
-from palpate.data.formats.layout import Images, file_names, natural, paired
+from palpate.data.formats.layout import Images, file_names, natural, paired, suspect_rows
 from palpate.data.manifest import CLIMBS
+from palpate.data.scanning import Facts, Format, Scan
 
 FACTS = Facts(
     name="SSVTP (Touch-Vision-Language)",
@@ -151,7 +151,7 @@ def _add_words(result: Scan, captions: dict[str, str | None]) -> None:
             without.append(where)
     result.facts["text_source"] = ", ".join(sorted(sources)) or "none"
     text = "neither a text file nor a caption in the list"
-    tvl.suspect_rows(result, without, "no-text", text)
+    suspect_rows(result, without, "no-text", text)
 
 
 def _first_line(path: Path) -> str | None:

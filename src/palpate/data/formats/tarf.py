@@ -21,7 +21,6 @@ import re
 from pathlib import Path
 
 from palpate.core import PalpateError, Progress, quiet
-from palpate.data.formats.base import Facts, Format, Scan
 from palpate.data.formats.layout import (
     is_split,
     natural,
@@ -33,6 +32,7 @@ from palpate.data.formats.layout import (
     require_layout,
     subfolders,
 )
+from palpate.data.scanning import Facts, Format, Scan
 
 FACTS = Facts(
     name="TaRF",

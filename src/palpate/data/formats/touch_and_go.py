@@ -23,12 +23,10 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from palpate.core import PalpateError, Progress, Split, quiet, write_text
-from palpate.data.formats.base import WORLD, Facts, Format, Into, Scan, world_facts
-from palpate.data.formats.layout import require_folder, subfolders
-from palpate.data.formats.recordings import Recordings, VideoFiles, first_frames, rows_of, thin
+from palpate.data.formats.layout import has_listed_videos, require_folder, require_videos
+from palpate.data.formats.recordings import Recordings, first_frames, rows_of, thin
 from palpate.data.images import Check
 from palpate.data.listing import (
-    INCONCLUSIVE,
     FrameList,
     FrameTable,
     categories_in,
@@ -37,6 +35,8 @@ from palpate.data.listing import (
     write_list,
 )
 from palpate.data.manifest import Manifest
+from palpate.data.scanning import WORLD, Facts, Format, Into, Scan, world_facts
+from palpate.data.tables import INCONCLUSIVE
 
 FACTS = Facts(
     name="Touch and Go",
@@ -60,28 +60,6 @@ _NAMES = (
 CATEGORIES: dict[int, str] = dict(enumerate(_NAMES.split(", ")))
 #: Part of the official split -> its list.
 OFFICIAL = {"train": "train.txt", "test": "test.txt"}
-PLACES = ("dataset", "final_dataset", ".")
-MODALITIES = {"vision": ("video_frame", "video.mp4"), "tactile": ("gelsight_frame", "gelsight.mp4")}
-
-
-def detect(source: Path) -> bool:
-    """Whether a folder has a list and a recording."""
-    lists = ("label.txt", *OFFICIAL.values())
-    return any((source / name).is_file() for name in lists) and bool(find_videos(source))
-
-
-def find_videos(root: Path) -> dict[str, VideoFiles]:
-    """Recordings by name; extracted frames go before the raw video."""
-    videos: dict[str, VideoFiles] = {}
-    for place in PLACES:
-        for name in subfolders(root / place):
-            paths: dict[str, Path | None] = {}
-            for modality, (frames, video) in MODALITIES.items():
-                folder, file = (root / place / name / part for part in (frames, video))
-                paths[modality] = folder if folder.is_dir() else file if file.is_file() else None
-            if any(paths.values()):
-                videos.setdefault(name, paths)
-    return videos
 
 
 def scan(
@@ -161,18 +139,7 @@ def write_lists(manifest: Manifest, split: Split, folder: Path) -> list[Path]:
     return files
 
 
-FORMAT = Format(FACTS, detect, LOOKS_FOR, scan, write_lists)
-
-
-def require_videos(root: Path) -> dict[str, VideoFiles]:
-    """The recordings."""
-    videos = find_videos(root)
-    if not videos:
-        must = f"{root} must hold recordings: folders with video.mp4 and gelsight.mp4, or "
-        must += "video_frame/ and gelsight_frame/"
-        got = "none there, nor in dataset/ or final_dataset/"
-        raise PalpateError(must, got, f"Check the folder, or fetch videos from {FACTS.url}")
-    return videos
+FORMAT = Format(FACTS, has_listed_videos, LOOKS_FOR, scan, write_lists)
 
 
 def _read_lists(

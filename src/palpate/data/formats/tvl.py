@@ -11,8 +11,7 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 from palpate.core import PARTS, write_text
-from palpate.data.formats.base import Row, Scan
-from palpate.data.formats.layout import count_rows
+from palpate.data.scanning import Row, Scan
 from palpate.data.tables import csv_text, header_of, open_table
 
 CITATION = (
@@ -61,9 +60,3 @@ def clean_caption(text: str | None) -> str | None:
     """Adjectives between commas: trimmed, lower case, no full stops, none empty; None if none."""
     words = (" ".join(word.split()) for word in (text or "").replace(".", "").lower().split(","))
     return ", ".join(word for word in words if word) or None
-
-
-def suspect_rows(scan: Scan, places: Sequence[str], kind: str, text: str) -> None:
-    """Report similar rows at the first of them, with their number; nothing for no rows."""
-    if places:
-        scan.suspect(places[0], kind, f"{count_rows(places)}: {text}")

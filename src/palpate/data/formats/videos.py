@@ -31,10 +31,7 @@ from typing import Any
 
 from palpate.core import PalpateError, ProblemsError, Progress, few, quiet, require
 from palpate.data.contacts import Contacts, find_contacts, thumbnail
-from palpate.data.formats import touch_and_go
-from palpate.data.formats.base import Cells, Facts, Format, Into, Scan
-from palpate.data.formats.layout import require_folder
-from palpate.data.formats.pairs import (
+from palpate.data.detection import (
     ORDER,
     SIDES,
     Side,
@@ -44,10 +41,12 @@ from palpate.data.formats.pairs import (
     templates_of,
     walked,
 )
+from palpate.data.formats.layout import has_listed_videos, require_folder
 from palpate.data.formats.recordings import Recordings, Row, thin
 from palpate.data.frames import MOVING, streams_of
 from palpate.data.images import SUFFIXES, Check, in_threads, read_image
-from palpate.data.rows import PART_NAMES
+from palpate.data.manifest import PART_NAMES
+from palpate.data.scanning import Cells, Facts, Format, Into, Scan
 from palpate.data.streams import Finding, findings
 from palpate.data.templates import FIX, Fields, Template, assign, walk
 
@@ -74,7 +73,7 @@ class _Video:
 
 def detect(source: Path) -> bool:
     """Whether this is a folder with videos or stacks below it, and without images."""
-    if not source.is_dir() or touch_and_go.detect(source):
+    if not source.is_dir() or has_listed_videos(source):
         return False
     files = [name for _, _, names in islice(os.walk(source), 500) for name in names]
     images = any(name.lower().endswith(SUFFIXES) for name in files)

@@ -33,7 +33,6 @@ from itertools import islice
 from pathlib import Path
 
 from palpate.core import PalpateError, Progress, Split, few, quiet
-from palpate.data.formats.base import Cells, Facts, Format, Row, Scan
 from palpate.data.formats.layout import (
     Images,
     natural,
@@ -42,6 +41,7 @@ from palpate.data.formats.layout import (
     report_missing_folders,
     require_folder,
 )
+from palpate.data.scanning import Cells, Facts, Format, Row, Scan
 
 FACTS = Facts(
     name="VisGel",

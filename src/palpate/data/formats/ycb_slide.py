@@ -27,7 +27,6 @@ from pathlib import Path
 from typing import Literal
 
 from palpate.core import Progress, quiet, require
-from palpate.data.formats.base import Facts, Format, Scan
 from palpate.data.formats.layout import (
     Images,
     numbered,
@@ -36,6 +35,7 @@ from palpate.data.formats.layout import (
     require_layout,
     subfolders,
 )
+from palpate.data.scanning import Facts, Format, Scan
 
 Part = Literal["real", "sim"]
 FACTS = Facts(

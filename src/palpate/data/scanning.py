@@ -11,21 +11,31 @@ from __future__ import annotations
 import inspect
 import posixpath
 from collections import Counter
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
 from typing import Any
 
-from palpate.core import Problem, Progress, Split, few, inside, quiet, read_json
+from palpate.core import (
+    PalpateError,
+    Problem,
+    ProblemsError,
+    Progress,
+    Split,
+    few,
+    inside,
+    quiet,
+    read_json,
+)
 from palpate.data.images import Check, check_image, in_threads
-from palpate.data.imported import Imported, place_of, raise_if, require_some
 from palpate.data.manifest import IMAGE_COLUMNS, Manifest
 
 #: Manifest column -> cell; ``split`` may hold the part of the data set's own split.
 Cells = dict[str, Any]
 #: (place, cells): where a row was read, ``file:line`` or a path, and its cells.
 Row = tuple[str, Cells]
+FIX = "Correct these, or skip the bad rows and list them"
 #: Kinds of problems of files that are not there; every other kind means that a file or row is bad.
 MISSING = ("missing-", "unpaired")
 
@@ -153,33 +163,6 @@ class Format:
         return "into" in inspect.signature(self.scan).parameters
 
 
-def imported_of(
-    scan: Scan,
-    source: Path,
-    facts: Mapping[str, str],
-    *,
-    skip_bad: bool,
-    check: Check,
-    progress: Progress = quiet,
-) -> Imported:
-    """A scan as an import that is not written yet.
-
-    Raises:
-        ProblemsError: with every bad row and file, unless ``skip_bad``.
-        PalpateError: if no usable row is left.
-    """
-    rows = finished(scan, check, progress)
-    raise_if(scan.problems, skip_bad)
-    require_some(len(rows), source, scan.problems)
-    manifest = manifest_of(scan, rows, {**facts, **scan.facts})
-    ids = set(manifest.ids)
-    splits: dict[str, Split] = {}
-    for name, split in scan.splits.items():
-        if parts := {i: part for i, part in split.parts.items() if i in ids}:
-            splits[name] = Split(parts, split.rule, manifest.digest)
-    return Imported(manifest, scan.problems, splits, scan.inconclusive, scan.suspicious)
-
-
 def manifest_of(scan: Scan, rows: Iterable[Row], facts: Mapping[str, str]) -> Manifest:
     """The manifest of finished rows."""
     return Manifest.from_rows((row for _, row in rows), scan.base.resolve(), facts, scan.more)
@@ -192,7 +175,7 @@ def finished(scan: Scan, check: Check, progress: Progress = quiet) -> list[Row]:
     """
     rows = _checked_images(scan, _two_images(scan, _checked_paths(scan)), check, progress)
     rows = _unique(scan, rows)
-    scan.problems.sort(key=place_of)
+    scan.problems.sort(key=Problem.sort_key)
     return rows
 
 
@@ -302,3 +285,18 @@ def _default_id(where: str, row: Cells) -> tuple[str, str]:
         return f"{row['video']}/{row['frame']}", "video and frame"
     path = Path(row.get("tactile") or row.get("vision") or where)
     return path.with_suffix("").as_posix(), "the path"
+
+
+def raise_if(problems: Sequence[Problem], skip_bad: bool) -> None:
+    """Raise all problems at once unless they are to be skipped."""
+    if problems and not skip_bad:
+        raise ProblemsError(problems, FIX, example={"skip_bad": True})
+
+
+def require_some(samples: int, source: object, skipped: Sequence[Problem]) -> None:
+    """Reject an import without samples."""
+    if samples == 0 and skipped:
+        raise ProblemsError(skipped, "No sample is left without these: correct the data set")
+    if samples == 0:
+        must = f"{source} must hold at least one usable sample"
+        raise PalpateError(must, "none", "Check the labels and the folder")
