@@ -2,8 +2,6 @@
 
 import errno
 import json
-import os
-import signal
 import subprocess
 import sys
 import time
@@ -15,6 +13,7 @@ import pytest
 from forge import commands
 from forge.pictures import paint
 from forge.scores import IDS, LABELS, by_key, feature_sets
+from palpate.cli import main
 from palpate.core import Split
 from palpate.evaluation import scoring
 from palpate.report.results import Results
@@ -168,42 +167,25 @@ def test_a_full_disk_loses_no_scores(capsys, sets, monkeypatch):
     assert (status, "TMMD" in out, "The disk must have room for o.json" in err) == (2, True, True)
 
 
-def test_a_killed_run_goes_on_from_its_embeddings_and_leaves_no_cache(tmp_path):
+def test_a_killed_run_goes_on_from_its_embeddings_and_leaves_no_cache(tmp_path, monkeypatch):
     pytest.importorskip("torch")
+    monkeypatch.chdir(tmp_path)
     for seed, name in enumerate(("real", "made")):
-        paint(tmp_path / name, map(str, range(60)), seed)
-    args = (
-        "--generated",
-        "made",
-        "--reference",
-        "real",
-        "--encoder",
-        "palpate/mini",
-        "-o",
-        "s.json",
-    )
-    args = (*args, "--companions", "none", "--presets", "paper")
-    process = subprocess.Popen(
-        [sys.executable, "-m", "palpate", "score", *args, "--permutations", "200000"],
-        cwd=tmp_path,
-        stdout=subprocess.DEVNULL,
-        stderr=subprocess.DEVNULL,
-    )
-    cache = tmp_path / ".s.json.work"
-    deadline = time.monotonic() + 60
+        paint(Path(name), map(str, range(60)), seed)
+    command = "score --generated made --reference real --encoder palpate/mini -o s.json -q"
+    args = [*command.split(), "--companions", "none", "--presets", "paper", "--permutations"]
+    process = subprocess.Popen([sys.executable, "-m", "palpate", *args, "200000"])
+    cache, deadline = Path(".s.json.work"), time.monotonic() + 60
     while len([*cache.rglob("tactile-*.npz")]) < 2 and time.monotonic() < deadline:
         time.sleep(0.02)
-    os.kill(process.pid, signal.SIGKILL)
+    process.kill()
     process.wait()
     stamps = {p: p.stat().st_mtime_ns for p in cache.rglob("tactile-*.npz")}
     assert len(stamps) == 2
-    done = run(*args, "--permutations", "0", "--cache", cache, cwd=tmp_path)
-    assert done.returncode == 0, done.stderr
+    assert main([*args, "0", "--cache", str(cache)]) == 0
     assert {p: p.stat().st_mtime_ns for p in cache.rglob("tactile-*.npz")} == stamps
-    done = run(*args, "--permutations", "0", cwd=tmp_path)
-    assert done.returncode == 0, done.stderr
+    assert main([*args, "0"]) == 0
     assert not cache.exists()
-    assert (tmp_path / "s.json").is_file()
 
 
 def test_probe_scores_material_and_retrieval(capsys, tmp_path, small_manifest):

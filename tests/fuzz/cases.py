@@ -37,17 +37,8 @@ def random_case(seed: int, number: int, base: Path, folder: Path) -> list[str]:
     args = prepare(command, base, folder)
     files = sorted(p for p in (folder / "in").rglob("*") if p.is_file())
     places = [str(p) for p in (*files[:3], *files[-2:], folder / "in", folder / "out" / "none")]
-    outputs = [
-        "",
-        ".",
-        "..",
-        "/",
-        "OUT/a/b/c",
-        "OUT/x.json",
-        "OUT/\udcff",
-        "OUT/" + "x" * 300,
-        *places,
-    ]
+    long = "OUT/" + "x" * 300
+    outputs = ["", ".", "..", "/", "OUT/a/b/c", "OUT/x.json", "OUT/\udcff", long, *places]
     outputs = [o.replace("OUT", str(folder / "out")) for o in (*outputs, "OUT", "OUT/f", "OUT/\n")]
     outputs += [str(folder / "in" / "null")]
     with contextlib.suppress(PermissionError):  # a /dev/null of the case's own
@@ -124,11 +115,8 @@ def _ending(status: int | str, out: str, err: str, as_json: bool) -> Iterator[st
 def place(trace: str) -> str:
     """Exception and innermost line of palpate in a traceback: what failures are grouped by."""
     frames = re.findall(r'/(palpate/[^"]+)", line (\d+), in (\w+)', trace)
-    last = [
-        line
-        for line in trace.strip().split("\n")
-        if re.match(r"[\w.]+(Error|Exception|\w+)\b(:|$)", line)
-    ]
+    lines = trace.strip().split("\n")
+    last = [line for line in lines if re.match(r"[\w.]+(Error|Exception|\w+)\b(:|$)", line)]
     at = "{}:{} {}".format(*frames[-1]) if frames else "?"
     return f"{(last or ['?'])[-1][:90]} at {at}"
 
@@ -148,9 +136,8 @@ def _traces(folder: Path, before: dict[str, tuple[int, ...]]) -> Iterator[str]:
     if changed := [path for path in before if after.get(path) != before[path]]:
         yield f"an input was changed: {Path(changed[0]).name!r}"
     for name in ("in", "out", "cwd", "tmp", ""):
-        left = [
-            p.name for p in (folder / name).iterdir() if p.name not in ("in", "out", "cwd", "tmp")
-        ]
+        parts = ("in", "out", "cwd", "tmp")
+        left = [p.name for p in (folder / name).iterdir() if p.name not in parts]
         resumed = (".work", ".part")  # the same command goes on from these
         strange = [n for n in left if n.startswith(".") and not n.endswith(resumed)]
         if strange or (name in ("tmp", "") and left):
@@ -169,9 +156,7 @@ def broken(file: Path) -> str:
             pl.read_parquet(file, glob=False)
         elif file.suffix in (".png", ".jpg"):
             Image.open(file).load()
-        elif file.suffix == ".html" and not file.read_text(encoding="utf-8").rstrip().endswith(
-            "</html>"
-        ):
+        elif file.suffix == ".html" and not file.read_text("utf-8").rstrip().endswith("</html>"):
             return "no end"
     except Exception as error:
         return repr(error)[:80]

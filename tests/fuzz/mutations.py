@@ -24,50 +24,10 @@ Rng = np.random.Generator
 LONG = "x" * 140_000
 WORDS = [
     *("", " ", "0", "-1", "1.5", "nan", "inf", "1e400", "9" * 30, "9" * 5000, "null", "True"),
-    *(
-        "\0",
-        "a\0b",
-        "\udcff",
-        "a\nb",
-        "\r",
-        "\t",
-        "\ud800",
-        "\ufeff",
-        "\u202e",
-        "é",
-        "e\u0301",
-        "日本",
-        "\x1b[2J",
-    ),
-    *(
-        "..",
-        ".",
-        "../../x.png",
-        "/etc/passwd",
-        "~",
-        "a//b",
-        "C:\\x",
-        "x" * 300,
-        LONG,
-        "-x",
-        "--help",
-    ),
-    *(
-        '"',
-        "'",
-        '"a',
-        "a,b",
-        "a;b",
-        "{",
-        "[",
-        "[bold]",
-        "{0}",
-        "%s",
-        "<script>",
-        "${x}",
-        "=1+1",
-        "*",
-    ),
+    *("\0", "a\0b", "\udcff", "a\nb", "\r", "\t", "\ud800", "\ufeff", "\u202e", "é", "e\u0301"),
+    *("日本", "\x1b[2J", "..", ".", "../../x.png", "/etc/passwd", "~", "a//b", "C:\\x", "x" * 300),
+    *(LONG, "-x", "--help", '"', "'", '"a', "a,b", "a;b", "{", "[", "[bold]", "{0}", "%s"),
+    *("<script>", "${x}", "=1+1", "*"),
 ]
 VALUES: list[Any] = [
     *(None, True, 0, -1, 1.5, 2**63, 10**30, 1e308, float("nan"), float("inf"), [], {}, [None]),
@@ -190,23 +150,14 @@ def parquet(rng: Rng, data: bytes) -> bytes:
         metadata[pick(rng, list(metadata))] = pick(rng, WORDS).encode("utf-8", "replace").decode()
     name = pick(rng, table.columns)
     n = len(table)
-    column = pick(
-        rng,
-        [
-            *(
-                pl.Series(name, [value] * n)
-                for value in (None, 1, 1.5, True, b"x", ["x"], {"a": 1})
-            ),
-            *(pl.Series(name, [float("nan")] * n), pl.Series(name, [-(2**62)] * n)),
-            *(pl.Series(name, [word.encode("utf-8", "replace").decode()] * n) for word in WORDS),
-            table[name].cast(pl.String, strict=False).cast(pl.Categorical),
-            table[name].shuffle(0),
-            pl.Series(name, [[]] * n, dtype=pl.List(pl.Float64)),
-            pl.datetime_range(pl.datetime(2020, 1, 1), pl.datetime(2020, 1, 1), eager=True).sample(
-                n, with_replacement=True
-            ),
-        ],
-    )
+    day = pl.datetime(2020, 1, 1)
+    words = [word.encode("utf-8", "replace").decode() for word in WORDS]
+    values = [None, 1, 1.5, True, b"x", ["x"], {"a": 1}, float("nan"), -(2**62), *words]
+    columns = [pl.Series(name, [value] * n) for value in values]
+    columns += [table[name].cast(pl.String, strict=False).cast(pl.Categorical)]
+    columns += [table[name].shuffle(0), pl.Series(name, [[]] * n, dtype=pl.List(pl.Float64))]
+    columns += [pl.datetime_range(day, day, eager=True).sample(n, with_replacement=True)]
+    column = pick(rng, columns)
     tables = [table.drop(name), table.head(0), table.head(1), pl.concat([table, table])]
     tables += [table.rename({name: pick(rng, WORDS[1:5])}), table.select([])]
     kind = int(rng.integers(3))
@@ -387,15 +338,8 @@ def option(rng: Rng, verb: str, places: list[str]) -> list[str]:
     elif "int" in hint or "float" in hint:
         values = numbers
     elif "str" in hint and not small:
-        values = [
-            *WORDS,
-            *places,
-            "a=b",
-            "material=kind",
-            "vision=vision",
-            "frame=1",
-            "id=id || 'x'",
-        ]
+        values = [*WORDS, *places, "a=b", "material=kind", "vision=vision", "frame=1"]
+        values.append("id=id || 'x'")
     count = int(rng.integers(1, 3)) if "tuple" in hint else 1
     return [flag, *(pick(rng, values) for _ in range(count))]
 

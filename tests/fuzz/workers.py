@@ -7,12 +7,12 @@ import os
 import re
 import resource
 import tempfile
-import threading
-import time
 import traceback
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from multiprocessing.connection import Connection
 from pathlib import Path
+from queue import SimpleQueue
 
 from fuzz import cases, seeds
 
@@ -71,31 +71,31 @@ class Worker:
             self.process = None
 
 
-def run(numbers: range, seed: int, workers: int = 2) -> Iterator[tuple[int, list[str], list[str]]]:
-    """Yield (number, arguments, failures) of each case as it ends."""
+def run(
+    numbers: range, seed: int, workers: int = 2, base: Path | None = None
+) -> Iterator[tuple[int, list[str], list[str]]]:
+    """Yield (number, arguments, failures) of each case; ``base`` holds the inputs already."""
     with tempfile.TemporaryDirectory(prefix="palpate-fuzz-") as place:
-        base, work = Path(place) / "base", Path(place) / "work"
-        with contextlib.redirect_stdout(io.StringIO()):
-            seeds.build(base)
-        todo, lock, done = iter(numbers), threading.Lock(), []
+        if base is None:
+            base = Path(place) / "base"
+            with contextlib.redirect_stdout(io.StringIO()):
+                seeds.build(base)
+        idle: SimpleQueue[Worker] = SimpleQueue()
+        every = [Worker(seed, base, Path(place) / "work") for _ in range(workers)]
+        for worker in every:
+            idle.put(worker)
 
-        def follow() -> None:
-            worker = Worker(seed, base, work)
+        def check(number: int) -> tuple[int, list[str], list[str]]:
+            worker = idle.get()
             try:
-                while (number := _next(todo, lock)) is not None:
-                    done.append((number, *worker.check(number)))
+                return number, *worker.check(number)
             finally:
+                idle.put(worker)
+
+        pool = ThreadPoolExecutor(workers)
+        try:
+            yield from pool.map(check, numbers)
+        finally:
+            pool.shutdown(cancel_futures=True)
+            for worker in every:
                 worker.stop()
-
-        threads = [threading.Thread(target=follow) for _ in range(workers)]
-        for thread in threads:
-            thread.start()
-        while done or any(thread.is_alive() for thread in threads):
-            while done:
-                yield done.pop(0)
-            time.sleep(0.05)
-
-
-def _next(numbers: Iterator[int], lock: threading.Lock) -> int | None:
-    with lock:
-        return next(numbers, None)
