@@ -6,16 +6,13 @@ import json
 import os
 import traceback
 from collections.abc import Callable
-from itertools import product
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 from hypothesis import settings
-from PIL import Image
 
-from forge.pictures import put
+from forge.worlds import six_videos
 from palpate.data.manifest import Manifest
 
 # A busy machine is no failure: how long an example takes is not tested.
@@ -51,18 +48,7 @@ def real_data() -> Path:
 @pytest.fixture
 def small_manifest(tmp_path: Path) -> Manifest:
     """Six videos of three materials, two touches of four frames each, with 32-pixel pictures."""
-    rng, rows = np.random.default_rng(0), []
-    for v, touch, k in product(range(6), range(2), range(4)):
-        frame, material = 100 * touch + k, ("Wood", "Grass", "Brick")[v % 3]
-        row = {"id": f"v{v}/{frame}", "video": f"v{v}", "frame": frame, "material": material}
-        row["contact"] = f"v{v}#{touch}"
-        for side in ("vision", "tactile", "background"):
-            row[side] = f"v{v}/{side}/{frame}.png"
-            base = 100 if side == "background" else 40 * (v % 3) + 20
-            image = (base + rng.integers(0, 30, (32, 32, 3))).astype(np.uint8)
-            put(tmp_path / "root" / row[side], Image.fromarray(image))
-        rows.append(row)
-    return Manifest.from_rows(rows, tmp_path / "root")
+    return six_videos(tmp_path / "root")
 
 
 @pytest.fixture(scope="session")

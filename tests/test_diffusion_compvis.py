@@ -13,8 +13,9 @@ from safetensors.torch import save_file
 
 import palpate as pp
 from forge.models import VQ_F4, decode, encode, make_encoders, make_pipeline, make_state
+from forge.worlds import by_video
 from palpate.cli import main
-from palpate.core import PalpateError, Split
+from palpate.core import PalpateError
 from palpate.diffusion.autoencoder import Autoencoder, load_autoencoder, to_bytes
 from palpate.diffusion.presets import PAPER, TINY
 from palpate.diffusion.training import train_pipeline
@@ -213,12 +214,6 @@ def test_folders_of_other_models_are_rejected(tmp_path):
 
 
 # --- in a generator ----------------------------------------------------------------------------
-
-
-def by_video(manifest):
-    train = [i for i in manifest.ids if i[1] in "0123"]
-    test = [i for i in manifest.ids if i not in train]
-    return Split.from_ids(train=train, test=test, manifest=manifest.digest)
 
 
 def test_an_autoencoder_that_does_not_fit_preset_or_start_is_rejected(small_manifest, tmp_path):

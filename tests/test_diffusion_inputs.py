@@ -13,8 +13,9 @@ from PIL import Image
 
 from forge.models import arrays, make_encoders, make_pipeline
 from forge.pictures import photos
+from forge.worlds import by_video
 from palpate.cli import main
-from palpate.core import PalpateError, Split
+from palpate.core import PalpateError
 from palpate.diffusion.autoencoder import LatentStats
 from palpate.diffusion.denoiser import Denoiser, PhotoMap, inputs_of, lengths_of, slots_of
 from palpate.diffusion.generation import generate
@@ -27,12 +28,6 @@ from palpate.training.options import LoopOptions
 from palpate.training.steps import Step
 
 GVST = ConditionPolicy(width=8, source="resnet", photo_size=16, photo_width=4)
-
-
-def by_video(manifest):
-    train = [i for i in manifest.ids if i < "v4"]
-    test = [i for i in manifest.ids if i not in train]
-    return Split.from_ids(train=train, test=test, manifest=manifest.digest)
 
 
 @pytest.mark.parametrize(("size", "width"), [(16, 4), (64, 32), (256, 64)])

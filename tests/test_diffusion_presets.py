@@ -9,8 +9,9 @@ import torch
 from diffusers import UNet2DConditionModel
 from safetensors import safe_open
 
+from forge.worlds import by_video
 from palpate.cli import main
-from palpate.core import PalpateError, Split
+from palpate.core import PalpateError
 from palpate.diffusion.autoencoder import LatentStats
 from palpate.diffusion.denoiser import load_unet
 from palpate.diffusion.options import ConditionPolicy
@@ -28,9 +29,7 @@ UNET = {"attention_head_dim": 8, "cross_attention_dim": 128, "sample_size": 16}
 def tag(small_manifest, tmp_path, monkeypatch):
     """A data set and a split of it by video, saved in the working directory."""
     monkeypatch.chdir(tmp_path)
-    train = [i for i in small_manifest.ids if i < "v4"]
-    test = [i for i in small_manifest.ids if i not in train]
-    split = Split.from_ids(train=train, test=test, manifest=small_manifest.digest)
+    split = by_video(small_manifest)
     small_manifest.save(tmp_path / "tag" / "manifest.parquet")
     split.save(tmp_path / "split.json")
     return small_manifest, split

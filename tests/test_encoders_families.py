@@ -19,13 +19,13 @@ from transformers import (
     SiglipModel,
 )
 
+from forge.worlds import by_video
 from palpate import probe
 from palpate.core import PalpateError
 from palpate.data.manifest import Manifest
 from palpate.encoders import Encoder, EncoderSet
 from palpate.encoders.tokenizer import save_tokenizer, train_tokenizer
 from palpate.report.notes import sentence
-from test_evaluation_guard import by_video
 
 SIZE = {"hidden_size": 32, "intermediate_size": 64, "num_hidden_layers": 2}
 SIZE |= {"num_attention_heads": 2}

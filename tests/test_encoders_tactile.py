@@ -12,6 +12,7 @@ from PIL import Image
 from safetensors.torch import save_file
 from torch.nn.functional import conv2d, gelu, layer_norm, linear, normalize
 
+from forge.worlds import by_video
 from palpate import probe, score
 from palpate.core import PalpateError
 from palpate.data.manifest import Manifest
@@ -20,7 +21,6 @@ from palpate.encoders.embed import embed
 from palpate.encoders.preprocess import prepared_images
 from palpate.encoders.presets import preset
 from palpate.encoders.tactile import load_tactile
-from test_evaluation_guard import by_video
 
 WIDTH, DEPTH, HEADS = 128, 2, 2
 

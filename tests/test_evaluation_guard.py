@@ -10,22 +10,15 @@ from PIL import Image
 from safetensors.numpy import save_file
 
 from forge.models import make_encoders
+from forge.worlds import by_video
 from palpate import audit, probe, score
-from palpate.core import PalpateError, Split
+from palpate.core import PalpateError
 from palpate.data.manifest import Manifest
 from palpate.encoders import Encoder, EncoderSet, train_encoder
 from palpate.encoders.preprocess import digest_images, union
 from palpate.evaluation.inputs import guard
 from palpate.report.notes import COMMAND_LINE, sentence
 from palpate.report.terminal import audit_text
-
-
-def by_video(manifest, *train):
-    """A split with these videos in train and the others in test."""
-    videos = manifest.column("video")
-    ids = list(zip(manifest.ids, videos, strict=True))
-    parts = ([i for i, v in ids if (v in train) == part] for part in (True, False))
-    return Split.from_ids(train=next(parts), test=next(parts), manifest=manifest.digest)
 
 
 @pytest.fixture(scope="module")

@@ -14,8 +14,8 @@ from filelock import FileLock
 from torch import nn
 from transformers import CLIPConfig, CLIPModel
 
+from forge.worlds import by_video
 from palpate.cli import main
-from palpate.core import Split
 from palpate.encoders.contrastive import new_clip, plan_encoder, train_tactile
 from palpate.encoders.encoder_set import ClipEncoders, EncoderSet, new_tactile
 from palpate.encoders.preprocess import Preprocess
@@ -31,9 +31,7 @@ MEMORY = 14e9  # of the largest: weights, gradient, moments, their copies for th
 @pytest.fixture
 def split(small_manifest):
     """Four videos of three materials to train on, two to test."""
-    train = [i for i in small_manifest.ids if i < "v4"]
-    test = [i for i in small_manifest.ids if i not in train]
-    return Split.from_ids(train=train, test=test, manifest=small_manifest.digest)
+    return by_video(small_manifest)
 
 
 #: Take a minute or 15 GB; `paper` of the generator takes its step in test_diffusion_presets.
