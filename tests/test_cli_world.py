@@ -1,16 +1,13 @@
 """``palpate world``: every option of a world can be given, and the others come from the preset."""
 
 import dataclasses
-import inspect
 
 import pytest
 
 from palpate.cli import main
-from palpate.cli.presets import attributes
 from palpate.cli.terminal import join_help_lines, parse
 from palpate.cli.world import Options, world_options
 from palpate.sim import MATERIALS, PRESETS, WorldOptions
-from palpate.training.options import LoopOptions
 
 SMALL = PRESETS["small"]
 
@@ -68,12 +65,3 @@ def test_groups_that_a_verb_makes_need_no_source(monkeypatch):
     group = Options.__dataclass_fields__["world"].default_factory
     monkeypatch.setattr(group, "__module__", "palpate.cli.world")
     join_help_lines(Options)
-
-
-def test_texts_of_attributes_are_read_from_docstrings_with_and_without_indentation():
-    texts = []
-    for doc in (LoopOptions.__doc__, inspect.cleandoc(LoopOptions.__doc__)):
-        record = type("Record", (), {"__doc__": doc})
-        texts.append(attributes(record))
-    assert texts[0] == texts[1]
-    assert "weight_decay" in texts[0]

@@ -100,7 +100,7 @@ def test_photos_drive_it_without_encoders_and_it_comes_back_from_its_folder(tmp_
     "change", [{"photo_size": 48}, {"photo_size": 8}, {"photo_width": 6}, {"photo_width": 0}]
 )
 def test_sizes_that_do_not_halve_to_8_are_rejected(change):
-    with pytest.raises(PalpateError, match=r"`photo_(size|width)` must be a "):
+    with pytest.raises(PalpateError, match=r"`condition.photo_(size|width)` must be a "):
         replace(TINY, condition=replace(GVST, **change))
 
 
@@ -111,10 +111,9 @@ def test_gvst_from_the_command_line_needs_no_text_and_no_encoder(
     small_manifest.save(tmp_path / "tag" / "manifest.parquet")
     by_video(small_manifest).save(tmp_path / "split.json")
     command = ["train", "generator", "tag", "--split", "split.json", "--preset", "tiny"]
-    small = ["--condition-photo-size", "16", "--condition-photo-width", "4"]
-    assert (
-        main([*command, "--source", "resnet", *small, "--steps", "2", "-o", "gvst", "--json"]) == 0
-    )
+    gvst = ["source=resnet", "photo_size=16", "photo_width=4"]
+    small = ["--set", *(f"condition.{field}" for field in gvst), "--steps", "2"]
+    assert main([*command, *small, "-o", "gvst", "--json"]) == 0
     facts = json.loads(capsys.readouterr().out)
     assert (facts["source"], facts["text_source"]) == ("resnet", None)
     assert not (tmp_path / "gvst" / "encoders").exists()
@@ -124,7 +123,7 @@ def test_gvst_from_the_command_line_needs_no_text_and_no_encoder(
     capsys.readouterr()
     assert main(["generate", "--text", "rough", "--model", "gvst", "-o", "u.png"]) == 2
     assert "--text must be left out" in capsys.readouterr().err
-    assert main([*command, "--source", "text", "-o", "no"]) == 2
+    assert main([*command, "--set", "condition.source=text", "-o", "no"]) == 2
     assert "--clip must have text and vision" in capsys.readouterr().err
 
 

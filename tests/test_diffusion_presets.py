@@ -99,7 +99,7 @@ def test_paper_takes_a_real_step(tmp_path):
 def test_a_trained_unet_goes_on_from_its_folder(tag, tmp_path, capsys):
     start = write_unet(tmp_path / "ldm")
     command = ["train", "generator", "tag", "--split", "split.json", "--preset", "tiny"]
-    small = ["--size", "64", "--clip", "palpate/mini", "--unet", "ldm", "--warmup", "500"]
+    small = ["--clip", "palpate/mini", "--set", "size=64", "unet=ldm", "loop.warmup=500"]
     assert main([*command, *small, "--steps", "1", "-o", "model", "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["steps"] == 1
     pipeline = TactilePipeline.from_pretrained(tmp_path / "model", device="cpu")

@@ -5,19 +5,16 @@ import os
 import signal
 import subprocess
 import sys
-from typing import get_args
 
 import numpy as np
 import pytest
 from PIL import Image
 
 from palpate.cli import main
-from palpate.cli.presets import EncoderPresetName
 from palpate.core import PalpateError, Split
 from palpate.data import Manifest
 
 pytest.importorskip("torch")
-from palpate.encoders.presets import PRESETS
 from palpate.studies.split_study import compare_splits
 
 
@@ -115,19 +112,19 @@ def test_a_field_of_a_preset_is_switched_off_or_refused(capsys, monkeypatch, tmp
 
     monkeypatch.setattr("palpate.encoders.contrastive.train_encoder", stop)
     train = ["train", "encoder", str(tmp_path), "-o", "none", "--preset", "tiny"]
-    assert main([*train, "--clip-norm", "none", "--lr", "0.5"]) == 2
+    fields = ["tactile_course.clip_norm=none", "tactile_course.lr=0.5"]
+    assert main([*train, "--set", *fields]) == 2
     course = presets[0].tactile_course
     assert (course.clip_norm, course.lr, course.patience) == (None, 0.5, None)
     for words, must in (
-        (("--warmup", "1.5"), "--warmup must lie in [0, 1]"),
-        (("--augment-crop", "5"), "--augment-crop must lie in [0, 0.99]"),
+        ("tactile_course.warmup=1.5", "--set tactile_course.warmup must lie in [0, 1]"),
+        (
+            "tactile_course.augment.crop=5",
+            "--set tactile_course.augment.crop must lie in [0, 0.99]",
+        ),
     ):
-        assert main([*train, *words]) == 2
+        assert main([*train, "--set", words]) == 2
         assert must in capsys.readouterr().err
-
-
-def test_every_preset_of_train_encoder_is_taken():
-    assert set(get_args(EncoderPresetName)) == set(PRESETS)
 
 
 def test_a_study_needs_seeds_and_either_encoders_or_training(data, tmp_path, capsys, monkeypatch):

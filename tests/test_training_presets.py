@@ -91,8 +91,9 @@ def test_the_paper_s_preset_from_training_to_the_probe(
     small_manifest.save(tmp_path / "tag" / "manifest.parquet")
     split.save(tmp_path / "split.json")
     where = ["tag", "--split", "split.json"]
-    size = ["--tactile-width", "32", "--tactile-layers", "2", "--tactile-heads", "2"]
-    course = ["--clip", "clip", "--batch-size", "8", "--epochs", "1", "--chunk", "4", "-o", "out"]
+    size = ["--set", "tactile.width=32", "tactile.layers=2", "tactile.heads=2"]
+    size += ["--set", "tactile_course.batch=8"]
+    course = ["--clip", "clip", "--epochs", "1", "--chunk", "4", "-o", "out"]
     assert main(["train", "encoder", *where, "--preset", "paper", *size, *course]) == 0
     encoders = EncoderSet.load(tmp_path / "out")
     assert encoders.tactile.config.patch_size == 14

@@ -64,8 +64,9 @@ def close(one, two):
 
 @pytest.mark.slow
 def test_two_processes_take_the_steps_of_one(place):
-    run(place, "encoder", "one", "--evaluations", "2", "--keep", "best")
-    out = run(place, "encoder", "two", "--evaluations", "2", "--keep", "best", processes=2)
+    keep = ["--set", "tactile_course.evaluations=2", "tactile_course.keep=best"]
+    run(place, "encoder", "one", *keep)
+    out = run(place, "encoder", "two", *keep, processes=2)
     assert "processes" in out
     assert out.count("Encoders two") == 1  # the first process alone prints
     assert EncoderSet.load(place / "two").card["processes"] == 2
@@ -158,7 +159,7 @@ def test_what_all_processes_raise_is_printed_once(place):
         assert done.returncode != 0
         return [line for line in done.stderr.splitlines() if line.startswith("palpate train")]
 
-    (line,) = stderr("--lr", "1e30")
+    (line,) = stderr("--set", "tactile_course.lr=1e30")
     assert "must be finite" in line
-    (line,) = stderr("--batch-size", "7")
-    assert "--batch-size must be a multiple of the 2 processes. Got 7. " in line
+    (line,) = stderr("--set", "tactile_course.batch=7")
+    assert "--set tactile_course.batch must be a multiple of the 2 processes. Got 7. " in line

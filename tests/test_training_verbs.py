@@ -69,10 +69,10 @@ def test_encoders_and_a_generator_from_the_command_line(data, tmp_path, capsys, 
     # From the command's own model: its encoders and autoencoder, and its record goes with it.
     capsys.readouterr()
     started = ["train", "generator", *common, "--start", "model", "-o", "on"]
-    for idle in (["--sampler-guidance", "2"], ["--unet-layers", "3"]):  # one is as in the preset
-        assert main([*started, *idle]) == 2
+    for idle in ("sampler.guidance=2", "unet.layers=3"):  # one is as in the preset
+        assert main([*started, "--set", idle]) == 2
         error = " ".join(capsys.readouterr().err.split())
-        assert f"{idle[0]} must be left out with a generator to go on from" in error
+        assert f"--set {idle} must be left out with a generator to go on from" in error
     assert (
         main(["train", "generator", *common, "--start", "model", "--steps", "1", "-o", "on"]) == 0
     )
@@ -95,8 +95,9 @@ def test_encoders_and_a_generator_from_the_command_line(data, tmp_path, capsys, 
 def test_a_loss_that_is_no_number_ends_a_generator_in_one_line(data, tmp_path, capsys, monkeypatch):
     monkeypatch.chdir(tmp_path)
     command = ["train", "generator", "tag", "--split", "split.json", "--preset", "tiny", "--quiet"]
-    options = ["--source", "resnet", "--condition-photo-size", "16", "--condition-photo-width", "4"]
-    harm = ["--lr", "1e30", "--warmup", "0", "--steps", "4"]
+    options = ["--set", "condition.source=resnet", "condition.photo_size=16"]
+    options += ["condition.photo_width=4"]
+    harm = ["--set", "loop.lr=1e30", "loop.warmup=0", "--steps", "4"]
     assert main([*command, *options, *harm, "-o", "model"]) == 2
     (line,) = capsys.readouterr().err.strip().splitlines()
     assert "of generator must be finite. Got nan at step" in line

@@ -2,18 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
-from typing import Any, Literal
+from dataclasses import dataclass
+from typing import Any
 
-from palpate.cli.presets import EncoderPresetName, Training, preset_flags, print_plan, with_flags
 from palpate.cli.terminal import Switch, Terminal, require_extra
-from palpate.encoders.presets import PRESETS, EncoderPreset
-
-_SKIP = ("name", "cost", "pretrained", "tactile_course.epochs", "targets")
-#: Of the vision and text encoders that are trained first where none are given.
-_CLIP = ("clip_course", "vision", "text", "dim", "vocabulary", "context")
-_FLAGS = ("tactile_course", _SKIP + _CLIP)
-_Preset = preset_flags("Preset", EncoderPreset, *_FLAGS)
+from palpate.cli.training import PRESETS, Training, print_plan
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -23,30 +16,22 @@ class Options(Training):
     clip: str | None = None
     """Hub id or folder of a pretrained CLIP, or palpate/mini. Default: the preset's, or a small one
     that is trained first on the same train part."""
-    preset: EncoderPresetName = "mini"
-    """Size and course; `tvl-*` are TVL's and `paper` is the paper's, for GPUs."""
     epochs: float | None = None
-    """Default: the preset's."""
-    targets: Literal["diagonal", "identical-text", "soft-text"] | None = None
-    """`diagonal` is the paper's loss; `identical-text` counts equal captions as positives;
-    `soft-text` is TVL's. Default: the preset's."""
+    """Passes over the train part. Default: the preset's."""
     dry_run: Switch = False
     """Print parameters, steps and time, and stop."""
-    fields: _Preset = field(default_factory=_Preset)  # pyright: ignore[reportInvalidTypeForm]
-    """Fields of the preset."""
 
 
 def run(options: Options, terminal: Terminal) -> dict[str, Any]:
     """Train, and print the accuracy of a linear material probe on the test part."""
     require_extra("palpate train encoder")
+    preset = PRESETS["train encoder"].preset(options.preset, options.settings)
     options.require_data()
     from palpate.encoders.contrastive import plan_encoder, train_encoder
 
-    preset = with_flags(PRESETS[options.preset], options.fields, *_FLAGS)
     data, machine = (options.data, options.split), options.machine
     if options.dry_run:
-        how: dict[str, Any] = {"epochs": options.epochs, "device": machine.device}
-        plan = plan_encoder(*data, preset=preset, **how)
+        plan = plan_encoder(*data, preset=preset, epochs=options.epochs, device=machine.device)
         return print_plan(terminal, f"Plan of {options.output}", plan)
     with terminal.progress() as progress:
         encoders = train_encoder(
@@ -55,7 +40,6 @@ def run(options: Options, terminal: Terminal) -> dict[str, Any]:
             clip=options.clip,
             output=options.output,
             epochs=options.epochs,
-            targets=options.targets,
             seed=options.seed,
             device=machine.device,
             compute=machine.compute,

@@ -8,7 +8,6 @@ from typing import Annotated, Any, Literal
 
 import tyro
 
-from palpate.cli.presets import EncoderPresetName, Machine
 from palpate.cli.terminal import (
     Common,
     OptionalOutPath,
@@ -17,6 +16,7 @@ from palpate.cli.terminal import (
     guard_output,
     require_extra,
 )
+from palpate.cli.training import Machine
 from palpate.core import PalpateError
 
 
@@ -28,7 +28,7 @@ class Training:
 
     train: Switch = False
     """Train and score one encoder for each split and seed. Run again to resume."""
-    preset: EncoderPresetName = "mini"
+    preset: str = "mini"
     """As in `palpate train encoder`."""
     clip: str | None = None
     """As in `palpate train encoder`."""

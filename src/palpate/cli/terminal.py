@@ -64,9 +64,10 @@ OPTION_NAMES: dict[tuple[str, str], str] = {
     ("audit", "test"): "TEST",
     ("caption check", "captions"): "CAPTIONS",
     ("", "columns"): "--map",
-    ("train encoder", "batch"): "--batch-size",
-    ("train generator", "batch"): "--batch-size",
-    ("train generator", "dropout"): "--condition-dropout",
+    ("train encoder", "batch"): "--set tactile_course.batch",
+    ("train generator", "batch"): "--set loop.batch",
+    ("train generator", "source"): "--set condition.source",
+    ("presets", "name"): "NAME",
     ("", "side"): "--as",
     ("", "data"): "PATH",
     ("", "source"): "PATH",
@@ -319,7 +320,12 @@ def _option_names(options: type[Any]) -> list[str]:
 
 
 def option_name(verb: str, argument: str) -> str:
-    """Return how the command line writes an argument of the verb's function."""
+    """Return how the command line writes an argument of the verb's function.
+
+    A name with a dot is a field of a preset.
+    """
+    if "." in argument:
+        return f"--set {argument}"
     name = OPTION_NAMES.get((verb, argument)) or OPTION_NAMES.get(("", argument))
     return name or f"--{argument.replace('_', '-')}"
 

@@ -70,6 +70,11 @@ VERBS: dict[str, Verb] = {
         "Train a generator of tactile images",
         "palpate train generator tag/ --split noleak.json --clip encoders/ -o model/",
     ),
+    "presets": Verb(
+        "presets",
+        "List complete configurations of the trainings, or the fields of one",
+        "palpate presets mini",
+    ),
     "generate": Verb(
         "generate", "Make tactile images for photos", "palpate generate photo.jpg -o tactile.png"
     ),

@@ -95,7 +95,7 @@ def train_autoencoder(
     factor = options.patch * 2 ** (len(options.widths) - 1)
     if side % factor or side > min(images.shape[1:3]):
         must, got = f"must be a multiple of {factor} that fits into the images", f"{side}"
-        raise PalpateError(must, got, "Choose another", argument="crop")
+        raise PalpateError(must, got, "Choose another", argument="autoencoder.crop")
     with seeded(seed, "autoencoder"):
         model = copy.deepcopy(start) if start is not None else build_autoencoder(options)
     model.requires_grad_(True).to(device)

@@ -61,7 +61,7 @@ def train_background_autoencoder(
     side = options.crop or images.shape[1]
     if side % 4 or side > min(images.shape[1:3]):
         must = "must be a multiple of 4 that fits into the images"
-        raise PalpateError(must, f"{side}", "Choose another", argument="crop")
+        raise PalpateError(must, f"{side}", "Choose another", argument="autoencoder.crop")
     if start is None:
         with seeded(seed, "background autoencoder"):
             model = BackgroundAutoencoder(options.channels, options.narrow, options.wide)

@@ -21,15 +21,17 @@ class AutoencoderOptions:
     """Shape and training of a VQ autoencoder.
 
     Attributes:
-        patch: side of the patches of the stem (1: none).
+        patch: side of the patches of the stem; 1: none [px].
         widths: channels of each resolution level; each level after the first halves the size.
         layers: residual blocks a level.
         codes: entries of the codebook.
         channels: latent channels.
         groups: of the group normalization.
-        steps_free, steps_quantized: optimizer steps of the two stages.
-        batch, lr: of both stages; the last starts at half the rate.
-        crop: side of the random crops of stage 1 in pixels (0: whole images).
+        steps_free: length of the first stage [optimizer steps].
+        steps_quantized: length of the second stage [optimizer steps].
+        batch: of both stages [images].
+        lr: peak learning rate; the last stage starts at half of it.
+        crop: side of the random crops of stage 1; 0: whole images [px].
     """
 
     patch: int = 4
@@ -51,9 +53,12 @@ class BackgroundOptions:
 
     Attributes:
         channels: latent channels.
-        narrow, wide: channels of the networks at half and at a quarter of the size.
-        steps, batch, lr: of the training.
-        crop: side of the random crops in pixels, a multiple of 4 (0: whole images).
+        narrow: channels of the networks at half of the size.
+        wide: channels of the networks at a quarter of the size.
+        steps: length of the training [optimizer steps].
+        batch: of the training [images].
+        lr: peak learning rate.
+        crop: side of the random crops, a multiple of 4; 0: whole images [px].
     """
 
     channels: int = 8
@@ -106,7 +111,7 @@ class ConditionPolicy:
             without text), ``both`` (two tokens: text, then photo), ``resnet`` (that baseline as
             published, GVST: 8 x 8 tokens that a residual network makes of the photo; it is trained
             with the denoiser, and no encoder is needed).
-        photo_size: of ``resnet``: side of the photos in pixels, a power of 2 from 16 on.
+        photo_size: of ``resnet``: side of the photos, a power of 2 from 16 on [px].
         photo_width: of ``resnet``: channels of its first level, a multiple of 4; each further level
             halves the size and doubles them, up to eight times.
         patches: tokens that follow the embedding of a photo: the states of its patches in the
@@ -139,10 +144,11 @@ class Schedule:
     t = sigmoid(normal(0.5, 1)) in training (Esser et al. 2024).
 
     Attributes:
-        beta_start, beta_end: first and last beta; sqrt(beta) is linear between them
-            (diffusers' ``scaled_linear``); not of ``flow``.
-        steps: T; a time in [0, 1] goes into the network as T t.
-        prediction: see above.
+        beta_start: the first beta; sqrt(beta) is linear to the last (diffusers'
+            ``scaled_linear``); not of ``flow``.
+        beta_end: the last beta.
+        steps: T; a time from 0 to 1 goes into the network as T t.
+        prediction: what the network predicts: the noise, or the velocity of flow matching.
     """
 
     beta_start: float = 0.0015
@@ -165,9 +171,9 @@ class SamplerOptions:
 
     Attributes:
         method: ``dpm`` (DPM-Solver++ of order 2), or ``ddim`` (eta 0), for epsilon alone.
-        steps: network evaluations per sample (two each under guidance).
+        steps: network evaluations a sample; two each under guidance.
         guidance: s; 1 means none.
-        batch: samples at once; results do not depend on it (up to rounding).
+        batch: at once; results do not depend on it, up to rounding [images].
         rescale: share phi of the guidance rescaling of Lin et al. (2024), which pulls the spread of
             the guided prediction back to that of the conditional one; 0 is the plain formula.
         high: guide only at times t / T up to this (Kynkaanniemi et al. 2024).

@@ -324,7 +324,10 @@ def train_tactile(  # noqa: PLR0913 - one row per choice of the training
 
 
 def _require_rows(
-    train: Manifest, options: LoopOptions, what: str = "samples", argument: str = "batch"
+    train: Manifest,
+    options: LoopOptions,
+    what: str = "samples",
+    argument: str = "tactile_course.batch",
 ) -> None:
     if len(train) == 1:
         must = f"The train part must hold two {what}: the loss compares them with each other"
@@ -337,7 +340,7 @@ def _require_rows(
 
 def _require_held_out(held: Manifest, options: LoopOptions) -> None:
     if not len(held) and (options.keep == "best" or options.patience):
-        name = "keep" if options.keep == "best" else "patience"
+        name = f"tactile_course.{'keep' if options.keep == 'best' else 'patience'}"
         must, fix = "needs a part val of the split", "Make one: palpate split --val 0.1"
         raise shared(PalpateError(must, "none", fix, argument=name))
     if len(held) == 1 and options.evaluations:
@@ -439,7 +442,7 @@ def train_clip(  # noqa: PLR0913 - as train_tactile
     train, side, missing = _pictured(train_part(manifest, split))
     course, words = _clip_course(preset), "photos" if side == "vision" else "samples"
     options = course.options(len(train), seed, epochs)
-    _require_rows(train, options, words, "clip_batch_size")
+    _require_rows(train, options, words, "clip_course.batch")
     texts, source = texts_of(train)
     how = Preprocess(preset.image, preset.image) if start is None else start.preprocess
     with first_alone():
@@ -549,7 +552,7 @@ def _facts(
     """What decides the result of a training run; also the run's key."""
     return {
         "preset": preset.name,
-        "settings": {k: v for k, v in asdict(preset).items() if k != "cost"},
+        "settings": {k: v for k, v in asdict(preset).items() if k not in ("cost", "score")},
         "options": options.facts,
         "seed": options.seed,
         "train_manifest": train.digest,

@@ -23,10 +23,10 @@ class LoopOptions:
     """What decides the result of a training.
 
     Attributes:
-        steps: optimizer steps in all.
-        batch: rows per step, over all processes.
+        steps: length in all [optimizer steps].
+        batch: of a step, over all processes [rows].
         lr: peak learning rate (the effective one; nothing multiplies it later).
-        warmup: steps of linear warm-up.
+        warmup: length of the linear warm-up [optimizer steps].
         decay: ``cosine`` to zero after the warm-up, or ``constant``.
         weight_decay: of AdamW; applied to parameters of two or more dimensions.
         clip_norm: largest gradient norm, or None.
@@ -45,7 +45,7 @@ class LoopOptions:
     batch: int
     lr: float
     warmup: int = 20
-    decay: str = "cosine"
+    decay: Literal["cosine", "constant"] = "cosine"
     weight_decay: float = 0.01
     clip_norm: float | None = 1.0
     ema: float | None = None
@@ -53,7 +53,7 @@ class LoopOptions:
     betas: tuple[float, float] = (0.9, 0.999)
     evaluations: int = 10
     patience: int | None = None
-    keep: str = "last"
+    keep: Literal["last", "best"] = "last"
 
     def __post_init__(self) -> None:
         valid = {

@@ -1,0 +1,100 @@
+"""What the verbs that train share: data, output, preset, and how to run it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, fields
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import tyro
+
+from palpate.cli.settings import PresetTable, Settings
+from palpate.cli.terminal import Common, OutPath, Switch, Terminal
+from palpate.diffusion.presets import PRESETS as GENERATORS
+from palpate.diffusion.presets import DiffusionPreset
+from palpate.encoders.presets import PRESETS as ENCODERS
+from palpate.training.options import Compute
+
+_TEXTS = {"name": "", "cost": "", "score": ""}
+#: The presets of each verb, and what ``--set`` leaves to other options.
+PRESETS = {
+    "train encoder": PresetTable(
+        ENCODERS, {**_TEXTS, "pretrained": "--clip", "tactile_course.epochs": "--epochs"}
+    ),
+    "train autoencoder": PresetTable(
+        {name: preset for name, preset in GENERATORS.items() if preset.autoencoder},
+        {f.name: "" for f in fields(DiffusionPreset) if f.name not in ("size", "autoencoder")},
+    ),
+    "train generator": PresetTable(
+        GENERATORS,
+        {
+            **_TEXTS,
+            "condition.width": "",
+            "epochs": "--epochs",
+            "loop.steps": "--steps",
+            "loop.seed": "--seed",
+        },
+    ),
+}
+
+
+@dataclass(frozen=True, kw_only=True)
+class Machine:
+    """How to run it on the machine at hand; nothing here changes what is computed."""
+
+    device: str = "auto"
+    """auto, cpu, cuda, mps."""
+    precision: Literal["float32", "bf16", "fp16"] = "float32"
+    """Of matrix products; the weights stay float32. bf16 is float32 on an x86 CPU without bf16."""
+    tf32: bool = True
+    """Let float32 products on CUDA round their factors to 10 bits."""
+    compile: Switch = False
+    """Compile the loss with torch.compile: minutes at the start, faster steps."""
+    channels_last: Switch = False
+    """Memory layout of convolutions."""
+    gradient_checkpointing: Switch = False
+    """Compute activations twice instead of keeping them."""
+    chunk: int | None = None
+    """Rows that a contrastive encoder sees at a time; the loss is that of the whole batch."""
+    checkpoint_minutes: float = 5.0
+    """Time between checkpoints."""
+    trackers: tuple[Literal["tensorboard", "wandb"], ...] = ()
+    """Where the log goes, too."""
+
+    @property
+    def compute(self) -> Compute:
+        """The settings as the rooms take them."""
+        return Compute(**{k: v for k, v in vars(self).items() if k != "device"})
+
+
+@dataclass(frozen=True, kw_only=True)
+class Training(Common):
+    """What all trainings take."""
+
+    data: Annotated[Path, tyro.conf.Positional]
+    """Manifest file, the folder of an import, or a data set."""
+    output: OutPath
+    """Folder for what is trained; must be new or empty."""
+    split: Path | None = None
+    """Split file; only its train part is trained on. Default: the one that lies with the data, in
+    `splits/`."""
+    preset: str = "mini"
+    """Size and course; `palpate presets` lists all, with what each takes."""
+    settings: Settings = ()
+    """Fields of the preset, as `loop.lr=3e-4`; `palpate presets NAME` lists all."""
+    seed: int = 0
+    """Of everything random: weights, order, augmentation, noise."""
+    machine: Machine = field(default_factory=Machine)
+    """How to run it on the machine at hand."""
+
+    def require_data(self) -> None:
+        """Raise ``PalpateError`` if the data are not there, before torch is imported (seconds)."""
+        from palpate.data.importing import require_source
+
+        require_source(self.data)
+
+
+def print_plan(terminal: Terminal, title: str, plan: dict[str, Any]) -> dict[str, Any]:
+    """Print what a training would take, and return it."""
+    terminal.facts(title, plan | {"seconds": f"{plan['seconds']:,.0f}"})
+    return plan
