@@ -89,7 +89,7 @@ class Training(Common):
 
     def require_data(self) -> None:
         """Raise ``PalpateError`` if the data are not there, before torch is imported (seconds)."""
-        from palpate.data.importing import require_source
+        from palpate.data.formats import require_source
 
         require_source(self.data)
 
