@@ -1,17 +1,20 @@
 """Several processes, kills and flags: `palpate train` as users start it."""
 
 import hashlib
+import io
 import json
 import os
 import subprocess
 import sys
 import time
+from contextlib import chdir, redirect_stdout
 from pathlib import Path
 
 import numpy as np
 import psutil
 import pytest
 
+from palpate.cli import main
 from palpate.core import Split
 from palpate.encoders import EncoderSet
 
@@ -42,10 +45,14 @@ def command(kind, output, *more, processes=1):
     return [*start, "palpate", "train", kind, *where, "--checkpoint-minutes", "0", *more]
 
 
-def run(place, *args, **kwargs):
-    done = subprocess.run(
-        command(*args, **kwargs), cwd=place, env=ENV, capture_output=True, text=True, check=False
-    )
+def run(place, *args, processes=1):
+    """What a training prints; one process is this one."""
+    words = command(*args, processes=processes)
+    if processes == 1:
+        with chdir(place), redirect_stdout(io.StringIO()) as out:
+            assert main(words[words.index("train") :]) == 0
+        return out.getvalue()
+    done = subprocess.run(words, cwd=place, env=ENV, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr[-2000:]
     return done.stdout
 
@@ -88,13 +95,9 @@ def test_killed_again_and_again_it_ends_in_the_same_bytes(place, processes, most
     rng, log = np.random.default_rng(0), place / ".killed.work" / "tactile" / "log.jsonl"
     kills = 0
     for _ in range(most):
-        process = psutil.Popen(
-            command("encoder", "killed", *more, processes=processes),
-            cwd=place,
-            env=ENV,
-            stdout=subprocess.DEVNULL,
-            stderr=subprocess.DEVNULL,
-        )
+        words = command("encoder", "killed", *more, processes=processes)
+        quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
+        process = psutil.Popen(words, cwd=place, env=ENV, **quiet)
         while process.poll() is None and not log.exists():
             time.sleep(0.02)
         time.sleep(rng.uniform(0, 0.3))
@@ -153,9 +156,7 @@ def test_when_a_process_dies_the_others_end_without_a_traceback_and_the_run_can_
 def test_what_all_processes_raise_is_printed_once(place):
     def stderr(*more):
         parts = command("encoder", "out", "--clip", "palpate/mini", *more, processes=2)
-        done = subprocess.run(
-            parts, cwd=place, env=ENV, capture_output=True, text=True, check=False
-        )
+        done = subprocess.run(parts, cwd=place, env=ENV, capture_output=True, text=True)
         assert done.returncode != 0
         return [line for line in done.stderr.splitlines() if line.startswith("palpate train")]
 
