@@ -11,7 +11,7 @@ from palpate.core import PalpateError
 from palpate.diffusion.autoencoder import LatentStats
 from palpate.diffusion.denoiser import Denoiser, build_unet
 from palpate.diffusion.options import ConditionPolicy, Schedule, UNetOptions
-from palpate.diffusion.presets import MINI, PAPER, PRESETS, preset_named
+from palpate.diffusion.presets import MINI, PAPER, PRESETS, SMALL, preset_named
 from palpate.diffusion.training import DiffusionLoss, train_denoiser
 from palpate.training.options import LoopOptions
 from palpate.training.steps import Step
@@ -34,9 +34,11 @@ def denoiser(policy: ConditionPolicy = POLICY, *, background: bool = False, mean
 def test_the_papers_unet_has_the_parameters_of_latent_diffusion():
     with torch.device("meta"):
         net = build_unet(PAPER.unet, PAPER.condition, channels=3, size=64)
+        small = build_unet(SMALL.unet, SMALL.condition, channels=8, size=SMALL.size // 4)
         wide = build_unet(PAPER.unet, PAPER.condition, channels=3, size=64, background=3)
     count = sum(p.numel() for p in net.parameters())
     assert round(count / 1e6, 1) == 406.3
+    assert round(sum(p.numel() for p in small.parameters()) / 1e6) == 64
     # w/ BG adds three input channels to the first 3 x 3 convolution and nothing else.
     assert sum(p.numel() for p in wide.parameters()) - count == 3 * 192 * 9
     # Attention at 1/2, 1/4 and 1/8 with heads of 32 channels.
