@@ -20,6 +20,7 @@ from palpate.core import Split
 from palpate.data.importing import import_dataset
 from palpate.encoders.encoder_set import load_clip
 from palpate.leakage import split as leak_free_split
+from palpate.report.labels import measured
 from palpate.sim import PRESETS, write_world
 from palpate.studies.split_study import compare_splits
 
@@ -69,8 +70,8 @@ def table(results):
         "| score | chance | Orig, % | NoLeak, % | drop, points | drop, % of Orig |",
         "|---|---|---|---|---|---|",
     ]
-    for d in (s for s in results if s.metric.endswith(" difference")):
-        metric = d.metric.removesuffix(" difference")
+    for d in (s for s in results if s.b is not None):
+        metric = measured(d)
         if not re.fullmatch(SHOWN, metric):
             continue
         a, b = results[metric, "Orig"], results[metric, "NoLeak"]
@@ -105,7 +106,7 @@ def page(studies, command, seeds):
         )
         seconds = [row["seconds"] for row in results.settings["trainings"].values()]
         videos = len(set(manifest.column("video")))
-        drops = [s for s in results if s.metric.endswith(" difference")]
+        drops = [s for s in results if s.b is not None]
         sure = sum(bool(s.details["decided"]) and s.value > 0 for s in drops)
         parts.append(
             f"## {look}, {LOOKS[look]['leak']} leak\n\n{len(manifest)} contact frames, {len(set(manifest.column('contact')))} contacts, {videos} videos "

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from palpate.core import FeatureSet, Progress, Score, Split, digest_json
+from palpate.core import FeatureSet, Measure, Progress, Score, Split, digest_json
 from palpate.data.images import cached_images
 from palpate.data.manifest import Manifest
 from palpate.diffusion.autoencoder import BackgroundAutoencoder
@@ -33,6 +33,7 @@ from palpate.metrics import tmmd
 from palpate.metrics.means import mean_of
 from palpate.metrics.probe import material_accuracy
 from palpate.metrics.retrieval import retrieval
+from palpate.report.labels import measured
 
 #: Touches generated for the generator's scores, evenly over the new world.
 GENERATED = 400
@@ -189,11 +190,11 @@ def score_generator(
         cache=cache,
         progress=progress,
     )
-    kept = ("TMMD", "material accuracy", "SSIM", "PSNR")
+    kept = tuple(map(Measure, ("TMMD", "material accuracy", "SSIM", "PSNR")))
     rows = [
-        _row(f"{s.metric}, {s.subject}", s, s.n)
+        _row(f"{measured(s)}, {s.a}", s, s.n)
         for s in scores
-        if s.metric in kept and s.value is not None
+        if s.measure in kept and s.b is None and s.value is not None
     ]
     known, real = (embed(part, encoders, "tactile", cache=cache) for part in (train, test))
     gels, ids = gels_of(test, pipeline.size, cache), test.ids

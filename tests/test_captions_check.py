@@ -37,7 +37,7 @@ def samples(tmp_path):
 
 
 def shares(results):
-    return {s.subject: s.value for s in results["share of captions"]}
+    return {s.a: s.value for s in results["share of captions"]}
 
 
 @pytest.mark.parametrize(
@@ -138,7 +138,7 @@ def test_texts_that_train_and_test_share(samples, tmp_path):
 
 
 def accuracies(results):
-    return {s.subject: s.value for s in results["material accuracy from the text"]}
+    return {s.a: s.value for s in results["material accuracy from the text"]}
 
 
 def test_codes_of_the_label_are_recognized_on_new_videos(samples):
@@ -206,7 +206,7 @@ def test_captions_of_tvl(real_data, capsys):
     path = real_data / "tvl" / "test_items.json"
     args = ["caption", "check", path, "--map", "text=label", "id=tactile_fp", "--json", "-q"]
     assert main([*map(str, args)]) == 0
-    scores = {s["subject"]: s for s in json.loads(capsys.readouterr().out)["scores"]}
+    scores = {s["a"]: s for s in json.loads(capsys.readouterr().out)["scores"]}
     assert {s["n"] for s in scores.values()} == {402}
     assert scores["naming a material"]["value"] == pytest.approx(73 / 402)
     assert scores["visual words"]["value"] == pytest.approx(103 / 402)

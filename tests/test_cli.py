@@ -129,7 +129,7 @@ def test_files_that_cannot_be_written_or_read_are_mistakes_too(
     odd.write_text(
         '{"format": "palpate-split/1", "rule": {}, "digest": "x", "parts": {"train": 3}}'
     )
-    row = {"metric": "m", "subject": "s", "value": "high"}
+    row = {"metric": "m", "a": "s", "value": "high"}
     scores.write_text(json.dumps({"format": "palpate-results/1", "title": "t", "scores": [row]}))
     for args, words in (
         (["audit", *lists, "-o", folder], f"{folder} must be writable"),

@@ -16,6 +16,7 @@ from forge.scores import IDS, LABELS, by_key, feature_sets
 from palpate.cli import main
 from palpate.core import Split
 from palpate.evaluation import scoring
+from palpate.report.labels import label_of, subject_of
 from palpate.report.results import Results
 
 PAIR = (
@@ -108,7 +109,8 @@ def test_embeddings_load_no_torch_and_the_results_make_a_page(sets):
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
-    assert {s.subject for s in Results.load(Path("s.json")).scores} == {"near", "far", "near - far"}
+    scores = Results.load(Path("s.json")).scores
+    assert {subject_of(s) for s in scores} == {"near", "far", "near - far"}
     assert Path("t.tex").read_text().startswith("% palpate")
     assert Path("page.html").is_file()
     assert "TMMD" in Path("p.html").read_text()
@@ -208,7 +210,7 @@ def test_probe_scores_material_and_retrieval(capsys, tmp_path, small_manifest):
     status, out, err = call(capsys, *args, verb="probe")
     assert status == 0, err
     results = Results.load(tmp_path / "p.json")
-    assert [s.metric for s in results.scores] == [
+    assert [label_of(s) for s in results.scores] == [
         *("material accuracy", "material accuracy, balanced"),
         *("material accuracy, 20-NN", "material accuracy, 20-NN, balanced"),
         *(f"top-{k} of 24 (vision by tactile)" for k in (1, 5, 10)),

@@ -122,7 +122,7 @@ def test_letters_that_a_stream_lacks_are_question_marks_and_json_stays_whole(her
     done = palpate(*SCORE, "--names", "grün", "--json", **ascii_only)
     assert (
         done.returncode,
-        {s["subject"] for s in json.loads(done.stdout.decode("ascii"))["scores"]},
+        {s["a"] for s in json.loads(done.stdout.decode("ascii"))["scores"]},
     ) == (0, {"grün"})
 
 

@@ -173,7 +173,7 @@ def test_a_score_is_a_number_that_prints_how_it_was_made():
 def test_scores_of_different_settings_share_no_column(change):
     a = Score("TMMD", "ours", 1.0, bandwidth=10.0, encoder="e1")
     same = Score("TMMD", "theirs", 2.0, bandwidth=10.0, encoder="e1")
-    assert set(columns([a, same, Score("SSIM", "ours", 0.5)])) == {"TMMD", "SSIM"}
+    assert [len(c) for c in columns([a, same, Score("SSIM", "ours", 0.5)])] == [2, 1]
     fields = {"bandwidth": 10.0, "encoder": "e1"} | change
     with pytest.raises(PalpateError, match=next(iter(change))):
         columns([a, Score("TMMD", "theirs", 2.0, **fields)])

@@ -96,7 +96,7 @@ def test_matched_videos_score_as_the_real_ones_do():
         test, train = videos_of(rng, "test", centers, 8), videos_of(rng, "train", centers, 16)
         sets = {"train": matched_features(train, test, seed)}
         result = compare(sets, test, floor=test, preset="grouped", sigma=10, permutations=0)
-        values.append([(s.value, s.floor) for s in result.scores if " E" not in s.metric][1:])
+        values.append([(s.value, s.floor) for s in result.scores if s.kind == "value"][1:])
     of_train, of_test = np.mean(values, axis=0).T
     assert len(of_test) == 3
     assert (of_test > 0.01).all()

@@ -13,6 +13,7 @@ from palpate.report.results import Results
 
 pytest.importorskip("torch")
 from forge.models import make_encoders
+from palpate.report.labels import label_of
 
 DIRECTIONS = [
     "text by tactile",
@@ -60,8 +61,8 @@ def test_one_call_gives_both_classifiers_and_retrieval_in_all_directions(
     for direction in DIRECTIONS:
         names += [f"top-{k} of 24 ({direction})" for k in (1, 5, 10)]
     medians = [f"median rank of 24 ({direction})" for direction in DIRECTIONS]
-    assert [s.metric for s in results] == names + medians
-    assert {s.subject for s in results} == {"real"}
+    assert [label_of(s) for s in results] == names + medians
+    assert {s.a for s in results} == {"real"}
     assert all(s.details["chance"] > 0 for s in results)
     accuracy = results["material accuracy", "real"]
     assert (accuracy.n, accuracy.split) == (24, split.digest)
@@ -103,14 +104,14 @@ def test_a_page_shows_confusions_and_what_was_retrieved(manifest, split, encoder
 
 def test_encoders_are_compared_on_the_same_videos(manifest, split, encoders):
     results = probe(manifest, split, encoder={"a": encoders, "b": make_encoders(7)}, top=(1,))
-    assert {s.subject for s in results if " difference" not in s.metric} == {"a", "b"}
+    assert {s.a for s in results if s.b is None} == {"a", "b"}
     difference = results["material accuracy difference", "a - b"]
     a, b = (results["material accuracy", name] for name in "ab")
     assert difference.value == pytest.approx(a.value - b.value)
     assert a.encoder != b.encoder
     # An encoder is no worse than itself, in any score.
     same = probe(manifest, split, encoder={"a": encoders, "b": encoders}, top=(1,))
-    assert {s.value for s in same if s.metric.endswith(" difference")} == {0.0}
+    assert {s.value for s in same if s.b is not None} == {0.0}
 
 
 def test_splits_are_compared_with_pools_of_one_size(manifest, encoders):
@@ -119,9 +120,9 @@ def test_splits_are_compared_with_pools_of_one_size(manifest, encoders):
         "NoLeak": split_of(manifest, "v0", "v5"),
     }
     results = probe(manifest, splits, encoder=encoders, top=(1,))
-    assert {
-        s.metric for s in results if s.metric.startswith("top-1") and "difference" not in s.metric
-    } == {f"top-1 of 16 ({direction})" for direction in DIRECTIONS}
+    assert {label_of(s) for s in results if s.metric == "top-1" and s.b is None} == {
+        f"top-1 of 16 ({direction})" for direction in DIRECTIONS
+    }
     pools = {s.details["pools"] for s in results["top-1 of 16 (text by tactile)"]}
     assert pools == {20, 1}
     assert any("points" in fact for fact in results.facts)
@@ -175,7 +176,7 @@ def test_samples_without_a_partner_are_left_out_and_counted(manifest, split, enc
         material=pl.lit(None, pl.String),
     )
     results = probe(some, split, encoder=encoders, top=(1,))
-    assert [s.metric for s in results] == [
+    assert [label_of(s) for s in results] == [
         "top-1 of 18 (vision by tactile)",
         "top-1 of 18 (tactile by vision)",
         "median rank of 18 (vision by tactile)",

@@ -20,6 +20,7 @@ from palpate.evaluation.controls import matched_features
 from palpate.metrics import Polynomial, compare, contact_scores, distance, i_tmmd, ssim
 from palpate.metrics.distributions import prdc_rows
 from palpate.metrics.intervals import spread_of_values
+from palpate.report.labels import label_of, subject_of
 
 SETS = feature_sets()
 TEST, TRAIN = IDS[:24], IDS[24:]
@@ -62,8 +63,8 @@ def test_embeddings_agree_with_loops_and_with_the_library():
     )
     library = compare(made, SETS["real"], floor=SETS["real"], preset="grouped")
     for s in [*library.scores, *library.differences]:
-        got = scores[s.metric, s.subject, "grouped"]
-        assert (got.value, got.interval, got.floor) == (s.value, s.interval, s.floor), s.metric
+        got = scores[label_of(s), subject_of(s), "grouped"]
+        assert (got.value, got.interval, got.floor) == (s.value, s.interval, s.floor), label_of(s)
     for metric in ("FID", "KID", "Precision", "Recall", "Density", "Coverage"):
         assert f"{metric} (embeddings)" in {m for m, _, _ in scores}
     assert results.settings["digests"] == {"encoder": "e" * 64, "reference": SETS["real"].digest}
@@ -430,8 +431,8 @@ def test_images_are_embedded_and_scored_as_their_features(tmp_path, small_manife
     ]
     made = embedded(Manifest.from_rows(rows, tmp_path / "a"), mini)
     for s in compare({"a": made}, real, floor=real, preset="grouped", permutations=19).scores:
-        got = scores[s.metric, "a", "grouped"].value
-        assert got == pytest.approx(s.value, rel=1e-6, abs=1e-6), s.metric
+        got = scores[label_of(s), "a", "grouped"].value
+        assert got == pytest.approx(s.value, rel=1e-6, abs=1e-6), label_of(s)
     metrics = {m for m, _, _ in scores}
     for metric in (
         "FID (tactile) difference",
@@ -492,7 +493,7 @@ def test_an_encoder_of_simulated_images_says_so_in_every_score(
     reference = Manifest(table, small_manifest.root, facts)
     results = score(tmp_path / "g", reference, encoder=mini, permutations=0)
     notes = {
-        s.metric: [n.params["real"] for n in s.notes if n.code == "synthetic-encoder"]
+        label_of(s): [n.params["real"] for n in s.notes if n.code == "synthetic-encoder"]
         for s in results
         if s.encoder
     }
@@ -515,7 +516,7 @@ def test_one_background_stands_for_all_images_of_a_folder(tmp_path, small_manife
     made = [np.asarray(Image.open(f)) for f in sorted((tmp_path / "g").rglob("*.png"))]
     want = contact_scores(np.stack(made), np.stack(pixels[1:]), pixels[0])
     for s in want:
-        got = results[s.metric, "g"]
+        got = results[label_of(s), "g"]
         assert got.value == pytest.approx(s.value)
         assert got.settings["background"] == s.settings["background"]
     with pytest.raises(PalpateError, match=r"background='gel\.png'"):
@@ -554,7 +555,7 @@ def test_tactile_images_without_photos_are_scored(tmp_path, small_manifest, mini
     ids = small_manifest.ids
     split = Split.from_ids(train=ids[:24], test=ids[24:], rule={}, manifest=reference.digest)
     results = score(tmp_path / "g", reference, encoder=mini, split=split, permutations=0)
-    subjects = {s.subject for s in results["TMMD"]}
+    subjects = {subject_of(s) for s in results["TMMD"]}
     assert subjects == {"g", "background only", "real, same material"}
     results.to_html(tmp_path / "page.html")
     labels = score(tmp_path / "g", reference, encoder=mini, labels="cluster:2", **FAST)

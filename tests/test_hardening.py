@@ -83,8 +83,8 @@ def typed_manifest(path: Path) -> None:
             ("r.json", RESULTS % fields, "report r.json -o p.html", words)
             for fields, words in (
                 (', "facts": 3', "facts of type int"),
-                (', "scores": [{"metric": "m", "subject": "s"}]', "'value'"),
-                (', "scores": [{"metric": "m", "subject": "s", "value": "high"}]', "of type str"),
+                (', "scores": [{"metric": "m", "a": "s"}]', "'value'"),
+                (', "scores": [{"metric": "m", "a": "s", "value": "high"}]', "of type str"),
                 (', "audits": [3]', "audits that holds no object"),
                 (', "wrong": 3', "unknown field wrong"),
             )

@@ -6,6 +6,7 @@ from scipy import stats
 
 from palpate.core import FeatureSet
 from palpate.metrics import ci_tmmd, compare, d_tmmd, four_scores, i_tmmd
+from palpate.report.labels import label_of, measured
 from test_metrics_tactile import change, codes, keep, world
 
 OFF_DIAGONAL = {"denominator": "mean_off_diagonal"}
@@ -216,8 +217,8 @@ def test_no_generator_is_nearer_to_a_floor_that_is_none(options):
             {"right": right, "collapsed": collapsed}, real, floor=real, permutations=0, **options
         )
         for d in found.differences:
-            excess = " E " in d.metric  # which does not depend on the number of frames
-            if d.metric.startswith(("I-", "CI-")):
+            excess = d.kind == "excess"  # which does not depend on the number of frames
+            if d.metric in ("I-TMMD", "CI-TMMD"):
                 assert (
                     (d.details["better"] is not None) == ("gap" in d.details) == (known or excess)
                 )
@@ -226,7 +227,7 @@ def test_no_generator_is_nearer_to_a_floor_that_is_none(options):
     found = compare(
         {"right": right, "collapsed": collapsed}, some, floor=some, permutations=0, **options
     )
-    gaps = {d.metric: "gap" in d.details for d in found.differences if " E " not in d.metric}
+    gaps = {label_of(d): "gap" in d.details for d in found.differences if d.kind == "difference"}
     assert list(gaps.values()) == [False, True, False, False]
 
 
@@ -239,14 +240,14 @@ def test_where_classes_are_left_out_so_they_are_of_differences():
         [v["value"] for v in ci_tmmd(s).details["per_class"].values()] for s in (a, b, r)
     )
     delta = np.subtract(one, two)
-    of_metric = {d.metric.removesuffix(" difference"): d for d in found.differences}
+    of_metric = {measured(d): d for d in found.differences}
     d = of_metric["CI-TMMD"]
     error = delta.std(ddof=1) / np.sqrt(5)
     reach = stats.t.ppf(0.975, 4) * error
-    assert (d.metric, d.value) == ("CI-TMMD difference", pytest.approx(delta.mean(), abs=1e-9))
+    assert (label_of(d), d.value) == ("CI-TMMD difference", pytest.approx(delta.mean(), abs=1e-9))
     assert d.interval == pytest.approx((delta.mean() - reach, delta.mean() + reach), abs=1e-9)
     assert d.interval_method == "paired leave-one-class-out jackknife, t, 4 df"
-    left_out = {s.metric: s.details.get("left_out") for s in found.scores}
+    left_out = {label_of(s): s.details.get("left_out") for s in found.scores}
     assert left_out["CI-TMMD"] == left_out["CI-TMMD E"] == "class"
     gap = abs(np.mean(one) - np.mean(real)) - abs(np.mean(two) - np.mean(real))
     assert d.details["gap"] == pytest.approx(gap, abs=1e-9)

@@ -321,7 +321,7 @@ def test_images_without_contact_are_excluded_and_named():
         assert Note("no-contact", {"count": 2, "n": 5}) in score.notes
         assert score.value == pytest.approx(other.value)
         assert score.interval == pytest.approx(other.interval)
-        assert (score.n, score.subject, score.split) == (5, "mini", "s")
+        assert (score.n, score.a, score.split) == (5, "mini", "s")
         assert other.notes == ()
     json.dumps([s.to_json() for s in scores], allow_nan=False)
     none = contact_residual(made, background, background)

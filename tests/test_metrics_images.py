@@ -125,7 +125,7 @@ def test_scores_name_their_settings_and_the_lowest_images():
     b[2] = 255 - a[2]
     score = ssim(a, b, ids=list("pqrstu"), subject="mini", split="s")
     assert score.details["lowest"][0]["id"] == "r"
-    assert (score.subject, score.split, score.n, score.m) == ("mini", "s", 6, 6)
+    assert (score.a, score.split, score.n, score.m) == ("mini", "s", 6, 6)
     assert (score.higher_is_better, score.estimator) == (True, "per-image mean")
     assert score.settings["size"] == [20, 27]
 

@@ -26,7 +26,7 @@ def test_a_video_is_left_out_of_both_sides_of_a_difference():
     left = np.array([1 / 3 - 1 / 3, 3 / 3 - 2 / 3, 2 / 4 - 1 / 2])  # without p, q, r
     half = 4.302652729911275 * np.sqrt(2 / 3 * ((left - left.mean()) ** 2).sum())
     assert score.interval == pytest.approx((max(-1, 0.1 - half), min(1, 0.1 + half)))
-    assert (score.details["a"], score.details["b"], score.details["better"]) == ("a", "b", "a")
+    assert (score.a, score.b, score.details["better"]) == ("a", "b", "a")
     assert score.details["relative"] == pytest.approx(1 - 0.5 / 0.6)
 
 

@@ -6,11 +6,12 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from palpate.core import Note, PalpateError, Score
+from palpate.core import Measure, Note, PalpateError, Score
 from palpate.metrics import ci_tmmd, compare, four_scores, i_tmmd, tmmd
 from palpate.metrics.intervals import Scored, permutation_test
 from palpate.metrics.kernels import Gaussian, blocked_sums
 from palpate.metrics.paired import difference, holm
+from palpate.report.labels import label_of, subject_of
 from test_metrics_mmd import loop_mmd, mmd2, unit_rows
 from test_metrics_tactile import change, codes, keep, share, world
 
@@ -143,22 +144,21 @@ def three():
 def test_differences_are_the_jackknife_of_the_difference(three):
     r, generators = three
     found = compare(generators, r, floor=r)
-    assert [s.subject for s in found.scores[::6]] == ["near", "far", "mid"]
+    assert [s.a for s in found.scores[::6]] == ["near", "far", "mid"]
     for name, of in generators.items():
         single = four_scores(of, r, floor=r, subject=name)
-        of_four = [s for s in found.scores if s.subject == name and s.metric[-2:] != " E"]
+        of_four = [s for s in found.scores if s.a == name and s.kind == "value"]
         assert of_four == single
-    of_four = [d for d in found.differences if " E " not in d.metric]
+    of_four = [d for d in found.differences if d.kind == "difference"]
     assert len(of_four) == 12
     groups = sorted(set(r.groups))
     for d in of_four:
-        a, b = generators[d.details["a"]], generators[d.details["b"]]
-        metric = d.metric.removesuffix(" difference")
+        a, b = generators[d.a], generators[d.b]
         each = [
-            {x.metric: x.value for x in four_scores(s, r, permutations=0)}[metric] for s in (a, b)
+            {x.metric: x.value for x in four_scores(s, r, permutations=0)}[d.metric] for s in (a, b)
         ]
         assert d.value == pytest.approx(each[0] - each[1], abs=1e-12)
-        if metric == "TMMD":
+        if d.metric == "TMMD":
             out = [[keep(s, np.array(s.groups) != g) for s in (a, b, r)] for g in groups]
             gaps = np.array([tmmd(x, z).value - tmmd(y, z).value for x, y, z in out])
             error = np.sqrt((len(gaps) - 1) / len(gaps) * ((gaps - gaps.mean()) ** 2).sum())
@@ -169,12 +169,12 @@ def test_differences_are_the_jackknife_of_the_difference(three):
             )
             assert d.interval_method == "paired leave-one-group-out jackknife, t, 14 df"
     first = found.differences[0]
-    assert (first.subject, first.details["better"]) == ("near - far", "near")
+    assert (subject_of(first), first.details["better"]) == ("near - far", "near")
     assert first.details["p_better"] > 0.99
     width = lambda s: s.interval[1] - s.interval[0]
-    ci = [s for s in found.scores if s.metric == "CI-TMMD"]
+    ci = [s for s in found.scores if s.measure == Measure("CI-TMMD")]
     paired = next(
-        d for d in found.differences if d.metric.startswith("CI") and d.subject == "near - mid"
+        d for d in found.differences if (d.metric, d.a, d.b) == ("CI-TMMD", "near", "mid")
     )
     assert width(paired) < 0.5 * min(width(s) for s in ci)  # what the videos have in common is gone
 
@@ -202,7 +202,7 @@ def test_order_of_ids_does_not_matter_and_other_samples_are_refused(three):
 def test_undefined_scores_have_no_difference(three):
     r, generators = three
     no_labels = {name: change(s, labels=None) for name, s in generators.items()}
-    found = {d.metric: d for d in compare(no_labels, r).differences}
+    found = {label_of(d): d for d in compare(no_labels, r).differences}
     assert found["D-TMMD difference"].value is None
     assert codes(found["D-TMMD difference"]) == ["undefined:score"]
     same = compare({"a": generators["near"], "b": generators["near"]}, r).differences[0]
@@ -225,7 +225,7 @@ def test_without_a_reference_the_nearer_to_the_floor_is_better(three):
             d.higher_is_better,
         ) == (None, None, False, None)
         assert d.details["p_value"] is not None
-    found = {d.metric: d for d in compare(sets, r, floor=r).differences}
+    found = {label_of(d): d for d in compare(sets, r, floor=r).differences}
     one = found["I-TMMD difference"]
     assert one.value < 0  # lower, and worse
     assert one.details["better"] == "near"
@@ -294,16 +294,16 @@ def test_the_excess_of_two_generators_is_compared_on_the_same_videos(three):
     }
     found = compare(sets, r, floor=r, permutations=0)
     metrics = ["TMMD", "I-TMMD", "I-TMMD E", "CI-TMMD", "CI-TMMD E", "D-TMMD"]
-    assert [(s.metric, s.subject) for s in found.scores] == [(m, s) for s in sets for m in metrics]
+    assert [(label_of(s), s.a) for s in found.scores] == [(m, s) for s in sets for m in metrics]
     groups = sorted(set(r.groups))
     for metric, function in (("I-TMMD E", i_tmmd), ("CI-TMMD E", ci_tmmd)):
         value = lambda s: function(s).details["E"]  # noqa: B023
-        score = {s.subject: s for s in found.scores if s.metric == metric}
+        score = {s.a: s for s in found.scores if label_of(s) == metric}
         for name, s in sets.items():
             assert score[name].value == pytest.approx(value(s))
             assert score[name].interval == pytest.approx(function(s).details["E_interval"])
             assert score[name].floor == pytest.approx(value(r))
-        (d,) = (d for d in found.differences if d.metric == f"{metric} difference")
+        (d,) = (d for d in found.differences if label_of(d) == f"{metric} difference")
         a, b, floor = (value(s) for s in (*sets.values(), r))
         out = np.array(
             [[value(keep(s, np.array(s.groups) != g)) for s in (*sets.values(), r)] for g in groups]
@@ -325,13 +325,13 @@ def test_the_excess_of_two_generators_is_compared_on_the_same_videos(three):
         assert d.details["better"] == "near"
     bare = {name: change(s, groups=None) for name, s in sets.items()}
     scores = compare(bare, change(r, groups=None), permutations=0).scores
-    assert not [s for s in scores if s.metric.endswith(" E")]
+    assert not [s for s in scores if s.kind == "excess"]
 
 
 def test_the_p_value_of_a_metric_without_direction_is_that_of_the_gap_to_the_floor(three):
     r, generators = three
     sets = {"near": generators["near"], "far": generators["far"]}
-    d = {x.metric: x for x in compare(sets, r, floor=r, permutations=0).differences}[
+    d = {label_of(x): x for x in compare(sets, r, floor=r, permutations=0).differences}[
         "I-TMMD difference"
     ]
     groups = sorted(set(r.groups))
@@ -362,7 +362,7 @@ def test_the_p_value_of_a_metric_without_direction_is_that_of_the_gap_to_the_flo
     assert d.details["p_value"] == pytest.approx(
         2 * min(d.details["p_better"], 1 - d.details["p_better"])
     )
-    bare = {x.metric: x for x in compare(sets, r, permutations=0).differences}["I-TMMD difference"]
+    bare = next(x for x in compare(sets, r, permutations=0).differences if x.metric == "I-TMMD")
     assert bare.details["p_value"] == pytest.approx(d.details["p_difference"])
 
 
@@ -381,7 +381,7 @@ def test_the_gap_is_recomputed_without_each_video_in_all_three_sets():
         "collapsed": change(near, features=x / np.linalg.norm(x, axis=1, keepdims=True)),
         "near": near,
     }
-    found = {d.metric: d for d in compare(sets, r, floor=r, permutations=0).differences}
+    found = {label_of(d): d for d in compare(sets, r, floor=r, permutations=0).differences}
     groups, gaps = np.array(r.groups), {}
     for metric, function, factor in (
         ("I-TMMD", i_tmmd, share(r)),

@@ -417,7 +417,7 @@ def test_four_scores_equal_the_single_metrics_and_carry_their_settings(preset):
     for score, single in zip(scores, singles, strict=True):
         assert score.value == pytest.approx(single.value, abs=1e-9)
         assert score.interval == pytest.approx(single.interval, abs=1e-9)
-        assert (score.encoder, score.split, score.subject, score.n) == (
+        assert (score.encoder, score.split, score.a, score.n) == (
             "e" * 64,
             "s" * 64,
             "mini",

@@ -111,7 +111,7 @@ def test_preferences_and_differences_are_those_of_a_slow_count(plan, study, down
 
 def test_davidson_expects_as_many_ties_as_there_are(results):
     rows = results.settings["preference"]["comparisons"]
-    strength = {s.subject: np.exp(s.value) for s in results.scores if s.metric == "human strength"}
+    strength = {s.a: np.exp(s.value) for s in results.scores if s.metric == "human strength"}
     nu, expected = results["human strength", "ours"].details["nu"], 0.0
     for row in rows:
         a, b = strength[row["a"]], strength[row["b"]]
@@ -252,7 +252,7 @@ def compare(plan, votes, table):
         cells[name][row["id"], row["method"]] = row[name]
     metrics = [of_images(name, images) for name, images in cells.items()]
     arrays = VoteArrays(plan, known, kept, seed=0, replicates=100)
-    return {(s.metric, s.subject): s for s in agreement_scores(metrics, arrays, quiet)}
+    return {(s.metric, s.a): s for s in agreement_scores(metrics, arrays, quiet)}
 
 
 def test_metrics_that_agree_with_people_have_a_high_tau(plan, downloads, results):
@@ -584,6 +584,7 @@ def test_neither_torch_nor_the_server_is_loaded(study, downloads, folders, tmp_p
     code = f"""
 import sys
 from palpate import preference
+from palpate.report.labels import label_of, subject_of
 preference.make({str(folders.reference)!r}, {[str(m) for m in folders.methods]!r}, dry_run=True)
 preference.score({str(study)!r}, {str(downloads)!r}, replicates=100)
 assert not {{"torch", "starlette", "uvicorn", "diffusers"}} & set(sys.modules)

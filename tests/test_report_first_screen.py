@@ -37,7 +37,7 @@ def best(cells):
 
 def test_the_verdict_has_each_metric_once_and_the_best_but_never_the_real_images():
     columns = telling_columns(score_tables(measured()))
-    assert [c.metric for c in columns] == ["TMMD", "material accuracy", "D-TMMD"]
+    assert [c.name for c in columns] == ["TMMD", "material accuracy", "D-TMMD"]
     rows = verdict(measured())
     assert list(rows) == ["ours", "theirs", "background only", "real images (floor)"]
     assert best(rows["theirs"]) == [True, True, True]
@@ -94,7 +94,7 @@ def test_a_metric_that_is_undefined_is_not_filled_from_another_preset():
     scores += [score("D-TMMD", s, None, settings=presets[0], **d) for s in ("a", "b")]
     scores += [score("D-TMMD", s, 0.5, settings=presets[1], **d) for s in ("a", "b")]
     column = telling_columns(score_tables(scores))[1]
-    assert (column.metric, [c.defined for c in column.cells]) == ("D-TMMD", [False, False])
+    assert (column.name, [c.defined for c in column.cells]) == ("D-TMMD", [False, False])
     assert [c.title for c in cards(Results("T", scores=scores), [column])] == []
 
 
@@ -220,7 +220,7 @@ def test_what_a_page_is_about():
 
 def test_strips_are_explained_on_a_score_with_interval_null_and_floor():
     column, chosen = annotated(score_tables([score("SSIM", null=None), score()]))
-    assert (column.metric, chosen.metric) == ("TMMD", "TMMD")
+    assert (column.name, chosen.metric) == ("TMMD", "TMMD")
     assert annotated(score_tables([score(null=None)])) is None
 
 

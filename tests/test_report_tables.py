@@ -6,6 +6,7 @@ import pytest
 
 from forge.results import difference, score, text_note
 from palpate.core import Note, PalpateError
+from palpate.report.labels import label_of, subject_of
 from palpate.report.notes import decimals, number, percent, plural, score_text
 from palpate.report.results import Results
 from palpate.report.study_tables import score_sheets
@@ -48,14 +49,14 @@ def test_decimals_follow_the_largest_value(values, digits):
     [
         ("CI-TMMD", "Tactile features"),
         ("CMMD", "Image distributions"),
-        ("recall (tactile)", "Image distributions"),
+        ("recall", "Image distributions"),
         ("contact SSIM", "Image by image"),
         ("recall@5", "Recognition"),
         ("novel", "Other metrics"),
     ],
 )
 def test_families(metric, title):
-    assert family_of(metric).title == title
+    assert family_of(score(metric)).title == title
 
 
 def test_scores_of_a_family_are_one_table_with_what_they_share():
@@ -66,7 +67,7 @@ def test_scores_of_a_family_are_one_table_with_what_they_share():
         score("I-TMMD", "b", n=200),
     ]
     (table,) = score_tables(scores)
-    assert [(c.metric, c.size) for c in table.columns] == [("TMMD", "n = 240"), ("I-TMMD", "")]
+    assert [(c.name, c.size) for c in table.columns] == [("TMMD", "n = 240"), ("I-TMMD", "")]
     assert table.columns[1].cells[1].size == "n = 200"
     assert ("bandwidth σ", "10") in table.made
     assert table.columns[0].made == [("seed", "1, 2")]
@@ -93,7 +94,7 @@ def test_scores_of_different_settings_raise():
         ),
         ([{"split": "a" * 64}, {"split": "b" * 64}], ["split aaaa", "split bbbb"]),
         ([{"reference": "a" * 64}, {"reference": "b" * 64}], ["reference aaaa", "reference bbbb"]),
-        ([{"metric": "FID (tactile)"}, {"metric": "FID (inception)"}], ["tactile", "inception"]),
+        ([{"features": "tactile"}, {"features": "CLIP (v2) vision"}], ["tactile", "(v2) vision"]),
     ],
 )
 def test_other_presets_splits_references_and_features_have_their_own_tables(changes, titles):
@@ -111,11 +112,9 @@ def test_scores_without_reference_go_with_their_subject():
         score("I-TMMD", "b"),
     ]
     first, second = score_tables(scores)
-    subjects = [
-        {cell.score.subject for c in t.columns for cell in c.cells} for t in (first, second)
-    ]
+    subjects = [{cell.score.a for c in t.columns for cell in c.cells} for t in (first, second)]
     assert subjects == [{"a"}, {"b"}]
-    assert [c.metric for c in second.columns] == ["TMMD", "I-TMMD"]
+    assert [c.name for c in second.columns] == ["TMMD", "I-TMMD"]
 
 
 def test_features_of_several_networks_do_not_split_the_scores_of_one_run():
@@ -135,13 +134,13 @@ def test_features_of_several_networks_do_not_split_the_scores_of_one_run():
 def test_the_dagger_needs_a_decided_difference_against_every_other(differences, best):
     table = score_tables([*(score(subject=s) for s in "abc"), *differences])[0]
     cells = table.columns[0].cells
-    assert [c.score.subject for c in cells if c.decided] == ([best] if best else [])
+    assert [c.score.a for c in cells if c.decided] == ([best] if best else [])
 
 
 def test_the_best_by_value_is_among_those_that_are_compared():
     scores = [score(subject=s, value=v) for s, v in (("a", 2.0), ("b", 3.0), ("photo", 1.0))]
     best = [
-        [c.score.subject for c in score_tables(all_scores)[0].columns[0].cells if c.best]
+        [c.score.a for c in score_tables(all_scores)[0].columns[0].cells if c.best]
         for all_scores in (scores, [*scores, difference("a", "b")])
     ]
     assert best == [["photo"], ["a"]]
@@ -163,9 +162,30 @@ def test_more_than_two_generators_are_ranked():
     assert rankings(score_tables([score(subject="a"), score(subject="b"), pairs[0]])[0]) == []
 
 
-def test_a_bandwidth_is_no_kind_of_features():
-    tables = score_tables([score("TMMD"), score("TMMD (σ multi)")])
-    assert [[c.label for c in t.columns] for t in tables] == [["TMMD", "TMMD (σ multi)"]]
+def test_a_table_is_headed_by_the_features_and_a_column_by_the_kernel():
+    fields = {"features": "CLIP (v2) vision", "kernel": "σ (wide)"}
+    (table,) = score_tables([score("CMMD", **fields), score("CMMD", features="CLIP (v2) vision")])
+    assert table.title == "Image distributions of CLIP (v2) vision"
+    assert [c.label for c in table.columns] == ["CMMD (σ (wide))", "CMMD"]
+    assert table.columns[0].name == "CMMD (CLIP (v2) vision) (σ (wide))"
+
+
+@pytest.mark.parametrize(
+    ("fields", "names"),
+    [
+        ({}, ("TMMD", "ours")),
+        ({"features": "CLIP", "kernel": "σ = 5"}, ("TMMD (CLIP) (σ = 5)", "ours")),
+        ({"settings": {"pool": 24}, "features": "a by b"}, ("TMMD of 24 (a by b)", "ours")),
+        ({"kind": "excess"}, ("TMMD E", "ours")),
+        ({"kind": "excess", "b": "theirs"}, ("TMMD E difference", "ours - theirs")),
+        ({"kind": "difference", "b": "theirs"}, ("TMMD difference", "ours - theirs")),
+        ({"kind": "lead", "b": "theirs"}, ("TMMD, ahead", "ours against theirs")),
+        ({"kind": "effect size", "b": "theirs"}, ("effect size of TMMD", "ours - theirs")),
+    ],
+)
+def test_the_label_joins_the_fields(fields, names):
+    s = score(subject="ours", **fields)
+    assert (label_of(s), subject_of(s)) == names
 
 
 def test_equal_notes_have_one_number():
@@ -197,7 +217,8 @@ def test_what_follows_from_the_fields_of_a_score_is_a_note(changes, code):
 def test_differences_are_rows_below_their_scores():
     table = score_tables([score(subject="a"), score(subject="b"), difference("a", "b")])[0]
     (row,) = table.differences
-    assert (row.metric, row.a, row.b, row.confidence, row.p) == ("TMMD", "a", "b", 0.975, 0.05)
+    assert (row.name, row.score.a, row.score.b) == ("TMMD", "a", "b")
+    assert (row.confidence, row.p) == (0.975, 0.05)
 
 
 def test_only_square_matrices_of_numbers_are_drawn():

@@ -8,6 +8,7 @@ from scipy import stats
 
 from palpate.core import Note, PalpateError, Score
 from palpate.metrics.intervals import spread_of_values
+from palpate.report.labels import label_of
 from palpate.studies.claims import (
     FAMILY,
     TRADITIONAL,
@@ -29,12 +30,14 @@ def difference(metric, value, reach=0.1, pair=("Ours", "GVST"), **details):
     """A paired difference with a symmetric interval."""
     up = HIGHER.get(metric, None if metric in FAMILY[1:] else False)
     return Score(
-        f"{metric} difference",
-        " - ".join(pair),
+        metric,
+        pair[0],
         value,
         None if reach is None else (value - reach, value + reach),
+        kind="difference",
+        b=pair[1],
         higher_is_better=up,
-        details={"a": pair[0], "b": pair[1], **details},
+        details=details,
     )
 
 
@@ -67,7 +70,7 @@ def test_of_several_seeds_no_p_value_or_verdict_of_one_remains():
     made = over_seeds([a, b])
     assert (made.value, made.null) == (0, None)
     assert [*over_seeds([a, b, a]).notes] == [*over_seeds([b, a]).notes] == notes
-    kept = {"a": "Ours", "b": "GVST", "kind": "same", "classes": ["Wood", "Brick"]}
+    kept = {"kind": "same", "classes": ["Wood", "Brick"]}
     assert made.details == {**kept, "matrix": [[2, 1], [1, 2]], "by_seed": [-0.9, 0.9]}
     assert over_seeds([a]).details["p_value"] == 1e-6
 
@@ -182,8 +185,10 @@ def test_metrics_are_held_against_people():
 
 
 def test_features_of_a_tactile_encoder_are_no_fid_of_the_paper():
-    tactile = difference("FID (tactile)", 5, pair=("Ours", "Ours w/ BG"))
-    shipped = difference("FID (palpate/mini vision)", 5, pair=("Ours", "Ours w/ BG"))
+    tactile, shipped = (
+        replace(difference("FID", 5, pair=("Ours", "Ours w/ BG")), features=features)
+        for features in ("tactile", "palpate/mini vision")
+    )
     claim = "FID prefers what people do not"
     assert verdicts(preference_claims([tactile], PEOPLE))[claim] == "undecided"
     made = {c.claim: c for c in preference_claims([shipped], PEOPLE)}[claim]
@@ -238,7 +243,7 @@ def test_differences_of_seeds_are_joined_by_metric_pair_and_preset():
     ]
     runs[0].append(difference("SSIM", 1.0))  # one seed alone
     made = differences_over_seeds(runs)
-    assert [(d.metric, d.value) for d in made] == [("TMMD difference", -1.5)]
+    assert [(label_of(d), d.value) for d in made] == [("TMMD difference", -1.5)]
     gap = difference("I-TMMD", -0.5, gap=0.4, gap_interval=[0.3, 0.5])
     joined = differences_over_seeds([[gap], [gap]])[0]
     assert joined.details["gap"] == pytest.approx(0.4)

@@ -11,7 +11,7 @@ import polars as pl
 import pytest
 
 from palpate.cli import main
-from palpate.core import FeatureSet, PalpateError, Score, Split, digest_file
+from palpate.core import FeatureSet, Measure, PalpateError, Score, Split, digest_file
 from palpate.core.digest import canonical_json
 from palpate.encoders.models import shipped_folder
 from palpate.preference.scoring import PREFERENCE, STRENGTH
@@ -357,7 +357,7 @@ def test_cells_are_means_over_seeds_that_name_their_stages():
     seeds = [
         [forged(OURS, "TMMD", v, f"scores-{k}", floor=v / 10)] for k, v in enumerate((1, 2, 6))
     ]
-    score = Scores.over_seeds(seeds, "results").get("TMMD", OURS)
+    score = Scores.over_seeds(seeds, "results").get(Measure("TMMD"), OURS)
     assert score is not None
     assert score.value == pytest.approx(3)
     assert score.floor == pytest.approx(0.3)
@@ -386,10 +386,7 @@ def test_tables_hold_methods_controls_and_both_judges():
         )
         for pair, v in values.items()
     }
-    probed = {
-        ("material accuracy", split): forged(split, "material accuracy", 0.5)
-        for split in (ORIG, NOLEAK)
-    }
+    probed = [forged(split, "material accuracy", 0.5) for split in (ORIG, NOLEAK)]
     names = {"methods": [*METHODS, "other"], "controls": [*CONTROLS]}
     one, three, four = study_tables(WORLD, judged, probed, **names)
     assert one.columns[:3] == ["images", "judged by encoder of", "material accuracy, real images"]
@@ -420,13 +417,13 @@ def test_people_are_columns_of_table_three():
     votes = [forged(n, m, 0.7) for m in (PREFERENCE, STRENGTH) for n in (OURS, "theirs")]
     votes.append(forged(OURS, "human accuracy of material", 0.4))
     how = {"methods": [OURS, "GVST"], "controls": [], "people": votes}
-    one, three, four = study_tables(WORLD, judged, {}, **how)
+    one, three, four = study_tables(WORLD, judged, [], **how)
     assert three.columns == ["images", "TMMD", PREFERENCE, STRENGTH]
     assert [None if c is None else c.value for c in three.rows[0][1:]] == [1.0, 0.7, 0.7]
     assert three.rows[1][2:] == [None, None]
     assert PREFERENCE not in {*one.columns, *four.columns}
     how["people"] = [forged("theirs", PREFERENCE, 0.7)]
-    assert study_tables(WORLD, judged, {}, **how)[1].columns == ["images", "TMMD"]
+    assert study_tables(WORLD, judged, [], **how)[1].columns == ["images", "TMMD"]
 
 
 def test_the_papers_numbers_stand_beside_its_own_data_alone():
@@ -438,39 +435,40 @@ def test_the_papers_numbers_stand_beside_its_own_data_alone():
         for j in (ORIG, NOLEAK)
     }
     study = replace(WORLD, paper=True)
-    one, three, four = study_tables(study, judged, {}, methods=[OURS], controls=[])
+    one, three, four = study_tables(study, judged, [], methods=[OURS], controls=[])
     assert {row[0]: row[3] for row in one.rows}["paper, NoLeak"] == "1.37"
     assert {row[0]: row[1] for row in three.rows}["paper, Ours w/ BG"] == "0.54"
     assert {row[0]: row[1] for row in four.rows}["paper, GVST"] == "1.98"
     digit = replace(STUDIES["world-digit"], paper=True)
     assert {
-        r[0]: r[1] for r in study_tables(digit, judged, {}, methods=[OURS], controls=[])[1].rows
+        r[0]: r[1] for r in study_tables(digit, judged, [], methods=[OURS], controls=[])[1].rows
     }["paper, GVST"] == "2.67"
 
 
 def test_the_papers_numbers_are_of_its_own_metrics_alone():
     """FID of another network is not the paper's FID."""
-    other = "FID (palpate/mini vision)"
-    scores = [forged(OURS, m, 1.0) for m in ("SSIM", "FID (Inception)", other)]
+    networks = ("Inception", "palpate/mini vision")
+    scores = [forged(OURS, "SSIM", 1.0)]
+    scores += [forged(OURS, "FID", 1.0, features=network) for network in networks]
     judged = {
         (s, j): Scores.over_seeds([scores], "results")
         for s in (ORIG, NOLEAK)
         for j in (ORIG, NOLEAK)
     }
     study = replace(WORLD, paper=True)
-    three = study_tables(study, judged, {}, methods=[OURS], controls=[])[1]
+    three = study_tables(study, judged, [], methods=[OURS], controls=[])[1]
     [printed] = [row for row in three.rows if row[0] == "paper, Ours"]
     cells = dict(zip(three.columns, printed, strict=True))
-    assert (cells["SSIM"], cells["FID (Inception)"], cells[other]) == ("0.49", "43.9", None)
+    assert (cells["SSIM"], cells["FID (Inception)"]) == ("0.49", "43.9")
+    assert cells["FID (palpate/mini vision)"] is None
 
 
 def test_differences_that_are_stored_are_of_a_method_and_not_of_e():
-    score = forged("Ours - x", "I-TMMD difference", 1.0)
-    score = replace(score, details={"a": "x", "b": OURS})
+    score = forged("x", "I-TMMD", 1.0, kind="difference", b=OURS)
     assert judging._compares(score, [OURS])
     assert not judging._compares(score, ["other"])
-    assert not judging._compares(replace(score, metric="I-TMMD E difference"), [OURS])
-    assert judging._compares(forged(FLOOR, "I-TMMD E", 1.0), [OURS])
+    assert not judging._compares(replace(score, kind="excess"), [OURS])
+    assert judging._compares(forged(FLOOR, "I-TMMD", 1.0, kind="excess"), [OURS])
     assert collecting._compares(score, [OURS, "x"])  # in either order
     assert not collecting._compares(score, [OURS])
 
@@ -489,8 +487,8 @@ def test_half_probes_name_train_images_beside_the_real_ones_of_labeled_samples()
     images = replace(real, features=x[rows])
     split = Split.from_ids(train=ids, test=videos, rule={}, manifest="m" * 64)
     near, of_real = judging._cross_fitted(train, images, real, rows, split)
-    assert (near.subject, near.value, near.n) == (NEAREST, 0.75, 4)
-    assert (of_real.subject, of_real.value, of_real.n) == (judging.HALF_PROBES, 1, 4)
+    assert (near.a, near.value, near.n) == (NEAREST, 0.75, 4)
+    assert (of_real.a, of_real.value, of_real.n) == (judging.HALF_PROBES, 1, 4)
 
 
 @pytest.mark.slow

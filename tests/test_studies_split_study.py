@@ -65,11 +65,11 @@ def test_a_planted_leak_costs_what_it_is_worth(data, tmp_path, capsys, monkeypat
     monkeypatch.setattr("palpate.metrics.probe.NEIGHBORS", 1)
     assert main(["probe", *ARGS, "--work", "run", "--json"]) == 0
     made = json.loads(capsys.readouterr().out)
-    values = {(s["metric"], s["subject"]): s for s in made["scores"]}
-    orig, clean = (values["material accuracy, 1-NN", name] for name in ("orig", "noleak"))
+    values = {(s["metric"], s["a"], s["b"]): s for s in made["scores"]}
+    orig, clean = (values["material accuracy, 1-NN", name, None] for name in ("orig", "noleak"))
     assert orig["value"] > 0.95  # a frame of every test video is in train
     assert clean["value"] < 0.8  # a new video says nothing of its material
-    drop = values["material accuracy, 1-NN difference", "orig - noleak"]
+    drop = values["material accuracy, 1-NN", "orig", "noleak"]
     assert drop["value"] == pytest.approx(orig["value"] - clean["value"])
     assert len(orig["details"]["by_seed"]) == 2
     assert "2 seeds" in drop["interval_method"]

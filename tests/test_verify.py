@@ -99,13 +99,13 @@ def test_an_edited_cell_of_a_matrix_is_named(vectors):
 
 def test_numbers_added_and_removed_by_hand_are_named(vectors):
     def change(data):
-        data["scores"].append({"metric": "TMMD", "subject": "mine", "value": 0.0})
+        data["scores"].append({"metric": "TMMD", "a": "mine", "value": 0.0})
         data["scores"].pop(0)
 
     first = Results.load(vectors).scores[0]
     edit(vectors, change)
     assert differing(vectors) == {
-        f"{first.metric} of {first.subject} (grouped)": "not in the file",
+        f"{first.metric} of {first.a} (grouped)": "not in the file",
         "TMMD of mine": "in the file, not made again",
     }
     assert not verify(vectors).ok
@@ -203,19 +203,19 @@ def test_the_tolerance_is_relative_and_of_small_numbers_the_sixth_decimal(a, b, 
 
 
 def test_effect_sizes_and_p_values_may_differ_by_what_threads_make_of_them():
-    score = Score("effect size of TMMD", "x", 0.3019, details={"p_adjusted": 0.8177, "n": 3.0})
+    score = Score("TMMD", "x", 0.3019, b="y", details={"p_adjusted": 0.8177, "n": 3.0})
 
-    def same(metric="effect size of TMMD", value=0.3019, **details):
-        before = replace(score, metric=metric)
+    def same(kind="effect size", value=0.3019, **details):
+        before = replace(score, kind=kind)
         other = replace(before, value=value, details={**score.details, **details})
         return not difference(plain(before), plain(other), TOLERANCE)
 
     assert same(value=0.3014)
     assert not same(value=0.31)
-    assert not same("TMMD", value=0.3014)
-    assert same("TMMD", p_adjusted=0.8174)
-    assert not same("TMMD", p_adjusted=0.83)
-    assert not same("TMMD", n=3.001)
+    assert not same("difference", value=0.3014)
+    assert same("difference", p_adjusted=0.8174)
+    assert not same("difference", p_adjusted=0.83)
+    assert not same("difference", n=3.001)
 
 
 @pytest.fixture

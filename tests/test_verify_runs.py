@@ -106,7 +106,7 @@ def test_an_edit_by_hand_is_named(forged, monkeypatch, change, name):
 def test_what_is_not_of_the_run_is_named(forged, monkeypatch):
     made = Results.load(forged)
     monkeypatch.setattr(verifying, "_study_again", lambda *_: made)
-    edit(forged, lambda data: data["scores"].append({**data["scores"][0], "subject": "mine"}))
+    edit(forged, lambda data: data["scores"].append({**data["scores"][0], "a": "mine"}))
     edit(forged, lambda data: data.update(facts=[]))
     assert differing(forged) == {
         "TMMD of mine": "in the file, not made again",

@@ -191,10 +191,10 @@ def score(metric="TMMD", subject="a", value=1.374, **changes):
 
 def difference(a, b, metric="TMMD", value=-1.0, better=None, **changes):
     """A paired difference a - b; decided if ``better`` is given."""
-    details = {"a": a, "b": b, "better": better, "decided": better is not None}
+    details = {"better": better, "decided": better is not None}
     details |= {"p_better": 0.975, "p_adjusted": 0.05}
     fields = {"interval": (-1.5, -0.5), "n": 240, "details": details}
-    return Score(f"{metric} difference", f"{a} - {b}", value, **(fields | changes))
+    return Score(metric, a, value, kind="difference", b=b, **(fields | changes))
 
 
 def full_results(folder, n=6, side=64):

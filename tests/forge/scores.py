@@ -3,6 +3,7 @@
 import numpy as np
 
 from palpate.core import FeatureSet
+from palpate.report.labels import label_of, subject_of
 
 VIDEOS, FRAMES, DIM = 8, 6, 5
 IDS = [f"v{v}/{k}" for v in range(VIDEOS) for k in range(FRAMES)]
@@ -32,7 +33,7 @@ def feature_sets() -> dict[str, FeatureSet]:
 
 def by_key(results) -> dict:
     """Scores by (metric, subject, preset)."""
-    return {(s.metric, s.subject, s.settings.get("preset")): s for s in results}
+    return {(label_of(s), subject_of(s), s.settings.get("preset")): s for s in results}
 
 
 def codes(results) -> list[str]:

@@ -42,12 +42,13 @@ from palpate.core.files import (
 from palpate.core.notes import Note
 from palpate.core.progress import Progress, quiet, track
 from palpate.core.samples import SampleRef
-from palpate.core.score import Score, columns, require_comparable
+from palpate.core.score import Measure, Score, columns, require_comparable
 from palpate.core.split import PARTS, Split
 
 __all__ = [
     "PARTS",
     "FeatureSet",
+    "Measure",
     "MissingExtraError",
     "Note",
     "PalpateError",

@@ -6,7 +6,7 @@ import html
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import Any, Literal, NamedTuple
 
 from palpate.core.digest import plain, short
 from palpate.core.errors import PalpateError
@@ -16,6 +16,9 @@ from palpate.core.records import from_plain
 #: Settings that must agree before two scores may share a column.
 COMPARABLE = (
     "metric",
+    "features",
+    "kernel",
+    "kind",
     "estimator",
     "bandwidth",
     "scale",
@@ -33,15 +36,41 @@ BETTER: Mapping[bool | None, str] = {
 }
 
 
+Kind = Literal["value", "difference", "excess", "lead", "effect size"]
+
+
+class Measure(NamedTuple):
+    """What a number measures, whatever it was measured on: see the same fields of :class:`Score`.
+
+    ``excess`` tells the between-group excess E from the metric itself.
+    """
+
+    metric: str
+    features: str = ""
+    kernel: str = ""
+    excess: bool = False
+
+
 @dataclass(frozen=True)
 class Score:
     """One number with its interval and its settings.
 
+    What it is of are fields; no name is ever taken apart (``palpate.report.labels`` joins them).
+
     Attributes:
-        metric: e.g. ``"TMMD"``, ``"SSIM"``.
-        subject: what was scored: ``"generated"``, ``"real"``, ``"background"``, a generator's name.
+        metric: the bare name: ``"TMMD"``, ``"SSIM"``, ``"material accuracy"``, ``"top-5"``.
+        a: what was scored: ``"generated"``, ``"real"``, ``"background"``, a generator's name.
         value: the score, or None where it is undefined (``notes`` say why); never NaN or infinite.
         interval: (low, high), or None where none can be given.
+        features: what the metric compares, where it is computed on several kinds: ``"Inception"``,
+            ``"tactile"``, ``"pixels"``; of retrieval what is found by what (``"text by tactile"``).
+            '' where the metric has its own: TMMD and its relatives the ruler features.
+        kernel: the kernel of MMD where it is not the default, e.g. ``"σ median"``; else ''.
+        kind: ``value``, of ``a``; ``difference``: the value of ``a`` minus that of ``b``;
+            ``excess``: the between-group excess E of I- or CI-TMMD, of ``a`` or, with ``b``, the
+            difference of two. In the claims of a study also ``lead``, by how much ``a`` is better
+            than ``b``, and ``effect size``, a difference in units of its error.
+        b: what ``a`` is compared with; None where nothing is.
         level: coverage the interval aims at.
         interval_method: e.g. ``"leave-one-video-out jackknife, t, 23 df"``.
         null: the range that the score falls into if generated and real images do not differ, or
@@ -62,9 +91,13 @@ class Score:
     """
 
     metric: str
-    subject: str
+    a: str
     value: float | None
     interval: tuple[float, float] | None = None
+    features: str = ""
+    kernel: str = ""
+    kind: Kind = "value"
+    b: str | None = None
     level: float = 0.95
     interval_method: str = ""
     null: tuple[float, float] | None = None
@@ -90,6 +123,11 @@ class Score:
             pair = numbers if isinstance(numbers, Sequence) else (numbers,)
             if not all(v is None or math.isfinite(v) for v in pair):
                 object.__setattr__(self, name, None)
+
+    @property
+    def measure(self) -> Measure:
+        """What is measured; of a difference, what its two sides are."""
+        return Measure(self.metric, self.features, self.kernel, self.kind == "excess")
 
     def __float__(self) -> float:
         """Return the value; NaN where it is undefined."""
@@ -131,7 +169,9 @@ class Score:
             f"seed {self.seed}" if self.seed is not None else "",
             *(f"{name} {short(d)}" for name in names if (d := getattr(self, name))),
         ]
-        head = f"{self.metric} of {self.subject}: {value}"
+        fields = (self.features, self.kernel, "" if self.kind == "value" else self.kind)
+        name = ", ".join(filter(None, (self.metric, *fields)))
+        head = f"{name} of {self.a}{f' against {self.b}' if self.b else ''}: {value}"
         return "\n  ".join([head, *(", ".join(filter(None, line)) for line in (how, data))])
 
     def _repr_html_(self) -> str:
@@ -166,16 +206,20 @@ def require_comparable(scores: Sequence[Score]) -> None:
             if plain(a) != plain(b):
                 raise PalpateError(
                     f"Scores in one column must agree in {name}",
-                    f"{a!r} for {known[0].subject!r} and {b!r} for {score.subject!r}",
+                    f"{a!r} for {known[0].a!r} and {b!r} for {score.a!r}",
                     "Score both again with the same settings, or put them into two tables",
                 )
 
 
-def columns(scores: Iterable[Score]) -> dict[str, list[Score]]:
-    """Return scores by metric, in order of first appearance; each list can be compared."""
-    table: dict[str, list[Score]] = {}
+def columns(scores: Iterable[Score]) -> list[list[Score]]:
+    """Return the scores of each measure and kind, in order of first appearance.
+
+    Raises:
+        PalpateError: if two scores of one column were not made with the same settings.
+    """
+    table: dict[tuple[Measure, Kind, bool], list[Score]] = {}
     for score in scores:
-        table.setdefault(score.metric, []).append(score)
+        table.setdefault((score.measure, score.kind, score.b is None), []).append(score)
     for column in table.values():
         require_comparable(column)
-    return table
+    return [*table.values()]

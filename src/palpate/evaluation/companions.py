@@ -238,18 +238,14 @@ def _attempt(outcome: Outcome, name: str, run: Callable[[], Outcome], default: b
 
 
 def _compared(
-    compare: Callable[..., Any],
-    features: Features,
-    metric: str,
-    name: str | None = None,
-    **options: Any,
+    compare: Callable[..., Any], features: Features, metric: str, **options: Any
 ) -> Outcome:
-    """Scores and differences of ``compare``, whose ``metric`` is renamed after the features."""
+    """Scores and differences of ``compare``, which say what they are of."""
     outcome = Outcome()
     for sets in features.batches():
         result = compare(sets, features.reference, **features.common, **options)
-        outcome.scores += _renamed(result.scores, metric, features, name)
-        outcome.differences += _renamed(result.differences, metric, features, name)
+        outcome.scores += _named(result.scores, metric, features)
+        outcome.differences += _named(result.differences, metric, features)
     return outcome
 
 
@@ -259,12 +255,12 @@ def _fid(features: Features) -> Outcome:
 
 def _cmmd(features: Features) -> Outcome:
     options: dict[str, Any] = {**features.family, "preset": "cmmd"}
-    return _compared(compare_tmmd, features, "TMMD", "CMMD", **options)
+    return _compared(compare_tmmd, features, "CMMD", **options)
 
 
 def _kid(features: Features) -> Outcome:
     options: dict[str, Any] = {"preset": "paper", "normalize": False, "permutations": 0}
-    outcome = _compared(compare_tmmd, features, "TMMD", "KID", kernel=Polynomial(), **options)
+    outcome = _compared(compare_tmmd, features, "KID", kernel=Polynomial(), **options)
     for scores in (outcome.scores, outcome.differences):
         noted = [Note("kid-interval")] if scores is outcome.scores else []
         for k, s in enumerate(scores):
@@ -291,18 +287,15 @@ def _prdc(features: Features) -> Outcome:
                 one = next(iter(scores.values()))
                 units = metric_groups if one.settings["grouped"] else None
                 between = mean_differences(scores, values, units)
-                outcome.differences += _renamed(between, one.metric, features)
+                outcome.differences += _named(between, one.metric, features)
             for s in scores.values():
-                outcome.scores += _renamed([s], s.metric, features)
+                outcome.scores += _named([s], s.metric, features)
     return outcome
 
 
-def _renamed(
-    scores: Sequence[Score], old: str, features: Features, new: str | None = None
-) -> list[Score]:
-    """Scores whose metric says where the features come from: ``FID (Inception)``."""
-    label = f"{new or old} ({features.name})"
-    return [replace(s, metric=label + s.metric.removeprefix(old)) for s in scores]
+def _named(scores: Sequence[Score], metric: str, features: Features) -> list[Score]:
+    """Scores of a metric that say where the features come from."""
+    return [replace(s, metric=metric, features=features.name) for s in scores]
 
 
 def _mean_of_pairs(pairs: Pairs, metric: Literal["SSIM", "PSNR", "MS-SSIM"]) -> Outcome:

@@ -126,7 +126,8 @@ def memorization(
         ],
     }
     common: dict[str, Any] = {
-        "subject": subject,
+        "a": subject,
+        "features": space,
         "n": len(made),
         "m": len(test),
         "split": split,
@@ -138,8 +139,8 @@ def memorization(
     share = _spread(lambda d, r: (d < np.quantile(r, QUANTILE)).mean(), made, test, groups)
     area = _spread(_nearness, made, test, groups)
     return [
-        _score(f"{SHARE} ({space})", share, QUANTILE, common, settings | {"quantile": QUANTILE}),
-        _score(f"{NEARNESS} ({space})", area, 0.5, common, settings),
+        _score(SHARE, share, QUANTILE, common, settings | {"quantile": QUANTILE}),
+        _score(NEARNESS, area, 0.5, common, settings),
     ]
 
 

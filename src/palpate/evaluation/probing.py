@@ -17,6 +17,7 @@ import numpy as np
 
 from palpate.core import (
     FeatureSet,
+    Measure,
     Note,
     PalpateError,
     Progress,
@@ -35,6 +36,7 @@ from palpate.metrics.paired import differences_of_means
 from palpate.metrics.probe import class_accuracies
 from palpate.metrics.retrieval import TIE, Floats, retrieval, unit_rows
 from palpate.report.calls import Call
+from palpate.report.labels import measured, subject_of
 from palpate.report.results import Match, Results, Strip
 
 if TYPE_CHECKING:
@@ -334,15 +336,15 @@ def results_of(
     """
     scores: list[Score] = []
     single = all(len(of) == 1 for of in runs.values())
-    by_metric: dict[str, dict[str, list[Mean]]] = {}
+    by_measure: dict[Measure, dict[str, list[Mean]]] = {}
     for subject, of in runs.items():
         for run in of:
             for mean in run.means:
-                by_metric.setdefault(mean.score.metric, {}).setdefault(subject, []).append(mean)
-        for means in (sets.get(subject) for sets in by_metric.values()):
+                by_measure.setdefault(mean.score.measure, {}).setdefault(subject, []).append(mean)
+        for means in (sets.get(subject) for sets in by_measure.values()):
             scores += [means[0].score if single else over_seeds(means)] if means else []
         scores += [median for run in of if single for median in run.medians]
-    differences = [d for sets in by_metric.values() for d in differences_of_means(sets)]
+    differences = [d for sets in by_measure.values() for d in differences_of_means(sets)]
     all_runs = [run for of in runs.values() for run in of]
     notes = list({canonical_json(note): note for run in all_runs for note in run.notes}.values())
     names = ("modality", "label", "group", "top", "pool", "text_threshold", "seed")
@@ -368,13 +370,11 @@ def results_of(
 def _drop(difference: Score) -> str:
     """What a score loses from the first split to the second, in one sentence."""
     d, points = difference.details, 100 * float(difference)
-    line = (
-        f"{difference.metric.removesuffix(' difference')}, {d['a']} - {d['b']}: {points:.1f} points"
-    )
+    line = f"{measured(difference)}, {subject_of(difference)}: {points:.1f} points"
     if difference.interval:
         line += " [{:.1f}, {:.1f}]".format(*(100 * bound for bound in difference.interval))
     if d.get("relative") is not None:
-        line += f", {100 * d['relative']:.0f} % of {d['a']}"
+        line += f", {100 * d['relative']:.0f} % of {difference.a}"
         if d["relative_interval"]:
             line += " [{:.0f}, {:.0f}]".format(*(100 * bound for bound in d["relative_interval"]))
     return line

@@ -3,8 +3,8 @@
 Read and align (:mod:`palpate.evaluation.inputs`), embed, the TMMD family (TMMD, I-, CI- and D-TMMD:
 distances of feature sets, of halves, within and between classes), companions
 (:mod:`palpate.evaluation.companions`), controls of a split (:mod:`palpate.evaluation.controls`),
-notes, results. Metrics of one name with another bandwidth get names of their own
-(``TMMD (σ median)``), so that no two of them share a column.
+notes, results. Scores of one metric with another bandwidth say so as their ``kernel``, so that no
+two of them share a column.
 """
 
 from __future__ import annotations
@@ -54,12 +54,13 @@ from palpate.evaluation.inputs import (
 from palpate.evaluation.memorization import FEATURES, PIXELS, contact_rows, memorization
 from palpate.metrics import compare, compare_tmmd, require_same_ids, tmmd
 from palpate.report.calls import OBJECT, PATH, Call
+from palpate.report.labels import measured
 from palpate.report.results import GalleryItem, Results
 
 if TYPE_CHECKING:
     from palpate.data.manifest import Manifest
 
-#: Bandwidth of the paper; the name of a metric says any other one where several are requested.
+#: Bandwidth of the paper; scores name any other one as their kernel where several are requested.
 SIGMA = 10.0
 
 
@@ -92,12 +93,10 @@ class Family:
         return columns + [(presets[0], "multi")] * (not self.sigmas and rows <= MANY)
 
     def named(self, score: Score, sigma: float | str) -> Score:
-        """A score with an unusual bandwidth in the metric's name."""
+        """A score that names an unusual bandwidth."""
         if len(self.sigmas) == 1 or sigma == SIGMA:
             return score
-        tag = f"(σ {sigma})" if isinstance(sigma, str) else f"(σ = {sigma:g})"
-        base = score.metric.removesuffix(" difference")
-        return replace(score, metric=f"{base} {tag}" + score.metric[len(base) :])
+        return replace(score, kernel=f"σ {sigma}" if isinstance(sigma, str) else f"σ = {sigma:g}")
 
 
 def score_family(
@@ -137,8 +136,8 @@ def score_family(
             outcome.differences += [family.named(s, sigma) for s in result.differences]
             for s in scores:
                 outcome.scores.append(named := family.named(s, sigma))
-                if s.metric.endswith(" E") and s.floor and s.interval and s.interval[1] < s.floor:
-                    params = {"metric": named.metric, "subject": s.subject}
+                if s.kind == "excess" and s.floor and s.interval and s.interval[1] < s.floor:
+                    params = {"metric": measured(named), "subject": s.a}
                     outcome.notes.append(Note("below-floor", params))
         progress("TMMD family", done + 1, len(columns))
     return outcome
@@ -336,7 +335,7 @@ def _clusters(labels: Source) -> tuple[Source, int]:
 
 def _with_clusters(outcome: Outcome, clusters: int, of: str) -> Outcome:
     """Scores that looked at classes, and their differences, say that these are clusters."""
-    of_classes = {s.metric for s in outcome.scores if "classes" in s.details}
+    of_classes = {s.measure for s in outcome.scores if "classes" in s.details}
     for scores in (outcome.scores, outcome.differences):
         scores[:] = [
             replace(
@@ -344,7 +343,7 @@ def _with_clusters(outcome: Outcome, clusters: int, of: str) -> Outcome:
                 settings={**s.settings, "labels": f"cluster:{clusters} of {of}"},
                 notes=[*s.notes, Note("pseudo-labels", {"clusters": clusters, "of": of})],
             )
-            if s.metric.removesuffix(" difference") in of_classes
+            if s.measure in of_classes
             else s
             for s in scores
         ]
@@ -684,7 +683,7 @@ def with_warnings(
             notes=[
                 *s.notes,
                 *(of_encoder if s.encoder == digest else []),
-                *of_generator.get(s.subject, []),
+                *of_generator.get(s.a, []),
             ],
         )
         for s in scores

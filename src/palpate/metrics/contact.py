@@ -211,7 +211,7 @@ class Contacts:
 
     def scores(self, *, ids: Sequence[str] | None = None, **fields: Any) -> list[Score]:
         """One score a metric; ``fields`` as :func:`palpate.metrics.mean_score`."""
-        fields, n, none = {"subject": "generated", **fields}, len(self.area), self.area == 0
+        n, none = len(self.area), self.area == 0
         names = checked_names("ids", ids, n) or [str(i) for i in range(n)]
         count, first = int(none.sum()), [names[i] for i in np.flatnonzero(none)[:10]]
         notes = [Note("no-contact", {"count": count, "n": n})] if count else []

@@ -108,7 +108,7 @@ class PerImage:
 
     def score(self, **fields: Any) -> Score:
         """Their mean; ``fields`` as :func:`mean_score`."""
-        fields = {"subject": "generated", "bounds": self.bounds, **fields}
+        fields = {"bounds": self.bounds, **fields}
         return mean_score(
             self.metric, self.values, settings=self.settings, notes=self.notes, **fields
         )
@@ -146,6 +146,7 @@ def mean_score(
     metric: str,
     values: Array,
     *,
+    subject: str = "generated",
     ids: Sequence[str] | None = None,
     groups: Sequence[str] | None = None,
     bounds: tuple[float, float] = (-np.inf, np.inf),
@@ -159,6 +160,7 @@ def mean_score(
         metric: its name.
         values: (n,) one a pair; infinite where a pair is identical, NaN where it has no value
             (``notes`` say why): both are excluded.
+        subject: what is scored.
         ids: n names.
         groups: n groups.
         bounds: of the metric; a t interval may leave them.
@@ -187,8 +189,9 @@ def mean_score(
     }
     return Score(
         metric,
-        value=float(kept.mean()) if len(kept) else None,
-        interval=interval,
+        subject,
+        float(kept.mean()) if len(kept) else None,
+        interval,
         level=LEVEL,
         interval_method=spread.method if interval else "",
         estimator="per-image mean",

@@ -61,18 +61,19 @@ def mean_of(
     values: NDArray[Any],
     groups: Sequence[str],
     *,
+    subject: str,
     weights: Array | None = None,
     **fields: Any,
 ) -> Mean:
     """Mean of values (n,) in [0, 1], weighted (n,) or not, as a score with an interval over groups.
 
-    ``fields`` are further fields of the score.
+    ``subject`` is what is scored; ``fields`` are further fields of the score.
     """
     values = np.asarray(values, dtype=np.float64)
     weights = np.ones(len(values)) if weights is None else weights
     value = float(weights @ values / weights.sum())
     fields = {"higher_is_better": True, "n": len(values)} | fields
-    score = Score(metric, value=value, **fields)
+    score = Score(metric, subject, value, **fields)
     mean = Mean(score, values, weights, np.array(groups, dtype=str))
     spread = spread_of([[mean]])
     interval = spread.interval(0.0, 1.0)

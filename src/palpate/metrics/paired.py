@@ -39,9 +39,9 @@ class Comparison:
     """Scores of several generators, and their differences.
 
     Attributes:
-        scores: the metrics of each generator, in the order given; ``subject`` is its name.
-        differences: one score a metric and pair, ``value`` = a - b; ``details`` as in
-            :func:`difference`, and ``p_adjusted``.
+        scores: the metrics of each generator, in the order given; ``a`` is its name.
+        differences: one score a metric and pair of names ``a`` and ``b``, ``value`` = a - b;
+            ``details`` as in :func:`difference`, and ``p_adjusted``.
     """
 
     scores: list[Score]
@@ -53,8 +53,8 @@ def compare(
 ) -> Comparison:
     """TMMD, I-, CI- and D-TMMD of several generators on the same samples, with paired differences.
 
-    I- and CI-TMMD of halves of whole groups are followed by their between-group excess E, as a
-    metric of its own (``"I-TMMD E"``, ``"CI-TMMD E"``).
+    I- and CI-TMMD of halves of whole groups are followed by their between-group excess E, a score
+    of the kind ``"excess"``.
 
     Args:
         generators: name -> features of its samples; all with the same ids (any order), labels and
@@ -157,7 +157,7 @@ def difference(a: Scored, b: Scored, floor: Scored | None = None) -> Score:
         floor: real samples, for a metric without a better direction.
 
     Returns:
-        ``details``: ``a``, ``b``, ``better`` (a name or None), ``p_better``, ``decided`` (whether
+        ``details``: ``better`` (a name or None), ``p_better``, ``decided`` (whether
         the interval of what decides excludes 0), ``p_value``, and for metrics without reference
         ``gap``, ``gap_interval`` and ``p_difference``.
 
@@ -206,7 +206,7 @@ def excess_of(result: Scored) -> Scored | None:
     kept = ("unit", "left_out", "units", "backend", "version", "classes", "excluded")
     of_excess = replace(
         score,
-        metric=f"{score.metric} E",
+        kind="excess",
         value=d["E"],
         interval=tuple(interval) if interval else None,
         null=None,
@@ -228,7 +228,7 @@ def _spread(value: float, replicates: Array, df: int) -> Spread:
 def _verdict(x: Score, y: Score, spread: Spread, interval: Interval | None) -> dict[str, Any]:
     """Which of two is ahead, by a difference of which 0 is a tie."""
     ahead = spread.value if x.higher_is_better else -spread.value
-    better = x.subject if ahead > 0 else y.subject if ahead < 0 else None
+    better = x.a if ahead > 0 else y.a if ahead < 0 else None
     if interval is None:
         return {"better": better, "p_value": None}
     return {
@@ -252,14 +252,14 @@ def _as_difference(
     empty = {"better": None, "p_better": None, "p_value": None, "decided": False}
     return replace(
         x,
-        metric=f"{x.metric} difference",
-        subject=f"{x.subject} - {y.subject}",
+        kind="excess" if x.kind == "excess" else "difference",
+        b=y.a,
         value=value,
         interval=interval,
         interval_method=method,
         null=None,
         floor=None,
-        details={"a": x.subject, "b": y.subject, **empty, **details},
+        details={**empty, **details},
         notes=(note,) if note else (),
     )
 

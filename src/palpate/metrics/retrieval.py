@@ -115,8 +115,9 @@ def retrieval(  # noqa: PLR0913 - one argument a choice
         settings: more to keep in the scores.
 
     Returns:
-        b found by a (``"top-1 of 356 (text by tactile)"``), and a found by b; ``details`` holds the
-        chance level, and the mean number of right keys.
+        b found by a (``"top-1"`` with ``features`` of ``"text by tactile"``), and a found by b;
+        ``settings["pool"]`` is the pool's size, ``details`` holds the chance level, and the mean
+        number of right keys.
 
     Raises:
         PalpateError: if ids differ, the pool is larger than the set, n < 2, or on texts that are
@@ -150,7 +151,11 @@ def retrieval(  # noqa: PLR0913 - one argument a choice
     }
     forth, back = (
         _retrieved(
-            [pair[way] for pair in by_draw], draws, groups, name, top=top, fields=dict(fields)
+            [pair[way] for pair in by_draw],
+            draws,
+            groups,
+            top=top,
+            fields={**fields, "features": name},
         )
         for way, name in enumerate((f"{names[1]} by {names[0]}", f"{names[0]} by {names[1]}"))
     )
@@ -242,7 +247,6 @@ def _retrieved(
     by_draw: Sequence[Ranks],
     draws: Sequence[NDArray[np.intp]],
     groups: NDArray[np.str_],
-    name: str,
     *,
     top: Sequence[int],
     fields: dict[str, Any],
@@ -264,7 +268,7 @@ def _retrieved(
     details |= {"right_keys": float(np.mean([ranks.right.mean() for ranks in by_draw]))}
     means = [
         mean_of(
-            f"top-{k} of {size} ({name})",
+            f"top-{k}",
             averaged([ranks.within(k) for ranks in by_draw]),
             queries,
             weights=seen[used],
@@ -276,12 +280,12 @@ def _retrieved(
     ]
     ranks = averaged([r.expected for r in by_draw])
     details["chance"] = float(np.median(averaged([c.expected for c in chance])))
-    median = _median(f"median rank of {size} ({name})", ranks, queries, details, fields)
+    median = _median(ranks, queries, details, fields)
     return Retrieved(means, median)
 
 
 def _median(
-    metric: str, ranks: Array, groups: Sequence[str], details: dict[str, Any], fields: Any
+    ranks: Array, groups: Sequence[str], details: dict[str, Any], fields: dict[str, Any]
 ) -> Score:
     value = float(np.median(ranks))
     share = mean_of("share", ranks <= value, groups, subject="").score
@@ -292,9 +296,8 @@ def _median(
         low, high = np.quantile(ranks, bounds, method="inverted_cdf").tolist()
         interval, method = (low, high), f"Woodruff, from the {share.interval_method}"
     fields |= {"estimator": "median", "interval": interval, "interval_method": method}
-    return Score(
-        metric, value=value, n=len(ranks), higher_is_better=False, details=details, **fields
-    )
+    fields |= {"a": fields.pop("subject"), "n": len(ranks), "higher_is_better": False}
+    return Score("median rank", value=value, details=details, **fields)
 
 
 def _check(a: FeatureSet, b: FeatureSet, pool: int | None) -> None:

@@ -23,6 +23,7 @@ from palpate.metrics.images import per_image
 from palpate.preference.arrays import FEWER, VoteArrays
 from palpate.preference.plan import REFERENCE, Plan
 from palpate.preference.statistics import Array, tau_b
+from palpate.report.labels import measured
 from palpate.report.results import Results
 
 BY_IMAGE, BY_METHOD = "Kendall's tau with people, by image", "Kendall's tau with people, by method"
@@ -93,13 +94,13 @@ def _of_results(plan: Plan, results: Results) -> list[Metric]:
     """Scores by method; of a metric whose target is the floor, the distance to it."""
     values: dict[str, dict[str, float]] = {}
     for s in results.scores:
-        if s.subject not in plan.methods or s.value is None or s.metric.endswith(" difference"):
+        if s.a not in plan.methods or s.value is None or s.b is not None:
             continue
-        name = ", ".join(filter(None, [s.metric, str(s.settings.get("preset", ""))]))
+        name = ", ".join(filter(None, [measured(s), str(s.settings.get("preset", ""))]))
         if s.higher_is_better is not None:
-            values.setdefault(name, {})[s.subject] = s.value if s.higher_is_better else -s.value
+            values.setdefault(name, {})[s.a] = s.value if s.higher_is_better else -s.value
         elif s.floor is not None:
-            values.setdefault(name, {})[s.subject] = -abs(s.value - s.floor)
+            values.setdefault(name, {})[s.a] = -abs(s.value - s.floor)
     return [Metric(name, {}, of_method) for name, of_method in values.items()]
 
 

@@ -163,9 +163,9 @@ class VoteArrays:
         """A score with its :meth:`interval`."""
         interval, method, notes = self.interval(value, replicates, items)
         return Score(
-            metric=metric,
-            subject=subject,
-            value=float(value) if np.isfinite(value) else None,
+            metric,
+            subject,
+            float(value) if np.isfinite(value) else None,
             interval=interval,
             interval_method=method,
             n=int(n),

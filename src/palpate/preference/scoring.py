@@ -193,12 +193,10 @@ def preference_scores(arrays: VoteArrays) -> list[Score]:
     ]
     differences: list[Score] = []
     for c, (a, b) in enumerate(arrays.columns):
-        name, items = f"{PREFERENCE} difference", arrays.answered(c)
-        made = _net(
-            arrays.score(name, f"{a} - {b}", shares[c], replicates[:, c], votes[c], items=items)
-        )
+        items = arrays.answered(c)
+        made = _net(arrays.score(PREFERENCE, a, shares[c], replicates[:, c], votes[c], items=items))
         verdict = _verdict(made, (a, b), 2 * replicates[:, c] - 1, items)
-        differences.append(replace(made, details=verdict))
+        differences.append(replace(made, kind="difference", b=b, details=verdict))
     return [*scores, *holm(differences)]
 
 
@@ -220,8 +218,6 @@ def _verdict(made: Score, pair: tuple[str, str], replicates: Array, items: int) 
     if sure and made.notes:
         above = 0.5 + np.sign(float(made)) * (0.5 - 0.5**items)
     return {
-        "a": a,
-        "b": b,
         "better": a if float(made) > 0 else b if float(made) < 0 else None,
         "p_better": above if sure else None,
         "p_value": max(2 * min(above, 1 - above), 1 / len(replicates)) if sure else None,

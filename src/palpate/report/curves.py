@@ -34,7 +34,7 @@ def panels_of(table: Sheet) -> list[Panel]:
             for row in table.rows
             if (score := row.cells[k].score) is not None
         ]
-        if rows and len({score.metric for _, score, _ in rows}) == 1:
+        if rows and len({(score.measure, score.kind) for _, score, _ in rows}) == 1:
             panels.append(Panel(f"{head.label} {head.arrow}".strip(), rows))
     return panels
 

@@ -83,8 +83,8 @@ def _drawings(results: Results) -> dict[str, Drawing]:
 
 def _telling(panel: Panel) -> int:
     """The place of a panel among those that say most."""
-    metric = panel.rows[0][1].metric
-    return TELLING.index(metric) if metric in TELLING else len(TELLING)
+    measure = panel.rows[0][1].measure
+    return TELLING.index(measure) if measure in TELLING else len(TELLING)
 
 
 def _pictures(results: Results) -> dict[str, Picture]:

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 from markupsafe import Markup
 
-from palpate.core import Score
+from palpate.core import Measure, Score
 from palpate.report import plots
 from palpate.report.notes import number, p_text, percent, plural, sentence
 from palpate.report.results import Audit, Results
@@ -15,16 +15,16 @@ from palpate.report.sentences import share_of
 from palpate.report.tables import REAL, Cell, Column, Table, best_by_value, defined
 
 #: Columns of the verdict table, the most telling first; others follow as they come.
-TELLING = ("TMMD", "material accuracy", "D-TMMD", "CI-TMMD", "SSIM")
+TELLING = tuple(map(Measure, ("TMMD", "material accuracy", "D-TMMD", "CI-TMMD", "SSIM")))
 COLUMNS, CARDS, CARD_ROWS = 5, 3, 4
-#: Beginnings of metrics whose null is that generated and real images are alike.
+#: Metrics whose null is that generated and real images are alike.
 DISTANCES = ("TMMD", "FID", "CMMD", "KID")
 #: Width of the strip in a card, and of the one that explains strips, in pixels.
 STRIP, READING = 296.0, 330.0
 #: What a metric asks, for the title of its card.
 QUESTIONS = {
-    "TMMD": "Distance to real images, TMMD",
-    "material accuracy": "Material read from the image",
+    TELLING[0]: "Distance to real images, TMMD",
+    TELLING[1]: "Material read from the image",
 }
 #: Axis of shares.
 UNIT = plots.Axis(-0.02, 1.02, (), 1, width=92)
@@ -88,10 +88,10 @@ def telling_columns(tables: Sequence[Table]) -> list[Column]:
 
     So a column of another preset never stands in for one that is undefined.
     """
-    first: dict[str, Column] = {}
+    first: dict[Measure, Column] = {}
     for column in (c for table in tables for c in table.columns):
-        first.setdefault(column.metric, column)
-    known = [first.pop(metric) for metric in TELLING if metric in first]
+        first.setdefault(column.measure, column)
+    known = [first.pop(measure) for measure in TELLING if measure in first]
     others = [c for c in first.values() if any(cell.defined for cell in c.cells)]
     return [*known, *others][:COLUMNS]
 
@@ -106,7 +106,7 @@ def cards(
     for column in columns:
         if cells := [cell for cell in column.cells if cell.defined]:
             shown = _compared(column, cells, controls, subjects)
-            subjects = subjects or [cell.score.subject for cell in shown]
+            subjects = subjects or [cell.score.a for cell in shown]
             made.append(_score_card(column, shown, len(cells), controls))
     return made[:CARDS]
 
@@ -135,7 +135,7 @@ def _score_card(
     column: Column, shown: Sequence[Cell], known: int, controls: Collection[str]
 ) -> Card:
     first = shown[0]
-    share = "accuracy" in column.metric
+    share = "accuracy" in column.measure.metric
     mark = first.baselines.get("chance") if share else first.score.floor
     axis = strip_axis([cell.score for cell in shown], STRIP)
     small = UNIT if share or axis is None else replace(axis, ticks=(), width=UNIT.width)
@@ -143,10 +143,10 @@ def _score_card(
     left = f" {len(shown)} of {known} rows." if known > len(shown) else ""
     told = [n for cell in shown for n in cell.score.notes if n.code == "text"]
     left += f" * {sentence(told[0]).partition(':')[0]}." if told else ""
-    title = f"{QUESTIONS.get(column.metric, column.metric)} {column.arrow}"
+    title = f"{QUESTIONS.get(column.measure, column.name)} {column.arrow}"
     if share:
         chance = f"Share named right by a probe; dashed: chance, {percent(mark)}." if mark else ""
-        real = next((c.score for c in shown if c.score.subject == REAL), None)
+        real = next((c.score for c in shown if c.score.a == REAL), None)
         if mark and real and real.interval and real.interval[0] <= mark:
             chance = f"The probe does not tell real images from chance, {percent(mark)} (dashed)."
         return Card(title, rows, f"{chance}{left}".strip())
@@ -166,18 +166,18 @@ def _compared(
     Cards that follow hold the subjects of the first, and the real images in the place of the last
     method.
     """
-    real = [c for c in cells if c.score.subject == REAL]
-    if same := [c for name in before for c in cells if c.score.subject == name]:
-        apart = [c for c in same if c.score.subject in controls]
-        methods = [c for c in same if c.score.subject not in {*controls, REAL}]
+    real = [c for c in cells if c.score.a == REAL]
+    if same := [c for name in before for c in cells if c.score.a == name]:
+        apart = [c for c in same if c.score.a in controls]
+        methods = [c for c in same if c.score.a not in {*controls, REAL}]
         room = CARD_ROWS - len(real)
         methods = methods[: max(1, room - len(apart))]
         return [*methods, *apart[: room - len(methods)], *real]
-    methods = [c for c in cells if c.score.subject != REAL and c.score.subject not in controls]
+    methods = [c for c in cells if c.score.a != REAL and c.score.a not in controls]
     others = methods[1:]
     best = best_by_value([c.score for c in others], column.digits) or {0}
-    apart = [c for c in cells if c.score.subject in controls]
-    photo = [c for c in apart if "nearest photo" in c.score.subject] or apart
+    apart = [c for c in cells if c.score.a in controls]
+    photo = [c for c in apart if "nearest photo" in c.score.a] or apart
     chosen = [*methods[:1], *(others[k] for k in sorted(best)[:1] if others), *photo[:1], *real[:1]]
     more = [c for c in (*others, *cells) if all(c is not other for other in chosen)]
     room = CARD_ROWS - len(chosen)
@@ -199,7 +199,7 @@ def _strip_facts(score: Score, column: Column) -> str:
     facts: list[str] = []
     if score.interval:
         low, high = (number(v, column.digits) for v in score.interval)
-        facts.append(f"{score.subject}: {100 * score.level:g} % interval [{low}, {high}]")
+        facts.append(f"{score.a}: {100 * score.level:g} % interval [{low}, {high}]")
     if score.floor is not None:
         facts.append(f"dashed: real images {number(score.floor, column.digits)}")
     return "; ".join(filter(None, [*facts, _against_real(score)])) + "." * bool(facts)
@@ -212,7 +212,7 @@ def _against_real(score: Score) -> str:
     decides; a metric without a better direction has the floor to compare with.
     """
     p = score.details.get("p_value")
-    if score.metric.startswith(DISTANCES) and p is not None:
+    if score.metric in DISTANCES and p is not None:
         shown = "differs from real" if p < 0.05 else "not shown to differ from real"
         return f"p {'' if p < 0.001 else '= '}{p_text(p)}: {shown}"
     if score.higher_is_better is not None or score.floor is None or not score.interval:
@@ -220,7 +220,7 @@ def _against_real(score: Score) -> str:
     low, high = score.interval
     if low <= score.floor <= high:
         return "the interval holds the floor"
-    varied = high < score.floor and score.metric.startswith(("I-TMMD", "CI-TMMD"))
+    varied = high < score.floor and score.metric in ("I-TMMD", "CI-TMMD")
     lack = ": images vary less than real ones" if varied else ""
     return f"the interval is {'below' if high < score.floor else 'above'} the floor{lack}"
 
@@ -233,10 +233,10 @@ def _score_row(
     controls: Collection[str],
 ) -> CardRow:
     score = cell.score
-    label = f"{score.subject} (control)" if score.subject in controls else score.subject
+    label = f"{score.a} (control)" if score.a in controls else score.a
     label += "*" * any(note.code == "text" for note in score.notes)
     drawing = plots.bar(axis, score.value, score.interval, mark=mark)
-    share = "accuracy" in column.metric
+    share = "accuracy" in column.measure.metric
     text = percent(float(score)) if share else number(score.value, column.digits)
     return CardRow(label, drawing, text)
 

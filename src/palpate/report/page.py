@@ -25,6 +25,7 @@ from markupsafe import Markup, escape
 from palpate._version import __version__
 from palpate.core import PalpateError, Progress, SampleRef, plain, quiet, write_json, write_text
 from palpate.report import audits, first_screen, plots, sentences, study_tables
+from palpate.report.labels import label_of, subject_of
 from palpate.report.notes import count, digits_of, number, percent, plural, sentence, where
 from palpate.report.results import GalleryItem, LeakPair, Results, Strip
 from palpate.report.study_tables import sheets
@@ -340,6 +341,8 @@ def environment() -> Environment:
         "READING": first_screen.READING,
         "open_claims": OPEN_CLAIMS,
         "digits_of": digits_of,
+        "label_of": label_of,
+        "subject_of": subject_of,
         "verdict_marks": study_tables.MARKS,
     }
     for module in (audits, first_screen, plots, sentences, study_tables):

@@ -22,6 +22,7 @@ from palpate.core.records import from_plain
 from palpate.core.samples import SampleRef
 from palpate.core.score import Score
 from palpate.report.calls import Call
+from palpate.report.labels import label_of, subject_of
 from palpate.report.study import Claim, StudyTable
 
 if TYPE_CHECKING:
@@ -343,9 +344,9 @@ class Strip:
 class Results:
     """Scores, audits and images of a run: a table of scores that can also be drawn as a page.
 
-    Iterates over its scores; ``results["TMMD"]`` lists those of a metric, ``results["TMMD", "a"]``
-    is that of generator ``a`` (of several presets the first; ``results["TMMD", "a", "paper"]``
-    names one).
+    Iterates over its scores; ``results["TMMD"]`` lists those of a column, by its printed name (as
+    ``"FID (Inception)"``), ``results["TMMD", "ours"]`` is that of generator ``ours`` (of several
+    presets the first; ``results["TMMD", "ours", "paper"]`` names one).
 
     Attributes:
         title: heading of the page.
@@ -389,7 +390,7 @@ class Results:
     @overload
     def __getitem__(self, key: int) -> Score: ...
     def __getitem__(self, key: int | str | tuple[str, ...]) -> list[Score] | Score:
-        """The scores of a metric, the score of (metric, subject) or of (metric, subject, preset).
+        """The scores of a column, the score of (column, row) or of (column, row, preset).
 
         A number is a place in ``scores``.
 
@@ -447,9 +448,8 @@ class Results:
 
         from palpate.report.notes import sentence
 
-        names = (
-            "metric subject value level interval_method floor estimator bandwidth scale n m seed"
-        )
+        names = "metric features kernel kind a b value level interval_method floor"
+        names += " estimator bandwidth scale n m seed"
         names += " higher_is_better encoder reference split"
         rows: list[dict[str, Any]] = []
         for score in self.scores:
@@ -547,7 +547,7 @@ def _writer(name: str) -> Any:
 
 
 def _key(score: Score) -> tuple[str, str, str]:
-    return score.metric, score.subject, str(score.settings.get("preset", ""))
+    return label_of(score), subject_of(score), str(score.settings.get("preset", ""))
 
 
 def _preformatted(text: str) -> str:

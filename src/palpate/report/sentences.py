@@ -170,7 +170,7 @@ def audit_line(audit: Audit) -> str:
 def purpose(results: Results) -> str:
     """Return the question that the page answers."""
     parts: list[str] = []
-    families = {family_of(score.metric).title for score in results.scores}
+    families = {family_of(score).title for score in results.scores}
     probed = families and not results.gallery and families <= {"Recognition", "Retrieval"}
     if "Captions" in families:
         parts.append("what do captions give away about their labels, and can they be used")
@@ -205,10 +205,10 @@ def score_line(scores: Sequence[Score]) -> str:
         for score in (cell.score for cell in cells[:3]):
             low_high = [number(v, column.digits) for v in score.interval or ()]
             interval = f" [{', '.join(low_high)}]" if low_high else ""
-            values.append(f"{score.subject} {number(score.value, column.digits)}{interval}")
+            values.append(f"{score.a} {number(score.value, column.digits)}{interval}")
         floors = [cell.score.floor for cell in cells if cell.score.floor is not None]
         floor = f"; floor {number(floors[0], column.digits)}" if floors else ""
-        return f"{column.metric} ({column.better}): {', '.join(values)}{floor}."
+        return f"{column.name} ({column.better}): {', '.join(values)}{floor}."
     return ""
 
 

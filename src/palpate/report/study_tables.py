@@ -11,8 +11,9 @@ import re
 from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass, replace
 from itertools import count
+from typing import Any
 
-from palpate.core import Note, Score
+from palpate.core import Measure, Note, Score
 from palpate.core.score import ARROWS, BETTER
 from palpate.report.notes import confidence, digits_of, number, p_text
 from palpate.report.results import Results
@@ -130,10 +131,10 @@ def scores_of_methods(results: Results) -> list[Score]:
     Results of real images alone, as a probe's, are returned whole.
     """
     controls = {REAL, *controls_of(results)}
-    first: dict[tuple[str, str], Score] = {}
+    first: dict[Any, Score] = {}
     for score in results.scores:
-        if score.subject not in controls:
-            first.setdefault((score.metric, score.subject), score)
+        if score.a not in controls:
+            first.setdefault((score.measure, score.a, score.b), score)
     return [*first.values()] or [*results.scores]
 
 
@@ -172,16 +173,16 @@ def lay(columns: Sequence[Column], controls: Collection[str] = ()) -> Sheet:
     The best of a column is marked among those that compete and are no ``controls``.
     """
     footnotes = Footnotes()
-    subjects = list(dict.fromkeys(c.score.subject for column in columns for c in column.cells))
+    subjects = list(dict.fromkeys(c.score.a for column in columns for c in column.cells))
     subjects.sort(key=lambda subject: (subject == REAL, subject in controls))
     best: set[int] = set()
     for column in columns:
-        free = (c.competes and c.score.subject not in controls for c in column.cells)
+        free = (c.competes and c.score.a not in controls for c in column.cells)
         scores = [c.score if f else None for c, f in zip(column.cells, free, strict=True)]
         best |= {id(column.cells[k]) for k in best_by_value(scores, column.digits)}
     rows: list[Row] = []
     for subject in subjects:
-        cells = [[c for c in column.cells if c.score.subject == subject] for column in columns]
+        cells = [[c for c in column.cells if c.score.a == subject] for column in columns]
         control = subject in controls
         for k in range(max(map(len, cells))):  # several where seeds differ
             entries = [Entry(subject)]
@@ -192,7 +193,7 @@ def lay(columns: Sequence[Column], controls: Collection[str] = ()) -> Sheet:
                 )
             rows.append(Row(entries, control, bool(rows) and control != rows[-1].control))
     heads = [Head("", "", "", False)]
-    heads += [Head(c.metric, c.arrow, c.better, True) for c in columns]
+    heads += [Head(c.name, c.arrow, c.better, True) for c in columns]
     floors = [
         ""
         if (floor := next((c.score.floor for c in column.cells), None)) is None
@@ -264,7 +265,7 @@ def difference_sheet(table: Table) -> Sheet:
     for d in table.differences:
         words = ["" if d.confidence is None else confidence(d.confidence), p_text(d.p)]
         score = Entry(d.score, d.digits, footnotes=footnotes.numbers(notes_of(d.score)))
-        names = map(Entry, (f"{d.metric} {d.arrow}", d.a, d.b))
+        names = map(Entry, (f"{d.name} {d.arrow}", d.score.a, d.score.b))
         rows.append(Row([*names, score, *map(Entry, words)], False, False))
     text = "a - b; where the interval excludes 0 the difference is more than chance."
     title = f"Paired differences: {table.title}"
@@ -313,12 +314,12 @@ def file_names(kind: str, titles: Sequence[str]) -> list[str]:
 
 def _digits(column: Sequence[Score | str | None]) -> list[int]:
     """Decimals of each cell: equal ones for the scores of one metric in one column."""
-    by_metric: dict[str, list[Score]] = {}
+    alike: dict[tuple[Measure, str], list[Score]] = {}
     for score in column:
         if isinstance(score, Score):
-            by_metric.setdefault(score.metric, []).append(score)
-    digits = {metric: digits_of(scores) for metric, scores in by_metric.items()}
-    return [digits[s.metric] if isinstance(s, Score) else 0 for s in column]
+            alike.setdefault((score.measure, score.kind), []).append(score)
+    digits = {key: digits_of(scores) for key, scores in alike.items()}
+    return [digits[s.measure, s.kind] if isinstance(s, Score) else 0 for s in column]
 
 
 def _head(label: str, column: Sequence[Score | str | None], compared: bool) -> Head:

@@ -14,17 +14,15 @@ from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Any
 
-from palpate.core import Note, Score, columns, plain, short
+from palpate.core import Measure, Note, Score, columns, plain, short
 from palpate.core.score import ARROWS, BETTER
+from palpate.report.labels import label_of, measured, subject_of
 from palpate.report.notes import decimals, digits_of, number
-
-#: What the name of a metric ends in where the score is the difference of two generators.
-DIFFERENCE = " difference"
 
 
 @dataclass(frozen=True)
 class Family:
-    """Metrics that answer one question, and the parts of their names (lower case)."""
+    """Metrics that answer one question: by words that are part of their names (lower case)."""
 
     title: str
     question: str = ""
@@ -53,7 +51,7 @@ FAMILIES = (
     Family(
         "Image distributions",
         "Are the sets of images similar to a general image encoder?",
-        ("cmmd", "fid", "kid", "mmd", "precision", "recall (", "density", "coverage"),
+        ("cmmd", "fid", "kid", "mmd", "precision", "recall ", "density", "coverage"),
     ),
     Family(
         "Image by image",
@@ -81,7 +79,7 @@ FAMILIES = (
         "Retrieval",
         "Which text, photo or tactile image belongs to it? The share of samples for which a right "
         "one is among the k most similar, and the median of its rank.",
-        ("top-", "rank of", "retriev"),
+        ("top-", "median rank", "retriev"),
     ),
     Family("Other metrics"),
 )
@@ -92,7 +90,7 @@ DECIDED = (
     "better than every other one compared (metrics without reference: closer to the floor) by a "
     "paired difference whose interval excludes 0"
 )
-#: Subject of real images.
+#: The ``a`` of scores of real images.
 REAL = "real"
 #: What the cells of a matrix are.
 DIVERGENCE = (
@@ -159,7 +157,8 @@ class Column:
     """One metric.
 
     Attributes:
-        metric: its name; ``label`` lacks the features, which are in the table's title.
+        measure: what is measured.
+        name: that in words; ``label`` lacks the features, which are in the table's title.
         higher_is_better: the direction.
         digits: decimals of all its numbers.
         size: sample sizes if all of its scores share them.
@@ -167,7 +166,8 @@ class Column:
         cells: its scores.
     """
 
-    metric: str
+    measure: Measure
+    name: str
     label: str
     higher_is_better: bool | None
     digits: int
@@ -191,19 +191,17 @@ class Difference:
     """A paired difference of two generators, a - b: one row below the scores.
 
     Attributes:
-        score: the difference; metric: of the two scores.
+        score: the difference, of the generators ``score.a`` and ``score.b``.
+        name: of what is measured.
         arrow: its better direction.
-        a, b: the generators.
         confidence: that a is better, in [0, 1], or None.
         p: two-sided p-value, adjusted by Holm over the pairs, or None.
         digits: decimals of value and interval.
     """
 
     score: Score
-    metric: str
+    name: str
     arrow: str
-    a: str
-    b: str
     confidence: float | None
     p: float | None
     digits: int
@@ -246,9 +244,9 @@ def defined(score: Score) -> bool:
     return score.value is not None
 
 
-def family_of(metric: str) -> Family:
-    """Return the family of a metric."""
-    name = f"{metric.lower()} ("
+def family_of(score: Score) -> Family:
+    """Return the family of a score's metric."""
+    name = f"{score.metric.lower()} "
     return next((f for f in FAMILIES[:-1] if any(p in name for p in f.parts)), FAMILIES[-1])
 
 
@@ -261,10 +259,9 @@ def notes_of(score: Score) -> list[Note]:
         notes.append(Note("nearer-to-floor"))
     if "no contact" in Cell(score, ()).baselines:
         notes.append(Note("no-contact-baseline"))
-    family = score.metric.split(" ")[0]
-    lacks_floor = score.floor is None and not score.metric.endswith(DIFFERENCE)
-    if lacks_floor and defined(score) and family in ("TMMD", "I-TMMD", "CI-TMMD", "D-TMMD"):
-        code = "no-floor-of-tmmd" if family == "TMMD" else "floor-unknown"
+    lacks_floor = score.floor is None and score.b is None
+    if lacks_floor and defined(score) and score.metric in ("TMMD", "I-TMMD", "CI-TMMD", "D-TMMD"):
+        code = "no-floor-of-tmmd" if score.metric == "TMMD" else "floor-unknown"
         notes += [] if any(note.code == "no-floor" for note in notes) else [Note(code)]
     return notes
 
@@ -291,11 +288,10 @@ def score_tables(scores: Sequence[Score]) -> list[Table]:
     references = _references(scores)
     groups: dict[tuple[int, str, str, str, int], list[Score]] = {}
     for score, reference in zip(scores, references, strict=True):
-        metric = score.metric.removesuffix(DIFFERENCE)
-        place = FAMILIES.index(family_of(metric))
+        place = FAMILIES.index(family_of(score))
         preset = str(score.settings.get("preset", ""))
         split = "" if score.settings.get("axis") == "split" else score.split or ""
-        key = (place, preset, split, _features(metric), reference)
+        key = (place, preset, split, score.features, reference)
         groups.setdefault(key, []).append(score)
     several = [len({key[k] for key in groups} - {""}) > 1 for k in (2, 4)]
     tables: list[Table] = []
@@ -313,14 +309,6 @@ def score_tables(scores: Sequence[Score]) -> list[Table]:
     return tables
 
 
-def _features(metric: str) -> str:
-    """``"tactile"`` of ``"FID (tactile)"``; '' for a name without brackets, or with a bandwidth."""
-    bracket = (
-        metric[metric.rindex(" (") + 2 : -1] if metric.endswith(")") and " (" in metric else ""
-    )
-    return "" if bracket.startswith("σ") else bracket
-
-
 def _references(scores: Sequence[Score]) -> list[int]:
     """Return which reference each score was compared with: 0 for the first of its metric, 1 ...
 
@@ -328,38 +316,38 @@ def _references(scores: Sequence[Score]) -> list[int]:
     metric. A score without one (I-, CI-, D-TMMD) goes with the last of its subject that has one,
     else with the first after it.
     """
-    known: dict[tuple[str, str | None], list[str]] = {}
+    known: dict[tuple[Measure, str | None], list[str]] = {}
     index: list[int | None] = []
     for score in scores:
         if score.reference is None:
             index.append(None)
             continue
-        metric = known.setdefault((score.metric.removesuffix(DIFFERENCE), score.encoder), [])
+        metric = known.setdefault((score.measure, score.encoder), [])
         metric += [] if score.reference in metric else [score.reference]
         index.append(metric.index(score.reference))
-    last: dict[str, int] = {}
+    last: dict[tuple[str, str | None], int] = {}
     for score, k in reversed(list(zip(scores, index, strict=True))):
         if k is not None:
-            last[score.subject] = k
+            last[score.a, score.b] = k
     result: list[int] = []
     for score, k in zip(scores, index, strict=True):
         if k is not None:
-            last[score.subject] = k
-        result.append(last.get(score.subject, 0))
+            last[score.a, score.b] = k
+        result.append(last.get((score.a, score.b), 0))
     return result
 
 
 def _table(title: str, question: str, scores: Sequence[Score]) -> Table:
     footnotes = Footnotes()
-    differences = [s for s in scores if s.metric.endswith(DIFFERENCE)]
-    members = [s for s in scores if not s.metric.endswith(DIFFERENCE)]
+    differences = [s for s in scores if s.b is not None]
+    members = [s for s in scores if s.b is None]
     heads: list[Column] = []
-    for metric, column in columns(members).items():
+    for column in columns(members):
         sizes = [_size(score) for score in column]
         shared = sizes[0] if len(set(sizes)) == 1 else ""
         digits, winner = digits_of(column), best_of(column, differences)
-        names = {name for d in differences for name in (d.details["a"], d.details["b"])}
-        competes = [s.subject in names if names else s.subject != REAL for s in column]
+        names = {name for d in differences for name in (d.a, d.b)}
+        competes = [s.a in names if names else s.a != REAL for s in column]
         best = best_by_value(
             [s if c else None for s, c in zip(column, competes, strict=True)], digits
         )
@@ -369,15 +357,15 @@ def _table(title: str, question: str, scores: Sequence[Score]) -> Table:
                 footnotes.numbers(notes_of(score)),
                 "" if shared else size,
                 k in best,
-                score.subject == winner,
+                score.a == winner,
                 competes[k],
             )
             for k, (score, size) in enumerate(zip(column, sizes, strict=True))
         ]
-        features = _features(metric)
-        label = metric.removesuffix(f" ({features})") if features else metric
-        direction = column[0].higher_is_better
-        heads.append(Column(metric, label, direction, digits, shared, _made(column), cells))
+        first = column[0]
+        names = first.measure, measured(first), measured(replace(first, features=""))
+        facts = first.higher_is_better, digits, shared, _made(column)
+        heads.append(Column(*names, *facts, cells))
     columns(differences)
     rows = [_difference(score) for score in differences if defined(score)]
     shared = [fact for fact in heads[0].made if all(fact in h.made for h in heads)] if heads else []
@@ -389,10 +377,8 @@ def _difference(score: Score) -> Difference:
     details = score.details
     return Difference(
         score,
-        score.metric.removesuffix(DIFFERENCE),
+        measured(score),
         ARROWS[score.higher_is_better],
-        str(details["a"]),
-        str(details["b"]),
         details.get("p_better"),
         details.get("p_adjusted"),
         digits_of([score]),
@@ -407,7 +393,7 @@ def rankings(table: Table) -> list[tuple[str, str]]:
     """
     of_metric: dict[str, list[Difference]] = {}
     for d in table.differences:
-        of_metric.setdefault(f"{d.metric} {d.arrow}", []).append(d)
+        of_metric.setdefault(f"{d.name} {d.arrow}", []).append(d)
     if not of_metric or max(map(len, of_metric.values())) < 3:
         return []
     rows = [(m, _ranking(ds)) for m, ds in of_metric.items()]
@@ -415,15 +401,19 @@ def rankings(table: Table) -> list[tuple[str, str]]:
 
 
 def _ranking(differences: Sequence[Difference]) -> str:
-    wins = dict.fromkeys([name for d in differences for name in (d.a, d.b)], 0)
+    wins = dict.fromkeys([name for d in differences for name in _pair(d.score)], 0)
     known = [d for d in differences if d.confidence is not None]
     for d in known:
-        wins[d.a if (d.confidence or 0) > 0.5 else d.b] += 1
-    apart = {frozenset((d.a, d.b)) for d in known if d.p is not None and d.p < 0.05}
+        wins[_pair(d.score)[(d.confidence or 0) <= 0.5]] += 1
+    apart = {frozenset(_pair(d.score)) for d in known if d.p is not None and d.p < 0.05}
     names = sorted(wins, key=lambda name: -wins[name])
     signs = [">" if frozenset(pair) in apart else "~" for pair in pairwise(names)]
     steps = (f" {sign} {name}" for sign, name in zip(signs, names[1:], strict=True))
     return names[0] + "".join(steps) if known else ""
+
+
+def _pair(difference: Score) -> tuple[str, str]:
+    return difference.a, difference.b or ""
 
 
 def _size(score: Score) -> str:
@@ -440,8 +430,8 @@ def best_of(column: Sequence[Score], differences: Sequence[Score]) -> str | None
     """
     wins: dict[str, bool] = {}
     for d in differences:
-        if column and d.metric == column[0].metric + DIFFERENCE:
-            for name in (d.details["a"], d.details["b"]):
+        if column and d.measure == column[0].measure:
+            for name in _pair(d):
                 won = bool(d.details.get("decided")) and d.details.get("better") == name
                 wins[name] = wins.get(name, True) and won
     return next((name for name, won in wins.items() if won), None)
@@ -513,7 +503,7 @@ def heat_tables(scores: Sequence[Score]) -> list[Heat]:
         names: Sequence[Any] = score.details.get("classes") or range(1, len(matrix) + 1)
         values = [abs(v) for row in matrix for v in row if v is not None]
         digits, top = min(3, decimals(values)), max(values, default=0.0) or 1.0
-        parts = [score.metric, score.subject, str(score.settings.get("preset", ""))]
+        parts = [label_of(score), subject_of(score), str(score.settings.get("preset", ""))]
         title = ", ".join(filter(None, parts))
         if any(title == table.title for table in tables) and score.reference:
             title += f", reference {short(score.reference)}"
@@ -531,8 +521,8 @@ def heat_tables(scores: Sequence[Score]) -> list[Heat]:
 
 def facts_of(table: Table) -> list[tuple[str, str]]:
     """Return (what, how) the scores were made: what all columns share, then what is of one."""
-    sizes = [(f"{c.metric}, size", c.size) for c in table.columns if c.size]
-    single = [(f"{c.metric}, {what}", how) for c in table.columns for what, how in c.made]
+    sizes = [(f"{c.name}, size", c.size) for c in table.columns if c.size]
+    single = [(f"{c.name}, {what}", how) for c in table.columns for what, how in c.made]
     return [*sizes, *table.made, *single]
 
 

@@ -91,8 +91,8 @@ def score_rows(table: Table) -> list[dict[str, str]]:
     """Return the scores of a table, a row each."""
     return [
         {
-            "metric": f"{column.metric} {column.arrow}",
-            "subject": cell.score.subject,
+            "metric": f"{column.name} {column.arrow}",
+            "subject": cell.score.a,
             "value": _number(cell.score.value, column.digits)
             + " *" * cell.best
             + " †" * cell.decided,

@@ -20,17 +20,18 @@ from statistics import fmean
 import numpy as np
 from scipy import special
 
-from palpate.core import Score
+from palpate.core import Measure, Score
+from palpate.report.labels import measured
 from palpate.report.notes import number
 from palpate.report.study import Claim, StudyTable, Verdict
-from palpate.studies.evidence import DIFFERENCE, ahead, in_words, metric_of, over_seeds, side_of
+from palpate.studies.evidence import ahead, in_words, over_seeds, side_of
 
 #: Metrics that compare pixels, or features of networks trained on photos (paper, table 3).
 TRADITIONAL = ("SSIM", "PSNR", "LPIPS", "FID", "CMMD")
 #: Metrics on features of a tactile encoder (paper, Eq. 2-7).
 FAMILY = ("TMMD", "I-TMMD", "CI-TMMD", "D-TMMD")
-#: What feature metrics are called whose features are of a tactile encoder: none of the paper's.
-TACTILE = "(tactile)"
+#: Features of a tactile encoder: none of the paper's traditional metrics are computed on them.
+TACTILE = "tactile"
 PEOPLE = "human preference"
 #: How to read a lead.
 BEHIND = "below 0: behind"
@@ -69,20 +70,16 @@ def differences_over_seeds(runs: Sequence[Iterable[Score]]) -> list[Score]:
     Returns:
         One score for each metric and pair of methods that every seed has.
     """
-    listed = [_chosen(s for s in run if _is_difference(s)) for run in runs]
+    listed = [_chosen(s for s in run if s.b is not None) for run in runs]
     shared = [key for key in listed[0] if all(key in run for run in listed)] if listed else []
     return [_combined([run[key] for run in listed]) for key in shared]
 
 
-def _is_difference(score: Score) -> bool:
-    return score.metric.endswith(DIFFERENCE) and {"a", "b"} <= {*score.details}
-
-
-def _chosen(scores: Iterable[Score]) -> dict[tuple[str, str], Score]:
-    """By metric and pair; of several presets ``grouped``, else the first."""
-    chosen: dict[tuple[str, str], Score] = {}
+def _chosen(scores: Iterable[Score]) -> dict[tuple[Measure, str, str | None], Score]:
+    """By measure and pair; of several presets ``grouped``, else the first."""
+    chosen: dict[tuple[Measure, str, str | None], Score] = {}
     for score in scores:
-        key = score.metric, score.subject
+        key = score.measure, score.a, score.b
         if key not in chosen or score.settings.get("preset") == "grouped":
             chosen[key] = score
     return chosen
@@ -130,7 +127,7 @@ def leak_claims(
     gains = {task: ahead(difference, names[0]) for task, difference in tasks.items()}
     source, rows = "paper, tables 1 and 2", list[Claim]()
     for task, gain in gains.items():
-        lead = f"Lead of {names[0]} over {names[1]} in {metric_of(tasks[task])}"
+        lead = f"Lead of {names[0]} over {names[1]} in {measured(tasks[task])}"
         why = f"{lead} ({BEHIND}): {in_words(gain)}{_runs(gain)}"
         verdict = decide([side_of(gain)])
         claim, known = f"Leakage inflates {task}", gain.interval is not None
@@ -152,20 +149,14 @@ def _runs(score: Score) -> str:
 
 def _of_metric(metric: str, difference: Score) -> bool:
     """Whether a difference is of one of the paper's metrics, on features it may be called after."""
-    name = metric_of(difference)
-    if metric in FAMILY:
-        return name == metric
-    return name.partition(" (")[0] == metric and not name.endswith(TACTILE)
+    measure = difference.measure
+    usual = not measure.kernel and not measure.excess and measure.features != TACTILE
+    return measure.metric == metric and usual
 
 
 def _between(differences: Iterable[Score], metric: str, a: str, b: str) -> list[Score]:
     """Differences of a metric between two methods."""
-    return [
-        d
-        for d in differences
-        if {d.details["a"], d.details["b"]} == {a, b}
-        and (metric_of(d) == metric if metric == PEOPLE else _of_metric(metric, d))
-    ]
+    return [d for d in differences if {d.a, d.b} == {a, b} and _of_metric(metric, d)]
 
 
 def preference_claims(
@@ -179,7 +170,7 @@ def preference_claims(
             without a human study, and then every row is undecided.
         names: of the methods.
     """
-    names, votes = names or Names(), [s for s in people if _is_difference(s)]
+    names, votes = names or Names(), [s for s in people if s.b is not None]
     return [
         _preference_claim(metric, differences, votes, names) for metric in (*TRADITIONAL, *FAMILY)
     ]
@@ -211,20 +202,10 @@ def _leads(scores: Sequence[Score]) -> str:
     if not scores:
         return ""
     parts: list[str] = []
-    for front, same in groupby(scores, key=lambda s: _pair(s)[0]):
-        each = [f"over {_pair(s)[1]} {in_words(s)}" for s in same]
+    for front, same in groupby(scores, key=lambda s: s.a):
+        each = [f"over {s.b} {in_words(s)}" for s in same]
         parts.append(f"of {front} {', '.join(each)}")
-    return f"lead by {_label(scores[0])} ({BEHIND}): {'; '.join(parts)}"
-
-
-def _label(score: Score) -> str:
-    return score.metric.removesuffix(", ahead")
-
-
-def _pair(score: Score) -> tuple[str, str]:
-    """The two methods of a score of :func:`ahead`, the one in front first."""
-    front, _, other = score.subject.partition(" against ")
-    return front, other
+    return f"lead by {measured(scores[0])} ({BEHIND}): {'; '.join(parts)}"
 
 
 def _capital(sentence: str) -> str:
@@ -252,7 +233,7 @@ def _ranking_claim(
     claim: str, front: str, other: str, differences: Sequence[Score], people: Sequence[Score]
 ) -> Claim:
     pair = front, other
-    votes = [s for s in people if _is_difference(s)]
+    votes = [s for s in people if s.b is not None]
     compared = _between(differences, "TMMD", *pair) + _between(votes, PEOPLE, *pair)
     deciding = [ahead(d, front) for d in compared]
     others = [
@@ -260,10 +241,10 @@ def _ranking_claim(
     ]
     why = f"{other} was not compared with {front}"
     if scores := [*deciding, *others]:
-        each = ", ".join(f"{_label(s)} {in_words(s)}" for s in scores)
+        each = ", ".join(f"{measured(s)} {in_words(s)}" for s in scores)
         why = f"Lead of {front} over {other} ({BEHIND}): {each}{_runs(scores[0])}"
         if deciding and others:
-            people_too = any(metric_of(d) == PEOPLE for d in compared)
+            people_too = any(d.metric == PEOPLE for d in compared)
             why += f". {'TMMD and people decide' if people_too else 'TMMD decides'}"
     sides = [side_of(s) for s in deciding]
     source = "paper, tables 3 and 4" if "images" in claim else "paper, table 3"
@@ -281,28 +262,27 @@ def effect_size(difference: Score) -> Score | None:
     value = abs(difference.value) / ((high - low) / (2 * Z))
     return replace(
         difference,
-        metric=f"effect size of {metric_of(difference)}",
+        kind="effect size",
         value=value,
         interval=None,
         interval_method="",
         estimator="difference over its standard error",
         scale=1.0,
         higher_is_better=True,
-        details={k: difference.details[k] for k in ("a", "b")}
-        | {"difference": difference.value, "error": (high - low) / (2 * Z)},
+        details={"difference": difference.value, "error": (high - low) / (2 * Z)},
     )
 
 
 def effect_table(differences: Sequence[Score]) -> StudyTable:
     """How well each metric tells methods apart: effect sizes, a row a metric, a column a pair."""
-    pairs = list(dict.fromkeys((d.details["a"], d.details["b"]) for d in differences))
+    pairs = list(dict.fromkeys((d.a, d.b) for d in differences))
+    rank = {Measure(name): k for k, name in enumerate((*TRADITIONAL, *FAMILY))}
+    bare = lambda d: d.measure._replace(features="", kernel="")
+    place = lambda d: (rank.get(bare(d), len(rank)), measured(d))
     rows: list[list[Score | str | None]] = []
-    for metric, same in groupby(sorted(differences, key=metric_of), key=metric_of):
-        of_pair = {(d.details["a"], d.details["b"]): effect_size(d) for d in same}
-        rows.append([metric, *(of_pair.get(pair) for pair in pairs)])
-    order = [*TRADITIONAL, *FAMILY]
-    rank = {name: k for k, name in enumerate(order)}
-    rows.sort(key=lambda row: rank.get(str(row[0]).partition(" (")[0], len(order)))
+    for (_, name), same in groupby(sorted(differences, key=place), key=place):
+        of_pair = {(d.a, d.b): effect_size(d) for d in same}
+        rows.append([name, *(of_pair.get(pair) for pair in pairs)])
     return StudyTable(
         "What tells methods apart",
         "The difference of two methods over its standard error, of every metric; 2 is about where "
@@ -320,15 +300,15 @@ def discrimination_claim(differences: Sequence[Score], names: Names | None = Non
     """
     names = names or Names()
     known = [{*pair} for pair in names.pairs]
-    differences = [d for d in differences if {d.details["a"], d.details["b"]} in known]
+    differences = [d for d in differences if {d.a, d.b} in known]
     claim, source = "Traditional metrics hardly discriminate between methods", "paper, section 1"
-    sizes: dict[str, dict[tuple[str, str], list[float]]] = {"traditional": {}, "family": {}}
+    sizes: dict[str, dict[tuple[str, str | None], list[float]]] = {"traditional": {}, "family": {}}
     evidence: list[Score] = []
     for kind, metrics in (("traditional", TRADITIONAL), ("family", FAMILY)):
         for d in differences:
             effect = effect_size(d) if any(_of_metric(m, d) for m in metrics) else None
             if effect is not None and effect.value is not None:
-                pair = d.details["a"], d.details["b"]
+                pair = d.a, d.b
                 sizes[kind].setdefault(pair, []).append(effect.value)
                 evidence.append(effect)
     shared = [pair for pair in sizes["traditional"] if pair in sizes["family"]]

@@ -8,28 +8,22 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from palpate.core import Note, Progress, Score, Split, read_json
+from palpate.core import Measure, Note, Progress, Score, Split, read_json
 from palpate.data.manifest import Manifest
 from palpate.diffusion.generation import Generated
 from palpate.evaluation.probing import results_of
+from palpate.report.labels import measured
 from palpate.report.notes import percent
 from palpate.report.results import Audit, Results
 from palpate.studies.claims import Names, differences_over_seeds, effect_table, paper_claims
 from palpate.studies.controls import FLOOR, NEAREST
 from palpate.studies.demo_page import gallery as gallery_of
-from palpate.studies.evidence import DIFFERENCE, difference_between, in_words, metric_of
-from palpate.studies.judging import (
-    MATERIAL,
-    probing_plan,
-    read_probed,
-    read_scores,
-    stage_of,
-    stamped,
-)
+from palpate.studies.evidence import difference_between, in_words
+from palpate.studies.judging import probing_plan, read_probed, read_scores, stage_of, stamped
 from palpate.studies.making import After, Facts
 from palpate.studies.methods import BACKGROUND, OURS, VQ
 from palpate.studies.study import NOLEAK, ORIG, SPLITS, Study
-from palpate.studies.study_tables import FAMILY, READING, RETRIEVAL, Scores, same_task, study_tables
+from palpate.studies.study_tables import FAMILY, NAMED, READING, RETRIEVAL, Scores, study_tables
 
 
 def collect(
@@ -61,13 +55,12 @@ def collect(
     runs = {split: [read_probed(after[node]) for node in nodes] for split, nodes in probes.items()}
     plan = probing_plan(manifest, splits)
     probed = results_of(study.title, runs, plan, manifest, splits)
-    known = {(s.metric, s.subject): s for s in probed.scores}
     own, noleak = judged[NOLEAK, NOLEAK], seeds[NOLEAK, NOLEAK]
-    extra = [m for m in own.metrics if any(s.details.get("extra") for s in own.of(m))]
+    extra = list(dict.fromkeys(s.measure for s in own.of_one if s.details.get("extra")))
     names: dict[str, Sequence[str]] = {"methods": methods, "controls": list(study.controls)}
     votes = [] if people is None else [*Results.load(people).scores]
     tables = [
-        *study_tables(study, judged, known, **names, extra=extra, people=votes),
+        *study_tables(study, judged, probed.scores, **names, extra=extra, people=votes),
         effect_table([d for d in differences_over_seeds(noleak) if _compares(d, methods)]),
     ]
     answers = [Results.load(after["utility"] / "results.json")] if useful else []
@@ -82,7 +75,7 @@ def collect(
         title=study.title,
         facts=[_leak(audits), *_distance(own), *_material(own), *probed.facts[:1]],
         audits=audits,
-        scores=[s for (metric, _), s in own.by_name.items() if DIFFERENCE not in metric],
+        scores=own.of_one,
         gallery=[
             replace(item, method=study.on_both[0])
             for item in gallery_of(manifest, Generated.load(after[gallery] / "images"), 0)
@@ -103,19 +96,15 @@ def collect(
 
 def _compares(difference: Score, methods: Sequence[str]) -> bool:
     """Whether a difference is of the paper's two comparisons or of the best method."""
-    pair = {difference.details[k] for k in ("a", "b")}
+    pair = {difference.a, difference.b}
     return pair == {VQ, BACKGROUND} or (OURS in pair and pair <= {*methods, NEAREST})
 
 
 def _tasks_of_encoders(scores: Sequence[Score]) -> dict[str, Score]:
     """Task -> what it loses from the data set's own split to ours, as the encoders measure it."""
-    tasks = (MATERIAL, *RETRIEVAL)
-    return {
-        task: s
-        for task in tasks
-        for s in scores
-        if s.metric.endswith(DIFFERENCE) and same_task(metric_of(s), task)
-    }
+    differences = {s.measure: s for s in scores if s.b is not None}
+    tasks = (NAMED, *RETRIEVAL)
+    return {measured(task): differences[task] for task in tasks if task in differences}
 
 
 def _tasks_of_generators(
@@ -123,18 +112,18 @@ def _tasks_of_generators(
 ) -> dict[str, Score]:
     """The same of generated images, each split judged by its encoder."""
     tasks: dict[str, Score] = {}
-    for metric in FAMILY:
+    for measure in FAMILY:
         each = [
-            [s for run in seeds[split, split] for s in run if _is(s, metric)] for split in SPLITS
+            [s for run in seeds[split, split] for s in run if _is(s, measure)] for split in SPLITS
         ]
         if all(each):
-            tasks[f"generation, {metric}"] = difference_between(*each, names=SPLITS)
+            tasks[f"generation, {measured(measure)}"] = difference_between(*each, names=SPLITS)
     return tasks
 
 
-def _is(score: Score, metric: str) -> bool:
-    known = score.metric, score.subject, score.settings.get("preset")
-    return known == (metric, OURS, READING)
+def _is(score: Score, measure: Measure) -> bool:
+    fields = score.measure, score.a, score.b, score.settings.get("preset")
+    return fields == (measure, OURS, None, READING)
 
 
 def _staged_rows(rows: Sequence[Sequence[Any]], stage: str) -> list[list[Any]]:
@@ -150,7 +139,7 @@ def _leak(audits: Sequence[Audit]) -> str:
 
 
 def _distance(scores: Scores) -> list[str]:
-    ours, floor, near = (scores.get("TMMD", name) for name in (OURS, FLOOR, NEAREST))
+    ours, floor, near = (scores.get(FAMILY[0], name) for name in (OURS, FLOOR, NEAREST))
     if ours is None:
         return []
     more = f", real images of other videos {in_words(floor)}" if floor else ""
@@ -159,7 +148,7 @@ def _distance(scores: Scores) -> list[str]:
 
 
 def _material(scores: Scores) -> list[str]:
-    ours, real = scores.get(MATERIAL, OURS), scores.get(MATERIAL, "real")
+    ours, real = scores.get(NAMED, OURS), scores.get(NAMED, "real")
     if ours is None or real is None:
         return []
     chance = percent(ours.details["chance"])

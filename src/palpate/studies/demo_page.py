@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from pathlib import Path
 
-from palpate.core import Note, Score, rng_for
+from palpate.core import Measure, Note, Score, rng_for
 from palpate.data.manifest import Manifest
 from palpate.diffusion.generation import Generated
 from palpate.evaluation.controls import BACKGROUND
@@ -57,7 +57,8 @@ def _leak_fact(run: DemoRun) -> str:
 
 def _score(run: DemoRun, metric: str, subject: str, preset: str | None = None) -> Score | None:
     for s in run.scores:
-        if (s.metric, s.subject) == (metric, subject) and s.settings.get("preset") == preset:
+        same = (s.measure, s.a, s.b) == (Measure(metric), subject, None)
+        if same and s.settings.get("preset") == preset:
             return s
     return None
 

@@ -16,14 +16,12 @@ import numpy as np
 from scipy import special
 
 from palpate.core import Note, PalpateError, Score, plain
+from palpate.report.labels import label_of, measured, subject_of
 from palpate.report.notes import digits_of, number
-
-#: End of the metric of every difference.
-DIFFERENCE = " difference"
 
 
 def over_seeds(scores: Sequence[Score]) -> Score:
-    """One score of several seeds' scores of one metric and subject, at the head of this file.
+    """One score of several seeds' scores of one measure and subject, at the head of this file.
 
     Returns:
         The mean; ``details["by_seed"]`` has the values. Value or interval is None if one of the
@@ -34,8 +32,8 @@ def over_seeds(scores: Sequence[Score]) -> Score:
     Raises:
         PalpateError: without scores, or if metrics or subjects differ.
     """
-    if len(kinds := {(s.metric, s.subject) for s in scores}) != 1:
-        got = ", ".join(f"{m} of {s}" for m, s in sorted(kinds)) or "none"
+    if len(kinds := {f"{label_of(s)} of {subject_of(s)}" for s in scores}) != 1:
+        got = ", ".join(sorted(kinds)) or "none"
         fix = "Pass one score a seed"
         raise PalpateError("Scores over seeds must be of one metric and subject", got, fix)
     first, values = scores[0], [s.value for s in scores]
@@ -102,9 +100,9 @@ def difference_between(a: Sequence[Score], b: Sequence[Score], names: tuple[str,
         PalpateError: as :func:`over_seeds`, or if the two differ in metric.
     """
     x, y = over_seeds(a), over_seeds(b)
-    if x.metric != y.metric:
+    if x.measure != y.measure:
         must, fix = "A difference must be of one metric", "Pair scores by their metric"
-        raise PalpateError(must, f"{x.metric} and {y.metric}", fix)
+        raise PalpateError(must, f"{measured(x)} and {measured(y)}", fix)
     value = None if x.value is None or y.value is None else x.value - y.value
     interval = _limits_of_difference(x, y)
     gap: dict[str, Any] = {}
@@ -115,8 +113,9 @@ def difference_between(a: Sequence[Score], b: Sequence[Score], names: tuple[str,
             gap = {"gap": near.value - far.value, "gap_interval": limits}
     return replace(
         x,
-        metric=x.metric + DIFFERENCE,
-        subject=" - ".join(names),
+        kind="difference",
+        a=names[0],
+        b=names[1],
         value=value,
         interval=interval,
         interval_method="recovery of variances, splits as independent" if interval else "",
@@ -124,7 +123,7 @@ def difference_between(a: Sequence[Score], b: Sequence[Score], names: tuple[str,
         floor=None,
         split=None,
         reference=None,
-        details={"a": names[0], "b": names[1], "values": [x.value, y.value], **gap},
+        details={"values": [x.value, y.value], **gap},
     )
 
 
@@ -155,11 +154,6 @@ def _reach(score: Score) -> tuple[float, float] | None:
     return score.value - score.interval[0], score.interval[1] - score.value
 
 
-def metric_of(difference: Score) -> str:
-    """The metric that a difference is of."""
-    return difference.metric.removesuffix(DIFFERENCE)
-
-
 def ahead(difference: Score, name: str) -> Score:
     """By how much ``name`` is better in a difference of two; below 0 where the other one is.
 
@@ -170,10 +164,10 @@ def ahead(difference: Score, name: str) -> Score:
     Raises:
         PalpateError: if the difference is not between ``name`` and another one.
     """
-    pair = difference.details.get("a"), difference.details.get("b")
+    pair = difference.a, difference.b
     if name not in pair:
         must, fix = f"A difference must be between {name!r} and another", "Check the names"
-        raise PalpateError(must, difference.subject, fix)
+        raise PalpateError(must, subject_of(difference), fix)
     value, interval = difference.value, difference.interval
     if difference.higher_is_better is None and "gap" in difference.details:
         value = difference.details["gap"]
@@ -184,8 +178,9 @@ def ahead(difference: Score, name: str) -> Score:
     other = pair[1] if name == pair[0] else pair[0]
     return replace(
         difference,
-        metric=f"{metric_of(difference)}, ahead",
-        subject=f"{name} against {other}",
+        kind="lead",
+        a=name,
+        b=other,
         value=value,
         interval=interval and (float(interval[0]), float(interval[1])),
         higher_is_better=True,

@@ -144,7 +144,7 @@ def judge_images(
         cache=cache,
         progress=progress,
     )
-    scores = [s for s in results if s.metric != MATERIAL or s.subject not in OF_TRAIN]
+    scores = [s for s in results if s.metric != MATERIAL or s.a not in OF_TRAIN]
     images = {n: load_images(image_files(f, test.ids), judging.size) for n, f in folders.items()}
     real = load_images(test.paths("tactile"), judging.size)
     features = embed(test, judge, "tactile", cache=cache, still=True)
@@ -164,7 +164,7 @@ def judge_images(
             judged = Judged(subject, x, real, made[subject], features, judging.seed)
             one = metric(judged)
             details = {**one.details, "extra": True}  # a column of the tables
-            scores.append(replace(one, subject=subject, split=split.digest, details=details))
+            scores.append(replace(one, a=subject, split=split.digest, details=details))
     write_json(place / "scores.json", [stamped(s, stage_of(place)).to_json() for s in scores])
     return {"scores": len(scores), "judge": judge.digest("tactile")}
 
@@ -184,10 +184,9 @@ def _compares(score: Score, methods: Mapping[str, str]) -> bool:
 
     Differences between two controls say nothing of a method, those of E what those of I and CI say.
     """
-    pair = [score.details.get(k) for k in ("a", "b")]
-    if pair == [None, None]:
+    if score.b is None:
         return True
-    return any(name in methods for name in pair) and not score.metric.endswith(" E difference")
+    return score.kind != "excess" and (score.a in methods or score.b in methods)
 
 
 def image_files(folder: Path, ids: Sequence[str]) -> list[Path]:

@@ -11,11 +11,12 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
-from palpate.core import Score
+from palpate.core import Measure, Score
 from palpate.preference.scoring import PREFERENCE, STRENGTH
+from palpate.report.labels import measured
 from palpate.report.study import StudyTable
 from palpate.studies.controls import FLOOR, HALVES
-from palpate.studies.evidence import DIFFERENCE, over_seeds
+from palpate.studies.evidence import over_seeds
 from palpate.studies.judging import HALF_PROBES, MATERIAL
 from palpate.studies.methods import OURS
 from palpate.studies.study import NOLEAK, ORIG, SPLITS, Study
@@ -25,21 +26,24 @@ Judgments = Mapping[tuple[str, str], "Scores"]
 Cell = Score | str | None
 #: The reading of the TMMD family that tables show; the scores hold the others as well.
 READING = "grouped"
-FAMILY = ("TMMD", "I-TMMD", "CI-TMMD", "D-TMMD")
+FAMILY = tuple(map(Measure, ("TMMD", "I-TMMD", "CI-TMMD", "D-TMMD")))
 RETRIEVAL = tuple(
-    f"top-{k} ({a} by {b})" for a, b in (("text", "tactile"), ("vision", "tactile")) for k in (1, 5)
+    Measure(f"top-{k}", f"{name} by tactile") for name in ("text", "vision") for k in (1, 5)
 )
+NAMED = Measure(MATERIAL)
 
 
-def _printed(columns: Sequence[str], numbers: str) -> Mapping[str, str]:
+def _printed(columns: Sequence[Measure], numbers: str) -> Mapping[Measure, str]:
     """Numbers as the paper prints them; a share ends in %."""
     return dict(zip(columns, numbers.replace("%", " %").split("  "), strict=True))
 
 
-_SPLIT_1, _SPLIT_2 = (MATERIAL, *FAMILY), (*RETRIEVAL, *FAMILY[:2])
-_METHOD = ("SSIM", "PSNR", "LPIPS", "FID (Inception)", "CMMD (CLIP)", *FAMILY)
+_SPLIT_1, _SPLIT_2 = (NAMED, *FAMILY), (*RETRIEVAL, *FAMILY[:2])
+_PIXELS = (Measure("SSIM"), Measure("PSNR"))
+_PHOTOS = (Measure("LPIPS"), Measure("FID", "Inception"), Measure("CMMD", "CLIP"))
+_METHOD = (*_PIXELS, *_PHOTOS, *FAMILY)
 #: What the paper prints: (table, row) -> column -> number. Table 4 of DIGIT is "HCT".
-PAPER: Mapping[tuple[int | str, str], Mapping[str, str]] = {
+PAPER: Mapping[tuple[int | str, str], Mapping[Measure, str]] = {
     (1, ORIG): _printed(_SPLIT_1, "54.7%  0.33  0.04  0.21  0.06"),
     (1, NOLEAK): _printed(_SPLIT_1, "37.8%  1.37  0.15  1.43  0.44"),
     (2, ORIG): _printed(_SPLIT_2, "36.7%  70.3%  79.5%  95.7%  0.46  0.13"),
@@ -54,15 +58,15 @@ PAPER: Mapping[tuple[int | str, str], Mapping[str, str]] = {
 
 @dataclass(frozen=True)
 class Scores:
-    """Scores by (metric, subject), in the order of their making; readings other than ours aside."""
+    """Scores by what they are of, in the order of their making; readings other than ours aside."""
 
-    by_name: Mapping[tuple[str, str], Score]
+    by_name: Mapping[Key, Score]
 
     @classmethod
     def over_seeds(cls, seeds: Sequence[Sequence[Score]], stage: str) -> Scores:
         """The means of what each seed scores; a score that a seed lacks is left out."""
         tables = [{_key(s): s for s in scores} for scores in seeds]
-        merged: dict[tuple[str, str], Score] = {}
+        merged: dict[Key, Score] = {}
         for key in tables[0]:
             if not all(key in table for table in tables):
                 continue
@@ -76,33 +80,32 @@ class Scores:
             )
         return cls(merged)
 
-    def get(self, metric: str, subject: str) -> Score | None:
+    def get(self, measure: Measure, subject: str) -> Score | None:
         """One score, or None."""
-        return self.by_name.get((metric, subject))
-
-    def of(self, metric: str) -> list[Score]:
-        """Everything that a metric says."""
-        return [s for (name, _), s in self.by_name.items() if name == metric]
+        return self.by_name.get((measure, subject, None, False))
 
     @property
-    def metrics(self) -> list[str]:
-        """The metrics in their order, without differences."""
-        return [m for m in dict.fromkeys(m for m, _ in self.by_name) if DIFFERENCE not in m]
+    def of_one(self) -> list[Score]:
+        """All scores of one subject each: without differences."""
+        return [score for score in self.by_name.values() if score.b is None]
 
 
-def _key(score: Score) -> tuple[str, str]:
-    reading = score.settings.get("preset")
-    return score.metric + (f", {reading}" if reading == "paper" else ""), score.subject
+#: What is measured, of what, compared with what, and whether it is the paper's reading.
+Key = tuple[Measure, str, str | None, bool]
+
+
+def _key(score: Score) -> Key:
+    return score.measure, score.a, score.b, score.settings.get("preset") == "paper"
 
 
 def study_tables(
     study: Study,
     judged: Judgments,
-    probed: Mapping[tuple[str, str], Score],
+    probed: Sequence[Score],
     *,
     methods: Sequence[str],
     controls: Sequence[str],
-    extra: Sequence[str] = (),
+    extra: Sequence[Measure] = (),
     people: Sequence[Score] = (),
 ) -> list[StudyTable]:
     """The tables of a study.
@@ -110,14 +113,15 @@ def study_tables(
     Args:
         study: which tables it makes, and whether the paper's numbers stand beside.
         judged: see :data:`Judgments`.
-        probed: (metric, split) -> what the encoder of the split scores on its test part.
+        probed: what the encoder of each split, the score's ``a``, scores on its test part.
         methods: compared on the split without leaks, in their order.
         controls: that were scored.
-        extra: names of further metrics.
+        extra: further metrics.
         people: scores of ``palpate preference score``, columns of table 3.
     """
     make = {1: _of_splits, 2: _of_splits, 3: _of_methods, 4: _of_methods}
-    votes = {(s.metric, s.subject): s for s in people if s.metric in (PREFERENCE, STRENGTH)}
+    asked = [s for s in people if s.metric in (PREFERENCE, STRENGTH) and s.b is None]
+    votes = {(s.measure, s.a): s for s in asked}
     subjects = [*controls, HALF_PROBES, HALVES]
     context = _Context(study, judged, probed, methods, subjects, extra, votes)
     return [make[number](context, number) for number in study.tables]
@@ -127,22 +131,22 @@ def study_tables(
 class _Context:
     study: Study
     judged: Judgments
-    probed: Mapping[tuple[str, str], Score]
+    probed: Sequence[Score]
     methods: Sequence[str]
     controls: Sequence[str]
-    extra: Sequence[str]
-    people: Mapping[tuple[str, str], Score]
+    extra: Sequence[Measure]
+    people: Mapping[tuple[Measure, str], Score]
 
     def present(self, split: str, names: Iterable[str]) -> list[str]:
         """Those that are scored on a split."""
-        known = {subject for _, subject in self.judged[split, split].by_name}
+        known = {score.a for score in self.judged[split, split].of_one}
         return [name for name in names if name in known]
 
 
 def _of_splits(context: _Context, number: int) -> StudyTable:
     """Tables 1 and 2: what the encoders know, and how far the images of each split are."""
-    tasks = (MATERIAL,) if number == 1 else RETRIEVAL
-    heads = {task: f"{task}, real images" for task in tasks}
+    tasks = (NAMED,) if number == 1 else RETRIEVAL
+    heads = [f"{measured(task)}, real images" for task in tasks]
     family = FAMILY if number == 1 else FAMILY[:2]
     rows: list[list[Cell]] = []
     controls: list[str] = []
@@ -171,20 +175,14 @@ def _of_splits(context: _Context, number: int) -> StudyTable:
         "test images themselves. The paper: without leaks every column is worse."
     )
     names = {1: "material and generation", 2: "retrieval and generation"}
-    columns = ["images", "judged by encoder of", *heads.values(), *family]
+    columns = ["images", "judged by encoder of", *heads, *map(measured, family)]
     title = f"Table {number}: {names[number]} by split"
     return StudyTable(title, text, columns, rows, controls=[*dict.fromkeys(controls)])
 
 
-def _probed(context: _Context, task: str, split: str) -> Score | None:
-    metric = next((m for m, s in context.probed if s == split and same_task(m, task)), None)
-    return None if metric is None else context.probed[metric, split]
-
-
-def same_task(metric: str, task: str) -> bool:
-    """``top-1 of 480 (text by tactile)`` is ``top-1 (text by tactile)``."""
-    first, _, rest = metric.partition(" of ")
-    return metric == task or (bool(rest) and f"{first} {rest.partition(' ')[2]}" == task)
+def _probed(context: _Context, task: Measure, split: str) -> Score | None:
+    key = task, split, None
+    return next((s for s in context.probed if (s.measure, s.a, s.b) == key), None)
 
 
 def _of_methods(context: _Context, number: int) -> StudyTable:
@@ -196,8 +194,9 @@ def _of_methods(context: _Context, number: int) -> StudyTable:
     methods = context.methods if number == 3 else prior
     metrics = [*FAMILY]
     if number == 3:
-        of_photos = [m for m in scores.metrics if m.startswith(("LPIPS", "FID", "CMMD"))]
-        metrics = ["SSIM", "PSNR", *of_photos, *FAMILY, MATERIAL, *context.extra]
+        photos = {measure.metric for measure in _PHOTOS}
+        of_photos = dict.fromkeys(s.measure for s in scores.of_one if s.metric in photos)
+        metrics = [*_PIXELS, *of_photos, *FAMILY, NAMED, *context.extra]
     subjects = context.present(NOLEAK, [*methods, *context.controls])
     metrics = [m for m in metrics if any(scores.get(m, s) for s in subjects)]
     subjects = [s for s in subjects if any(scores.get(m, s) for m in metrics)]
@@ -226,4 +225,6 @@ def _of_methods(context: _Context, number: int) -> StudyTable:
         4: "The paper: Ours before GVST in every column.",
     }[number]
     title = {3: "Table 3: methods by metric", 4: "Table 4: against prior art"}[number]
-    return StudyTable(title, text, ["images", *metrics], rows, best=True, controls=controls)
+    return StudyTable(
+        title, text, ["images", *map(measured, metrics)], rows, best=True, controls=controls
+    )

@@ -22,7 +22,7 @@ videos and draws (:mod:`palpate.metrics.means`); gains are paired by both.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, TypeGuard
@@ -296,37 +296,37 @@ def _rows_of(name: str) -> list[str]:
 
 
 def _gain(more: Sequence[Mean], less: Sequence[Mean]) -> Score:
-    return differences_of_means({more[0].score.subject: more, less[0].score.subject: less})[0]
+    return differences_of_means({more[0].score.a: more, less[0].score.a: less})[0]
 
 
-def utility_claims(table: StudyTable) -> list[Claim]:
+def utility_claims(table: StudyTable, generators: Iterable[str]) -> list[Claim]:
     """Generated images help a classifier of real touch: one row a generator of a table of material.
 
     The gain at the fewest real videos a class decides, where help is needed most; the others are
     listed.
     """
     claims, first = list[Claim](), table.columns[1]
-    for label, *cells in table.rows:
-        gains = [(k, c) for k, c in zip(table.columns[1:], cells, strict=True) if _is_score(c)]
-        if not str(label).startswith(GAIN) or label in table.controls or not gains:
+    for name in generators:
+        cells = zip(table.columns[1:], _gains(table, name), strict=True)
+        gains = [(k, cell) for k, cell in cells if _is_score(cell)]
+        if not gains or f"{GAIN}{name}" in table.controls:
             continue
         scores = [score for _, score in gains]
         each = ", ".join(f"{in_words(score)} at {k}" for k, score in gains)
         why = f"Accuracy on real images of new videos changes by {each} real videos a class."
-        if perfect := _gain_of(table, CEILING):
+        if _is_score(perfect := _gains(table, CEILING)[0]):
             why += (
                 f" Images of a perfect generator would change it by {in_words(perfect)} at {first}."
             )
-        name = str(label).removeprefix(GAIN)
         claim = f"Images of {name} help a classifier of real touch"
         claims.append(Claim(claim, "beyond the paper", decide([side_of(scores[0])]), why, scores))
     return claims
 
 
-def _gain_of(table: StudyTable, name: str) -> Score | None:
-    """The gain by images of one name at the fewest videos, if there are such."""
-    cell = next((row[1] for row in table.rows if row[0] == f"{GAIN}{name}"), None)
-    return cell if _is_score(cell) else None
+def _gains(table: StudyTable, name: str) -> Sequence[Score | str | None]:
+    """The gains by images of one name, from the fewest videos on; None where there are none."""
+    cells = (row[1:] for row in table.rows if row[0] == f"{GAIN}{name}")
+    return next(cells, [None] * (len(table.columns) - 1))
 
 
 def _is_score(cell: Any) -> TypeGuard[Score]:
@@ -394,7 +394,9 @@ def measure_utility(
         how: Facts = {"controls": [*shown], "progress": progress}
         tables.append(utility(manifest, split, judge, folders, draws, **how))
     table = table_over_seeds(tables)
-    claims = utility_claims(table)
+    claims = utility_claims(
+        table, list(dict.fromkeys(n for images in runs.values() for n in images))
+    )
     Results("", tables=[table], claims=claims).save(place / "results.json")
     return {"claims": len(claims)}
 

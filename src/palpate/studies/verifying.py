@@ -23,6 +23,7 @@ from typing import Any, Literal
 from palpate.core import PalpateError, Progress, few, plain, quiet, read_json, read_record, require
 from palpate.core.files import reading_entry
 from palpate.report.calls import OBJECT, PATH, ROWS, Call, is_there
+from palpate.report.labels import label_of, subject_of
 from palpate.report.results import AUDIT_FORMAT, RESULTS_FORMAT, Audit, Results
 from palpate.studies.graph import Node, in_order
 from palpate.studies.stages import Stage, stage_of, stage_outputs
@@ -143,10 +144,10 @@ def _items(results: Results) -> dict[str, Any]:
     """Every score, audit, sentence, table, claim, strip and call by what it is called."""
     items, seen = dict[str, Any](), Counter[str]()
     for part in PARTS:
-        for item in plain(getattr(results, part)):
+        for item in getattr(results, part):
             name = _name(part, item)
             seen[name] += 1
-            items[name if seen[name] == 1 else f"{name} ({seen[name]})"] = item
+            items[name if seen[name] == 1 else f"{name} ({seen[name]})"] = plain(item)
     if "stages" in results.settings:
         items["digests"] = plain(results.settings.get("digests"))
     return items
@@ -154,14 +155,14 @@ def _items(results: Results) -> dict[str, Any]:
 
 def _name(part: str, item: Any) -> str:
     if part == "scores":
-        preset = item["settings"].get("preset")
-        return f"{item['metric']} of {item['subject']}" + (f" ({preset})" if preset else "")
+        preset = item.settings.get("preset")
+        return f"{label_of(item)} of {subject_of(item)}" + (f" ({preset})" if preset else "")
     if part == "facts":
         return f"fact {item[:60]!r}"
     if part == "strips":
-        return f"retrieved {item['keys']} for {item['queries']} {item['query']['id']}"
+        return f"retrieved {item.keys} for {item.queries} {item.query.id}"
     key = {"calls": "verb", "audits": "name", "tables": "title", "claims": "claim"}[part]
-    return f"{part.removesuffix('s')} {item[key]}"
+    return f"{part.removesuffix('s')} {getattr(item, key)}"
 
 
 def _calls_again(
@@ -321,7 +322,7 @@ def difference(before: Any, after: Any, tolerance: float) -> str:
 
 def _differences(a: Any, b: Any, tolerance: float, name: str) -> Iterator[str]:
     if isinstance(a, Mapping) and isinstance(b, Mapping):
-        if "effect size" in str(a.get("metric")):
+        if a.get("kind") == "effect size":
             tolerance = max(tolerance, LEAST["effect size"])
         for key in dict.fromkeys([*a, *b]):
             x, y = a.get(key), b.get(key)
