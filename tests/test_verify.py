@@ -81,7 +81,7 @@ def test_an_edited_field_of_one_score_is_named(vectors, field, value, words):
     words = words.replace("48", str(first["n"] + 1))
     edit(vectors, change)
     (name,) = differing(vectors)
-    assert name == f"TMMD of {first['subject']} ({first['settings']['preset']})"
+    assert name == f"TMMD of {first['a']} ({first['settings']['preset']})"
     assert words in differing(vectors)[name]
 
 
