@@ -36,8 +36,8 @@ FUNCTIONS = {
     "i_tmmd": ONE_SET,
     "kid": "generated, reference, **options",
     "mean_score": (
-        "metric, values, *, ids=None, groups=None, bounds=(-inf, inf), higher_is_better=True, "
-        "notes=(), **fields"
+        "metric, values, *, subject='generated', ids=None, groups=None, bounds=(-inf, inf), "
+        "higher_is_better=True, notes=(), **fields"
     ),
     "ms_ssim": f"{IMAGES}, **options",
     "per_image": f"metric, {IMAGES}",

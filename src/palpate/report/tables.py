@@ -404,7 +404,7 @@ def _ranking(differences: Sequence[Difference]) -> str:
     wins = dict.fromkeys([name for d in differences for name in _pair(d.score)], 0)
     known = [d for d in differences if d.confidence is not None]
     for d in known:
-        wins[_pair(d.score)[(d.confidence or 0) <= 0.5]] += 1
+        wins[_pair(d.score)[int((d.confidence or 0) <= 0.5)]] += 1
     apart = {frozenset(_pair(d.score)) for d in known if d.p is not None and d.p < 0.05}
     names = sorted(wins, key=lambda name: -wins[name])
     signs = [">" if frozenset(pair) in apart else "~" for pair in pairwise(names)]
