@@ -37,7 +37,7 @@ QUICK = {
     "train generator": ["--preset", "tiny", "--steps", "2"],
     "generate": ["--steps", "2"],
     "score": ["--permutations", "19"],
-    "world": ["--preset", "tiny"],
+    "world": ["--preset", "tiny", "--size", "16", "--materials", "2", "--workers", "1"],
 }
 SLOW = {"docs/start/train.md": pytest.mark.slow, "docs/start/reproduce.md": pytest.mark.nightly}
 #: Pages that `make docs` writes.
