@@ -355,40 +355,6 @@ def test_scores_of_other_backgrounds_are_not_comparable():
     require_comparable([score, contact_residual(*backwards)])
 
 
-# ---- bad input
-
-GEL, REAL = pressed(12)
-MADE = pressed(13)[1]
-
-
-def with_pixel(x, value):
-    x = x.copy()
-    x[2, 0, 0, 0] = value
-    return x
-
-
-@pytest.mark.parametrize("call", [contact_scores])
-@pytest.mark.parametrize(
-    ("made", "real", "background", "words"),
-    [
-        (with_pixel(MADE, np.nan), REAL, GEL, ["`generated`", "image 2"]),
-        (MADE, with_pixel(REAL, np.nan), GEL, ["`reference`", "image 2"]),
-        (MADE, REAL, with_pixel(GEL, 1.5), ["`background`", "1.5", "image 2"]),
-        (MADE, REAL, GEL[:2], ["`reference` and `background`", "one to one"]),
-        (MADE[:2], REAL, GEL, ["one to one"]),
-        (MADE[:, :40], REAL[:, :40], GEL, ["one to one"]),
-        (MADE[:0], REAL[:0], GEL[:0], ["n >= 1"]),
-        (MADE[0], REAL[0], GEL[0], ["shape (n, h, w, 3 or 1)"]),
-        (MADE[:, :10], REAL[:, :10], GEL[:, :10], ["11 x 11", "10 x 48"]),
-        ([[1], [1, 2]], REAL, GEL, ["`generated`", "array"]),
-    ],
-)
-def test_bad_images_are_rejected_by_name(call, made, real, background, words):
-    with pytest.raises(PalpateError) as caught:
-        call(made, real, background)
-    assert [word for word in words if word not in str(caught.value)] == []
-
-
 def test_the_real_clips(real_data):
     """Contact in nearly all in-contact frames, hardly any in frames long before."""
     av = pytest.importorskip("av", reason="PyAV is not installed")

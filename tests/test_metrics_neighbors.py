@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from palpate.core import FeatureSet, Note, PalpateError, Score
+from palpate.core import FeatureSet, Note, Score
 from palpate.metrics import distributions, prdc
 from palpate.metrics.intervals import spread_of_values
 
@@ -176,28 +176,6 @@ def test_the_scale_of_the_features_changes_nothing(factor):
     scaled = prdc(features(factor * x), features(factor * y))
     assert [s.value for s in scaled] == [s.value for s in prdc(features(x), features(y))]
     assert [s.details["empty_balls"] for s in scaled] == [0] * 4
-
-
-def test_bad_input_is_rejected_by_name():
-    rng = np.random.default_rng(7)
-    good = rng.normal(size=(9, 3))
-    for args, match in [
-        ((features(good[:5]), features(good)), "at least 6 rows"),
-        ((features(good), features(good[:5])), "at least 6 rows"),
-        ((features(good), features(good), 0), "`k` must be a whole number of at least 1"),
-        ((features(good), features(good[:, :2])), "same width"),
-        ((features((good * 9).astype(int)), features(good)), "floating-point"),
-        ((features(good, encoder="a" * 64), features(good, encoder="b" * 64)), "one encoder"),
-        ((features(good, ["v", *[None] * 8]), features(good, ["v"] * 9)), "known for every row"),
-    ]:
-        with pytest.raises(PalpateError, match=match):
-            prdc(*args)
-    with pytest.raises(PalpateError, match="`grouped` must be False without groups"):
-        prdc(features(good, list("aabbccdde")), features(good), grouped=True)
-    with pytest.raises(PalpateError, match=r"5 real rows outside it. Got 4 outside group 'a'"):
-        prdc(features(good, list("abcdefghi")), features(good, list("aaaaabcde")))
-    with pytest.warns(UserWarning, match="float16 features were widened"):
-        prdc(features(good.astype(np.float16)), features(good.astype(np.float16)))
 
 
 @pytest.mark.parametrize("seed", range(12, 22))

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from palpate.core import Measure, Note, PalpateError, Score
+from palpate.core import Measure, Note, Score
 from palpate.metrics import ci_tmmd, compare, four_scores, i_tmmd, tmmd
 from palpate.metrics.intervals import Scored, permutation_test
 from palpate.metrics.kernels import Gaussian, blocked_sums
@@ -179,23 +179,13 @@ def test_differences_are_the_jackknife_of_the_difference(three):
     assert width(paired) < 0.5 * min(width(s) for s in ci)  # what the videos have in common is gone
 
 
-def test_order_of_ids_does_not_matter_and_other_samples_are_refused(three):
+def test_order_of_ids_does_not_matter(three):
     r, generators = three
     near, far = generators["near"], generators["far"]
     turned = far.take(list(far.ids)[::-1])
     assert compare({"a": near, "b": turned}, r).differences[0].value == pytest.approx(
         compare({"a": near, "b": far}, r).differences[0].value
     )
-    with pytest.raises(PalpateError, match="1 missing and 0 surplus ids, first 'c0v0/000'"):
-        compare({"a": near, "b": far.take(list(far.ids)[1:])}, r)
-    with pytest.raises(PalpateError, match="same groups"):
-        compare({"a": near, "b": change(far, groups=list(far.groups)[::-1])}, r)
-    with pytest.raises(PalpateError, match="same labels"):
-        compare({"a": near, "b": change(far, labels=None)}, r)
-    with pytest.raises(PalpateError, match="one encoder"):
-        compare({"a": near, "b": change(far, encoder="f" * 64)}, r)
-    with pytest.raises(PalpateError, match="must hold a generator"):
-        compare({}, r)
     assert compare({"a": near}, r).differences == []
 
 

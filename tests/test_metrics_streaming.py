@@ -133,20 +133,6 @@ def test_bad_batches_are_named_at_once_and_change_nothing():
     assert metric.compute() == before
 
 
-@pytest.mark.parametrize(
-    ("call", "match"),
-    [
-        (lambda: TMMD(preset="best"), "`preset`"),
-        (lambda: TMMD(keeep="sums"), "keeep"),
-        (lambda: TMMD().compute(), "must have generated and real samples"),
-        (lambda: feed(TMMD(), sets()[0]).compute(), "0 real"),
-    ],
-)
-def test_what_is_rejected(call, match):
-    with pytest.raises(PalpateError, match=match):
-        call()
-
-
 def test_buffers_may_be_used_again():
     g, r = sets()
     buffer, metric = np.empty((10, 6)), TMMD()

@@ -13,7 +13,8 @@ from scipy import stats
 from palpate.core import FeatureSet, PalpateError, Score, require_comparable
 from palpate.metrics import PRESETS, ci_tmmd, d_tmmd, four_scores, i_tmmd, tmmd
 from palpate.metrics.mmd import half_of, sample_units
-from palpate.metrics.tactile import i_tmmd_of, reference_free
+from palpate.metrics.table import build_table
+from palpate.metrics.tactile import i_tmmd_of
 from palpate.report.notes import sentence
 from test_metrics_mmd import loop_mmd, mmd2, unit_rows
 
@@ -157,7 +158,7 @@ def check_excess(backend, seed, frames):
     # Every leave-one-out value has the same weights.
     one = s.groups[0]
     rest = i_tmmd(s.take([i for i, g in zip(s.ids, s.groups, strict=True) if g != one]))
-    first = reference_free(i_tmmd_of, s, None, {"backend": backend}).excess[0]
+    first = i_tmmd_of(build_table(s, None, {"backend": backend})).excess[0]
     assert first == pytest.approx(rest.details["E"], abs=1e-9 + bound)
 
 
@@ -542,36 +543,3 @@ def test_unstable_classes_are_flagged():
     assert score.details["unstable"]
     assert codes(score)[0] == "unstable-denominators"
     assert "unreliable: m" in sentence(score.notes[0])
-
-
-@pytest.mark.parametrize(
-    ("call", "words"),
-    [
-        (
-            lambda g: tmmd(g, change(g, encoder="f" * 64)),
-            ["one encoder", "eeeeeeeeeeee", "ffffffffffff"],
-        ),
-        (lambda g: four_scores(g, g, floor=change(g, encoder="f" * 64)), ["floor", "one encoder"]),
-        (lambda g: four_scores(g, g, floor=without_groups(g)), ["floor", "groups"]),
-        (lambda g: i_tmmd(without_groups(g), halves="group"), ["halves='group'"]),
-        (lambda g: i_tmmd(without_groups(g), preset="grouped"), ["grouped"]),
-        (lambda g: tmmd(g, g.features, estimator="grouped"), ["grouped"]),
-        (lambda g: i_tmmd(change(g, groups=[None, *g.groups[1:]])), ["groups", "1 row (0)"]),
-        (lambda g: i_tmmd(change(g, features=3 * g.features)), ["L2-normalized", "norm 3"]),
-        (
-            lambda g: tmmd(g, change(g, features=g.features[:, :4], encoder=None), normalize=True),
-            ["same width"],
-        ),
-        (lambda g: i_tmmd(g, preset="best"), ["preset", "paper-tables"]),
-        (lambda g: i_tmmd(g, halves="thirds"), ["halves", "ordered"]),
-        (lambda g: d_tmmd(g, denominator="none"), ["denominator"]),
-        (lambda g: d_tmmd(g, aggregate="none"), ["aggregate"]),
-        (lambda g: i_tmmd(g, seed=-1), ["seed"]),
-        (lambda g: i_tmmd(g, sigma=-1.0), ["sigma"]),
-    ],
-)
-def test_refuses_bad_options(call, words):
-    with pytest.raises(PalpateError) as caught:
-        call(world(19))
-    for word in words:
-        assert word in str(caught.value)

@@ -134,9 +134,8 @@ def audit(  # noqa: PLR0913
             empty part.
         ProblemsError: with every bad row of all inputs, unless ``skip_bad``.
     """
-    if test is not None and split is not None:
-        must = "An audit takes train and test samples, or samples with a split"
-        raise PalpateError(must, "both", "Pass one of them")
+    must = "An audit takes train and test samples, or samples with a split"
+    require(test is None or split is None, None, must, "both", fix="Pass one of them")
     options = _Options(
         by,
         near_frames,
@@ -150,9 +149,8 @@ def audit(  # noqa: PLR0913
         progress,
     )
     _check(options)
-    if impact is not None and test is not None:
-        must, fix = "needs all samples and a split", "Import them, and audit them with a split"
-        raise PalpateError(must, "train and test apart", fix, argument="impact")
+    must, fix = "needs all samples and a split", "Import them, and audit them with a split"
+    require(impact is None or test is None, "impact", must, "train and test apart", fix=fix)
     sources = [x for x in (train_or_data, test, pretrain) if x is not None]
     read = read_all(sources, skip_bad, progress, root, reading)
     parts = [source.manifest for source in read]
@@ -164,18 +162,18 @@ def audit(  # noqa: PLR0913
         result = _compare(parts[0], parts[1], options, title)
         test_part = parts[1]
     else:
-        whole = parts[0]
+        samples = parts[0]
         parted = _stated(read[0].splits) if split is None else Split.load(split)
-        test_part, val = whole.part(parted, "test"), whole.part(parted, "val")
+        test_part, val = samples.part(parted, "test"), samples.part(parted, "val")
         title = name or str(parted.rule.get("name") or _name(split, "split"))
-        result = _compare(whole.part(parted, "train"), test_part, options, title, val=val)
-        notes += _split_notes(whole, parted, val, result.group)
+        result = _compare(samples.part(parted, "train"), test_part, options, title, val=val)
+        notes += _split_notes(samples, parted, val, result.group)
         result = replace(result, split=parted.digest)
         if impact is not None and result.reason in ("untouched", "similar"):
             notes.append(Note("impact-of-nothing"))
         elif impact is not None:
             try:
-                result = replace(result, impact=impact(whole, parted, result.group, title))
+                result = replace(result, impact=impact(samples, parted, result.group, title))
             except PalpateError as error:  # the audit itself must not be lost
                 bare = PalpateError(*error.args, argument=error.argument)
                 notes.append(Note("impact-failed", {"reason": f"{bare}", "example": error.example}))
@@ -194,9 +192,9 @@ def _check(options: _Options) -> None:
     require(frames >= 0, "near_frames", "must be at least 0", frames, 30)
     require(worst >= 0, "worst", "must be at least 0", worst, 12)
     require_choice("identity", options.identity, ("auto", "names", "images"))
-    known = set(options.modalities) <= set(MODALITIES)
+    accepted = set(options.modalities) <= set(MODALITIES)
     must = "must be among vision, tactile"
-    require(known, "modalities", must, list(options.modalities), ["vision"])
+    require(accepted, "modalities", must, list(options.modalities), ["vision"])
     require(0 < rate <= 0.1, "false_positives", "must lie in (0, 0.1]", rate, 0.001)
 
 
@@ -218,16 +216,16 @@ def _name(source: Any, default: str) -> str:
     return Path(source).stem if default == "split" else Path(source).name
 
 
-def _split_notes(whole: Manifest, split: Split, val: Manifest, group: str) -> list[Note]:
+def _split_notes(samples: Manifest, split: Split, val: Manifest, group: str) -> list[Note]:
     """What a reader must know of the split itself."""
     notes: list[Note] = []
-    if split.manifest is not None and split.manifest != whole.digest:
+    if split.manifest is not None and split.manifest != samples.digest:
         notes.append(Note("split-of-other-manifest"))
-    if unused := len(whole) - len(split.parts):
-        notes.append(Note("samples-in-no-part", {"count": unused, "of": len(whole)}))
+    if unused := len(samples) - len(split.parts):
+        notes.append(Note("samples-in-no-part", {"count": unused, "of": len(samples)}))
     if len(val) and group != NO_GROUP:
-        others = whole.part(split, "train", "test").column(group)
-        if shared := set(val.column(group)) & set(others) - {None}:
+        elsewhere = samples.part(split, "train", "test").column(group)
+        if shared := set(val.column(group)) & set(elsewhere) - {None}:
             notes.append(Note("validation-leaks", {"count": len(shared), "group": group}))
     return notes
 
@@ -255,9 +253,8 @@ def _with_images(train: Manifest, test: Manifest) -> bool:
 def _group(train: Manifest, test: Manifest, options: _Options) -> str:
     """The group to audit by."""
     for part, samples in (("train", train), ("test", test)):
-        if not len(samples):
-            must, got = f"The {part} part must hold samples", "none"
-            raise PalpateError(must, got, "Check the split or list file")
+        must, fix = f"The {part} part must hold samples", "Check the split or list file"
+        require(len(samples) > 0, None, must, "none", fix=fix)
     group = known_group(train, test) if options.by == "auto" else options.by
     listed = all("path" in part.table.columns for part in (train, test))
     images = options.images and _with_images(train, test)

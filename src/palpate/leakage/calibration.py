@@ -58,13 +58,13 @@ class Tail:
     @classmethod
     def of(cls, null: Floats, groups: Ints, share: float) -> Tail | None:
         """Fit one to (n,) similarities of unrelated images; None if too few are known."""
-        known = np.isfinite(null)
-        if known.sum() < FEWEST:
+        finite = np.isfinite(null)
+        if finite.sum() < FEWEST:
             return None
-        z = _fisher(null[known])
+        z = _fisher(null[finite])
         location = max(float(np.quantile(z, TAIL)), LEAST)
         over = z > location
-        videos = len(np.unique(groups[known][over]))
+        videos = len(np.unique(groups[finite][over]))
         excess = videos * float((z[over] - location).mean()) if videos else 0.0
         weight = videos + PRIOR
         scale = (excess + PRIOR * EXCESS) / weight
@@ -149,8 +149,8 @@ def measured(nulls: Sequence[Floats], groups: Ints, shares: Sequence[float], rat
     half = np.unique(groups, return_inverse=True)[1] % 2 == 0
     over = 0
     for fold in (half, ~half):
-        others = [null[~fold] for null in nulls]
-        fitted = tails(others, groups[~fold], shares) or tails(nulls, groups, shares)
+        complement = [null[~fold] for null in nulls]
+        fitted = tails(complement, groups[~fold], shares) or tails(nulls, groups, shares)
         values = score([null[fold] for null in nulls], fitted)
         over += int((values >= threshold(fitted, rate)).sum())
     return over / len(groups)

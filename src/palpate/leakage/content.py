@@ -51,16 +51,16 @@ def shows_nothing(parts: Sequence[Manifest], column: str, progress: Progress = q
         for row in table.iter_rows()
     ]
     rows = [rows[k] for k in np.unique(np.linspace(0, len(rows) - 1, SAMPLED).astype(int)) if rows]
-    known = column == "tactile" and all(background for _, background in rows)
-    pairs = rows if known else [(path, path) for path, _ in rows]
+    recorded = column == "tactile" and all(background for _, background in rows)
+    pairs = rows if recorded else [(path, path) for path, _ in rows]
     files = sorted({path for pair in pairs for path in pair if path})
     small = dict(in_threads(_thumbnail, files, "looking for contact", progress))
-    shown = [(small[a], small[b]) for a, b in pairs if a and b]
-    shown = [(x, ground) for x, ground in shown if x is not None and ground is not None]
-    if len(shown) < FEWEST:
+    readable = [(small[a], small[b]) for a, b in pairs if a and b]
+    readable = [(x, ground) for x, ground in readable if x is not None and ground is not None]
+    if len(readable) < FEWEST:
         return False
-    images, grounds = (np.stack(side) for side in zip(*shown, strict=True))
-    ratio = structure(images, grounds if known else np.median(images, axis=0, keepdims=True))
+    images, grounds = (np.stack(side) for side in zip(*readable, strict=True))
+    ratio = structure(images, grounds if recorded else np.median(images, axis=0, keepdims=True))
     return bool(np.quantile(ratio, SHARE) < LIMIT)
 
 

@@ -279,14 +279,14 @@ class Whitened(Descriptors):
         white = [w(centered[:, c]) for c, w in enumerate(self._white)]
         image = np.stack(white, axis=1).reshape(len(logs), -1, SIDE, SIDE)
         down, right = (x.reshape(-1, SIDE * SIDE) for x in np.gradient(image, axis=(2, 3)))
-        whole = down @ _POOL, right @ _POOL
+        total = down @ _POOL, right @ _POOL
         forward: list[Floats] = []
         backward: list[Floats] = []
         for angle in 2 * np.pi * np.arange(DIRECTIONS // 2) / DIRECTIONS:
             y, x = np.float32(np.sin(angle)), np.float32(np.cos(angle))
             forward.append(np.maximum(y * down + x * right, 0) @ _POOL)
             # What is left of the sum is the opposite direction.
-            backward.append(np.maximum(forward[-1] - y * whole[0] - x * whole[1], 0))
+            backward.append(np.maximum(forward[-1] - y * total[0] - x * total[1], 0))
         pooled = np.stack(forward + backward, axis=1).reshape(len(logs), -1)
         return np.sqrt(unit(pooled))
 
@@ -485,8 +485,8 @@ def _sampler(
 
 def _pool() -> Floats:
     """(side^2, cells^2): triangles that overlap by half."""
-    place = (np.arange(SIDE) + 0.5) * SLOPE_CELLS / SIDE - 0.5
-    side = np.maximum(0, 1 - np.abs(place[:, None] - np.arange(SLOPE_CELLS)))
+    center = (np.arange(SIDE) + 0.5) * SLOPE_CELLS / SIDE - 0.5
+    side = np.maximum(0, 1 - np.abs(center[:, None] - np.arange(SLOPE_CELLS)))
     return np.kron(side, side).astype(np.float32)
 
 

@@ -56,17 +56,17 @@ def nested_groups(manifest: Manifest) -> list[str]:
 
     Objects and sessions that cut across videos, or are no fewer than these, are no coarser groups.
     """
-    known = _known(manifest, ["object", "session", "video", "contact"])
-    size = {c: manifest.table[c].n_unique() for c in known}
-    if "video" in known:
+    complete = _known(manifest, ["object", "session", "video", "contact"])
+    size = {c: manifest.table[c].n_unique() for c in complete}
+    if "video" in complete:
         pairs = {
             c: manifest.table.select("video", c).n_unique()
             for c in ("object", "session")
-            if c in known
+            if c in complete
         }
-        known = [c for c in known if c not in pairs or size[c] < size["video"] == pairs[c]]
-    coarse = [c for c in known if c in ("object", "session")]
-    return sorted(coarse, key=size.__getitem__) + [c for c in known if c not in coarse]
+        complete = [c for c in complete if c not in pairs or size[c] < size["video"] == pairs[c]]
+    coarse = [c for c in complete if c in ("object", "session")]
+    return sorted(coarse, key=size.__getitem__) + [c for c in complete if c not in coarse]
 
 
 def _known(manifest: Manifest, columns: Sequence[str]) -> list[str]:
@@ -112,12 +112,11 @@ def components(manifest: Manifest, by: Sequence[str], links: Sequence[Ints] = ()
     for column in by:
         require(column in GROUPS, "by", f"must be among {', '.join(GROUPS)}", repr(column), "video")
         empty = table[column].null_count()
-        if empty:
-            raise PalpateError(
-                f"Every sample needs a {column} to be split by it",
-                f"{empty} of {n} samples without",
-                "Fill the column, or choose another one",
-            )
+        must, got = (
+            f"Every sample needs a {column} to be split by it",
+            f"{empty} of {n} samples without",
+        )
+        require(not empty, None, must, got, fix="Fill the column, or choose another one")
     labels = [table[c].rank("dense").cast(pl.Int64).fill_null(0).to_numpy() - 1 for c in by]
     return _names(manifest, by, _joined([*labels, *links], n))
 
@@ -126,10 +125,10 @@ def _joined(labels: Sequence[Ints], n: int) -> Ints:
     """Components of the graph between n samples and their labels, as numbers."""
     rows, columns, nodes = [np.zeros(0, np.int64)], [np.zeros(0, np.int64)], n
     for label in labels:
-        known = np.flatnonzero(label >= 0)
-        values, place = np.unique(label[known], return_inverse=True)
-        rows.append(known)
-        columns.append(place + nodes)
+        labeled = np.flatnonzero(label >= 0)
+        values, number = np.unique(label[labeled], return_inverse=True)
+        rows.append(labeled)
+        columns.append(number + nodes)
         nodes += len(values)
     row, column = np.concatenate(rows), np.concatenate(columns)
     graph = coo_matrix((np.ones(len(row), np.int8), (row, column)), (nodes, nodes))

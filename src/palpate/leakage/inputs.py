@@ -14,7 +14,7 @@ from typing import Any, Literal
 
 import polars as pl
 
-from palpate.core import Note, PalpateError, Problem, ProblemsError, Progress, Split, quiet
+from palpate.core import Note, PalpateError, Problem, ProblemsError, Progress, Split, quiet, require
 from palpate.data.formats import FORMATS
 from palpate.data.imported import splits_of
 from palpate.data.listing import categories_in, contact_names, read_lists
@@ -53,18 +53,17 @@ def read(
     reading: Mapping[str, Any] | None = None,
 ) -> Source:
     """Read samples; ``root`` and ``reading`` as in :func:`palpate.leakage.audit`."""
-    options = {name: value for name, value in (reading or {}).items() if value}
-    root = options.pop("root", root)
+    root = (reading or {}).get("root") or root
     several = data if isinstance(data, list | tuple) else ()
     paths = [path for path in several if isinstance(path, str | Path)]
     if len(paths) == len(several) > 1:
-        manifest, skipped = _join([Path(path) for path in paths], skip_bad, root, options)
+        manifest, skipped = _join([Path(path) for path in paths], skip_bad, root, reading)
         return Source(manifest, {}, _notes(skipped))
     source = paths[0] if len(paths) == len(several) == 1 else data
     path = Path(source) if isinstance(source, (str, Path)) else None
     # A table may name images that are not at hand; everything else is read as `palpate.load` does.
     table = path if path and path.is_file() and not (is_manifest(path) or is_list(path)) else None
-    named = None if table is None else read_names(table, **options, root=root)
+    named = None if table is None else read_names(table, **_options(reading), root=root)
     if named is not None:
         manifest, skipped, split = named
         if skipped and not skip_bad:
@@ -75,7 +74,7 @@ def read(
         notes = [Note("names-only", {"name": str(path and path.name)})] if bare else []
         return Source(manifest, splits, [*_notes(skipped), *notes])
     manifest, skipped = read_samples(
-        source, skip_bad=skip_bad, root=root, progress=progress, **options
+        source, skip_bad=skip_bad, root=root, progress=progress, **_options(reading)
     )
     notes = _notes(skipped)
     if "side_assumed" in manifest.facts:
@@ -85,9 +84,14 @@ def read(
     return Source(manifest, splits_of(path) if path is not None else {}, notes)
 
 
+def _options(reading: Mapping[str, Any] | None) -> dict[str, Any]:
+    """What is stated of how to read, but the root."""
+    return {k: v for k, v in (reading or {}).items() if v and k != "root"}
+
+
 def _notes(skipped: Sequence[Problem]) -> list[Note]:
-    shown = [str(problem) for problem in skipped[:SHOWN]]
-    return [Note("rows-skipped", {"count": len(skipped), "problems": shown})] if skipped else []
+    lines = [str(problem) for problem in skipped[:SHOWN]]
+    return [Note("rows-skipped", {"count": len(skipped), "problems": lines})] if skipped else []
 
 
 def read_all(
@@ -114,8 +118,8 @@ def read_all(
             raise
     if problems:
         raise ProblemsError(problems, FIX)
-    given = next((t for t in map((reading or {}).get, ("tactile", "vision")) if t), None)
-    named, template = name_together([part.manifest for part in parts], given)
+    stated = next((t for t in map((reading or {}).get, ("tactile", "vision")) if t), None)
+    named, template = name_together([part.manifest for part in parts], stated)
     notes = [Note("names-read", {"template": template})] if template else []
     return [
         Source(
@@ -210,14 +214,13 @@ def _prefixed(column: str, names: pl.Series, part: str) -> pl.Expr:
 
 
 def _join(
-    paths: list[Path], skip_bad: bool, root: str | Path | None, reading: Mapping[str, Any]
+    paths: list[Path], skip_bad: bool, root: str | Path | None, reading: Mapping[str, Any] | None
 ) -> tuple[Manifest, list[Problem]]:
     """Several lists as one manifest."""
     for path in paths:
-        if not path.is_file() or is_manifest(path):
-            must = "Several paths must all be lists"
-            got = f"{path}, which is none" if path.exists() else f"no file {path}"
-            raise PalpateError(must, got, "Name one manifest, or lists alone")
+        must, listed = "Several paths must all be lists", path.is_file() and not is_manifest(path)
+        got = f"{path}, which is none" if path.exists() else f"no file {path}"
+        require(listed, None, must, got, fix="Name one manifest, or lists alone")
     if not all(map(is_list, paths)):
         parts = read_all(paths, skip_bad, quiet, root, reading)
         return Manifest.join(*(part.manifest for part in parts)), []

@@ -24,7 +24,7 @@ class View:
     """One way to compare images."""
 
     descriptors: Descriptors  # of all images
-    known: NDArray[np.bool_]  # (items,) those that can be compared so
+    usable: NDArray[np.bool_]  # (items,) those that can be compared so
     queries: NDArray[np.bool_]  # (items,) those whose matches are of interest
     shares: Sequence[float]  # of the rate of false positives of these, for each question
 
@@ -52,16 +52,16 @@ def image_views(images: Pool, base: Ints, queries: Ints) -> list[View]:
     for luma, wanted in kinds:
         descriptors: list[tuple[Whitened, NDArray[np.bool_]]] = []
         for backgrounds in (None, images.backgrounds):
-            known = ~images.blank if backgrounds is None else ~images.blank & (backgrounds >= 0)
-            if backgrounds is None or (known[base].any() and known[queries].any()):
+            usable = ~images.blank if backgrounds is None else ~images.blank & (backgrounds >= 0)
+            if backgrounds is None or (usable[base].any() and usable[queries].any()):
                 described = Whitened(
-                    images.pixels, images.images, backgrounds, gray=luma, fit=both[known[both]]
+                    images.pixels, images.images, backgrounds, gray=luma, fit=both[usable[both]]
                 )
-                descriptors.append((described, known))
-        whole = sum(sum(described.shares) for described, _ in descriptors)
+                descriptors.append((described, usable))
+        total = sum(sum(described.shares) for described, _ in descriptors)
         views += [
-            View(d, known, wanted, tuple(share / whole for share in d.shares))
-            for d, known in descriptors
+            View(d, usable, wanted, tuple(share / total for share in d.shares))
+            for d, usable in descriptors
         ]
     return views
 
@@ -91,8 +91,8 @@ def ordered(view: View, base: Ints, null: Unrelated) -> bool:
     """Whether recording order says anything: whether best matches lie within the window."""
     itself = Apart(null.apart.queries, null.apart.base, 0)
     _, places = answers(view, base, [(base[null.rows], itself)], ways=1)[0]
-    known = places[0] >= 0
-    near = np.abs(null.apart.queries - null.apart.base[places[0]])[known] <= WINDOW
+    matched = places[0] >= 0
+    near = np.abs(null.apart.queries - null.apart.base[places[0]])[matched] <= WINDOW
     chance = 2 * WINDOW / len(base)
     return bool(near.mean() > chance + 4 * np.sqrt(chance / max(len(near), 1)))
 
@@ -117,16 +117,16 @@ def answers(
         for each task the similarities and places in ``base``, (questions, n); NaN and -1 where
         there is none.
     """
-    b = np.flatnonzero(view.known[base])
+    b = np.flatnonzero(view.usable[base])
     closest: list[tuple[Floats, Ints]] = []
-    known = [np.flatnonzero(view.known[items]) for items, _ in tasks]
+    usable = [np.flatnonzero(view.usable[items]) for items, _ in tasks]
     for items, _ in tasks:
         shape = (len(view.descriptors.shares), len(items))
         closest.append((np.full(shape, np.nan, np.float32), np.full(shape, -1, np.int64)))
     for k, (question, index) in enumerate(view.descriptors.ways[:ways]):
         progress("comparing images", k, len(view.descriptors.ways))
         among = index(base[b])
-        for (items, apart), q, (similarity, place) in zip(tasks, known, closest, strict=True):
+        for (items, apart), q, (similarity, row) in zip(tasks, usable, closest, strict=True):
             if not len(q) or not len(b):
                 continue
             if apart is not None:
@@ -135,7 +135,7 @@ def answers(
             rows, values = rows[:, 0], values[:, 0]
             better = (rows >= 0) & ~(values <= similarity[question, q])
             similarity[question, q[better]] = values[better]
-            place[question, q[better]] = b[rows[better]]
+            row[question, q[better]] = b[rows[better]]
     return closest
 
 
@@ -143,12 +143,12 @@ def links(
     view: View, base: Ints, count: int, progress: Progress = quiet
 ) -> Iterator[tuple[int, Ints, Ints, Floats]]:
     """Pairs of images that may be linked: (question, i, j, cosines)."""
-    b = np.flatnonzero(view.known[base])
+    b = np.flatnonzero(view.usable[base])
     itself = Apart(np.arange(len(b)), np.arange(len(b)), 0)
     for k, (question, index) in enumerate(view.descriptors.ways):
         progress("comparing images", k, len(view.descriptors.ways))
         if not len(b):
             return
         rows, cosines = index(base[b]).closest(base[b], count, itself)
-        known = rows >= 0
-        yield question, b[np.nonzero(known)[0]], b[rows[known]], cosines[known]
+        matched = rows >= 0
+        yield question, b[np.nonzero(matched)[0]], b[rows[matched]], cosines[matched]

@@ -133,7 +133,7 @@ class Matches:
     """The answer for the images of test."""
 
     score: Floats  # (n,) NaN where there is nothing to compare with
-    place: Ints  # (n,) the best match in the base, -1 for none
+    row: Ints  # (n,) the best match in the base, -1 for none
     threshold: float  # score from which images are flagged
     note: Note  # where the threshold is from
     tails: Sequence[Tail] = ()  # of the null, one for each question; none without a null
@@ -154,28 +154,28 @@ def _match(images: Pool, base: Ints, queries: Ints, rate: float, progress: Progr
     nulls: list[Floats] = []
     for view in views:
         tasks = [(queries, None)] + ([] if null is None else [(base[null.rows], null.apart)])
-        (similarity, place), *more = answers(view, base, tasks, progress)
+        (similarity, row), *more = answers(view, base, tasks, progress)
         similarity[:, ~view.queries[queries]] = np.nan
-        matches += zip(similarity, place, strict=True)
+        matches += zip(similarity, row, strict=True)
         # Equal images of two videos are copies for certain, and say nothing of unrelated ones.
         nulls += [np.where(row < SAME, row, np.nan) for values, _ in more for row in values]
     similarities, places = (np.stack(x) for x in zip(*matches, strict=True))
     shares = [share for view in views for share in view.shares]
-    known = [] if null is None else calibration.tails(nulls, null.groups, shares)
-    fitted = known or [Tail(0, 1, 1, 1)] * len(shares)  # the highest cosine
+    tails = [] if null is None else calibration.tails(nulls, null.groups, shares)
+    fitted = tails or [Tail(0, 1, 1, 1)] * len(shares)  # the highest cosine
     rarest = np.nan_to_num(calibration.surprises(similarities, fitted), nan=-np.inf).argmax(axis=0)
     score = calibration.score(similarities, fitted)
-    place = np.take_along_axis(places, rarest[None], axis=0)[0]
+    row = np.take_along_axis(places, rarest[None], axis=0)[0]
     limit = calibration.threshold(fitted, rate)
-    if null is None or not known or limit > TIGHT:
-        params = {"images": len(base), "threshold": round(limit, 3) if known else None}
-        return Matches(score, place, 1.0, Note("cannot-tell-no-null", params))
+    if null is None or not tails or limit > TIGHT:
+        params = {"images": len(base), "threshold": round(limit, 3) if tails else None}
+        return Matches(score, row, 1.0, Note("cannot-tell-no-null", params))
     groups = len(np.unique(null.groups))
     first = np.count_nonzero(np.cumsum(shares) < 1 + 1e-6)  # of images in color, or of all
     params = {"threshold": round(limit, 3), "samples": len(null.rows), "groups": groups}
     return Matches(
         score,
-        place,
+        row,
         limit,
         Note(f"threshold-{null.source}", params | {"rate": rate, "few": groups < VIDEOS}),
         fitted,
@@ -198,13 +198,13 @@ def _flags(
     item, first = images.item[cut:], _first(images.item[:cut], len(images.images))
     at = np.full(len(images.images) + 1, -1, np.int64)  # the last for samples without an image
     at[queries] = np.arange(len(queries))
-    at, known = at[item], at[item] >= 0
+    at, present = at[item], at[item] >= 0
     score, nearest = np.full(len(item), np.nan, np.float32), np.full(len(item), -1, np.int64)
-    if known.any() and len(base):
-        score[known] = matches.score[at[known]]
-        nearest[known] = first[base[matches.place[at[known]]]]
+    if present.any() and len(base):
+        score[present] = matches.score[at[present]]
+        nearest[present] = first[base[matches.row[at[present]]]]
     thumbs, rows = np.unique(images.images[base], return_index=True)
-    same = known & np.isin(images.images[item], thumbs)
+    same = present & np.isin(images.images[item], thumbs)
     score[same] = 1.0
     nearest[same] = first[base[rows[np.searchsorted(thumbs, images.images[item[same]])]]]
     flag = same | (np.nan_to_num(score) >= matches.threshold)
@@ -245,8 +245,8 @@ def _verdict(
     """Whether the flags are more than chance explains: all of them, or the strongest alone."""
     if same.any() or not flag.any():
         return "leaks" if same.any() else "none" if matches.tails else "cannot tell"
-    known = np.isfinite(matches.unrelated).sum()
-    if matches.measured and calibration.missed(matches.measured, int(known), rate):
+    count = np.isfinite(matches.unrelated).sum()
+    if matches.measured and calibration.missed(matches.measured, int(count), rate):
         return "cannot tell"
     groups = np.where(unit >= 0, unit, -1 - np.arange(len(unit)))
     strongest = float(np.nanmax(score))
@@ -267,8 +267,8 @@ def _shown(images: Pool, part: slice) -> Ints:
 
 def _first(item: Ints, count: int) -> Ints:
     """(count,) the first sample of each image; -1 for none."""
-    first, known = np.full(count, -1, np.int64), np.flatnonzero(item >= 0)[::-1]
-    first[item[known]] = known
+    first, present = np.full(count, -1, np.int64), np.flatnonzero(item >= 0)[::-1]
+    first[item[present]] = present
     return first
 
 

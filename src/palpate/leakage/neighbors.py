@@ -64,8 +64,8 @@ def nearest(queries: Floats, base: Floats, k: int = 1, *, apart: Apart | None = 
 
 def _largest(apart: Apart) -> int:
     """The most base rows that are related to one query."""
-    known = apart.base[np.isin(apart.base, apart.queries)]
-    return int(np.unique(known, return_counts=True)[1].max(initial=0))
+    related = apart.base[np.isin(apart.base, apart.queries)]
+    return int(np.unique(related, return_counts=True)[1].max(initial=0))
 
 
 def _search(queries: Floats, base: Floats, k: int) -> tuple[Ints, Any]:

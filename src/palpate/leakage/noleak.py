@@ -18,7 +18,7 @@ from collections.abc import Mapping, Sequence
 from importlib import resources
 from typing import Any
 
-from palpate.core import Note, PalpateError, Split, digest_json, require
+from palpate.core import Note, Split, digest_json, require
 from palpate.data.manifest import Manifest
 
 FORMAT = "palpate-noleak/1"
@@ -44,20 +44,20 @@ def verify_record(record: Mapping[str, Any]) -> None:
     """Check a record's checksum and every split's digest."""
     body = {k: v for k, v in record.items() if k != "sha256"}
     entries = [entry for by_seed in record["splits"].values() for entry in by_seed.values()]
-    if digest_json(body) != record.get("sha256") or any(
-        Split.from_ids(**entry["videos"]).digest != entry["digest"] for entry in entries
-    ):
-        must, got = "A NoLeak record must match its checksum", "a record that was changed"
-        raise PalpateError(must, got, "Install palpate again")
+    same = digest_json(body) == record.get("sha256") and all(
+        Split.from_ids(**entry["videos"]).digest == entry["digest"] for entry in entries
+    )
+    must, got = "A NoLeak record must match its checksum", "a record that was changed"
+    require(same, None, must, got, fix="Install palpate again")
 
 
 def record_split(record: Mapping[str, Any], train: float, val: float, seed: int) -> Split:
     """A split of the record, over videos."""
-    ratio = next((name for name, shares in RATIOS.items() if shares == (train, val)), None)
-    if ratio is None:
-        shares = ", ".join(f"train {t} and val {v}" for t, v in RATIOS.values())
-        must, got = f"The record's shares are {shares}", f"train {train} and val {val}"
-        raise PalpateError(must, got, "Choose one of these, or make a split by your groups")
+    ratio = next((name for name, shares in RATIOS.items() if shares == (train, val)), "")
+    shares = ", ".join(f"train {t} and val {v}" for t, v in RATIOS.values())
+    must, got = f"The record's shares are {shares}", f"train {train} and val {val}"
+    fix = "Choose one of these, or make a split by your groups"
+    require(ratio != "", None, must, got, fix=fix)
     must = f"must be one of {', '.join(map(str, SEEDS))}, the record's seeds"
     require(str(seed) in record["splits"][ratio], "seed", must, seed)
     entry = record["splits"][ratio][str(seed)]
@@ -83,13 +83,11 @@ def published(
         return videos
     column: list[str | None] = manifest.column("video")
     unknown = sorted({str(v) for v in column if v not in videos.parts})
-    if unknown:
-        names = ", ".join(map(repr, unknown[:8])) + " ..." * (len(unknown) > 8)
-        raise PalpateError(
-            "The video of every sample must be one that the record knows",
-            f"{len(unknown)} of {len(set(column))} that are not: {names}",
-            "Use the data set's video ids, or make a split by your groups",
-        )
+    names = ", ".join(map(repr, unknown[:8])) + " ..." * (len(unknown) > 8)
+    must = "The video of every sample must be one that the record knows"
+    got = f"{len(unknown)} of {len(set(column))} that are not: {names}"
+    fix = "Use the data set's video ids, or make a split by your groups"
+    require(not unknown, None, must, got, fix=fix)
     parts = {i: videos.parts[str(v)] for i, v in zip(manifest.ids, column, strict=True)}
     absent = sorted(set(videos.parts) - set(column))
     more = [Note("videos-without-samples", {"videos": absent, "of": len(videos)})] if absent else []

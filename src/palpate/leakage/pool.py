@@ -77,8 +77,8 @@ def pool(
     item = np.full(len(paths), -1, np.int64)
     readable = row >= 0
     key = np.stack([row, recorded], axis=1)[readable]
-    different, place = np.unique(key, axis=0, return_inverse=True)
-    item[readable] = place.ravel()
+    different, number = np.unique(key, axis=0, return_inverse=True)
+    item[readable] = number.ravel()
     images, backgrounds = different[:, 0], different[:, 1]
     result = Pool(
         item, unit, thumbs.pixels, images, backgrounds, np.zeros(len(images), bool), notes
@@ -138,12 +138,12 @@ def _with_medians(
 
 def _untouched(pixels: NDArray[np.uint8], recorded: Ints, unit: Ints) -> tuple[float, int]:
     """The strength that untouched gel shows, and from how many pairs of backgrounds."""
-    known = np.unique(np.stack([unit, recorded], axis=1)[(unit >= 0) & (recorded >= 0)], axis=0)
-    first = np.flatnonzero(known[1:, 0] == known[:-1, 0])
+    pairs = np.unique(np.stack([unit, recorded], axis=1)[(unit >= 0) & (recorded >= 0)], axis=0)
+    first = np.flatnonzero(pairs[1:, 0] == pairs[:-1, 0])
     if len(first) < PAIRS:
         return UNTOUCHED[0], 0
     first = first[np.linspace(0, len(first) - 1, min(len(first), MOST)).astype(np.int64)]
-    levels = strength(pixels, known[first, 1], known[first + 1, 1])
+    levels = strength(pixels, pairs[first, 1], pairs[first + 1, 1])
     return float(np.clip(1.5 * np.quantile(levels, 0.1), *UNTOUCHED)), len(first)
 
 

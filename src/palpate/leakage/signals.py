@@ -17,7 +17,7 @@ The signals of the images' content, whose thresholds are calibrated, are in ``ne
 from __future__ import annotations
 
 from collections.abc import Collection, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -129,12 +129,11 @@ class Flags(Signal):
 
     def summary(self, train: Manifest, test: Manifest, gaps: Gaps, worst: int) -> Signal:
         """The signal as a result, with its strongest pairs."""
-        facts: dict[str, Any] = {f.name: getattr(self, f.name) for f in fields(Signal)}
+        signal = Signal(*(getattr(self, f.name) for f in fields(Signal)))
         if self.cause is not None:
             counts = {name: int((self.cause == name).sum()) for name in CAUSES}
-            facts["causes"] = {name: count for name, count in counts.items() if count}
-        facts["worst"] = self._worst(train, test, gaps, worst)
-        return Signal(**facts)
+            signal = replace(signal, causes={name: n for name, n in counts.items() if n})
+        return replace(signal, worst=self._worst(train, test, gaps, worst))
 
     def _worst(self, train: Manifest, test: Manifest, gaps: Gaps, worst: int) -> list[LeakPair]:
         """The strongest pairs, one a video first; then a few of each cause that is no leak."""
@@ -166,8 +165,8 @@ def identical_samples(
     ``named`` are the columns in which equal names mean the same thing; without ``id`` and ``video``
     nothing can be checked.
     """
-    place = {name: k for k, name in enumerate(train.ids)} if "id" in named else {}
-    same = np.array([place.get(name, -1) for name in test.ids], np.int64)
+    row = {name: k for k, name in enumerate(train.ids)} if "id" in named else {}
+    same = np.array([row.get(name, -1) for name in test.ids], np.int64)
     nearest = np.where(same >= 0, same, np.where(gaps.frames == 0, gaps.row, -1))
     flag = nearest >= 0
     score = np.where(bool({"id", "video"} & {*named}), flag, np.nan).astype(np.float32)
@@ -202,14 +201,14 @@ def time_gap(gaps: Gaps, near: int) -> Flags | None:
         gaps: the nearest train frames.
         near: flagged up to this many frames; the score halves with each further ``near``.
     """
-    known = gaps.frames >= 0
-    if not known.any():
+    timed = gaps.frames >= 0
+    if not timed.any():
         return None
-    score = np.where(known, np.exp2(-gaps.frames / max(near, 1)), 0.0).astype(np.float32)
+    score = np.where(timed, np.exp2(-gaps.frames / max(near, 1)), 0.0).astype(np.float32)
     return Flags.of(
         "time gap",
         score,
-        known & (gaps.frames <= near),
+        timed & (gaps.frames <= near),
         gaps.row,
         threshold=0.5 if near else 1.0,
         notes=[Note("near-frames", {"frames": near})],
@@ -251,12 +250,10 @@ def signal_table(
 ) -> pl.DataFrame:
     """A row for each test sample: ``id, video, frame, material, leaking, gap`` and every signal."""
     ids = np.array(train.ids, object)
-    columns = {name: series for f in flags for name, series in f.columns(ids).items()}
-    return test.table.select("id", "video", "frame", "material").with_columns(
-        leaking=pl.Series(leaking(flags, len(test))),
-        gap=pl.Series(gaps.frames).replace(-1, None),
-        **columns,
+    table = test.table.select("id", "video", "frame", "material").with_columns(
+        leaking=pl.Series(leaking(flags, len(test))), gap=pl.Series(gaps.frames).replace(-1, None)
     )
+    return table.with_columns(s.alias(name) for f in flags for name, s in f.columns(ids).items())
 
 
 def leaking(flags: Sequence[Flags], count: int) -> NDArray[np.bool_]:

@@ -119,9 +119,9 @@ def split(  # noqa: PLR0913  # pyright: ignore[reportInconsistentOverload]
             name = f"NoLeak fold {fold} of {folds}"
             facts |= {"name": name, "folds": folds, "fold": fold, "shares": shares}
         where = {g: parts[k] for g, k in zip(names, assignment.tolist(), strict=True)}
-        of = {i: where[g] for i, g in zip(manifest.ids, groups, strict=True)}
-        more = [*notes, *_question(manifest, of), *_notes(manifest, facts)]
-        splits.append(Split(of, dict(facts), manifest.digest, more))
+        part_of = {i: where[g] for i, g in zip(manifest.ids, groups, strict=True)}
+        more = [*notes, *_question(manifest, part_of), *_notes(manifest, facts)]
+        splits.append(Split(part_of, dict(facts), manifest.digest, more))
     return splits[0] if folds is None else splits
 
 
@@ -132,8 +132,8 @@ def _check(train: float, val: float, folds: int | None, noleak: str | None) -> N
         raise PalpateError(must, got, "Choose smaller shares", example={"train": 0.8, "val": 0.1})
     least = 2 + (val > 0)
     require(folds is None or folds >= least, "folds", f"must be at least {least}", folds, 5)
-    known = noleak in (None, "touch-and-go", "hct")
-    require(known, "noleak", "must be touch-and-go or hct", repr(noleak), "touch-and-go")
+    accepted = noleak in (None, "touch-and-go", "hct")
+    require(accepted, "noleak", "must be touch-and-go or hct", repr(noleak), "touch-and-go")
 
 
 def _near_links(
@@ -142,14 +142,14 @@ def _near_links(
     """Labels of near-duplicate clusters, and their description for the rule."""
     if near is None:
         return [], None
-    known = near in (*MODALITIES, "both")
-    require(known, "near", "must be vision, tactile or both", repr(near), "both")
+    accepted = near in (*MODALITIES, "both")
+    require(accepted, "near", "must be vision, tactile or both", repr(near), "both")
     from palpate.leakage.near import near_groups
 
     modalities = [m for m in MODALITIES if near in (m, "both") and manifest.table[m].count()]
-    if not modalities:
-        must = f"Near-duplicates need {'' if near == 'both' else f'{near} '}images"
-        raise PalpateError(must, "samples without any", "Leave it out, or import the images")
+    must = f"Near-duplicates need {'' if near == 'both' else f'{near} '}images"
+    fix = "Leave it out, or import the images"
+    require(len(modalities) > 0, None, must, "samples without any", fix=fix)
     folder = None if cache is None else Path(cache)
     links = [near_groups(manifest, m, cache=folder, progress=progress) for m in modalities]
     return links, {"modalities": modalities}
@@ -161,8 +161,8 @@ def _columns(
     """The columns to keep whole, and why."""
     if by != "auto":
         return list(dict.fromkeys([by] if isinstance(by, str) else by)), []
-    known = (not manifest.table[c].null_count() for c in ("video", "object", "contact"))
-    if links and not any(known):
+    complete = (not manifest.table[c].null_count() for c in ("video", "object", "contact"))
+    if links and not any(complete):
         return [], [Note("group-near-only")]
     column, reason = choose_group(manifest, parts)
     return [column], [reason] if reason else []
@@ -187,13 +187,11 @@ def _problem(
             counts[row[group], column[material]] += 1
     biggest = int(counts[:, -1].argmax())
     largest, wanted = float(counts[biggest, -1] / len(groups)), 1 - max(target)
-    if 1 - largest < LEAST_FILL * wanted:
-        raise PalpateError(
-            f"The smaller parts must get at least {LEAST_FILL:.0%} of their wanted {wanted:.1%}",
-            f"{kind} {names[biggest]!r} with {largest:.1%} of all samples, which leaves them"
-            f" {1 - largest:.2%} at best",
-            "Choose a finer group, thin that group out, or choose a larger train share",
-        )
+    must = f"The smaller parts must get at least {LEAST_FILL:.0%} of their wanted {wanted:.1%}"
+    rest = f"which leaves them {1 - largest:.2%} at best"
+    got = f"{kind} {names[biggest]!r} with {largest:.1%} of all samples, {rest}"
+    fix = "Choose a finer group, thin that group out, or choose a larger train share"
+    require(1 - largest >= LEAST_FILL * wanted, None, must, got, fix=fix)
     return names, materials, Problem(counts, np.array(target))
 
 
@@ -230,8 +228,8 @@ def _question(manifest: Manifest, parts: Mapping[str, str]) -> list[Note]:
     coarse = next((c for c in ("object", "session") if c in shared), None)
     if coarse is None:
         return []
-    known = "object" in shared and "video" in nested_groups(manifest)[1:]
-    other = coarse if shared[coarse][0] else "video" if known else None
+    nested = "object" in shared and "video" in nested_groups(manifest)[1:]
+    other = coarse if shared[coarse][0] else "video" if nested else None
     return [Note("question", {"shared": shared, "other": other})]
 
 
@@ -250,5 +248,5 @@ def _notes(manifest: Manifest, facts: dict[str, Any]) -> list[Note]:
 
 def _fold_parts(folds: int, val: bool) -> list[list[str]]:
     """For each split the part of each fold."""
-    others = ["val" if val else "train", *["train"] * (folds - 2)]
-    return [np.roll(["test", *others], fold).tolist() for fold in range(folds)]
+    untested = ["val" if val else "train", *["train"] * (folds - 2)]
+    return [np.roll(["test", *untested], fold).tolist() for fold in range(folds)]

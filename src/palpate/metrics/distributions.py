@@ -48,7 +48,7 @@ import numpy as np
 from scipy import linalg
 
 from palpate._version import __version__
-from palpate.core import FeatureSet, Note, PalpateError, Score, rng_for
+from palpate.core import FeatureSet, Note, Score, require, rng_for
 from palpate.metrics.inputs import (
     Array,
     Index,
@@ -56,7 +56,7 @@ from palpate.metrics.inputs import (
     checked_pair,
     checked_whole,
     copies_across,
-    feature_set,
+    feature_sets,
     require_one_encoder,
 )
 from palpate.metrics.intervals import Scored, Spread, jackknife_errors, spread_of_values
@@ -109,9 +109,14 @@ def fid(
         PalpateError: on features that cannot be used, unequal widths, fewer than two rows, or
             encoders of different digests.
     """
-    x = feature_set(generated, ids=ids, groups=groups, encoder=encoder)
-    y = feature_set(
-        reference, argument="reference", ids=reference_ids, groups=reference_groups, encoder=encoder
+    x, y = feature_sets(
+        generated,
+        reference,
+        ids,
+        groups=groups,
+        reference_ids=reference_ids,
+        reference_groups=reference_groups,
+        encoder=encoder,
     )
     return _fid(x, y, **options).score
 
@@ -150,14 +155,12 @@ def _fid(
 ) -> Scored:
     """FID, and its value without each block."""
     checked_whole(0, seed=seed)
-    require_one_encoder(generated, reference, "Generated and reference")
-    sets, names = (generated.features, reference.features), ("generated", "reference")
-    x, y = checked_pair(*sets, normalize=False, least=2, names=names)
+    x, y, groups, notes = _rows(generated, reference, 2)
     center = (x.mean(axis=0, dtype=np.float64) + y.mean(axis=0, dtype=np.float64)) / 2
     a, b = _normal(x, center), _normal(y, center)
     value, delta = _distance(a, b), a[0] - b[0]
     details: dict[str, Any] = {"mean_term": float(delta @ delta)}
-    blocks, replicates, units = _draw_blocks(generated, reference, seed), np.zeros(0), list[str]()
+    blocks, replicates, units = _draw_blocks(len(x), len(y), groups, seed), np.zeros(0), list[str]()
     sets = ((x, blocks.x), (y, blocks.y))
     if min(len(v) - np.bincount(at).max() for v, at in sets) > 1:
         units = list(blocks.names)
@@ -166,8 +169,6 @@ def _fid(
     error = float(jackknife_errors(replicates[:, None])[0])
     limits = Spread(value, error, len(units) - 1, "").interval(0.0)
     n, d = min(len(x), len(y)), x.shape[1]
-    copies = copies_across(x, y)
-    notes = [Note("copied-rows", {"count": copies, "n": len(x)})] if copies else []
     notes.append(Note("fid-biased") if n > d else Note("fid-mostly-bias", {"n": n, "d": d}))
     notes += [Note("no-interval-few-units")] if limits is None else []
     score = Score(
@@ -216,13 +217,13 @@ def _of_sums(n: int, sums: Array) -> Normal:
 
 def _without_each(x: Array, block: Index, count: int, center: Array) -> Iterator[Normal]:
     """The normal distribution without each block of rows."""
-    whole, sizes = None, np.bincount(block, minlength=count)
+    total, sizes = None, np.bincount(block, minlength=count)
     for b in range(count):
         if (n := len(x) - int(sizes[b])) <= x.shape[1]:
             yield _normal(x[block != b], center)
             continue
-        whole = _sums(x, center) if whole is None else whole
-        yield _of_sums(n, whole - _sums(x[block == b], center))
+        total = _sums(x, center) if total is None else total
+        yield _of_sums(n, total - _sums(x[block == b], center))
 
 
 def _factor(cov: Array) -> Array:
@@ -259,15 +260,25 @@ class _Blocks(NamedTuple):
     method: str
 
 
-def _draw_blocks(generated: FeatureSet, reference: FeatureSet, seed: int) -> _Blocks:
-    """Groups, or rows where a set has no groups, in at most :data:`BLOCKS` blocks."""
-    n, m = len(generated.ids), len(reference.ids)
-    rng = rng_for(seed, "fid blocks")
+def _rows(
+    generated: FeatureSet, reference: FeatureSet, least: int
+) -> tuple[Array, Array, list[list[str] | None], list[Note]]:
+    """Both sets of rows and of groups, checked, and a note of copies."""
+    require_one_encoder(generated, reference, "Generated and reference")
+    sets, names = (generated.features, reference.features), ("generated", "reference")
+    x, y = checked_pair(*sets, normalize=False, least=least, names=names)
     groups = [checked_names("groups", s.groups, len(s.ids)) for s in (generated, reference)]
+    copies = copies_across(x, y)
+    return x, y, groups, [Note("copied-rows", {"count": copies, "n": len(x)})] * bool(copies)
+
+
+def _draw_blocks(n: int, m: int, groups: Sequence[list[str] | None], seed: int) -> _Blocks:
+    """Groups, or rows where a set has no groups, in at most :data:`BLOCKS` blocks."""
+    rng = rng_for(seed, "fid blocks")
     if groups[0] is None or groups[1] is None:
         count, units, unit = min(BLOCKS, n, m), n + m, "row"
         x, y = rng.permutation(n) % count, rng.permutation(m) % count
-        what = "rows, taken as independent"
+        members = "rows, taken as independent"
     else:
         names, of_row = np.unique(groups[0] + groups[1], return_inverse=True)
         x, y, units, unit = of_row[:n], of_row[n:], len(names), "group"
@@ -281,9 +292,9 @@ def _draw_blocks(generated: FeatureSet, reference: FeatureSet, seed: int) -> _Bl
         for u in order[np.argsort(-size[order], kind="stable")]:
             block[u] = int(load.argmin())
             load[block[u]] += size[u]
-        x, y, count, what = block[x], block[y], BLOCKS, f"whole groups ({units} groups)"
+        x, y, count, members = block[x], block[y], BLOCKS, f"whole groups ({units} groups)"
     details = {"units": units, "unit": unit, "left_out": "block"}
-    method = f"leave-one-block-out jackknife, {count} random blocks of {what}, t, {count - 1} df"
+    method = f"leave-one-block-out jackknife, {count} random blocks of {members}, t, {count - 1} df"
     return _Blocks(x, y, [f"block {b}" for b in range(count)], details, method)
 
 
@@ -322,9 +333,14 @@ def prdc(
         PalpateError: on features that cannot be used, unequal widths, encoders of different
             digests, or (grouped) a group outside which there are fewer than k rows.
     """
-    x = feature_set(generated, ids=ids, groups=groups, encoder=encoder)
-    y = feature_set(
-        reference, argument="reference", ids=reference_ids, groups=reference_groups, encoder=encoder
+    x, y = feature_sets(
+        generated,
+        reference,
+        ids,
+        groups=groups,
+        reference_ids=reference_ids,
+        reference_groups=reference_groups,
+        encoder=encoder,
     )
     return prdc_rows(x, y, k, **options)[0]
 
@@ -343,16 +359,10 @@ def prdc_rows(
     (n,) over generated rows for Precision and Density, (m,) over real ones for Recall and Coverage.
     """
     checked_whole(1, k=k)
-    require_one_encoder(generated, reference, "Generated and reference")
-    sets, names = (generated.features, reference.features), ("generated", "reference")
-    x, y = checked_pair(*sets, normalize=False, least=k + 1, names=names)
-    groups = [checked_names("groups", s.groups, len(s.ids)) for s in (generated, reference)]
-    known = None not in groups
-    if grouped and not known:
-        must, fix = "must be False without groups in both sets", "Fill the groups"
-        raise PalpateError(must, "True", fix, argument="grouped")
-    grouped = known if grouped is None else grouped
-    copies = copies_across(x, y)
+    x, y, groups, copied = _rows(generated, reference, k + 1)
+    both, must = None not in groups, "must be False without groups in both sets"
+    require(both or not grouped, "grouped", must, grouped, fix="Fill the groups")
+    grouped = both if grouped is None else grouped
     center = (x.sum(axis=0, dtype=np.float64) + y.sum(axis=0, dtype=np.float64)) / (len(x) + len(y))
     x, y = x - center, y - center  # so that a large common mean costs no digits
     radii = [
@@ -366,13 +376,11 @@ def prdc_rows(
         over_real, balls = metric in ("Recall", "Coverage"), int(metric != "Recall")
         spread = spread_of_values(values, groups[over_real])
         interval = spread.interval(0.0, np.inf if metric == "Density" else 1.0)
-        empty, of = int((radii[balls] == 0).sum()), ("generated", "real")[balls]
+        empty, side = int((radii[balls] == 0).sum()), ("generated", "real")[balls]
         details = {"radius_generated": median[0], "radius_real": median[1], "empty_balls": empty}
-        notes = [
-            (copies, Note("copied-rows", {"count": copies, "n": len(x)})),
-            (empty, Note("empty-balls", {"count": empty, "n": len(radii[balls]), "of": of})),
-            (interval is None, Note("no-interval-over-groups")),
-        ]
+        balls = Note("empty-balls", {"count": empty, "n": len(radii[balls]), "of": side})
+        notes = [*copied, *[balls] * (empty > 0)]
+        notes += [Note("no-interval-over-groups")] * (interval is None)
         scores.append(
             Score(
                 metric,
@@ -389,7 +397,7 @@ def prdc_rows(
                 higher_is_better=True,
                 settings={"k": k, "grouped": grouped, "inside": "<"},
                 details=details | {"version": __version__},
-                notes=tuple(note for holds, note in notes if holds),
+                notes=tuple(notes),
             )
         )
     return scores, rows
@@ -399,11 +407,12 @@ def _squared_radii(name: str, x: Array, groups: Sequence[str] | None, k: int) ->
     """Squared distance (n,) to the k-th nearest row of another group; without groups of any row."""
     n = len(x)
     unit = np.arange(n) if groups is None else np.unique(groups, return_inverse=True)[1]
-    others = (n - np.bincount(unit))[unit]
-    if groups is not None and others.min() < k:
-        must = f"Every group must have at least k = {k} {name} rows outside it"
-        got = f"{others.min()} outside group {groups[int(others.argmin())]!r}"
-        raise PalpateError(must, got, "Choose a smaller k, more groups, or leave the groups out")
+    outside = (n - np.bincount(unit))[unit]
+    names = ["none"] * n if groups is None else groups
+    must = f"Every group must have at least k = {k} {name} rows outside it"
+    got = f"{outside.min()} outside group {names[int(outside.argmin())]!r}"
+    fix = "Choose a smaller k, more groups, or leave the groups out"
+    require(groups is None or outside.min() >= k, None, must, got, fix=fix)
     radii = np.empty(n)
     for rows, squares in _blocks(x, x):
         squares[unit[rows, None] == unit] = np.inf

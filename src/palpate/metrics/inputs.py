@@ -18,14 +18,13 @@ import warnings
 from collections.abc import Callable, Generator, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
-from dataclasses import replace
 from typing import Any, Literal, TypeVar
 
 import numpy as np
 from array_api_compat import array_namespace, device
 from numpy.typing import NDArray
 
-from palpate.core import FeatureSet, PalpateError, PalpateWarning, require
+from palpate.core import FeatureSet, PalpateWarning, require
 from palpate.core.features import is_missing
 
 Array = NDArray[np.float64]
@@ -39,11 +38,11 @@ NORM_TOLERANCE = 1e-3
 SLAB = 8192
 
 
-def invalid(name: str, must: str, got: str, fix: str, **example: Any) -> PalpateError:
-    """The error for an input; ``name`` is an argument ("x") or a clause ("The features of 'a'")."""
+def check(holds: bool, name: str, must: str, got: Any, fix: str) -> None:
+    """Check an input, whose ``name`` is an argument ("x") or a clause ("The features of 'a'")."""
     if name.isidentifier():
-        return PalpateError(must, got, fix, argument=name, example=example)
-    return PalpateError(f"{name} {must}", got, fix, example=example)
+        require(holds, name, must, got, fix=fix)
+    require(holds, None, f"{name} {must}", got, fix=fix)
 
 
 def feature_set(
@@ -63,19 +62,38 @@ def feature_set(
     Raises:
         PalpateError: on what does not turn into rows, or columns of another length.
     """
-    if isinstance(features, FeatureSet):
-        given: dict[str, Any] = {"ids": ids, "labels": labels, "groups": groups}
-        n = len(features.ids)
-        changed: dict[str, Any] = {k: column(k, v, n) for k, v in given.items() if v is not None}
-        if encoder is not None:
-            changed["encoder"] = encoder
-        return replace(features, **changed) if changed else features
-    x = as_array(argument, to_host(features))
-    if x.ndim != 2:
-        raise _not_rows(argument, x)
-    n = len(x)
-    names = column("ids", ids, n) or [f"{argument} {k:0{len(str(n))}d}" for k in range(n)]
-    return FeatureSet(names, x, column("labels", labels, n), column("groups", groups, n), encoder)
+    base = features if isinstance(features, FeatureSet) else None
+    columns = (ids, labels, groups)
+    if base is not None and all(v is None for v in (*columns, encoder)):
+        return base
+    x = as_array(argument, to_host(features if base is None else base.features))
+    _check_rows(argument, x, x.ndim == 2)
+    n, names = len(x), ("ids", "labels", "groups")
+    ids, labels, groups = (
+        getattr(base, name, None) if v is None else column(name, v, n)
+        for name, v in zip(names, columns, strict=True)
+    )
+    ids = ids or [f"{argument} {k:0{len(str(n))}d}" for k in range(n)]
+    return FeatureSet(ids, x, labels, groups, encoder or getattr(base, "encoder", None))
+
+
+def feature_sets(
+    generated: Any,
+    reference: Any,
+    ids: Any = None,
+    labels: Any = None,
+    groups: Any = None,
+    *,
+    reference_ids: Any = None,
+    reference_groups: Any = None,
+    encoder: str | None = None,
+) -> tuple[FeatureSet, FeatureSet]:
+    """Both sets of a metric; arguments and errors as of :func:`feature_set`."""
+    x = feature_set(generated, ids=ids, labels=labels, groups=groups, encoder=encoder)
+    names = (reference_ids, reference_groups)
+    return x, feature_set(
+        reference, argument="reference", ids=names[0], groups=names[1], encoder=encoder
+    )
 
 
 def column(name: str, values: Any, n: int) -> list[Any] | None:
@@ -87,9 +105,8 @@ def column(name: str, values: Any, n: int) -> list[Any] | None:
     if values is None:
         return None
     items: Any = values.tolist() if hasattr(values, "tolist") else list(values)
-    if not isinstance(items, list) or len(items) != n:
-        got = str(len(items)) if isinstance(items, list) else repr(items)
-        raise invalid(name, f"must have one entry a row ({n})", got, "Pass the order of the rows")
+    count = len(items) if isinstance(items, list) else items
+    check(count == n, name, f"must have one entry a row ({n})", count, "Pass the order of the rows")
     return items
 
 
@@ -130,11 +147,13 @@ def as_array(name: str, x: Any) -> Any:
             x = x.float()
     if isinstance(x, np.memmap):  # np.asarray would forget where it comes from
         return x
+    problem = ""
     try:
-        return np.asarray(x)
+        x = np.asarray(x)
     except (TypeError, ValueError, RuntimeError) as error:
-        got = str(error).splitlines()[0]
-        raise invalid(name, "must turn into an array", got, "Pass rows of one width") from None
+        problem = str(error).splitlines()[0]
+    check(not problem, name, "must turn into an array", problem, "Pass rows of one width")
+    return x
 
 
 def checked_features(name: str, x: Any, *, normalize: Normalize = "check", least: int = 1) -> Any:
@@ -144,7 +163,7 @@ def checked_features(name: str, x: Any, *, normalize: Normalize = "check", least
     or widened is copied into memory. Arrays of other libraries stay on their device.
 
     Args:
-        name: argument or clause for errors, see :func:`invalid`.
+        name: argument or clause for errors, see :func:`check`.
         x: an array (n, d).
         normalize: ``"check"`` rejects rows whose L2 norm is not 1 within 1e-3; ``True`` divides by
             the norm; ``False`` takes rows as they are.
@@ -154,39 +173,33 @@ def checked_features(name: str, x: Any, *, normalize: Normalize = "check", least
         PalpateError: on integers, a wrong shape, too few rows, NaN or infinity, zero or
             un-normalized rows (their numbers are given).
     """
-    known = normalize in (True, False, "check")
-    require(known, "normalize", 'must be "check", True or False', repr(normalize))
+    accepted = normalize in (True, False, "check")
+    require(accepted, "normalize", 'must be "check", True or False', repr(normalize))
     x = as_array(name, x)
     kind = str(x.dtype).rsplit(".", maxsplit=1)[-1]
-    if not kind.startswith(("float", "bfloat", "longdouble", ">f", "<f")):
-        fix = "Pass the encoder's float output, not pixels or codes"
-        raise invalid(name, "must be floating-point features", f"dtype {x.dtype}", fix)
-    if x.ndim != 2 or x.shape[1] == 0:
-        raise _not_rows(name, x)
-    if len(x) < least:
-        must = f"must have at least {least} rows for this estimator"
-        raise invalid(name, must, str(len(x)), "Pass more samples")
+    floating = kind.startswith(("float", "bfloat", "longdouble", ">f", "<f"))
+    fix = "Pass the encoder's float output, not pixels or codes"
+    check(floating, name, "must be floating-point features", f"dtype {x.dtype}", fix)
+    _check_rows(name, x, x.ndim == 2 and x.shape[1] > 0)
+    must = f"must have at least {least} rows for this estimator"
+    check(len(x) >= least, name, must, len(x), "Pass more samples")
     if kind in ("float16", "bfloat16"):
         _warn_widened(name, kind)
-    return _checked_norms(name, _at_least_float32(x), normalize)
-
-
-def _checked_norms(name: str, x: Any, normalize: Normalize) -> Any:
+    x = _at_least_float32(x)
     norms = row_norms(x)
-    fix = "Check what those rows were made from"
-    if (bad := ~np.isfinite(norms)).any():
-        raise invalid(name, "must be finite", f"NaN or infinity in {rows_text(bad)}", fix)
+    bad, fix = ~np.isfinite(norms), "Check what those rows were made from"
+    check(not bad.any(), name, "must be finite", f"NaN or infinity in {rows_text(bad)}", fix)
     if normalize is False:
         return x
-    if (bad := norms == 0).any():
-        raise invalid(name, "must have no zero vector", f"zeros in {rows_text(bad)}", fix)
+    bad = norms == 0
+    check(not bad.any(), name, "must have no zero vector", f"zeros in {rows_text(bad)}", fix)
     if normalize is True:
         scale = norms[:, None] if isinstance(x, np.ndarray) else like(norms[:, None], x)
         return (x / scale).astype(x.dtype) if isinstance(x, np.ndarray) else x / scale
-    if (bad := np.abs(norms - 1) > NORM_TOLERANCE).any():
-        got = f"norm {norms[np.flatnonzero(bad)[0]]:.4g} in {rows_text(bad)}"
-        fix = "Divide by the norm, or choose to keep the norms"
-        raise invalid(name, "must be L2-normalized", got, fix, normalize=True)
+    bad = np.abs(norms - 1) > NORM_TOLERANCE
+    got = f"norm {', '.join(f'{v:.4g}' for v in norms[bad][:1])} in {rows_text(bad)}"
+    fix = "Divide by the norms with normalize=True, or keep them with False"
+    check(not bad.any(), name, "must be L2-normalized", got, fix)
     return x
 
 
@@ -201,16 +214,18 @@ def checked_pair(
     x, y = as_array(names[0], x), as_array(names[1], y)
     first, second = (f"`{name}`" if name.isidentifier() else name for name in names)
     both = f"{first} and {second.replace('The ', 'the ', 1)}"
-    if x.ndim == y.ndim == 2 and x.shape[1] != y.shape[1]:
-        got, fix = f"{x.shape[1]} and {y.shape[1]}", "Embed both with the same encoder"
-        raise PalpateError(f"{both} must have the same width", got, fix)
+    got = " and ".join(str(v.shape[-1]) for v in (x, y) if v.ndim)
+    same = not x.ndim == y.ndim == 2 or x.shape[1] == y.shape[1]
+    must, fix = f"{both} must have the same width", "Embed both with the same encoder"
+    require(same, None, must, got, fix=fix)
     library = lambda v: f"{type(v).__module__.split('.')[0]} {getattr(v, 'device', '')}"
     homes = [library(v) if is_foreign(v) else "numpy" for v in (x, y)]
-    if homes[0] != homes[1]:
-        must = f"{both} must be arrays of one library on one device"
-        raise PalpateError(must, " and ".join(homes), "Move one of them")
-    given: dict[str, Any] = {"normalize": normalize, "least": least}
-    a, b = (checked_features(name, v, **given) for name, v in zip(names, (x, y), strict=True))
+    must = f"{both} must be arrays of one library on one device"
+    require(homes[0] == homes[1], None, must, " and ".join(homes), fix="Move one of them")
+    a, b = (
+        checked_features(name, v, normalize=normalize, least=least)
+        for name, v in zip(names, (x, y), strict=True)
+    )
     if isinstance(a, np.ndarray):
         dtype = np.result_type(a.dtype, b.dtype)
         return a.astype(dtype, copy=False), b.astype(dtype, copy=False)
@@ -240,9 +255,9 @@ def row_norms(x: Any) -> Array:
     return norms
 
 
-def _not_rows(name: str, x: Any) -> PalpateError:
-    must = "must have shape (n, d), one row a sample"
-    return invalid(name, must, f"shape {tuple(x.shape)}", "Stack one feature vector a row")
+def _check_rows(name: str, x: Any, holds: bool) -> None:
+    must, fix = "must have shape (n, d), one row a sample", "Stack one feature vector a row"
+    check(holds, name, must, f"shape {tuple(x.shape)}", fix)
 
 
 def _warn_widened(name: str, kind: str) -> None:
@@ -285,26 +300,25 @@ def checked_names(name: str, values: Any, n: int) -> list[str] | None:
     if items is None:
         return None
     missing = np.array([is_missing(v) for v in items], dtype=bool)
-    if missing.any():
-        fix = f"Fill {name}, or pass None for all"
-        raise invalid(name, "must be known for every row", f"none in {rows_text(missing)}", fix)
+    must, got = "must be known for every row", f"none in {rows_text(missing)}"
+    check(not missing.any(), name, must, got, f"Fill {name}, or pass None for all")
     return [str(v) for v in items]
 
 
 def checked_whole(least: int, **values: Any) -> None:
     """Reject parameters that are not whole numbers of at least ``least``."""
+    must = f"must be a whole number of at least {least}"
     for name, value in values.items():
-        whole = isinstance(value, int | np.integer) and not isinstance(value, bool)
-        if not whole or not least <= value < 2**63:
-            must = f"must be a whole number of at least {least}"
-            raise invalid(name, must, repr(value), "Drop it for the default")
+        whole_number = isinstance(value, int | np.integer) and not isinstance(value, bool)
+        holds = whole_number and least <= value < 2**63
+        require(holds, name, must, repr(value), fix="Drop it for the default")
 
 
 def checked_scale(scale: Any) -> None:
     """Reject a factor on the result that is not a finite number above 0."""
     number = isinstance(scale, int | float | np.number) and not isinstance(scale, bool)
-    if not number or not 0 < scale < np.inf:
-        raise invalid("scale", "must be positive", repr(scale), "Drop it for the default")
+    positive = number and 0 < scale < np.inf
+    require(positive, "scale", "must be positive", repr(scale), fix="Drop it for the default")
 
 
 def require_one_encoder(a: FeatureSet, b: FeatureSet, both: str) -> None:
@@ -313,10 +327,11 @@ def require_one_encoder(a: FeatureSet, b: FeatureSet, both: str) -> None:
     Raises:
         PalpateError: with both digests.
     """
-    if a.encoder is not None and b.encoder is not None and a.encoder != b.encoder:
-        must = f"{both} features must come from one encoder"
-        got = f"digests {a.encoder[:12]} and {b.encoder[:12]}"
-        raise PalpateError(must, got, "Embed both with the same encoder")
+    digests = [d or "" for d in (a.encoder, b.encoder)]
+    must = f"{both} features must come from one encoder"
+    got = f"digests {digests[0][:12]} and {digests[1][:12]}"
+    same = "" in digests or digests[0] == digests[1]
+    require(same, None, must, got, fix="Embed both with the same encoder")
 
 
 T = TypeVar("T")

@@ -331,8 +331,8 @@ def class_estimate(sums: PairSums, statistic: Callable[[Totals], Array], unit: s
     errors[: without.shape[1]] = jackknife_errors(without)
     reason = f"(a class has too few {unit}s to leave one out)"
     method = f"leave-one-class-out jackknife, t, {classes - 1} df {reason}"
-    of_classes = {"errors": errors, "df": classes - 1, "replicates": without, "of_classes": True}
-    return replace(over_units, method=method, **of_classes)
+    values, units = over_units.values, over_units.units
+    return Estimate(values, errors, classes - 1, method, without, units, of_classes=True)
 
 
 def without_set(t: Totals, c: int) -> Totals:

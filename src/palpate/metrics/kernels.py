@@ -34,18 +34,8 @@ from typing import Any, ClassVar, Literal
 import numpy as np
 from array_api_compat import array_namespace
 
-from palpate.core import PalpateError, PalpateWarning, require, rng_for
-from palpate.metrics.inputs import (
-    Array,
-    Index,
-    host,
-    in_threads,
-    invalid,
-    like,
-    release,
-    row_norms,
-    rows_at,
-)
+from palpate.core import PalpateWarning, require, rng_for
+from palpate.metrics.inputs import Array, Index, host, in_threads, like, release, row_norms, rows_at
 from palpate.metrics.intervals import PairSums, one_hot, split_by
 from palpate.metrics.moments import moments_of
 
@@ -102,13 +92,12 @@ class Gaussian(Kernel):
     stationary = True
 
     def __post_init__(self) -> None:
-        given = np.atleast_1d(np.asarray(self.sigmas))
-        if given.dtype.kind not in "iuf" or not (
-            given.size and np.isfinite(given).all() and (given > 0).all()
-        ):
-            fix = "Choose a bandwidth, or several"
-            raise invalid("sigma", "must be positive", repr(self.sigmas), fix, sigma=10)
-        object.__setattr__(self, "sigmas", tuple(given.ravel().tolist()))
+        sigmas = np.atleast_1d(np.asarray(self.sigmas))
+        positive = sigmas.dtype.kind in "iuf" and bool(np.isfinite(sigmas).all())
+        positive = positive and sigmas.size > 0 and bool((sigmas > 0).all())
+        fix = "Choose a bandwidth, or several"
+        require(positive, "sigma", "must be positive", repr(self.sigmas), 10, fix=fix)
+        object.__setattr__(self, "sigmas", tuple(sigmas.ravel().tolist()))
 
     def unit(self, width: int) -> float:
         """The first bandwidth."""
@@ -160,9 +149,9 @@ class Polynomial(Kernel):
 
 def checked_kernel(kernel: Any) -> None:
     """Reject what is no kernel; None is the Gaussian of ``sigma``."""
-    if kernel is not None and not isinstance(kernel, Kernel):
-        must = "must be a kernel: Gaussian(), Polynomial() or another Kernel"
-        raise invalid("kernel", must, repr(kernel), "Import one from palpate.metrics")
+    must = "must be a kernel: Gaussian(), Polynomial() or another Kernel"
+    holds = kernel is None or isinstance(kernel, Kernel)
+    require(holds, "kernel", must, repr(kernel), fix="Import one from palpate.metrics")
 
 
 def gaussian(sigma: Sigma, x: Any, groups: Sequence[str] | Index | None = None) -> Gaussian:
@@ -180,9 +169,9 @@ def gaussian(sigma: Sigma, x: Any, groups: Sequence[str] | Index | None = None) 
     """
     if not isinstance(sigma, str):
         return Gaussian(sigma)
-    if sigma not in ("median", "multi"):
-        must = 'must be positive, several of that, "median" or "multi"'
-        raise invalid("sigma", must, repr(sigma), "Choose one of these", sigma=10)
+    must = 'must be positive, several of that, "median" or "multi"'
+    by_name = sigma in ("median", "multi")
+    require(by_name, "sigma", must, repr(sigma), 10, fix="Choose one of these")
     middle = median_distance(x, groups)
     factors = FACTORS if sigma == "multi" else (1.0,)
     return Gaussian(tuple(f * middle for f in factors), f"gaussian, {sigma}")
@@ -208,10 +197,9 @@ def median_distance(x: Any, groups: Sequence[str] | Index | None = None) -> floa
         apart = wanted & (names[:, None] != names)
         wanted = apart if apart.any() else wanted
     middle = float(np.median(distance[wanted])) if wanted.any() else 0.0
-    if not middle > 1e-12:
-        got = f"{n} row{'s' * (n != 1)}, {'all equal' if n > 1 else 'no pair'}"
-        must = "The median distance needs rows that differ"
-        raise PalpateError(must, got, "Choose a bandwidth", example={"sigma": 10})
+    got = f"{n} row{'s' * (n != 1)}, {'all equal' if n > 1 else 'no pair'}"
+    must = "must be a number where the median distance has no rows that differ"
+    require(middle > 1e-12, "sigma", must, got, 10, fix="Choose a bandwidth")
     return middle
 
 

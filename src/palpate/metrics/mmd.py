@@ -51,12 +51,12 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, fields
+from dataclasses import dataclass, fields, replace
 from typing import Any, Literal
 
 import numpy as np
 
-from palpate.core import PalpateError, PalpateWarning, require_choice, seed_for
+from palpate.core import PalpateWarning, require, require_choice, seed_for
 from palpate.metrics.inputs import (
     Array,
     Index,
@@ -66,7 +66,6 @@ from palpate.metrics.inputs import (
     checked_scale,
     checked_whole,
     copies_across,
-    invalid,
 )
 from palpate.metrics.intervals import PairSums, Totals, mean_of_pairs
 from palpate.metrics.kernels import (
@@ -129,9 +128,9 @@ def largest_bound(sums: PairSums, estimator: str, scale: float) -> float:
     if sums.bound is None:
         return 0.0
     # Where there are no pairs there is nothing to bound; elsewhere a bound that overflowed is none.
-    known = np.isfinite(mmd_matrix(sums.totals, estimator, scale))
-    known &= ~np.eye(sums.segments, dtype=bool)
-    off = mmd_bound(sums.bound.totals, estimator, scale)[known]
+    defined = np.isfinite(mmd_matrix(sums.totals, estimator, scale))
+    defined &= ~np.eye(sums.segments, dtype=bool)
+    off = mmd_bound(sums.bound.totals, estimator, scale)[defined]
     return float(np.where(np.isfinite(off), off, np.inf).max(initial=0.0))
 
 
@@ -227,10 +226,10 @@ def distance(  # noqa: PLR0913
     gx = checked_names("groups_x", groups_x, len(x))
     gy = checked_names("groups_y", groups_y, len(y))
     if estimator == "grouped":
-        if gx is None or gy is None:
-            must = "must be unbiased or biased where the groups of a set are unknown"
-            raise invalid("estimator", must, "'grouped'", "Pass groups_x and groups_y")
-        unit = unit_index(gx, gy)
+        must = "must be unbiased or biased where the groups of a set are unknown"
+        both = gx is not None and gy is not None
+        require(both, "estimator", must, repr(estimator), fix="Pass groups_x and groups_y")
+        unit = unit_index(gx or (), gy or ())
     kernel = gaussian(sigma, y, gy) if kernel is None else kernel
     sums = kernel_sums(
         [x, y],
@@ -243,15 +242,16 @@ def distance(  # noqa: PLR0913
     )
     value = float(mmd_matrix(sums.totals, estimator, scale)[0, 1])
     bound = largest_bound(sums, estimator, scale)
-    if not np.isfinite(sums.totals.sums).all():
-        fix = "Normalize the rows, or scale them down"
-        raise PalpateError("Kernel values must be finite", "infinity or NaN", fix)
-    if not np.isfinite(value):
-        got = f"{len(set(gx or ()))} and {len(set(gy or ()))} groups"
-        must = "Each set must have at least two groups, not all shared"
-        raise PalpateError(must, got, "Pass more groups", example={"estimator": "unbiased"})
-    how = (sums.backend, estimator, kernel.settings(), kernel.bandwidth, scale)
-    return Distance(value, bound, *how, m=len(x), n=len(y))
+    finite, fix = (
+        bool(np.isfinite(sums.totals.sums).all()),
+        "Normalize the rows, or scale them down",
+    )
+    require(finite, None, "Kernel values must be finite", "infinity or NaN", fix=fix)
+    got = f"{len(set(gx or ()))} and {len(set(gy or ()))} groups"
+    must = "must not be grouped unless each set has at least two groups, not all shared"
+    require(np.isfinite(value), "estimator", must, got, "unbiased", fix="Pass more groups")
+    settings = (sums.backend, estimator, kernel.settings(), kernel.bandwidth, scale)
+    return Distance(value, bound, *settings, m=len(x), n=len(y))
 
 
 @dataclass(frozen=True)
@@ -311,21 +311,20 @@ def plan_for(options: Mapping[str, Any], *, grouped: bool) -> Options:
     """
     preset = options.get("preset") or ("grouped" if grouped else "paper")
     require_choice("preset", preset, tuple(PRESETS))
-    given: dict[str, Any] = {k: v for k, v in options.items() if k != "preset"}
     names = [f.name for f in fields(Options)]
-    if unknown := sorted(set(given) - set(names)):
-        must = f"must not be given: options are {', '.join(names)}"
-        raise invalid(unknown[0], must, ", ".join(unknown), "Check the spelling")
-    plan = Options(**{**asdict(PRESETS[preset]), **given})
+    unknown = sorted(set(options) - set(names))
+    must = f"must not be given: options are {', '.join(names)}"
+    require(not unknown, "".join(unknown[:1]), must, ", ".join(unknown), fix="Check the spelling")
+    plan = replace(PRESETS[preset], **{**options, "preset": preset})
     for name, choices in CHOICES.items():
         require_choice(name, getattr(plan, name), choices)
     checked_scale(plan.scale)
     checked_whole(0, permutations=plan.permutations, seed=plan.seed)
     checked_kernel(plan.kernel)
     for name, value in (("estimator", "grouped"), ("halves", "group")):
-        if not grouped and getattr(plan, name) == value:
-            must = f"must know the group of every sample for {name}={value!r}"
-            raise invalid("groups", must, "none", "Pass groups, or another preset", preset="paper")
+        must = f"must know the group of every sample for {name}={value!r}"
+        fits = grouped or getattr(plan, name) != value
+        require(fits, "groups", must, "none", fix="Pass groups, or another preset, e.g. paper")
     return plan
 
 
@@ -401,14 +400,14 @@ def self_distances(t: Totals, plan: Options, design: Array | None = None) -> tup
         (K,) dist^2 and (K,) E, NaN where undefined: a set of one group, no group with two samples,
         or fewer than 4 samples.
     """
-    whole = whole_sets(t)
-    within, between, same = _even_means(whole.even or whole)
+    joined = whole_sets(t)
+    within, between, same = _even_means(joined.even or joined)
     excess, spread = within - between, same - between  # E = w - b
-    pairs = np.diagonal(whole.pairs)  # whole numbers, unlike sums of weights
-    bad = ~np.isfinite(excess) | (whole.n < LEAST) | (pairs == whole.n) | (pairs == whole.n**2)
+    pairs = np.diagonal(joined.pairs)  # whole numbers, unlike sums of weights
+    bad = ~np.isfinite(excess) | (joined.n < LEAST) | (pairs == joined.n) | (pairs == joined.n**2)
     excess, spread = (np.where(bad, np.nan, plan.scale * a) for a in (excess, spread))
     if plan.halves == "group":
-        if design is None or design.shape[1] != len(whole.n):
+        if design is None or design.shape[1] != len(joined.n):
             design = design_of(t, plan)
         return design[0] * excess + design[1] * spread, excess
     return _between_halves(mmd_matrix(t, _estimator(plan), plan.scale)), excess

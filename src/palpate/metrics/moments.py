@@ -94,8 +94,8 @@ class Moments:
 
     def _part(self, x: Any, at: Index) -> tuple[Any, ...]:
         """(E, F, G, fourth, diagonal, rho) of some rows of one item."""
-        whole = at[-1] - at[0] == len(at) - 1  # a slice is not copied
-        rows = x[int(at[0]) : int(at[-1]) + 1] if whole else rows_at(x, at)
+        adjacent = at[-1] - at[0] == len(at) - 1  # a slice is not copied
+        rows = x[int(at[0]) : int(at[-1]) + 1] if adjacent else rows_at(x, at)
         z = rows - like(self.center, x)
         z *= 1 / self.sigma
         squares = row_norms(z) ** 2

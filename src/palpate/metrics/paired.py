@@ -31,7 +31,8 @@ from palpate.core import FeatureSet, Note, PalpateError, Score, require_comparab
 from palpate.metrics.inputs import Array, feature_set, require_one_encoder
 from palpate.metrics.intervals import Interval, Scored, Spread, jackknife_errors, spread_of_values
 from palpate.metrics.means import Mean, spread_of
-from palpate.metrics.tactile import floors_of, four_of, not_comparable, tmmd_scored, with_floor
+from palpate.metrics.table import build_table
+from palpate.metrics.tactile import floors_of, four_of, not_comparable, tmmd_of, with_floor
 
 
 @dataclass(frozen=True)
@@ -107,7 +108,7 @@ def compare_tmmd(generators: Mapping[str, Any], reference: Any, **options: Any) 
     """
     reference = feature_set(reference, argument="reference")
     sets = {
-        name: [tmmd_scored(of, reference, {**options, "subject": name})]
+        name: [tmmd_of(build_table(of, reference, {**options, "subject": name}))]
         for name, of in same_samples(generators).items()
     }
     return _compared(sets, [None])

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from scipy.optimize import minimize
 from scipy.special import log_softmax
 
-from palpate.core import FeatureSet, PalpateError, Score, rng_for
+from palpate.core import FeatureSet, Score, require, rng_for
 from palpate.metrics.inputs import Array, require_one_encoder
 from palpate.metrics.means import Mean, mean_of
 from palpate.metrics.retrieval import TIE, blocks, unit_rows
@@ -67,9 +67,8 @@ def fit_probe(train: FeatureSet, *, l2: float | None = None, seed: int = 0) -> P
     """
     x, labels, groups = _labeled(train, "train")
     classes = sorted(set(labels))
-    if len(classes) < 2:
-        must, fix = "A probe needs at least two classes in train", "Use another split"
-        raise PalpateError(must, f"{len(classes)}", fix)
+    must = "A probe needs at least two classes in train"
+    require(len(classes) > 1, None, must, len(classes), fix="Use another split")
     y = np.searchsorted(classes, labels)
     mean, sd = x.mean(axis=0), np.maximum(x.std(axis=0), 1e-8)
     z = (x - mean) / sd
@@ -207,13 +206,13 @@ def _accuracies(
     **fields: Any,
 ) -> list[Mean]:
     """A classifier's accuracy and balanced accuracy, next to chance and the commonest class."""
-    _, known, _ = _labeled(train, "train")
+    _, trained, _ = _labeled(train, "train")
     _, truth, groups = _labeled(test, "test")
-    counts, majority = Counter(truth), Counter(known).most_common(1)[0][0]
+    counts, majority = Counter(truth), Counter(trained).most_common(1)[0][0]
     details = {
-        "chance": 1 / len(set(known)),
+        "chance": 1 / len(set(trained)),
         "recall": recall_by_class(hits, truth),
-        "unseen_classes": sorted(set(truth) - set(known)),
+        "unseen_classes": sorted(set(truth) - set(trained)),
         **details,
     }
     fields |= {"encoder": test.encoder}
@@ -238,9 +237,11 @@ def _labeled(features: FeatureSet, part: str) -> tuple[Array, list[str], list[st
     """Rows with a label: features as float64, labels, groups (the id where there is none)."""
     labels = features.labels or []
     keep = [k for k, label in enumerate(labels) if label]
-    if not keep:
-        must = f"The {part} features must have rows with a label"
-        raise PalpateError(must, "none", "Check the split, and the column of the labels")
+    must, fix = (
+        f"The {part} features must have rows with a label",
+        "Check the split, and the labels",
+    )
+    require(bool(keep), None, must, "none", fix=fix)
     groups = features.ids if features.groups is None else features.groups
     names = [groups[k] or features.ids[k] for k in keep]
     return features.features[keep].astype(np.float64), [labels[k] for k in keep], names

@@ -20,10 +20,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from palpate.core import FeatureSet, Note, PalpateError, Score, digest_json
-from palpate.metrics.inputs import Normalize, checked_features, checked_names, invalid, to_host
+from palpate.core import FeatureSet, Note, PalpateError, Score, digest_json, require
+from palpate.metrics.inputs import checked_features, checked_names, to_host
 from palpate.metrics.mmd import plan_for
-from palpate.metrics.tactile import tmmd_scored
+from palpate.metrics.table import build_table
+from palpate.metrics.tactile import tmmd_of
 
 COLUMNS = ("ids", "groups")
 
@@ -37,26 +38,16 @@ class Batch:
     ids: list[str] | None = None
     groups: list[str] | None = None
 
-    @classmethod
-    def of(cls, features: Any, normalize: Normalize, *, real: bool, **columns: Any) -> Batch:
-        """A checked copy, widened to float32 at least: callers often use their buffers again."""
-        name = f"The {'real' if real else 'generated'} features of this update"
-        x = checked_features(name, to_host(features), normalize=False, least=0)
-        if normalize is not False:
-            checked_features(name, x, normalize=normalize, least=0)
-        names = [checked_names(c, columns.get(c), len(x)) for c in COLUMNS]
-        return cls(np.array(x, order="C"), bool(real), *names)
-
-    @property
-    def given(self) -> list[str]:
-        """Which of ids and groups there are."""
-        return [name for name in COLUMNS if getattr(self, name) is not None]
+    def columns(self) -> dict[str, list[str]]:
+        """The ids and groups that there are."""
+        columns = {name: getattr(self, name) for name in COLUMNS}
+        return {name: values for name, values in columns.items() if values is not None}
 
     def to_bytes(self) -> NDArray[np.uint8]:
         """The batch as bytes: size and ``real`` as int64, then an npz; several may be joined."""
-        names = {name: np.array(getattr(self, name), dtype=str) for name in self.given}
+        names = [(name, np.array(v, dtype=str)) for name, v in self.columns().items()]
         buffer = io.BytesIO()
-        np.savez(buffer, allow_pickle=False, features=self.features, **names)
+        np.savez(buffer, allow_pickle=False, features=self.features, **dict(names))
         head = np.array([buffer.getbuffer().nbytes, self.real], dtype="<i8").view(np.uint8)
         return np.concatenate([head, np.frombuffer(buffer.getvalue(), dtype=np.uint8)])
 
@@ -67,8 +58,8 @@ class Batch:
             size, real = (int(v) for v in joined[:16].view("<i8"))
             stop = 16 + size
             with np.load(io.BytesIO(joined[16:stop].tobytes()), allow_pickle=False) as data:
-                names = {name: data[name].tolist() for name in COLUMNS if name in data}
-                yield cls(data["features"], bool(real), **names)
+                names = [data[name].tolist() if name in data else None for name in COLUMNS]
+                yield cls(data["features"], bool(real), *names)
             joined = joined[stop:]
 
 
@@ -76,24 +67,25 @@ def require_like(batch: Batch, before: Sequence[Batch]) -> None:
     """Raise where a batch does not fit those before: their last one, and the last of its set."""
     for other in [*before[-1:], *[b for b in before if b.real == batch.real][-1:]]:
         widths = [b.features.shape[1] for b in (other, batch)]
-        if widths[0] != widths[1]:
-            must, got = "must have the same width in all updates", f"{widths[0]} and {widths[1]}"
-            raise invalid("features", must, got, "Embed all with the same encoder")
-        if len(batch.features) and batch.real == other.real and batch.given != other.given:
-            got = " and ".join(", ".join(b.given) or "none" for b in (other, batch))
-            must = "All updates of one set must give the same of ids and groups"
-            raise PalpateError(must, got, "Give each always, or never")
+        must, fix = "must have the same width in all updates", "Embed all with the same encoder"
+        require(widths[0] == widths[1], "features", must, f"{widths[0]} and {widths[1]}", fix=fix)
+        both = [", ".join(b.columns()) or "none" for b in (other, batch)]
+        same = not len(batch.features) or batch.real != other.real or both[0] == both[1]
+        must = "All updates of one set must give the same of ids and groups"
+        require(same, None, must, " and ".join(both), fix="Give each always, or never")
 
 
 def joined(batches: Sequence[Batch], real: bool, encoder: str | None) -> FeatureSet:
     """The rows of a set in the order of arrival."""
     batches = [b for b in batches if b.real == real]
     features = np.concatenate([b.features for b in batches])
-    columns: dict[str, Any] = {
-        name: [v for b in batches for v in getattr(b, name)] for name in batches[0].given
-    }
-    columns.setdefault("ids", row_ids(features, "real" if real else "generated"))
-    return FeatureSet(features=features, encoder=encoder, **columns)
+    of_batches = [b.columns() for b in batches]
+    ids, groups = (
+        [v for columns in of_batches for v in columns[name]] if name in of_batches[0] else None
+        for name in COLUMNS
+    )
+    ids = ids or row_ids(features, "real" if real else "generated")
+    return FeatureSet(ids, features, None, groups, encoder)
 
 
 def row_ids(features: NDArray[Any], kind: str) -> list[str]:
@@ -155,7 +147,11 @@ class TMMD:
             PalpateError: at once for rows that :func:`palpate.metrics.inputs.checked_features`
                 rejects, another width than before, or columns of another length.
         """
-        batch = Batch.of(features, self.plan.normalize, real=real, ids=ids, groups=groups)
+        name = f"The {'real' if real else 'generated'} features of this update"
+        x = checked_features(name, to_host(features), normalize=False, least=0)
+        checked_features(name, x, normalize=self.plan.normalize, least=0)
+        names = (checked_names(c, v, len(x)) for c, v in (("ids", ids), ("groups", groups)))
+        batch = Batch(np.array(x, order="C"), bool(real), *names)  # buffers are often used again
         require_like(batch, self.batches)
         if len(batch.features):
             self.batches.append(batch)
@@ -166,23 +162,18 @@ class TMMD:
         Raises:
             PalpateError: if a set is missing, or as :func:`palpate.metrics.tmmd`.
         """
-        return self.score_of(self.batches)
+        if score := self.score_of(self.batches):
+            return score
+        rows = [sum(len(b.features) for b in self.batches if b.real == real) for real in (0, 1)]
+        must, fix = "TMMD must have generated and real samples", "Call update for both"
+        raise PalpateError(must, f"{rows[0]} generated and {rows[1]} real", fix)
 
-    def missing(self, batches: Sequence[Batch]) -> bool:
-        """Whether batches lack a set."""
-        return len({b.real for b in batches}) < 2
-
-    def score_of(self, batches: Sequence[Batch]) -> Score:
-        """The score of batches."""
-        if self.missing(batches):
-            rows = [
-                sum(len(b.features) for b in batches if b.real == real) for real in (False, True)
-            ]
-            got = f"{rows[0]} generated and {rows[1]} real"
-            must, fix = "TMMD must have generated and real samples", "Call update for both"
-            raise PalpateError(must, got, fix)
+    def score_of(self, batches: Sequence[Batch]) -> Score | None:
+        """The score of batches; None where a set is missing."""
+        if len({b.real for b in batches}) < 2:
+            return None
         generated, real = (joined(batches, real, self.encoder) for real in (False, True))
-        score = tmmd_scored(generated, real, self.options).score
+        score = tmmd_of(build_table(generated, real, self.options)).score
         repeated = len(generated.ids) - len(set(generated.ids))
         notes = [Note("repeated-ids", {"count": repeated})] if repeated else []
         return replace(score, notes=(*score.notes, *notes))

@@ -8,8 +8,9 @@ the value as a tensor (NaN where it is undefined), because loggers and torchmetr
 States, with their ``dist_reduce_fx``:
 
 * ``records`` ("cat"): byte strings that describe themselves
-  (:class:`palpate.metrics.streaming.Batch`). Features, names and counts travel in one gather;
-  processes may have seen unequal numbers of rows, or none.
+  (:class:`palpate.metrics.streaming.Batch`), made of the batches when torchmetrics reads the state.
+  Features, names and counts travel in one gather; processes may have seen unequal numbers of rows,
+  or none.
 * ``settings`` ("max"): digest of the settings, which must be the same in all processes.
 
 torch and torchmetrics are loaded when this module is, and by no other module of this room.
@@ -18,12 +19,13 @@ torch and torchmetrics are loaded when this module is, and by no other module of
 from __future__ import annotations
 
 import importlib
-from itertools import islice
 from typing import Any, Self
 
-from palpate.core import MissingExtraError, PalpateError, Score
+import numpy as np
+
+from palpate.core import MissingExtraError, Score, require
 from palpate.metrics import streaming
-from palpate.metrics.streaming import Batch, require_like
+from palpate.metrics.streaming import Batch
 
 try:
     torch: Any = importlib.import_module("torch")
@@ -63,16 +65,22 @@ class TMMD(Metric):
         self.add_state("settings", settings, dist_reduce_fx="max")
         self.add_state("records", [], dist_reduce_fx="cat")
 
+    @property
+    def records(self) -> list[Any]:
+        """The batches as bytes; an empty record where there is none, so that all gather a type."""
+        records = [b.to_bytes() for b in self.plain.batches] or [np.zeros(0, np.uint8)]
+        return [torch.from_numpy(r).to(self.device) for r in records]
+
+    @records.setter
+    def records(self, records: Any) -> None:
+        tensors = records if isinstance(records, list) else [records]
+        self.plain.batches = [b for r in tensors for b in Batch.read(r.cpu().numpy())]
+
     def update(
         self, features: Any, real: bool = False, *, ids: Any = None, groups: Any = None
     ) -> None:
         """Add a batch, as :meth:`palpate.metrics.streaming.TMMD.update`."""
-        self._score = None
-        batch = Batch.of(features, self.plain.plan.normalize, real=real, ids=ids, groups=groups)
-        # It must fit the last batch, and the last of its set; the ninth byte is ``real``.
-        of_set = (r for r in reversed(self.records) if len(r) and bool(r[8]) == batch.real)
-        require_like(batch, self._read([*islice(of_set, 1), *self.records[-1:]]))
-        self._append([batch])
+        self.plain.update(features, real, ids=ids, groups=groups)
 
     def compute(self) -> Any:
         """The value, a float64 tensor on the metric's device; NaN where it is undefined.
@@ -82,7 +90,7 @@ class TMMD(Metric):
                 in settings that states depend on.
         """
         self._require_settings(self.settings)
-        self._score = self.plain.score_of(self._read(self.records))
+        self._score = self.plain.compute()
         return self._tensor(self._score)
 
     def score(self) -> Score:
@@ -93,20 +101,17 @@ class TMMD(Metric):
 
     def forward(self, *args: Any, **kwargs: Any) -> Any:
         """Add a batch and return the value of the batch alone, see the class."""
-        before = len(self.records)
+        before = len(self.plain.batches)
         self.update(*args, **kwargs)
-        added = self._read(self.records[before:])
-        alone = [*self._real(), *(b for b in added if not b.real)]
-        score = None if self.plain.missing(alone) else self.plain.score_of(alone)
-        self._forward_cache = self._tensor(score)
+        alone = [b for k, b in enumerate(self.plain.batches) if b.real or k >= before]
+        self._forward_cache = self._tensor(self.plain.score_of(alone))
         return self._forward_cache
 
     def reset(self) -> None:
         """Forget all batches; with ``reset_real_features=False`` not those of real samples."""
-        kept = [] if self.plain.reset_real_features else self._real()
         super().reset()
         self._score = None
-        self._append(kept)
+        self.plain.reset()
 
     def merge_state(self, incoming_state: Any) -> None:
         """Add the state of another metric of the same settings.
@@ -122,35 +127,17 @@ class TMMD(Metric):
         super().merge_state(incoming_state)
         self._update_count += getattr(incoming_state, "_update_count", 1)
 
-    def sync(self, *args: Any, **kwargs: Any) -> None:
-        """As torchmetrics; a process without data gathers an empty record of the right type."""
-        if isinstance(self.records, list) and not self.records:
-            self.records.append(torch.zeros(0, dtype=torch.uint8, device=self.device))
-        super().sync(*args, **kwargs)
-
     def set_dtype(self, dst_type: Any) -> Self:
         """Do nothing: records are bytes."""
         return self
 
     def _require_settings(self, settings: Any) -> None:
-        if bytes(settings.cpu().tolist()).hex() != self.plain.digest:
-            must = f"States of {type(self).__name__} that are merged must have the same settings"
-            got, fix = "different ones", "Construct the metric with the same arguments everywhere"
-            raise PalpateError(must, got, fix)
+        same = bytes(settings.cpu().tolist()).hex() == self.plain.digest
+        must = f"States of {type(self).__name__} that are merged must have the same settings"
+        fix = "Construct the metric with the same arguments everywhere"
+        require(same, None, must, "different ones", fix=fix)
 
     def _tensor(self, score: Score | None) -> Any:
         value = float("nan") if score is None else float(score)
         wide = torch.float32 if self.device.type == "mps" else torch.float64
         return torch.tensor(value, dtype=wide, device=self.device)
-
-    def _read(self, records: Any) -> list[Batch]:
-        tensors = records if isinstance(records, list) else [records]
-        return [batch for r in tensors for batch in Batch.read(r.detach().cpu().numpy())]
-
-    def _append(self, batches: list[Batch]) -> None:
-        records = [b.to_bytes() for b in batches if len(b.features)]
-        self.records.extend(torch.from_numpy(r).to(self.device) for r in records)
-
-    def _real(self) -> list[Batch]:
-        """What was seen of real samples."""
-        return [batch for batch in self._read(self.records) if batch.real]
