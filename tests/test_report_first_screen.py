@@ -6,12 +6,12 @@ import pytest
 
 from forge.results import Tree, clean_audit, full_audit, full_results, gallery, score
 from palpate.core import Note
+from palpate.report.families import defined, families
 from palpate.report.first_screen import about, annotated, cards, caution, telling_columns
 from palpate.report.page import render_page
 from palpate.report.results import Results
 from palpate.report.study import Claim, StudyTable
-from palpate.report.study_tables import lay
-from palpate.report.tables import score_tables
+from palpate.report.tables import grid
 
 
 def measured():
@@ -27,7 +27,7 @@ def measured():
 
 def verdict(scores, controls=()):
     """Subject -> its cells, as they are laid out from the most telling columns."""
-    rows = lay(telling_columns(score_tables(scores)), controls).rows
+    rows = grid(telling_columns(families(scores)), controls).rows
     return {row.cells[0].value: row.cells[1:] for row in rows}
 
 
@@ -36,7 +36,7 @@ def best(cells):
 
 
 def test_the_verdict_has_each_metric_once_and_the_best_but_never_the_real_images():
-    columns = telling_columns(score_tables(measured()))
+    columns = telling_columns(families(measured()))
     assert [c.name for c in columns] == ["TMMD", "material accuracy", "D-TMMD"]
     rows = verdict(measured())
     assert list(rows) == ["ours", "theirs", "background only", "real images (floor)"]
@@ -48,7 +48,7 @@ def test_the_verdict_has_each_metric_once_and_the_best_but_never_the_real_images
 
 
 def test_controls_of_a_study_follow_the_methods_and_are_never_the_best():
-    rows = lay(telling_columns(score_tables(measured())), ["theirs"]).rows
+    rows = grid(telling_columns(families(measured())), ["theirs"]).rows
     assert [(row.cells[0].value, row.control, row.rule) for row in rows] == [
         ("ours", False, False),
         ("background only", False, False),
@@ -80,8 +80,8 @@ def test_a_ratio_that_is_not_known_is_never_the_best_and_has_its_note():
     note = Note("unstable-denominators", {"known_errors": True, "classes": ["Brick"]})
     wild = score("D-TMMD", "wild", 0.05, higher_is_better=None, notes=[note])
     others = [score("D-TMMD", s, v, higher_is_better=None) for s, v in (("a", 1.0), ("b", 2.0))]
-    columns = telling_columns(score_tables([wild, *others]))
-    sheet = lay(columns)
+    columns = telling_columns(families([wild, *others]))
+    sheet = grid(columns)
     ((cell,), (a,), *_) = (row.cells[1:] for row in sheet.rows)
     assert (cell.best, a.best) == (False, True)
     assert note in [sheet.notes[k - 1] for k in cell.footnotes]
@@ -93,14 +93,14 @@ def test_a_metric_that_is_undefined_is_not_filled_from_another_preset():
     d = {"higher_is_better": None, "interval": None}
     scores += [score("D-TMMD", s, None, settings=presets[0], **d) for s in ("a", "b")]
     scores += [score("D-TMMD", s, 0.5, settings=presets[1], **d) for s in ("a", "b")]
-    column = telling_columns(score_tables(scores))[1]
-    assert (column.name, [c.defined for c in column.cells]) == ("D-TMMD", [False, False])
+    column = telling_columns(families(scores))[1]
+    assert (column.name, [defined(s) for s in column.scores]) == ("D-TMMD", [False, False])
     assert [c.title for c in cards(Results("T", scores=scores), [column])] == []
 
 
 def test_cards_hold_the_leak_the_distance_and_the_material():
     results = Results("T", audits=[full_audit(), clean_audit()], scores=measured())
-    columns = telling_columns(score_tables(results.scores))
+    columns = telling_columns(families(results.scores))
     leak, distance, material = cards(results, columns)
     assert [(r.label, r.text) for r in leak.rows] == [("Orig", "99.10 %"), ("NoLeak", "0 %")]
     assert "image; median of Orig: 304 frames away." in leak.foot
@@ -114,7 +114,7 @@ def test_the_card_of_the_material_always_holds_the_real_images():
     accuracy = {"higher_is_better": True, "null": None, "floor": None}
     scores = [score("material accuracy", f"m{k}", k / 10, **accuracy) for k in range(6)]
     scores.append(score("material accuracy", "real", 0.9, **accuracy))
-    (card,) = cards(Results("T", scores=scores), telling_columns(score_tables(scores)))
+    (card,) = cards(Results("T", scores=scores), telling_columns(families(scores)))
     assert [row.label for row in card.rows] == ["m0", "m5", "m1", "real"]
     assert "4 of 7 rows." in card.foot
 
@@ -122,7 +122,7 @@ def test_the_card_of_the_material_always_holds_the_real_images():
 def test_a_card_compares_the_first_method_with_the_best_other_and_a_control():
     subjects = {"ours": 2.0, "variant": 3.0, "GVST": 1.0, "mean": 9.0, "real, nearest photo": 0.5}
     scores = [score("TMMD", s, v) for s, v in subjects.items()]
-    columns = telling_columns(score_tables(scores))
+    columns = telling_columns(families(scores))
     (card,) = cards(Results("T", scores=scores), columns, ["mean", "real, nearest photo"])
     labels = ["ours", "GVST", "variant", "real, nearest photo (control)"]
     assert [row.label for row in card.rows] == labels
@@ -135,7 +135,7 @@ def test_cards_compare_the_same_subjects():
     more = {"higher_is_better": True, "null": None, "floor": None}
     scores = [score("TMMD", s, v) for s, v in distances.items()]
     scores += [score("material accuracy", s, v, **more) for s, v in shares.items()]
-    columns = telling_columns(score_tables(scores))
+    columns = telling_columns(families(scores))
     made = cards(Results("T", scores=scores), columns, ["real, nearest photo"])
     photo = "real, nearest photo (control)"
     assert [row.label for row in made[0].rows] == ["ours", "near", "other", photo]
@@ -149,7 +149,7 @@ def test_a_card_never_loses_its_method_to_controls():
     names = ["ours", "a", "b", "c", "real"]
     scores = [score("TMMD", s, 1.0) for s in names[:4]]
     scores += [score("material accuracy", s, 0.5, **more) for s in names]
-    columns = telling_columns(score_tables(scores))
+    columns = telling_columns(families(scores))
     made = cards(Results("T", scores=scores), columns, names[1:4])[1]
     labels = [row.label for row in made.rows]
     assert (labels[0], labels[-1], len(labels)) == ("ours", "real", 4)
@@ -161,7 +161,7 @@ def test_a_probe_that_does_not_read_real_images_says_so(low):
     scores = [
         score("material accuracy", s, 0.5, interval=(low, 0.6), **more) for s in ("a", "real")
     ]
-    made = cards(Results("T", scores=scores), telling_columns(score_tables(scores)))[0]
+    made = cards(Results("T", scores=scores), telling_columns(families(scores)))[0]
     assert ("tell real images from chance, 25.0 % (dashed)" in made.foot) == (low < 0.25)
 
 
@@ -182,7 +182,7 @@ def test_a_card_says_what_is_shown_against_real_images(values, words):
     if values["metric"] != "TMMD":
         values["higher_is_better"] = None
     scores = [score(value=-0.001, interval=(-0.004, 0.002), null=(-0.1, 0.1), **values)]
-    (card,) = cards(Results("T", scores=scores), telling_columns(score_tables(scores)))
+    (card,) = cards(Results("T", scores=scores), telling_columns(families(scores)))
     assert words in card.foot
     assert "band" not in card.foot
     assert ("real" in card.foot.partition("dashed: real images")[2]) == ("real" in words)
@@ -219,9 +219,9 @@ def test_what_a_page_is_about():
 
 
 def test_strips_are_explained_on_a_score_with_interval_null_and_floor():
-    column, chosen = annotated(score_tables([score("SSIM", null=None), score()]))
+    column, chosen = annotated(families([score("SSIM", null=None), score()]))
     assert (column.name, chosen.metric) == ("TMMD", "TMMD")
-    assert annotated(score_tables([score(null=None)])) is None
+    assert annotated(families([score(null=None)])) is None
 
 
 def test_a_page_opens_with_samples_and_cards_and_has_no_empty_heading(tmp_path):

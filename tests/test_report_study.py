@@ -14,15 +14,14 @@ from PIL import Image
 from forge.results import Tree, images, score, study_results, text_note
 from palpate.cli import main
 from palpate.core import SampleRef
-from palpate.report import drawing, write_report
-from palpate.report.curves import Panel, panels_of, strips_drawing
-from palpate.report.drawing import Shape, Words
+from palpate.report import write_report
+from palpate.report.families import families
 from palpate.report.first_screen import telling_columns
 from palpate.report.page import OPEN_CLAIMS, render_page
 from palpate.report.results import GalleryItem, Results
-from palpate.report.study import Claim, StudyTable
-from palpate.report.study_tables import brief, file_names, lay, sheet, tally
-from palpate.report.tables import score_tables
+from palpate.report.strips import Panel, panels_of, strips_svg
+from palpate.report.study import Claim, StudyTable, brief, tally
+from palpate.report.tables import file_names, grid, of_study
 from palpate.report.terminal import as_text
 from palpate.studies.evidence import in_words
 
@@ -38,7 +37,7 @@ def up(subject, value, **changes):
 def best_of(table):
     return [
         {head.label for head, cell in zip(laid.heads, row.cells, strict=True) if cell.best}
-        for laid in [sheet(table)]
+        for laid in [of_study(table)]
         for row in laid.rows
     ]
 
@@ -61,7 +60,7 @@ def test_the_best_of_a_column_follows_its_direction_and_is_no_control():
     assert best_of(table) == [{"accuracy", "D"}, {"TMMD"}, set()]
     assert best_of(dataclasses.replace(table, best=False)) == [set()] * 3
     assert best_of(dataclasses.replace(table, controls=["photo", "b"])) == [set()] * 3
-    heads = [(head.arrow, head.scores) for head in sheet(table).heads]
+    heads = [(head.arrow, head.scores) for head in of_study(table).heads]
     assert heads == [("", False), ("↓", True), ("↑", True), ("→", True)]
 
 
@@ -106,25 +105,25 @@ def test_ranks_have_no_decimals_and_empty_columns_stand_with_the_scores():
         [name, score("rank", name, value, interval=None), None]
         for name, value in (("a", 2.0), ("b", 1.0))
     ]
-    laid = sheet(StudyTable("T", "", ["", "rank", "k = 8"], rows))
+    laid = of_study(StudyTable("T", "", ["", "rank", "k = 8"], rows))
     assert [row.cells[1].digits for row in laid.rows] == [0, 0]
     assert [head.scores for head in laid.heads] == [False, True, True]
     lost = [["a", score("rank", "a", math.nan, interval=None)], *rows]
-    assert sheet(StudyTable("T", "", ["", "rank"], lost)).rows[1].cells[1].digits == 0
+    assert of_study(StudyTable("T", "", ["", "rank"], lost)).rows[1].cells[1].digits == 0
     shares = [["a", up("a", 1.0, interval=None)], ["b", up("b", 0.0, interval=None)]]
-    assert sheet(StudyTable("T", "", ["", "share"], shares)).rows[0].cells[1].digits == 3
+    assert of_study(StudyTable("T", "", ["", "share"], shares)).rows[0].cells[1].digits == 3
 
 
 def test_rows_may_be_short():
     table = StudyTable("T", "", ["", "a", "b"], [["x", up("x", 0.5)], ["y"]])
-    assert [len(row.cells) for row in sheet(table).rows] == [3, 3]
+    assert [len(row.cells) for row in of_study(table).rows] == [3, 3]
     assert "0.50 [" in str(Results("T", tables=[table]))
 
 
 def test_how_a_table_was_made_names_stages_sizes_and_intervals():
     rows = [["a", up("a", 0.5, n=40, details={"stage": "probe-0"})]]
     rows.append(["b", up("b", 0.6, n=1200, details={"stage": "probe-1"}, seed=3)])
-    made = dict(sheet(StudyTable("T", "", ["", "v"], rows)).made)
+    made = dict(of_study(StudyTable("T", "", ["", "v"], rows)).made)
     assert made == {
         "n": "40 to 1,200",
         "interval": "95 %, jackknife, t, 9 df",
@@ -219,29 +218,37 @@ def test_numbers_of_a_reason_are_those_of_its_evidence(tmp_path):
         assert text.count(number) == 2
 
 
+def drawn(panels, name):
+    """The elements of a kind in a drawing of strips: tag, class and text or position."""
+    tree = ET.fromstring(strips_svg("T", panels))
+    return [e for e in tree.iter() if (e.get("class") or "").split()[-1:] == [name]]
+
+
+def texts(panels):
+    return [e.text for e in ET.fromstring(strips_svg("T", panels)).iter() if e.tag.endswith("text")]
+
+
 def test_the_axis_of_strips_is_that_of_the_methods_and_a_control_beyond_it_an_arrow():
     close = {"null": None, "floor": 0.1, "interval": None}
     rows = [("a", up("a", 0.1, **close), False), ("b", up("b", 0.2, **close), False)]
-    drawn = strips_drawing("T", [Panel("accuracy", rows)])
-    wide = strips_drawing("T", [Panel("accuracy", [*rows, ("x", up("x", 9.0, **close), True)])])
-    ticks = [{p.text for p in d.parts if isinstance(p, Words)} for d in (drawn, wide)]
+    far = [Panel("accuracy", [*rows, ("x", up("x", 9.0, **close), True)])]
+    ticks = [{*texts(panels)} for panels in ([Panel("accuracy", rows)], far)]
     assert ticks[0] - {"dot: score; dashed: floor"} <= ticks[1]
-    arrows = [p for p in wide.parts if isinstance(p, Shape) and p.fill and len(p.points) == 3]
-    assert len(arrows) == 1
-    assert "9.00" in " ".join(ticks[1])
+    assert [e.tag.rpartition("}")[2] for e in drawn(far, "value")] == ["circle", "circle", "path"]
+    assert "9.000" in ticks[1]
 
 
 def test_degrees_of_freedom_are_a_range():
     how = [f"jackknife, t, {n} df" for n in ("11.0", "9", "14.8")]
     rows = [[h, up(h, 0.5, interval_method=h)] for h in how]
-    made = dict(sheet(StudyTable("T", "", ["", "v"], rows)).made)
+    made = dict(of_study(StudyTable("T", "", ["", "v"], rows)).made)
     assert made["interval"] == "95 %, jackknife, t, 9-14.8 df"
 
 
 def test_a_table_with_controls_shows_directions_and_one_of_differences_none():
     rows = [["a", up("a", 0.5)], ["photo", up("photo", 0.6)]]
     table = StudyTable("T", "", ["", "accuracy"], rows, controls=["photo"])
-    heads = [sheet(t).heads[1].arrow for t in (table, dataclasses.replace(table, controls=[]))]
+    heads = [of_study(t).heads[1].arrow for t in (table, dataclasses.replace(table, controls=[]))]
     assert heads == ["↑", ""]
 
 
@@ -284,7 +291,7 @@ def test_everything_is_escaped(tmp_path):
     for path in files:
         if path.suffix == ".svg":
             assert {tag.tag.rpartition("}")[2] for tag in ET.parse(path).iter()} <= {
-                *("svg", "title", "desc", "rect", "path", "text")
+                *("svg", "title", "desc", "style", "rect", "path", "text", "line", "circle")
             }
     assert str(results).count(NASTY[:20]) > 5
 
@@ -312,52 +319,41 @@ def test_many_rows_long_words_and_empty_things_are_drawn(tmp_path):
 # --- drawings as files ----------------------------------------------------------------------
 
 
-def test_long_words_are_cut():
-    assert drawing.cut_to("x" * 100, 120) == f"{'x' * 12}..."
-    assert drawing.cut_to("short", 120) == "short"
-
-
 def test_strips_draw_value_interval_null_and_floor_and_hollow_controls(study):
     results, _ = study
-    table = sheet(results.tables[0])
-    panels = panels_of(table)
+    panels = panels_of(of_study(results.tables[0]))
     assert [p.title for p in panels] == ["TMMD ↓", "material accuracy ↑", "D-TMMD →", "LPIPS ↓"]
     rows = [(label, s, False) for label, s, _ in panels[0].rows]  # all are on the axis
-    rows.append(("inside", dataclasses.replace(rows[0][1], interval=None), True))
-    parts = strips_drawing("T", [Panel("TMMD", rows)]).parts
-    dots = [
-        p for p in parts if isinstance(p, drawing.Shape) and p.ink == "mark" and len(p.points) == 16
-    ]
-    assert [p.fill for p in dots] == [True] * 7 + [False]
-    centers = [np.mean(p.points, axis=0)[0] for p in dots]
+    rows.append(("inside " * 9, dataclasses.replace(rows[0][1], interval=None), True))
+    panel = [Panel("TMMD", rows)]
+    dots = [float(e.get("cx")) for name in ("value", "hollow") for e in drawn(panel, name)]
+    assert len(drawn(panel, "hollow")) == 1
     values = [s.value for _, s, _ in rows]
-    slope, start = np.polyfit(values, centers, 1)
-    assert centers == pytest.approx([start + slope * v for v in values])
-    spans = [p for p in parts if isinstance(p, drawing.Shape) and p.width == 1.8]
-    ends = [x for p in spans for x, _ in p.points]
-    assert ends == pytest.approx(
-        [start + slope * v for row in results.tables[0].rows for v in row[1].interval]
-    )
-    texts = [p.text for p in parts if isinstance(p, drawing.Words)]
-    assert texts.count("nearest photo") == 1
-    assert "1.20 [1.08, 1.32]" in texts
-    text = next(
-        p for p in strips_drawing("T", panels[2:3]).parts if getattr(p, "text", "") == "undefined"
-    )
-    assert text.x > 400
+    slope, start = np.polyfit(values, dots, 1)
+    assert dots == pytest.approx([start + slope * v for v in values], abs=0.02)
+    ends = [re.findall(r"M([\d.]+) 11.0v?", e.get("d"))[0] for e in drawn(panel, "interval")]
+    lows = [row[1].interval[0] for row in results.tables[0].rows]
+    assert [float(x) for x in ends] == pytest.approx([start + slope * v for v in lows], abs=0.02)
+    words = texts(panel)
+    assert words.count("nearest photo") == 1
+    assert "1.20 [1.08, 1.32]" in words
+    assert "inside inside inside in..." in words
+    assert "undefined" in texts(panels[2:3])
 
 
 def test_strips_of_scores_know_the_controls_of_the_study():
     scores = [score("TMMD", name) for name in ("ours", "photo", "real")]
-    columns = telling_columns(score_tables(scores))
-    (panel,) = panels_of(lay(columns, {"photo", "real"}))
+    columns = telling_columns(families(scores))
+    (panel,) = panels_of(grid(columns, {"photo", "real"}))
     assert [control for *_, control in panel.rows] == [False, True, True]
     assert panel.title == "TMMD ↓"
 
 
 def test_labels_of_strips_are_all_words_before_the_scores():
     rows = [["Ours", "Orig", up("a", 0.5), "note"], ["Ours", "NoLeak", up("a", 0.4), "note"]]
-    (panel,) = panels_of(sheet(StudyTable("T", "", ["method", "split", "accuracy", "why"], rows)))
+    (panel,) = panels_of(
+        of_study(StudyTable("T", "", ["method", "split", "accuracy", "why"], rows))
+    )
     assert [label for label, *_ in panel.rows] == ["Ours, Orig", "Ours, NoLeak"]
 
 

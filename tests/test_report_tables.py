@@ -6,11 +6,11 @@ import pytest
 
 from forge.results import difference, score, text_note
 from palpate.core import Note, PalpateError
+from palpate.report.families import families, family_of
 from palpate.report.labels import label_of, subject_of
-from palpate.report.notes import decimals, number, percent, plural, score_text
+from palpate.report.numbers import decimals, number, percent, plural, score_text
 from palpate.report.results import Results
-from palpate.report.study_tables import score_sheets
-from palpate.report.tables import family_of, heat_tables, rankings, score_tables
+from palpate.report.tables import grids, heat_tables, listing, of_differences, rankings
 
 
 @pytest.mark.parametrize(
@@ -56,7 +56,7 @@ def test_decimals_follow_the_largest_value(values, digits):
     ],
 )
 def test_families(metric, title):
-    assert family_of(score(metric)).title == title
+    assert family_of(score(metric))[1] == title
 
 
 def test_scores_of_a_family_are_one_table_with_what_they_share():
@@ -66,23 +66,23 @@ def test_scores_of_a_family_are_one_table_with_what_they_share():
         score("I-TMMD", "a", n=100),
         score("I-TMMD", "b", n=200),
     ]
-    (table,) = score_tables(scores)
+    (table,) = families(scores)
     assert [(c.name, c.size) for c in table.columns] == [("TMMD", "n = 240"), ("I-TMMD", "")]
-    assert table.columns[1].cells[1].size == "n = 200"
-    assert ("bandwidth σ", "10") in table.made
-    assert table.columns[0].made == [("seed", "1, 2")]
+    assert [row.cells[2].below[-1] for row in grids(table)[0].rows[:2]] == ["n = 100", "n = 200"]
+    assert ("bandwidth σ", "10") in table.facts
+    assert ("TMMD, seed", "1, 2") in table.facts
 
 
 def test_several_seeds_of_a_subject_share_a_cell():
-    (table,) = score_tables([score(seed=1), score(seed=2)])
-    (laid,) = score_sheets(table)
+    (table,) = families([score(seed=1), score(seed=2)])
+    (laid,) = grids(table)
     assert [row.cells[0].value for row in laid.rows] == ["a", "a", "real images (floor)"]
 
 
 def test_scores_of_different_settings_raise():
     for change in ({"bandwidth": 5.0}, {"encoder": "e"}, {"scale": 1.0}):
         with pytest.raises(PalpateError, match="must agree in"):
-            score_tables([score(), score(subject="b", **change)])
+            families([score(), score(subject="b", **change)])
 
 
 @pytest.mark.parametrize(
@@ -98,7 +98,7 @@ def test_scores_of_different_settings_raise():
     ],
 )
 def test_other_presets_splits_references_and_features_have_their_own_tables(changes, titles):
-    tables = score_tables([score(**change) for change in changes])
+    tables = families([score(**change) for change in changes])
     assert len(tables) == len(titles)
     assert all(title in table.title for title, table in zip(titles, tables, strict=True))
     assert [bool(t.question) for t in tables] == [True, False]
@@ -111,15 +111,15 @@ def test_scores_without_reference_go_with_their_subject():
         score("TMMD", "b", reference="r2"),
         score("I-TMMD", "b"),
     ]
-    first, second = score_tables(scores)
-    subjects = [{cell.score.a for c in t.columns for cell in c.cells} for t in (first, second)]
+    first, second = families(scores)
+    subjects = [{s.a for c in t.columns for s in c.scores} for t in (first, second)]
     assert subjects == [{"a"}, {"b"}]
     assert [c.name for c in second.columns] == ["TMMD", "I-TMMD"]
 
 
 def test_features_of_several_networks_do_not_split_the_scores_of_one_run():
     scores = [score("KID", "a", reference="r1", encoder="e"), score("CMMD", "a", reference="r2")]
-    assert len(score_tables(scores)) == 1
+    assert len(families(scores)) == 1
 
 
 @pytest.mark.parametrize(
@@ -132,16 +132,16 @@ def test_features_of_several_networks_do_not_split_the_scores_of_one_run():
     ],
 )
 def test_the_dagger_needs_a_decided_difference_against_every_other(differences, best):
-    table = score_tables([*(score(subject=s) for s in "abc"), *differences])[0]
-    cells = table.columns[0].cells
-    assert [c.score.a for c in cells if c.decided] == ([best] if best else [])
+    (family,) = families([*(score(subject=s) for s in "abc"), *differences])
+    assert family.columns[0].winner == best
 
 
 def test_the_best_by_value_is_among_those_that_are_compared():
     scores = [score(subject=s, value=v) for s, v in (("a", 2.0), ("b", 3.0), ("photo", 1.0))]
     best = [
-        [c.score.a for c in score_tables(all_scores)[0].columns[0].cells if c.best]
+        [column.scores[k].a for k in column.best()]
         for all_scores in (scores, [*scores, difference("a", "b")])
+        for column in families(all_scores)[0].columns[:1]
     ]
     assert best == [["photo"], ["a"]]
 
@@ -153,18 +153,19 @@ def test_more_than_two_generators_are_ranked():
 
     pairs = [pair("a", "b", 0.01, 0.02), pair("a", "c", 0.3, 0.6), pair("b", "c", 0.9, 0.2)]
     results = Results("Scores", scores=[*(score(subject=s) for s in "abc"), *pairs])
-    (table,) = score_tables(results.scores)
-    assert rankings(table) == [("TMMD ↓", "b ~ c ~ a")]  # b and a are no neighbors
+    (table,) = families(results.scores)
+    assert rankings(table).plain()[1] == [["TMMD ↓", "b ~ c ~ a"]]  # b and a are no neighbors
     assert "b ~ c ~ a" in str(results)
     assert "a - b" not in str(results)
     decided = [pairs[0], pair("a", "c", 0.01, 0.001), pairs[2]]
-    assert rankings(score_tables([*results.scores[:3], *decided])[0]) == [("TMMD ↓", "b ~ c > a")]
-    assert rankings(score_tables([score(subject="a"), score(subject="b"), pairs[0]])[0]) == []
+    (other,) = families([*results.scores[:3], *decided])
+    assert rankings(other).plain()[1] == [["TMMD ↓", "b ~ c > a"]]
+    assert rankings(families([score(subject="a"), score(subject="b"), pairs[0]])[0]) is None
 
 
 def test_a_table_is_headed_by_the_features_and_a_column_by_the_kernel():
     fields = {"features": "CLIP (v2) vision", "kernel": "σ (wide)"}
-    (table,) = score_tables([score("CMMD", **fields), score("CMMD", features="CLIP (v2) vision")])
+    (table,) = families([score("CMMD", **fields), score("CMMD", features="CLIP (v2) vision")])
     assert table.title == "Image distributions of CLIP (v2) vision"
     assert [c.label for c in table.columns] == ["CMMD (σ (wide))", "CMMD"]
     assert table.columns[0].name == "CMMD (CLIP (v2) vision) (σ (wide))"
@@ -195,9 +196,10 @@ def test_equal_notes_have_one_number():
         score(subject="a", notes=(copied, text_note("Seen."))),
         score(subject="b", notes=(other, Note("copied-rows", {"count": 1, "n": 5}))),
     ]
-    (table,) = score_tables(scores)
-    assert [c.footnotes for c in table.columns[0].cells] == [[1, 2], [1, 3]]
-    assert table.notes == [copied, text_note("Seen."), other]
+    (table,) = families(scores)
+    written = listing(table)
+    assert [row.cells[-1].footnotes for row in written.rows] == [[1, 2], [1, 3]]
+    assert written.notes == [copied, text_note("Seen."), other]
 
 
 @pytest.mark.parametrize(
@@ -210,15 +212,14 @@ def test_equal_notes_have_one_number():
     ],
 )
 def test_what_follows_from_the_fields_of_a_score_is_a_note(changes, code):
-    assert [note.code for note in score_tables([score(**changes)])[0].notes] == [code]
-    assert score_tables([score("FID", floor=None)])[0].notes == []
+    assert [note.code for note in listing(families([score(**changes)])[0]).notes] == [code]
+    assert listing(families([score("FID", floor=None)])[0]).notes == []
 
 
 def test_differences_are_rows_below_their_scores():
-    table = score_tables([score(subject="a"), score(subject="b"), difference("a", "b")])[0]
-    (row,) = table.differences
-    assert (row.name, row.score.a, row.score.b) == ("TMMD", "a", "b")
-    assert (row.confidence, row.p) == (0.975, 0.05)
+    family = families([score(subject="a"), score(subject="b"), difference("a", "b")])[0]
+    (row,) = of_differences(family).plain()[1]
+    assert row == ["TMMD ↓", "a", "b", "-1.00 [-1.50, -0.50]", "97.5 %", "0.05"]
 
 
 def test_only_square_matrices_of_numbers_are_drawn():

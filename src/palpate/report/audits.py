@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import NamedTuple
 
-from palpate.report.notes import count, number, plural, score_text
+from palpate.report.numbers import count, number, plural, score_text
 from palpate.report.results import Audit, ImpactRow, LeakPair
 
 

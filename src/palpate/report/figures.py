@@ -10,17 +10,17 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from markupsafe import Markup
 from PIL import Image, ImageDraw, ImageFont, ImageOps
 
 from palpate.core import atomic_path, write_text
 from palpate.report import audits
-from palpate.report.curves import Panel, panels_of, strips_drawing
-from palpate.report.drawing import COLORS, Drawing
+from palpate.report.families import REAL, families
 from palpate.report.first_screen import COLUMNS, TELLING, telling_columns
 from palpate.report.page import gallery_images, in_turns, material_of, pair_images
 from palpate.report.results import Audit, Results
-from palpate.report.study_tables import controls_of, file_names, lay, sheets
-from palpate.report.tables import REAL, score_tables
+from palpate.report.strips import COLORS, panels_of, strips_svg
+from palpate.report.tables import file_names, grid, of_study
 from palpate.report.thumbnails import Wanted, read_image
 
 #: Samples and pairs side by side.
@@ -59,7 +59,7 @@ def save_figures(results: Results, folder: Path, *, base: Path) -> list[Path]:
     drawings = _drawings(results)  # scores are checked before anything is written
     files: list[Path] = []
     for name, drawing in drawings.items():
-        write_text(path := folder / f"{name}.svg", str(drawing.to_svg()))
+        write_text(path := folder / f"{name}.svg", str(drawing))
         files.append(path)
     for name, picture in _pictures(results).items():
         with atomic_path(path := folder / f"{name}.png") as part:
@@ -68,23 +68,19 @@ def save_figures(results: Results, folder: Path, *, base: Path) -> list[Path]:
     return files
 
 
-def _drawings(results: Results) -> dict[str, Drawing]:
-    drawings: dict[str, Drawing] = {}
-    columns = telling_columns(score_tables(results.scores))
-    if panels := panels_of(lay(columns, {REAL, *controls_of(results)})):
-        drawings["strips-scores"] = strips_drawing("Scores", panels)
-    tables = sheets(results)
+def _drawings(results: Results) -> dict[str, Markup]:
+    drawings: dict[str, Markup] = {}
+    columns = telling_columns(families(results.scores))
+    if panels := panels_of(grid(columns, {REAL, *results.controls})):
+        drawings["strips-scores"] = strips_svg("Scores", panels)
+    tables = list(map(of_study, results.tables))
     for name, table in zip(file_names("strips", [t.title for t in tables]), tables, strict=True):
         panels = [p for p in panels_of(table) if any(s.interval for _, s, _ in p.rows)]
-        if panels := sorted(panels, key=_telling)[:COLUMNS]:
-            drawings[name] = strips_drawing(table.title, panels)
+        rank = {measure: k for k, measure in enumerate(TELLING)}
+        panels.sort(key=lambda panel: rank.get(panel.rows[0][1].measure, len(rank)))
+        if panels := panels[:COLUMNS]:
+            drawings[name] = strips_svg(table.title, panels)
     return drawings
-
-
-def _telling(panel: Panel) -> int:
-    """The place of a panel among those that say most."""
-    measure = panel.rows[0][1].measure
-    return TELLING.index(measure) if measure in TELLING else len(TELLING)
 
 
 def _pictures(results: Results) -> dict[str, Picture]:

@@ -9,10 +9,11 @@ from markupsafe import Markup
 
 from palpate.core import Measure, Score
 from palpate.report import plots
-from palpate.report.notes import number, p_text, percent, plural, sentence
+from palpate.report.families import REAL, Column, Family, baselines, best_by_value, defined
+from palpate.report.notes import sentence
+from palpate.report.numbers import number, p_text, percent, plural
 from palpate.report.results import Audit, Results
 from palpate.report.sentences import share_of
-from palpate.report.tables import REAL, Cell, Column, Table, best_by_value, defined
 
 #: Columns of the verdict table, the most telling first; others follow as they come.
 TELLING = tuple(map(Measure, ("TMMD", "material accuracy", "D-TMMD", "CI-TMMD", "SSIM")))
@@ -83,17 +84,16 @@ def caution(results: Results) -> str:
     return "Preset smoke trains for seconds, to show that everything runs; it can decide nothing."
 
 
-def telling_columns(tables: Sequence[Table]) -> list[Column]:
-    """Return at most five columns of different metrics, each of the first table that has it.
+def telling_columns(families: Sequence[Family]) -> list[Column]:
+    """Return at most five columns of different metrics, each of the first family that has it.
 
     So a column of another preset never stands in for one that is undefined.
     """
     first: dict[Measure, Column] = {}
-    for column in (c for table in tables for c in table.columns):
+    for column in (c for family in families for c in family.columns):
         first.setdefault(column.measure, column)
-    known = [first.pop(measure) for measure in TELLING if measure in first]
-    others = [c for c in first.values() if any(cell.defined for cell in c.cells)]
-    return [*known, *others][:COLUMNS]
+    telling = [first.pop(measure) for measure in TELLING if measure in first]
+    return [*telling, *(c for c in first.values() if any(map(defined, c.scores)))][:COLUMNS]
 
 
 def cards(
@@ -101,14 +101,14 @@ def cards(
 ) -> list[Card]:
     """Return at most three cards: the leak, then the most telling scores."""
     audits = [audit for audit in results.audits if audit.test_samples]
-    made = [_leak_card(audits)] if audits else []
+    cards = [_leak_card(audits)] if audits else []
     subjects: list[str] = []
     for column in columns:
-        if cells := [cell for cell in column.cells if cell.defined]:
-            shown = _compared(column, cells, controls, subjects)
-            subjects = subjects or [cell.score.a for cell in shown]
-            made.append(_score_card(column, shown, len(cells), controls))
-    return made[:CARDS]
+        if scores := [score for score in column.scores if defined(score)]:
+            compared = _compared(column, scores, controls, subjects)
+            subjects = subjects or [score.a for score in compared]
+            cards.append(_score_card(column, compared, len(scores), controls))
+    return cards[:CARDS]
 
 
 def _leak_card(audits: Sequence[Audit]) -> Card:
@@ -132,58 +132,61 @@ def _leak_card(audits: Sequence[Audit]) -> Card:
 
 
 def _score_card(
-    column: Column, shown: Sequence[Cell], known: int, controls: Collection[str]
+    column: Column, scores: Sequence[Score], defined_scores: int, controls: Collection[str]
 ) -> Card:
-    first = shown[0]
-    share = "accuracy" in column.measure.metric
-    mark = first.baselines.get("chance") if share else first.score.floor
-    axis = strip_axis([cell.score for cell in shown], STRIP)
+    first, share = scores[0], "accuracy" in column.measure.metric
+    mark = baselines(first).get("chance") if share else first.floor
+    axis = strip_axis(scores, STRIP)
     small = UNIT if share or axis is None else replace(axis, ticks=(), width=UNIT.width)
-    rows = [_score_row(cell, column, small, mark, controls) for cell in shown]
-    left = f" {len(shown)} of {known} rows." if known > len(shown) else ""
-    told = [n for cell in shown for n in cell.score.notes if n.code == "text"]
-    left += f" * {sentence(told[0]).partition(':')[0]}." if told else ""
+    rows: list[CardRow] = []
+    for score in scores:
+        label = f"{score.a} (control)" if score.a in controls else score.a
+        label += "*" * any(note.code == "text" for note in score.notes)
+        drawing = plots.bar(small, score.value, score.interval, mark=mark)
+        text = percent(float(score)) if share else number(score.value, column.digits)
+        rows.append(CardRow(label, drawing, text))
+    left = f" {len(scores)} of {defined_scores} rows." * (defined_scores > len(scores))
+    remarks = [n for score in scores for n in score.notes if n.code == "text"]
+    left += f" * {sentence(remarks[0]).partition(':')[0]}." if remarks else ""
     title = f"{QUESTIONS.get(column.measure, column.name)} {column.arrow}"
     if share:
         chance = f"Share named right by a probe; dashed: chance, {percent(mark)}." if mark else ""
-        real = next((c.score for c in shown if c.score.a == REAL), None)
+        real = next((s for s in scores if s.a == REAL), None)
         if mark and real and real.interval and real.interval[0] <= mark:
             chance = f"The probe does not tell real images from chance, {percent(mark)} (dashed)."
         return Card(title, rows, f"{chance}{left}".strip())
     if axis is None:
         return Card(title, rows, left.strip())
-    drawing = plots.bar(axis, first.score.value, first.score.interval, first.score.null, mark)
+    drawing = plots.bar(axis, first.value, first.interval, first.null, mark)
     rows[0] = replace(rows[0], drawing=Markup(""))
-    foot = f"{_strip_facts(first.score, column)}{left}".strip()
+    foot = f"{_strip_facts(first, column)}{left}".strip()
     return Card(title, rows, foot, drawing + plots.axis_row(axis))
 
 
 def _compared(
-    column: Column, cells: Sequence[Cell], controls: Collection[str], before: Sequence[str]
-) -> list[Cell]:
+    column: Column, scores: Sequence[Score], controls: Collection[str], before: Sequence[str]
+) -> list[Score]:
     """The first method, the best other one, the nearest photo, real images; then as they come.
 
     Cards that follow hold the subjects of the first, and the real images in the place of the last
     method.
     """
-    real = [c for c in cells if c.score.a == REAL]
-    if same := [c for name in before for c in cells if c.score.a == name]:
-        apart = [c for c in same if c.score.a in controls]
-        methods = [c for c in same if c.score.a not in {*controls, REAL}]
+    same = [score for name in before for score in scores if score.a == name]
+    real = [score for score in scores if score.a == REAL]
+    apart = [score for score in same or scores if score.a in controls]
+    methods = [score for score in same or scores if score.a not in {*controls, REAL}]
+    if same:
         room = CARD_ROWS - len(real)
         methods = methods[: max(1, room - len(apart))]
         return [*methods, *apart[: room - len(methods)], *real]
-    methods = [c for c in cells if c.score.a != REAL and c.score.a not in controls]
     others = methods[1:]
-    best = best_by_value([c.score for c in others], column.digits) or {0}
-    apart = [c for c in cells if c.score.a in controls]
-    photo = [c for c in apart if "nearest photo" in c.score.a] or apart
-    chosen = [*methods[:1], *(others[k] for k in sorted(best)[:1] if others), *photo[:1], *real[:1]]
-    more = [c for c in (*others, *cells) if all(c is not other for other in chosen)]
-    room = CARD_ROWS - len(chosen)
-    place = len(chosen) - len(photo[:1]) - len(real[:1])
-    unique = list({id(c): c for c in more}.values())[:room]
-    return [*chosen[:place], *unique, *chosen[place:]]
+    best = best_by_value(others, column.digits) or {0}
+    front = [*methods[:1], *(others[k] for k in sorted(best)[:1] if others)]
+    photo = [score for score in apart if "nearest photo" in score.a] or apart
+    back = [*photo[:1], *real[:1]]
+    more = {id(score): score for score in (*others, *scores)}
+    more = [score for k, score in more.items() if k not in map(id, (*front, *back))]
+    return [*front, *more[: CARD_ROWS - len(front) - len(back)], *back]
 
 
 def strip_axis(scores: Sequence[Score], width: float) -> plots.Axis | None:
@@ -225,26 +228,10 @@ def _against_real(score: Score) -> str:
     return f"the interval is {'below' if high < score.floor else 'above'} the floor{lack}"
 
 
-def _score_row(
-    cell: Cell,
-    column: Column,
-    axis: plots.Axis | None,
-    mark: float | None,
-    controls: Collection[str],
-) -> CardRow:
-    score = cell.score
-    label = f"{score.a} (control)" if score.a in controls else score.a
-    label += "*" * any(note.code == "text" for note in score.notes)
-    drawing = plots.bar(axis, score.value, score.interval, mark=mark)
-    share = "accuracy" in column.measure.metric
-    text = percent(float(score)) if share else number(score.value, column.digits)
-    return CardRow(label, drawing, text)
-
-
-def annotated(tables: Sequence[Table]) -> tuple[Column, Score] | None:
+def annotated(families: Sequence[Family]) -> tuple[Column, Score] | None:
     """Return the first score with interval, null and floor, to explain the drawings on; or None."""
-    for column in (c for table in tables for c in table.columns):
-        for score in (cell.score for cell in column.cells):
+    for column in (c for family in families for c in family.columns):
+        for score in column.scores:
             if defined(score) and score.interval and score.null and score.floor is not None:
                 return column, score
     return None

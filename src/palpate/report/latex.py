@@ -13,12 +13,13 @@ import unicodedata
 from collections.abc import Callable, Iterable, Sequence
 from itertools import zip_longest
 
-from palpate.core import Note, short
-from palpate.report.notes import number, sentence
+from palpate.core import short
+from palpate.report.families import defined, families
+from palpate.report.notes import sentence
+from palpate.report.numbers import number
 from palpate.report.results import Results
-from palpate.report.study import Claim
-from palpate.report.study_tables import Entry, Sheet, file_names, score_sheets, sheets, tally
-from palpate.report.tables import defined, score_tables
+from palpate.report.study import Claim, tally
+from palpate.report.tables import Cell, Table, file_names, grids, of_study
 
 #: First line of the file: how the command recognizes its own file.
 MARK = "% palpate: tables of scores"
@@ -66,13 +67,11 @@ def latex_tables(results: Results) -> str:
     Raises:
         PalpateError: if two scores that share a column were not made with the same settings.
     """
-    laid = [(table, [table.text] if table.text else []) for table in sheets(results)]
-    for table in score_tables(results.scores):
-        for part in score_sheets(table):
-            facts = "; ".join(f"{what} {_short(how)}" for what, how in part.made)
-            laid.append((part, [facts] if facts else []))
-    names = file_names("tab", [table.title for table, _ in laid])
-    parts = [_sheet(t, caption, name) for (t, caption), name in zip(laid, names, strict=True)]
+    captions = [(table, table.text) for table in map(of_study, results.tables)]
+    for table in (table for family in families(results.scores) for table in grids(family)):
+        captions.append((table, "; ".join(f"{what} {_short(how)}" for what, how in table.made)))
+    names = file_names("tab", [table.title for table, _ in captions])
+    parts = [_table(t, caption, name) for (t, caption), name in zip(captions, names, strict=True)]
     parts.insert(len(results.tables), _claims(results.claims))
     commands = (re.sub(r"[\x00-\x1f\x7f\u2028\u2029]", " ", c) for c in results.commands)
     needs = r"% Needs \usepackage{booktabs} and \usepackage{graphicx}."
@@ -80,25 +79,27 @@ def latex_tables(results: Results) -> str:
     return "\n".join([*head, "", *(line for lines in parts for line in lines)]).rstrip() + "\n"
 
 
-def _sheet(table: Sheet, caption: Sequence[str], name: str) -> list[str]:
+def _table(table: Table, text: str, name: str) -> list[str]:
     """Controls in italics between rules, what is below a value in lines of their own."""
     if not table.rows:
         return []
-    heads = (f"{escape(h.label)} {ARROWS[h.arrow] if h.arrow else ''}".strip() for h in table.heads)
-    rows = [_row(list(heads)), r"\midrule"]
+    heads = [f"{escape(h.label)} {ARROWS[h.arrow] if h.arrow else ''}".strip() for h in table.heads]
+    rows = [_row(heads), r"\midrule"]
     for row in table.rows:
         rows += [r"\midrule"] * row.rule
-        rows.append(_row([_entry(cell, row.control) for cell in row.cells]))
+        rows.append(_row([_cell(cell, row.control) for cell in row.cells]))
         below = zip_longest(*(_lines_below(cell) for cell in row.cells), fillvalue="")
         rows += [_row(line) for line in below]
-    caption = [table.title, *caption, *table.marks("Bold:")]
+    caption = [table.title, *([text] if text else []), *table.marks("Bold:")]
     caption += ["Italics: controls"] * any(row.control for row in table.rows)
-    notes = _footnotes(range(1, len(table.notes) + 1), table.notes)
     columns = "".join("r" if h.scores else "l" for h in table.heads)
-    return _float(caption, columns, rows, notes, name)
+    notes = (f"{_raised([k])}~{escape(sentence(note))}" for k, note in enumerate(table.notes, 1))
+    footnotes = ". ".join(note.rstrip(".") for note in notes)
+    below = rf"\par\smallskip\parbox{{\linewidth}}{{\footnotesize {footnotes}.}}"
+    return _float(caption, columns, rows, [below] * bool(footnotes), name)
 
 
-def _entry(cell: Entry, control: bool) -> str:
+def _cell(cell: Cell, control: bool) -> str:
     if cell.score is None:
         words = escape(cell.value) if isinstance(cell.value, str) else "--"
         return rf"\textit{{{words}}}" if control and cell.value else words
@@ -110,7 +111,7 @@ def _entry(cell: Entry, control: bool) -> str:
     return (rf"$\mathbf{{{text}}}$" if cell.best else f"${text}$") + dagger + marks
 
 
-def _lines_below(cell: Entry) -> list[str]:
+def _lines_below(cell: Cell) -> list[str]:
     if cell.score is None or not defined(cell.score):
         return []
     pair = ", ".join(_math(number(v, cell.digits)) for v in cell.score.interval or ())
@@ -145,12 +146,6 @@ def _float(
 def _short(text: str) -> str:
     """Cut a digest to its short name."""
     return short(text) if re.fullmatch(r"[0-9a-f]{32,128}", text) else text
-
-
-def _footnotes(numbers: Iterable[int], notes: Sequence[Note]) -> list[str]:
-    texts = (f"{_raised([k])}~{escape(sentence(notes[k - 1]))}" for k in sorted(numbers))
-    text = ". ".join(note.rstrip(".") for note in texts)
-    return [rf"\par\smallskip\parbox{{\linewidth}}{{\footnotesize {text}.}}"] if text else []
 
 
 def _math(text: str) -> str:

@@ -10,14 +10,14 @@ import json
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
-from palpate.core import Note, plain
+from palpate.core import plain
+from palpate.report.families import Family, families
 from palpate.report.notes import HOW_TO_READ, sentence
 from palpate.report.results import Results
 from palpate.report.sentences import purpose, summary_lines
-from palpate.report.study import Claim
-from palpate.report.study_tables import Sheet, difference_sheet, sheet, tally
-from palpate.report.tables import Table, facts_of, marks, score_tables
-from palpate.report.terminal import NAMES, audit_text, score_rows, sheet_rows, sheet_words
+from palpate.report.study import Claim, tally
+from palpate.report.tables import Head, Table, listing, of_differences, of_study
+from palpate.report.terminal import audit_text
 
 _SPECIAL = str.maketrans({c: f"\\{c}" for c in "\\`*_[]|<>"})
 
@@ -32,8 +32,8 @@ def render_markdown(results: Results) -> str:
     lines = [f"# {esc(results.title)}", "", f"palpate: {esc(purpose(results))}", "", *_items(facts)]
     if results.notes:
         lines += ["## Read this first", "", *_items(map(sentence, results.notes))]
-    tables = [line for table in score_tables(results.scores) for line in _scores(table)]
-    studied = [line for table in map(sheet, results.tables) for line in _sheet(table)]
+    tables = [line for family in families(results.scores) for line in _scores(family)]
+    studied = [line for table in map(of_study, results.tables) for line in _table(table)]
     sections = {
         "Claims": _claims(results.claims),
         "Tables": studied,
@@ -62,20 +62,14 @@ def code(text: str) -> str:
     return f"{fence}{pad}{text}{pad}{fence}"
 
 
-def pipe_table(rows: Sequence[Mapping[str, str]], words: Sequence[str] = NAMES) -> list[str]:
-    """Return rows as a padded table without the columns that are empty.
-
-    ``words`` are the columns of text; others are flush right.
-    """
-    names = [name for name in rows[0] if any(row[name] for row in rows)]
-    heads = [esc(name) for name in names]
-    cells = [[esc(row[name]) for name in names] for row in rows]
-    widths = [max(3, *map(len, column)) for column in zip(heads, *cells, strict=True)]
-    right = [name not in words for name in names]
-    rule = ["-" * (w - r) + ":" * r for w, r in zip(widths, right, strict=True)]
+def pipe_table(heads: Sequence[Head], rows: Sequence[Sequence[str]]) -> list[str]:
+    """Return rows as a padded table; numbers are flush right."""
+    cells = [[esc(str(head)) for head in heads], *([*map(esc, row)] for row in rows)]
+    widths = [max(3, *map(len, column)) for column in zip(*cells, strict=True)]
+    rule = ["-" * (w - h.scores) + ":" * h.scores for w, h in zip(widths, heads, strict=True)]
     padded = [
-        [c.rjust(w) if r else c.ljust(w) for c, w, r in zip(row, widths, right, strict=True)]
-        for row in (heads, *cells)
+        [c.rjust(w) if h.scores else c.ljust(w) for c, w, h in zip(row, widths, heads, strict=True)]
+        for row in cells
     ]
     return [f"| {' | '.join(row)} |" for row in (padded[0], rule, *padded[1:])] + [""]
 
@@ -88,38 +82,24 @@ def _fenced(text: str, language: str = "text") -> list[str]:
     return [f"```{language}", text.replace("```", "` ` `"), "```"] if text else []
 
 
-def _scores(table: Table) -> list[str]:
-    grid = pipe_table(score_rows(table)) if table.columns else []
-    marked = marks((cell for column in table.columns for cell in column.cells), "*")
-    lines = _laid((table.title, table.question), grid, marked, facts_of(table), table.notes)
-    return [*lines, *(_sheet(difference_sheet(table)) if table.differences else [])]
+def _scores(family: Family) -> list[str]:
+    differences = [of_differences(family)] if family.differences else []
+    return [line for table in (listing(family), *differences) for line in _table(table)]
 
 
-def _sheet(table: Sheet) -> list[str]:
-    grid = pipe_table(sheet_rows(table), sheet_words(table)) if table.rows else []
-    return _laid((table.title, table.text), grid, table.marks("*"), table.made, table.notes)
-
-
-def _laid(
-    head: tuple[str, str],
-    grid: Sequence[str],
-    marked: Sequence[str],
-    made: Iterable[tuple[str, str]],
-    notes: Sequence[Note],
-) -> list[str]:
-    title, text = map(esc, head)
-    lines = [f"### {title}", "", *([text, ""] if text else []), *grid]
-    lines += [line for mark in marked for line in (esc(mark), "")]
-    lines += [f"- {esc(what)}: {esc(how)}" for what, how in made]
-    lines += [f"- ({k}) {esc(sentence(note))}" for k, note in enumerate(notes, 1)]
+def _table(table: Table) -> list[str]:
+    grid = pipe_table(*table.plain()) if table.rows else []
+    lines = [f"### {esc(table.title)}", "", *([esc(table.text), ""] if table.text else []), *grid]
+    lines += [line for mark in table.marks("*") for line in (esc(mark), "")]
+    lines += [f"- {esc(what)}: {esc(how)}" for what, how in table.made]
+    lines += [f"- ({k}) {esc(sentence(note))}" for k, note in enumerate(table.notes, 1)]
     return [*lines, ""]
 
 
 def _claims(claims: Sequence[Claim]) -> list[str]:
-    rows = [
-        {"claim": f"{c.claim} ({c.source})", "verdict": c.verdict, "why": c.why} for c in claims
-    ]
-    return [f"{tally(claims)}.", "", *pipe_table(rows, list(rows[0]))] if rows else []
+    rows = [[f"{c.claim} ({c.source})", c.verdict, c.why] for c in claims]
+    heads = [Head(name) for name in ("claim", "verdict", "why")]
+    return [f"{tally(claims)}.", "", *pipe_table(heads, rows)] if rows else []
 
 
 def _tree(value: Mapping[str, Any], depth: int = 0) -> list[str]:

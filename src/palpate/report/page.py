@@ -23,13 +23,21 @@ from jinja2 import Environment, FunctionLoader, StrictUndefined
 from markupsafe import Markup, escape
 
 from palpate._version import __version__
-from palpate.core import PalpateError, Progress, SampleRef, plain, quiet, write_json, write_text
-from palpate.report import audits, first_screen, plots, sentences, study_tables
-from palpate.report.labels import label_of, subject_of
-from palpate.report.notes import count, digits_of, number, percent, plural, sentence, where
+from palpate.core import (
+    PalpateError,
+    Progress,
+    SampleRef,
+    Score,
+    plain,
+    quiet,
+    write_json,
+    write_text,
+)
+from palpate.report import audits, first_screen, labels, plots, sentences, study, tables
+from palpate.report.families import REAL, defined, families
+from palpate.report.notes import sentence
+from palpate.report.numbers import count, digits_of, number, percent, plural, where
 from palpate.report.results import GalleryItem, LeakPair, Results, Strip
-from palpate.report.study_tables import sheets
-from palpate.report.tables import defined, heat_tables, score_tables
 from palpate.report.thumbnails import Album, Wanted, fit
 
 #: Samples of the first screen; their images take at most a third of the bytes.
@@ -122,10 +130,9 @@ def render_page(
             larger than ``max_bytes``.
     """
     rows, essential = image_rows(results)
-    tables = score_tables(results.scores)
-    columns = first_screen.telling_columns(tables)
-    controls = study_tables.controls_of(results)
-    cards = first_screen.cards(results, columns, controls)
+    by_family = families(results.scores)
+    columns = first_screen.telling_columns(by_family)
+    cards = first_screen.cards(results, columns, results.controls)
     samples = gallery_images(results.gallery)
     hero_rows: dict[Hashable, list[Wanted]] = {
         id(item): images for item, images in samples[:HERO_ROWS]
@@ -140,12 +147,11 @@ def render_page(
         "facts": list(results.facts) or ([] if cards else sentences.summary_lines(results)),
         "cards": cards,
         "row_labels": [wanted.label for wanted in samples[0][1]] if samples else [],
-        "sheets": sheets(results),
-        "tables": tables,
-        "verdict": study_tables.lay(columns, controls),
-        "folded": len(tables) > 1,
-        "reading": first_screen.annotated(tables),
-        "heats": heat_tables(study_tables.scores_of_methods(results)),
+        "studied": list(map(tables.of_study, results.tables)),
+        "families": by_family,
+        "verdict": tables.grid(columns, results.controls),
+        "reading": first_screen.annotated(by_family),
+        "heats": tables.heat_tables(_scores_of_methods(results)),
         "settings": plain(results.settings),
         "citations": CITATIONS,
         "style": Markup(_template("style.css")),
@@ -291,6 +297,18 @@ def in_turns(items: Sequence[GalleryItem]) -> list[GalleryItem]:
     return [item for turn in zip_longest(*queues.values()) for item in turn if item is not None]
 
 
+def _scores_of_methods(results: Results) -> list[Score]:
+    """The scores of methods: without controls, and of several presets the first.
+
+    Results of real images alone, as a probe's, are returned whole.
+    """
+    first: dict[Any, Score] = {}
+    for score in results.scores:
+        if score.a not in {REAL, *results.controls}:
+            first.setdefault((score.measure, score.a, score.b), score)
+    return [*first.values()] or [*results.scores]
+
+
 def _lede(results: Results) -> str:
     """What the page shows; of audits alone, the question that the split asks."""
     lines = (
@@ -341,11 +359,9 @@ def environment() -> Environment:
         "READING": first_screen.READING,
         "open_claims": OPEN_CLAIMS,
         "digits_of": digits_of,
-        "label_of": label_of,
-        "subject_of": subject_of,
-        "verdict_marks": study_tables.MARKS,
+        "verdict_marks": study.MARKS,
     }
-    for module in (audits, first_screen, plots, sentences, study_tables):
+    for module in (audits, first_screen, labels, plots, sentences, study, tables):
         functions |= {k: v for k, v in vars(module).items() if callable(v)}
     env.globals.update(functions)
     words: dict[str, Any] = {"count": count, "number": number}

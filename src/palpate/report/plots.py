@@ -15,7 +15,7 @@ import numpy as np
 from markupsafe import Markup, escape
 
 from palpate.core import Score
-from palpate.report.notes import count, number, score_text
+from palpate.report.numbers import count, number, score_text
 from palpate.report.results import Audit, Signal
 
 WIDTH, HEIGHT, PAD = 148, 22, 7  # pixels of an interval bar
@@ -85,10 +85,14 @@ def bar(
     interval: tuple[float, float] | None,
     null: tuple[float, float] | None = None,
     mark: float | None = None,
+    *,
+    at: tuple[float, float] = (0, 0),
+    hollow: bool = False,
 ) -> Markup:
     """Draw a value with its interval and null band on ``axis``, and a mark: the floor, or chance.
 
-    The same numbers are next to it as text, so it is hidden from screen readers.
+    The same numbers are next to it as text, so it is hidden from screen readers. ``at`` is where it
+    is in another drawing. A value beyond the axis is an arrow.
     """
     if axis is None:
         return Markup("")
@@ -106,9 +110,13 @@ def bar(
     if interval:
         a, b = map(axis.x, interval)
         parts.append(f'<path class="interval" d="M{a} {mid}H{b}M{a} {mid - 4}v8M{b} {mid - 4}v8"/>')
-    if value is not None:
-        parts.append(f'<circle class="value" cx="{axis.x(value)}" cy="{mid}" r="4"/>')
-    return _svg("bar", axis.width, HEIGHT, parts)
+    if value is not None and axis.low <= value <= axis.high:
+        name = "value hollow" if hollow else "value"
+        parts.append(f'<circle class="{name}" cx="{axis.x(value)}" cy="{mid}" r="4"/>')
+    elif value is not None:
+        tip = 6 if value > axis.high else -6
+        parts.append(f'<path class="value" d="M{axis.x(value)} {mid - 5}l{tip} 5l{-tip} 5z"/>')
+    return _svg("bar", axis.width, HEIGHT, parts, at=at)
 
 
 def share_bar(share: float) -> Markup:
@@ -118,7 +126,7 @@ def share_bar(share: float) -> Markup:
     return _svg("share", "100%", 10, [rail, leak] if share > 0 else [rail])
 
 
-def axis_row(axis: Axis | None) -> Markup:
+def axis_row(axis: Axis | None, at: tuple[float, float] = (0, 0)) -> Markup:
     """Draw the labeled axis below a column of bars."""
     if axis is None:
         return Markup("")
@@ -129,14 +137,21 @@ def axis_row(axis: Axis | None) -> Markup:
         label = min(max(x, half), axis.width - half)
         parts.append(f'<line class="tick" x1="{x}" x2="{x}" y1="1" y2="5"/>')
         parts.append(f'<text x="{label:.2f}" y="17" text-anchor="middle">{text}</text>')
-    return _svg("bar axis", axis.width, 20, parts)
+    return _svg("bar axis", axis.width, 20, parts, at=at)
 
 
 def _svg(
-    name: str, width: float | str, height: float, parts: Iterable[str], label: str = ""
+    name: str,
+    width: float | str,
+    height: float,
+    parts: Iterable[str],
+    *,
+    label: str = "",
+    at: tuple[float, float] = (0, 0),
 ) -> Markup:
     role = f'role="img" aria-label="{escape(label)}"' if label else 'aria-hidden="true"'
     size = f'width="{width}" height="{height:.0f}" {role} focusable="false"'
+    size += f' x="{at[0]:g}" y="{at[1]:g}"' * any(at)
     return Markup(f'<svg class="{name}" {size}>{"".join(parts)}</svg>')
 
 
@@ -192,7 +207,7 @@ def _histogram(
         x, (anchor, shift) = at(marker[0]), ("end", -1) if marker[0] > 0.55 else ("start", 1)
         line = f'<line class="median" x1="{x:.3f}%" x2="{x:.3f}%" y1="4" y2="{bottom}"/>'
         parts += [line, _text("median-label", x + shift, 14, marker[1], anchor)]
-    return _svg("histogram", "100%", bottom + 42, parts, label)
+    return _svg("histogram", "100%", bottom + 42, parts, label=label)
 
 
 def _text(name: str, x: float, y: float, text: str, anchor: str) -> str:

@@ -406,6 +406,11 @@ class Results:
             raise KeyError(f"no score of {', '.join(names)}; there is {'; '.join(known) or 'none'}")
         return matches if isinstance(key, str) else matches[0]
 
+    @property
+    def controls(self) -> set[str]:
+        """The subjects that a table of the study names as controls."""
+        return {name for table in self.tables for name in table.controls}
+
     def __str__(self) -> str:
         """The tables of scores and of a study, and the claims, as in the terminal."""
         return _writer("terminal").as_text(self)

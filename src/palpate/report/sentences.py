@@ -5,9 +5,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from palpate.core import Note, Score
-from palpate.report.notes import count, number, percent, plural, question, score_text
+from palpate.report.families import defined, families, family_of
+from palpate.report.notes import question
+from palpate.report.numbers import count, number, percent, plural, score_text
 from palpate.report.results import CANNOT_TELL, Audit, Results, Signal
-from palpate.report.tables import Table, family_of, score_tables
 
 #: Beginning of a kind of leak -> what it means ({thing} is the rest of the name, {data} what test
 #: is compared with), and the sentence about a share of the test samples. The first match wins.
@@ -170,9 +171,9 @@ def audit_line(audit: Audit) -> str:
 def purpose(results: Results) -> str:
     """Return the question that the page answers."""
     parts: list[str] = []
-    families = {family_of(score).title for score in results.scores}
-    probed = families and not results.gallery and families <= {"Recognition", "Retrieval"}
-    if "Captions" in families:
+    asked = {family_of(score)[1] for score in results.scores}
+    probed = asked and not results.gallery and asked <= {"Recognition", "Retrieval"}
+    if "Captions" in asked:
         parts.append("what do captions give away about their labels, and can they be used")
     elif results.strips or probed:
         parts.append(
@@ -196,17 +197,16 @@ def purpose(results: Results) -> str:
 
 def score_line(scores: Sequence[Score]) -> str:
     """Return the first column with a value, in one sentence; '' if there is none."""
-    tables: list[Table] = score_tables(scores)
-    for column in (column for table in tables for column in table.columns):
-        cells = [cell for cell in column.cells if cell.defined]
-        if not cells:
+    for column in (column for family in families(scores) for column in family.columns):
+        known = [score for score in column.scores if defined(score)]
+        if not known:
             continue
         values: list[str] = []
-        for score in (cell.score for cell in cells[:3]):
+        for score in known[:3]:
             low_high = [number(v, column.digits) for v in score.interval or ()]
             interval = f" [{', '.join(low_high)}]" if low_high else ""
             values.append(f"{score.a} {number(score.value, column.digits)}{interval}")
-        floors = [cell.score.floor for cell in cells if cell.score.floor is not None]
+        floors = [score.floor for score in known if score.floor is not None]
         floor = f"; floor {number(floors[0], column.digits)}" if floors else ""
         return f"{column.name} ({column.better}): {', '.join(values)}{floor}."
     return ""

@@ -13,6 +13,8 @@ from typing import Literal
 from palpate.core import Score
 
 Verdict = Literal["holds", "does not hold", "undecided"]
+#: Verdict -> the mark before its word, for those who do not see colors.
+MARKS = {"holds": "✓", "does not hold": "✗", "undecided": "?"}
 
 
 @dataclass(frozen=True)
@@ -56,3 +58,25 @@ class Claim:
     why: str
     evidence: Sequence[Score] = ()
     measured: bool = True
+
+
+def tally(claims: Sequence[Claim]) -> str:
+    """Return how many claims have which verdict: ``4 hold, 1 undecided, 1 not measured``."""
+    verdicts = [claim.verdict if claim.measured else "not measured" for claim in claims]
+    counts = {verdict: verdicts.count(verdict) for verdict in (*MARKS, "not measured")}
+    many = {"holds": "hold", "does not hold": "do not hold"}
+    words = (
+        f"{n} {verdict if n == 1 else many.get(verdict, verdict)}"
+        for verdict, n in counts.items()
+        if n
+    )
+    return ", ".join(words)
+
+
+def brief(text: str, most: int = 220) -> str:
+    """Return the first clauses of a long reason; its evidence has all of it."""
+    if len(text) <= most:
+        return text
+    ends = (text.rfind("; ", 0, most), text.rfind(" ", 0, most), most)
+    cut = text[: next(end for end in ends if end > 0)]
+    return f"{cut.rpartition(' [')[0] if cut.count('[') > cut.count(']') else cut} …"

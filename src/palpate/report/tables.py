@@ -1,97 +1,45 @@
-"""The table model of scores: what rows, columns, footnotes and best marks there are.
+"""The one table model: heads, rows of cells, footnotes and best marks, ready to be written.
 
-The terminal, Markdown, LaTeX and HTML write these tables; none decides anything on its own. A
-column is what :func:`palpate.core.columns` makes, so scores of different settings raise instead of
-sharing one. Scores of another family of metrics, another preset, another split, other features or
-another reference are in tables of their own.
+The terminal, Markdown, LaTeX and HTML write a :class:`Table` and decide nothing. Tables come from a
+study (:func:`of_study`) and from families of scores: a row a score (:func:`listing`), a row a
+subject (:func:`grid`), a row a paired difference (:func:`of_differences`). The best of a column is
+marked by value alone, among the rows that are no controls; a dagger marks the one that paired
+differences decide for.
 """
 
 from __future__ import annotations
 
-import math
-from collections.abc import Iterable, Sequence
+import re
+from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass, replace
-from itertools import pairwise
+from functools import partial
+from itertools import count, pairwise, zip_longest
 from typing import Any
 
-from palpate.core import Measure, Note, Score, columns, plain, short
+from palpate.core import Measure, Note, Score, plain, short
 from palpate.core.score import ARROWS, BETTER
-from palpate.report.labels import label_of, measured, subject_of
-from palpate.report.notes import decimals, digits_of, number
-
-
-@dataclass(frozen=True)
-class Family:
-    """Metrics that answer one question: by words that are part of their names (lower case)."""
-
-    title: str
-    question: str = ""
-    parts: tuple[str, ...] = ()
-
-
-#: The first family whose parts match takes a metric.
-FAMILIES = (
-    Family(
-        "People",
-        "Which images do people find closer to the real ones, ties as half a vote, and which "
-        "materials do they recognize?",
-        ("human ",),
-    ),
-    Family(
-        "Agreement of metrics with people",
-        "Kendall's tau-b: 1 orders images or methods as people do, 0 has nothing to do with it.",
-        ("tau with people",),
-    ),
-    Family(
-        "Tactile features",
-        "Are generated and real images similar to a tactile encoder? I-, CI- and D-TMMD need no "
-        "reference images.",
-        ("tmmd",),
-    ),
-    Family(
-        "Image distributions",
-        "Are the sets of images similar to a general image encoder?",
-        ("cmmd", "fid", "kid", "mmd", "precision", "recall ", "density", "coverage"),
-    ),
-    Family(
-        "Image by image",
-        "Does each generated image match its real image, pixel by pixel or patch by patch?",
-        ("contact ", "ssim", "psnr", "lpips", "l1", "mse"),
-    ),
-    Family(
-        "Captions",
-        "Can they be used, and do they name what they should only describe? Those of a contact "
-        "count once.",
-        ("share of captions",),
-    ),
-    Family(
-        "Material from captions",
-        "How often is the material predicted from the text alone, on new videos? Text that only "
-        "describes lies between the commonest material and 1.",
-        ("from the text",),
-    ),
-    Family(
-        "Recognition",
-        "What can be read from the image, by a classifier trained on the train part?",
-        ("acc", "probe", "@"),
-    ),
-    Family(
-        "Retrieval",
-        "Which text, photo or tactile image belongs to it? The share of samples for which a right "
-        "one is among the k most similar, and the median of its rank.",
-        ("top-", "median rank", "retriev"),
-    ),
-    Family("Other metrics"),
+from palpate.report.families import (
+    BASELINES,
+    REAL,
+    Column,
+    Family,
+    baselines,
+    best_by_value,
+    defined,
+    interval_text,
+    notes_of,
+    size_of,
 )
-#: Column of a baseline -> its key in the details of a score.
-BASELINES = {"no contact": "empty", "chance": "chance", "majority": "majority"}
+from palpate.report.labels import label_of, measured, subject_of
+from palpate.report.numbers import confidence, decimals, digits_of, number, p_text
+from palpate.report.numbers import count as count_text
+from palpate.report.study import StudyTable
+
 BEST = "best of its column by value alone, controls aside"
 DECIDED = (
     "better than every other one compared (metrics without reference: closer to the floor) by a "
     "paired difference whose interval excludes 0"
 )
-#: The ``a`` of scores of real images.
-REAL = "real"
 #: What the cells of a matrix are.
 DIVERGENCE = (
     "Row against column; the diagonal compares two halves of one class. Stronger color: farther "
@@ -101,169 +49,106 @@ CONFUSION = (
     "Rows: the true class of test samples. Columns: what the classifier called them, as a share of "
     "the row."
 )
-#: What a preset of the TMMD family means, for the head of its table.
-PRESETS = {
-    "paper": "the paper's formula to the letter, random halves",
-    "paper-tables": "the reading that fits the paper's printed tables",
-    "cmmd": "as CMMD's published code",
-    "grouped": "whole groups, or both images of a scene, kept together",
-}
+#: Title of the rankings, which replace the differences of more than two generators.
+RANKED = "Best first on the same samples: > decided, ~ not decided"
+_DEGREES = re.compile(r"[\d.]+(?= df)")
+
+
+@dataclass(frozen=True)
+class Head:
+    """One column: label and better direction ('' where none is shown); whether it holds numbers."""
+
+    label: str
+    arrow: str = ""
+    better: str = ""
+    scores: bool = False
+
+    def __str__(self) -> str:
+        return f"{self.label} {self.arrow}".strip()
 
 
 @dataclass(frozen=True)
 class Cell:
-    """A score in a table.
+    """Words, a score with its decimals, or nothing.
 
     Attributes:
-        score: the score.
+        value: as in the table.
+        digits: decimals of value and interval.
+        best: the best of its column.
+        decided: paired differences decide for it.
         footnotes: numbers, from 1, of its notes below the table.
-        size: ``"n = 240"``; '' where the whole column shares it.
-        best: the best of its column, by value (:func:`best_by_value`).
-        decided: better than every other one by a paired difference that is decided.
-        competes: whether it can be the best: where there are differences, whether it has one, else
-            whether it is not of real images.
+        below: lines under the interval: p-value, null band, size.
     """
 
-    score: Score
-    footnotes: Sequence[int]
-    size: str = ""
+    value: Score | str | None
+    digits: int = 0
     best: bool = False
     decided: bool = False
-    competes: bool = True
+    footnotes: Sequence[int] = ()
+    below: Sequence[str] = ()
 
     @property
-    def defined(self) -> bool:
-        """Whether the score has a finite value."""
-        return defined(self.score)
+    def score(self) -> Score | None:
+        """The score, if it is one."""
+        return self.value if isinstance(self.value, Score) else None
 
-    @property
-    def p_value(self) -> float | None:
-        """p-value of the permutation test."""
-        return self.score.details.get("p_value")
-
-    @property
-    def baselines(self) -> dict[str, float]:
-        """Name -> what it scores without a look at the sample: chance, the commonest class ..."""
-        known = {name: self.score.details.get(key) for name, key in BASELINES.items()}
-        return {
-            name: value
-            for name, value in known.items()
-            if isinstance(value, int | float) and math.isfinite(value)
-        }
+    def text(self) -> str:
+        """The cell as plain text: ``1.37 [1.01, 1.75] * (1)``."""
+        words = [self.value if isinstance(self.value, str) else ""]
+        if self.score is not None:
+            words = [value_text(self.score.value, self.digits)]
+            words += [range_text(self.score.interval, self.digits)] * defined(self.score)
+        marks = ["*"] * self.best + ["†"] * self.decided + [f"({k})" for k in self.footnotes]
+        return " ".join(filter(None, [*words, *marks]))
 
 
 @dataclass(frozen=True)
-class Column:
-    """One metric.
+class Row:
+    """One row; ``rule`` is whether methods end and controls begin above it, or the other way."""
 
-    Attributes:
-        measure: what is measured.
-        name: that in words; ``label`` lacks the features, which are in the table's title.
-        higher_is_better: the direction.
-        digits: decimals of all its numbers.
-        size: sample sizes if all of its scores share them.
-        made: (what, how) its scores were made, where that differs from the other columns.
-        cells: its scores.
-    """
-
-    measure: Measure
-    name: str
-    label: str
-    higher_is_better: bool | None
-    digits: int
-    size: str
-    made: Sequence[tuple[str, str]]
     cells: Sequence[Cell]
-
-    @property
-    def arrow(self) -> str:
-        """The better direction."""
-        return ARROWS[self.higher_is_better]
-
-    @property
-    def better(self) -> str:
-        """The better direction in words."""
-        return BETTER[self.higher_is_better]
-
-
-@dataclass(frozen=True)
-class Difference:
-    """A paired difference of two generators, a - b: one row below the scores.
-
-    Attributes:
-        score: the difference, of the generators ``score.a`` and ``score.b``.
-        name: of what is measured.
-        arrow: its better direction.
-        confidence: that a is better, in [0, 1], or None.
-        p: two-sided p-value, adjusted by Holm over the pairs, or None.
-        digits: decimals of value and interval.
-    """
-
-    score: Score
-    name: str
-    arrow: str
-    confidence: float | None
-    p: float | None
-    digits: int
+    control: bool = False
+    rule: bool = False
 
 
 @dataclass(frozen=True)
 class Table:
-    """Scores of one family: rows are subjects, columns metrics.
+    """A table as it is written.
 
     Attributes:
-        title: family, preset, features, split and reference, as far as they are needed.
-        question: what the family answers; '' in its further tables.
-        columns: the metrics.
-        differences: paired differences of these scores.
+        title, text: its heading, and how to read it.
+        heads: one a column.
+        rows: as many cells each as there are heads.
         notes: the footnotes.
-        made: (what, how) all columns were made.
+        made: (what, how) the scores were made.
+        strips: whether a page draws each score on the axis of its column.
     """
 
     title: str
-    question: str
-    columns: Sequence[Column]
-    differences: Sequence[Difference]
-    notes: Sequence[Note]
-    made: Sequence[tuple[str, str]]
+    text: str
+    heads: Sequence[Head]
+    rows: Sequence[Row]
+    notes: Sequence[Note] = ()
+    made: Sequence[tuple[str, str]] = ()
+    strips: bool = False
 
+    def column(self, k: int) -> list[Score]:
+        """The scores of a column."""
+        return [score for row in self.rows if (score := row.cells[k].score) is not None]
 
-@dataclass(frozen=True)
-class Heat:
-    """A square matrix: D-TMMD's divergences, or confusions; ``shares`` lie in [0, 1]."""
+    def marks(self, best: str) -> list[str]:
+        """What the marks mean, where there are any; ``best`` is how the best is marked."""
+        cells = [cell for row in self.rows for cell in row.cells]
+        marks = [f"{best} {BEST}"] * any(cell.best for cell in cells)
+        return marks + [f"† {DECIDED}"] * any(cell.decided for cell in cells)
 
-    title: str
-    meaning: str
-    labels: Sequence[str]
-    values: Sequence[Sequence[str]]
-    shares: Sequence[Sequence[float]]
-
-
-def defined(score: Score) -> bool:
-    """Return whether a score has a value."""
-    return score.value is not None
-
-
-def family_of(score: Score) -> Family:
-    """Return the family of a score's metric."""
-    name = f"{score.metric.lower()} "
-    return next((f for f in FAMILIES[:-1] if any(p in name for p in f.parts)), FAMILIES[-1])
-
-
-def notes_of(score: Score) -> list[Note]:
-    """Return what a reader must know of a score: its notes, and what follows from its fields."""
-    notes = [*score.notes]
-    if excluded := score.details.get("excluded"):
-        notes.append(Note("excluded-classes", {"excluded": excluded}))
-    if score.higher_is_better is None and score.details.get("gap") is not None:
-        notes.append(Note("nearer-to-floor"))
-    if "no contact" in Cell(score, ()).baselines:
-        notes.append(Note("no-contact-baseline"))
-    lacks_floor = score.floor is None and score.b is None
-    if lacks_floor and defined(score) and score.metric in ("TMMD", "I-TMMD", "CI-TMMD", "D-TMMD"):
-        code = "no-floor-of-tmmd" if score.metric == "TMMD" else "floor-unknown"
-        notes += [] if any(note.code == "no-floor" for note in notes) else [Note(code)]
-    return notes
+    def plain(self) -> tuple[list[Head], list[list[str]]]:
+        """Heads and rows of plain text without the columns that are empty; controls say so."""
+        rows = [[cell.text() for cell in row.cells] for row in self.rows]
+        for cells, row in zip(rows, self.rows, strict=True):
+            cells[0] += " (control)" * row.control
+        kept = [k for k in range(len(self.heads)) if any(row[k] for row in rows)]
+        return [self.heads[k] for k in kept], [[row[k] for k in kept] for row in rows]
 
 
 class Footnotes:
@@ -279,213 +164,246 @@ class Footnotes:
         return sorted({self.notes.index(note) + 1 for note in notes})
 
 
-def score_tables(scores: Sequence[Score]) -> list[Table]:
-    """Return the tables of all scores: families in fixed order, metrics as they first appear.
-
-    Raises:
-        PalpateError: if two scores that share a column were not made with the same settings.
-    """
-    references = _references(scores)
-    groups: dict[tuple[int, str, str, str, int], list[Score]] = {}
-    for score, reference in zip(scores, references, strict=True):
-        place = FAMILIES.index(family_of(score))
-        preset = str(score.settings.get("preset", ""))
-        split = "" if score.settings.get("axis") == "split" else score.split or ""
-        key = (place, preset, split, score.features, reference)
-        groups.setdefault(key, []).append(score)
-    several = [len({key[k] for key in groups} - {""}) > 1 for k in (2, 4)]
-    tables: list[Table] = []
-    for key, members in sorted(groups.items(), key=lambda item: item[0][0]):
-        place, preset, split, features, _ = key
-        title = [FAMILIES[place].title + (f" of {features}" if features else "")]
-        title += [f"{preset}: {PRESETS[preset]}" if preset in PRESETS else preset] if preset else []
-        title += [f"split {short(split)}"] if split and several[0] else []
-        known = dict.fromkeys(short(s.reference) for s in members if s.reference)
-        title += [f"reference {' and '.join(known) or 'not recorded'}"] if several[1] else []
-        question = FAMILIES[place].question
-        if any(question == table.question for table in tables):
-            question = ""
-        tables.append(_table(", ".join(title), question, members))
-    return tables
+def value_text(value: float | None, digits: int) -> str:
+    """Return a number with an ASCII minus, as not every terminal has the true one."""
+    return "undefined" if value is None else number(value, digits).replace("−", "-")
 
 
-def _references(scores: Sequence[Score]) -> list[int]:
-    """Return which reference each score was compared with: 0 for the first of its metric, 1 ...
-
-    Different encoders make different features of the same images, so references are counted by
-    metric. A score without one (I-, CI-, D-TMMD) goes with the last of its subject that has one,
-    else with the first after it.
-    """
-    known: dict[tuple[Measure, str | None], list[str]] = {}
-    index: list[int | None] = []
-    for score in scores:
-        if score.reference is None:
-            index.append(None)
-            continue
-        metric = known.setdefault((score.measure, score.encoder), [])
-        metric += [] if score.reference in metric else [score.reference]
-        index.append(metric.index(score.reference))
-    last: dict[tuple[str, str | None], int] = {}
-    for score, k in reversed(list(zip(scores, index, strict=True))):
-        if k is not None:
-            last[score.a, score.b] = k
-    result: list[int] = []
-    for score, k in zip(scores, index, strict=True):
-        if k is not None:
-            last[score.a, score.b] = k
-        result.append(last.get((score.a, score.b), 0))
-    return result
+def range_text(pair: Sequence[float] | None, digits: int) -> str:
+    """Return ``"[1.01, 1.75]"``, or '' for None."""
+    return f"[{', '.join(value_text(v, digits) for v in pair)}]" if pair else ""
 
 
-def _table(title: str, question: str, scores: Sequence[Score]) -> Table:
-    footnotes = Footnotes()
-    differences = [s for s in scores if s.b is not None]
-    members = [s for s in scores if s.b is None]
-    heads: list[Column] = []
-    for column in columns(members):
-        sizes = [_size(score) for score in column]
-        shared = sizes[0] if len(set(sizes)) == 1 else ""
-        digits, winner = digits_of(column), best_of(column, differences)
-        names = {name for d in differences for name in (d.a, d.b)}
-        competes = [s.a in names if names else s.a != REAL for s in column]
-        best = best_by_value(
-            [s if c else None for s, c in zip(column, competes, strict=True)], digits
+def of_study(table: StudyTable) -> Table:
+    """Return a table of a study with its digits, directions, best marks and footnotes."""
+    footnotes, width = Footnotes(), len(table.columns)
+    rows = [[*row, *[None] * width][:width] for row in table.rows]
+    controls = [bool(row) and row[0] in table.controls for row in rows]
+    scores = [[v if isinstance(v, Score) else None for v in row] for row in rows]
+    columns = [[row[k] for row in scores] for k in range(width)]
+    digits = [_digits(column) for column in columns]
+    best = [
+        best_by_value(
+            [None if control else s for s, control in zip(column, controls, strict=True)],
+            max(places, default=0),
         )
+        if table.best
+        else set[int]()
+        for column, places in zip(columns, digits, strict=True)
+    ]
+    written: list[Row] = []
+    for r, (row, control) in enumerate(zip(rows, controls, strict=True)):
         cells = [
-            Cell(
-                score,
-                footnotes.numbers(notes_of(score)),
-                "" if shared else size,
-                k in best,
-                score.a == winner,
-                competes[k],
-            )
-            for k, (score, size) in enumerate(zip(column, sizes, strict=True))
+            Cell(v, digits[k][r], r in best[k], footnotes=footnotes.numbers(v.notes))
+            if isinstance(v, Score)
+            else Cell(v)
+            for k, v in enumerate(row)
         ]
-        first = column[0]
-        names = first.measure, measured(first), measured(replace(first, features=""))
-        facts = first.higher_is_better, digits, shared, _made(column)
-        heads.append(Column(*names, *facts, cells))
-    columns(differences)
-    rows = [_difference(score) for score in differences if defined(score)]
-    shared = [fact for fact in heads[0].made if all(fact in h.made for h in heads)] if heads else []
-    heads = [replace(h, made=[fact for fact in h.made if fact not in shared]) for h in heads]
-    return Table(title, question, heads, rows, footnotes.notes, shared)
+        written.append(Row(cells, control, r > 0 and control != controls[r - 1]))
+    compared = table.best or bool(table.controls)
+    heads = [
+        _head(label, [s for s in column if s], compared, empty=not any(row[k] for row in rows))
+        for k, (label, column) in enumerate(zip(table.columns, columns, strict=True))
+    ]
+    made = _made([v for row in rows for v in row if isinstance(v, Score)])
+    return Table(table.title, table.text, heads, written, footnotes.notes, made)
 
 
-def _difference(score: Score) -> Difference:
-    details = score.details
-    return Difference(
-        score,
-        measured(score),
-        ARROWS[score.higher_is_better],
-        details.get("p_better"),
-        details.get("p_adjusted"),
-        digits_of([score]),
-    )
+def _digits(column: Sequence[Score | None]) -> list[int]:
+    """Decimals of each cell: equal ones for the scores of one measure in one column."""
+    alike: dict[tuple[Measure, str], list[Score]] = {}
+    for score in filter(None, column):
+        alike.setdefault((score.measure, score.kind), []).append(score)
+    digits = {key: digits_of(scores) for key, scores in alike.items()}
+    return [digits[s.measure, s.kind] if s else 0 for s in column]
 
 
-def rankings(table: Table) -> list[tuple[str, str]]:
-    """Return (metric, generators from best to worst) where three or more are compared.
+def _head(label: str, scores: Sequence[Score], compared: bool, *, empty: bool) -> Head:
+    """A column's head; one that is empty is among the numbers."""
+    directions = {score.higher_is_better for score in scores}
+    shown = compared and len(directions) == 1 and not re.search("[↑↓→]", label)
+    if not shown or (None in directions and all(s.floor is None for s in scores)):
+        return Head(label, scores=bool(scores) or empty)
+    return Head(label, ARROWS[scores[0].higher_is_better], BETTER[scores[0].higher_is_better], True)
+
+
+def _made(scores: Sequence[Score]) -> list[tuple[str, str]]:
+    """How the scores of a study's table were made, as (what, how)."""
+    sizes = sorted({score.n for score in scores if score.n})
+    degrees: dict[str, list[str]] = {}  # methods that differ in these alone are one
+    for method in (interval_text(s) for s in scores if s.interval):
+        degrees.setdefault(_DEGREES.sub("{}", method), []).extend(_DEGREES.findall(method))
+    facts = {
+        "n": [" to ".join(dict.fromkeys(f"{n:,}" for n in (*sizes[:1], *sizes[-1:])))],
+        "interval": [
+            method.replace("{}", "-".join(dict.fromkeys((min(n, key=float), max(n, key=float)))))
+            if n
+            else method
+            for method, n in degrees.items()
+        ],
+        "estimator": [score.estimator for score in scores],
+        "seed": [str(score.seed) for score in scores if score.seed is not None],
+        "stages": [str(score.details.get("stage", "")) for score in scores],
+    }
+    rows = {what: list(dict.fromkeys(filter(None, how))) for what, how in facts.items()}
+    return [(what, _few(what, how)) for what, how in rows.items() if how]
+
+
+def _few(what: str, words: Sequence[str], most: int = 12) -> str:
+    more = [f"{len(words) - most} more"] * (len(words) > most)
+    return ("; " if what == "interval" else ", ").join([*words[:most], *more])
+
+
+def grid(columns: Sequence[Column], controls: Collection[str] = (), *, full: bool = False) -> Table:
+    """Return columns of scores with a row a subject; the last is of real images.
+
+    The best of a column is marked among those that compete and are no ``controls``. ``full`` adds
+    what is known of each score, rows of baselines, and strips.
+    """
+    footnotes, rows = Footnotes(), list[Row]()
+    best = [column.best(controls) for column in columns]
+    subjects = dict.fromkeys(score.a for column in columns for score in column.scores)
+    for subject in sorted(subjects, key=lambda name: (name == REAL, name in controls)):
+        places = [[k for k, s in enumerate(c.scores) if s.a == subject] for c in columns]
+        control = subject in controls
+        for several in zip_longest(*places):  # where seeds differ
+            cells = [
+                Cell(None) if k is None else _cell(column, k, k in of_column, footnotes, full)
+                for column, k, of_column in zip(columns, several, best, strict=True)
+            ]
+            rule = bool(rows) and control != rows[-1].control
+            rows.append(Row([Cell(subject), *cells], control, rule))
+    floors = [_text(column, column.scores[0].floor) for column in columns]
+    if any(floors):
+        real = rows.pop().cells[1:] if REAL in subjects else [Cell(None)] * len(columns)
+        cells = [
+            Cell(text) if cell.score is None and text else cell
+            for text, cell in zip(floors, real, strict=True)
+        ]
+        rule = bool(rows) and rows[-1].control
+        rows.append(Row([Cell("real images (floor)"), *cells], REAL in controls, rule))
+    for name in BASELINES if full else ():
+        values = (
+            [v for s in c.scores if (v := baselines(s).get(name)) is not None] for c in columns
+        )
+        texts = [_text(c, next(iter(v), None)) for c, v in zip(columns, values, strict=True)]
+        if any(texts):
+            rows.append(Row([Cell(name), *map(Cell, texts)]))
+    heads = [
+        Head(""),
+        *(Head(c.label if full else c.name, c.arrow, c.better, True) for c in columns),
+    ]
+    return Table("The verdict", "", heads, rows, footnotes.notes, strips=full)
+
+
+def _text(column: Column, value: float | None) -> str | None:
+    return None if value is None else number(value, column.digits)
+
+
+def _cell(column: Column, k: int, best: bool, footnotes: Footnotes, full: bool) -> Cell:
+    score, below = column.scores[k], list[str]()
+    if full:
+        p, null = p_text(score.details.get("p_value")), score.null or ()
+        below += [f"p {p}" if p.startswith("<") else f"p = {p}"] * bool(p)
+        below += [f"null {' to '.join(number(v, column.digits) for v in null)}"] * bool(null)
+        below += [size_of(score)] * (not column.size and bool(size_of(score)))
+    numbers = footnotes.numbers(notes_of(score))
+    return Cell(score, column.digits, best, score.a == column.winner, numbers, below)
+
+
+def grids(family: Family) -> list[Table]:
+    """Return the scores of one family with all that is known of them, and their differences."""
+    tables: list[Table] = []
+    if family.columns:
+        words = {"title": family.title, "text": family.question, "made": family.facts}
+        tables.append(replace(grid(family.columns, full=True), **words))
+    return tables + [of_differences(family)] * bool(family.differences)
+
+
+def listing(family: Family) -> Table:
+    """Return the scores of one family, a row each, so that names and notes have room."""
+    footnotes, rows = Footnotes(), list[Row]()
+    for column in family.columns:
+        best, text = column.best(), partial(value_text, digits=column.digits)
+        for k, score in enumerate(column.scores):
+            base = baselines(score)
+            words = [
+                range_text(score.interval, column.digits),
+                range_text(score.null, column.digits),
+                p_text(score.details.get("p_value")),
+                "" if score.floor is None else text(score.floor),
+                *(text(base[name]) if name in base else "" for name in BASELINES),
+                count_text(score.n) if score.n else "",
+            ]
+            value = Cell(text(score.value), best=k in best, decided=score.a == column.winner)
+            names = Cell(f"{column.name} {column.arrow}"), Cell(score.a)
+            notes = Cell(None, footnotes=footnotes.numbers(notes_of(score)))
+            rows.append(Row([*names, value, *map(Cell, words), notes]))
+    numbers = ("value", "95 % interval", "null", "p", "floor", *BASELINES, "n")
+    heads = [Head("metric"), Head("subject"), *(Head(n, scores=True) for n in numbers)]
+    heads.append(Head("notes"))
+    title, text = family.title, family.question
+    return Table(title, text, heads, rows, footnotes.notes, family.facts)
+
+
+def of_differences(family: Family) -> Table:
+    """Return the paired differences of a family, a row each."""
+    footnotes, rows = Footnotes(), list[Row]()
+    for d in family.differences:
+        better, p = d.details.get("p_better"), d.details.get("p_adjusted")
+        words = ["" if better is None else confidence(better), p_text(p)]
+        names = _with_arrow(d), d.a, d.b
+        cell = Cell(d, digits_of([d]), footnotes=footnotes.numbers(notes_of(d)))
+        rows.append(Row([*map(Cell, names), cell, *map(Cell, words)]))
+    labels = ("metric", "a", "b", "a - b", "a better", "Holm p")
+    heads = [Head(label, scores=k > 2) for k, label in enumerate(labels)]
+    text = "a - b; where the interval excludes 0 the difference is more than chance."
+    return Table(f"Paired differences: {family.title}", text, heads, rows, footnotes.notes)
+
+
+def _with_arrow(difference: Score) -> str:
+    return f"{measured(difference)} {ARROWS[difference.higher_is_better]}"
+
+
+def rankings(family: Family) -> Table | None:
+    """Return the generators of each metric from best to worst where three or more are compared.
 
     ``>`` separates neighbors whose paired difference is decided (Holm's p under 0.05), ``~``
     between the others. Metrics without a better direction have no row.
     """
-    of_metric: dict[str, list[Difference]] = {}
-    for d in table.differences:
-        of_metric.setdefault(f"{d.name} {d.arrow}", []).append(d)
-    if not of_metric or max(map(len, of_metric.values())) < 3:
-        return []
-    rows = [(m, _ranking(ds)) for m, ds in of_metric.items()]
-    return [(metric, ranking) for metric, ranking in rows if ranking]
+    by_metric: dict[str, list[Score]] = {}
+    for d in family.differences:
+        by_metric.setdefault(_with_arrow(d), []).append(d)
+    if max(map(len, by_metric.values()), default=0) < 3:
+        return None
+    orders = [(metric, _ranking(each)) for metric, each in by_metric.items()]
+    rows = [Row([Cell(metric), Cell(order)]) for metric, order in orders if order]
+    return Table(RANKED, "", [Head("metric"), Head("best first")], rows) if rows else None
 
 
-def _ranking(differences: Sequence[Difference]) -> str:
-    wins = dict.fromkeys([name for d in differences for name in _pair(d.score)], 0)
-    known = [d for d in differences if d.confidence is not None]
-    for d in known:
-        wins[_pair(d.score)[int((d.confidence or 0) <= 0.5)]] += 1
-    apart = {frozenset(_pair(d.score)) for d in known if d.p is not None and d.p < 0.05}
+def _ranking(differences: Sequence[Score]) -> str:
+    wins = dict.fromkeys([name for d in differences for name in (d.a, d.b or "")], 0)
+    apart: set[frozenset[str]] = set()
+    for d in differences:
+        better, p = d.details.get("p_better"), d.details.get("p_adjusted")
+        if better is not None:
+            wins[d.a if better > 0.5 else d.b or ""] += 1
+            apart |= {frozenset((d.a, d.b or ""))} if p is not None and p < 0.05 else set()
     names = sorted(wins, key=lambda name: -wins[name])
     signs = [">" if frozenset(pair) in apart else "~" for pair in pairwise(names)]
     steps = (f" {sign} {name}" for sign, name in zip(signs, names[1:], strict=True))
-    return names[0] + "".join(steps) if known else ""
+    return names[0] + "".join(steps) if any(wins.values()) else ""
 
 
-def _pair(difference: Score) -> tuple[str, str]:
-    return difference.a, difference.b or ""
+@dataclass(frozen=True)
+class Heat:
+    """A square matrix: D-TMMD's divergences, or confusions; ``shares`` lie in [0, 1]."""
 
-
-def _size(score: Score) -> str:
-    sizes = {"n": score.n or None, "m": score.m}
-    return ", ".join(f"{name} = {value:,}" for name, value in sizes.items() if value is not None)
-
-
-def best_of(column: Sequence[Score], differences: Sequence[Score]) -> str | None:
-    """Return the subject that is better than every other by a decided paired difference, or None.
-
-    Args:
-        column: scores of one metric.
-        differences: paired differences; subjects without one (controls) take no part.
-    """
-    wins: dict[str, bool] = {}
-    for d in differences:
-        if column and d.measure == column[0].measure:
-            for name in _pair(d):
-                won = bool(d.details.get("decided")) and d.details.get("better") == name
-                wins[name] = wins.get(name, True) and won
-    return next((name for name, won in wins.items() if won), None)
-
-
-def best_by_value(column: Sequence[Score | None], digits: int) -> set[int]:
-    """Return the places of the best scores, by the direction of the metric.
-
-    They are compared as written with ``digits``, or with those of the narrowest interval if these
-    are more. None where fewer than two compete. A score does not compete that is None, undefined,
-    or a ratio whose denominators are not known (``unstable-denominators``); without a direction,
-    also one without a floor.
-    """
-    competing = {
-        k: score
-        for k, score in enumerate(column)
-        if score is not None
-        and defined(score)
-        and not (score.higher_is_better is None and score.floor is None)
-        and all(note.code != "unstable-denominators" for note in score.notes)
-    }
-    directions = {score.higher_is_better for score in competing.values()}
-    if len(competing) < 2 or len(directions) > 1:
-        return set()
-    digits = max(digits, digits_of(competing.values(), finest=True))
-    worth: dict[int, float] = {}
-    for k, score in competing.items():
-        written = round(float(score), digits)
-        distance = abs(written - round(score.floor or 0.0, digits))
-        worth[k] = {True: -written, False: written, None: distance}[score.higher_is_better]
-    least = min(worth.values()) + 0.5 * 10**-digits
-    return {k for k, value in worth.items() if value < least}
-
-
-def _made(column: Sequence[Score]) -> list[tuple[str, str]]:
-    """Return how the scores of one column were made, as (what, how)."""
-    first = column[0]
-    intervals = (
-        ", ".join(filter(None, [f"{100 * s.level:g} %", s.interval_method]))
-        for s in column
-        if s.interval is not None
-    )
-    rows = [
-        ("estimator", first.estimator),
-        ("bandwidth σ", f"{first.bandwidth:g}" if first.bandwidth is not None else ""),
-        ("scale", f"× {first.scale:g}" if first.scale != 1 else ""),
-        ("interval", "; ".join(dict.fromkeys(intervals))),
-        ("seed", ", ".join(dict.fromkeys(str(s.seed) for s in column if s.seed is not None))),
-        *((str(k).replace("_", " "), str(plain(v))) for k, v in first.settings.items()),
-        ("encoder", first.encoder or ""),
-        ("reference", first.reference or ""),
-        ("split", first.split or ""),
-    ]
-    return [(what, how) for what, how in rows if how]
+    title: str
+    meaning: str
+    labels: Sequence[str]
+    values: Sequence[Sequence[str]]
+    shares: Sequence[Sequence[float]]
 
 
 def heat_tables(scores: Sequence[Score]) -> list[Heat]:
@@ -519,16 +437,12 @@ def heat_tables(scores: Sequence[Score]) -> list[Heat]:
     return tables
 
 
-def facts_of(table: Table) -> list[tuple[str, str]]:
-    """Return (what, how) the scores were made: what all columns share, then what is of one."""
-    sizes = [(f"{c.name}, size", c.size) for c in table.columns if c.size]
-    single = [(f"{c.name}, {what}", how) for c in table.columns for what, how in c.made]
-    return [*sizes, *table.made, *single]
-
-
-def marks(cells: Iterable[Any], best: str) -> list[str]:
-    """Return what the marks of cells mean, where there are any; ``best`` is how it is marked."""
-    cells = list(cells)
-    known = {f"{best} {BEST}": any(cell.best for cell in cells)}
-    known[f"† {DECIDED}"] = any(cell.decided for cell in cells)
-    return [text for text, shown in known.items() if shown]
+def file_names(kind: str, titles: Sequence[str]) -> list[str]:
+    """Return a name for each file: its kind and title in a short form, and a number if needed."""
+    names: list[str] = []
+    for title in titles:
+        words = re.sub("[^a-z0-9]+", "-", title.lower()).strip("-")[:48].strip("-")
+        name = words if words.startswith(f"{kind}-") else f"{kind}-{words}".strip("-")
+        same = (f"{name}-{k}" for k in count(2))
+        names.append(name if name not in names else next(n for n in same if n not in names))
+    return names

@@ -22,7 +22,7 @@ from scipy import special
 
 from palpate.core import Measure, Score
 from palpate.report.labels import measured
-from palpate.report.notes import number
+from palpate.report.numbers import number
 from palpate.report.study import Claim, StudyTable, Verdict
 from palpate.studies.evidence import ahead, in_words, over_seeds, side_of
 

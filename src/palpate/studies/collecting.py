@@ -13,7 +13,7 @@ from palpate.data.manifest import Manifest
 from palpate.diffusion.generation import Generated
 from palpate.evaluation.probing import results_of
 from palpate.report.labels import measured
-from palpate.report.notes import percent
+from palpate.report.numbers import percent
 from palpate.report.results import Audit, Results
 from palpate.studies.claims import Names, differences_over_seeds, effect_table, paper_claims
 from palpate.studies.controls import FLOOR, NEAREST

@@ -9,9 +9,9 @@ from palpate.core import Measure, Note, Score, rng_for
 from palpate.data.manifest import Manifest
 from palpate.diffusion.generation import Generated
 from palpate.evaluation.controls import BACKGROUND
-from palpate.report.notes import number, percent
+from palpate.report.families import families
+from palpate.report.numbers import number, percent
 from palpate.report.results import GalleryItem, Results
-from palpate.report.tables import score_tables
 from palpate.studies.demo import NEAREST, DemoRun
 from palpate.studies.methods import SHIPPED
 
@@ -67,8 +67,8 @@ def _with_interval(run: DemoRun, score: Score | None) -> str:
     """The score and its interval, rounded as in the tables."""
     if score is None or score.value is None:
         return "undefined"
-    columns = (column for table in score_tables(run.scores) for column in table.columns)
-    digits = next(c.digits for c in columns if any(cell.score is score for cell in c.cells))
+    columns = (column for family in families(run.scores) for column in family.columns)
+    digits = next(c.digits for c in columns if any(s is score for s in c.scores))
     low_high = ", ".join(number(v, digits) for v in score.interval or ())
     return number(score.value, digits) + (f" [{low_high}]" if low_high else "")
 

@@ -17,7 +17,7 @@ from scipy import special
 
 from palpate.core import Note, PalpateError, Score, plain
 from palpate.report.labels import label_of, measured, subject_of
-from palpate.report.notes import digits_of, number
+from palpate.report.numbers import digits_of, number
 
 
 def over_seeds(scores: Sequence[Score]) -> Score:
