@@ -31,7 +31,7 @@ from palpate.diffusion.options import SamplerOptions
 from palpate.diffusion.pipeline import TactilePipeline
 from palpate.encoders.embed import texts_of
 from palpate.encoders.encoder_set import EncoderSet
-from palpate.studies.making import fresh
+from palpate.studies.files import fresh
 
 sys.path.append(str(Path(__file__).parents[1] / "recipes"))
 from mini import COMPUTE, GENERATOR, GENERATOR_ROUNDS, GENERATOR_STEPS, train_round

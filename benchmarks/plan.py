@@ -28,7 +28,7 @@ from palpate.diffusion.autoencoder import BackgroundAutoencoder
 from palpate.diffusion.denoiser import build_unet
 from palpate.diffusion.presets import PAPER
 from palpate.encoders.presets import PAPER as ENCODER
-from palpate.studies.reproduce import nodes_of, plan_of
+from palpate.studies.reproduce import Plan
 from palpate.studies.study import ON_DISK, STUDIES
 
 #: (train samples, test samples): the paper's counts, four fifths of them train.
@@ -98,14 +98,14 @@ def stages() -> dict[str, float]:
     Images are counted in sets of the test part.
     """
     with tempfile.TemporaryDirectory() as empty:
-        plan = plan_of(STUDIES["tag"], preset="paper", root=empty, vq=VQ)
-        nodes = nodes_of(plan)
+        plan = Plan(STUDIES["tag"], preset="paper", root=empty, vq=VQ)
+        nodes = plan.nodes()
     named = lambda start: [n for n in nodes if n.name.startswith(start)]
-    judged = [len(n.inputs["methods"]) + len(n.inputs["controls"]) for n in named("scores-")]
+    controls = len(plan.study.controls)
+    judged = [len(n.options["methods"]) + controls for n in named("scores-")]
     return {
-        "generators": sum(n.inputs["steps"] for n in nodes if "diffusion" in n.inputs)
-        / plan.preset.steps,
-        "sets of images": sum("make" not in n.inputs for n in named("images-")),
+        "generators": float(sum("training" in n.options for n in nodes)),
+        "sets of images": sum("make" not in n.options for n in named("images-")),
         "encoders": len(named("encoder-")),
         "background autoencoders": sum("-vq-" not in n.name for n in named("autoencoder-")),
         "sets of features": sum(judged),

@@ -29,7 +29,7 @@ import argparse
 import math
 import os
 import sys
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -53,8 +53,8 @@ from palpate.encoders.encoder_set import ClipEncoders, EncoderSet, load_clip
 from palpate.encoders.models import SHIPPED, shipped_root
 from palpate.encoders.presets import EncoderPreset, preset
 from palpate.sim import PRESETS, VERSION, WorldOptions, write_world
-from palpate.studies.making import fresh
-from palpate.studies.stages import Run
+from palpate.studies.files import fresh
+from palpate.studies.stages import Stage, run_stage, stored_stage
 from palpate.training.options import Compute
 
 NAME = "palpate/mini"
@@ -142,8 +142,14 @@ class Recipe:
     """The parts, each a stage of a run folder; a finished stage is read, not made again."""
 
     def __init__(self, work: Path) -> None:
-        self.run, self.cache = Run(work, print_line), work / "cache"
+        self.work, self.cache = work, work / "cache"
         self.common: dict[str, Any] = {"cache": self.cache, "progress": self.progress}
+
+    def stage(
+        self, name: str, inputs: Mapping[str, Any], build: Callable[[Path], Mapping[str, Any]]
+    ) -> Stage:
+        """A stage, made if it is not there."""
+        return run_stage(self.work / name, inputs, build, print_line=print_line)
 
     @staticmethod
     def progress(what: str, done: int, total: int, remark: str = "") -> None:
@@ -168,11 +174,11 @@ class Recipe:
             facts = {"frames": record.counts["contact_frames"], "videos": record.counts["videos"]}
             return {"digest": record.digest, **facts}
 
-        stage = self.run.stage(f"world {name}", {"options": WORLDS[name].digest}, build)
+        stage = self.stage(f"world {name}", {"options": WORLDS[name].digest}, build)
         return Manifest.load(stage.folder / "tree")
 
-    def clip(self) -> Path:
-        """Vision and text, by contrast of photos and captions."""
+    def clip(self) -> Stage:
+        """Vision and text, by contrast of photos and captions; in ``clip``."""
         train = self.world("gelsight")
 
         def build(folder: Path) -> Mapping[str, Any]:
@@ -181,7 +187,7 @@ class Recipe:
             return {"vision": clip.digest("vision"), "text": clip.digest("text")}
 
         inputs = {"preset": ENCODER, "epochs": CLIP_EPOCHS, "seed": SEED, "train": train.digest}
-        return self.run.stage("clip", inputs, build).folder / "clip"
+        return self.stage("clip", inputs, build)
 
     def _pair(
         self, train: Manifest, preset: EncoderPreset, folder: Path, epochs: float, **how: Any
@@ -195,13 +201,19 @@ class Recipe:
         how: dict[str, Any] = {"epochs": TACTILE_EPOCHS, "seed": SEED}
 
         def build(folder: Path) -> Mapping[str, Any]:
-            parts = train, everything(train), load_clip(clip), ENCODER, folder / "training"
+            parts = (
+                train,
+                everything(train),
+                load_clip(clip.folder / "clip"),
+                ENCODER,
+                folder / "training",
+            )
             encoders = train_tactile(*parts, **how, **self.common)
             encoders.save(fresh(folder / "encoders"))
             return {"tactile": encoders.digest("tactile"), "text": encoders.digest("text")}
 
-        inputs = {"preset": ENCODER, **how, "clip": self.run.stages["clip"].digest}
-        return EncoderSet.load(self.run.stage("tactile", inputs, build).folder / "encoders")
+        inputs = {"preset": ENCODER, **how, "clip": clip.digest}
+        return EncoderSet.load(self.stage("tactile", inputs, build).folder / "encoders")
 
     def encoders(self) -> EncoderSet:
         """The three encoders; vision goes on with one photo each of many more objects."""
@@ -217,7 +229,7 @@ class Recipe:
 
         inputs = {"preset": VISION, "epochs": VISION_EPOCHS, "seed": SEED, "train": train.digest}
         inputs |= {m: encoders.digest(m) for m in encoders.modalities}
-        return EncoderSet.load(self.run.stage("encoders", inputs, build).folder / "encoders")
+        return EncoderSet.load(self.stage("encoders", inputs, build).folder / "encoders")
 
     def autoencoder(self) -> AnyAutoencoder:
         """The background autoencoder, of tactile images of both looks."""
@@ -236,7 +248,7 @@ class Recipe:
             return {"digest": model.digest}
 
         inputs = {"options": AUTOENCODER, "seed": SEED, "train": digests}
-        stage = self.run.stage("autoencoder", inputs, build)
+        stage = self.stage("autoencoder", inputs, build)
         return load_autoencoder(stage.folder / "autoencoder")
 
     def generator(self) -> TactilePipeline:
@@ -279,7 +291,7 @@ class Recipe:
             return {"digest": pipeline.digest, "train": len(train)}
 
         name = f"generator {number + 1}" if number else "generator"
-        folder = self.run.stage(name, inputs, build).folder
+        folder = self.stage(name, inputs, build).folder
         return TactilePipeline.from_pretrained(folder / "model")
 
     def scores(self) -> dict[str, Any]:
@@ -298,7 +310,7 @@ class Recipe:
             "sampler": GENERATOR.sampler,
             "worlds": [self.world(name).digest for name in WORLDS],
         }
-        stage = self.run.stage("scores", inputs, build)
+        stage = self.stage("scores", inputs, build)
         return read_json(stage.folder / "scores.json", "scores")
 
     def _samples(self) -> dict[str, Manifest]:
@@ -328,9 +340,9 @@ class Recipe:
     def _worlds(self) -> list[dict[str, Any]]:
         rows: list[dict[str, Any]] = []
         for name, o in WORLDS.items():
-            made = self.run.stages[f"world {name}"].facts
+            facts = stored_stage(self.work / f"world {name}").facts
             row = {"world": name, "seed": o.seed, "look": o.look, "version": VERSION}
-            rows.append(row | {key: made[key] for key in ("frames", "videos", "digest")})
+            rows.append(row | {key: facts[key] for key in ("frames", "videos", "digest")})
         return rows
 
     def verify(self) -> int:

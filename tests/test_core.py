@@ -30,7 +30,7 @@ from palpate.core import (
     seed_for,
     to_numpy,
 )
-from palpate.studies.stages import Run
+from palpate.studies.stages import run_stage
 
 PROBLEMS = [Problem("a:1", "bad-line", "x"), Problem("a:2", "bad-line", "y")]
 
@@ -275,13 +275,13 @@ def test_a_stage_is_built_once_and_again_for_other_inputs(tmp_path):
         calls.append(1)
         return {"n": len(calls)}
 
-    first = Run(tmp_path).stage("a", {"k": 1}, build)
-    again = Run(tmp_path).stage("a", {"k": 1}, build)
+    first = run_stage(tmp_path / "a", {"k": 1}, build)
+    again = run_stage(tmp_path / "a", {"k": 1}, build)
     assert (first.facts, again.facts, len(calls)) == ({"n": 1}, {"n": 1}, 1)
-    other = Run(tmp_path).stage("a", {"k": 2}, build)
+    other = run_stage(tmp_path / "a", {"k": 2}, build)
     assert (other.facts, len(calls)) == ({"n": 2}, 2)
     assert other.digest != first.digest
-    Run(tmp_path).stage("a", {"k": 2}, build, read={"b": "0" * 64})
+    run_stage(tmp_path / "a", {"k": 2}, build, read={"b": "0" * 64})
     assert len(calls) == 3
 
 
@@ -289,11 +289,11 @@ def test_a_stage_killed_after_its_mark_has_the_digest_of_its_files(tmp_path):
     def build(folder):
         (folder / "text").write_text("x")
 
-    whole = Run(tmp_path / "whole").stage("a", {}, build)
+    whole = run_stage(tmp_path / "whole" / "a", {}, build)
     record = tmp_path / "whole" / "a" / "stage.json"
     shutil.copytree(whole.folder, tmp_path / "run" / "a.partial")  # killed before it was renamed
     shutil.copy(record, tmp_path / "run" / "a.partial.json")
-    assert Run(tmp_path / "run").stage("a", {}, build).outputs == whole.outputs
+    assert run_stage(tmp_path / "run" / "a", {}, build).outputs == whole.outputs
 
 
 @pytest.mark.parametrize(("inputs", "resumed"), [({"k": 1}, True), ({"k": 2}, False)])
@@ -303,10 +303,10 @@ def test_a_killed_stage_resumes_for_the_same_inputs_only(tmp_path, inputs, resum
         raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        Run(tmp_path).stage("a", {"k": 1}, killed)
+        run_stage(tmp_path / "a", {"k": 1}, killed)
     assert not (tmp_path / "a").exists()
     build = lambda folder: {"resumed": (folder / "checkpoint").exists()}
-    assert Run(tmp_path).stage("a", inputs, build).facts == {"resumed": resumed}
+    assert run_stage(tmp_path / "a", inputs, build).facts == {"resumed": resumed}
 
 
 def test_a_rejected_input_leaves_no_partial_folder(tmp_path):
@@ -314,7 +314,7 @@ def test_a_rejected_input_leaves_no_partial_folder(tmp_path):
         raise PalpateError("a", "b", "c")
 
     with pytest.raises(PalpateError):
-        Run(tmp_path).stage("a", {}, reject)
+        run_stage(tmp_path / "a", {}, reject)
     assert list(tmp_path.iterdir()) == []
 
 

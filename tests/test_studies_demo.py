@@ -6,43 +6,45 @@ import shutil
 import signal
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 from PIL import Image
 
 from palpate.cli import main
+from palpate.core import PalpateError, read_json, write_json
+from palpate.data.importing import import_dataset
+from palpate.diffusion.pipeline import TactilePipeline
+from palpate.encoders import models
+from palpate.encoders.encoder_set import EncoderSet
+from palpate.encoders.models import shipped_folder
 from palpate.report.results import Results
+from palpate.sim import MINI_SEEDS, write_world
+from palpate.studies.demo import PRESETS, Demo
+from palpate.studies.files import require_unseen
+from palpate.studies.reproduce import run_study
 from palpate.studies.verifying import verify
 
 pytestmark = pytest.mark.slow
+DEMO = Demo(preset="tiny", device="cpu")
 
 
-def demo(output: Path, *args: str, kill_at: str | None = None) -> tuple[int, list[str]]:
-    """Run the tiny demo in its own process; ``kill_at`` sends SIGKILL when that stage has begun."""
+def demo(output: Path, *args: str, kill_at: str | None = None) -> list[str]:
+    """The lines of the tiny demo in its own process, killed when the stage ``kill_at`` begins."""
     command = [sys.executable, "-m", "palpate", "demo", "--preset", "tiny", "--output", str(output)]
-    lines: list[str] = []
-    environment = os.environ | {"OMP_NUM_THREADS": "1"}
-    with subprocess.Popen(
-        [*command, *args],
-        stdout=subprocess.DEVNULL,
-        stderr=subprocess.PIPE,
-        text=True,
-        env=environment,
-    ) as process:
-        assert process.stderr is not None
+    lines, environment = [], os.environ | {"OMP_NUM_THREADS": "1"}
+    pipes = {"stdout": subprocess.DEVNULL, "stderr": subprocess.PIPE, "text": True}
+    with subprocess.Popen([*command, *args], **pipes, env=environment) as process:
         for line in process.stderr:
             lines.append(line.strip())
             if kill_at is not None and line.startswith(f"{kill_at}: ..."):
                 process.send_signal(signal.SIGKILL)
-    return process.returncode, lines
-
-
-def finished(output: Path, *args: str) -> list[str]:
-    """The lines of a demo that must succeed."""
-    status, lines = demo(output, *args)
-    assert status == 0, "\n".join(lines)
+    assert process.returncode == (-signal.SIGKILL if kill_at else 0), "\n".join(lines)
     return lines
+
+
+STAGES = ["world", "data", "split", "encoders", "generator", "generated", "scores"]
 
 
 def reused(lines: list[str]) -> set[str]:
@@ -58,7 +60,7 @@ def outcome(run: Path) -> tuple[object, dict[str, bytes]]:
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory) -> Path:
     run = tmp_path_factory.mktemp("whole") / "run"
-    finished(run)
+    demo(run)
     return run
 
 
@@ -108,54 +110,48 @@ def test_the_leak_of_the_world_is_what_the_audit_reports(whole):
     "stage", ["generator", pytest.param("generated", marks=pytest.mark.nightly)]
 )
 def test_a_killed_demo_resumes_from_its_last_finished_stage(whole, tmp_path, stage):
-    run = tmp_path / "run"
-    status, lines = demo(run, kill_at=stage)
-    assert status == -signal.SIGKILL
+    run = shutil.copytree(whole, tmp_path / "run")
+    for name in STAGES[STAGES.index(stage) :]:
+        shutil.rmtree(run / name)
+    demo(run, kill_at=stage)
     assert not (run / stage).exists()
-    assert not (run / "page.html").exists()
-    done = {line.split(":")[0] for line in lines if ": done in" in line}
-    assert "split" in done
-    assert reused(finished(run)) == done
+    assert reused(demo(run)) == {*STAGES[: STAGES.index(stage)]}
     assert outcome(run) == outcome(whole)
 
 
 @pytest.mark.nightly
 def test_a_demo_killed_between_the_last_file_of_a_stage_and_its_mark_resumes(whole, tmp_path):
-    run = tmp_path / "run"
-    finished(run)
-    stages = [p.name for p in run.iterdir() if (p / "stage.json").is_file()]
-    assert len(stages) == 7
-    for name in stages:  # as each stage was just before it was marked as finished
+    run = shutil.copytree(whole, tmp_path / "run")
+    for name in STAGES:  # as each stage was just before it was marked as finished
         record = json.loads((run / name / "stage.json").read_text())
-        inputs = {key: record[key] for key in ("digest", "inputs")}
+        inputs = {key: record[key] for key in ("digest", "inputs", "read")}
         (run / f"{name}.partial.json").write_text(json.dumps(inputs))
         (run / name / "stage.json").unlink()
         (run / name).rename(run / f"{name}.partial")
-    finished(run)
+    demo(run)
     assert not list(run.glob("*.partial"))
     assert outcome(run) == outcome(whole)
 
 
 @pytest.mark.nightly
-def test_a_finished_demo_runs_nothing_again_and_another_seed_does(whole):
-    assert not [line for line in finished(whole) if ": done in" in line]
-    _, lines = demo(whole, "--seed", "1", kill_at="encoders")
-    begun = {line.split(":")[0] for line in lines if ": ..." in line}
-    assert "split" in begun
-    assert "world" not in begun
-    finished(whole)  # as it was, for the tests that follow
+def test_a_finished_demo_runs_nothing_again_and_another_seed_does(whole, tmp_path):
+    run = shutil.copytree(whole, tmp_path / "run")
+    assert reused(demo(run)) == {*STAGES}
+    lines = demo(run, "--seed", "1", kill_at="encoders")
+    assert "split: ..." in lines
+    assert "world" in reused(lines)
 
 
 @pytest.mark.nightly
 def test_images_that_change_in_place_rebuild_everything_that_read_them(tmp_path):
     data, run = tmp_path / "data", tmp_path / "run"
     assert main(["world", "-o", str(data), "--preset", "tiny", "--seed", "5", "-q"]) == 0
-    finished(run, "--data", str(data))
+    demo(run, "--data", str(data))
     for path in data.rglob("*.jpg"):
         with Image.open(path) as image:
             turned = image.rotate(180)
         turned.save(path)
-    assert reused(finished(run, "--data", str(data))) <= {"split"}
+    assert reused(demo(run, "--data", str(data))) <= {"split"}
 
 
 def test_an_encoder_and_a_generator_of_another_split_are_noted(whole, tmp_path, monkeypatch):
@@ -217,9 +213,9 @@ def test_unreadable_photos_stop_generating_unless_skipped(whole, tmp_path):
 
 @pytest.mark.nightly
 def test_real_clips_become_a_page(real_data, tmp_path):
-    finished(tmp_path / "run", "--data", str(real_data / "touch_and_go" / "clips"))
+    demo(tmp_path / "run", "--data", str(real_data / "touch_and_go" / "clips"))
     results = Results.load(tmp_path / "run" / "page.json")
-    assert results.settings["stages"]["data"]["samples"] == 436
+    assert results.settings["facts"]["data"]["samples"] == 436
     assert [a.group for a in results.audits] == ["contact", "video"]
     assert [a.groups_shared > 0 for a in results.audits] == [False, True]
     # Photos of one video are similar, whatever contact they belong to.
@@ -244,3 +240,67 @@ def test_the_page_of_the_demo_opens_cleanly_in_a_browser(whole, chromium):
         assert page.evaluate("document.images.length") > 20
         assert page.evaluate("document.documentElement.scrollWidth <= innerWidth")
         page.close()
+
+
+# --- on shipped models: which stages fall away, what training starts from
+
+
+def test_no_preset_uses_a_world_that_the_shipped_models_saw():
+    assert not {p.world.seed for p in PRESETS.values()} & {*MINI_SEEDS}
+
+
+def test_training_goes_on_from_the_shipped_models(tmp_path, monkeypatch):
+    shutil.copytree(models.shipped_root(), tmp_path / "models")
+    monkeypatch.setattr(models, "shipped_root", lambda: tmp_path / "models")
+    demo = run_study(DEMO, tmp_path / "run")
+    assert [*demo.settings["stages"]] == STAGES
+    encoders = EncoderSet.load(tmp_path / "run" / "encoders" / "encoders")
+    model = TactilePipeline.from_pretrained(tmp_path / "run" / "generator" / "model")
+    ready, shipped = (
+        EncoderSet.load("palpate/mini"),
+        TactilePipeline.from_pretrained("palpate/mini"),
+    )
+    assert encoders.digest("vision") == ready.digest("vision")
+    assert encoders.digest("tactile") != ready.digest("tactile")
+    assert (model.training["start"], model.stats) == (shipped.digest, shipped.stats)
+    assert {s.encoder for s in demo.scores if s.metric == "TMMD"} == {encoders.digest("tactile")}
+    notes = {note.code: note.params for note in demo.notes}
+    assert notes["models-shipped"]["name"] == "palpate/mini"
+    lines: list[str] = []
+    run_study(DEMO, tmp_path / "run", print_line=lines.append)
+    assert all("already done" in line for line in lines)
+    # Other words change nothing; another license changes everything that carries the card.
+    file = shipped_folder("palpate/mini", "clip") / "palpate.json"
+    record = json.loads(file.read_text())
+    for key, stages in {"summary": {*STAGES}, "license": {"world", "data", "split"}}.items():
+        record["card"][key] = "other"
+        file.write_text(json.dumps(record))
+        lines.clear()
+        run_study(DEMO, tmp_path / "run", print_line=lines.append)
+        assert {line.split(":")[0] for line in lines if "already done" in line} == stages
+
+
+def test_a_world_that_the_shipped_models_saw_is_an_error(tmp_path):
+    seen = replace(PRESETS["tiny"].world, seed=MINI_SEEDS[3])
+    write_world(tmp_path / "seen", seen, workers=1)
+    assert read_json(tmp_path / "seen" / "world.json", "world")["seen_by_shipped_models"]
+    words = "must not have been trained on the data"
+    (tmp_path / "link").symlink_to(tmp_path / "seen" / "manifest.parquet")
+    for part in ("seen", "seen/manifest.parquet", "seen/dataset", "link"):
+        with pytest.raises(PalpateError, match=words):
+            run_study(replace(DEMO, data=tmp_path / part), tmp_path / "run")
+    manifest = import_dataset(tmp_path / "seen", tmp_path / "import").manifest
+    (tmp_path / "seen").rename(tmp_path / "gone")
+    with pytest.raises(PalpateError, match=words):
+        require_unseen(tmp_path, manifest.facts)  # a manifest names the seed of its world
+    require_unseen(tmp_path, manifest.facts | {"world_seed": "7"})
+    # The nearest world decides: a new one inside the folder of a seen one is unseen.
+    write_json(tmp_path / "gone" / "new" / "world.json", {"format": "palpate-world/1"})
+    require_unseen(tmp_path / "gone" / "new" / "manifest.parquet")
+
+
+def test_absent_models_are_reported_before_any_work(tmp_path, monkeypatch):
+    monkeypatch.setattr(models, "shipped_root", lambda: tmp_path)
+    with pytest.raises(PalpateError, match="installed package"):
+        run_study(DEMO, tmp_path / "run")
+    assert not list((tmp_path / "run").glob("*"))

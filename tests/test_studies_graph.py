@@ -6,26 +6,24 @@ import signal
 import subprocess
 import sys
 import time
-from functools import partial
 from pathlib import Path
 
 import pytest
 
 from palpate.core import PalpateError, locked
-from palpate.studies.graph import Node, plan_graph, run_graph
+from palpate.studies.graph import Named, Node, plan_graph, run_graph
 
 
-def write(text, folder, before, progress):
+def write(work, *, text):
     """Write the text below those of the nodes before."""
-    texts = [(place / "text").read_text() for place in before.values()]
-    (folder / "text").write_text("".join([*texts, text]))
-    progress("writing", 1, 1)
+    texts = [(folder / "text").read_text() for folder in work.after.values()]
+    (work.folder / "text").write_text("".join([*texts, text]))
+    work.progress("writing", 1, 1)
     return {"text": text, "process": os.getpid()}
 
 
 def node(name, *after, text=None, **fields):
-    text = text or name
-    return Node(name, partial(write, text), {"text": text}, after, **fields)
+    return Node(name, write, {"text": text or name}, after, **fields)
 
 
 def built(lines):
@@ -86,7 +84,7 @@ def test_what_reads_a_stage_is_built_again_where_that_has_other_files(tmp_path, 
     """As of a training on a GPU, whose weights are not the same twice."""
     run_graph(DIAMOND, tmp_path)
     shutil.rmtree(tmp_path / "a")
-    other = Node("a", partial(write, text), {"text": "a"})
+    other = Node("a", write, {"text": Named(text, "a")})
     nodes = [other if n.name == "a" else n for n in DIAMOND]
     lines = []
     run_graph(nodes, tmp_path, jobs=jobs, print_line=lines.append)
@@ -115,7 +113,7 @@ def test_a_graph_that_cannot_be_run(tmp_path, nodes, words):
     assert not (tmp_path / "run").exists()
 
 
-def fail(error, folder, before, progress):
+def fail(work, *, error):
     raise error
 
 
@@ -124,7 +122,7 @@ def fail(error, folder, before, progress):
     "error", [PalpateError("must", "got", "fix", argument="seed"), ZeroDivisionError("bug")]
 )
 def test_an_error_stops_the_run_and_finished_nodes_stay(tmp_path, jobs, error):
-    nodes = [node("a"), Node("b", partial(fail, error), {}, ("a",)), node("c", "b")]
+    nodes = [node("a"), Node("b", fail, {"error": Named(error, "")}, ("a",)), node("c", "b")]
     lines = []
     with pytest.raises(type(error)) as raised:
         run_graph(nodes, tmp_path, jobs=jobs, print_line=lines.append)
@@ -133,7 +131,7 @@ def test_an_error_stops_the_run_and_finished_nodes_stay(tmp_path, jobs, error):
     assert [p.parent.name for p in tmp_path.glob("*/stage.json")] == ["a"]
 
 
-def die(folder, before, progress):
+def die(work):
     os.kill(os.getpid(), signal.SIGKILL)
 
 
@@ -142,20 +140,20 @@ def test_a_process_that_dies_is_one_line(tmp_path):
         run_graph([Node("a", die, {})], tmp_path, jobs=2)
 
 
-def name_process(folder, before, progress):
-    (folder / "process").write_text(str(os.getpid()))
+def name_process(work):
+    (work.folder / "process").write_text(str(os.getpid()))
 
 
-def end_first(folder, before, progress):
+def end_first(work):
     """Kill the process that built ``a`` and now waits."""
-    os.kill(int((folder.parent / "a" / "process").read_text()), signal.SIGKILL)
+    os.kill(int((work.after["a"] / "process").read_text()), signal.SIGKILL)
     time.sleep(0.3)
 
 
 def test_an_idle_process_that_dies_is_one_line(tmp_path):
-    nodes = [Node("b", partial(rest, 1.0), {}), Node("a", name_process, {})]
+    nodes = [Node("b", rest, {"seconds": 1.0}), Node("a", name_process)]
     nodes += [Node("c", end_first, {}, ("b", "a"))]
-    nodes += [Node(n, partial(rest, 0.0), {}, ("c",)) for n in "de"]
+    nodes += [Node(n, rest, {"seconds": 0.0}, ("c",)) for n in "de"]
     with pytest.raises(PalpateError, match=r"must stay alive\. Got one ended with status -9"):
         run_graph(nodes, tmp_path, jobs=2)
 
@@ -171,7 +169,7 @@ def test_torchrun_is_refused(tmp_path, monkeypatch):
         run_graph(DIAMOND, tmp_path)
 
 
-def settings(folder, before, progress):
+def settings(work):
     time.sleep(0.3)  # the other process takes the other node
     return {n: os.environ.get(n) for n in ("CUDA_VISIBLE_DEVICES", "OMP_NUM_THREADS")}
 
@@ -184,7 +182,7 @@ def test_gpus_are_dealt_out_and_threads_are_those_of_one_process(tmp_path, monke
     assert sorted(facts) == [("4", "3"), ("7", "3")]
 
 
-def rest(seconds, folder, before, progress):
+def rest(work, *, seconds):
     time.sleep(seconds)
 
 
@@ -197,12 +195,12 @@ def test_work_within_a_node_is_reported_under_its_name(tmp_path, jobs):
 
 SCRIPT = """
 import sys, time
-from functools import partial
 from pathlib import Path
 from palpate.studies.graph import Node, run_graph
 
-def grow(name, folder, before, progress):
+def grow(work):
     # Lines, one after the other, each of which holds what came before; resumes.
+    folder, name = work.folder, work.stage
     file = folder / "lines"
     lines = file.read_text().splitlines() if file.exists() else []
     (folder.parent / f"{name}.resumed").write_text(str(len(lines)))
@@ -213,7 +211,7 @@ def grow(name, folder, before, progress):
 
 if __name__ == "__main__":
     names = ["a", "b", "c"]
-    nodes = [Node(n, partial(grow, n), {}, ("a",) if n == "c" else ()) for n in names]
+    nodes = [Node(n, grow, {}, ("a",) if n == "c" else ()) for n in names]
     run_graph(nodes, Path(sys.argv[1]), jobs=int(sys.argv[2]))
 """
 

@@ -11,8 +11,8 @@ from palpate.data.manifest import Manifest
 from palpate.diffusion.autoencoders import load_autoencoder
 from palpate.encoders.embed import texts_of
 from palpate.studies import making
-from palpate.studies.methods import METHODS
-from palpate.studies.study import PRESETS
+from palpate.studies.graph import Work
+from palpate.studies.methods import Setting
 
 
 def test_the_stock_gel_is_of_the_train_part(small_manifest, tmp_path):
@@ -20,8 +20,8 @@ def test_the_stock_gel_is_of_the_train_part(small_manifest, tmp_path):
     none = pl.lit(None, pl.String).alias("background")
     manifest = replace(small_manifest, table=small_manifest.table.with_columns(none))
     split = Split({i: "train" if i[1] in "03" else "test" for i in manifest.ids})
-    how = {"size": 32, "progress": lambda *_: None}
-    setting = making.setting_of(manifest, split, tmp_path / "stage", **how)
+    train, test = (manifest.part(split, part) for part in ("train", "test"))
+    setting = Setting(train, test, Work(tmp_path / "stage"), 32)
     stock = np.median(np.asarray(setting.pixels(setting.train)), axis=0).astype(np.uint8)
     gels = np.asarray(setting.pixels(setting.test, "background"))
     assert gels.shape == (len(setting.test), 32, 32, 3)
@@ -46,16 +46,14 @@ class Pipeline:
 
 def test_by_text_each_image_is_that_of_its_sample_s_text(small_manifest, tmp_path, monkeypatch):
     split = Split({i: "train" if i[1] in "03" else "test" for i in small_manifest.ids})
-    monkeypatch.setattr(making, "data_of", lambda after, name: (small_manifest, split))
+    monkeypatch.setattr(making, "data_of", lambda work, name: (small_manifest, split))
     fake = type("Fake", (), {"from_pretrained": lambda folder: Pipeline()})
     monkeypatch.setattr(making, "TactilePipeline", fake)
-    how = {"split": "NoLeak", "method": METHODS["Ours, by text"], "preset": PRESETS["smoke"]}
-    how |= {"generator": "g", "seed": 0, "device": "cpu"}
-    after, place = {"g": tmp_path}, tmp_path / "stage"
-    place.mkdir()
-    facts = making.make_images(place, after, lambda *_: None, **how)
+    work = Work(tmp_path / "stage", {"g": tmp_path}, device="cpu")
+    work.folder.mkdir()
+    facts = making.make_images(work, split="NoLeak", seed=0, generator="g", by_text=True)
     test = small_manifest.part(split, "test")
-    made = Manifest.load(place / "images")
+    made = Manifest.load(work.folder / "images")
     assert facts["images"] == len(test)
     assert made.ids == test.ids
     for path, text in zip(made.paths("tactile"), texts_of(test)[0], strict=True):
@@ -64,10 +62,9 @@ def test_by_text_each_image_is_that_of_its_sample_s_text(small_manifest, tmp_pat
 
 def test_a_given_autoencoder_is_taken_and_measured(small_manifest, tmp_path, monkeypatch):
     split = Split({i: "train" if i[1] in "03" else "test" for i in small_manifest.ids})
-    monkeypatch.setattr(making, "data_of", lambda after, name: (small_manifest, split))
-    where = tmp_path / "stage"
-    how = {"split": "NoLeak", "options": "palpate/mini", "size": 64, "device": "cpu"}
-    facts = making.make_autoencoder(where, {}, lambda *_: None, **how)
+    monkeypatch.setattr(making, "data_of", lambda work, name: (small_manifest, split))
+    work = Work(tmp_path / "stage", device="cpu")
+    facts = making.make_autoencoder(work, split="NoLeak", options="palpate/mini", size=64)
     given = load_autoencoder("palpate/mini")
-    assert facts["digest"] == given.digest == load_autoencoder(where / "autoencoder").digest
+    assert facts["digest"] == given.digest == load_autoencoder(work.folder / "autoencoder").digest
     assert facts["ceiling"]["psnr"] > 10

@@ -4,12 +4,14 @@ import json
 import shutil
 from dataclasses import replace
 from functools import partial
-from itertools import combinations
+from itertools import combinations, product
 
 import numpy as np
 import polars as pl
 import pytest
 
+from forge.commands import call
+from forge.studies import TINY
 from palpate.cli import main
 from palpate.core import FeatureSet, Measure, PalpateError, Score, Split, digest_file
 from palpate.core.digest import canonical_json
@@ -18,14 +20,23 @@ from palpate.preference.scoring import PREFERENCE, STRENGTH
 from palpate.report.results import Results
 from palpate.sim import WorldOptions
 from palpate.sim.presets import MINI_SEEDS
-from palpate.studies import collecting, controls, demo, judging, reproduce
-from palpate.studies.controls import CONTROLS, FLOOR, NEAREST
-from palpate.studies.graph import in_order
-from palpate.studies.making import slug
-from palpate.studies.methods import METHODS, OURS, Method, Setting
-from palpate.studies.reproduce import nodes_of, plan_of
-from palpate.studies.stages import stage_digest
-from palpate.studies.study import NOLEAK, ORIG, STUDIES, Study
+from palpate.studies import collecting, controls, files, judging, reproduce
+from palpate.studies.controls import CONTROLS
+from palpate.studies.graph import Work, digests_of
+from palpate.studies.methods import METHODS, Method, Setting
+from palpate.studies.names import (
+    FLOOR,
+    HALF_PROBES,
+    HALVES,
+    NEAREST,
+    NOLEAK,
+    ORIG,
+    OURS,
+    SPLITS,
+    slug,
+)
+from palpate.studies.reproduce import Plan
+from palpate.studies.study import STUDIES, Study
 from palpate.studies.study_tables import Scores, study_tables
 from palpate.studies.verifying import verify
 
@@ -49,7 +60,7 @@ def test_compared_methods_differ_in_what_their_row_says():
             assert replace(other, condition=made[OURS].condition) == made[OURS]
 
 
-def test_no_shipped_model_has_seen_the_worlds():
+def test_no_shipped_model_has_seen_the_worlds_and_another_study_has_another_name():
     for study in STUDIES.values():
         for preset in study.presets.values():
             if study.world is not None:
@@ -57,12 +68,14 @@ def test_no_shipped_model_has_seen_the_worlds():
                 assert isinstance(world, WorldOptions)
                 assert world.seed not in MINI_SEEDS
     seen = replace(WORLD, name="seen", world={**(WORLD.world or {}), "seed": MINI_SEEDS[0]})
-    with pytest.raises(PalpateError, match="must be one that no shipped model saw"):
-        plan_of(seen)
+    other = replace(WORLD, methods=WORLD.methods[:1])
+    for study, words in ((seen, "one that no shipped model saw"), (other, "a name of its own")):
+        with pytest.raises(PalpateError, match=words):
+            Plan(study)
 
 
 def test_nodes_train_once_for_each_split_and_seed():
-    nodes = {n.name: n for n in nodes_of(plan_of(WORLD, preset="smoke", seeds=(0, 1)))}
+    nodes = {n.name: n for n in Plan(WORLD, preset="smoke", seeds=(0, 1)).nodes()}
     for seed, split in ((s, p) for s in (0, 1) for p in (ORIG, NOLEAK)):
         assert {f"encoder-{split}-{seed}", f"ours-{split}-{seed}"} <= {*nodes}
         for judge in (ORIG, NOLEAK):  # both encoders judge both generators
@@ -72,28 +85,24 @@ def test_nodes_train_once_for_each_split_and_seed():
     assert "ours-by-text-NoLeak-0" not in nodes
     assert "ours-NoLeak-0" in nodes["images-ours-by-text-NoLeak-0"].after
     judged = nodes["scores-NoLeak-by-NoLeak-1"]
-    assert {*judged.inputs["methods"]} == {*METHODS}
-    assert judged.inputs["controls"] == [*CONTROLS]
+    assert {*judged.options["methods"]} == {*METHODS}
+    assert judged.options["study"].name["controls"] == [*CONTROLS]
 
 
 def test_another_seed_leaves_the_nodes_of_the_first(tmp_path):
     one, two = (
-        {n.name: (n.inputs, n.after, n.version) for n in nodes_of(plan_of(WORLD, seeds=seeds))}
+        {n.name: (n.options, n.after, n.version) for n in Plan(WORLD, seeds=seeds).nodes()}
         for seeds in ((0,), (0, 1))
     )
     changed = {name for name in one if one[name] != two[name]}
     assert changed == {"results", "utility"}
-    read = {n.name: n for n in nodes_of(plan_of(WORLD, seeds=(0, 1)))}["utility"].after
+    read = {n.name: n for n in Plan(WORLD, seeds=(0, 1)).nodes()}["utility"].after
     assert {"images-ours-NoLeak-0", "images-ours-NoLeak-1"} <= {*read}
 
 
 def digests(study, **options):
     """Name -> digest of what the stage reads."""
-    read = {}
-    for n in in_order(nodes_of(plan_of(study, preset="smoke", **options))):
-        inputs = {**n.inputs, "after": {name: read[name] for name in n.after}}
-        read[n.name] = stage_digest(n.name, inputs, n.version)
-    return read
+    return digests_of(Plan(study, preset="smoke", **options).nodes())
 
 
 def test_other_weights_under_one_name_build_what_reads_them(tmp_path):
@@ -111,9 +120,9 @@ def test_other_weights_under_one_name_build_what_reads_them(tmp_path):
 
 
 def test_other_shipped_weights_build_what_reads_them(monkeypatch):
-    before, known = digests(WORLD), reproduce.model_stamp
+    before, stamp = digests(WORLD), reproduce.model_stamp
     monkeypatch.setattr(
-        reproduce, "model_stamp", lambda p, s: known(p, s) if p == "clip" else f"other {p}"
+        reproduce, "model_stamp", lambda p, s: stamp(p, s) if p == "clip" else f"other {p}"
     )
     after = digests(WORLD)
     trained = [n for n in before if n.startswith(("encoder", "ours", "gvst", "images-ours"))]
@@ -125,7 +134,7 @@ def test_other_shipped_weights_build_what_reads_them(monkeypatch):
 def test_the_words_of_a_card_build_nothing_again(monkeypatch, tmp_path, part):
     before = reproduce.model_stamp(part, "palpate/mini")
     record = json.loads((shipped_folder("palpate/mini", part) / "palpate.json").read_text())
-    monkeypatch.setattr(demo, "shipped_folder", lambda *_: tmp_path)
+    monkeypatch.setattr(files, "shipped_folder", lambda *_: tmp_path)
 
     def stamp(record):
         (tmp_path / "palpate.json").write_text(json.dumps(record))
@@ -141,25 +150,21 @@ def test_the_words_of_a_card_build_nothing_again(monkeypatch, tmp_path, part):
 @pytest.mark.parametrize("name", ["world-gelsight", "world-digit"])
 def test_what_a_stage_reads_is_the_same_from_its_record(name):
     """Keys of JSON are words: a number as a key would come back as another digest."""
-    for node in nodes_of(plan_of(STUDIES[name], seeds=(0, 1))):
-        written = canonical_json(node.inputs)
+    nodes = Plan(STUDIES[name], seeds=(0, 1)).nodes()
+    for node in nodes:
+        written = canonical_json(node.inputs(digests_of(nodes)))
         assert canonical_json(json.loads(written)) == written, node.name
 
 
-def test_the_size_of_the_paper_needs_its_autoencoder(tmp_path):
-    tag = STUDIES["tag"]
-    with pytest.raises(PalpateError, match="must be given for preset paper"):
-        plan_of(tag, preset="paper", root=tmp_path)
-    with pytest.raises(PalpateError, match="must be at least 4"):
-        plan_of(tag, preset="mini", root=tmp_path, steps=3)
-    file = tmp_path / "vq-f4.ckpt"
+def test_the_size_of_the_paper_takes_its_autoencoder(tmp_path):
+    tag, file = STUDIES["tag"], tmp_path / "vq-f4.ckpt"
     file.write_bytes(b"weights")
     made = {}
     for preset in ("paper", "mini"):
-        plan = plan_of(tag, preset=preset, root=tmp_path, vq=file, steps=400)
-        made[preset] = {n.name: n for n in nodes_of(plan)}
-        assert made[preset]["autoencoder-vq-NoLeak"].inputs["options"] == digest_file(file)
-        assert made[preset]["ours-vq-NoLeak-0"].inputs["steps"] == 400
+        plan = Plan(tag, preset=preset, root=tmp_path, vq=file, steps=400)
+        made[preset] = {n.name: n for n in plan.nodes()}
+        assert made[preset]["autoencoder-vq-NoLeak"].options["options"].name == digest_file(file)
+        assert made[preset]["ours-vq-NoLeak-0"].options["training"].steps == 400
     assert made["paper"].keys() == made["mini"].keys()
 
 
@@ -182,61 +187,55 @@ def test_a_function_without_source_or_with_values_of_another_is_refused(make):
 def test_a_method_of_your_own_trains_nothing():
     mine = Method("mine", "", make=controls.mean_image)
     study = replace(WORLD, name="mine", methods=[METHODS[OURS], mine])
-    nodes = {n.name: n for n in nodes_of(plan_of(study, preset="smoke"))}
+    nodes = {n.name: n for n in Plan(study, preset="smoke").nodes()}
     assert "images-mine-NoLeak-0" in nodes
     assert "mine-NoLeak-0" not in nodes
-    assert "mine" in nodes["scores-NoLeak-by-NoLeak-0"].inputs["methods"]
+    assert "mine" in nodes["scores-NoLeak-by-NoLeak-0"].options["methods"]
 
 
 def test_a_dry_run_writes_nothing(tmp_path, capsys):
     run = tmp_path / "run"
-    assert main(["reproduce", "world-digit", "-o", str(run), "--dry-run", "--json"]) == 0
-    stages = json.loads(capsys.readouterr().out)["stages"]
+    _, out, _ = call(capsys, "reproduce", "world-digit", "-o", run, "--dry-run", "--json")
+    stages = json.loads(out)["stages"]
     assert not run.exists()
     assert [*stages][:2] == ["world", "data"]
     assert [*stages][-1] == "results"
     assert not any(stages.values())
 
 
-def test_a_human_study_must_be_one(tmp_path):
-    Results("t", scores=[Score("TMMD", "Ours", 0.1)]).save(tmp_path / "scores.json")
-    with pytest.raises(PalpateError, match="must hold scores of palpate preference score"):
-        plan_of(WORLD, people=tmp_path / "scores.json")
-
-
 @pytest.mark.parametrize(
     ("args", "words"),
     [
-        (["world-gelsigt", "-o", "r"], "study"),
-        (["world-gelsight", "-o", "r", "--preset", "huge"], "--preset must be one of smoke, mini"),
-        (["world-gelsight", "-o", "r", "--seeds", "1", "1"], "--seeds must hold"),
-        (["world-gelsight", "-o", "r", "--root", "x"], "--root must be left out"),
-        (["world-gelsight", "-o", "r", "--method", "dir"], "--method must be NAME=FOLDER"),
-        (["world-gelsight", "-o", "r", "--method", "a=dir"], "a must be a folder of images"),
-        (["world-gelsight", "-o", "r", "--method", "GVST=dir"], "a name of its own"),
+        (["world-gelsigt"], "study"),
+        (["world-gelsight", "--preset", "huge"], "--preset must be one of smoke, mini"),
+        (["world-gelsight", "--seeds", "1", "1"], "--seeds must hold"),
+        (["world-gelsight", "--root", "x"], "--root must be left out"),
+        (["tag"], "--root must be given for the study tag"),
+        (["tag", "--root", "x"], "--root must exist"),
+        (["tag", "--root", ".", "--preset", "paper"], "--vq must be given for preset paper"),
+        (["tag", "--root", ".", "--steps", "3"], "--steps must be at least 4"),
+        (
+            ["world-gelsight", "--people", "s.json"],
+            "--people must hold scores of palpate preference",
+        ),
+        (["world-gelsight", "--method", "dir"], "--method must be NAME=FOLDER"),
+        (["world-gelsight", "--method", "a=dir"], "a must be a folder of images"),
+        (["world-gelsight", "--method", "GVST=dir"], "a name of its own"),
     ],
 )
 def test_mistakes_are_reported_in_one_line(args, words, capsys, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    assert main(["reproduce", *args]) == 2
-    lines = capsys.readouterr().err.splitlines()
-    assert words in lines[0]
+    Results("t", scores=[Score("TMMD", "Ours", 0.1)]).save(tmp_path / "s.json")
+    status, _, lines = call(capsys, "reproduce", *args, "-o", "r")
+    assert status == 2
+    assert words in lines.splitlines()[0]
     assert not (tmp_path / "r").exists()
 
 
-def test_another_study_has_another_name():
-    with pytest.raises(PalpateError, match="must have a name of its own"):
-        plan_of(replace(WORLD, methods=WORLD.methods[:1]))
-
-
-def test_a_study_on_disk_needs_a_root(small_manifest, tmp_path):
-    study = Study("mine", "Mine", (1, 3, 4))
-    with pytest.raises(PalpateError, match="must be given for the study mine"):
-        plan_of(study)
+def test_a_study_on_disk_makes_no_world(small_manifest, tmp_path):
     small_manifest.save(tmp_path / "data" / "manifest.parquet")
-    names = [n.name for n in nodes_of(plan_of(study, root=tmp_path / "data"))]
-    assert "world" not in names
-    assert names[0] == "data"
+    nodes = Plan(Study("mine", "Mine", (1, 3, 4)), root=tmp_path / "data").nodes()
+    assert (nodes[0].name, "world" in {n.name for n in nodes}) == ("data", False)
 
 
 @pytest.fixture
@@ -244,7 +243,7 @@ def setting(small_manifest, tmp_path):
     """A train and a test video of each of three materials."""
     split = Split({i: "train" if i < "v3" else "test" for i in small_manifest.ids})
     train, test = (small_manifest.part(split, part) for part in ("train", "test"))
-    return Setting(train, test, 32, 0, 1, "palpate/mini", tmp_path / "cache", tmp_path)
+    return Setting(train, test, Work(tmp_path, cache=tmp_path / "cache"), 32, 0, 1, "palpate/mini")
 
 
 def rows_of(setting, images):
@@ -257,20 +256,19 @@ def columns_of(setting, rows, name):
     return np.array(setting.train.column(name))[rows], np.array(setting.test.column(name))
 
 
-def test_the_floor_is_of_other_videos_of_the_material(setting):
-    rows = rows_of(setting, controls.other_videos(setting))
-    material, wanted = columns_of(setting, rows, "material")
-    video, own = columns_of(setting, rows, "video")
-    assert (material == wanted).all()
+def of_whole_videos(setting, images):
+    """Materials of these images and of the test samples; whole videos stand for whole videos."""
+    rows = rows_of(setting, images)
+    video, own = np.array(setting.train.column("video"))[rows], setting.test.column("video")
     assert len({*zip(video, own, strict=True)}) == len({*own}) == 3
+    return np.array(setting.train.column("material"))[rows], setting.test.column("material")
 
 
-def test_a_wrong_material_is_never_right(setting):
-    rows = rows_of(setting, controls.wrong_material(setting))
-    material, wanted = columns_of(setting, rows, "material")
-    assert (material != wanted).all()
-    video, own = columns_of(setting, rows, "video")
-    assert len({*zip(video, own, strict=True)}) == len({*own}) == 3  # whole videos
+def test_the_floor_is_of_other_videos_of_the_material_and_a_wrong_one_never_right(setting):
+    material, own = of_whole_videos(setting, controls.other_videos(setting))
+    assert (material == own).all()
+    material, own = of_whole_videos(setting, controls.wrong_material(setting))
+    assert (material != own).all()
 
 
 def with_materials(setting, train, test):
@@ -300,21 +298,17 @@ def test_controls_use_the_material_of_an_image_and_known_ones_alone(setting):
 
 
 def test_without_materials_none_is_wrong(setting):
-    none = pl.lit(None, pl.String).alias("material")
-    parts = (setting.train, setting.test)
-    train, test = (replace(p, table=p.table.with_columns(none)) for p in parts)
-    bare = replace(setting, train=train, test=test)
+    bare = with_materials(setting, [None] * len(setting.train), [None] * len(setting.test))
     assert controls.wrong_material(bare) is None
-    video, own = columns_of(bare, rows_of(bare, controls.other_videos(bare)), "video")
-    assert len({*zip(video, own, strict=True)}) == len({*own}) == 3
+    of_whole_videos(bare, controls.other_videos(bare))
 
 
 def test_a_memorized_video_is_one_a_material(setting):
-    rows = rows_of(setting, controls.memorized(setting))
-    material, wanted = columns_of(setting, rows, "material")
-    video, _ = columns_of(setting, rows, "video")
-    assert (material == wanted).all()
-    assert len({*video}) == len({*wanted}) == 3
+    rows, own = rows_of(setting, controls.memorized(setting)), setting.test.column("material")
+    columns = (np.array(setting.train.column(name))[rows] for name in ("material", "video"))
+    material, video = columns
+    assert (material == own).all()
+    assert len({*video}) == len({*own}) == 3
 
 
 def test_constant_controls(setting):
@@ -369,20 +363,13 @@ def test_cells_are_means_over_seeds_that_name_their_stages():
 
 
 def test_tables_hold_methods_controls_and_both_judges():
-    values = {
-        (s, j): 1.0 + 10 * a + b
-        for a, s in enumerate((ORIG, NOLEAK))
-        for b, j in enumerate((ORIG, NOLEAK))
-    }
+    values = {pair: 1.0 + k for k, pair in enumerate(product(SPLITS, SPLITS))}
     metrics = ("SSIM", "TMMD", "I-TMMD", "CI-TMMD", "D-TMMD")
     subjects = (OURS, "GVST", "other", FLOOR, NEAREST)
+    half = forged(HALF_PROBES, "material accuracy", 0.5)
     judged = {
         pair: Scores.over_seeds(
-            [
-                [forged(judging.HALF_PROBES, "material accuracy", 0.5)]
-                + [forged(n, m, v) for n in subjects for m in metrics]
-            ],
-            "results",
+            [[half, *(forged(n, m, v) for n in subjects for m in metrics)]], "results"
         )
         for pair, v in values.items()
     }
@@ -396,11 +383,11 @@ def test_tables_hold_methods_controls_and_both_judges():
         for judge in (ORIG, NOLEAK):
             for name in (OURS, FLOOR):
                 assert cells[f"{name}, {split}", judge][3].value == values[split, judge]
-    listed = [OURS, "GVST", "other", FLOOR, NEAREST, judging.HALF_PROBES]
+    listed = [OURS, "GVST", "other", FLOOR, NEAREST, HALF_PROBES]
     assert [row[0] for row in three.rows] == listed
-    assert not [row for row in one.rows if str(row[0]).startswith(judging.HALF_PROBES)]
+    assert not [row for row in one.rows if str(row[0]).startswith(HALF_PROBES)]
     assert [row[0] for row in four.rows] == [OURS, "GVST", "other", FLOOR, NEAREST]
-    assert three.controls == [FLOOR, NEAREST, judging.HALF_PROBES]
+    assert three.controls == [FLOOR, NEAREST, HALF_PROBES]
     assert three.columns[:2] == ["images", "SSIM"]
     assert "All methods but other are trained from random weights" in three.text
     for table in (one, three, four):
@@ -408,12 +395,13 @@ def test_tables_hold_methods_controls_and_both_judges():
         assert not any("paper" in str(row[0]) for row in table.rows)
 
 
+def judgments(*scores):
+    """The same scores by every encoder of the images of both splits."""
+    return {pair: Scores.over_seeds([scores], "results") for pair in product(SPLITS, SPLITS)}
+
+
 def test_people_are_columns_of_table_three():
-    judged = {
-        (s, j): Scores.over_seeds([[forged(n, "TMMD", 1.0) for n in (OURS, "GVST")]], "results")
-        for s in (ORIG, NOLEAK)
-        for j in (ORIG, NOLEAK)
-    }
+    judged = judgments(forged(OURS, "TMMD", 1.0), forged("GVST", "TMMD", 1.0))
     votes = [forged(n, m, 0.7) for m in (PREFERENCE, STRENGTH) for n in (OURS, "theirs")]
     votes.append(forged(OURS, "human accuracy of material", 0.4))
     how = {"methods": [OURS, "GVST"], "controls": [], "people": votes}
@@ -426,41 +414,22 @@ def test_people_are_columns_of_table_three():
     assert study_tables(WORLD, judged, [], **how)[1].columns == ["images", "TMMD"]
 
 
-def test_the_papers_numbers_stand_beside_its_own_data_alone():
-    judged = {
-        (s, j): Scores.over_seeds(
-            [[forged(OURS, "TMMD", 1.0), forged(OURS, "SSIM", 0.5)]], "results"
-        )
-        for s in (ORIG, NOLEAK)
-        for j in (ORIG, NOLEAK)
-    }
-    study = replace(WORLD, paper=True)
-    one, three, four = study_tables(study, judged, [], methods=[OURS], controls=[])
-    assert {row[0]: row[3] for row in one.rows}["paper, NoLeak"] == "1.37"
-    assert {row[0]: row[1] for row in three.rows}["paper, Ours w/ BG"] == "0.54"
-    assert {row[0]: row[1] for row in four.rows}["paper, GVST"] == "1.98"
-    digit = replace(STUDIES["world-digit"], paper=True)
-    assert {
-        r[0]: r[1] for r in study_tables(digit, judged, [], methods=[OURS], controls=[])[1].rows
-    }["paper, GVST"] == "2.67"
-
-
-def test_the_papers_numbers_are_of_its_own_metrics_alone():
+def test_the_papers_numbers_stand_beside_its_own_data_and_metrics_alone():
     """FID of another network is not the paper's FID."""
     networks = ("Inception", "palpate/mini vision")
-    scores = [forged(OURS, "SSIM", 1.0)]
-    scores += [forged(OURS, "FID", 1.0, features=network) for network in networks]
-    judged = {
-        (s, j): Scores.over_seeds([scores], "results")
-        for s in (ORIG, NOLEAK)
-        for j in (ORIG, NOLEAK)
-    }
-    study = replace(WORLD, paper=True)
-    three = study_tables(study, judged, [], methods=[OURS], controls=[])[1]
-    [printed] = [row for row in three.rows if row[0] == "paper, Ours"]
-    cells = dict(zip(three.columns, printed, strict=True))
+    scores = [forged(OURS, metric, 1.0) for metric in ("SSIM", "TMMD")]
+    judged = judgments(*scores, *(forged(OURS, "FID", 1.0, features=n) for n in networks))
+    study, digit = (replace(STUDIES[n], paper=True) for n in ("world-gelsight", "world-digit"))
+    one, three, four = study_tables(study, judged, [], methods=[OURS], controls=[])
+    by_name = [{row[0]: row for row in table.rows} for table in (one, three, four)]
+    assert by_name[0]["paper, NoLeak"][3] == "1.37"
+    assert by_name[1]["paper, Ours w/ BG"][1] == "0.54"
+    assert by_name[2]["paper, GVST"][1] == "1.98"
+    cells = dict(zip(three.columns, by_name[1]["paper, Ours"], strict=True))
     assert (cells["SSIM"], cells["FID (Inception)"]) == ("0.49", "43.9")
     assert cells["FID (palpate/mini vision)"] is None
+    hct = study_tables(digit, judged, [], methods=[OURS], controls=[])[1]
+    assert {row[0]: row[1] for row in hct.rows}["paper, GVST"] == "2.67"
 
 
 def test_differences_that_are_stored_are_of_a_method_and_not_of_e():
@@ -488,13 +457,14 @@ def test_half_probes_name_train_images_beside_the_real_ones_of_labeled_samples()
     split = Split.from_ids(train=ids, test=videos, rule={}, manifest="m" * 64)
     near, of_real = judging._cross_fitted(train, images, real, rows, split)
     assert (near.a, near.value, near.n) == (NEAREST, 0.75, 4)
-    assert (of_real.a, of_real.value, of_real.n) == (judging.HALF_PROBES, 1, 4)
+    assert (of_real.a, of_real.value, of_real.n) == (HALF_PROBES, 1, 4)
 
 
 @pytest.mark.slow
-def test_the_study_at_smoke(tmp_path):
+def test_a_study_from_its_command_to_its_page(tmp_path, monkeypatch):
     """Every table, method and control; other people's images; running again builds nothing."""
-    run, command = tmp_path / "run", ["reproduce", "world-gelsight", "--preset", "smoke", "-q"]
+    monkeypatch.setitem(STUDIES, WORLD.name, replace(WORLD, presets={"smoke": TINY}))
+    run, command = tmp_path / "run", ["reproduce", WORLD.name, "--preset", "smoke", "-q"]
     assert main([*command, "-o", str(run)]) == 0
     for name in ("results.json", "page.html", "page.md", "tables.tex"):
         assert (run / name).stat().st_size > 0, name
@@ -504,7 +474,7 @@ def test_the_study_at_smoke(tmp_path):
     assert "Material accuracy by training data" in {table.title for table in results.tables}
     assert "beyond the paper" in {claim.source for claim in results.claims}
     rows = [row[0] for row in results.tables[1].rows]
-    assert {*METHODS, *CONTROLS, controls.HALVES, judging.HALF_PROBES} == {*rows}
+    assert {*METHODS, *CONTROLS, HALVES, HALF_PROBES} == {*rows}
     assert len(results.audits) == 2
     assert results.audits[1].leaked_fraction == 0 < results.audits[0].leaked_fraction
     assert results.claims

@@ -21,12 +21,12 @@ from palpate.core import PalpateError, Score, Split, digest_file, digest_json, s
 from palpate.evaluation.companions import Weights
 from palpate.report.results import Results
 from palpate.report.study import Claim, StudyTable
-from palpate.studies.graph import in_order
-from palpate.studies.judging import read_scores
+from palpate.studies.files import read_scores
+from palpate.studies.graph import digests_of, in_order
 from palpate.studies.methods import OURS
-from palpate.studies.reproduce import nodes_of, plan_of, run_study
-from palpate.studies.stages import stage_digest
-from palpate.studies.study import SPLITS, STUDIES
+from palpate.studies.names import SPLITS
+from palpate.studies.reproduce import Plan, run_study
+from palpate.studies.study import STUDIES
 
 GOLDEN = Path(__file__).parent / "golden" / "study_stages.json"
 #: What holds no times.
@@ -35,10 +35,10 @@ KEPT = ("*.png", "*.safetensors", "*.npz", "*.parquet", "scores.json", "results.
 
 def kind_of(node) -> str:
     """What builds a node: ``make_encoders`` for that of every split and seed."""
-    return getattr(node.build, "func", node.build).__name__
+    return node.call.__name__
 
 
-NODES = in_order(nodes_of(small_study.plan()))
+NODES = in_order(small_study.plan().nodes())
 KINDS = list(dict.fromkeys(map(kind_of, NODES)))
 
 
@@ -60,10 +60,9 @@ def differing(run, other):
 
 def digests(study: str, preset: str) -> dict[str, str]:
     """Kind of stage -> digest over what each of them reads."""
-    read, of_kind = {}, {}
-    for node in in_order(nodes_of(plan_of(STUDIES[study], preset=preset))):
-        inputs = {**node.inputs, "after": {name: read[name] for name in node.after}}
-        read[node.name] = stage_digest(node.name, inputs, node.version)
+    nodes, of_kind = Plan(STUDIES[study], preset=preset).nodes(), {}
+    read = digests_of(nodes)
+    for node in in_order(nodes):
         of_kind.setdefault(kind_of(node), []).append(read[node.name])
     return {kind: short(digest_json(values)) for kind, values in of_kind.items()}
 
@@ -110,13 +109,12 @@ def inception(path, seed=0):
 
 def test_published_weights_are_read_by_what_judges_alone(tmp_path):
     def read(**weights):
-        plan = plan_of(small_study.STUDY, preset="tiny", weights=Weights(**weights))
-        return {n.name: stage_digest(n.name, n.inputs, n.version) for n in nodes_of(plan)}
+        return digests_of(Plan(small_study.STUDY, "tiny", weights=Weights(**weights)).nodes())
 
     file, other = inception(tmp_path / "a.pt"), inception(tmp_path / "b.pt", seed=1)
     none, one, two = read(), read(inception=file), read(inception=other)
     judges = {name for name in none if name.startswith("scores-")}
-    assert {name for name in none if none[name] != one[name]} == judges
+    assert {name for name in none if none[name] != one[name]} == judges | {"results"}
     assert all(one[name] != two[name] for name in judges)
     assert read(lpips=(file, other)) != read(lpips=(other, file)) != none
     assert read(clip="openai/clip") != none

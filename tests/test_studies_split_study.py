@@ -132,7 +132,7 @@ def test_a_study_needs_seeds_and_either_encoders_or_training(data, tmp_path, cap
     with pytest.raises(PalpateError, match="`seeds` must hold at least one"):
         compare_splits(data, ["orig.json"], work="run", seeds=(0, 0))
     monkeypatch.setenv("WORLD_SIZE", "2")
-    with pytest.raises(PalpateError, match="must run in one process"):
+    with pytest.raises(PalpateError, match="must be begun by one process"):
         compare_splits(data, ["orig.json"], work="run")
     monkeypatch.delenv("WORLD_SIZE")
     assert main(["probe", "tag", "--split", "orig.json"]) == 2

@@ -11,7 +11,8 @@ from palpate.core import FeatureSet, PalpateError, Score
 from palpate.report.results import Results
 from palpate.report.study import StudyTable
 from palpate.studies import utility as utility_module
-from palpate.studies.controls import CEILING, NEAREST
+from palpate.studies.graph import Work
+from palpate.studies.names import CEILING, NEAREST
 from palpate.studies.utility import (
     GAIN,
     REAL,
@@ -297,7 +298,7 @@ def test_whether_images_help_is_decided_by_all_seeds(tmp_path, monkeypatch, gain
         return table_of(gain, gain)
 
     monkeypatch.setattr(utility_module, "utility", forged)
-    monkeypatch.setattr(utility_module, "data_of", lambda after, name: (None, None))
+    monkeypatch.setattr(utility_module, "data_of", lambda work: (None, None))
     load = SimpleNamespace(load=lambda folder, device: folder)
     monkeypatch.setattr(utility_module, "EncoderSet", load)
     runs = {f"encoder-{k}": {"Ours": f"images-{k}"} for k in range(len(gains))}
@@ -305,8 +306,8 @@ def test_whether_images_help_is_decided_by_all_seeds(tmp_path, monkeypatch, gain
     names.append("controls-NoLeak")
     after = {name: tmp_path / name for name in names}
     (after["controls-NoLeak"] / "real-nearest-photo").mkdir(parents=True)
-    how = {"runs": runs, "controls": [NEAREST, "mean image"], "draws": Draws(), "device": "cpu"}
-    measure_utility(tmp_path, after, lambda *_: None, **how)
+    control_names = [NEAREST, "mean image"]
+    measure_utility(Work(tmp_path, after), runs=runs, controls=control_names, draws=Draws())
     results = Results.load(tmp_path / "results.json")
     assert results.claims[0].verdict == verdict
     assert results.tables[0].rows[0][1].details["by_seed"] == list(gains)

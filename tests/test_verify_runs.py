@@ -4,21 +4,22 @@ import json
 import shutil
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from PIL import Image
 
 from palpate.cli import main
-from palpate.core import Score, read_json
+from palpate.core import Score
 from palpate.report.results import Results
 from palpate.report.study import Claim, StudyTable
-from palpate.studies import study as studies
-from palpate.studies import verifying
-from palpate.studies.methods import METHODS, OURS
-from palpate.studies.reproduce import plan_of, run_study
-from palpate.studies.stages import Run
-from palpate.studies.study import NOLEAK, STUDIES
+from palpate.studies import reproduce
+from palpate.studies.methods import METHODS
+from palpate.studies.names import NOLEAK, OURS
+from palpate.studies.reproduce import Plan, run_study
+from palpate.studies.stages import record_of, run_stage
+from palpate.studies.study import STUDIES
 from palpate.studies.verifying import verify
 
 SCORE = Score("TMMD", "Ours", 1.25, n=8, details={"stage": "results"})
@@ -27,7 +28,7 @@ SCORE = Score("TMMD", "Ours", 1.25, n=8, details={"stage": "results"})
 @pytest.fixture
 def forged(tmp_path) -> Path:
     """The results of a run of two stages of a study that palpate does not know."""
-    run = Run(tmp_path / "run")
+    run = tmp_path / "run"
 
     def images(folder):
         (folder / "a.txt").write_text("an image")
@@ -41,18 +42,19 @@ def forged(tmp_path) -> Path:
         made = Results("Forged", ["Fact: 3 of 4"], scores=[SCORE], tables=[table])
         replace(made, claims=[claim]).save(folder / "results.json")
 
-    made = run.stage("images", {"seed": 0}, images)
-    run.stage("results", {"after": {"images": made.digest}, "images": "no stage"}, results)
-    records = {n: read_json(s.folder / "stage.json", "") for n, s in run.stages.items()}
-    settings = {"study": "forged", "stages": {n: _stated(r) for n, r in records.items()}}
-    settings["digests"] = {"manifest": "m"}
-    whole = Results.load(run.folder / "results" / "results.json")
-    replace(whole, settings=settings).save(run.folder / "results.json")
-    return run.folder / "results.json"
+    stages = {"images": run_stage(run / "images", {"seed": 0}, images)}
+    stages["results"] = run_stage(run / "results", {"images": stages["images"].digest}, results)
+    settings = {"study": "forged", "digests": {"manifest": "m"}, **record_of(stages)}
+    plain = Results.load(run / "results" / "results.json")
+    replace(plain, settings=settings).save(run / "results.json")
+    return run / "results.json"
 
 
-def _stated(record):
-    return {k: record[k] for k in ("digest", "outputs", "seconds")}
+def same_again(file, monkeypatch):
+    """A study that is run again has the results of today's file."""
+    results = Results.load(file)
+    plan = SimpleNamespace(nodes=list, results=lambda stages: results)
+    monkeypatch.setattr(reproduce, "plan_again", lambda settings, folder: plan)
 
 
 def differing(file):
@@ -96,16 +98,14 @@ def test_an_unknown_study_is_checked_by_its_records_alone(forged):
 )
 def test_an_edit_by_hand_is_named(forged, monkeypatch, change, name):
     """Of a study that is made again as it was."""
-    made = Results.load(forged)
-    monkeypatch.setattr(verifying, "_study_again", lambda *_: made)
+    same_again(forged, monkeypatch)
     assert differing(forged) == {}
     edit(forged, change)
     assert list(differing(forged)) == [name]
 
 
 def test_what_is_not_of_the_run_is_named(forged, monkeypatch):
-    made = Results.load(forged)
-    monkeypatch.setattr(verifying, "_study_again", lambda *_: made)
+    same_again(forged, monkeypatch)
     edit(forged, lambda data: data["scores"].append({**data["scores"][0], "a": "mine"}))
     edit(forged, lambda data: data.update(facts=[]))
     assert differing(forged) == {
@@ -155,8 +155,8 @@ def toy(tmp_path_factory):
     people = folder.parent / "people.json"
     Results("People", scores=[SCORE]).save(people)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(studies, "STUDIES", {"toy": one})
-        run_study(plan_of(one, preset="smoke", people=people), folder)
+        patch.setitem(STUDIES, "toy", one)
+        run_study(Plan(one, preset="smoke", people=people), folder)
         people.unlink()
         yield folder
 

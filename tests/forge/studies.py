@@ -21,7 +21,7 @@ from palpate.sim import Video, WorldOptions, plan_world, write_world
 from palpate.sim.leak import cut
 from palpate.sim.plan import contact_rows
 from palpate.studies.methods import METHODS, OURS
-from palpate.studies.reproduce import Plan, plan_of, run_study
+from palpate.studies.reproduce import Plan, run_study
 from palpate.studies.study import PRESETS, Study
 
 # --- the procedural world in a data set's layout, without the files that only a world has
@@ -153,7 +153,7 @@ STUDY = Study(
 
 
 def plan() -> Plan:
-    return plan_of(STUDY, preset="tiny", device="cpu")
+    return Plan(STUDY, preset="tiny", device="cpu")
 
 
 def run(folder: Path, **options) -> Results:

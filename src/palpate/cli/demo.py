@@ -6,8 +6,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
+from palpate.cli.reproduce import run_into
 from palpate.cli.terminal import Common, OutPath, Terminal, require_extra
-from palpate.core import PalpateError
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -33,33 +33,10 @@ class Options(Common):
 def run(options: Options, terminal: Terminal) -> dict[str, Any]:
     """Run the stages and write the page."""
     require_extra("palpate demo")
-    from palpate.report import summary_lines
-    from palpate.studies.demo import DemoOptions, run_demo
-    from palpate.studies.demo_page import results_of
+    from palpate.studies.demo import Demo
 
-    output = options.output
-    kept = any(output.glob("*.partial")) or any(output.glob("*/stage.json"))
-    if output.is_dir() and any(output.iterdir()) and not kept:
-        must, got = "must be new, empty, or a run folder of the demo", f"{output}, with other files"
-        raise PalpateError(must, got, "Choose another folder", argument="output")
     data = options.data and options.data.resolve()
-    try:
-        with terminal.progress() as progress:
-            demo = run_demo(
-                DemoOptions(options.preset, data, options.seed, options.device),
-                output,
-                print_line=terminal.print_line,
-                progress=progress,
-            )
-    except PalpateError:
-        if output.is_dir() and not any(output.iterdir()):  # nothing was done
-            output.rmdir()
-        raise
-    results = results_of(demo, terminal.command)
-    page = output / "page.html"
-    results.to_html(page)
-    terminal.print("")
-    for line in summary_lines(results):
-        terminal.print(line)
-    terminal.print(f"Page: {page}")
-    return {"page": str(page), "facts": list(results.facts), "digests": results.settings["digests"]}
+    demo = Demo(options.preset, data, options.seed, options.device)
+    results = run_into(options.output, demo, terminal)
+    page = str(options.output / "page.html")
+    return {"page": page, "facts": list(results.facts), "digests": results.settings["digests"]}

@@ -4,12 +4,17 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
 from palpate.cli.terminal import Common, OutPath, Switch, Terminal, require_extra
-from palpate.core import PalpateError
+from palpate.core import require
+
+if TYPE_CHECKING:
+    from palpate.report.results import Results
+    from palpate.studies import reproduce
+    from palpate.studies.demo import Demo
 
 #: Names of ``palpate.studies.study.STUDIES``, without its imports.
 Study = Literal["world-gelsight", "world-digit", "tag", "hct", "clips"]
@@ -66,13 +71,12 @@ def run(options: Options, terminal: Terminal) -> dict[str, Any]:
     others = _folders(options.method)
     from palpate.core import write_text
     from palpate.evaluation.companions import Weights
-    from palpate.report import summary_lines
     from palpate.studies.graph import plan_graph
-    from palpate.studies.reproduce import nodes_of, plan_of, run_study
+    from palpate.studies.reproduce import Plan
     from palpate.studies.study import STUDIES
 
     output = options.output
-    plan = plan_of(
+    plan = Plan(
         STUDIES[options.study],
         preset=options.preset,
         seeds=options.seeds,
@@ -85,34 +89,49 @@ def run(options: Options, terminal: Terminal) -> dict[str, Any]:
         weights=Weights(inception=options.inception, clip=options.clip, lpips=options.lpips),
     )
     if options.dry_run:
-        stages = plan_graph(nodes_of(plan), output)
+        stages = plan_graph(plan.nodes(), output)
         for name, done in stages.items():
             terminal.print(f"{'done' if done else 'to do':>5}  {name}")
         return {"stages": stages}
+    results = run_into(output, plan, terminal, options.jobs)
+    write_text(output / "tables.tex", results.to_latex())
+    results.save_figures(output / "figures")
+    files = {"results": output / "results.json", "page": output / "page.html"}
+    digests = results.settings["digests"]
+    return {**{k: str(v) for k, v in files.items()}, "facts": results.facts, "digests": digests}
+
+
+def run_into(
+    output: Path, plan: reproduce.Plan | Demo, terminal: Terminal, jobs: int = 1
+) -> Results:
+    """Run all stages in a run folder, write the page and print what it says first.
+
+    Raises:
+        PalpateError: if the folder holds other files, or as the stages raise.
+    """
+    from palpate.report import summary_lines
+    from palpate.studies.reproduce import run_study
+
     kept = any(output.glob("*.partial")) or any(output.glob("*/stage.json"))
-    if output.is_dir() and any(output.iterdir()) and not kept:
-        must, got = "must be new, empty, or a run folder", f"{output}, with other files"
-        raise PalpateError(must, got, "Choose another folder", argument="output")
+    free = not output.is_dir() or not any(output.iterdir()) or kept
+    must, got = "must be new, empty, or a run folder", f"{output}, with other files"
+    require(free, "output", must, got, fix="Choose another folder")
     with terminal.progress() as progress:
         results = run_study(
             plan,
             output,
             command=terminal.command,
-            jobs=options.jobs,
+            jobs=jobs,
             print_line=terminal.print_line,
             progress=progress,
         )
     page = output / "page.html"
     results.to_html(page)
-    write_text(output / "tables.tex", results.to_latex())
-    results.save_figures(output / "figures")
     terminal.print("")
     for line in summary_lines(results):
         terminal.print(line)
     terminal.print(f"Page: {page}")
-    files = {"results": output / "results.json", "page": page}
-    digests = results.settings["digests"]
-    return {**{k: str(v) for k, v in files.items()}, "facts": results.facts, "digests": digests}
+    return results
 
 
 def _folders(values: tuple[str, ...]) -> dict[str, Path]:
@@ -120,8 +139,7 @@ def _folders(values: tuple[str, ...]) -> dict[str, Path]:
     folders: dict[str, Path] = {}
     for value in values:
         name, equals, folder = value.partition("=")
-        if not (name and equals and folder) or name in folders:
-            must, example = "must be NAME=FOLDER, each name once", {"method": "flowtouch=dir/"}
-            raise PalpateError(must, value, "", argument="method", example=example)
+        once = bool(name and equals and folder) and name not in folders
+        require(once, "method", "must be NAME=FOLDER, each name once", value, "flowtouch=dir/")
         folders[name] = Path(folder)
     return folders

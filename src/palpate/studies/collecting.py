@@ -5,71 +5,81 @@ from __future__ import annotations
 import shutil
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from itertools import product
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from palpate.core import Measure, Note, Progress, Score, Split, read_json
-from palpate.data.manifest import Manifest
+from palpate.core import Measure, Note, Score
 from palpate.diffusion.generation import Generated
 from palpate.evaluation.probing import results_of
 from palpate.report.labels import measured
 from palpate.report.numbers import percent
 from palpate.report.results import Audit, Results
 from palpate.studies.claims import Names, differences_over_seeds, effect_table, paper_claims
-from palpate.studies.controls import FLOOR, NEAREST
-from palpate.studies.demo_page import gallery as gallery_of
 from palpate.studies.evidence import difference_between, in_words
-from palpate.studies.judging import probing_plan, read_probed, read_scores, stage_of, stamped
-from palpate.studies.making import After, Facts
-from palpate.studies.methods import BACKGROUND, OURS, VQ
-from palpate.studies.study import NOLEAK, ORIG, SPLITS, Study
+from palpate.studies.files import data_of, gallery, read_audits, read_scores
+from palpate.studies.graph import Work
+from palpate.studies.judging import probing_plan, read_probed, stamped
+from palpate.studies.names import (
+    BACKGROUND,
+    FLOOR,
+    NEAREST,
+    NOLEAK,
+    ORIG,
+    OURS,
+    SPLITS,
+    VQ,
+    images_node,
+    scores_node,
+)
+from palpate.studies.stages import Facts
 from palpate.studies.study_tables import FAMILY, NAMED, READING, RETRIEVAL, Scores, study_tables
+
+if TYPE_CHECKING:
+    from palpate.studies.study import Study
 
 
 def collect(
-    place: Path,
-    after: After,
-    progress: Progress,
-    *,
-    study: Study,
-    methods: Sequence[str],
-    judgments: Mapping[tuple[str, str], Sequence[str]],
-    probes: Mapping[str, Sequence[str]],
-    gallery: str,
-    people: Path | None = None,
-    useful: bool = False,
+    work: Work, *, study: Study, methods: Sequence[str], seeds: Sequence[int], people: Path | None
 ) -> Facts:
     """Write ``results.json``: everything but the record of the run.
 
-    ``judgments``: (split of the images, split of the judge) -> nodes, one a seed; ``probes``: split
-    -> nodes; ``gallery``: node of the images that are shown; ``people``: results of a
-    human study, columns of table 3 and evidence of claims; ``useful``: whether there is the stage
-    ``utility``.
+    ``people``: results of a human study, columns of table 3 and evidence of claims.
     """
-    manifest = Manifest.load(after["data"])
-    splits = {name: Split.load(after["split"] / f"{name}.json") for name in SPLITS}
-    audits = [Audit.from_json(a) for a in read_json(after["split"] / "audits.json", "audits")]
-    stage = stage_of(place)
-    seeds = {pair: [read_scores(after[n]) for n in nodes] for pair, nodes in judgments.items()}
-    judged = {pair: Scores.over_seeds(scores, stage) for pair, scores in seeds.items()}
-    runs = {split: [read_probed(after[node]) for node in nodes] for split, nodes in probes.items()}
+    after, stage, manifest = work.after, work.stage, data_of(work)[0]
+    splits = {name: data_of(work, name)[1] for name in SPLITS}
+    audits = read_audits(work)
+    runs_of = {
+        pair: [read_scores(after[scores_node(*pair, seed)]) for seed in seeds]
+        for pair in product(SPLITS, SPLITS)
+    }
+    judged = {pair: Scores.over_seeds(scores, stage) for pair, scores in runs_of.items()}
+    runs = {s: [read_probed(after[f"probe-{s}-{seed}"]) for seed in seeds] for s in SPLITS}
     plan = probing_plan(manifest, splits)
     probed = results_of(study.title, runs, plan, manifest, splits)
-    own, noleak = judged[NOLEAK, NOLEAK], seeds[NOLEAK, NOLEAK]
+    own, noleak = judged[NOLEAK, NOLEAK], runs_of[NOLEAK, NOLEAK]
     extra = list(dict.fromkeys(s.measure for s in own.of_one if s.details.get("extra")))
-    names: dict[str, Sequence[str]] = {"methods": methods, "controls": list(study.controls)}
     votes = [] if people is None else [*Results.load(people).scores]
     tables = [
-        *study_tables(study, judged, probed.scores, **names, extra=extra, people=votes),
+        *study_tables(
+            study,
+            judged,
+            probed.scores,
+            methods=methods,
+            controls=list(study.controls),
+            extra=extra,
+            people=votes,
+        ),
         effect_table([d for d in differences_over_seeds(noleak) if _compares(d, methods)]),
     ]
-    answers = [Results.load(after["utility"] / "results.json")] if useful else []
+    answers = [Results.load(after[n] / "results.json") for n in ("utility",) if n in after]
     tables += [table for answer in answers for table in answer.tables]
-    images = [m for m in methods if m.startswith("GVST")]
-    tasks = {**_tasks_of_encoders(probed.scores), **_tasks_of_generators(seeds)}
-    named = Names(OURS, images, BACKGROUND, VQ)
+    of_images = [m for m in methods if m.startswith("GVST")]
+    tasks = {**_tasks_of_encoders(probed.scores), **_tasks_of_generators(runs_of)}
+    named = Names(OURS, of_images, BACKGROUND, VQ)
     claims = paper_claims(noleak, tasks=tasks, people=votes, names=named)
     claims += [claim for answer in answers for claim in answer.claims]
+    images = after[images_node(study.on_both[0], NOLEAK, seeds[0])] / "images"
     notes = [*probed.notes, *([Note("synthetic-data")] if manifest.facts.get("synthetic") else [])]
     results = Results(
         title=study.title,
@@ -78,7 +88,7 @@ def collect(
         scores=own.of_one,
         gallery=[
             replace(item, method=study.on_both[0])
-            for item in gallery_of(manifest, Generated.load(after[gallery] / "images"), 0)
+            for item in gallery(manifest, Generated.load(images), 0)
         ],
         settings={
             "split rule": {name: dict(s.rule) for name, s in splits.items()},
@@ -88,9 +98,9 @@ def collect(
         tables=[replace(t, rows=_staged_rows(t.rows, stage)) for t in tables],
         claims=[replace(c, evidence=[stamped(s, stage) for s in c.evidence]) for c in claims],
     )
-    results.save(place / "results.json")
+    results.save(work.folder / "results.json")
     if people is not None:  # ``palpate verify`` reads it again
-        shutil.copyfile(people, place / "people.json")
+        shutil.copyfile(people, work.folder / "people.json")
     return {"tables": len(tables), "claims": len(claims), "scores": len(results.scores)}
 
 

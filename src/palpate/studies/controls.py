@@ -22,30 +22,22 @@ as are these two where a split leaks all videos.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from pathlib import Path
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from palpate.core import Progress, quiet, rng_for
+from palpate.core import rng_for
 from palpate.data.manifest import Manifest
 from palpate.diffusion.autoencoder import BackgroundAutoencoder
 from palpate.diffusion.autoencoders import load_autoencoder
 from palpate.encoders.embed import embed
 from palpate.encoders.encoder_set import EncoderSet, load_clip
 from palpate.evaluation.controls import matched_rows
+from palpate.studies.graph import Work
 from palpate.studies.methods import Images, Make, Setting
-
-#: Real images of other videos: the score that no generator needs to beat.
-FLOOR = "real, other videos"
-#: The control that retrieves instead of generating.
-NEAREST = "real, nearest photo"
-EMPTY, MEAN, WRONG = "empty background", "mean image", "real, wrong material"
-CEILING, ONE, MEMORIZED = "reconstruction", "one image for all", "one video a material"
-#: One half of a generator's images against the other half.
-HALVES = "halves of Ours"
+from palpate.studies.names import CEILING, EMPTY, FLOOR, MEAN, MEMORIZED, NEAREST, ONE, WRONG
 
 
 def _columns(setting: Setting, name: str) -> tuple[NDArray[Any], NDArray[Any]]:
@@ -55,26 +47,30 @@ def _columns(setting: Setting, name: str) -> tuple[NDArray[Any], NDArray[Any]]:
     return train, test
 
 
+def _matched(setting: Setting, wanted: Sequence[str] | None = None) -> Images | None:
+    """Whole train videos of the materials of the test videos, or of those that are wanted."""
+    (materials, own), (videos, video) = (_columns(setting, c) for c in ("material", "video"))
+    test = own if wanted is None else wanted, video
+    rows = matched_rows((materials, videos), test, setting.seed)
+    return None if rows is None else setting.pixels(setting.train)[rows]
+
+
 def other_videos(setting: Setting) -> Images | None:
     """Whole train videos in the place of the test videos; None if train lacks a material."""
-    (known, material), (videos, video) = (_columns(setting, c) for c in ("material", "video"))
-    rows = matched_rows((known, videos), (material, video), setting.seed)
-    return None if rows is None else setting.pixels(setting.train)[rows]
+    return _matched(setting)
 
 
 def wrong_material(setting: Setting) -> Images | None:
     """Whole train videos of another material than the test video's; None without two materials."""
-    (known, material), (videos, video) = (_columns(setting, c) for c in ("material", "video"))
-    names = sorted({*known} - {""})
+    materials, own = _columns(setting, "material")
+    names = sorted({*materials} - {""})
     if len(names) < 2:
         return None
     wrong: list[str] = []
-    for m, v in zip(material, video, strict=True):
-        others = [name for name in names if name != m]
-        rng = rng_for(setting.seed, "control", "wrong", m, v)
-        wrong.append(others[int(rng.integers(len(others)))])
-    rows = matched_rows((known, videos), (wrong, video), setting.seed)
-    return None if rows is None else setting.pixels(setting.train)[rows]
+    for m, video in zip(own, _columns(setting, "video")[1], strict=True):
+        rng = rng_for(setting.seed, "control", "wrong", m, video)
+        wrong.append(_drawn(rng, [name for name in names if name != m]))
+    return _matched(setting, wrong)
 
 
 def empty_background(setting: Setting) -> Images:
@@ -90,24 +86,22 @@ def mean_image(setting: Setting) -> Images:
 
 def nearest_photo(setting: Setting) -> Images:
     """The real tactile images of the train photos most similar to the test photos."""
-    encoders = EncoderSet(load_clip(setting.clip, device=setting.device))
-    how: dict[str, Any] = {"cache": setting.cache, "progress": setting.progress}
-    rows = nearest_rows(setting.train, setting.test, encoders, **how)
+    encoders = EncoderSet(load_clip(setting.clip, device=setting.work.device))
+    rows = nearest_rows(setting.train, setting.test, encoders, setting.work)
     return setting.pixels(setting.train)[rows]
 
 
 def nearest_rows(
-    train: Manifest,
-    test: Manifest,
-    encoders: EncoderSet,
-    *,
-    cache: Path | None = None,
-    progress: Progress = quiet,
+    train: Manifest, test: Manifest, encoders: EncoderSet, work: Work
 ) -> NDArray[np.intp]:
     """For each test sample the row of the train photo most similar to its photo (cosine)."""
-    options: dict[str, Any] = {"cache": cache, "still": True, "progress": progress}
     photos, queries = (
-        np.asarray(embed(part, encoders, "vision", **options).features) for part in (train, test)
+        np.asarray(
+            embed(
+                part, encoders, "vision", cache=work.cache, still=True, progress=work.progress
+            ).features
+        )
+        for part in (train, test)
     )
     return (queries @ photos.T).argmax(axis=1)
 
@@ -131,21 +125,24 @@ def one_image(setting: Setting) -> Images:
 
 def memorized(setting: Setting) -> Images | None:
     """Images of one train video of the sample's material; None if train lacks a material."""
-    (known, material), (videos, video) = (_columns(setting, c) for c in ("material", "video"))
+    (materials, material), (videos, video) = (_columns(setting, c) for c in ("material", "video"))
     frames: dict[str, NDArray[np.intp]] = {}
     for name in sorted({*material}):
-        of = {*videos[known == name]}
-        if not of:
+        choice = {*videos[materials == name]}
+        if not choice:
             return None
-        names = sorted(of - {*video} or of)
         rng = rng_for(setting.seed, "control", "one video", name)
-        one = names[int(rng.integers(len(names)))]
-        frames[name] = np.flatnonzero((known == name) & (videos == one))
+        one = _drawn(rng, sorted(choice - {*video} or choice))
+        frames[name] = np.flatnonzero((materials == name) & (videos == one))
     rows: list[int] = []
     for i, m in zip(setting.test.ids, material, strict=True):
         rng = rng_for(setting.seed, "control", "memorized", i)
         rows.append(int(rng.choice(frames[m])))
     return setting.pixels(setting.train)[rows]
+
+
+def _drawn(rng: np.random.Generator, names: Sequence[str]) -> str:
+    return names[int(rng.integers(len(names)))]
 
 
 CONTROLS: Mapping[str, Make] = {

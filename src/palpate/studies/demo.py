@@ -12,344 +12,381 @@ goes on from the models that ship.
 
 from __future__ import annotations
 
-import dataclasses
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
-from palpate.core import (
-    PalpateError,
-    Progress,
-    Score,
-    Split,
-    digest_file,
-    digest_folder,
-    digest_json,
-    digest_lines,
-    quiet,
-    read_json,
-    require_choice,
-    write_json,
-)
+from palpate.core import Measure, Note, Progress, Score, Split, require, require_choice, write_json
 from palpate.data.images import cached_images
 from palpate.data.importing import import_dataset
 from palpate.data.manifest import Manifest
-from palpate.diffusion.autoencoders import load_autoencoder
-from palpate.diffusion.generation import Generated, generate
-from palpate.diffusion.pipeline import TactilePipeline
-from palpate.diffusion.training import train_pipeline
+from palpate.diffusion.generation import Generated
+from palpate.diffusion.presets import MINI, DiffusionPreset
 from palpate.encoders.contrastive import train_tactile
 from palpate.encoders.encoder_set import EncoderSet, load_clip
-from palpate.encoders.models import Part, shipped_folder
+from palpate.encoders.presets import PRESETS as ENCODERS
+from palpate.encoders.presets import EncoderPreset
+from palpate.evaluation.controls import BACKGROUND
 from palpate.evaluation.scoring import score
 from palpate.leakage.auditing import audit
 from palpate.leakage.splitting import split as leak_free_split
-from palpate.report.results import Audit
-from palpate.sim.presets import MINI_SEEDS
-from palpate.studies.controls import NEAREST, nearest_rows
-from palpate.studies.graph import Node, run_graph
-from palpate.studies.making import After, cache_of, fresh, make_world, write_images
-from palpate.studies.methods import SHIPPED
-from palpate.studies.presets import PRESETS
-from palpate.studies.stages import Stage
+from palpate.report.families import families
+from palpate.report.numbers import number, percent
+from palpate.report.results import Results
+from palpate.sim import PRESETS as WORLDS
+from palpate.sim import WorldOptions
+from palpate.studies.controls import nearest_rows
+from palpate.studies.files import (
+    data_of,
+    data_stamp,
+    fresh,
+    gallery,
+    model_stamp,
+    read_audits,
+    read_scores,
+    write_images,
+    write_scores,
+)
+from palpate.studies.graph import Named, Node, Nodes, Work
+from palpate.studies.making import Training, make_generator, make_images, make_world, read_data
+from palpate.studies.names import NEAREST, SHIPPED
+from palpate.studies.stages import Facts, Stage, record_of
+from palpate.studies.study import TEN
+
+#: Name of the split file, without its ending.
+SPLIT = "noleak"
 
 
 @dataclass(frozen=True)
-class DemoOptions:
+class DemoPreset:
+    """A complete run.
+
+    Attributes:
+        name: of the preset.
+        world: the embedded data set, used where no data is given.
+        encoder, diffusion: how the training of the shipped models goes on.
+        train: share of the train part.
+        tactile_epochs: passes of the tactile encoder over the train part.
+    """
+
+    name: str
+    world: WorldOptions
+    encoder: EncoderPreset
+    diffusion: DiffusionPreset
+    train: float
+    tactile_epochs: float
+
+
+_TINY = replace(WORLDS["tiny"], objects_per_material=4, contacts_per_video=2, frames_per_contact=2)
+_MINI = replace(
+    WORLDS["demo"],
+    materials=TEN,
+    objects_per_material=24,
+    contacts_per_video=3,
+    frames_per_contact=2,
+    free_written="background",
+)
+PRESETS = {
+    preset.name: preset
+    for preset in (
+        DemoPreset(
+            "tiny",  # for tests
+            _TINY,
+            ENCODERS["mini"],
+            replace(
+                MINI,
+                loop=replace(MINI.loop, steps=4, batch=8),
+                sampler=replace(MINI.sampler, steps=2),
+            ),
+            train=0.75,
+            tactile_epochs=0.5,
+        ),
+        DemoPreset("mini", _MINI, ENCODERS["mini"], MINI, train=0.85, tactile_epochs=6),
+    )
+}
+
+
+@dataclass(frozen=True)
+class Demo:
     """What to run.
 
     Attributes:
-        preset: see :data:`palpate.studies.presets.PRESETS`.
+        preset: see :data:`PRESETS`.
         data: a data set on disk, or None for the embedded world.
         seed: of the split, the weights, the order of training and the noise.
         device: ``auto``, ``cpu``, ``cuda`` ...
     """
+
+    name: ClassVar[str] = "demo"
 
     preset: str = "mini"
     data: Path | None = None
     seed: int = 0
     device: str = "auto"
 
-
-@dataclass(frozen=True)
-class DemoRun:
-    """A finished run; see the stages' folders for the files.
-
-    Attributes:
-        manifest, split: the data, and the leak-free split that was trained and scored on.
-        audits: of the data set's own splits, if it has any, and of the leak-free one.
-        generated: the images generated for the test part.
-        scores: see :func:`palpate.evaluation.score`.
-        stages: by name, with digests, facts and times.
-        options: what was requested.
-    """
-
-    manifest: Manifest
-    split: Split
-    audits: list[Audit]
-    generated: Generated
-    scores: list[Score]
-    stages: Mapping[str, Stage]
-    options: DemoOptions
-
-    def settings(self) -> dict[str, Any]:
-        """Options, digests, versions and times, for the page."""
-        options = dataclasses.asdict(self.options)
-        digests = {n: s.facts["digest"] for n, s in self.stages.items() if "digest" in s.facts}
-        return {
-            "dataset": self.stages["data"].facts["dataset"],
-            "models": SHIPPED,
-            "options": {k: str(v) if isinstance(v, Path) else v for k, v in options.items()},
-            "digests": {"manifest": self.manifest.digest, "split": self.split.digest} | digests,
-            "split rule": dict(self.split.rule),
-            "stages": {
-                name: {k: v for k, v in stage.facts.items() if k != "digest"}
-                for name, stage in self.stages.items()
-            },
-            "seconds": {name: round(stage.seconds, 1) for name, stage in self.stages.items()},
-            **self.stages["scores"].made_with,
-        }
-
-
-def run_demo(
-    options: DemoOptions,
-    folder: Path,
-    *,
-    print_line: Callable[[str], None] = lambda line: None,
-    progress: Progress = quiet,
-) -> DemoRun:
-    """Run all stages, or those that are not there yet for the same inputs.
-
-    Args:
-        options: what to run.
-        folder: run folder; running again with the same folder resumes.
-        print_line: called with one line per stage, and with the time left.
-        progress: called with what is done within a stage, and over the whole.
-
-    Raises:
-        PalpateError: on bad data or options; finished stages stay.
-    """
-    stages = run_graph(demo_nodes(options), folder, print_line=print_line, progress=progress)
-    return demo_of(options, stages)
-
-
-def demo_nodes(options: DemoOptions) -> list[Node]:
-    """The graph of a demo.
-
-    Raises:
-        PalpateError: on bad options.
-    """
-    return _Demo(options).nodes()
-
-
-def demo_of(options: DemoOptions, stages: Mapping[str, Stage]) -> DemoRun:
-    """What finished stages hold."""
-    after = {name: stage.folder for name, stage in stages.items()}
-    manifest, split = _data(after)
-    audits = [Audit.from_json(a) for a in read_json(after["split"] / "audits.json", "audits")]
-    generated = Generated.load(after["generated"] / "generated")
-    scores = [Score.from_json(s) for s in read_json(after["scores"] / "scores.json", "scores")]
-    return DemoRun(manifest, split, audits, generated, scores, stages, options)
-
-
-class _Demo:
-    """The nodes, and the methods that build them: each fills its folder and reads earlier ones."""
-
-    def __init__(self, options: DemoOptions) -> None:
-        if options.data is not None and not options.data.exists():
-            must, got = "must exist", f"nothing at {options.data}"
-            raise PalpateError(must, got, "Check the path", argument="data")
-        self.options = options
-        require_choice("preset", options.preset, PRESETS)
-        self.preset = PRESETS[options.preset]
-        parts: tuple[Part, ...] = ("clip", "encoders", "autoencoder", "generator")
-        self.models = {part: model_stamp(part, SHIPPED) for part in parts}
+    @classmethod
+    def again(cls, settings: Mapping[str, Any]) -> Demo:
+        """The demo that a record says."""
+        options = settings["options"]
+        data = options["data"] and Path(options["data"])
+        return cls(settings["preset"], data, settings["seeds"][0], options["device"])
 
     def nodes(self) -> list[Node]:
-        """The graph; data that is given has no node."""
-        preset, seed, models = self.preset, {"seed": self.options.seed}, self.models
-        data, nodes = self.options.data, list[Node]()
+        """The stages; data that is given has no world.
+
+        Raises:
+            PalpateError: on bad options.
+        """
+        data, seed, nodes = self.data, self.seed, Nodes()
+        exists, got = data is None or data.exists(), f"nothing at {data}"
+        require(exists, "data", "must exist", got, fix="Check the path")
+        require_choice("preset", self.preset, PRESETS)
+        preset, size, root = PRESETS[self.preset], None, None
+        clip, tactile, autoencoder, start = (
+            Named(SHIPPED, model_stamp(part, SHIPPED))
+            for part in ("clip", "encoders", "autoencoder", "generator")
+        )
         if data is None:
-            build = partial(make_world, options=preset.world)
-            nodes.append(Node("world", build, {"options": preset.world}))
-        inputs: dict[str, Any] = {"size": preset.diffusion.size}
-        inputs |= {"source": data and str(data.resolve()), "stamp": data and stamp(data)}
-        nodes.append(Node("data", self.data, inputs, ("world",) if data is None else ()))
-        inputs = seed | {"train": preset.train}
-        nodes.append(Node("split", self.split, inputs, ("data",), measures=True))
-        inputs = {"preset": preset.encoder, "epochs": preset.tactile_epochs}
-        inputs |= {"clip": models["clip"], "start": models["encoders"]}
-        nodes.append(Node("encoders", self.encoders, seed | inputs, ("data", "split")))
-        inputs = {"preset": preset.diffusion, "start": models["generator"]}
-        inputs |= {"autoencoder": models["autoencoder"]}
-        after = ["data", "split", "encoders"]
-        nodes.append(Node("generator", self.generator, seed | inputs, after))
-        nodes.append(Node("generated", self.generated, seed, ("data", "split", "generator")))
-        after = ["data", "split", "generated", "encoders"]
-        inputs = seed | {"controls": [NEAREST]}
-        return [*nodes, Node("scores", self.scores, inputs, after, measures=True)]
-
-    def how(self, place: Path, progress: Progress) -> dict[str, Any]:
-        """Options of every training."""
-        options = self.options
-        common = {"seed": options.seed, "cache": cache_of(place), "device": options.device}
-        return {**common, "progress": progress}
-
-    def data(self, place: Path, after: After, progress: Progress) -> dict[str, Any]:
-        """The manifest of the given data, or of the embedded world."""
-        source = self.options.data or after["world"] / "tree"
-        size = None if self.options.data is None else 4 * self.preset.diffusion.size
-        require_unseen(source)
-        imported = import_dataset(source, place, size=size, overwrite=True, progress=progress)
-        # Images may lie elsewhere than the source.
-        require_unseen(imported.manifest.root, imported.manifest.facts)
-        return {
-            "digest": imported.manifest.digest,
-            "dataset": imported.facts.get("dataset", source.name),
-            "samples": len(imported.manifest),
-            "inconclusive": imported.inconclusive,
-            "facts": dict(imported.facts),
-        }
-
-    def split(self, place: Path, after: After, progress: Progress) -> dict[str, Any]:
-        """The leak-free split, and the audits of it and of the data set's own splits."""
-        manifest, options = Manifest.load(after["data"]), self.options
-        clean = leak_free_split(manifest, train=self.preset.train, by="auto", seed=options.seed)
-        clean.save(place / "noleak.json")
-        how: dict[str, Any] = {"cache": cache_of(place), "progress": progress}
-        audits = [
-            audit(manifest, split=path, name=path.stem, by="video", **how)
-            for path in sorted((after["data"] / "splits").glob("*.json"))
-            if Split.load(path).ids("test")
-        ]
-        group = str(clean.rule["group"])
-        name = "NoLeak" if group == "video" else f"NoLeak by {group}"
-        audits.append(audit(manifest, split=clean, by=group, name=name, **how))
-        if group != "video" and not manifest.table["video"].null_count():
-            name = f"{name}, seen by video"
-            audits.append(audit(manifest, split=clean, by="video", name=name, images=False))
-        write_json(place / "audits.json", [a.to_json() for a in audits])
-        return {"digest": clean.digest, "counts": clean.counts(), "rule": dict(clean.rule)}
-
-    def encoders(self, place: Path, after: After, progress: Progress) -> dict[str, Any]:
-        """The frozen CLIP with a tactile encoder that goes on from the shipped one."""
-        encoders = train_tactile(
-            *_data(after),
-            load_clip(SHIPPED, device=self.options.device),
-            self.preset.encoder,
-            place / "training",
-            start=EncoderSet.load(SHIPPED),
-            epochs=self.preset.tactile_epochs,
-            **self.how(place, progress),
+            nodes.add("world", make_world, options=preset.world)
+        else:
+            root = Named(data, [str(data.resolve()), data_stamp(data)])
+            size = 4 * preset.diffusion.size
+        nodes.add(
+            "data",
+            read_data,
+            *(node.name for node in nodes),
+            read=Named(partial(import_sized, size=size), size),
+            root=root,
+            name="world" if data is None else data.name,
+            unseen=True,
         )
-        encoders.save(fresh(place / "encoders"))
-        source = encoders.card.get("text_source")
-        return {"digest": encoders.digest("tactile"), "text_source": source}
-
-    def generator(self, place: Path, after: After, progress: Progress) -> dict[str, Any]:
-        """The trained pipeline."""
-        manifest, split = _data(after)
-        pipeline = train_pipeline(
-            manifest,
-            split,
-            EncoderSet.load(after["encoders"] / "encoders"),
-            load_autoencoder(SHIPPED),
-            self.preset.diffusion,
-            place / "training",
-            start=TactilePipeline.from_pretrained(SHIPPED),
-            **self.how(place, progress),
+        train = preset.train
+        nodes.add("split", make_demo_splits, "data", seed=seed, train=train, measures=True)
+        nodes.add(
+            "encoders",
+            train_on,
+            "data",
+            "split",
+            seed=seed,
+            preset=preset.encoder,
+            epochs=preset.tactile_epochs,
+            clip=clip,
+            start=tactile,
         )
-        pipeline.save(fresh(place / "model"))
-        loop = pipeline.training["loop"]
-        return {
-            "ceiling": pipeline.training["ceiling"],
-            "digest": pipeline.digest,
-            "parameters": pipeline.training["parameters"],
-            "steps": loop["steps"],
-            "batch": loop["batch"],
-            "learning_rate": loop["lr"],
-            "source": pipeline.training["source"],
-            "background": pipeline.background,
-            "sampler": dataclasses.asdict(pipeline.sampler),
-        }
-
-    def generated(self, place: Path, after: After, progress: Progress) -> dict[str, Any]:
-        """A tactile image for each photo of the test part."""
-        manifest, split = _data(after)
-        pipeline = TactilePipeline.from_pretrained(after["generator"] / "model")
-        how: dict[str, Any] = {"seed": self.options.seed, "progress": progress}
-        made = generate(manifest, split=split, model=pipeline, output=place / "generated", **how)
-        return {"images": len(made.ids)}
-
-    def scores(self, place: Path, after: After, progress: Progress) -> dict[str, Any]:
-        """The scores of the generated images and of the controls."""
-        manifest, split = _data(after)
-        encoders, cache = EncoderSet.load(after["encoders"] / "encoders"), cache_of(place)
-        train, test = manifest.part(split, "train"), manifest.part(split, "test")
-        rows = nearest_rows(train, test, encoders, cache=cache, progress=progress)
-        images = cached_images(train, "tactile", self.preset.diffusion.size, cache)
-        write_images(place / "nearest", test.ids, images[rows])
-        results = score(
-            [after["generated"] / "generated", place / "nearest"],
-            manifest,
-            encoder=encoders,
-            split=split,
-            names=["generated", NEAREST],
-            presets=("grouped", "paper"),
-            companions=("ssim", "psnr"),
-            seed=self.options.seed,
-            cache=cache,
-            progress=progress,
-            allow_seen=True,  # an image may be in two videos; the scores say so
+        nodes.add(
+            "generator",
+            make_generator,
+            "data",
+            "split",
+            split=SPLIT,
+            seed=seed,
+            training=Training(preset.diffusion),
+            clip=clip,
+            autoencoder=autoencoder,
+            start=start,
         )
-        write_json(place / "scores.json", [s.to_json() for s in results])
-        return {"scores": len(results)}
+        after = ("data", "split", "generator")
+        nodes.add("generated", make_images, *after, split=SPLIT, seed=seed, generator=after[-1])
+        after = ("data", "split", "generated", "encoders")
+        size = preset.diffusion.size
+        nodes.add("scores", score_images, *after, seed=seed, size=size, measures=True)
+        return nodes
+
+    def results(self, stages: Mapping[str, Stage], jobs: int = 1) -> Results:
+        """What the page says of finished stages."""
+        return Page(self, stages).results(jobs)
 
 
-def _data(after: After) -> tuple[Manifest, Split]:
-    """The manifest and the leak-free split."""
-    return Manifest.load(after["data"]), Split.load(after["split"] / "noleak.json")
+def import_sized(source: Path, folder: Path, progress: Progress, *, size: int | None) -> None:
+    """Import a data set, its images no larger than ``size`` pixels."""
+    import_dataset(source, folder, size=size, overwrite=True, progress=progress)
 
 
-def model_stamp(part: Part, source: str | None) -> str | None:
-    """What names a given model: the digest of its folder or file, or its hub id."""
-    if source is None:
-        return None
-    if (shipped := shipped_folder(source, part)) is not None:
-        record = read_json(shipped / "palpate.json", "model record")  # with digests of weights
-        for card in {"card", "training"} & {*record}:  # what is trained from it carries the rest
-            record[card] = {k: v for k, v in record[card].items() if k not in ("title", "summary")}
-        return digest_json(record)
-    if Path(source).is_file():
-        return digest_file(Path(source))
-    return digest_folder(Path(source)) if Path(source).is_dir() else source
+def make_demo_splits(work: Work, *, seed: int, train: float) -> Facts:
+    """The leak-free split, and the audits of it and of the data set's own splits."""
+    data = work.after["data"]
+    manifest = Manifest.load(data)
+    clean = leak_free_split(manifest, train=train, by="auto", seed=seed)
+    clean.save(work.folder / f"{SPLIT}.json")
+    measured = partial(audit, manifest, cache=work.cache, progress=work.progress)
+    audits = [
+        measured(split=path, name=path.stem, by="video")
+        for path in sorted((data / "splits").glob("*.json"))
+        if Split.load(path).ids("test")
+    ]
+    group = str(clean.rule["group"])
+    name = "NoLeak" if group == "video" else f"NoLeak by {group}"
+    audits.append(measured(split=clean, by=group, name=name))
+    if group != "video" and not manifest.table["video"].null_count():
+        name = f"{name}, seen by video"
+        audits.append(audit(manifest, split=clean, by="video", name=name, images=False))
+    write_json(work.folder / "audits.json", [a.to_json() for a in audits])
+    return {"digest": clean.digest, "counts": clean.counts(), "rule": dict(clean.rule)}
 
 
-def require_unseen(source: Path, facts: Mapping[str, str] | None = None) -> None:
-    """Raise for data that the shipped models were trained on: it cannot judge them.
-
-    Args:
-        source: a world, or any file or folder of one; the nearest ``world.json`` there or above
-            decides.
-        facts: of the manifest made of it; they hold the world's seed where ``world.json`` is out of
-            sight.
-    """
-    place = Path(source).resolve()
-    marks = (folder / "world.json" for folder in (place, *place.parents))
-    mark = next((m for m in marks if m.is_file()), None)
-    record = read_json(mark, "world record") if mark is not None else {}
-    seen = isinstance(record, dict) and bool(record.get("seen_by_shipped_models"))
-    seed = (facts or {}).get("world_seed", "")
-    if seen or (seed.isdecimal() and int(seed) in MINI_SEEDS):
-        must = "The shipped models must not have been trained on the data that they are judged on"
-        raise PalpateError(must, f"{source}", "Write a world of another seed")
-
-
-def stamp(source: Path) -> str:
-    """Names, sizes and modification times of the files of a data set: changes when it does."""
-    files = sorted(p for p in source.rglob("*") if p.is_file()) if source.is_dir() else [source]
-    return digest_lines(
-        f"{p.relative_to(source)} {(s := p.stat()).st_size} {s.st_mtime_ns}" for p in files
+def train_on(
+    work: Work, *, seed: int, preset: EncoderPreset, epochs: float, clip: str, start: str
+) -> Facts:
+    """The frozen CLIP with a tactile encoder that goes on from the one of ``start``."""
+    encoders = train_tactile(
+        *data_of(work, SPLIT),
+        load_clip(clip, device=work.device),
+        preset,
+        work.folder / "training",
+        start=EncoderSet.load(start),
+        epochs=epochs,
+        seed=seed,
+        cache=work.cache,
+        device=work.device,
+        progress=work.progress,
     )
+    encoders.save(fresh(work.folder / "encoders"))
+    source = encoders.card.get("text_source")
+    return {"digest": encoders.digest("tactile"), "text_source": source}
+
+
+def score_images(work: Work, *, seed: int, size: int) -> Facts:
+    """The scores of the generated images and of the controls."""
+    manifest, split = data_of(work, SPLIT)
+    encoders = EncoderSet.load(work.after["encoders"] / "encoders")
+    train, test = manifest.part(split, "train"), manifest.part(split, "test")
+    rows = nearest_rows(train, test, encoders, work)
+    images = cached_images(train, "tactile", size, work.cache)
+    write_images(work.folder / "nearest", test.ids, images[rows])
+    results = score(
+        [work.after["generated"] / "images", work.folder / "nearest"],
+        manifest,
+        encoder=encoders,
+        split=split,
+        names=["generated", NEAREST],
+        presets=("grouped", "paper"),
+        companions=("ssim", "psnr"),
+        seed=seed,
+        cache=work.cache,
+        progress=work.progress,
+        allow_seen=True,  # an image may be in two videos; the scores say so
+    )
+    write_scores(work.folder, results.scores)
+    return {"scores": len(results)}
+
+
+class Page:
+    """From a finished run to the results of its page: facts, gallery, notes, commands."""
+
+    def __init__(self, demo: Demo, stages: Mapping[str, Stage]) -> None:
+        self.demo, self.stages = demo, stages
+        self.work = Work(Path(), {name: stage.folder for name, stage in stages.items()})
+        self.manifest, self.split = data_of(self.work, SPLIT)
+        self.generated = Generated.load(self.work.after["generated"] / "images")
+        self.scores = read_scores(self.work.after["scores"])
+        self.audits = read_audits(self.work)
+
+    def results(self, jobs: int) -> Results:
+        """Everything of the page."""
+        demo, facts = self.demo, {name: stage.facts for name, stage in self.stages.items()}
+        digests = {name: fact["digest"] for name, fact in facts.items() if "digest" in fact}
+        settings = {
+            "study": demo.name,
+            "dataset": facts["data"]["dataset"],
+            "models": SHIPPED,
+            "preset": demo.preset,
+            "seeds": [demo.seed],
+            "options": {"data": demo.data and str(demo.data), "device": demo.device, "jobs": jobs},
+            "digests": {"manifest": self.manifest.digest, "split": self.split.digest} | digests,
+            "split rule": dict(self.split.rule),
+            "facts": facts,
+            **record_of(self.stages),
+        }
+        return Results(
+            title="From photo to tactile image",
+            facts=[self._leak(), self._distance(), self._material()],
+            audits=self.audits,
+            scores=self.scores,
+            gallery=gallery(self.manifest, self.generated, demo.seed),
+            settings=settings,
+            notes=self._notes(),
+            commands=self._next_steps(),
+        )
+
+    def _leak(self) -> str:
+        audits = {(a.split == self.split.digest, a.group): a for a in self.audits}
+        noleak = audits[True, str(self.split.rule["group"])]
+        by_video = audits.get((True, "video"), noleak)
+        original = next((a for (ours, _), a in audits.items() if not ours), None)
+        fact = f"NoLeak (whole {noleak.group}s kept together) leaks "
+        fact += percent(noleak.leaked_fraction)
+        if original is not None:
+            gap = ""
+            if original.gap_median is not None:
+                gap = f", a median of {original.gap_median:g} frames from the nearest train frame"
+            share = f"{percent(original.leaked_fraction)} of the test samples of the data set's own"
+            return f"Leak: {share} split share a video with train{gap}; {fact}."
+        if by_video is not noleak:
+            share = f"{percent(by_video.leaked_fraction)} of its test samples share a video with"
+            return f"Leak: {fact} by {noleak.group}, but {share} train: there are too few videos."
+        return f"Leak: {fact}."
+
+    def _score(self, metric: str, subject: str, preset: str | None = None) -> Score | None:
+        for s in self.scores:
+            same = (s.measure, s.a, s.b) == (Measure(metric), subject, None)
+            if same and s.settings.get("preset") == preset:
+                return s
+        return None
+
+    def _with_interval(self, score: Score | None) -> str:
+        """The score and its interval, rounded as in the tables."""
+        if score is None or score.value is None:
+            return "undefined"
+        columns = (column for family in families(self.scores) for column in family.columns)
+        digits = next(c.digits for c in columns if any(s is score for s in c.scores))
+        low_high = ", ".join(number(v, digits) for v in score.interval or ())
+        return number(score.value, digits) + (f" [{low_high}]" if low_high else "")
+
+    def _distance(self) -> str:
+        given_gels = self.stages["generator"].facts["background"]
+        source = "photos and no-contact images" if given_gels else "photos alone"
+        background = self._score("TMMD", BACKGROUND, "grouped")
+        versus = f", the no-contact image {self._with_interval(background)}" if background else ""
+        value = self._with_interval(self._score("TMMD", "generated", "grouped"))
+        start = f"Distance: {len(self.generated.ids)} tactile images generated from {source}"
+        return f"{start} have TMMD (grouped) {value} to the real ones{versus} (lower is better)."
+
+    def _material(self) -> str:
+        generated, real, nearest, background = (
+            self._score("material accuracy", name)
+            for name in ("generated", "real", NEAREST, BACKGROUND)
+        )
+        if generated is None or real is None:
+            materials = self.manifest.table["material"].drop_nulls().n_unique()
+            return f"Material: {materials} materials, too few for a probe."
+        more = f", {percent(float(nearest))} of those of the nearest photo" if nearest else ""
+        more += f", {percent(float(background))} of the no-contact image" if background else ""
+        more += f"; chance is {percent(generated.details['chance'])}"
+        start = "Material: a probe fitted to real train images is right on"
+        shares = f"{percent(float(real))} of the real test images"
+        shares += f", {percent(float(generated))} of the generated ones"
+        return f"{start} {shares}{more}."
+
+    def _notes(self) -> list[Note]:
+        notes = [Note("synthetic-data")] if self.manifest.facts.get("synthetic") else []
+        notes.append(Note("models-shipped", {"name": SHIPPED}))
+        notes += self.split.notes
+        if self.manifest.table["text"].null_count():
+            notes.append(Note("template-texts"))
+        background = self._score("material accuracy", BACKGROUND)
+        if background is not None and float(background) > 2 * background.details["chance"]:
+            notes.append(Note("background-predicts-material", {"share": background.value}))
+        return notes
+
+    def _next_steps(self) -> list[str]:
+        folder = Path(self.stages["data"].folder).parent
+        data, split = folder / "data", folder / "split" / "noleak.json"
+        model, encoders = folder / "generator" / "model", folder / "encoders" / "encoders"
+        return [
+            f"palpate audit {data} --split {split} --worst 50",
+            f"palpate generate YOUR_PHOTOS/ --model {model} -o YOUR_IMAGES/",
+            f"palpate score --generated YOUR_IMAGES/ --reference {data} --split {split} "
+            f"--encoder {encoders} -o scores.json",
+        ]

@@ -1,11 +1,10 @@
-"""A graph of stages: each node a stage of a run folder that reads earlier ones.
+"""A graph of stages: each node a call that fills a folder and reads those of earlier nodes.
 
-A node is built by a function of its folder and of the folders of the nodes it comes after. Its
-digest holds those of the nodes before it (:mod:`palpate.studies.stages`), so that a changed option
-builds again what depends on it and nothing else; its record holds those of their files, so that it
-is built again after a stage that was made again with other files (trained on a GPU, say). Nodes
-that do not depend on each other may be built by several processes; the result does not depend on
-how many.
+The digest of a node's stage holds its options and those of the nodes before it
+(:mod:`palpate.studies.stages`), so that a changed option builds again what depends on it and
+nothing else; its record holds those of their files, so that it is built again after a stage that
+was made again with other files (trained on a GPU, say). Nodes that do not depend on each other may
+be built by several processes; the result does not depend on how many.
 """
 
 from __future__ import annotations
@@ -16,7 +15,7 @@ import signal
 import traceback
 from collections.abc import Callable, Generator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from multiprocessing.connection import wait
 from multiprocessing.process import BaseProcess
@@ -25,11 +24,51 @@ from typing import Any, NoReturn
 
 from palpate.core import PalpateError, Progress, few, locked, quiet, require
 from palpate.core.processes import exit_with_parent
-from palpate.studies.stages import Run, Stage, finished_stage, stage_digest
+from palpate.studies.stages import (
+    PrintLine,
+    Stage,
+    finished_stage,
+    run_stage,
+    stage_digest,
+    stored_stage,
+)
 
-Build = Callable[[Path, Mapping[str, Path], Progress], Mapping[str, Any] | None]
-PrintLine = Callable[[str], None]
 Channel = Any  # one end of a pipe, whose type depends on the system
+
+
+@dataclass(frozen=True)
+class Work:
+    """What a node's call works on.
+
+    Attributes:
+        folder: to fill.
+        after: name -> folder of the nodes that it reads.
+        cache: of the run; nothing depends on what it holds.
+        device: ``auto``, ``cpu``, ``cuda`` or ``mps``.
+        progress: called with what is done.
+    """
+
+    folder: Path
+    after: Mapping[str, Path] = field(default_factory=dict[str, Path])
+    cache: Path | None = None
+    device: str = "auto"
+    progress: Progress = quiet
+
+    @property
+    def stage(self) -> str:
+        """The name of the stage that is built."""
+        return self.folder.name.removesuffix(".partial")
+
+
+@dataclass(frozen=True)
+class Named:
+    """An option that a digest knows by another name than its value.
+
+    A function by its source, a model by its weights, a file by its bytes.
+    """
+
+    value: Any
+    name: Any
 
 
 @dataclass(frozen=True)
@@ -38,27 +77,54 @@ class Node:
 
     Attributes:
         name: folder of the stage in the run folder.
-        build: fills its folder, and returns facts (JSON) for ``stage.json``; called with the
-            folder, the folders of ``after`` by name, and a progress. For several processes a
-            function of a module, or a ``functools.partial`` of one.
-        inputs: what it reads besides earlier stages: options, digests, seeds.
+        call: called with a :class:`Work` and the options; fills the folder and returns facts
+            (JSON). For several processes a function of a module.
+        options: of the call; all of them enter the digest, those that are :class:`Named` by name.
         after: names of earlier nodes; their digests enter its own.
         version: raised by hand when the stage comes to write other bytes.
         measures: it trains nothing: ``palpate verify`` builds it again, to compare.
     """
 
     name: str
-    build: Build
-    inputs: Mapping[str, Any]
+    call: Callable[..., Mapping[str, Any] | None]
+    options: Mapping[str, Any] = field(default_factory=dict[str, Any])
     after: Sequence[str] = ()
     version: int = 1
     measures: bool = False
+
+    def build(self, work: Work) -> Mapping[str, Any] | None:
+        """Fill the folder of ``work``."""
+        values = ((k, v.value if isinstance(v, Named) else v) for k, v in self.options.items())
+        return self.call(work, **dict(values))
+
+    def inputs(self, digests: Mapping[str, str]) -> dict[str, Any]:
+        """What the stage reads, of the ``digests`` of earlier nodes."""
+        names = {k: v.name if isinstance(v, Named) else v for k, v in self.options.items()}
+        return {**names, "after": {name: digests[name] for name in self.after}}
+
+
+class Nodes(list[Node]):
+    """The nodes of a study, in their order."""
+
+    def add(
+        self,
+        name: str,
+        call: Callable[..., Mapping[str, Any] | None],
+        /,
+        *after: str,
+        measures: bool = False,
+        version: int = 1,
+        **options: Any,
+    ) -> None:
+        """Append a :class:`Node`."""
+        self.append(Node(name, call, options, after, version, measures))
 
 
 def run_graph(
     nodes: Sequence[Node],
     folder: Path,
     *,
+    device: str = "auto",
     jobs: int = 1,
     print_line: PrintLine = lambda line: None,
     progress: Progress = quiet,
@@ -71,11 +137,12 @@ def run_graph(
     Args:
         nodes: of the graph; those that are ready are begun in this order.
         folder: run folder.
+        device: ``auto``, ``cpu``, ``cuda`` or ``mps``.
         jobs: processes that build nodes; 1: this one. Each computes with OMP_NUM_THREADS threads,
             or where that is not set with its share of the cores, when sums may differ from those of
             other ``jobs`` in the last bits. Several GPUs are dealt out in turn.
         print_line: called with one line for each stage begun, reused or done.
-        progress: called with what is done within a node, and over the whole.
+        progress: called with what is done within a node, and over all.
 
     Returns:
         the stages by name, in the order of ``nodes``.
@@ -85,19 +152,18 @@ def run_graph(
             another run holds, or under ``torchrun``; or the first that a node raises: finished
             stages stay.
     """
-    if (processes := os.environ.get("WORLD_SIZE", "1")) != "1":
-        fix = "Run it once without torchrun, with several jobs"
-        raise PalpateError("A study must be begun by one process", processes, fix)
+    processes = os.environ.get("WORLD_SIZE", "1")
+    fix = "Run it once without torchrun, with several jobs"
+    require(processes == "1", None, "A study must be begun by one process", processes, fix=fix)
     require(jobs >= 1, "jobs", "must be at least 1", jobs)
-    ordered, folder = in_order(nodes), Path(folder)
-    with locked(folder):
-        whole = _Whole(ordered, folder, jobs, print_line, progress)
-        whole.take_finished()
+    run = _Run(in_order(nodes), Path(folder), device, jobs, print_line, progress)
+    with locked(run.folder):
+        run.take_finished()
         if jobs == 1:
-            _run_here(whole)
+            _run_here(run)
         else:
-            _run_in_workers(whole)
-    return {node.name: whole.stages[node.name] for node in nodes}
+            _run_in_workers(run)
+    return {node.name: run.stages[node.name] for node in nodes}
 
 
 def plan_graph(nodes: Sequence[Node], folder: Path) -> dict[str, bool]:
@@ -106,9 +172,31 @@ def plan_graph(nodes: Sequence[Node], folder: Path) -> dict[str, bool]:
     What comes after a stage that is not done may turn out to be, if that is made again with the
     same files.
     """
-    whole = _Whole(in_order(nodes), Path(folder), 1, lambda line: None, quiet)
-    whole.take_finished()
-    return {node.name: node.name in whole.stages for node in whole.ordered}
+    run = _Run(in_order(nodes), Path(folder))
+    run.take_finished()
+    return {node.name: node.name in run.stages for node in run.ordered}
+
+
+def measured_again(
+    nodes: Sequence[Node], folder: Path, target: Path, progress: Progress = quiet
+) -> dict[str, Stage]:
+    """All stages of a run: those that measure are built below ``target``, the others as stored.
+
+    Raises:
+        PalpateError: if a stage is not there.
+    """
+    stages: dict[str, Stage] = {}
+    for done, node in enumerate(in_order(nodes)):
+        progress("stages", done, len(nodes), node.name)
+        stage = stored_stage(folder / node.name)
+        if node.measures:
+            again = target / node.name
+            again.mkdir()
+            after = {name: stages[name].folder for name in node.after}
+            facts = dict(node.build(Work(again, after, target / "cache")) or {})
+            stage = replace(stage, folder=again, record={**stage.record, "facts": facts})
+        stages[node.name] = stage
+    return stages
 
 
 def in_order(nodes: Sequence[Node]) -> list[Node]:
@@ -119,17 +207,19 @@ def in_order(nodes: Sequence[Node]) -> list[Node]:
             or a circle.
     """
     names = [node.name for node in nodes]
-    if twice := sorted({name for name in names if names.count(name) > 1}):
-        raise PalpateError("Each stage must have a name of its own", few(twice), "Rename one")
-    if bad := [name for name in names if Path(name).name != name or name.startswith(".")]:
-        raise PalpateError("The name of a stage must be that of a folder", few(bad), "Rename it")
+    twice = sorted({name for name in names if names.count(name) > 1})
+    bad = [name for name in names if Path(name).name != name or name.startswith(".")]
+    must = "Each stage must have a name of its own"
+    require(not twice, None, must, few(twice), fix="Rename one")
+    must = "The name of a stage must be that of a folder"
+    require(not bad, None, must, few(bad), fix="Rename it")
     for node in nodes:
-        if unknown := sorted(set(node.after) - set(names)):
-            must = f"Stage {node.name} must come after stages of the same graph"
-            raise PalpateError(must, few(unknown), "Add it, or correct the name")
+        unknown, fix = sorted({*node.after} - {*names}), "Add it, or correct the name"
+        must = f"Stage {node.name} must come after stages of the same graph"
+        require(not unknown, None, must, few(unknown), fix=fix)
     ordered: dict[str, Node] = {}
     while len(ordered) < len(nodes):
-        ready = (n for n in nodes if n.name not in ordered and ordered.keys() >= set(n.after))
+        ready = (n for n in nodes if n.name not in ordered and ordered.keys() >= {*n.after})
         if (node := next(ready, None)) is None:
             circle = few(name for name in names if name not in ordered)
             raise PalpateError("No stage may come after itself", circle, "Break the circle")
@@ -137,48 +227,44 @@ def in_order(nodes: Sequence[Node]) -> list[Node]:
     return list(ordered.values())
 
 
-def _reads(ordered: Sequence[Node]) -> dict[str, dict[str, Any]]:
-    """What each stage reads, by name: its inputs and the digests of the nodes before it."""
+def digests_of(nodes: Sequence[Node]) -> dict[str, str]:
+    """What names each stage: the digest of what it reads, by name."""
     digests: dict[str, str] = {}
-    reads: dict[str, dict[str, Any]] = {}
-    for node in ordered:
-        reads[node.name] = {**node.inputs, "after": {name: digests[name] for name in node.after}}
-        digests[node.name] = stage_digest(node.name, reads[node.name], node.version)
-    return reads
+    for node in in_order(nodes):
+        digests[node.name] = stage_digest(node.name, node.inputs(digests), node.version)
+    return digests
 
 
 @dataclass
-class _Whole:
+class _Run:
     """All nodes of a run: what is done, and what is running."""
 
     ordered: Sequence[Node]
     folder: Path
-    jobs: int
-    print_line: PrintLine
-    progress: Progress
+    device: str = "auto"
+    jobs: int = 1
+    print_line: PrintLine = lambda line: None
+    progress: Progress = quiet
     stages: dict[str, Stage] = field(default_factory=dict[str, Stage])
     begun: set[str] = field(default_factory=set[str])
 
     def take_finished(self) -> None:
         """Take what needs no work, from now on or once what it reads has been made again."""
-        reads = _reads(self.ordered)
+        digests = digests_of(self.ordered)
         for node in self.ordered:
             if node.name in {*self.stages, *self.begun} or not self.stages.keys() >= {*node.after}:
                 continue
-            digest = stage_digest(node.name, reads[node.name], node.version)
             outputs = {name: self.stages[name].outputs for name in node.after}
-            if (stage := finished_stage(self.folder / node.name, digest, outputs)) is not None:
+            stage = finished_stage(self.folder / node.name, digests[node.name], outputs)
+            if stage is not None:
                 self.stages[node.name] = stage
                 self.print_line(f"{node.name}: already done ({stage.seconds:.0f} s then)")
 
-    def ready(self) -> _Task | None:
-        """The first node that may begin."""
+    def ready(self) -> tuple[Node, dict[str, Stage]] | None:
+        """The first node that may begin, with the stages that it reads."""
         waiting = (n for n in self.ordered if n.name not in {*self.stages, *self.begun})
-        node = next((n for n in waiting if self.stages.keys() >= set(n.after)), None)
-        if node is None:
-            return None
-        outputs = {name: self.stages[name].outputs for name in node.after}
-        return _Task(node, self.folder, _reads(self.ordered)[node.name], outputs)
+        node = next((n for n in waiting if self.stages.keys() >= {*n.after}), None)
+        return node and (node, {name: self.stages[name] for name in node.after})
 
     def begin(self, node: Node) -> None:
         self.begun.add(node.name)
@@ -196,69 +282,74 @@ class _Whole:
         self.progress("all stages", len(self.stages), len(self.ordered))
 
 
-@dataclass(frozen=True)
-class _Task:
-    """A node to build: in which run folder, with what it reads, of which files of earlier nodes."""
-
-    node: Node
-    folder: Path
-    inputs: Mapping[str, Any]
-    read: Mapping[str, str]
-
-
-def _build_node(task: _Task, print_line: PrintLine, progress: Progress) -> Stage:
-    """Build a node in this process."""
-    node, folder = task.node, task.folder
-    before = {name: folder / name for name in node.after}
+def _build_node(
+    folder: Path,
+    device: str,
+    task: tuple[Node, Mapping[str, Stage]],
+    print_line: PrintLine,
+    progress: Progress,
+) -> Stage:
+    """Build a node of the stages that it reads, in this process."""
+    node, before = task
 
     def report(what: str, done: int, total: int, remark: str = "") -> None:
         progress(f"{node.name}: {what}", done, total, remark)
 
-    def build(place: Path) -> Mapping[str, Any] | None:
-        return node.build(place, before, report)
+    def build(partial_folder: Path) -> Mapping[str, Any] | None:
+        after = {name: stage.folder for name, stage in before.items()}
+        return node.build(Work(partial_folder, after, folder / "cache", device, report))
 
     try:
-        how: dict[str, Any] = {"version": node.version, "read": task.read}
-        return Run(folder, print_line).stage(node.name, task.inputs, build, **how)
+        return run_stage(
+            folder / node.name,
+            node.inputs({name: stage.digest for name, stage in before.items()}),
+            build,
+            version=node.version,
+            read={name: stage.outputs for name, stage in before.items()},
+            print_line=print_line,
+        )
     except Exception:
         print_line(f"{node.name}: stopped by an error")
         raise
 
 
-def _run_here(whole: _Whole) -> None:
+def _run_here(run: _Run) -> None:
     def report(what: str, done: int, total: int, remark: str = "") -> None:
-        whole.show()
-        whole.progress(what, done, total, remark)
+        run.show()
+        run.progress(what, done, total, remark)
 
-    while (task := whole.ready()) is not None:
-        whole.begin(task.node)
-        whole.end(_build_node(task, whole.print_line, report))
+    while (task := run.ready()) is not None:
+        run.begin(task[0])
+        run.end(_build_node(run.folder, run.device, task, run.print_line, report))
 
 
-def _run_in_workers(whole: _Whole) -> None:
+def _run_in_workers(run: _Run) -> None:
     workers: dict[Channel, BaseProcess] = {}
     idle: list[Channel] = []
     with _ended_with(workers):
-        while len(whole.stages) < len(whole.ordered):
-            while (idle or len(workers) < whole.jobs) and (task := whole.ready()) is not None:
-                worker = idle.pop() if idle else _start_worker(workers, whole.jobs)
+        while len(run.stages) < len(run.ordered):
+            while (idle or len(workers) < run.jobs) and (task := run.ready()) is not None:
+                worker = idle.pop() if idle else _start_worker(workers, run)
                 try:
                     worker.send(task)
                 except OSError:  # it died while it was idle
                     _raise_dead(workers[worker])
-                whole.begin(task.node)
+                run.begin(task[0])
             for worker in wait([w for w in workers if w not in idle], timeout=1.0):
-                kind, value = _received(worker, workers[worker])
+                try:
+                    kind, value = worker.recv()
+                except (EOFError, OSError):
+                    _raise_dead(workers[worker])
                 if kind == "stage":
                     idle.append(worker)
-                    whole.end(value)
+                    run.end(value)
                 elif kind == "error":
                     raise value
                 elif kind == "line":
-                    whole.print_line(value)
+                    run.print_line(value)
                 else:
-                    whole.progress(*value)
-            whole.show()
+                    run.progress(*value)
+            run.show()
 
 
 @contextmanager
@@ -273,37 +364,23 @@ def _ended_with(workers: Mapping[Channel, BaseProcess]) -> Generator[None]:
             process.join()
 
 
-def _start_worker(workers: dict[Channel, BaseProcess], jobs: int) -> Channel:
+def _start_worker(workers: dict[Channel, BaseProcess], run: _Run) -> Channel:
     """Start a process that builds nodes; spawned, as a fork of threads can deadlock."""
     affinity = getattr(os, "sched_getaffinity", None)
     cores = len(affinity(0)) if affinity else os.cpu_count() or 1
-    gpus = os.environ.get("CUDA_VISIBLE_DEVICES", ",".join(_gpus())).split(",")
+    nvidia = (f"{k}" for k, _ in enumerate(Path("/dev").glob("nvidia[0-9]*")))
+    gpus = os.environ.get("CUDA_VISIBLE_DEVICES", ",".join(nvidia)).split(",")
     environment = {"CUDA_VISIBLE_DEVICES": gpus[len(workers) % len(gpus)]} if len(gpus) > 1 else {}
-    environment |= {"OMP_NUM_THREADS": os.environ.get("OMP_NUM_THREADS", f"{cores // jobs or 1}")}
+    threads = os.environ.get("OMP_NUM_THREADS", f"{cores // run.jobs or 1}")
+    environment |= {"OMP_NUM_THREADS": threads}
     context = multiprocessing.get_context("spawn")
     ours, theirs = context.Pipe()
-    process = context.Process(target=_work, args=(theirs, environment))
+    arguments = (theirs, environment, run.folder, run.device)
+    process = context.Process(target=_work, args=arguments)
     process.start()
     theirs.close()
     workers[ours] = process
     return ours
-
-
-def _gpus() -> list[str]:
-    """Numbers of the NVIDIA GPUs of a Linux machine."""
-    return [f"{number}" for number, _ in enumerate(Path("/dev").glob("nvidia[0-9]*"))]
-
-
-def _received(worker: Channel, process: BaseProcess) -> tuple[str, Any]:
-    """The next message of a worker: its kind and its value.
-
-    Raises:
-        PalpateError: if the worker has died.
-    """
-    try:
-        return worker.recv()
-    except (EOFError, OSError):
-        _raise_dead(process)
 
 
 def _raise_dead(process: BaseProcess) -> NoReturn:
@@ -314,12 +391,14 @@ def _raise_dead(process: BaseProcess) -> NoReturn:
     raise PalpateError("The processes of a study must stay alive", got, fix)
 
 
-def _work(channel: Channel, environment: Mapping[str, str]) -> None:
+def _work(channel: Channel, environment: Mapping[str, str], folder: Path, device: str) -> None:
     """Build the nodes that arrive, in a worker, until its parent ends."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent handles Ctrl-C
     exit_with_parent()
     os.environ.update(environment)  # before torch is loaded
-    send = partial(_send, channel)
+
+    def send(kind: str, value: Any) -> None:
+        channel.send((kind, value))
 
     def report(what: str, done: int, total: int, remark: str = "") -> None:
         send("progress", (what, done, total, remark))
@@ -327,11 +406,7 @@ def _work(channel: Channel, environment: Mapping[str, str]) -> None:
     while True:
         try:
             task = channel.recv()
-            send("stage", _build_node(task, partial(send, "line"), report))
+            send("stage", _build_node(folder, device, task, partial(send, "line"), report))
         except Exception as error:
             error.add_note(traceback.format_exc())  # a traceback is not sent along
             send("error", error)
-
-
-def _send(channel: Channel, kind: str, value: Any) -> None:
-    channel.send((kind, value))

@@ -1,19 +1,19 @@
 """What a study measures, stage by stage: what encoders know, and how good images are.
 
-Bodies of nodes, as :mod:`palpate.studies.making`. Every score carries ``details["stage"]``, the
+Calls of nodes, as :mod:`palpate.studies.making`. Every score carries ``details["stage"]``, the
 stage that it was made in.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from palpate.core import FeatureSet, Note, Progress, Score, Split, read_json, write_json
+from palpate.core import FeatureSet, Note, Score, Split
 from palpate.data.images import load_images
 from palpate.data.manifest import Manifest
 from palpate.encoders.embed import embed, embed_images
@@ -24,19 +24,32 @@ from palpate.evaluation.scoring import score
 from palpate.metrics import tmmd
 from palpate.metrics.means import Mean, mean_of
 from palpate.metrics.probe import fit_probe
-from palpate.studies.controls import FLOOR, HALVES, MEMORIZED, NEAREST, ONE, WRONG, nearest_rows
-from palpate.studies.making import After, Facts, cache_of, control_folders, data_of
-from palpate.studies.methods import OURS
-from palpate.studies.study import SPLITS, Judged, Metric
+from palpate.studies.controls import nearest_rows
+from palpate.studies.files import control_folders, data_of, read_scores, write_scores
+from palpate.studies.graph import Work
+from palpate.studies.methods import Judged
+from palpate.studies.names import (
+    FLOOR,
+    HALF_PROBES,
+    HALVES,
+    MATERIAL,
+    MEMORIZED,
+    NEAREST,
+    ONE,
+    OURS,
+    SPLITS,
+    WRONG,
+)
+from palpate.studies.stages import Facts
+
+if TYPE_CHECKING:
+    from palpate.studies.study import Preset, Study
 
 #: Controls that are train images, which a probe of material was fitted to.
 OF_TRAIN = (FLOOR, WRONG, NEAREST, ONE, MEMORIZED)
 #: Readings of the TMMD family: ours, and the paper's.
 READINGS = ("grouped", "paper")
 SIGMA = 10.0
-MATERIAL = "material accuracy"
-#: Real test images, named by the probes that name the images of the nearest photos.
-HALF_PROBES = "real, by half probes"
 
 
 def probing_plan(manifest: Manifest, splits: Mapping[str, Split]) -> Plan:
@@ -48,32 +61,26 @@ def probing_plan(manifest: Manifest, splits: Mapping[str, Split]) -> Plan:
     return plan_of(manifest, splits, plan)
 
 
-def probe_encoders(
-    place: Path, after: After, progress: Progress, *, split: str, encoders: str, device: str
-) -> Facts:
+def probe_encoders(work: Work, *, split: str, encoders: str) -> Facts:
     """What the encoder of a split knows of its test part (tables 1 and 2, left)."""
-    manifest, parts = data_of(after, split)
-    splits = {name: Split.load(after["split"] / f"{name}.json") for name in SPLITS}
+    manifest = data_of(work)[0]
+    splits = {name: data_of(work, name)[1] for name in SPLITS}
     plan = probing_plan(manifest, splits)
-    loaded = EncoderSet.load(after[encoders] / "encoders", device=device)
-    cache = cache_of(place)
-    probed = measure(manifest, parts, loaded, split, plan, cache=cache, progress=progress)
-    stage = stage_of(place)
-    write_json(place / "scores.json", [stamped(m.score, stage).to_json() for m in probed.means])
-    arrays = {}
-    for k, mean in enumerate(probed.means):
-        arrays |= {
-            f"values{k}": mean.values,
-            f"weights{k}": mean.weights,
-            f"groups{k}": mean.groups,
-        }
-    np.savez(place / "means.npz", **arrays)
+    loaded = EncoderSet.load(work.after[encoders] / "encoders", device=work.device)
+    probed = measure(
+        manifest, splits[split], loaded, split, plan, cache=work.cache, progress=work.progress
+    )
+    write_scores(work.folder, [stamped(mean.score, work.stage) for mean in probed.means])
+    np.savez(
+        work.folder / "means.npz",
+        **{f"{n}{k}": getattr(mean, n) for k, mean in enumerate(probed.means) for n in _MEAN},
+    )
     return {"scores": len(probed.means)}
 
 
 def read_probed(folder: Path) -> Probed:
     """The means that :func:`probe_encoders` wrote."""
-    scores = [Score.from_json(s) for s in read_json(folder / "scores.json", "scores")]
+    scores = read_scores(folder)
     with np.load(folder / "means.npz") as arrays:
         parts = [[arrays[f"{name}{k}"] for name in _MEAN] for k in range(len(scores))]
     return Probed([Mean(s, *part) for s, part in zip(scores, parts, strict=True)])
@@ -82,96 +89,73 @@ def read_probed(folder: Path) -> Probed:
 _MEAN = ("values", "weights", "groups")
 
 
-def read_scores(folder: Path) -> list[Score]:
-    """The scores that :func:`judge_images` wrote."""
-    return [Score.from_json(s) for s in read_json(folder / "scores.json", "scores")]
+def judge_images(
+    work: Work,
+    *,
+    study: Study,
+    preset: Preset,
+    split: str,
+    encoders: str,
+    methods: Mapping[str, str],
+    seed: int,
+    weights: Weights,
+) -> Facts:
+    """Every score of the images of a split's test part, by one encoder.
 
-
-@dataclass(frozen=True)
-class Judging:
-    """What is scored, by which encoder.
-
-    Attributes:
+    Args:
+        work: on the data, splits, images and encoders.
+        study: its controls and further metrics.
+        preset: size of the images, permutations of the test of TMMD, and frozen encoders.
         split: the images are of its test part.
         encoders: node of the judge.
         methods: name -> node of its images.
-        controls: names.
-        metrics: further ones.
-        clip: frozen encoders, of whose photos some are the nearest.
-        size: side of the images in pixels.
         seed: of the trainings.
-        permutations: of the permutation test of TMMD.
         weights: of FID, CMMD and LPIPS as published, as far as they are given.
     """
-
-    split: str
-    encoders: str
-    methods: Mapping[str, str]
-    controls: Sequence[str]
-    metrics: Sequence[Metric]
-    clip: str
-    size: int
-    seed: int
-    permutations: int
-    weights: Weights
-
-
-def judge_images(
-    place: Path, after: After, progress: Progress, *, judging: Judging, device: str
-) -> Facts:
-    """Every score of the images of a split's test part, by one encoder."""
-    name, methods, cache = judging.split, judging.methods, cache_of(place)
-    manifest, split = data_of(after, name)
-    judge = EncoderSet.load(after[judging.encoders] / "encoders", device=device)
-    folders = {method: after[node] / "images" for method, node in methods.items()}
-    folders |= control_folders(after, name, judging.controls)
-    test = manifest.part(split, "test")
+    manifest, parts = data_of(work, split)
+    judge = EncoderSet.load(work.after[encoders] / "encoders", device=work.device)
+    folders = {method: work.after[node] / "images" for method, node in methods.items()}
+    folders |= control_folders(work, split, [*study.controls])
+    test, size = manifest.part(parts, "test"), preset.diffusion.size
     gels = not test.table["background"].null_count()
     results = score(
         list(folders.values()),
         manifest,
         encoder=judge,
-        split=split,
+        split=parts,
         train=manifest,
         names=list(folders),
         presets=READINGS,
         sigma=SIGMA,
-        companions=("ssim", "psnr", *(("contact",) if gels else ()), *judging.weights.companions),
-        **vars(judging.weights),
+        companions=("ssim", "psnr", *(("contact",) if gels else ()), *weights.companions),
+        **vars(weights),
         controls=False,
-        permutations=judging.permutations,
+        permutations=preset.permutations,
         allow_seen=True,  # of the encoder of another split, and by the leak that is measured
-        cache=cache,
-        progress=progress,
+        cache=work.cache,
+        progress=work.progress,
     )
     scores = [s for s in results if s.metric != MATERIAL or s.a not in OF_TRAIN]
-    images = {n: load_images(image_files(f, test.ids), judging.size) for n, f in folders.items()}
-    real = load_images(test.paths("tactile"), judging.size)
-    features = embed(test, judge, "tactile", cache=cache, still=True)
-    made = {n: replace(features, features=embed_images(x, judge)) for n, x in images.items()}
+    images = {n: load_images(image_files(f, test.ids), size) for n, f in folders.items()}
+    real = load_images(test.paths("tactile"), size)
+    features = embed(test, judge, "tactile", cache=work.cache, still=True)
+    embedded = {n: replace(features, features=embed_images(x, judge)) for n, x in images.items()}
     scores = [s for s in scores if _compares(s, methods)]
-    if NEAREST in made and features.labels is not None:
-        train = manifest.part(split, "train")
-        vision = EncoderSet(load_clip(judging.clip, device=device))
-        rows = nearest_rows(train, test, vision, cache=cache)
-        scores += _cross_fitted(
-            embed(train, judge, cache=cache), made[NEAREST], features, rows, split
-        )
-    if OURS in made:
-        scores += _halves(made[OURS], judging.permutations, split)
-    for metric in judging.metrics:
+    if NEAREST in embedded and features.labels is not None:
+        train = manifest.part(parts, "train")
+        vision = EncoderSet(load_clip(preset.clip, device=work.device))
+        rows = nearest_rows(train, test, vision, work)
+        on_train = embed(train, judge, cache=work.cache)
+        scores += _cross_fitted(on_train, embedded[NEAREST], features, rows, parts)
+    if OURS in embedded:
+        scores += _halves(embedded[OURS], preset.permutations, parts)
+    for metric in study.metrics:
         for subject, x in images.items():
-            judged = Judged(subject, x, real, made[subject], features, judging.seed)
-            one = metric(judged)
+            one = metric(Judged(subject, x, real, embedded[subject], features, seed))
             details = {**one.details, "extra": True}  # a column of the tables
-            scores.append(replace(one, a=subject, split=split.digest, details=details))
-    write_json(place / "scores.json", [stamped(s, stage_of(place)).to_json() for s in scores])
+            scores.append(replace(one, a=subject, split=parts.digest, details=details))
+    write_scores(work.folder, [stamped(s, work.stage) for s in scores])
     return {"scores": len(scores), "judge": judge.digest("tactile")}
-
-
-def stage_of(place: Path) -> str:
-    """The name of the stage that is built in a folder."""
-    return place.name.removesuffix(".partial")
 
 
 def stamped(score: Score, stage: str) -> Score:

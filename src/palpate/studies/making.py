@@ -1,23 +1,21 @@
 """What a study makes, stage by stage: data, splits, encoders, autoencoders, generators, images.
 
-Each function is the body of a node (:class:`palpate.studies.graph.Node`): it fills ``place``, reads
-the folders of earlier nodes (``after``, by name), and returns facts. Caches lie in ``cache`` of the
-run folder; nothing depends on what they hold.
+Each function is the call of a node (:class:`palpate.studies.graph.Node`): it fills the folder of
+its work, reads those of earlier nodes, and returns facts.
 """
 
 from __future__ import annotations
 
-import re
 import shutil
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from PIL import Image
 
-from palpate.core import PalpateError, Progress, Split, write_json
+from palpate.core import Split, require, write_json
 from palpate.data.manifest import Manifest
 from palpate.diffusion.autoencoder import BackgroundAutoencoder
 from palpate.diffusion.autoencoder_training import measure_reconstruction
@@ -25,320 +23,269 @@ from palpate.diffusion.autoencoders import autoencoder_of, load_autoencoder
 from palpate.diffusion.generation import generate
 from palpate.diffusion.options import AutoencoderOptions, BackgroundOptions
 from palpate.diffusion.pipeline import TactilePipeline
+from palpate.diffusion.presets import DiffusionPreset
 from palpate.diffusion.training import train_pipeline
 from palpate.encoders import train_encoder
 from palpate.encoders.embed import texts_of
 from palpate.encoders.encoder_set import EncoderSet, load_clip
 from palpate.encoders.models import pick_device
+from palpate.encoders.presets import EncoderPreset
 from palpate.evaluation.inputs import read as read_samples
 from palpate.leakage.auditing import audit
 from palpate.leakage.splitting import split as leak_free_split
 from palpate.sim import WorldOptions, write_world
-from palpate.studies.methods import Images, Make, Method, Setting
-from palpate.studies.study import NOLEAK, ORIG, Preset, Study
-from palpate.training.options import Compute
+from palpate.studies.files import data_of, fresh, require_unseen, write_images
+from palpate.studies.graph import Work
+from palpate.studies.methods import Images, Make, Setting
+from palpate.studies.names import NOLEAK, ORIG, slug
+from palpate.studies.stages import Facts
+from palpate.training.options import Compute, Precision
 from palpate.training.processes import keep_logs
 
-Facts = dict[str, Any]
-After = Mapping[str, Path]
 
-
-def slug(name: str) -> str:
-    """A name as part of a folder's name: ``Ours w/ BG`` -> ``ours-w-bg``."""
-    return re.sub(r"[^a-z0-9]+", "-", name.lower()).strip("-")
-
-
-def cache_of(place: Path) -> Path:
-    """The folder of caches of the run that a stage belongs to."""
-    return place.parent / "cache"
-
-
-def data_of(after: After, name: str) -> tuple[Manifest, Split]:
-    """The data and one of its splits."""
-    return Manifest.load(after["data"]), Split.load(after["split"] / f"{name}.json")
-
-
-def fresh(folder: Path) -> Path:
-    """The folder, without what a killed call left in it between saving and finishing its stage."""
-    shutil.rmtree(folder, ignore_errors=True)
-    return folder
-
-
-def make_world(place: Path, after: After, progress: Progress, *, options: WorldOptions) -> Facts:
+def make_world(work: Work, *, options: WorldOptions) -> Facts:
     """The embedded world, in ``tree``."""
-    record = write_world(place / "tree", options, workers=2, progress=progress)
+    record = write_world(work.folder / "tree", options, workers=2, progress=work.progress)
     return {"digest": record.digest}
 
 
 def read_data(
-    place: Path, after: After, progress: Progress, *, study: Study, root: Path | None
+    work: Work, *, read: Callable[..., None], root: Path | None, name: str, unseen: bool
 ) -> Facts:
-    """The manifest."""
-    source = after["world"] / "tree" if "world" in after else root
-    assert source is not None
-    study.read(source, place, progress)
-    manifest = Manifest.load(place)
+    """The manifest of the data below ``root``, or of the embedded world.
+
+    ``name``: of a data set that states none; ``unseen``: the shipped models must not know it.
+    """
+    source = root or work.after["world"] / "tree"
+    if unseen:
+        require_unseen(source)
+    read(source, work.folder, work.progress)
+    manifest = Manifest.load(work.folder)
+    if unseen:  # images may lie elsewhere than the source
+        require_unseen(manifest.root, manifest.facts)
     videos = len({*manifest.column("video")} - {None})
-    dataset = str(manifest.facts.get("dataset", study.name))
+    dataset = str(manifest.facts.get("dataset", name))
     counts = {"samples": len(manifest), "videos": videos}
     return {"digest": manifest.digest, "dataset": dataset, **counts}
 
 
-def make_splits(
-    place: Path, after: After, progress: Progress, *, noleak: str | None = None
-) -> Facts:
+def make_splits(work: Work, *, noleak: str | None) -> Facts:
     """The data set's own split, one without leaks, and their audits.
 
     That is the published one of ``noleak``, or one by whole videos with as large a train part. A
     data set without a split of its own gets one by whole contacts in its place.
     """
-    manifest, own = Manifest.load(after["data"]), after["data"] / "splits" / f"{ORIG}.json"
-    made = partial(leak_free_split, manifest, seed=0)
-    original = Split.load(own) if own.is_file() else made(by="contact")
+    data = work.after["data"]
+    manifest, own = Manifest.load(data), data / "splits" / f"{ORIG}.json"
+    split_by = partial(leak_free_split, manifest, seed=0)
+    original = Split.load(own) if own.is_file() else split_by(by="contact")
     counts = original.counts()
     share = counts["train"] / (counts["train"] + counts["test"])
     if noleak == "touch-and-go":
         share = 0.8  # of the record
-    clean = made(by="video", train=share) if noleak is None else made(noleak=noleak, train=share)
-    splits, audits = {ORIG: original, NOLEAK: clean}, list[Any]()
+    rule: Any = {"by": "video"} if noleak is None else {"noleak": noleak}
+    splits, audits = {ORIG: original, NOLEAK: split_by(**rule, train=share)}, list[Any]()
     for name, split in splits.items():
-        split.save(place / f"{name}.json")
-        how: Facts = {"cache": cache_of(place), "progress": progress}
-        audits.append(audit(manifest, split=split, name=name, by="video", **how).to_json())
-    write_json(place / "audits.json", audits)
+        split.save(work.folder / f"{name}.json")
+        audited = audit(
+            manifest, split=split, name=name, by="video", cache=work.cache, progress=work.progress
+        )
+        audits.append(audited.to_json())
+    write_json(work.folder / "audits.json", audits)
     return {name: {"digest": s.digest, **s.counts()} for name, s in splits.items()}
 
 
-def make_encoders(
-    place: Path, after: After, progress: Progress, *, split: str, seed: int, **how: Any
-) -> Facts:
-    """A tactile encoder trained on the train part, with the frozen ones; in ``encoders``.
-
-    ``how``: clip, preset and device, as of :func:`palpate.train_encoder`.
-    """
-    manifest, parts = data_of(after, split)
-    folder = fresh(place / "encoders")
-    encoders = train_encoder(manifest, parts, output=folder, seed=seed, progress=progress, **how)
+def make_encoders(work: Work, *, split: str, seed: int, preset: EncoderPreset, clip: str) -> Facts:
+    """A tactile encoder trained on the train part, with the frozen ones; in ``encoders``."""
+    encoders = train_encoder(
+        *data_of(work, split),
+        preset=preset,
+        clip=clip,
+        output=fresh(work.folder / "encoders"),
+        seed=seed,
+        device=work.device,
+        progress=work.progress,
+    )
     return {"digest": encoders.digest("tactile"), "scores": encoders.card.get("scores")}
 
 
 def make_autoencoder(
-    place: Path,
-    after: After,
-    progress: Progress,
-    *,
-    split: str,
-    options: AutoencoderOptions | BackgroundOptions | str,
-    size: int,
-    device: str,
+    work: Work, *, split: str, options: AutoencoderOptions | BackgroundOptions | str, size: int
 ) -> Facts:
     """An autoencoder trained on the train part, or a trained one; in ``autoencoder``."""
-    manifest, parts = data_of(after, split)
-    cache = cache_of(place)
-    common: Facts = {"cache": cache, "device": device, "progress": progress}
+    manifest, parts = data_of(work, split)
+    training = work.folder / "training"
     if isinstance(options, str):
         model = load_autoencoder(options)
     else:
-        model = autoencoder_of(manifest, parts, options, size, place / "training", **common)
-    model.save(fresh(place / "autoencoder"))
-    setting = setting_of(manifest, parts, place, size=size, device=device, progress=progress)
+        model = autoencoder_of(
+            manifest,
+            parts,
+            options,
+            size,
+            training,
+            cache=work.cache,
+            device=work.device,
+            progress=work.progress,
+        )
+    model.save(fresh(work.folder / "autoencoder"))
+    setting = Setting(*_parts(manifest, parts), work, size)
     real, gels = setting.pixels(setting.test), None
     if isinstance(model, BackgroundAutoencoder):
         gels = setting.pixels(setting.test, "background")
     ceiling = measure_reconstruction(model, real, gels)
-    shutil.rmtree(place / "training", ignore_errors=True)
-    # Without a codebook nothing is known of it.
-    known = {k: float(v) for k, v in vars(ceiling).items() if v is not None}
-    return {"digest": model.digest, "ceiling": known}
+    shutil.rmtree(training, ignore_errors=True)
+    # Nothing is said of a codebook where there is none.
+    scores = {k: float(v) for k, v in vars(ceiling).items() if v is not None}
+    return {"digest": model.digest, "ceiling": scores}
+
+
+def _parts(manifest: Manifest, split: Split) -> tuple[Manifest, Manifest]:
+    return manifest.part(split, "train"), manifest.part(split, "test")
+
+
+@dataclass(frozen=True)
+class Training:
+    """How a generator is trained; ``steps`` None: as many as its preset says."""
+
+    diffusion: DiffusionPreset
+    background: bool = False
+    steps: int | None = None
+    precision: Precision = "float32"
 
 
 def make_generator(
-    place: Path,
-    after: After,
-    progress: Progress,
+    work: Work,
     *,
     split: str,
     seed: int,
-    method: Method,
-    preset: Preset,
+    training: Training,
+    clip: str,
     autoencoder: str,
-    device: str,
+    start: str | None = None,
 ) -> Facts:
-    """A method's generator trained from random weights on the train part; in ``model``.
+    """A generator trained on the train part; in ``model``.
 
-    ``autoencoder``: the node that trained it.
+    ``autoencoder``: the node that trained it, or a trained one; ``start``: the generator that
+    training goes on from, in the place of random weights.
     """
-    manifest, parts = data_of(after, split)
-    diffusion = method.preset(preset.diffusion)
-    encoders = EncoderSet(load_clip(preset.clip, device=device))
+    folder, diffusion = work.folder / "training", training.diffusion
+    trained = work.after.get(autoencoder)
     pipeline = train_pipeline(
-        manifest,
-        parts,
-        None if diffusion.condition.source == "resnet" else encoders,
-        load_autoencoder(after[autoencoder] / "autoencoder"),
+        *data_of(work, split),
+        None
+        if diffusion.condition.source == "resnet"
+        else EncoderSet(load_clip(clip, device=work.device)),
+        load_autoencoder(autoencoder if trained is None else trained / "autoencoder"),
         diffusion,
-        place / "training",
+        folder,
         seed=seed,
-        steps=preset.steps,
-        background=method.background,
-        cache=cache_of(place),
-        device=device,
-        compute=Compute(precision=preset.precision),
-        progress=progress,
+        steps=training.steps,
+        background=training.background,
+        start=start and TactilePipeline.from_pretrained(start),
+        cache=work.cache,
+        device=work.device,
+        compute=Compute(precision=training.precision),
+        progress=work.progress,
     )
-    pipeline.save(fresh(place / "model"))
-    keep_logs(place / "training", place / "model")
-    shutil.rmtree(place / "training")
+    pipeline.save(fresh(work.folder / "model"))
+    keep_logs(folder, work.folder / "model")
+    shutil.rmtree(folder)
     loop = pipeline.training["loop"]
-    facts = {"digest": pipeline.digest, "parameters": pipeline.training["parameters"]}
-    return {**facts, "steps": loop["steps"], "batch": loop["batch"]}
+    return {
+        "digest": pipeline.digest,
+        "parameters": pipeline.training["parameters"],
+        "steps": loop["steps"],
+        "batch": loop["batch"],
+        "background": pipeline.background,
+    }
 
 
 def make_images(
-    place: Path,
-    after: After,
-    progress: Progress,
-    *,
-    split: str,
-    seed: int,
-    method: Method,
-    generator: str,
-    preset: Preset,
-    device: str,
+    work: Work, *, split: str, seed: int, generator: str, by_text: bool = False
 ) -> Facts:
-    """A tactile image for each sample of the test part; in ``images``.
+    """A tactile image by the model of the node ``generator`` for each test sample; in ``images``.
 
-    ``generator``: the node that trained it; '' for a method that makes its images itself.
+    ``by_text``: each is driven by the sample's own text in the place of its photo.
     """
-    manifest, parts = data_of(after, split)
-    output = place / "images"
-    if method.make is not None:
-        autoencoder = after.get(f"autoencoder-{split}")
-        setting = setting_of(
-            manifest,
-            parts,
-            place,
-            size=preset.diffusion.size,
-            seed=seed,
-            steps=preset.steps,
-            clip=preset.clip,
-            device=device,
-            autoencoder=autoencoder and autoencoder / "autoencoder",
-            progress=progress,
-        )
-        made = _checked(method.name, method.make(setting), setting)
-        write_images(output, setting.test.ids, made)
-        return {"images": len(setting.test)}
-    pipeline = TactilePipeline.from_pretrained(after[generator] / "model").to(pick_device(device))
-    test = manifest.part(parts, "test")
-    if method.text_of:
+    manifest, parts = data_of(work, split)
+    test, output = manifest.part(parts, "test"), work.folder / "images"
+    pipeline = TactilePipeline.from_pretrained(work.after[generator] / "model")
+    pipeline = pipeline.to(pick_device(work.device))
+    if by_text:
         texts, gels = texts_of(test)[0], None
         if pipeline.background:
-            given = setting_of(manifest, parts, place, size=pipeline.size, progress=progress)
-            gels = given.pixels(test, "background")
+            setting = Setting(manifest.part(parts, "train"), test, work, pipeline.size)
+            gels = setting.pixels(test, "background")
         each = {text: np.asarray(pipeline.embed_text(text)) for text in dict.fromkeys(texts)}
         words = np.concatenate([each[text] for text in texts])
         images = pipeline.sample(None, test.ids, texts=words, seed=seed, background=gels)
         write_images(output, test.ids, images)
     else:
-        how: Facts = {"seed": seed, "device": device, "progress": progress}
-        generate(test, model=pipeline, output=output, **how)
+        generate(
+            test,
+            model=pipeline,
+            output=output,
+            seed=seed,
+            device=work.device,
+            progress=work.progress,
+        )
     return {"images": len(test), "pipeline": pipeline.digest}
 
 
+def make_own_images(
+    work: Work, *, split: str, seed: int, name: str, make: Make, size: int, steps: int, clip: str
+) -> Facts:
+    """The images of a method that is no diffusion model; in ``images``."""
+    autoencoder = work.after.get(f"autoencoder-{split}")
+    autoencoder = autoencoder and autoencoder / "autoencoder"
+    setting = Setting(*_parts(*data_of(work, split)), work, size, seed, steps, clip, autoencoder)
+    images = _checked(name, make(setting), setting)
+    write_images(work.folder / "images", setting.test.ids, images)
+    return {"images": len(setting.test)}
+
+
 def make_controls(
-    place: Path,
-    after: After,
-    progress: Progress,
-    *,
-    split: str,
-    controls: Mapping[str, Make],
-    preset: Preset,
-    device: str,
+    work: Work, *, split: str, controls: Mapping[str, Make], size: int, clip: str
 ) -> Facts:
     """The images of every control that the data allow, a folder each."""
-    manifest, parts = data_of(after, split)
-    setting = setting_of(
-        manifest,
-        parts,
-        place,
-        size=preset.diffusion.size,
-        steps=preset.steps,
-        clip=preset.clip,
-        device=device,
-        autoencoder=after[f"autoencoder-{split}"] / "autoencoder",
-        progress=progress,
-    )
-    made: list[str] = []
+    autoencoder = work.after[f"autoencoder-{split}"] / "autoencoder"
+    parts = _parts(*data_of(work, split))
+    setting = Setting(*parts, work, size, clip=clip, autoencoder=autoencoder)
+    written: list[str] = []
     for done, (name, make) in enumerate(controls.items()):
-        progress("controls", done, len(controls), name)
+        work.progress("controls", done, len(controls), name)
         if (images := make(setting)) is not None:
-            write_images(place / slug(name), setting.test.ids, _checked(name, images, setting))
-            made.append(name)
-    return {"controls": made}
+            images = _checked(name, images, setting)
+            write_images(work.folder / slug(name), setting.test.ids, images)
+            written.append(name)
+    return {"controls": written}
 
 
-def control_folders(after: After, split: str, names: Sequence[str]) -> dict[str, Path]:
-    """Folders of the images of those controls that the data allow, by name."""
-    folders = {name: after[f"controls-{split}"] / slug(name) for name in names}
-    return {name: folder for name, folder in folders.items() if folder.is_dir()}
-
-
-def take_images(
-    place: Path, after: After, progress: Progress, *, split: str, folder: Path, size: int
-) -> Facts:
+def take_images(work: Work, *, split: str, folder: Path, size: int) -> Facts:
     """Images that another system made for the test part, as ours; in ``images``.
 
     Raises:
         PalpateError: if the image of a test sample is missing.
     """
-    manifest, parts = data_of(after, split)
+    manifest, parts = data_of(work, split)
     ids = manifest.part(parts, "test").ids
     samples = read_samples(folder, str(folder)).take(ids)
-    write_images(place / "images", ids, samples.pixels(size, cache_of(place), progress))
+    pixels = samples.pixels(size, work.cache, work.progress)
+    write_images(work.folder / "images", ids, pixels)
     return {"images": len(ids), "digest": samples.image_digest()}
 
 
-def write_images(folder: Path, ids: Sequence[str], images: Images) -> None:
-    """Images as PNGs with the manifest that names their samples: what :func:`score` reads."""
-    folder.mkdir(exist_ok=True)
-    rows = [{"id": i, "tactile": f"{k}.png"} for k, i in enumerate(ids)]
-    for row, image in zip(rows, images, strict=True):
-        Image.fromarray(np.asarray(image)).save(folder / row["tactile"])
-    Manifest.from_rows(rows, folder).save(folder / "manifest.parquet")
-
-
-def _checked(name: str, made: Images | None, setting: Setting) -> Images:
+def _checked(name: str, images: Images | None, setting: Setting) -> Images:
     """The images that a function made.
 
     Raises:
         PalpateError: if it returned another number of images, or another kind of array.
     """
-    images = np.asarray(made)
+    images = np.asarray(images)
     shape = (len(setting.test), setting.size, setting.size, 3)
-    if images.shape != shape or images.dtype != np.uint8:
-        must = f"{name} must make an array {shape} of uint8, an image a test sample"
-        raise PalpateError(must, f"{images.shape} of {images.dtype}", "Change its function")
+    must = f"{name} must make an array {shape} of uint8, an image a test sample"
+    fits = images.shape == shape and images.dtype == np.uint8
+    got = f"{images.shape} of {images.dtype}"
+    require(fits, None, must, got, fix="Change its function")
     return images
-
-
-def setting_of(
-    manifest: Manifest,
-    split: Split,
-    place: Path,
-    *,
-    size: int,
-    progress: Progress,
-    seed: int = 0,
-    steps: int = 0,
-    clip: str = "",
-    device: str = "auto",
-    autoencoder: Path | None = None,
-) -> Setting:
-    """What makes images in a stage: the parts of a split, and where its files lie."""
-    train, test = (manifest.part(split, part) for part in ("train", "test"))
-    folder = place / "work"
-    cache = cache_of(place)
-    return Setting(
-        train, test, size, seed, steps, clip, cache, folder, device, autoencoder, progress
-    )

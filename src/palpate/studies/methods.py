@@ -16,21 +16,16 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from palpate.core import Progress, quiet
+from palpate.core import FeatureSet, Score
 from palpate.data.images import cached_images
 from palpate.data.manifest import Manifest
 from palpate.diffusion.generation import generate
 from palpate.diffusion.no_contact import gels_of
 from palpate.diffusion.presets import DiffusionPreset
+from palpate.studies.graph import Work
+from palpate.studies.names import BACKGROUND, BEST, GVST, OURS, SHIPPED, VQ
 
 Images = NDArray[np.uint8]
-#: The paper's training, driven at test time by the photo in the place of the text.
-OURS = "Ours"
-GVST, BEST = "GVST", "best"
-#: Behind the paper's kind of autoencoder, which is not given the gel; with it and without.
-VQ, BACKGROUND = "Ours, VQ", "Ours w/ BG"
-#: What ``palpate generate`` uses without a model.
-SHIPPED = "palpate/mini"
 #: Text conditions the training, with nothing that bridges to photos.
 BARE: Mapping[str, Any] = {"source": "text", "gap": "none", "noise": 0.0}
 
@@ -41,28 +36,22 @@ class Setting:
 
     Attributes:
         train, test: its parts; one image is made for each sample of ``test``.
+        work: cache, device, progress, and the stage's folder.
         size: side of the images in pixels.
         seed: of weights, order and noise.
         steps: optimizer steps of each compared method.
         clip: frozen vision and text encoders: a shipped name, hub id or folder.
-        cache: folder for decoded images and embeddings.
-        folder: empty folder for checkpoints.
-        device: ``auto``, ``cpu``, ``cuda`` or ``mps``.
         autoencoder: folder of the autoencoder of this split.
-        progress: called with what is done.
     """
 
     train: Manifest
     test: Manifest
+    work: Work
     size: int
-    seed: int
-    steps: int
-    clip: str
-    cache: Path
-    folder: Path
-    device: str = "auto"
+    seed: int = 0
+    steps: int = 0
+    clip: str = ""
     autoencoder: Path | None = None
-    progress: Progress = quiet
 
     def pixels(self, part: Manifest, column: str = "tactile") -> Images:
         """One image column as squares (n, size, size, 3); gels that are absent are the stock gel.
@@ -70,15 +59,39 @@ class Setting:
         Raises:
             PalpateError: if a sample has no such image.
         """
+        work = self.work
         if column == "background":
-            like = gels_of(self.train, self.size, self.cache, self.progress)
-            return gels_of(part, self.size, self.cache, self.progress, like=like)
-        return cached_images(part, column, self.size, self.cache, self.progress)
+            like = gels_of(self.train, self.size, work.cache, work.progress)
+            return gels_of(part, self.size, work.cache, work.progress, like=like)
+        return cached_images(part, column, self.size, work.cache, work.progress)
 
 
 #: Images (n, size, size, 3) of the samples of ``setting.test``, in their order; a control may be
 #: None where the data do not allow it.
 Make = Callable[[Setting], Images | None]
+
+
+@dataclass(frozen=True)
+class Judged:
+    """What a metric sees: generated images of the test samples, and the real ones, in one order.
+
+    Attributes:
+        subject: name of the method or control.
+        images, real: (n, size, size, 3) uint8.
+        features, reference: their embeddings by the tactile encoder, with materials and videos.
+        seed: of the training.
+    """
+
+    subject: str
+    images: Images
+    real: Images
+    features: FeatureSet
+    reference: FeatureSet
+    seed: int
+
+
+#: One score of the images of one subject; its ``metric`` is a further column of the tables.
+Metric = Callable[[Judged], Score]
 
 
 @dataclass(frozen=True)
@@ -112,10 +125,13 @@ class Method:
 
 def shipped(setting: Setting) -> Images:
     """Images of the generator that ships, which is not trained in a study."""
-    how: dict[str, Any] = {"seed": setting.seed, "device": setting.device}
-    made = generate(setting.test, model=SHIPPED, progress=setting.progress, **how)
+    work = setting.work
+    generated = generate(
+        setting.test, model=SHIPPED, seed=setting.seed, device=work.device, progress=work.progress
+    )
     side = (setting.size, setting.size)
-    return np.stack([np.asarray(i.resize(side, Image.Resampling.BOX)) for i in made.images])
+    images = (i.resize(side, Image.Resampling.BOX) for i in generated.images)
+    return np.stack([np.asarray(image) for image in images])
 
 
 METHODS: Mapping[str, Method] = {

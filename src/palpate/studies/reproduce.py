@@ -9,226 +9,396 @@
 
 ``results`` holds the means over seeds, tables and samples; ``results.json`` of the run folder is
 that with the record of the run (settings, versions, times), and ``page.html`` and others show it.
+The demo (:mod:`palpate.studies.demo`) is run in the same way.
 """
 
 from __future__ import annotations
 
-import dataclasses
-import hashlib
-import inspect
-from collections.abc import Callable, Mapping, Sequence
-from functools import partial
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from itertools import product
 from pathlib import Path
 from typing import Any
 
-from palpate.core import PalpateError, Progress, digest_file, quiet, read_json, require
+from palpate.core import Progress, digest_file, quiet, require, require_choice
 from palpate.evaluation.companions import Weights
 from palpate.evaluation.inputs import read as read_samples
 from palpate.preference.scoring import PREFERENCE
 from palpate.report.results import Results
+from palpate.sim import WorldOptions
 from palpate.sim.presets import MINI_SEEDS
 from palpate.studies import making
 from palpate.studies.collecting import collect
-from palpate.studies.demo import model_stamp, require_unseen, stamp
-from palpate.studies.graph import Node, run_graph
-from palpate.studies.judging import Judging, judge_images, probe_encoders
-from palpate.studies.making import slug
-from palpate.studies.methods import SHIPPED, Method, shipped
-from palpate.studies.stages import Stage
-from palpate.studies.study import NOLEAK, SPLITS, STUDIES, Preset, Study
+from palpate.studies.demo import Demo
+from palpate.studies.files import data_stamp, function_stamp, model_stamp, require_unseen
+from palpate.studies.graph import Named, Node, Nodes, run_graph
+from palpate.studies.judging import judge_images, probe_encoders
+from palpate.studies.making import Training
+from palpate.studies.methods import Method, shipped
+from palpate.studies.names import NOLEAK, SHIPPED, SPLITS, images_node, scores_node, slug
+from palpate.studies.stages import PrintLine, Stage, record_of
+from palpate.studies.study import STUDIES, Preset, Study
 from palpate.studies.utility import USEFUL, Draws, measure_utility
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclass(frozen=True)
 class Plan:
-    """A study with everything that a run of it chooses.
+    """A study with everything that a run of it chooses; checked before any work.
 
     Attributes:
         study: what is run.
-        preset: how large.
+        preset: name of its size.
         seeds: one training of every encoder and method each; splits and autoencoders are made once.
         root: the data set on disk, for a study that is not of the world.
         others: name -> folder of images of the test part (of the split without leaks) that another
             system made.
         device: ``auto``, ``cpu``, ``cuda`` or ``mps``.
         people: results of ``palpate preference score`` on images of the methods, or None.
+        steps: optimizer steps of each method, in place of the preset's.
+        vq: autoencoder of the paper's kind, in place of the preset's.
         weights: of FID, CMMD and LPIPS as published; without them their columns
             are missing.
-    """
-
-    study: Study
-    preset: Preset
-    seeds: Sequence[int]
-    root: Path | None = None
-    others: Mapping[str, Path] = dataclasses.field(default_factory=dict[str, Path])
-    device: str = "auto"
-    people: Path | None = None
-    weights: Weights = dataclasses.field(default_factory=Weights)
-
-    @property
-    def methods(self) -> list[str]:
-        """Names of all methods, of others last."""
-        return [*(m.name for m in self.study.methods), *self.others]
-
-
-def plan_of(
-    study: Study,
-    *,
-    preset: str = "mini",
-    seeds: Sequence[int] = (0,),
-    root: Path | str | None = None,
-    others: Mapping[str, Path | str] | None = None,
-    device: str = "auto",
-    people: Path | str | None = None,
-    steps: int | None = None,
-    vq: Path | str | None = None,
-    weights: Weights | None = None,
-) -> Plan:
-    """The plan of a run, checked before any work; ``steps`` and ``vq`` replace the preset's.
 
     Raises:
         PalpateError: for a study of another's name, an unknown preset, no seeds, a root that is
             missing or not wanted, or a folder that is not there or has the name of a method.
     """
-    if STUDIES.get(study.name, study) != study:
-        must, got = "must have a name of its own", f"another {study.name}"
-        raise PalpateError(must, got, 'Use replace(study, name="mine", ...)', argument="study")
-    names = ", ".join(study.presets)
-    require(preset in study.presets, "preset", f"must be one of {names}", repr(preset))
-    once = 0 < len(seeds) == len({*seeds})
-    require(once, "seeds", "must hold at least one seed, each once", list(seeds), (0, 1, 2))
-    if (root is None) == (study.world is None):
-        must = "must be given" if root is None else "must be left out"
-        must += f" for the study {study.name}"
-        fix = "Name the folder of the data set" if root is None else "Its data are made"
-        raise PalpateError(must, "none" if root is None else str(root), fix, argument="root")
-    if root is not None and not Path(root).exists():
-        raise PalpateError("must exist", f"nothing at {root}", "Check the path", argument="root")
-    folders = _folders(study, others or {})
-    votes = [] if people is None else [s.metric for s in Results.load(people).scores]
-    if people is not None and PREFERENCE not in votes:
+
+    study: Study
+    preset: str = "mini"
+    seeds: Sequence[int] = (0,)
+    root: Path | str | None = None
+    others: Mapping[str, Path | str] = field(default_factory=dict[str, Path | str])
+    device: str = "auto"
+    people: Path | str | None = None
+    steps: int | None = None
+    vq: Path | str | None = None
+    weights: Weights = field(default_factory=Weights)
+
+    def __post_init__(self) -> None:
+        study, seeds, root, people = self.study, self.seeds, self.root, self.people
+        own, fix = STUDIES.get(study.name, study) == study, 'Use replace(study, name="mine", ...)'
+        require(own, "study", "must have a name of its own", f"another {study.name}", fix=fix)
+        require_choice("preset", self.preset, study.presets)
+        once = 0 < len(seeds) == len({*seeds})
+        require(once, "seeds", "must hold at least one seed, each once", list(seeds), (0, 1, 2))
+        wanted = study.world is None
+        must = f"must be {'given' if wanted else 'left out'} for the study {study.name}"
+        fix = "Name the folder of the data set" if wanted else "Its data are made"
+        require((root is not None) == wanted, "root", must, str(root or "none"), fix=fix)
+        exists = root is None or Path(root).exists()
+        require(exists, "root", "must exist", f"nothing at {root}", fix="Check the path")
+        votes = [] if people is None else [s.metric for s in Results.load(people).scores]
         must, fix = "must hold scores of palpate preference score", "Pass what its -o wrote"
-        raise PalpateError(must, str(people), fix, argument="people")
-    chosen = study.presets[preset]
-    given = {"steps": steps, "vq": None if vq is None else str(vq)}
-    chosen = dataclasses.replace(chosen, **{k: v for k, v in given.items() if v is not None})
-    require(chosen.steps >= 4, "steps", "must be at least 4", chosen.steps)
-    if chosen.vq is None and any(method.vq for method in study.methods):
+        require(people is None or PREFERENCE in votes, "people", must, f"{people}", fix=fix)
+        size = self.size
+        require(size.steps >= 4, "steps", "must be at least 4", size.steps)
+        coded = size.vq is not None or not any(method.vq for method in study.methods)
         fix = "Pass the folder, hub id or .ckpt of latent diffusion's vq-f4"
-        raise PalpateError(f"must be given for preset {preset}", "none", fix, argument="vq")
-    if study.world is not None and chosen.clip == "palpate/mini":
-        seed = _world(study, chosen).seed
-        require(seed not in MINI_SEEDS, "world", "must be one that no shipped model saw", seed)
-    elif root is not None and chosen.clip == "palpate/mini":
-        require_unseen(Path(root))
-    place, votes = (None if path is None else Path(path) for path in (root, people))
-    weights = _whole(weights or Weights())
-    return Plan(study, chosen, tuple(seeds), place, folders, device, votes, weights)
-
-
-def _whole(weights: Weights) -> Weights:
-    """The weights by whole paths; a CLIP may be a hub id."""
-
-    def whole(path: Path | str, name: str) -> str:
-        if not Path(path).is_file():
-            got, fix = f"nothing at {path}", "Check the path"
-            raise PalpateError("must be a file", got, fix, argument=name)
-        return str(Path(path).resolve())
-
-    inception, clip, lpips = weights.inception, weights.clip, weights.lpips
-    return Weights(
-        inception=None if inception is None else whole(inception, "inception"),
-        clip=str(Path(clip).resolve()) if clip and Path(clip).exists() else clip,
-        lpips=None if lpips is None else (whole(lpips[0], "lpips"), whole(lpips[1], "lpips")),
-    )
-
-
-def _folders(study: Study, others: Mapping[str, Path | str]) -> dict[str, Path]:
-    """Folders of images of other systems, under names of their own."""
-    folders = {name: Path(folder) for name, folder in others.items()}
-    for name, folder in folders.items():
-        if slug(name) in {slug(m.name) for m in study.methods} | {slug(c) for c in study.controls}:
+        require(coded, "vq", f"must be given for preset {self.preset}", "none", fix=fix)
+        taken = {slug(name) for name in (*(m.name for m in study.methods), *study.controls)}
+        for name, folder in self.others.items():
             must, fix = "must have a name of its own", "Choose another name"
-            raise PalpateError(must, name, fix, argument="method")
-        if not folder.is_dir():
-            must, fix = f"{name} must be a folder of images", "Check the path"
-            raise PalpateError(must, f"nothing at {folder}", fix, argument="method")
-    return folders
+            require(slug(name) not in taken, "method", must, name, fix=fix)
+            must, got = f"{name} must be a folder of images", f"nothing at {folder}"
+            require(Path(folder).is_dir(), "method", must, got, fix="Check the path")
+        for name, path in self.weight_files:
+            exists = Path(path).is_file()
+            require(exists, name, "must be a file", f"nothing at {path}", fix="Check the path")
+        if size.clip == SHIPPED:
+            seed = self.world and self.world.seed
+            require(seed not in MINI_SEEDS, "world", "must be one that no shipped model saw", seed)
+            if root is not None:
+                require_unseen(Path(root))
+
+    @property
+    def size(self) -> Preset:
+        """The preset, with what replaces its fields."""
+        size = self.study.presets[self.preset]
+        vq = size.vq if self.vq is None else str(self.vq)
+        return replace(size, steps=size.steps if self.steps is None else self.steps, vq=vq)
+
+    @property
+    def weight_files(self) -> list[tuple[str, Path | str]]:
+        """The files of published weights, by what they are of; a CLIP may be a hub id."""
+        weights = self.weights
+        files = [] if weights.inception is None else [("inception", weights.inception)]
+        return [*files, *(("lpips", path) for path in weights.lpips or ())]
+
+    @property
+    def world(self) -> WorldOptions | None:
+        """The embedded world, where the data are that."""
+        changes = self.study.world
+        return None if changes is None else replace(self.size.world, **changes)
+
+    def nodes(self) -> list[Node]:
+        """The stages; those of another seed, method or split come on top of what is there."""
+        graph = _Graph(self)
+        graph.add_data()
+        for split in SPLITS:
+            graph.add_split(split)
+        for seed, split in product(self.seeds, SPLITS):
+            graph.add_encoders(split, seed)
+            for method in self.study.trained_on(split):
+                graph.add_method(method, split, seed)
+        for name, folder in self.others.items():
+            graph.nodes.add(
+                images_node(name, NOLEAK),
+                making.take_images,
+                *DATA,
+                split=NOLEAK,
+                folder=Named(folder, read_samples(folder, str(folder)).image_digest()),
+                size=self.size.diffusion.size,
+            )
+        for seed, split, judge in product(self.seeds, SPLITS, SPLITS):
+            graph.add_scores(split, judge, seed)
+        graph.add_utility()
+        graph.add_results()
+        return graph.nodes
+
+    def results(self, stages: Mapping[str, Stage], jobs: int = 1) -> Results:
+        """The results of finished stages, with what was chosen, digests, versions and times."""
+        facts, seeds = {name: stage.facts for name, stage in stages.items()}, self.seeds
+        digests = {"manifest": facts["data"]["digest"]}
+        digests |= {f"split {name}": facts["split"][name]["digest"] for name in SPLITS}
+        for seed, split in product(seeds, SPLITS):
+            digests[f"encoder {split} {seed}"] = facts[f"encoder-{split}-{seed}"]["digest"]
+        digests |= {f"weights of {n}": stamp for n, stamp in _stamps(self.weights).items()}
+        if self.people is not None:
+            digests["people"] = digest_file(Path(self.people))
+        results = Results.load(stages["results"].folder / "results.json")
+        settings = {
+            **results.settings,
+            "study": self.study.name,
+            "dataset": facts["data"]["dataset"],
+            "preset": self.preset,
+            "seeds": list(seeds),
+            "options": {
+                "root": self.root and str(self.root),
+                "methods of others": {name: str(folder) for name, folder in self.others.items()},
+                "people": self.people and str(self.people),
+                "steps of a method": self.size.steps,
+                "vq": self.size.vq if isinstance(self.size.vq, str) else None,
+                "weights": {n: _absolute(path) for n, path in vars(self.weights).items() if path},
+                "device": self.device,
+                "jobs": jobs,
+            },
+            "digests": digests,
+            **record_of(stages),
+        }
+        return replace(results, settings=settings)
 
 
-def nodes_of(plan: Plan) -> list[Node]:
-    """The nodes of a run; those of another seed, method or split come on top of what is there."""
-    study, preset, device = plan.study, plan.preset, plan.device
-    nodes = [*_data_nodes(plan)]
-    for split in SPLITS:
-        nodes += _autoencoder_nodes(plan, split)
-        after = ["data", "split", f"autoencoder-{split}"]
-        make = partial(making.make_controls, split=split, controls=study.controls, preset=preset)
-        inputs: dict[str, Any] = {"controls": {n: _source(f) for n, f in study.controls.items()}}
-        inputs |= {"size": preset.diffusion.size, **_clip(preset)}
-        name = f"controls-{split}"
-        nodes.append(Node(name, partial(make, device=device), inputs, after))
-    for seed, split in product(plan.seeds, SPLITS):
-        encoder = f"encoder-{split}-{seed}"
-        how: dict[str, Any] = {"preset": preset.encoder, "clip": preset.clip}
-        build = partial(making.make_encoders, split=split, seed=seed, device=device, **how)
-        inputs = {"preset": preset.encoder, **_clip(preset), "seed": seed}
-        nodes.append(Node(encoder, build, inputs, ["data", "split"]))
-        build = partial(probe_encoders, split=split, encoders=encoder, device=device)
-        after = ["data", "split", encoder]
-        name = f"probe-{split}-{seed}"
-        nodes.append(Node(name, build, {}, after, measures=True))
-        for method in study.trained_on(split):
-            nodes += _method_nodes(plan, method, split, seed)
-    nodes += [
-        Node(
-            _images_of_others(name),
-            partial(making.take_images, split=NOLEAK, folder=folder, size=preset.diffusion.size),
-            {"folder": read_samples(folder, str(folder)).image_digest()},
-            ["data", "split"],
+def _absolute(path: Any) -> Any:
+    """A path, or each of two, from anywhere; a hub id as it is."""
+    if isinstance(path, tuple):
+        return [_absolute(one) for one in path]
+    return str(Path(path).resolve()) if Path(path).exists() else str(path)
+
+
+def _stamps(weights: Weights) -> dict[str, Any]:
+    """What names the weights of published metrics that are given."""
+    stamps = {
+        "clip": model_stamp("clip", weights.clip and str(weights.clip)),
+        "inception": weights.inception and digest_file(Path(weights.inception)),
+        "lpips": weights.lpips and [digest_file(Path(path)) for path in weights.lpips],
+    }
+    return {name: stamp for name, stamp in stamps.items() if stamp}
+
+
+#: What nearly every node reads.
+DATA = ("data", "split")
+
+
+class _Graph:
+    """The nodes of a plan."""
+
+    def __init__(self, plan: Plan) -> None:
+        self.plan, self.study, self.size = plan, plan.study, plan.size
+        self.nodes = Nodes()
+        # Other weights under the same name make other stages.
+        self.clip = Named(self.size.clip, model_stamp("clip", self.size.clip))
+
+    def add_data(self) -> None:
+        """World, data and splits."""
+        study, root, nodes = self.study, self.plan.root, self.nodes
+        if (world := self.plan.world) is not None:
+            nodes.add("world", making.make_world, options=Named(world, [world, world.digest]))
+        nodes.add(
+            "data",
+            making.read_data,
+            *(node.name for node in nodes),
+            read=Named(study.read, function_stamp(study.read)),
+            root=root and Named(Path(root), [_absolute(root), data_stamp(Path(root))]),
+            name=study.name,
+            unseen=self.size.clip == SHIPPED,
         )
-        for name, folder in plan.others.items()
-    ]
-    for seed, split, judge in product(plan.seeds, SPLITS, SPLITS):
-        nodes.append(_score_node(plan, split, judge, seed))
-    useful = _utility_nodes(plan)
-    nodes += useful
-    judgments = {(s, j): [_scores(s, j, n) for n in plan.seeds] for s, j in product(SPLITS, SPLITS)}
-    probes = {split: [f"probe-{split}-{seed}" for seed in plan.seeds] for split in SPLITS}
-    shown = _images(study.on_both[0], NOLEAK, plan.seeds[0])
-    build = partial(
-        collect,
-        study=study,
-        methods=plan.methods,
-        judgments=judgments,
-        probes=probes,
-        gallery=shown,
-        people=plan.people,
-        useful=bool(useful),
-    )
-    read = [node for of in (judgments, probes) for nodes in of.values() for node in nodes]
-    after = ["data", "split", shown, *read, *(node.name for node in useful)]
-    inputs = {"study": study.name, "title": study.title, "tables": study.tables}
-    inputs |= {"paper": study.paper, "methods": plan.methods, "controls": list(study.controls)}
-    inputs |= {"people": plan.people and digest_file(plan.people)}
-    nodes.append(Node("results", build, inputs, after, measures=True))
-    return nodes
+        nodes.add("split", making.make_splits, "data", noleak=study.noleak, measures=True)
+
+    def add_split(self, split: str) -> None:
+        """Autoencoders and controls of a split."""
+        controls, size = self.study.controls, self.size.diffusion.size
+        kinds: dict[str, Any] = {f"autoencoder-{split}": self.size.autoencoder}
+        if any(m.vq for m in self.study.trained_on(split)):
+            kinds[f"autoencoder-vq-{split}"] = self.size.vq
+        for name, options in kinds.items():
+            if isinstance(options, str):
+                options = Named(options, model_stamp("autoencoder", options))
+            self.nodes.add(
+                name, making.make_autoencoder, *DATA, split=split, options=options, size=size
+            )
+        self.nodes.add(
+            f"controls-{split}",
+            making.make_controls,
+            *DATA,
+            f"autoencoder-{split}",
+            split=split,
+            controls=Named(controls, {n: function_stamp(make) for n, make in controls.items()}),
+            size=size,
+            clip=self.clip,
+        )
+
+    def add_encoders(self, split: str, seed: int) -> None:
+        """Encoders of a split, and what they know of it."""
+        name, preset = f"encoder-{split}-{seed}", self.size.encoder
+        self.nodes.add(
+            name, making.make_encoders, *DATA, split=split, seed=seed, preset=preset, clip=self.clip
+        )
+        probe = f"probe-{split}-{seed}"
+        self.nodes.add(
+            probe, probe_encoders, *DATA, name, split=split, encoders=name, measures=True
+        )
+
+    def add_method(self, method: Method, split: str, seed: int) -> None:
+        """Training, unless it shares that of another or makes its images itself, and images."""
+        size, images = self.size, images_node(method.name, split, seed)
+        autoencoder = f"autoencoder-vq-{split}" if method.vq else f"autoencoder-{split}"
+        if (make := method.make) is not None:
+            stamp: Any = function_stamp(make)
+            if make is shipped:
+                stamp = [stamp, model_stamp("generator", SHIPPED)]
+            self.nodes.add(
+                images,
+                making.make_own_images,
+                *DATA,
+                autoencoder,
+                split=split,
+                seed=seed,
+                name=method.name,
+                make=Named(make, stamp),
+                size=size.diffusion.size,
+                steps=size.steps,
+                clip=self.clip,
+            )
+            return
+        generator, by_text = f"{slug(method.text_of or method.name)}-{split}-{seed}", method.text_of
+        if not by_text:
+            diffusion = method.preset(size.diffusion)
+            self.nodes.add(
+                generator,
+                making.make_generator,
+                *DATA,
+                autoencoder,
+                split=split,
+                seed=seed,
+                training=Training(diffusion, method.background, size.steps, size.precision),
+                clip=self.clip,
+                autoencoder=autoencoder,
+            )
+        self.nodes.add(
+            images,
+            making.make_images,
+            *DATA,
+            generator,
+            split=split,
+            seed=seed,
+            generator=generator,
+            by_text=bool(by_text),
+        )
+
+    def add_scores(self, split: str, judge: str, seed: int) -> None:
+        """What the encoder of ``judge`` says of the images of ``split``."""
+        study, size, encoder = self.study, self.size, f"encoder-{judge}-{seed}"
+        chosen = [m.name for m in study.trained_on(split)] if judge == split else study.on_both
+        methods = {name: images_node(name, split, seed) for name in chosen}
+        if split == judge == NOLEAK:
+            methods |= {name: images_node(name, NOLEAK) for name in self.plan.others}
+        metrics = [function_stamp(metric) for metric in study.metrics]
+        sizes = [size.diffusion.size, size.permutations, self.clip.name]
+        self.nodes.add(
+            scores_node(split, judge, seed),
+            judge_images,
+            *DATA,
+            encoder,
+            f"controls-{split}",
+            *methods.values(),
+            study=Named(study, {"controls": list(study.controls), "metrics": metrics}),
+            preset=Named(size, sizes),
+            split=split,
+            encoders=encoder,
+            methods=methods,
+            seed=seed,
+            weights=Named(self.plan.weights, _stamps(self.plan.weights)),
+            measures=True,
+        )
+
+    def add_utility(self) -> None:
+        """What generated images add for a classifier of materials, where there are some."""
+        study, trained = self.study, self.study.trained_on(NOLEAK)
+        useful = [m.name for m in trained if m.make is None and m.name in study.useful]
+        if 2 in study.tables or not useful:
+            return
+        runs = {
+            f"encoder-{NOLEAK}-{seed}": {name: images_node(name, NOLEAK, seed) for name in useful}
+            for seed in self.plan.seeds
+        }
+        images = [node for nodes in runs.values() for node in nodes.values()]
+        self.nodes.add(
+            "utility",
+            measure_utility,
+            *DATA,
+            *runs,
+            f"controls-{NOLEAK}",
+            *images,
+            runs=runs,
+            controls=[name for name in USEFUL if name in study.controls],
+            draws=Draws(),
+            measures=True,
+        )
+
+    def add_results(self) -> None:
+        """Tables, claims and pictures."""
+        plan, study = self.plan, self.study
+        read = ("scores-", "probe-", "utility")
+        self.nodes.add(
+            "results",
+            collect,
+            *DATA,
+            images_node(study.on_both[0], NOLEAK, plan.seeds[0]),
+            *(node.name for node in self.nodes if node.name.startswith(read)),
+            study=Named(
+                study, [study.name, study.title, study.tables, study.paper, *study.controls]
+            ),
+            methods=[*(m.name for m in study.methods), *plan.others],
+            seeds=plan.seeds,
+            people=plan.people and Named(Path(plan.people), digest_file(Path(plan.people))),
+            measures=True,
+        )
 
 
 def run_study(
-    plan: Plan,
+    plan: Plan | Demo,
     folder: Path | str,
     *,
     command: str = "",
     jobs: int = 1,
-    print_line: Callable[[str], None] = lambda line: None,
+    print_line: PrintLine = lambda line: None,
     progress: Progress = quiet,
 ) -> Results:
-    """Run a study, or what is not there yet of it; write ``results.json`` and its tables.
+    """Run a study or the demo, or what is not there yet of it; write ``results.json``.
 
     Args:
-        plan: see :func:`plan_of`.
+        plan: see :class:`Plan`.
         folder: run folder; run again with the same one to go on.
         command: the command line that makes the run again.
         jobs: processes.
@@ -239,200 +409,46 @@ def run_study(
         PalpateError: on bad data or a folder in use; finished stages stay.
     """
     folder = Path(folder)
-    stages = run_graph(nodes_of(plan), folder, jobs=jobs, print_line=print_line, progress=progress)
-    results = Results.load(folder / "results" / "results.json")
-    settings = {**results.settings, **settings_of(plan, stages, jobs)}
-    results = dataclasses.replace(results, settings=settings, commands=[command] if command else [])
+    try:
+        stages = run_graph(
+            plan.nodes(),
+            folder,
+            device=plan.device,
+            jobs=jobs,
+            print_line=print_line,
+            progress=progress,
+        )
+    finally:
+        if folder.is_dir() and not any(folder.iterdir()):  # nothing was done
+            folder.rmdir()
+    results = plan.results(stages, jobs)
+    commands = [command] if command else []
+    results = replace(results, commands=[*commands, *results.commands])
     results.save(folder / "results.json")
     return results
 
 
-def _world(study: Study, preset: Preset) -> Any:
-    return dataclasses.replace(preset.world, **(study.world or {}))
-
-
-def _data_nodes(plan: Plan) -> list[Node]:
-    """World, data and splits."""
-    study, nodes = plan.study, list[Node]()
-    if study.world is not None:
-        world = _world(study, plan.preset)
-        build = partial(making.make_world, options=world)
-        nodes.append(Node("world", build, {"options": world, "digest": world.digest}))
-    build = partial(making.read_data, study=study, root=plan.root)
-    inputs: dict[str, Any] = {"read": _source(study.read)}
-    if plan.root is not None:
-        inputs |= {"root": str(plan.root.resolve()), "stamp": stamp(plan.root)}
-    nodes.append(Node("data", build, inputs, [node.name for node in nodes]))
-    inputs = {} if study.noleak is None else {"noleak": study.noleak}
-    build = partial(making.make_splits, noleak=study.noleak)
-    nodes.append(Node("split", build, inputs, ["data"], measures=True))
-    return nodes
-
-
-def _autoencoder_nodes(plan: Plan, split: str) -> list[Node]:
-    preset = plan.preset
-    kinds: dict[str, Any] = {f"autoencoder-{split}": preset.autoencoder}
-    if any(m.vq for m in plan.study.trained_on(split)):
-        kinds[f"autoencoder-vq-{split}"] = preset.vq
-    nodes: list[Node] = []
-    for name, options in kinds.items():
-        how: dict[str, Any] = {"split": split, "options": options, "size": preset.diffusion.size}
-        inputs = how
-        if isinstance(options, str):
-            inputs = {**how, "options": model_stamp("autoencoder", options)}
-        build = partial(making.make_autoencoder, device=plan.device, **how)
-        nodes.append(Node(name, build, inputs, ["data", "split"]))
-    return nodes
-
-
-def _utility_nodes(plan: Plan) -> list[Node]:
-    """What generated images add for a classifier of materials, where there are some."""
-    study = plan.study
-    useful = [m.name for m in study.trained_on(NOLEAK) if m.make is None and m.name in study.useful]
-    if 2 in study.tables or not useful:
-        return []
-    runs = {
-        f"encoder-{NOLEAK}-{seed}": {name: _images(name, NOLEAK, seed) for name in useful}
-        for seed in plan.seeds
-    }
-    inputs: dict[str, Any] = {
-        "draws": Draws(),
-        "controls": [c for c in USEFUL if c in study.controls],
-    }
-    build = partial(measure_utility, runs=runs, device=plan.device, **inputs)
-    after = ["data", "split", *runs, f"controls-{NOLEAK}"]
-    after += [node for of in runs.values() for node in of.values()]
-    inputs["methods"] = useful
-    return [Node("utility", build, inputs, after, measures=True)]
-
-
-def _images_of_others(name: str) -> str:
-    return f"images-{slug(name)}-{NOLEAK}"
-
-
-def _images(method: str, split: str, seed: int) -> str:
-    return f"images-{slug(method)}-{split}-{seed}"
-
-
-def _scores(split: str, judge: str, seed: int) -> str:
-    return f"scores-{split}-by-{judge}-{seed}"
-
-
-def _method_nodes(plan: Plan, method: Method, split: str, seed: int) -> list[Node]:
-    """Training, unless it shares that of another or makes its images itself, and images."""
-    preset = plan.preset
-    how: dict[str, Any] = {"split": split, "seed": seed, "preset": preset, "device": plan.device}
-    nodes, generator = list[Node](), ""
-    autoencoder = f"autoencoder-vq-{split}" if method.vq else f"autoencoder-{split}"
-    if method.make is None:
-        generator = f"{slug(method.text_of or method.name)}-{split}-{seed}"
-    if generator and not method.text_of:
-        inputs = {"diffusion": method.preset(preset.diffusion), "background": method.background}
-        inputs |= {"steps": preset.steps, **_clip(preset), "seed": seed}
-        inputs |= {"precision": preset.precision}
-        build = partial(making.make_generator, method=method, autoencoder=autoencoder, **how)
-        nodes.append(Node(generator, build, inputs, ["data", "split", autoencoder]))
-    build = partial(making.make_images, method=method, generator=generator, **how)
-    inputs = {"seed": seed, **({"text": True} if method.text_of else {})}
-    if method.make is not None:
-        inputs |= {"make": _source(method.make), "size": preset.diffusion.size}
-        inputs |= {"steps": preset.steps, **_clip(preset)}
-    if method.make is shipped:
-        inputs |= {"weights": model_stamp("generator", SHIPPED)}
-    after = ["data", "split", generator or autoencoder]
-    nodes.append(Node(_images(method.name, split, seed), build, inputs, after))
-    return nodes
-
-
-def _score_node(plan: Plan, split: str, judge: str, seed: int) -> Node:
-    """What the encoder of ``judge`` says of the images of ``split``."""
-    study, preset, encoder = plan.study, plan.preset, f"encoder-{judge}-{seed}"
-    chosen = [m.name for m in study.trained_on(split)]
-    if judge != split:
-        chosen = list(study.on_both)
-    methods = {name: _images(name, split, seed) for name in chosen}
-    if split == judge == NOLEAK:
-        methods |= {name: _images_of_others(name) for name in plan.others}
-    judging = Judging(
-        split,
-        encoder,
-        methods,
-        list(study.controls),
-        study.metrics,
-        preset.clip,
-        preset.diffusion.size,
-        seed,
-        preset.permutations,
-        plan.weights,
-    )
-    build = partial(judge_images, judging=judging, device=plan.device)
-    inputs = {**vars(judging), **_clip(preset), "metrics": [_source(m) for m in study.metrics]}
-    del inputs["weights"]
-    if plan.weights.companions:
-        inputs["weights"] = _stamps(plan.weights)
-    after = ["data", "split", encoder, f"controls-{split}", *methods.values()]
-    name = _scores(split, judge, seed)
-    return Node(name, build, inputs, after, measures=True)
-
-
-def _clip(preset: Preset) -> dict[str, str | None]:
-    """What names the frozen encoders: other weights under the same name make other stages."""
-    return {"clip": model_stamp("clip", preset.clip)}
-
-
-def _stamps(weights: Weights) -> dict[str, Any]:
-    """What names the weights of published metrics."""
-    made: dict[str, Any] = {"clip": model_stamp("clip", weights.clip and str(weights.clip))}
-    made["inception"] = weights.inception and digest_file(Path(weights.inception))
-    made["lpips"] = weights.lpips and [digest_file(Path(path)) for path in weights.lpips]
-    return {name: stamp for name, stamp in made.items() if stamp}
-
-
-def _source(function: Callable[..., Any]) -> str:
-    """What names a function: its module, its name, and the digest of its source.
+def plan_again(settings: Mapping[str, Any], folder: Path) -> Plan | Demo:
+    """The plan of a run by its record; what was given to it lies in the run folder.
 
     Raises:
-        PalpateError: if it has no source, or holds values of another function.
+        PalpateError: for a study that is not of palpate, or as :class:`Plan`.
     """
-    try:
-        text = hashlib.sha256(inspect.getsource(function).encode()).hexdigest()
-    except (OSError, TypeError):
-        text = ""
-    if not text or getattr(function, "__closure__", None):
-        must = "What a study reads or makes its images with must be a function of a file"
-        raise PalpateError(must, f"{function!r}"[:200], "Write it in a module")
-    return f"{function.__module__}.{function.__qualname__} {text}"
-
-
-def settings_of(plan: Plan, stages: Mapping[str, Stage], jobs: int) -> dict[str, Any]:
-    """The record of a run: what was chosen, digests, versions, machine, and every stage."""
-    records = {n: read_json(s.folder / "stage.json", "stage record") for n, s in stages.items()}
-    kept = ("digest", "outputs", "seconds", "date")
-    digests: dict[str, Any] = {"manifest": stages["data"].facts["digest"]}
-    digests |= {f"split {s}": stages["split"].facts[s]["digest"] for s in SPLITS}
-    for seed, split in product(plan.seeds, SPLITS):
-        name = f"encoder-{split}-{seed}"
-        digests[f"encoder {split} {seed}"] = stages[name].facts["digest"]
-    digests |= {f"weights of {name}": of for name, of in _stamps(plan.weights).items()}
-    if plan.people is not None:
-        digests["people"] = digest_file(plan.people)
-    return {
-        "study": plan.study.name,
-        "dataset": stages["data"].facts["dataset"],
-        "preset": plan.preset.name,
-        "seeds": list(plan.seeds),
-        "options": {
-            "root": str(plan.root) if plan.root else None,
-            "methods of others": {name: str(folder) for name, folder in plan.others.items()},
-            "people": str(plan.people) if plan.people else None,
-            "steps of a method": plan.preset.steps,
-            "vq": plan.preset.vq if isinstance(plan.preset.vq, str) else None,
-            "weights": {name: of for name, of in vars(plan.weights).items() if of},
-            "device": plan.device,
-            "jobs": jobs,
-        },
-        "digests": digests,
-        "stages": {n: {k: r[k] for k in kept if k in r} for n, r in records.items()},
-        "seconds": {"all stages": round(sum(s.seconds for s in stages.values()))},
-        **stages["results"].made_with,
-    }
+    if settings["study"] == Demo.name:
+        return Demo.again(settings)
+    fix = "Verify it where it is defined"
+    must = f"The study must be one of {', '.join(STUDIES)}, to be made again"
+    require(settings["study"] in STUDIES, None, must, repr(settings["study"]), fix=fix)
+    options = settings["options"]
+    others = {n: folder / images_node(n, NOLEAK) / "images" for n in options["methods of others"]}
+    return Plan(
+        STUDIES[settings["study"]],
+        preset=settings["preset"],
+        seeds=settings["seeds"],
+        root=options["root"] and folder / "data",
+        others=others,
+        people=options["people"] and folder / "results" / "people.json",
+        steps=options["steps of a method"],
+        vq=options["vq"],
+        weights=Weights(**options["weights"]),
+    )

@@ -7,20 +7,21 @@ was, within a training as well.
 
 from __future__ import annotations
 
-import os
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from palpate.core import PalpateError, Progress, Split, locked, quiet, require
+from palpate.core import Progress, Split, quiet, require
+from palpate.data.manifest import Manifest
 from palpate.data.reading import load
 from palpate.encoders import EncoderSet, train_encoder
 from palpate.encoders.encoder_set import load_clip
 from palpate.evaluation.probing import Plan, Probed, measure, named, plan_of, results_of
 from palpate.report.results import Results
-from palpate.studies.making import fresh
-from palpate.studies.stages import Run
+from palpate.studies.files import fresh
+from palpate.studies.graph import Named, Node, Work, run_graph
+from palpate.studies.stages import Facts, PrintLine
 from palpate.training.options import Compute
 
 
@@ -35,7 +36,7 @@ def compare_splits(  # noqa: PLR0913 - those of training
     seeds: Sequence[int] = (0, 1, 2),
     device: str = "auto",
     compute: Compute | None = None,
-    print_line: Callable[[str], None] = lambda line: None,
+    print_line: PrintLine = lambda line: None,
     progress: Progress = quiet,
     **options: Any,
 ) -> Results:
@@ -62,56 +63,81 @@ def compare_splits(  # noqa: PLR0913 - those of training
     Raises:
         PalpateError: without seeds, or as training and probing do.
     """
-    if (processes := os.environ.get("WORLD_SIZE", "1")) != "1":
-        fix = "Run it once without torchrun; palpate train encoder takes several"
-        raise PalpateError("A study of splits must run in one process", processes, fix)
     once = 0 < len(seeds) == len(set(seeds))
     require(once, "seeds", "must hold at least one seed, each once", list(seeds), (0, 1, 2))
-    run = Run(Path(work), print_line)
-    manifest, folder = load(data), run.folder
+    manifest, folder = load(data), Path(work)
     loaded = {name: Split.load(split) for name, split in named(splits, "split").items()}
     axis = "split" if len(loaded) > 1 else ""
     # A leaking split may hold a test image in train as well: that is what is measured.
-    plan = Plan(**options, allow_seen=True, axis=axis, trained=True)
-    plan = plan_of(manifest, loaded, plan)
-    training: dict[str, Any] = {"preset": preset, "clip": clip, "epochs": epochs, "device": device}
+    plan = plan_of(manifest, loaded, Plan(**options, allow_seen=True, axis=axis, trained=True))
     frozen = {} if clip is None else _digests(clip)
+    pairs = {f"{name}-{seed}": (name, seed) for name in loaded for seed in seeds}
+    nodes = [
+        Node(
+            stage,
+            train_on_split,
+            {
+                "manifest": Named(manifest, manifest.digest),
+                "split": Named(loaded[name], loaded[name].digest),
+                "seed": seed,
+                "preset": preset,
+                "clip": Named(clip, frozen),
+                "epochs": epochs,
+                "compute": Named(compute, ""),
+            },
+        )
+        for stage, (name, seed) in pairs.items()
+    ]
+    stages = run_graph(nodes, folder, device=device, print_line=print_line, progress=progress)
     runs: dict[str, list[Probed]] = {}
-    facts: dict[str, dict[str, Any]] = {}
-    with locked(folder):
-        for name, split in loaded.items():
-            for number in seeds:
-                stage = f"{name}-{number}"
-
-                def build(
-                    place: Path, split: Split = split, number: int = number
-                ) -> dict[str, Any]:
-                    output = fresh(place / "encoders")
-                    encoders = train_encoder(
-                        manifest,
-                        split,
-                        output=output,
-                        seed=number,
-                        compute=compute,
-                        progress=progress,
-                        **training,
-                    )
-                    return {"tactile": encoders.digest("tactile")}
-
-                inputs = {"manifest": manifest.digest, "split": split.digest, "seed": number}
-                inputs |= frozen
-                done = run.stage(stage, inputs | training, build)
-                encoders = EncoderSet.load(done.folder / "encoders", device=device)
-                facts[stage] = {"encoder": done.facts["tactile"], "seconds": done.seconds}
-                probed = measure(
-                    manifest, split, encoders, name, plan, cache=folder / "cache", progress=progress
-                )
-                runs.setdefault(name, []).append(probed)
+    for stage, (name, _) in pairs.items():
+        encoders = EncoderSet.load(stages[stage].folder / "encoders", device=device)
+        probed = measure(
+            manifest, loaded[name], encoders, name, plan, cache=folder / "cache", progress=progress
+        )
+        runs.setdefault(name, []).append(probed)
     results = results_of("Encoders trained on each split", runs, plan, manifest, loaded)
-    settings = {**training, "preset": getattr(preset, "name", preset), "seeds": list(seeds)}
-    settings |= frozen
-    more = {"training": settings, "trainings": facts}
-    return replace(results, settings={**results.settings, **more})
+    training = {
+        "preset": getattr(preset, "name", preset),
+        "clip": clip,
+        "epochs": epochs,
+        "device": device,
+        "seeds": list(seeds),
+        **frozen,
+    }
+    trainings = {
+        name: {"encoder": stage.facts["tactile"], "seconds": stage.seconds}
+        for name, stage in stages.items()
+    }
+    settings = {**results.settings, "training": training, "trainings": trainings}
+    return replace(results, settings=settings)
+
+
+def train_on_split(
+    work: Work,
+    *,
+    manifest: Manifest,
+    split: Split,
+    seed: int,
+    preset: Any,
+    clip: str | None,
+    epochs: float | None,
+    compute: Compute | None,
+) -> Facts:
+    """A tactile encoder of one split and seed, in ``encoders``."""
+    encoders = train_encoder(
+        manifest,
+        split,
+        preset=preset,
+        clip=clip,
+        output=fresh(work.folder / "encoders"),
+        epochs=epochs,
+        seed=seed,
+        device=work.device,
+        compute=compute,
+        progress=work.progress,
+    )
+    return {"tactile": encoders.digest("tactile")}
 
 
 def _digests(clip: str) -> dict[str, str]:

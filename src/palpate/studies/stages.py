@@ -1,4 +1,4 @@
-"""Run folders: a pipeline as named stages, each kept under the digest of what it read.
+"""A stage: a folder that is made by a call, kept under the digest of what the call read.
 
 ``run/NAME/stage.json`` marks a finished stage and holds its inputs, the digests of the files of
 earlier stages that it read, its facts, the digest of its own files, time, date and
@@ -20,7 +20,7 @@ import shutil
 import time
 from collections.abc import Callable, Mapping
 from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from importlib import metadata
 from pathlib import Path
 from typing import Any
@@ -31,6 +31,9 @@ from palpate.core.errors import PalpateError
 from palpate.core.files import read_json, write_json
 
 FORMAT = "palpate-stage/1"
+#: Facts of a stage (JSON) for its record.
+Facts = dict[str, Any]
+PrintLine = Callable[[str], None]
 
 
 @dataclass(frozen=True)
@@ -39,67 +42,65 @@ class Stage:
 
     Attributes:
         folder: its files.
-        digest: SHA-256 of its name and inputs; it is one of the inputs of later stages.
-        facts: what the builder returned.
-        outputs: SHA-256 of its files.
-        seconds: how long the last call of the builder took.
-        made_with: versions of packages, and the machine.
+        record: its ``stage.json``.
     """
 
     folder: Path
-    digest: str
-    facts: Mapping[str, Any]
-    outputs: str
-    seconds: float
-    made_with: Mapping[str, Any]
+    record: Mapping[str, Any]
+
+    @property
+    def digest(self) -> str:
+        """SHA-256 of its name and inputs; it is one of the inputs of later stages."""
+        return self.record["digest"]
+
+    @property
+    def facts(self) -> Mapping[str, Any]:
+        """What its call returned."""
+        return self.record["facts"]
+
+    @property
+    def outputs(self) -> str:
+        """SHA-256 of its files, as they were when it was finished."""
+        return self.record["outputs"]
+
+    @property
+    def seconds(self) -> float:
+        """How long the last call took."""
+        return self.record["seconds"]
 
 
-@dataclass
-class Run:
-    """A run folder.
+def run_stage(
+    folder: Path,
+    inputs: Mapping[str, Any],
+    build: Callable[[Path], Mapping[str, Any] | None],
+    *,
+    version: int = 1,
+    read: Mapping[str, str] | None = None,
+    print_line: PrintLine = lambda line: None,
+) -> Stage:
+    """Return the stage of a folder; build it unless it is there for the same inputs.
 
-    Attributes:
-        folder: where the stages lie; made if absent.
-        print_line: called with one line for each stage begun or reused.
-        stages: the finished stages of this run by name, in order.
+    Args:
+        folder: of the stage in its run folder; its name is the stage's.
+        inputs: everything that the stage reads: options, digests of files and earlier stages.
+        build: fills the folder that it is called with and returns facts (JSON).
+        version: of what the stage does; raised by hand when it comes to write other bytes.
+        read: name -> ``outputs`` of the earlier stages that it reads.
+        print_line: called with one line when it is begun or reused, and one when it is done.
+
+    Raises:
+        PalpateError: if the run folder cannot be used.
     """
-
-    folder: Path
-    print_line: Callable[[str], None] = lambda line: None
-    stages: dict[str, Stage] = field(default_factory=dict[str, Stage])
-
-    def stage(
-        self,
-        name: str,
-        inputs: Mapping[str, Any],
-        build: Callable[[Path], Mapping[str, Any] | None],
-        *,
-        version: int = 1,
-        read: Mapping[str, str] | None = None,
-    ) -> Stage:
-        """Return the stage; build it unless it exists for the same inputs.
-
-        Args:
-            name: folder name, unique in the run.
-            inputs: everything that the stage reads: options, digests of files and earlier stages.
-            build: fills the folder it is given and returns facts (JSON) for ``stage.json``.
-            version: of what the stage does; raised by hand when it comes to write other bytes.
-            read: name -> ``outputs`` of the earlier stages that it reads.
-
-        Raises:
-            PalpateError: if the run folder cannot be used.
-        """
-        digest, read = stage_digest(name, inputs, version), read or {}
-        stage = finished_stage(self.folder / name, digest, read)
-        if stage is not None:
-            self.print_line(f"{name}: already done ({stage.seconds:.0f} s then)")
-        else:
-            self.print_line(f"{name}: ...")
-            known = {"digest": digest, "version": version, "inputs": inputs, "read": read}
-            stage = _build(self.folder / name, known, build)
-            self.print_line(f"{name}: done in {stage.seconds:.0f} s")
-        self.stages[name] = stage
+    name, read = folder.name, dict(read or {})
+    digest = stage_digest(name, inputs, version)
+    if (stage := finished_stage(folder, digest, read)) is not None:
+        print_line(f"{name}: already done ({stage.seconds:.0f} s then)")
         return stage
+    print_line(f"{name}: ...")
+    inputs = {"digest": digest, "version": version, "inputs": inputs, "read": read}
+    stage = _build(folder, json.loads(canonical_json(inputs)), build)
+    print_line(f"{name}: done in {stage.seconds:.0f} s")
+    return stage
 
 
 def stage_digest(name: str, inputs: Mapping[str, Any], version: int = 1) -> str:
@@ -114,23 +115,51 @@ def finished_stage(folder: Path, digest: str, read: Mapping[str, str]) -> Stage 
     """
     record = _record(folder / "stage.json")
     same = record.get("digest") == digest and record.get("read") == read
-    return stage_of(folder, record) if same else None
+    return Stage(folder, record) if same else None
+
+
+def stored_stage(folder: Path) -> Stage:
+    """Return the finished stage in ``folder``, whatever it read.
+
+    Raises:
+        PalpateError: if there is none.
+    """
+    return Stage(folder, read_json(folder / "stage.json", "stage record"))
+
+
+def record_of(stages: Mapping[str, Stage]) -> dict[str, Any]:
+    """The record of a run for its results: every stage, the time, versions and machine."""
+    records = {name: stage.record for name, stage in stages.items()}
+    last = [*records.values()][-1]
+    return {
+        "stages": {
+            name: {key: record[key] for key in ("digest", "outputs", "seconds", "date")}
+            for name, record in records.items()
+        },
+        "seconds": {"all stages": round(sum(record["seconds"] for record in records.values()))},
+        "versions": last["versions"],
+        "machine": last["machine"],
+    }
+
+
+def stage_outputs(folder: Path) -> str:
+    """Return the digest of a stage's files, without its record."""
+    return digest_folder(folder, without="stage.json")
 
 
 def _build(
-    final: Path, known: Mapping[str, Any], build: Callable[[Path], Mapping[str, Any] | None]
+    final: Path, record: dict[str, Any], build: Callable[[Path], Mapping[str, Any] | None]
 ) -> Stage:
     partial = final.with_name(f"{final.name}.partial")
     partial_record = final.with_name(f"{final.name}.partial.json")
     before = _record(partial_record)
-    if any(before.get(key) != known[key] for key in ("digest", "read")):
+    if any(before.get(key) != record[key] for key in ("digest", "read")):
         shutil.rmtree(partial, ignore_errors=True)
     try:
         partial.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         must = f"The run folder {final.parent} must be writable"
         raise PalpateError(must, str(error), "Choose another folder") from None
-    record = json.loads(canonical_json(known))
     write_json(partial_record, record)
     start = time.monotonic()
     try:
@@ -143,33 +172,16 @@ def _build(
     record |= {"facts": facts, "outputs": stage_outputs(partial)}
     record["seconds"] = round(time.monotonic() - start, 2)
     record["date"] = datetime.datetime.now(datetime.UTC).date().isoformat()
-    record |= _made_with()
+    record["versions"] = {"palpate": __version__, "python": platform.python_version()}
+    for package in ("numpy", "torch", "diffusers", "transformers", "polars", "pillow"):
+        with suppress(metadata.PackageNotFoundError):
+            record["versions"][package] = metadata.version(package)
+    record["machine"] = f"{platform.machine()}, {os.cpu_count()} cores"
     write_json(partial / "stage.json", record)
     shutil.rmtree(final, ignore_errors=True)
     partial.replace(final)
     partial_record.unlink()
-    return stage_of(final, record)
-
-
-def stage_outputs(folder: Path) -> str:
-    """Return the digest of a stage's files, without its record."""
-    return digest_folder(folder, without="stage.json")
-
-
-def stage_of(folder: Path, record: Mapping[str, Any]) -> Stage:
-    """Return the finished stage in a folder that has this record."""
-    digest, facts, outputs = record["digest"], record["facts"], record["outputs"]
-    made_with = {key: record[key] for key in ("versions", "machine") if key in record}
-    return Stage(folder, digest, facts, outputs, record["seconds"], made_with)
-
-
-def _made_with() -> dict[str, Any]:
-    """Versions of what is installed, and the machine."""
-    versions = {"palpate": __version__, "python": platform.python_version()}
-    for package in ("numpy", "torch", "diffusers", "transformers", "polars", "pillow"):
-        with suppress(metadata.PackageNotFoundError):
-            versions[package] = metadata.version(package)
-    return {"versions": versions, "machine": f"{platform.machine()}, {os.cpu_count()} cores"}
+    return Stage(final, record)
 
 
 def _record(path: Path) -> dict[str, Any]:

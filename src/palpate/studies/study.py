@@ -12,7 +12,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
 
-from palpate.core import FeatureSet, Progress, Score
+from palpate.core import Progress
 from palpate.data.importing import import_dataset
 from palpate.diffusion.options import AutoencoderOptions, BackgroundOptions, UNetOptions
 from palpate.diffusion.presets import MINI, PAPER, DiffusionPreset
@@ -21,12 +21,9 @@ from palpate.encoders.presets import EncoderPreset
 from palpate.sim import PRESETS as WORLDS
 from palpate.sim import WorldOptions
 from palpate.studies.controls import CONTROLS
-from palpate.studies.methods import BEST, GVST, METHODS, OURS, SHIPPED, Images, Make, Method
+from palpate.studies.methods import METHODS, Make, Method, Metric
+from palpate.studies.names import BEST, GVST, NOLEAK, OURS, SHIPPED
 from palpate.training.options import Precision
-
-#: The data set's own split, and ours.
-ORIG, NOLEAK = "Orig", "NoLeak"
-SPLITS = (ORIG, NOLEAK)
 
 
 @dataclass(frozen=True)
@@ -57,29 +54,6 @@ class Preset:
     clip: str
     precision: Precision = "float32"
     permutations: int = 999
-
-
-@dataclass(frozen=True)
-class Judged:
-    """What a metric sees: generated images of the test samples, and the real ones, in one order.
-
-    Attributes:
-        subject: name of the method or control.
-        images, real: (n, size, size, 3) uint8.
-        features, reference: their embeddings by the tactile encoder, with materials and videos.
-        seed: of the training.
-    """
-
-    subject: str
-    images: Images
-    real: Images
-    features: FeatureSet
-    reference: FeatureSet
-    seed: int
-
-
-#: One score of the images of one subject; its ``metric`` is a further column of the tables.
-Metric = Callable[[Judged], Score]
 
 
 def imported(root: Path, folder: Path, progress: Progress) -> None:
@@ -128,14 +102,14 @@ class Study:
 
 
 #: Materials that feel different: with all twenty, minutes of training stay close to chance.
-_TEN = (
+TEN = (
     *("Wood", "Brick", "Tile", "Leather", "Synthetic Fabric"),
     *("Rubber", "Tree", "Grass", "Gravel", "Sand"),
 )
 _WORLD = replace(
     WORLDS["small"],
     two_videos=0.0,
-    materials=_TEN,
+    materials=TEN,
     objects_per_material=24,
     contacts_per_video=3,
     frames_per_contact=3,

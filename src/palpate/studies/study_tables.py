@@ -10,16 +10,17 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 from palpate.core import Measure, Score
 from palpate.preference.scoring import PREFERENCE, STRENGTH
 from palpate.report.labels import measured
 from palpate.report.study import StudyTable
-from palpate.studies.controls import FLOOR, HALVES
 from palpate.studies.evidence import over_seeds
-from palpate.studies.judging import HALF_PROBES, MATERIAL
-from palpate.studies.methods import OURS
-from palpate.studies.study import NOLEAK, ORIG, SPLITS, Study
+from palpate.studies.names import FLOOR, HALF_PROBES, HALVES, MATERIAL, NOLEAK, ORIG, OURS, SPLITS
+
+if TYPE_CHECKING:
+    from palpate.studies.study import Study
 
 #: Scores by (split of the images, split of the judge): means over seeds.
 Judgments = Mapping[tuple[str, str], "Scores"]

@@ -28,13 +28,14 @@ from pathlib import Path
 from typing import Any, TypeGuard
 
 import numpy as np
+import polars as pl
 from numpy.typing import NDArray
 
 from palpate.core import FeatureSet, PalpateError, Progress, Score, Split, quiet, rng_for
 from palpate.data.manifest import Manifest
 from palpate.encoders.embed import embed
 from palpate.encoders.encoder_set import EncoderSet
-from palpate.evaluation.inputs import guard
+from palpate.evaluation.inputs import guard, read
 from palpate.metrics.inputs import Array
 from palpate.metrics.means import Mean, mean_of
 from palpate.metrics.means import over_seeds as over_draws
@@ -43,11 +44,11 @@ from palpate.metrics.probe import fit_probe
 from palpate.report.results import Results
 from palpate.report.study import Claim, StudyTable
 from palpate.studies.claims import decide
-from palpate.studies.controls import CEILING, EMPTY, NEAREST
-from palpate.studies.embedding import embed_generated
 from palpate.studies.evidence import in_words, over_seeds, side_of
-from palpate.studies.making import After, Facts, control_folders, data_of
-from palpate.studies.study import NOLEAK
+from palpate.studies.files import control_folders, data_of
+from palpate.studies.graph import Work
+from palpate.studies.names import CEILING, EMPTY, NEAREST, NOLEAK
+from palpate.studies.stages import Facts
 
 #: Controls whose images train a classifier: a perfect generator, retrieval, and no touch at all.
 USEFUL = (CEILING, NEAREST, EMPTY)
@@ -95,14 +96,12 @@ class Draws:
         The first k of an order by (seed, draw, class, video): nested in k.
         """
         count = lambda label: shots if isinstance(shots, int) else shots[label]
-        videos = _videos(features)
-        kept = {
+        chosen = {
             (label, video)
-            for label, of in videos.items()
-            for video in sorted(of, key=lambda v: self._place(draw, label, v))[: count(label)]
+            for label, videos in _videos(features).items()
+            for video in sorted(videos, key=lambda v: self._place(draw, label, v))[: count(label)]
         }
-        pairs = zip(*_columns(features), strict=True)
-        return [k for k, pair in enumerate(pairs) if pair in kept]
+        return [k for k, pair in enumerate(_pairs(features)) if pair in chosen]
 
     def _place(self, draw: int, label: str, video: str) -> float:
         return float(rng_for(self.seed, "utility", draw, label, video).random())
@@ -112,36 +111,28 @@ class Draws:
 
         The videos of every class are dealt to the folds in turn.
         """
-        labels, groups = _columns(test)
-        if generated is None or {*_columns(generated)[1]}.isdisjoint(groups):
+        groups = [group for _, group in _pairs(test)]
+        if generated is None or {v for _, v in _pairs(generated)}.isdisjoint(groups):
             return np.zeros(len(groups), np.intp)
-        place = lambda v: float(rng_for(self.seed, "utility folds", v).random())
-        pairs = sorted({*zip(labels, groups, strict=True)}, key=lambda p: (p[0], place(p[1])))
+        order = lambda v: float(rng_for(self.seed, "utility folds", v).random())
+        pairs = sorted({*_pairs(test)}, key=lambda pair: (pair[0], order(pair[1])))
         number = {v: k % self.folds for k, v in enumerate(dict.fromkeys(v for _, v in pairs))}
         return np.array([number[g] for g in groups])
 
 
-def _columns(features: FeatureSet) -> tuple[list[str], list[str]]:
-    """Classes (one for all where there are none) and videos of the rows."""
-    n = len(features.ids)
-    labels = [str(v) for v in features.labels or [""] * n]
-    return labels, [str(g) for g in features.groups or features.ids]
+def _pairs(features: FeatureSet) -> list[tuple[str, str]]:
+    """Class (one for all where there are none) and video of every row."""
+    labels = features.labels or [""] * len(features.ids)
+    pairs = zip(labels, features.groups or features.ids, strict=True)
+    return [(str(label), str(video)) for label, video in pairs]
 
 
 def _videos(features: FeatureSet) -> dict[str, set[str]]:
     """Class -> its videos."""
     videos: dict[str, set[str]] = {}
-    for label, video in zip(*_columns(features), strict=True):
+    for label, video in _pairs(features):
         videos.setdefault(label, set()).add(video)
     return videos
-
-
-def _left(made: FeatureSet, tested: Sequence[set[str]]) -> dict[str, int]:
-    """Class -> its videos that are left by the fold, of these sets of videos, that tests most."""
-    return {
-        label: len(of) - max(len(of & fold) for fold in tested)
-        for label, of in _videos(made).items()
-    }
 
 
 def fewest_videos(draws: Draws, features: FeatureSet, test: FeatureSet) -> int:
@@ -149,55 +140,55 @@ def fewest_videos(draws: Draws, features: FeatureSet, test: FeatureSet) -> int:
 
     Classes that ``features`` has not at all do not count.
     """
-    fold = draws.fold_of(test, features)
-    rows = [*zip(*_columns(test), fold, strict=True)]
-    pairs = {*zip(*_columns(features), strict=True)}
-    known, left = {label for label, _ in pairs}, list[int]()
-    for label, number in {(label, f) for label, _, f in rows if label in known}:
-        tested = {video for _, video, f in rows if f == number}
-        left.append(sum(of == label and video not in tested for of, video in pairs))
+    videos = _videos(features)
+    rows = {*zip(_pairs(test), draws.fold_of(test, features), strict=True)}
+    tested = {number: {v for (_, v), fold in rows if fold == number} for _, number in rows}
+    left = (len(videos[label] - tested[n]) for (label, _), n in rows if label in videos)
     return min(left, default=0)
 
 
-def _joined(parts: Sequence[FeatureSet]) -> FeatureSet:
-    """Rows of several sets below each other."""
-    ids = [f"{k}/{i}" for k, part in enumerate(parts) for i in part.ids]
-    columns = [_columns(part) for part in parts]
-    labels, groups = ([v for column in columns for v in column[c]] for c in (0, 1))
-    x = np.concatenate([part.features for part in parts])
-    return FeatureSet(ids, x, labels, groups, parts[0].encoder)
-
-
-def _picked(features: FeatureSet, rows: Sequence[int]) -> FeatureSet:
-    """Some rows; ids may repeat across sets, so they are taken by place."""
-    labels, groups = _columns(features)
-    ids, x = [features.ids[k] for k in rows], features.features[list(rows)]
-    return FeatureSet(ids, x, [labels[k] for k in rows], [groups[k] for k in rows])
+def _picked(features: FeatureSet, rows: Iterable[int]) -> FeatureSet:
+    return features.take([features.ids[k] for k in rows])
 
 
 def _hits(draws: Draws, draw: int, test: FeatureSet, training: Training) -> Array:
     """Whether a probe is right on every test row; generated images are those of other folds."""
-    real, made = training.real, training.generated
-    fold, (labels, videos) = draws.fold_of(test, made), _columns(test)
-    places = [np.flatnonzero(fold == number) for number in np.unique(fold)]
-    tested = [{videos[k] for k in at} for at in places]
+    real, generated, pairs = training.real, training.generated, _pairs(test)
+    fold = draws.fold_of(test, generated)
+    parts = [np.flatnonzero(fold == number) for number in np.unique(fold)]
+    tested = [{pairs[k][1] for k in rows} for rows in parts]
     hits = np.zeros(len(fold))
-    for at, names in zip(places, tested, strict=True):
+    for rows, names in zip(parts, tested, strict=True):
         sets: list[FeatureSet] = []
         if real is not None:
             sets.append(_picked(real, draws.rows(real, training.of_real, draw)))
-        if made is not None:
-            others = [k for k, v in enumerate(_columns(made)[1]) if v not in names]
-            free, shots = _picked(made, others), training.of_generated or _left(made, tested)
+        if generated is not None:
+            videos = _videos(generated).items()
+            # As many of a class as are left by the fold that tests most.
+            left = {
+                c: len(of_class) - max(len(of_class & t) for t in tested) for c, of_class in videos
+            }
+            free = [k for k, (_, video) in enumerate(_pairs(generated)) if video not in names]
+            free = _picked(generated, free)
+            shots = training.of_generated or left
             sets.append(_picked(free, draws.rows(free, shots, draw)))
-        named = _named(_joined(sets), test.features[at], draws.l2)
-        hits[at] = np.array(named) == np.array(labels)[at]
+        named = _named(_joined(sets), test.features[rows], draws.l2)
+        hits[rows] = [name == pairs[k][0] for name, k in zip(named, rows, strict=True)]
     return hits
+
+
+def _joined(parts: Sequence[FeatureSet]) -> FeatureSet:
+    """Rows of several sets below each other."""
+    pairs = [pair for part in parts for pair in _pairs(part)]
+    ids = [f"{k}/{i}" for k, part in enumerate(parts) for i in part.ids]
+    x = np.concatenate([part.features for part in parts])
+    labels, groups = ([pair[c] for pair in pairs] for c in (0, 1))
+    return FeatureSet(ids, x, labels, groups, parts[0].encoder)
 
 
 def _named(features: FeatureSet, rows: NDArray[Any], l2: float) -> Sequence[str]:
     """The classes of rows (m, d), by a probe of these features; one class is always named."""
-    classes = {*_columns(features)[0]}
+    classes = {label for label, _ in _pairs(features)}
     if len(classes) < 2:
         return [*classes] * len(rows)
     return fit_probe(features, l2=l2).predict(rows)
@@ -254,7 +245,7 @@ def material_utility(
         if not any(features.labels or ()):
             must, fix = f"The features of {part!r} must have materials", "Pass a labeled manifest"
             raise PalpateError(must, "none", fix)
-    truth, groups = _columns(test)
+    truth, groups = ([pair[c] for pair in _pairs(test)] for c in (0, 1))
     common: dict[str, Any] = {"split": split, "encoder": test.encoder, "estimator": "mean"}
     details = {"chance": 1 / len(set(truth)), "draws": draws.draws}
 
@@ -370,34 +361,53 @@ def utility(
     )
 
 
+def embed_generated(
+    images: Path, manifest: Manifest, encoders: EncoderSet, progress: Progress = quiet
+) -> FeatureSet:
+    """Tactile features (n, d) of generated images.
+
+    Materials, videos, sensors and no-contact images are those of the manifest's samples.
+
+    Args:
+        images: a folder of ``palpate generate``, or one with a manifest.
+        manifest: samples of the same ids, and perhaps others.
+        encoders: with a tactile one.
+        progress: progress callback.
+
+    Raises:
+        PalpateError: if the folder is none of images, or an id is not in the manifest.
+    """
+    files = read(str(images), "generated").manifest
+    assert files is not None  # a folder holds images
+    paths = [str(path.resolve()) for path in files.paths("tactile")]
+    part = manifest.take(files.ids)
+    part = replace(part, table=part.table.with_columns(pl.Series("tactile", paths)))
+    return embed(part, encoders, "tactile", still=True, progress=progress)
+
+
 def measure_utility(
-    place: Path,
-    after: After,
-    progress: Progress,
-    *,
-    runs: Mapping[str, Mapping[str, str]],
-    controls: Sequence[str],
-    draws: Draws,
-    device: str,
+    work: Work, *, runs: Mapping[str, Mapping[str, str]], controls: Sequence[str], draws: Draws
 ) -> Facts:
     """The stage of a study: its table and claims over seeds, as ``results.json``.
 
     ``runs``: node of the judge -> method -> node of its images, made for photos; one a seed.
     ``controls``: their names.
     """
-    manifest, split = data_of(after, NOLEAK)
-    shown = control_folders(after, NOLEAK, controls)
+    manifest, split = data_of(work)
+    control_images = control_folders(work, NOLEAK, controls)
     tables = list[StudyTable]()
     for encoders, images in runs.items():
-        judge = EncoderSet.load(after[encoders] / "encoders", device=device)
-        folders = {name: after[node] / "images" for name, node in images.items()} | shown
-        how: Facts = {"controls": [*shown], "progress": progress}
-        tables.append(utility(manifest, split, judge, folders, draws, **how))
+        judge = EncoderSet.load(work.after[encoders] / "encoders", device=work.device)
+        folders = {name: work.after[node] / "images" for name, node in images.items()}
+        names, progress = [*control_images], work.progress
+        folders |= control_images
+        tables.append(
+            utility(manifest, split, judge, folders, draws, controls=names, progress=progress)
+        )
     table = table_over_seeds(tables)
-    claims = utility_claims(
-        table, list(dict.fromkeys(n for images in runs.values() for n in images))
-    )
-    Results("", tables=[table], claims=claims).save(place / "results.json")
+    generators = dict.fromkeys(name for images in runs.values() for name in images)
+    claims = utility_claims(table, generators)
+    Results("", tables=[table], claims=claims).save(work.folder / "results.json")
     return {"claims": len(claims)}
 
 

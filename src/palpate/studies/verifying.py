@@ -15,18 +15,19 @@ from __future__ import annotations
 import tempfile
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
+from functools import partial
 from importlib import import_module
 from pathlib import Path
 from typing import Any, Literal
 
-from palpate.core import PalpateError, Progress, few, plain, quiet, read_json, read_record, require
+from palpate.core import PalpateError, Progress, few, plain, quiet, read_record, require
 from palpate.core.files import reading_entry
 from palpate.report.calls import OBJECT, PATH, ROWS, Call, is_there
 from palpate.report.labels import label_of, subject_of
 from palpate.report.results import AUDIT_FORMAT, RESULTS_FORMAT, Audit, Results
-from palpate.studies.graph import Node, in_order
-from palpate.studies.stages import Stage, stage_of, stage_outputs
+from palpate.studies.graph import measured_again
+from palpate.studies.stages import stage_outputs
 
 FORMAT = "palpate-verification/1"
 #: Verb -> module and function of its calls.
@@ -123,10 +124,9 @@ def verify(
         results = Results(title="", audits=[Audit.load(file)])
     else:
         results = Results.load(file)
-    if isinstance(results.settings.get("stages"), Mapping):
-        checks, after, reasons = _run_again(results, file, progress)
-    else:
-        checks, (after, reasons) = list[Check](), _calls_again(results, file, progress)
+    staged = isinstance(results.settings.get("stages"), Mapping)
+    after, reasons = (_run_again if staged else _calls_again)(results, file, progress)
+    checks = list[Check]()
     before = _items(results)
     for name in dict.fromkeys([*before, *after]):
         if name not in after and reasons:
@@ -140,16 +140,19 @@ def verify(
     return Verification(str(file), checks)
 
 
-def _items(results: Results) -> dict[str, Any]:
+def _items(*results: Results) -> dict[str, Any]:
     """Every score, audit, sentence, table, claim, strip and call by what it is called."""
     items, seen = dict[str, Any](), Counter[str]()
-    for part in PARTS:
-        for item in getattr(results, part):
-            name = _name(part, item)
-            seen[name] += 1
-            items[name if seen[name] == 1 else f"{name} ({seen[name]})"] = plain(item)
-    if "stages" in results.settings:
-        items["digests"] = plain(results.settings.get("digests"))
+    for part, item in ((p, i) for p in PARTS for r in results for i in getattr(r, p)):
+        name = _name(part, item)
+        seen[name] += 1
+        items[name if seen[name] == 1 else f"{name} ({seen[name]})"] = plain(item)
+    for settings in (r.settings for r in results):
+        if isinstance(stages := settings.get("stages"), Mapping):
+            items["digests"] = plain(settings.get("digests"))
+            for name, record in stages.items():
+                outputs = record.get("outputs") if isinstance(record, Mapping) else record
+                items[f"stage {name}"] = outputs
     return items
 
 
@@ -170,33 +173,29 @@ def _calls_again(
 ) -> tuple[dict[str, Any], list[str]]:
     """The items that the calls of a file make now, and why some calls cannot be made."""
     calls = [*results.calls, *(a.call for a in results.audits if a.call is not None)]
-    parts: dict[str, list[Any]] = {part: [] for part in PARTS}
+    again = list[Results]()
     reasons = [] if calls else ["no call in the file makes it"]
     for call in calls:
         try:
             with reading_entry(file, f"The call of palpate {call.verb}"):
-                made = _made(call, progress)
+                again.append(_call_again(call, progress))
         except (PalpateError, OSError) as error:
             reasons.append(" ".join(str(error).split()))
-            continue
-        for part, items in parts.items():
-            items += getattr(made, part)
-    return _items(replace(Results(title=""), **parts)), reasons
+    return _items(*again), reasons
 
 
-def _made(call: Call, progress: Progress) -> Results:
+def _call_again(call: Call, progress: Progress) -> Results:
     """What a call makes now.
 
     Raises:
         PalpateError: if an input is missing, or never was a file.
     """
-    if call.verb not in FUNCTIONS:
-        must = f"The verb of a call must be one of {', '.join(FUNCTIONS)}"
-        raise PalpateError(must, repr(call.verb), "Run it again yourself")
+    must = f"The verb of a call must be one of {', '.join(FUNCTIONS)}"
+    require(call.verb in FUNCTIONS, None, must, repr(call.verb), fix="Run it again yourself")
     module, name = FUNCTIONS[call.verb]
-    arguments = {name: _decoded(value) for name, value in call.arguments.items()}
-    made = getattr(import_module(module), name)(**arguments, progress=progress)
-    return made if isinstance(made, Results) else Results(title="", audits=[made])
+    function = partial(getattr(import_module(module), name), progress=progress)
+    results = function(**{name: _decoded(value) for name, value in call.arguments.items()})
+    return results if isinstance(results, Results) else Results(title="", audits=[results])
 
 
 def _decoded(value: Any) -> Any:
@@ -210,8 +209,8 @@ def _decoded(value: Any) -> Any:
         raise PalpateError(must, got, "Save it, and pass its path")
     if isinstance(value, Mapping) and PATH in value:
         path = Path(value[PATH])
-        if not is_there(path):
-            raise PalpateError("An input must exist", f"nothing at {path}", "Put it there again")
+        got, fix = f"nothing at {path}", "Put it there again"
+        require(is_there(path), None, "An input must exist", got, fix=fix)
         if ROWS in value:
             from palpate.data.reading import load
 
@@ -224,95 +223,23 @@ def _decoded(value: Any) -> Any:
 
 def _run_again(
     results: Results, file: Path, progress: Progress
-) -> tuple[list[Check], dict[str, Any], list[str]]:
-    """Checks of the stages next to a file; what they make now, and why it cannot be made."""
-    folder = file.absolute().parent
-    checks = [_stage_check(name, folder, of) for name, of in results.settings["stages"].items()]
-    with tempfile.TemporaryDirectory() as place:
+) -> tuple[dict[str, Any], list[str]]:
+    """What the stages next to a file hold and make now, and why some cannot be made."""
+    from palpate.studies.reproduce import plan_again
+
+    folder, settings = file.absolute().parent, results.settings
+    folders = {name: folder / name for name in settings["stages"]}
+    absent = [name for name, path in folders.items() if not (path / "stage.json").is_file()]
+    reasons = [f"no record at {folders[name]}" for name in absent]
+    items = {f"stage {n}": stage_outputs(f) for n, f in folders.items() if n not in absent}
+    with tempfile.TemporaryDirectory() as target:
         try:
             with reading_entry(file, "The settings"):
-                again = _study_again if "study" in results.settings else _demo_again
-                made = again(results.settings, folder, Path(place), progress)
+                plan = plan_again(settings, folder)
+                stages = measured_again(plan.nodes(), folder, Path(target), progress)
+                return _items(plan.results(stages)) | items, reasons
         except (PalpateError, OSError) as error:
-            return checks, {}, [" ".join(str(error).split())]
-    return checks, _items(made), []
-
-
-def _stage_check(name: str, folder: Path, stated: Any) -> Check:
-    """Whether a stage holds the files of its record, and of the results."""
-    try:
-        before = read_json(folder / name / "stage.json", "stage record")["outputs"]
-    except (PalpateError, OSError, KeyError, TypeError):
-        return Check(f"stage {name}", "cannot check", f"no record at {folder / name}")
-    if isinstance(stated, Mapping):
-        before = stated.get("outputs", before)
-    why = difference(before, stage_outputs(folder / name), 0.0)
-    return Check(f"stage {name}", "differs" if why else "same", why)
-
-
-def _study_again(
-    settings: Mapping[str, Any], folder: Path, place: Path, progress: Progress
-) -> Results:
-    """The results of a study; what was given to it lies in the run folder, wherever it was."""
-    from palpate.evaluation.companions import Weights
-    from palpate.studies.making import slug
-    from palpate.studies.reproduce import nodes_of, plan_of, settings_of
-    from palpate.studies.study import NOLEAK, STUDIES
-
-    if settings["study"] not in STUDIES:
-        must = f"The study must be one of {', '.join(STUDIES)}, to be made again"
-        raise PalpateError(must, repr(settings["study"]), "Verify it where it is defined")
-    options = settings["options"]
-    others = options["methods of others"]
-    plan = plan_of(
-        STUDIES[settings["study"]],
-        preset=settings["preset"],
-        seeds=settings["seeds"],
-        root=options["root"] and folder / "data",
-        others={name: folder / f"images-{slug(name)}-{NOLEAK}" / "images" for name in others},
-        people=options["people"] and folder / "results" / "people.json",
-        steps=options["steps of a method"],
-        vq=options["vq"],
-        weights=Weights(**options["weights"]),
-    )
-    stages = _measured(nodes_of(plan), folder, place, progress)
-    made = Results.load(place / "results" / "results.json")
-    stored = {name: replace(stage, folder=folder / name) for name, stage in stages.items()}
-    return replace(made, settings=settings_of(plan, stored, options["jobs"]))
-
-
-def _demo_again(
-    settings: Mapping[str, Any], folder: Path, place: Path, progress: Progress
-) -> Results:
-    from palpate.studies.demo import DemoOptions, demo_nodes, demo_of
-    from palpate.studies.demo_page import results_of
-
-    given: dict[str, Any] = {**settings["options"]}
-    given["data"] = given["data"] and Path(given["data"])
-    options = DemoOptions(**given)
-    stages = _measured(demo_nodes(options), folder, place, progress)
-    return results_of(demo_of(options, stages), "")
-
-
-def _measured(
-    nodes: Sequence[Node], folder: Path, place: Path, progress: Progress
-) -> dict[str, Stage]:
-    """All stages: those that measure are built below ``place``, the others are those of the run.
-
-    Raises:
-        PalpateError: if a stage is not there.
-    """
-    stages: dict[str, Stage] = {}
-    for done, node in enumerate(in_order(nodes)):
-        progress("stages", done, len(nodes), node.name)
-        record = read_json(folder / node.name / "stage.json", "stage record")
-        stages[node.name] = stage_of(folder / node.name, record)
-        if node.measures:
-            made = place / node.name
-            made.mkdir()
-            facts = node.build(made, {n: stages[n].folder for n in node.after}, quiet)
-            stages[node.name] = replace(stages[node.name], folder=made, facts=dict(facts or {}))
-    return stages
+            return items, [*reasons, " ".join(str(error).split())]
 
 
 def difference(before: Any, after: Any, tolerance: float) -> str:
