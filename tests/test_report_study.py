@@ -123,7 +123,7 @@ def test_rows_may_be_short():
 def test_how_a_table_was_made_names_stages_sizes_and_intervals():
     rows = [["a", up("a", 0.5, n=40, details={"stage": "probe-0"})]]
     rows.append(["b", up("b", 0.6, n=1200, details={"stage": "probe-1"}, seed=3)])
-    made = dict(of_study(StudyTable("T", "", ["", "v"], rows)).made)
+    made = dict(of_study(StudyTable("T", "", ["", "v"], rows)).facts)
     assert made == {
         "n": "40 to 1,200",
         "interval": "95 %, jackknife, t, 9 df",
@@ -241,7 +241,7 @@ def test_the_axis_of_strips_is_that_of_the_methods_and_a_control_beyond_it_an_ar
 def test_degrees_of_freedom_are_a_range():
     how = [f"jackknife, t, {n} df" for n in ("11.0", "9", "14.8")]
     rows = [[h, up(h, 0.5, interval_method=h)] for h in how]
-    made = dict(of_study(StudyTable("T", "", ["", "v"], rows)).made)
+    made = dict(of_study(StudyTable("T", "", ["", "v"], rows)).facts)
     assert made["interval"] == "95 %, jackknife, t, 9-14.8 df"
 
 

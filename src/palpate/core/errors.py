@@ -117,9 +117,9 @@ def require(
         PalpateError: unless it ``holds``.
     """
     if not holds:
-        shown = {} if argument is None or example is None else {argument: example}
+        examples = {} if argument is None or example is None else {argument: example}
         text = got if isinstance(got, str) else repr(got)
-        raise PalpateError(must, text, fix, argument=argument, example=shown)
+        raise PalpateError(must, text, fix, argument=argument, example=examples)
 
 
 def require_rows(ids: Iterable[str], wanted: Sequence[str], must: str, fix: str) -> list[int]:

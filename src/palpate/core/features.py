@@ -107,17 +107,15 @@ class FeatureSet:
 
     def save(self, path: Path) -> None:
         """Write an ``.npz`` of plain arrays (no pickles), atomically."""
-        arrays: dict[str, np.ndarray] = {
-            "ids": np.array(list(self.ids), dtype=str),
-            "features": self.features,
+        columns, ids = {"labels": self.labels, "groups": self.groups}, np.array([*self.ids], str)
+        names = {
+            name: np.array(["" if is_missing(c) else c for c in column], dtype=str)
+            for name, column in columns.items()
+            if column is not None
         }
-        for name in ("labels", "groups"):
-            if (column := getattr(self, name)) is not None:
-                arrays[name] = np.array(["" if is_missing(c) else c for c in column], dtype=str)
-        if self.encoder:
-            arrays["encoder"] = np.array(self.encoder)
+        encoder = {"encoder": np.array(self.encoder)} if self.encoder else {}
         with atomic_path(Path(path)) as part, open(part, "wb") as file:
-            np.savez(file, allow_pickle=False, **arrays)
+            np.savez(file, allow_pickle=False, ids=ids, features=self.features, **names | encoder)
 
     @classmethod
     def load(cls, path: Path) -> FeatureSet:

@@ -39,9 +39,9 @@ def atomic_path(path: Path) -> Generator[Path]:
         final = path if stream else Path(os.path.realpath(path))
         if final.is_dir():
             raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(path))
-        place = Path(tempfile.gettempdir()) if stream else final.parent
-        place.mkdir(parents=True, exist_ok=True)
-        handle, name = tempfile.mkstemp(dir=place, prefix=f".{final.name}.", suffix=final.suffix)
+        parent = Path(tempfile.gettempdir()) if stream else final.parent
+        parent.mkdir(parents=True, exist_ok=True)
+        handle, name = tempfile.mkstemp(dir=parent, prefix=f".{final.name}.", suffix=final.suffix)
     except OSError as error:  # name the user's path, not the temporary one
         reason = error.strerror or str(error)
         if error.errno in NO_ROOM:
@@ -114,7 +114,7 @@ def locked(folder: Path, output: Path | None = None) -> Generator[None]:
     Raises:
         PalpateError: if another process holds it, or it cannot be made.
     """
-    made = not folder.exists()
+    new = not folder.exists()
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
@@ -137,7 +137,7 @@ def locked(folder: Path, output: Path | None = None) -> Generator[None]:
     try:
         yield
     finally:
-        if made:
+        if new:
             with suppress(OSError):
                 folder.rmdir()
         if handle >= 0:
@@ -155,12 +155,12 @@ def write_json(path: Path, value: Any) -> None:
     write_text(path, json.dumps(value, indent=1, ensure_ascii=False, allow_nan=False) + "\n")
 
 
-def read_json(path: Path, what: str) -> Any:
+def read_json(path: Path, role: str) -> Any:
     """Read a JSON file.
 
     Args:
         path: the file.
-        what: its role, for the error (``"split file"``).
+        role: its role, for the error (``"split file"``).
 
     Raises:
         PalpateError: if the file is missing or is not JSON.
@@ -172,23 +172,23 @@ def read_json(path: Path, what: str) -> Any:
         json.dumps(value, ensure_ascii=False, allow_nan=False).encode()
         return value
     except FileNotFoundError:
-        raise PalpateError(f"The {what} must exist", f"no file {path}", "Check the path") from None
+        raise PalpateError(f"The {role} must exist", f"no file {path}", "Check the path") from None
     except IsADirectoryError:
         fix = "Name the file itself"
-        raise PalpateError(f"The {what} must be a file", f"the folder {path}", fix) from None
+        raise PalpateError(f"The {role} must be a file", f"the folder {path}", fix) from None
     except (ValueError, RecursionError) as error:  # no JSON, no UTF-8, nested too deep
         fix = "Write it again with palpate"
-        raise PalpateError(f"The {what} {path} must be JSON", str(error), fix) from None
+        raise PalpateError(f"The {role} {path} must be JSON", str(error), fix) from None
 
 
 def read_record(
-    path: Path, what: str, *, form: str | Sequence[str] | None = None, keys: Sequence[str] = ()
+    path: Path, role: str, *, form: str | Sequence[str] | None = None, keys: Sequence[str] = ()
 ) -> dict[str, Any]:
     """Read a JSON object that a loader takes its settings from.
 
     Args:
         path: the file.
-        what: its role, for the error (``"pipeline card"``).
+        role: its role, for the error (``"pipeline card"``).
         form: its ``format``, newest first where several are read; None: a foreign file without one.
         keys: keys that it must have.
 
@@ -196,17 +196,17 @@ def read_record(
         PalpateError: if the file is missing, is not JSON, or is no object of that format with
             those keys.
     """
-    record, fix = read_json(path, what), "Name another folder, or copy the whole folder again"
+    record, fix = read_json(path, role), "Name another folder, or copy the whole folder again"
     if not isinstance(record, dict):
         got = f"a {type(record).__name__}"
-        raise PalpateError(f"The {what} {path} must be a JSON object", got, fix)
+        raise PalpateError(f"The {role} {path} must be a JSON object", got, fix)
     forms = [form] if isinstance(form, str) else form
     if forms is not None and record.get("format") not in forms:
         got = repr(record.get("format"))
         fix = "Name another folder, or install the release of palpate that wrote it"
-        raise PalpateError(f"The {what} {path} must have the format {forms[0]}", got, fix)
+        raise PalpateError(f"The {role} {path} must have the format {forms[0]}", got, fix)
     if missing := [name for name in keys if name not in record]:
-        must = f"The {what} {path} must have the keys {', '.join(keys)}"
+        must = f"The {role} {path} must have the keys {', '.join(keys)}"
         raise PalpateError(must, f"no {', no '.join(missing)}", fix)
     return record
 

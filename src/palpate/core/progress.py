@@ -15,19 +15,19 @@ T = TypeVar("T")
 class Progress(Protocol):
     """Called with the task, the amount done, the total (0 = unknown), and a short remark."""
 
-    def __call__(self, what: str, done: int, total: int, remark: str = "") -> None:
+    def __call__(self, task: str, done: int, total: int, remark: str = "") -> None:
         """Report once."""
         ...
 
 
-def quiet(what: str, done: int, total: int, remark: str = "") -> None:
+def quiet(task: str, done: int, total: int, remark: str = "") -> None:
     """Show nothing."""
 
 
-def track(items: Iterable[T], what: str, progress: Progress) -> Iterator[T]:
+def track(items: Iterable[T], task: str, progress: Progress) -> Iterator[T]:
     """Yield ``items`` and report after each."""
     count = len(items) if isinstance(items, Sequence) else 0
-    progress(what, 0, count)
+    progress(task, 0, count)
     for done, item in enumerate(items, 1):
         yield item
-        progress(what, done, count)
+        progress(task, done, count)

@@ -27,9 +27,8 @@ def from_plain(cls: type[T], data: Any) -> T:
         raise ValueError(f"a {cls.__name__} that is no object")
     if unknown := sorted(set(data) - set(hints)):
         raise ValueError(f"unknown field {unknown[0]}")
-    values = {name: _value(hints[name], value, name) for name, value in data.items()}
     try:
-        return cls(**values)
+        return cls(**{name: _value(hints[name], value, name) for name, value in data.items()})
     except TypeError as error:  # a field is missing
         raise ValueError(str(error)) from None
 
@@ -67,8 +66,8 @@ def _value_of_any(kinds: Sequence[Any], value: Any, name: str) -> Any:
     """``value`` as the first of some types that fits, such as a text or a record."""
     if value is None and type(None) in kinds:
         return None
-    *others, last = (kind for kind in kinds if kind is not type(None))
-    for kind in others:
+    *first, last = (kind for kind in kinds if kind is not type(None))
+    for kind in first:
         with suppress(ValueError):
             return _value(kind, value, name)
     return _value(last, value, name)

@@ -155,7 +155,7 @@ class Score:
         if self.interval is not None:
             method = ", ".join(filter(None, [f"{self.level:.0%}", self.interval_method]))
             value += " [{:.4g}, {:.4g}] ({})".format(*self.interval, method)
-        how = [
+        setting = [
             self.estimator,
             f"sigma {self.bandwidth:g}" if self.bandwidth is not None else "",
             f"scale {self.scale:g}" if self.scale != 1 else "",
@@ -172,7 +172,7 @@ class Score:
         fields = (self.features, self.kernel, "" if self.kind == "value" else self.kind)
         name = ", ".join(filter(None, (self.metric, *fields)))
         head = f"{name} of {self.a}{f' against {self.b}' if self.b else ''}: {value}"
-        return "\n  ".join([head, *(", ".join(filter(None, line)) for line in (how, data))])
+        return "\n  ".join([head, *(", ".join(filter(None, line)) for line in (setting, data))])
 
     def _repr_html_(self) -> str:
         head, *lines = map(html.escape, str(self).split("\n"))
@@ -200,13 +200,13 @@ def require_comparable(scores: Sequence[Score]) -> None:
     axis = scores[0].settings.get("axis") if scores else None
     for name in (name for name in COMPARABLE if name != axis):
         # Running sums do not know their reference: it must agree where it is known.
-        known = [s for s in scores if name != "reference" or s.reference is not None]
-        for score in known[1:]:
-            a, b = getattr(known[0], name), getattr(score, name)
+        compared = [s for s in scores if name != "reference" or s.reference is not None]
+        for score in compared[1:]:
+            a, b = getattr(compared[0], name), getattr(score, name)
             if plain(a) != plain(b):
                 raise PalpateError(
                     f"Scores in one column must agree in {name}",
-                    f"{a!r} for {known[0].a!r} and {b!r} for {score.a!r}",
+                    f"{a!r} for {compared[0].a!r} and {b!r} for {score.a!r}",
                     "Score both again with the same settings, or put them into two tables",
                 )
 

@@ -56,15 +56,15 @@ class Call:
     digests: Mapping[str, str] = field(default_factory=dict)
 
     @classmethod
-    def of(cls, verb: str, function: Callable[..., Any], given: Mapping[str, Any]) -> Call:
-        """The call of ``function`` with the arguments ``given``; their files are digested."""
+    def of(cls, verb: str, function: Callable[..., Any], arguments: Mapping[str, Any]) -> Call:
+        """The call of ``function`` with the ``arguments``; their files are digested."""
         defaults = {n: p.default for n, p in inspect.signature(function).parameters.items()}
-        arguments = {
+        recorded = {
             name: _recorded(value, name)
-            for name, value in given.items()
+            for name, value in arguments.items()
             if name not in SILENT and not _is(value, defaults.get(name, inspect.Parameter.empty))
         }
-        return cls(verb, arguments)
+        return cls(verb, recorded)
 
     def with_digests(self, digests: Mapping[str, Any]) -> Call:
         """The call with digests, nested ones by both names: ``{"generated": {"ours": ...}}``."""

@@ -146,8 +146,8 @@ class Column:
         return best_by_value(competing, self.digits)
 
     @property
-    def made(self) -> list[tuple[str, str]]:
-        """How its scores were made, as (what, how)."""
+    def facts(self) -> list[tuple[str, str]]:
+        """How its scores were made, by what."""
         first, each = self.scores[0], self.scores
         intervals = (interval_text(s) for s in each if s.interval is not None)
         facts = {
@@ -174,12 +174,11 @@ class Family:
     @property
     def facts(self) -> list[tuple[str, str]]:
         """How the scores were made: what all columns share, then what is of one."""
-        made = [column.made for column in self.columns]
-        shared = [fact for fact in made[0] if all(fact in m for m in made)] if made else []
+        each = [column.facts for column in self.columns]
+        shared = [fact for fact in each[0] if all(fact in own for own in each)] if each else []
         facts = [(f"{c.name}, size", c.size) for c in self.columns if c.size] + shared
-        for column, own in zip(self.columns, made, strict=True):
-            single = (fact for fact in own if fact not in shared)
-            facts += [(f"{column.name}, {name}", text) for name, text in single]
+        for column, own in zip(self.columns, each, strict=True):
+            facts += [(f"{column.name}, {f}", text) for f, text in own if (f, text) not in shared]
         return facts
 
 

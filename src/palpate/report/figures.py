@@ -115,11 +115,11 @@ def _background(results: Results) -> Picture | None:
 
 
 def _pairs(audit: Audit) -> Picture | None:
-    known = [pair_list for pair_list in audits.pair_lists(audit) if pair_list.has_images]
-    if not known:
+    lists = [pair_list for pair_list in audits.pair_lists(audit) if pair_list.has_images]
+    if not lists:
         return None
-    nearest = [pair_list for pair_list in known if pair_list.kind in ("", "time gap")]
-    pairs = (nearest or known)[0].pairs[:PAIRS]
+    nearest = [pair_list for pair_list in lists if pair_list.kind in ("", "time gap")]
+    pairs = (nearest or lists)[0].pairs[:PAIRS]
     headings = [audits.pair_facts(pair, "")[0] for pair in pairs]
     columns = [{w.label: w for w in pair_images(pair, audits.head_of(audit))} for pair in pairs]
     labels = list(dict.fromkeys(label for column in columns for label in column))
@@ -149,8 +149,8 @@ def _grid(picture: Picture, base: Path) -> Image.Image:
         pen.text((middle, top - GAP), text(heading, SIDE), COLORS["ink"], font, "ms")
     for r, (label, row) in enumerate(picture.rows):
         y = top + r * (SIDE + GAP)
-        place = (left - 2 * GAP, y + SIDE // 2)
-        pen.text(place, label, COLORS["ink"], font, "rm")
+        corner = (left - 2 * GAP, y + SIDE // 2)
+        pen.text(corner, label, COLORS["ink"], font, "rm")
         for k, wanted in enumerate(row):
             image.paste(_field(wanted, base, picture.crop), (left + k * (SIDE + GAP), y))
     return image
@@ -167,7 +167,7 @@ def _field(wanted: Wanted, base: Path, crop: bool) -> Image.Image:
         ImageDraw.Draw(field).rectangle((0, 0, SIDE - 1, SIDE - 1), outline=COLORS["line"], width=3)
         return field
     # Small images keep their pixels, as on the page.
-    how = Image.Resampling.NEAREST if tiny else Image.Resampling.LANCZOS
+    filtering = Image.Resampling.NEAREST if tiny else Image.Resampling.LANCZOS
     if crop:
-        return ImageOps.fit(image, (SIDE, SIDE), how)
-    return ImageOps.pad(image, (SIDE, SIDE), how, COLORS["paper"])
+        return ImageOps.fit(image, (SIDE, SIDE), filtering)
+    return ImageOps.pad(image, (SIDE, SIDE), filtering, COLORS["paper"])

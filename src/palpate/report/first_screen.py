@@ -124,9 +124,9 @@ def _leak_card(audits: Sequence[Audit]) -> Card:
     if any(a.leaked_fraction for a in audits):
         gaps = {a.name: a.gap_median for a in audits if a.leaked_fraction}
         name, gap = next(((n, g) for n, g in gaps.items() if g is not None), ("", None))
-        of = f" of {name}" if len(audits) > 1 else ""
+        whose = f" of {name}" if len(audits) > 1 else ""
         frames = "" if gap is None else f"{gap:g} frame{'s' * (gap != 1)} away"
-        near = f"; median{of}: {frames}" if frames else ""
+        near = f"; median{whose}: {frames}" if frames else ""
         foot = f"Train has the same video, object or image{near}."
     return Card("Test samples that leak from train", rows, foot)
 
@@ -179,12 +179,12 @@ def _compared(
         room = CARD_ROWS - len(real)
         methods = methods[: max(1, room - len(apart))]
         return [*methods, *apart[: room - len(methods)], *real]
-    others = methods[1:]
-    best = best_by_value(others, column.digits) or {0}
-    front = [*methods[:1], *(others[k] for k in sorted(best)[:1] if others)]
+    rivals = methods[1:]
+    best = best_by_value(rivals, column.digits) or {0}
+    front = [*methods[:1], *(rivals[k] for k in sorted(best)[:1] if rivals)]
     photo = [score for score in apart if "nearest photo" in score.a] or apart
     back = [*photo[:1], *real[:1]]
-    more = {id(score): score for score in (*others, *scores)}
+    more = {id(score): score for score in (*rivals, *scores)}
     more = [score for k, score in more.items() if k not in map(id, (*front, *back))]
     return [*front, *more[: CARD_ROWS - len(front) - len(back)], *back]
 
@@ -216,8 +216,8 @@ def _against_real(score: Score) -> str:
     """
     p = score.details.get("p_value")
     if score.metric in DISTANCES and p is not None:
-        shown = "differs from real" if p < 0.05 else "not shown to differ from real"
-        return f"p {'' if p < 0.001 else '= '}{p_text(p)}: {shown}"
+        verdict = "differs from real" if p < 0.05 else "not shown to differ from real"
+        return f"p {'' if p < 0.001 else '= '}{p_text(p)}: {verdict}"
     if score.higher_is_better is not None or score.floor is None or not score.interval:
         return ""
     low, high = score.interval

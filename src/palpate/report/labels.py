@@ -5,13 +5,13 @@ from __future__ import annotations
 from palpate.core import Measure, Score
 
 
-def measured(of: Score | Measure) -> str:
+def measured(score: Score | Measure) -> str:
     """Return what is measured, as the head of a column says it; of a difference what both are.
 
     ``FID (Inception)``, ``TMMD (σ median)``, ``I-TMMD E``, ``top-5 of 480 (text by tactile)``.
     """
-    measure = of.measure if isinstance(of, Score) else of
-    pool = of.settings.get("pool") if isinstance(of, Score) else None
+    measure = score.measure if isinstance(score, Score) else score
+    pool = score.settings.get("pool") if isinstance(score, Score) else None
     name = measure.metric + (f" of {pool}" if pool else "") + " E" * measure.excess
     return name + "".join(f" ({field})" for field in (measure.features, measure.kernel) if field)
 

@@ -69,7 +69,7 @@ def latex_tables(results: Results) -> str:
     """
     captions = [(table, table.text) for table in map(of_study, results.tables)]
     for table in (table for family in families(results.scores) for table in grids(family)):
-        captions.append((table, "; ".join(f"{what} {_short(how)}" for what, how in table.made)))
+        captions.append((table, "; ".join(f"{name} {_short(text)}" for name, text in table.facts)))
     names = file_names("tab", [table.title for table, _ in captions])
     parts = [_table(t, caption, name) for (t, caption), name in zip(captions, names, strict=True)]
     parts.insert(len(results.tables), _claims(results.claims))

@@ -91,7 +91,7 @@ def _table(table: Table) -> list[str]:
     grid = pipe_table(*table.plain()) if table.rows else []
     lines = [f"### {esc(table.title)}", "", *([esc(table.text), ""] if table.text else []), *grid]
     lines += [line for mark in table.marks("*") for line in (esc(mark), "")]
-    lines += [f"- {esc(what)}: {esc(how)}" for what, how in table.made]
+    lines += [f"- {esc(name)}: {esc(text)}" for name, text in table.facts]
     lines += [f"- ({k}) {esc(sentence(note))}" for k, note in enumerate(table.notes, 1)]
     return [*lines, ""]
 

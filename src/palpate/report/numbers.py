@@ -50,8 +50,8 @@ def digits_of(scores: Iterable[Score], *, finest: bool = False) -> int:
     halves = [half for low, high in intervals if (half := (high - low) / 2) > 0]
     largest = max(values, default=0.0)
     if not halves:
-        whole = not intervals and largest > 1 and all(v == round(v) for v in values)
-        return 0 if whole else decimals([*values, *(v for pair in intervals for v in pair)])
+        integers = not intervals and largest > 1 and all(v == round(v) for v in values)
+        return 0 if integers else decimals([*values, *(v for pair in intervals for v in pair)])
     digits, most = (
         1 - math.floor(math.log10(half)) for half in (statistics.median_low(halves), min(halves))
     )

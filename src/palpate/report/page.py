@@ -173,12 +173,12 @@ def render_page(
             environment()
             .get_template("page.html.j2")
             .render(
-                **fixed,
+                fixed,
                 notes=notes,
                 hero=hero,
                 images=album.rows,
                 gallery=(gallery[:OPEN_ROWS], gallery[OPEN_ROWS:]),
-                shown=len(hero) + len(gallery),
+                drawn=len(hero) + len(gallery),
                 strips=[(s, album.rows[id(s)]) for s in results.strips if id(s) in album.rows],
             )
         )
@@ -261,10 +261,10 @@ def gallery_images(gallery: Sequence[GalleryItem]) -> list[tuple[GalleryItem, li
             for kind, p in tactile
         ]
         rows.append((item, images))
-    known = [
+    present = [
         any(image.path for image in column) for column in zip(*(w for _, w in rows), strict=True)
     ]
-    return [(item, list(compress(images, known))) for item, images in rows]
+    return [(item, list(compress(images, present))) for item, images in rows]
 
 
 def _strip_images(strip: Strip) -> list[Wanted]:

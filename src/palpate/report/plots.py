@@ -194,8 +194,8 @@ def _histogram(
             if height:
                 tall, edge = max(1.0, scale * height), 0.06 * (b - a)
                 size = f'width="{at(b - edge) - at(a + edge):.3f}%" height="{tall:.1f}"'
-                place = f'x="{at(a + edge):.3f}%" y="{bottom - tall:.1f}"'
-                rect = f'<rect class="{kind}" {place} {size}><title>{escape(title)}</title></rect>'
+                corner = f'x="{at(a + edge):.3f}%" y="{bottom - tall:.1f}"'
+                rect = f'<rect class="{kind}" {corner} {size}><title>{escape(title)}</title></rect>'
                 parts.append(rect)
         parts.append(_text("panel", LEFT, bottom - PANEL - 7, panel.name, "start"))
     for share, text in ticks:
@@ -211,8 +211,8 @@ def _histogram(
 
 
 def _text(name: str, x: float, y: float, text: str, anchor: str) -> str:
-    place = f'x="{x:.3f}%" y="{y:.1f}" text-anchor="{anchor}"'
-    return f'<text class="{name}" {place}>{escape(text)}</text>'
+    corner = f'x="{x:.3f}%" y="{y:.1f}" text-anchor="{anchor}"'
+    return f'<text class="{name}" {corner}>{escape(text)}</text>'
 
 
 def gap_histogram(audit: Audit) -> Markup:
@@ -229,8 +229,8 @@ def gap_histogram(audit: Audit) -> Markup:
     labeled.append(len(counts))
     marker = None
     if audit.gap_median is not None:
-        place = float(np.interp(audit.gap_median, edges, positions))
-        marker = (place, f"median {number(audit.gap_median, 0)}")
+        median = float(np.interp(audit.gap_median, edges, positions))
+        marker = (median, f"median {number(audit.gap_median, 0)}")
     label = f"Histogram of gaps for {audit.name}: {count(sum(counts))} test samples, "
     label += f"{count(edges[0])} to {count(edges[-1])} frames"
     titles = [

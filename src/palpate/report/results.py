@@ -274,8 +274,8 @@ class Audit:
 
     def save(self, path: str | Path) -> None:
         """Write the audit as JSON, atomically; paths of inputs become relative to its folder."""
-        place = _from_folder(Path(path).parent, Path())
-        call = self.call and self.call.with_paths(place)
+        change = _from_folder(Path(path).parent, Path())
+        call = self.call and self.call.with_paths(change)
         write_json(Path(path), replace(self, call=call).to_json())
 
     @classmethod
@@ -402,8 +402,10 @@ class Results:
         names = (key,) if isinstance(key, str) else key
         matches = [score for score in self.scores if _key(score)[: len(names)] == names]
         if not matches:
-            known = dict.fromkeys(", ".join(_key(s)[: len(names)]) for s in self.scores)
-            raise KeyError(f"no score of {', '.join(names)}; there is {'; '.join(known) or 'none'}")
+            listed = dict.fromkeys(", ".join(_key(s)[: len(names)]) for s in self.scores)
+            raise KeyError(
+                f"no score of {', '.join(names)}; there is {'; '.join(listed) or 'none'}"
+            )
         return matches if isinstance(key, str) else matches[0]
 
     @property
@@ -472,8 +474,8 @@ class Results:
 
         So they stay right when a run folder is moved as a whole.
         """
-        place = _from_folder(folder, base)
-        return self.with_paths(place).with_call_paths(place)
+        change = _from_folder(folder, base)
+        return self.with_paths(change).with_call_paths(change)
 
     def with_paths(self, change: Callable[[str], str | None]) -> Results:
         """The results with ``change`` applied to the path of every image; None removes it."""
@@ -510,8 +512,8 @@ class Results:
         data = read_record(path, "results file", form=RESULTS_FORMAT)
         with reading_entry(path, "The results"):
             results = cls.from_json(data)
-        place = _below(path.parent)
-        return results.with_paths(place).with_call_paths(place)
+        change = _below(path.parent)
+        return results.with_paths(change).with_call_paths(change)
 
 
 def _from_folder(folder: Path, base: Path) -> Callable[[str], str]:
@@ -540,10 +542,12 @@ def _with_paths(value: Any, change: Callable[[str], str | None]) -> Any:
         value, (SampleRef, LeakPair, Signal, Audit, GalleryItem, Match, Strip, Results)
     ):
         return value
-    new = {field.name: _with_paths(getattr(value, field.name), change) for field in fields(value)}
-    paths = {name: new[name] for name in _PATHS.get(type(value), ())}
-    new |= {name: None if path is None else change(path) for name, path in paths.items()}
-    return replace(value, **new)
+    paths, names = _PATHS.get(type(value), ()), [field.name for field in fields(value)]
+    of_image = lambda path: None if path is None else change(path)
+    inside = lambda part: _with_paths(part, change)
+    return replace(
+        value, **{n: (of_image if n in paths else inside)(getattr(value, n)) for n in names}
+    )
 
 
 def _writer(name: str) -> Any:

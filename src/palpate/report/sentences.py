@@ -58,7 +58,7 @@ def _kind(kind: str, audit: Audit) -> tuple[str, str]:
     words = {"thing": thing, "data": data_of(audit), "a": "an" if thing[:1] in "aeiou" else "a"}
     for start, meaning, share in KINDS:
         if kind.startswith(start):
-            return meaning.format(**words), share.format(**words)
+            return meaning.format_map(words), share.format_map(words)
     return "", f"are flagged by {kind}"
 
 
@@ -100,8 +100,8 @@ def chance_text(signal: Signal) -> str:
     facts = [] if signal.expected is None else [f"{number(signal.expected)} expected by chance"]
     if signal.false_positives is not None and signal.expected is not None:
         rates = f"promised rate {percent(signal.false_positives)}"
-        known = signal.measured is not None
-        facts.append(rates + (f", measured {percent(signal.measured or 0.0)}" if known else ""))
+        tested = signal.measured is not None
+        facts.append(rates + (f", measured {percent(signal.measured or 0.0)}" if tested else ""))
     return words + (f" ({'; '.join(facts)})" if facts else "")
 
 
@@ -141,11 +141,11 @@ def question_line(audit: Audit) -> str:
     if not purpose or audit.against != "train":
         return ""
     things: list[str] = []
-    for column, (n, of) in audit.shared.items():
-        some = "no" if not n else "every" if n == of else "some"
-        things.append(f"{some} {column} shared" + (f" ({count(n)} of {count(of)})" if n else ""))
-    known = next((c for c in ("object", "session") if audit.shared.get(c, (0, 0))[0]), "")
-    other = f", not for new {known}s" if known else ""
+    for column, (n, total) in audit.shared.items():
+        some = "no" if not n else "every" if n == total else "some"
+        things.append(f"{some} {column} shared" + (f" ({count(n)} of {count(total)})" if n else ""))
+    shared = next((c for c in ("object", "session") if audit.shared.get(c, (0, 0))[0]), "")
+    other = f", not for new {shared}s" if shared else ""
     things[0] = things[0].capitalize()
     return f"{', '.join(things)}: the split is for {purpose}{other}."
 
@@ -159,10 +159,10 @@ def audit_line(audit: Audit) -> str:
     strongest = sorted(flagged, key=lambda s: -s.fraction)[:3]
     shares: list[str] = []
     for k, signal in enumerate(strongest):
-        of = "" if k else " of the test samples"
+        whose = "" if k else " of the test samples"
         if signal.checked < audit.test_samples:
-            of = f" of the {count(signal.checked)} checked"
-        shares.append(f"{percent(signal.fraction)}{of} {_kind(signal.kind, audit)[1]}")
+            whose = f" of the {count(signal.checked)} checked"
+        shares.append(f"{percent(signal.fraction)}{whose} {_kind(signal.kind, audit)[1]}")
     return f"{name}: " + " ".join(
         [*(["; ".join(shares) + "."] if shares else []), leak_line(audit)]
     )
@@ -190,23 +190,23 @@ def purpose(results: Results) -> str:
         parts.append("what did a study measure")
     if not parts:
         return "Results of palpate; nothing has been measured yet."
-    *others, last = parts
-    question = f"{', '.join(others)}{', and ' * bool(others)}{last}?"
+    *first, last = parts
+    question = f"{', '.join(first)}{', and ' * bool(first)}{last}?"
     return question[:1].upper() + question[1:]
 
 
 def score_line(scores: Sequence[Score]) -> str:
     """Return the first column with a value, in one sentence; '' if there is none."""
     for column in (column for family in families(scores) for column in family.columns):
-        known = [score for score in column.scores if defined(score)]
-        if not known:
+        scored = [score for score in column.scores if defined(score)]
+        if not scored:
             continue
         values: list[str] = []
-        for score in known[:3]:
+        for score in scored[:3]:
             low_high = [number(v, column.digits) for v in score.interval or ()]
             interval = f" [{', '.join(low_high)}]" if low_high else ""
             values.append(f"{score.a} {number(score.value, column.digits)}{interval}")
-        floors = [score.floor for score in known if score.floor is not None]
+        floors = [score.floor for score in scored if score.floor is not None]
         floor = f"; floor {number(floors[0], column.digits)}" if floors else ""
         return f"{column.name} ({column.better}): {', '.join(values)}{floor}."
     return ""

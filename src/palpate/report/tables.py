@@ -51,6 +51,8 @@ CONFUSION = (
 )
 #: Title of the rankings, which replace the differences of more than two generators.
 RANKED = "Best first on the same samples: > decided, ~ not decided"
+#: Stages, seeds ... that are named.
+FEW = 12
 _DEGREES = re.compile(r"[\d.]+(?= df)")
 
 
@@ -120,7 +122,7 @@ class Table:
         heads: one a column.
         rows: as many cells each as there are heads.
         notes: the footnotes.
-        made: (what, how) the scores were made.
+        facts: how the scores were made, by what.
         strips: whether a page draws each score on the axis of its column.
     """
 
@@ -129,7 +131,7 @@ class Table:
     heads: Sequence[Head]
     rows: Sequence[Row]
     notes: Sequence[Note] = ()
-    made: Sequence[tuple[str, str]] = ()
+    facts: Sequence[tuple[str, str]] = ()
     strips: bool = False
 
     def column(self, k: int) -> list[Score]:
@@ -205,8 +207,8 @@ def of_study(table: StudyTable) -> Table:
         _head(label, [s for s in column if s], compared, empty=not any(row[k] for row in rows))
         for k, (label, column) in enumerate(zip(table.columns, columns, strict=True))
     ]
-    made = _made([v for row in rows for v in row if isinstance(v, Score)])
-    return Table(table.title, table.text, heads, written, footnotes.notes, made)
+    facts = _facts([s for row in scores for s in row if s])
+    return Table(table.title, table.text, heads, written, footnotes.notes, facts)
 
 
 def _digits(column: Sequence[Score | None]) -> list[int]:
@@ -221,14 +223,14 @@ def _digits(column: Sequence[Score | None]) -> list[int]:
 def _head(label: str, scores: Sequence[Score], compared: bool, *, empty: bool) -> Head:
     """A column's head; one that is empty is among the numbers."""
     directions = {score.higher_is_better for score in scores}
-    shown = compared and len(directions) == 1 and not re.search("[↑↓→]", label)
-    if not shown or (None in directions and all(s.floor is None for s in scores)):
+    directed = compared and len(directions) == 1 and not re.search("[↑↓→]", label)
+    if not directed or (None in directions and all(s.floor is None for s in scores)):
         return Head(label, scores=bool(scores) or empty)
     return Head(label, ARROWS[scores[0].higher_is_better], BETTER[scores[0].higher_is_better], True)
 
 
-def _made(scores: Sequence[Score]) -> list[tuple[str, str]]:
-    """How the scores of a study's table were made, as (what, how)."""
+def _facts(scores: Sequence[Score]) -> list[tuple[str, str]]:
+    """How the scores of a study's table were made, by what."""
     sizes = sorted({score.n for score in scores if score.n})
     degrees: dict[str, list[str]] = {}  # methods that differ in these alone are one
     for method in (interval_text(s) for s in scores if s.interval):
@@ -245,13 +247,12 @@ def _made(scores: Sequence[Score]) -> list[tuple[str, str]]:
         "seed": [str(score.seed) for score in scores if score.seed is not None],
         "stages": [str(score.details.get("stage", "")) for score in scores],
     }
-    rows = {what: list(dict.fromkeys(filter(None, how))) for what, how in facts.items()}
-    return [(what, _few(what, how)) for what, how in rows.items() if how]
-
-
-def _few(what: str, words: Sequence[str], most: int = 12) -> str:
-    more = [f"{len(words) - most} more"] * (len(words) > most)
-    return ("; " if what == "interval" else ", ").join([*words[:most], *more])
+    rows: list[tuple[str, str]] = []
+    for name, texts in facts.items():
+        words = list(dict.fromkeys(filter(None, texts)))
+        words[FEW:] = [f"{len(words) - FEW} more"] * (len(words) > FEW)
+        rows += [(name, ("; " if name == "interval" else ", ").join(words))] * bool(words)
+    return rows
 
 
 def grid(columns: Sequence[Column], controls: Collection[str] = (), *, full: bool = False) -> Table:
@@ -315,8 +316,8 @@ def grids(family: Family) -> list[Table]:
     """Return the scores of one family with all that is known of them, and their differences."""
     tables: list[Table] = []
     if family.columns:
-        words = {"title": family.title, "text": family.question, "made": family.facts}
-        tables.append(replace(grid(family.columns, full=True), **words))
+        table = replace(grid(family.columns, full=True), title=family.title, text=family.question)
+        tables.append(replace(table, facts=family.facts))
     return tables + [of_differences(family)] * bool(family.differences)
 
 

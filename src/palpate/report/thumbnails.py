@@ -192,8 +192,8 @@ def amplified(image: Image.Image, background: Path | None, pattern: Image.Image)
         return contact - np.median(contact, axis=(0, 1)).astype(np.float32)
 
     gain = 110 / max(float(np.quantile(np.abs(contact_of(pattern)), 0.99)), 2.0)
-    shown = np.clip(128 + gain * contact_of(image), 0, 255)
-    return Image.fromarray(shown.round().astype(np.uint8))
+    gray = np.clip(128 + gain * contact_of(image), 0, 255)
+    return Image.fromarray(gray.round().astype(np.uint8))
 
 
 def to_rgb(image: Image.Image) -> Image.Image:
