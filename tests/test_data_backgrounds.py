@@ -7,8 +7,9 @@ import polars as pl
 import pytest
 from PIL import Image
 
+from forge.errors import fails
 from palpate.cli import main
-from palpate.core import PalpateError, Split
+from palpate.core import Split
 from palpate.data import load, propose_backgrounds
 from palpate.data.manifest import Manifest
 from test_data_contacts import gel_video
@@ -86,8 +87,7 @@ def test_backgrounds_that_are_there_stay(folder, tmp_path):
         "v1/000.png",
     }
     full = manifest_of(folder, range(3), background=lambda v, _: f"v{v}/000.png")
-    with pytest.raises(PalpateError, match="a background for every sample"):
-        propose_backgrounds(full, tmp_path / "c")
+    fails("a background for every sample", propose_backgrounds, full, tmp_path / "c")
 
 
 def test_a_video_that_is_all_contact_gets_nothing(folder, tmp_path):

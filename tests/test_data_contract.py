@@ -7,9 +7,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from forge.errors import fails
 from forge.formats import TREES, Tree
 from forge.pictures import tree
-from palpate.core import ProblemsError, Split
+from palpate.core import Split
 from palpate.data.formats import FORMATS
 from palpate.data.importing import import_dataset, validate, write_lists
 from palpate.data.manifest import IMAGE_COLUMNS, Manifest
@@ -146,13 +147,12 @@ def test_a_bad_image_is_reported_and_skipped_alone(name, folder, made, whole, tm
             victim.write_bytes(victim.read_bytes()[: victim.stat().st_size // 2])
     report = validate(copy.source, format=name, **copy.options)
     assert (bool(report.missing), bool(report.invalid)) == (how == "remove", how != "remove")
-    with pytest.raises(ProblemsError) as caught:
-        import_dataset(copy.source, tmp_path / "out", format=name, **copy.options)
-    assert facts_of(caught.value.problems) == facts_of([*report.missing, *report.invalid])
+    error = fails("", import_dataset, copy.source, tmp_path / "out", format=name, **copy.options)
+    assert facts_of(error.problems) == facts_of([*report.missing, *report.invalid])
     assert not (tmp_path / "out").exists(), "a failed import must leave nothing behind"
     options = copy.options | {"skip_bad": True}
     result = import_dataset(copy.source, tmp_path / "out", format=name, **options)
-    assert facts_of(result.skipped) == facts_of(caught.value.problems)
+    assert facts_of(result.skipped) == facts_of(error.problems)
     assert result.manifest.ids == [i for i in whole.manifest.ids if i != row["id"]]
     assert report.samples == len(result.manifest)
     kept = whole.manifest.take(result.manifest.ids)
@@ -161,7 +161,7 @@ def test_a_bad_image_is_reported_and_skipped_alone(name, folder, made, whole, tm
 
 
 def test_a_doubled_id_and_a_climbing_path_are_problems(name, made):
-    result = FORMATS[name].scan(made.source, **made.options)
+    result = FORMATS[name].read(made.source, made.options)
     _, row = result.rows[-1]
     result.rows += [("again", dict(row)), ("outside", {**row, "id": "x", "tactile": "../x.png"})]
     assert len(finished(result, "none")) == made.samples

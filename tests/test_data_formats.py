@@ -5,6 +5,7 @@ import shutil
 
 import pytest
 
+from forge.errors import fails
 from forge.formats import (
     drawn,
     imported,
@@ -69,8 +70,7 @@ def test_tarf_views_of_another_scale(tmp_path):
     root = make_tarf(tmp_path / "data").source
     for folder in (root / "vision").glob("*_40_30"):
         folder.rename(folder.with_name(folder.name.replace("40_30", "160_120")))
-    with pytest.raises(PalpateError, match=r"must have the scale 40_30\. Got 160_120, 80_60"):
-        import_dataset(root, tmp_path / "no")
+    fails(r"must have the scale 40_30\. Got 160_120, 80_60", import_dataset, root, tmp_path / "no")
     for folder in (root / "vision").glob("*_160_120"):
         shutil.rmtree(folder)
     result = import_dataset(root, tmp_path / "out")
@@ -152,8 +152,7 @@ def test_objectfolder_table_of_materials(tmp_path):
     import_ = lambda name: import_dataset(root, tmp_path / name).manifest.column("material")
     assert import_("with")[-1] == "Iron"
     table.write_text("number,stuff\n1,Wood\n")
-    with pytest.raises(PalpateError, match="Index, Name, Material"):
-        import_("other")
+    fails("Index, Name, Material", import_, "other")
     table.unlink()
     assert set(import_("without")) == {None}
 
@@ -277,8 +276,7 @@ def test_ycb_slide_simulated_part(tmp_path):
     assert drawn(result, "tactile") == [65, 66]
     assert result.facts["simulated"] == "yes"
     assert result.splits == {}
-    with pytest.raises(PalpateError, match="real or sim"):
-        import_dataset(tmp_path / "data" / "ycb", tmp_path / "bad", part="both")
+    fails("real or sim", import_dataset, tmp_path / "data" / "ycb", tmp_path / "bad", part="both")
 
 
 def test_ycb_slide_reports_everything_bad(tmp_path):

@@ -5,10 +5,11 @@ import sys
 
 import pytest
 
+from forge.errors import fails
 from forge.formats import HF_MAPS as MAPS
 from forge.formats import hf_kinds as kinds
 from forge.formats import hf_rows, save_hf
-from palpate.core import MissingExtraError, PalpateError, ProblemsError
+from palpate.core import MissingExtraError
 from palpate.data.importing import import_dataset, validate
 from palpate.data.manifest import Manifest
 
@@ -61,9 +62,8 @@ def test_bad_rows_are_reported_with_their_place(tmp_path):
     rows[3]["rgb"] = {"bytes": rows[3]["rgb"]["bytes"][:-200], "path": "x.png"}
     rows[4]["path"] = "a/b"
     source = save_hf(tmp_path / "mine", rows, **kinds())
-    with pytest.raises(ProblemsError) as caught:
-        import_dataset(source, tmp_path / "out", columns=BY_PATH)
-    reported = sorted((p.where, p.kind) for p in caught.value.problems)
+    error = fails("", import_dataset, source, tmp_path / "out", columns=BY_PATH)
+    reported = sorted((p.where, p.kind) for p in error.problems)
     expected = ["missing-image", "bad-image", "bad-image", "bad-frame"]
     assert reported == [(f"mine/train:{k}", kind) for k, kind in enumerate(expected, 1)]
     assert not (tmp_path / "out").exists()
@@ -87,30 +87,29 @@ def test_named_images_must_be_inside_the_source(tmp_path):
 
 
 def test_what_cannot_be_opened_is_reported(source, tmp_path, monkeypatch):
-    def fails(word, source, **options):
-        with pytest.raises(PalpateError, match=word):
-            import_dataset(source, tmp_path / "out", format="hf", **options)
+    def rejected(words, source, **options):
+        fails(words, import_dataset, source, tmp_path / "out", format="hf", **options)
 
-    fails("no vision and no tactile among part, path, kind, rgb, gel", source)
+    rejected("no vision and no tactile among part, path, kind, rgb, gel", source)
     next(source.glob("train/*.arrow")).write_bytes(b"x")
-    fails("mine must be whole and readable", source, columns=MAPS)
+    rejected("mine must be whole and readable", source, columns=MAPS)
     (tmp_path / "csvs").mkdir()
     (tmp_path / "csvs" / "train.csv").write_text("a\n1\n")
-    fails("must be made of parquet or arrow", tmp_path / "csvs")
+    rejected("must be made of parquet or arrow", tmp_path / "csvs")
     (tmp_path / "script").mkdir()
     (tmp_path / "script" / "script.py").write_text("raise SystemExit('ran')")
-    fails("script", tmp_path / "script")
-    fails("a name on the hub like user/name", tmp_path / "none" / "such" / "place")
+    rejected("script", tmp_path / "script")
+    rejected("a name on the hub like user/name", tmp_path / "none" / "such" / "place")
 
     def offline(*_, **__):
         raise ConnectionError("offline\nmode")
 
     monkeypatch.setenv("HF_HUB_OFFLINE", "1")
     monkeypatch.setattr("palpate.data.formats.huggingface_source._streamed", offline)
-    fails(r"user/name must be whole and readable. Got offline\. Check the name", "user/name")
+    rejected(r"user/name must be whole and readable. Got offline\. Check the name", "user/name")
     monkeypatch.delenv("HF_HUB_OFFLINE")  # a hub out of reach is reported at once
     monkeypatch.setattr("huggingface_hub.HfApi.dataset_info", offline)
-    fails("hub must be within reach.*hf download --repo-type dataset user/name", "user/name")
+    rejected("hub must be within reach.*hf download --repo-type dataset user/name", "user/name")
     assert not (tmp_path / "out").exists()
 
 

@@ -8,8 +8,8 @@ import pytest
 from PIL import Image
 
 import palpate.data.images as images
+from forge.errors import fails
 from forge.pictures import number, tree, write_image
-from palpate.core import PalpateError, ProblemsError
 from palpate.data.images import (
     cached_images,
     check_image,
@@ -39,8 +39,7 @@ def test_every_mode_becomes_rgb(tmp_path):
         image.save(tmp_path / "x.png")
         assert np.asarray(read_image(tmp_path / "x.png")).tolist() == [row], image.mode
     Image.fromarray(np.ones((2, 2), np.float32)).save(tmp_path / "f.tif")
-    with pytest.raises(PalpateError, match="floating-point"):
-        read_image(tmp_path / "f.tif")
+    fails("floating-point", read_image, tmp_path / "f.tif")
 
 
 def test_exif_orientation_is_applied(tmp_path):
@@ -66,8 +65,7 @@ def test_cut_empty_foreign_and_missing_files_are_rejected_by_name(tmp_path, suff
         bad = tmp_path / f"{name}.{suffix}"
         bad.write_bytes(content)
         assert check_image(bad), name
-        with pytest.raises(PalpateError, match=f"{name}.{suffix}"):
-            read_image(bad)
+        fails(f"{name}.{suffix}", read_image, bad)
     assert check_image(tmp_path / f"half.{suffix}", "header") is None
     assert check_image(tmp_path / f"none.{suffix}") == "no such file"
     assert check_image(tmp_path / f"none.{suffix}", "none") == "no such file"
@@ -98,9 +96,8 @@ def test_load_keeps_order_decodes_doubles_once_and_names_all_bad_files(tmp_path,
     assert steps[-1] == ("decoding images", 30, 30)
     paths[5].write_bytes(b"")
     paths[9].unlink()
-    with pytest.raises(ProblemsError) as caught:
-        load_images(paths, 32)
-    assert [p.where for p in caught.value.problems] == [str(paths[5]), str(paths[9])]
+    error = fails("", load_images, paths, 32)
+    assert [p.where for p in error.problems] == [str(paths[5]), str(paths[9])]
 
 
 def test_cache_is_mapped_reused_and_renewed_when_a_file_changes(tmp_path):
@@ -129,8 +126,7 @@ def test_cache_is_mapped_reused_and_renewed_when_a_file_changes(tmp_path):
     assert number(cached_images(manifest, "tactile", 64, cache)[1]) == 9
     (tmp_path / "d" / "2.png").write_bytes(b"")
     before = tree(cache)
-    with pytest.raises(ProblemsError):
-        cached_images(manifest, "tactile", 64, cache)
+    fails("", cached_images, manifest, "tactile", 64, cache)
     assert tree(cache) == before
 
 

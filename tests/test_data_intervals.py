@@ -4,8 +4,8 @@ import numpy as np
 import polars as pl
 import pytest
 
+from forge.errors import fails
 from forge.pictures import number, tree, write_frames, write_video
-from palpate.core import PalpateError, ProblemsError
 from palpate.data.images import read_image
 from palpate.data.importing import import_dataset, validate
 from palpate.data.listing import read_list
@@ -100,9 +100,8 @@ def test_validation_decodes_raw_videos(tmp_path):
     path.write_bytes(bytes(data))
     report = validate(root / "l.csv")
     assert [p.kind for p in report.invalid] == ["bad-video"]
-    with pytest.raises(ProblemsError) as caught:
-        import_dataset(root / "l.csv", tmp_path / "out")
-    assert list(caught.value.problems) == list(report.invalid)
+    error = fails("", import_dataset, root / "l.csv", tmp_path / "out")
+    assert list(error.problems) == list(report.invalid)
 
 
 def test_every_bad_interval_is_reported_by_its_line(tmp_path):
@@ -129,14 +128,13 @@ def test_every_bad_interval_is_reported_by_its_line(tmp_path):
         ("a,999999999999,9999999999999,x", "beyond-end"),
     ]
     (root / "l.csv").write_text("video,start,end,label\n" + "\n".join(line for line, _ in lines))
-    with pytest.raises(ProblemsError) as caught:
-        import_dataset(root / "l.csv", tmp_path / "out")
-    reported = [(p.where, p.kind) for p in caught.value.problems]
+    error = fails("", import_dataset, root / "l.csv", tmp_path / "out")
+    reported = [(p.where, p.kind) for p in error.problems]
     assert sorted(reported) == sorted(
         (f"{root / 'l.csv'}:{n}", kind) for n, (_, kind) in enumerate(lines, 2) if kind
     )
     assert f"overlap with 8 to 12 at {root / 'l.csv'}:4" in next(
-        p.text for p in caught.value.problems if p.where.endswith(":3")
+        p.text for p in error.problems if p.where.endswith(":3")
     )
     assert not (tmp_path / "out").exists()
     report = validate(root / "l.csv")
@@ -174,8 +172,7 @@ def test_mistakes(tmp_path):
         ({"size": 0}, "`size` must"),
         ({"root": tmp_path / "bare"}, "must hold recordings"),
     ):
-        with pytest.raises(PalpateError, match=word):
-            import_dataset(root / "l.csv", tmp_path / "out", format="intervals", **options)
+        fails(word, import_dataset, root / "l.csv", tmp_path / "out", format="intervals", **options)
     assert tree(tmp_path / "out") == set()
 
 

@@ -5,7 +5,7 @@ import time
 import numpy as np
 import pytest
 
-from palpate.core import PalpateError, ProblemsError
+from forge.errors import fails
 from palpate.data.listing import contact_names, read_frame_table, read_list, read_lists, write_list
 from palpate.data.reading import is_list
 from palpate.data.tables import read_categories
@@ -71,9 +71,8 @@ def test_every_bad_line_is_reported_or_skipped_with_its_place(tmp_path):
     lines = ["v/0000000001.jpg,3", *(line for line, _ in BAD.values()), "v/0000000019.jpg,5"]
     path = write(tmp_path / "bad.txt", "\n".join(lines))
     expected = [(f"{path}:{n}", kind) for n, (_, kind) in BAD.items()]
-    with pytest.raises(ProblemsError) as caught:
-        read_list(path)
-    assert places(caught.value.problems) == expected
+    error = fails("", read_list, path)
+    assert places(error.problems) == expected
     listed = read_list(path, skip_bad=True)
     assert listed.manifest.ids == ["v/0000000001", "v/0000000019"]
     assert places(listed.skipped) == expected
@@ -86,16 +85,13 @@ def test_every_bad_line_is_reported_or_skipped_with_its_place(tmp_path):
 )
 def test_empty_lists_and_foreign_bytes(tmp_path, content, place, kind):
     path = write(tmp_path / "l.txt", content)
-    with pytest.raises(ProblemsError) as caught:
-        read_list(path)
-    assert places(caught.value.problems) == [(f"{path}{place}", kind)]
+    error = fails("", read_list, path)
+    assert places(error.problems) == [(f"{path}{place}", kind)]
 
 
 def test_missing_lists_and_inconclusive_ones(tmp_path):
-    with pytest.raises(PalpateError, match="no file"):
-        read_list(tmp_path / "none.txt")
-    with pytest.raises(PalpateError, match="folder"):
-        read_list(tmp_path)
+    fails("no file", read_list, tmp_path / "none.txt")
+    fails("folder", read_list, tmp_path)
     listed = read_list(write(tmp_path / "unclear.txt", "v/1.jpg,-1\n"))
     assert (len(listed.manifest), listed.inconclusive, listed.skipped) == (0, 1, [])
 
@@ -103,9 +99,8 @@ def test_missing_lists_and_inconclusive_ones(tmp_path):
 def test_categories_next_to_the_list_name_the_material_and_reject_other_labels(tmp_path):
     write(tmp_path / "category_reference.txt", "Inconclusive: -1 (no)\nWood: 3\nRuber: 10\n")
     path = write(tmp_path / "l.txt", "v/1.jpg,3\nv/2.jpg,10\nv/3.jpg,11\nv/4.jpg,-1\n")
-    with pytest.raises(ProblemsError) as caught:
-        read_list(path)
-    assert places(caught.value.problems) == [(f"{path}:3", "unknown-label")]
+    error = fails("", read_list, path)
+    assert places(error.problems) == [(f"{path}:3", "unknown-label")]
     assert read_list(path, skip_bad=True).manifest.column("material") == ["Wood", "Rubber"]
     listed = read_list(path, categories={3: "x", 10: "y", 11: "z"})
     assert listed.manifest.column("material") == ["x", "y", "z"]
@@ -137,9 +132,8 @@ def test_write_list_can_be_read_back_and_rejects_what_could_not(tmp_path):
     write_list(tmp_path / "l.txt", [("a.b/0000000001", 3), ("c/2.png", 4)])
     assert (tmp_path / "l.txt").read_text() == "a.b/0000000001.jpg,3\nc/2.png,4\n"
     assert read_list(tmp_path / "l.txt").manifest.ids == ["a.b/0000000001", "c/2"]
-    with pytest.raises(ProblemsError) as caught:
-        write_list(tmp_path / "m.txt", [("v/1", 3), ("photo", 3), ("v/x", 3)])
-    assert [p.where for p in caught.value.problems] == ["row 2", "row 3"]
+    error = fails("", write_list, tmp_path / "m.txt", [("v/1", 3), ("photo", 3), ("v/x", 3)])
+    assert [p.where for p in error.problems] == ["row 2", "row 3"]
     assert not (tmp_path / "m.txt").exists()
 
 
@@ -149,12 +143,10 @@ def test_category_table_with_remarks_quotes_and_a_misspelling(tmp_path):
     names = {-1: "Inconclusive", 3: "Wood", 4: "Metal", 8: "Synthetic Fabric", 10: "Rubber"}
     assert read_categories(write(tmp_path / "c.txt", text)) == names | {19: "Others"}
     path = write(tmp_path / "d.txt", "Wood: 3\nStone\nIron: 3\n")
-    with pytest.raises(ProblemsError) as caught:
-        read_categories(path)
+    error = fails("", read_categories, path)
     kinds = [(f"{path}:2", "bad-line"), (f"{path}:3", "duplicate-id")]
-    assert places(caught.value.problems) == kinds
-    with pytest.raises(PalpateError, match="empty"):
-        read_categories(write(tmp_path / "e.txt", "\n"))
+    assert places(error.problems) == kinds
+    fails("empty", read_categories, write(tmp_path / "e.txt", "\n"))
 
 
 @pytest.mark.parametrize("code", ["utf-8", "utf-8-sig", "utf-16"])

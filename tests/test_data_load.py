@@ -3,10 +3,10 @@
 import polars as pl
 import pytest
 
+from forge.errors import fails
 from forge.formats import TREES
 from forge.pictures import tree, write_image
 from palpate import data
-from palpate.core import PalpateError, ProblemsError
 
 ROWS = [
     {"video": "x", "frame": k, "vision": f"v/{k}.jpg", "gel": f"t/{k}.jpg", "material": "Mat 5"}
@@ -81,9 +81,8 @@ def test_raw_videos_are_loaded_without_images_on_request(tmp_path):
     from test_data_touch_and_go import make_recordings
 
     root = make_recordings(tmp_path / "tag", raw=("a",))
-    with pytest.raises(PalpateError, match=r"palpate import .* -o DIR") as caught:
-        data.load(root)
-    assert caught.value.argument == "source"
+    error = fails(r"palpate import .* -o DIR", data.load, root)
+    assert error.argument == "source"
     manifest = data.load(root, images=False)
     assert manifest.column("tactile") == [None] * len(manifest)
 
@@ -109,18 +108,16 @@ def test_a_folder_of_one_modality(images, tmp_path):
 )
 def test_mistakes_name_the_argument(source, options, argument, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    with pytest.raises(PalpateError) as caught:
-        data.load(source, **options)
-    assert caught.value.argument == argument
+    error = fails("", data.load, source, **options)
+    assert error.argument == argument
 
 
 def test_bad_rows_are_raised_together_or_skipped(images):
     bad = ({"video": "x", "frame": "one"}, {"video": "x", "frame": 0}, {"vision": "../x.jpg"})
     rows = [*ROWS, *bad]
-    with pytest.raises(ProblemsError) as caught:
-        data.load(rows, root=images)
+    error = fails("", data.load, rows, root=images)
     kinds = enumerate(("bad-frame", "duplicate-id", "outside-root"), 4)
-    assert [(p.where, p.kind) for p in caught.value.problems] == [(f"row:{k}", v) for k, v in kinds]
+    assert [(p.where, p.kind) for p in error.problems] == [(f"row:{k}", v) for k, v in kinds]
     assert len(data.load(rows, root=images, skip_bad=True)) == 3
 
 

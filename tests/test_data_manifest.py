@@ -1,9 +1,9 @@
 """The manifest: round trip, digest, validation with every problem at once, joining."""
 
 import polars as pl
-import pytest
 
-from palpate.core import PalpateError, ProblemsError, Split
+from forge.errors import fails
+from palpate.core import Split
 from palpate.data.manifest import Manifest
 
 
@@ -34,35 +34,28 @@ def test_every_problem_is_listed_at_once(tmp_path):
         {"id": "4", "tactile": "../b.png"},
         {"id": "5", "background": "gone.png"},
     ]
-    with pytest.raises(ProblemsError) as caught:
-        Manifest.from_rows(rows, tmp_path).require_valid()
-    assert {(p.where, p.kind) for p in caught.value.problems} == {
+    error = fails("", Manifest.from_rows(rows, tmp_path).require_valid)
+    assert {(p.where, p.kind) for p in error.problems} == {
         ("row 2", "duplicate-id"),
         ("row 3", "null-id"),
         ("row 4", "outside-root"),
         ("row 5", "missing-file"),
     }
-    with pytest.raises(ProblemsError, match="1 empty"):
-        Manifest.from_rows([], tmp_path).require_valid()
+    fails("1 empty", Manifest.from_rows([], tmp_path).require_valid)
 
 
 def test_foreign_and_changed_files_are_rejected(small_manifest, tmp_path):
     path = tmp_path / "m.parquet"
-    with pytest.raises(PalpateError, match="must exist"):
-        Manifest.load(path)
+    fails("must exist", Manifest.load, path)
     path.write_text("no table")
-    with pytest.raises(PalpateError, match="Parquet"):
-        Manifest.load(path)
+    fails("Parquet", Manifest.load, path)
     small_manifest.table.write_parquet(path)
-    with pytest.raises(PalpateError, match="another program"):
-        Manifest.load(path)
+    fails("another program", Manifest.load, path)
     metadata = {"palpate.format": "palpate-manifest/1", "palpate.root": "."}
     metadata["palpate.digest"] = small_manifest.digest
     small_manifest.table.head(3).write_parquet(path, metadata=metadata)
-    with pytest.raises(PalpateError, match="another program"):
-        Manifest.load(path)
-    with pytest.raises(PalpateError, match="'color'"):
-        Manifest.from_rows([{"color": "red"}], tmp_path)
+    fails("another program", Manifest.load, path)
+    fails("'color'", Manifest.from_rows, [{"color": "red"}], tmp_path)
 
 
 def test_a_manifest_whose_paths_climb_out_is_not_loaded(tmp_path):
@@ -70,17 +63,14 @@ def test_a_manifest_whose_paths_climb_out_is_not_loaded(tmp_path):
     for path in ("../secret.png", "a/../../secret.png", str(tmp_path / "secret.png"), "C:/x.png"):
         manifest = Manifest.from_rows([{"id": "1", "vision": path}], tmp_path / "root")
         manifest.save(tmp_path / "root" / "manifest.parquet")
-        with pytest.raises(PalpateError, match="inside the root"):
-            Manifest.load(tmp_path / "root")
+        fails("inside the root", Manifest.load, tmp_path / "root")
 
 
 def test_parts_follow_the_split_and_foreign_ids_are_named(small_manifest):
     split = Split.from_ids(train=["v1/0", "v0/0"], test=["v2/3"])
     assert small_manifest.part(split, "train").ids == ["v0/0", "v1/0"]
-    with pytest.raises(PalpateError, match="first 'zz'"):
-        small_manifest.part(Split.from_ids(train=["zz"]), "train")
-    with pytest.raises(PalpateError, match="1 without"):
-        Manifest.from_rows([{"id": "1"}], ".").paths("vision")
+    fails("first 'zz'", small_manifest.part, Split.from_ids(train=["zz"]), "train")
+    fails("1 without", Manifest.from_rows([{"id": "1"}], ".").paths, "vision")
 
 
 def test_joined_manifests_find_their_files(small_manifest, tmp_path):
@@ -91,5 +81,4 @@ def test_joined_manifests_find_their_files(small_manifest, tmp_path):
     assert len(both) == len(small_manifest) + 1
     assert both.problems() == []
     assert both.table.tail(1)["tactile"][0] is None
-    with pytest.raises(PalpateError, match="must not share ids"):
-        Manifest.join(other, other)
+    fails("must not share ids", Manifest.join, other, other)

@@ -11,6 +11,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from forge.errors import fails
 from forge.pictures import write_image
 from palpate.cli import main
 from palpate.core import PalpateError
@@ -79,10 +80,9 @@ def test_expressions_use_columns_first_and_other_targets_in_any_order():
     ],
 )
 def test_mistakes_name_the_target_and_the_expression(maps, got):
-    with pytest.raises(PalpateError) as caught:
-        mapped(maps)
-    assert caught.value.argument == "columns"
-    assert got in caught.value.got
+    error = fails("", mapped, maps)
+    assert error.argument == "columns"
+    assert got in error.got
 
 
 @settings(max_examples=60)

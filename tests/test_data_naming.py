@@ -5,8 +5,8 @@ import shlex
 
 import pytest
 
+from forge.errors import fails
 from palpate.cli import main
-from palpate.core import PalpateError
 from palpate.data.naming import name_together, read_names
 
 
@@ -185,8 +185,7 @@ def test_bad_lines_and_wrong_options_are_named(tmp_path, capsys):
     manifest, problems, _ = read_names(path)
     assert (len(manifest), [p.where[-2:] for p in problems]) == (8, [":2", ":3"])
     path.write_text("v 0 999999999\n")
-    with pytest.raises(PalpateError, match="at most 20,000,000 frames"):
-        read_names(path)
+    fails("at most 20,000,000 frames", read_names, path)
     table = tmp_path / "t.csv"
     table.write_text(rows_of("own", range(3)) + "\nelse/where.png,else/where.png")
     _, problems, _ = read_names(table, tactile="rig/{video}/touch/{frame}.png")

@@ -6,8 +6,9 @@ from functools import partial
 import polars as pl
 import pytest
 
+from forge.errors import fails
 from forge.pictures import tree, write_frames, write_image
-from palpate.core import PalpateError, ProblemsError
+from palpate.core import PalpateError
 from palpate.data.formats import FORMATS
 from palpate.data.importing import import_dataset, validate
 from palpate.data.manifest import Manifest
@@ -87,10 +88,9 @@ def test_every_bad_row_is_reported_and_nothing_is_written(images, tmp_path):
     text = "\n".join(["id,vision,tactile,frame,text", *(line for line, _ in lines)])
     table = write_table(images / "pairs.csv", text)
     expected = [(f"{table}:{n}", k) for n, (_, some) in enumerate(lines, 2) for k in some]
-    with pytest.raises(ProblemsError) as caught:
-        import_pairs(table, tmp_path / "out")
-    assert [(p.where, p.kind) for p in caught.value.problems] == expected
-    assert "used by 2 rows" in caught.value.problems[4].text
+    error = fails("", import_pairs, table, tmp_path / "out")
+    assert [(p.where, p.kind) for p in error.problems] == expected
+    assert "used by 2 rows" in error.problems[4].text
     assert not (tmp_path / "out").exists()
     result = import_pairs(table, tmp_path / "out", skip_bad=True)
     assert [(p.where, p.kind) for p in result.skipped] == expected
@@ -134,11 +134,9 @@ def test_rows_that_cannot_be_right_are_reported_by_line(images, name, data, prob
 
 def test_tables_that_cannot_be_read(images, tmp_path):
     (images / "p.parquet").write_bytes(b"words")
-    with pytest.raises(ProblemsError, match="bad-table"):
-        import_pairs(images / "p.parquet", tmp_path / "out")
+    fails("bad-table", import_pairs, images / "p.parquet", tmp_path / "out")
     (images / "p.json").write_text('{"vision": ["v/0.jpg"]}')
-    with pytest.raises(PalpateError, match="a JSON list of objects"):
-        import_pairs(images / "p.json", tmp_path / "out")
+    fails("a JSON list of objects", import_pairs, images / "p.json", tmp_path / "out")
 
 
 def test_missing_columns_and_wrong_names(images, tmp_path):
@@ -149,14 +147,12 @@ def test_missing_columns_and_wrong_names(images, tmp_path):
         import_pairs(table, tmp_path / "out", columns={"video": "clap", "tactile": "touch"})
     with pytest.raises(PalpateError, match="no clap among"):
         import_pairs(table, tmp_path / "out", columns={"frame": "left(clap, 2)"})
-    with pytest.raises(PalpateError, match="'clip'"):
-        import_pairs(table, tmp_path / "out", columns={"clip": "video"})
+    fails("'clip'", import_pairs, table, tmp_path / "out", columns={"clip": "video"})
     for text, word in (
         ("clip,touch\nx,t/0.jpg\n", "no tactile among clip"),
         ("vision,tactile\n", "at least one"),
     ):
-        with pytest.raises(PalpateError, match=word):
-            import_pairs(write_table(images / "other.csv", text), tmp_path / "out")
+        fails(word, import_pairs, write_table(images / "other.csv", text), tmp_path / "out")
 
 
 def test_root_and_unusual_but_inner_paths(images, tmp_path):
@@ -205,8 +201,7 @@ def test_parquet_cells_of_any_type_and_brackets_in_names(images, tmp_path):
         ({"vision": ["v/0.jpg"], "text": [["x"]]}, "text of type List"),
     ):
         pl.DataFrame(bad).write_parquet(images / "bad.parquet")
-        with pytest.raises(PalpateError, match=word):
-            import_pairs(images / "bad.parquet", tmp_path / "bad")
+        fails(word, import_pairs, images / "bad.parquet", tmp_path / "bad")
 
 
 def test_tables_without_a_header(images, tmp_path):
@@ -214,8 +209,7 @@ def test_tables_without_a_header(images, tmp_path):
     maps = {"vision": "'v/' || path", "tactile": "'t/' || path", "material": "label"}
     result = import_pairs(table, tmp_path / "out", names="path, label", columns=maps)
     assert rows_of(result, "tactile", "material") == [("t/0.jpg", "3"), ("t/1.jpg", "4")]
-    with pytest.raises(PalpateError, match="A table must be one of"):
-        import_pairs(table, tmp_path / "out2")
+    fails("A table must be one of", import_pairs, table, tmp_path / "out2")
 
 
 # --- Maps, classes, parts, groups and ids
@@ -262,8 +256,7 @@ def test_classes_name_numbers_and_unknown_ones_are_problems(images, tmp_path, te
 )
 def test_bad_tables_of_classes(images, tmp_path, text, word):
     table = write_table(images / "t.csv", "vision,material\nv/0.jpg,3\n")
-    with pytest.raises(PalpateError, match=word):
-        import_pairs(table, tmp_path / "bad", classes=write_table(images / "c.txt", text))
+    fails(word, import_pairs, table, tmp_path / "bad", classes=write_table(images / "c.txt", text))
 
 
 def test_a_column_of_parts_becomes_the_split(images, tmp_path):
@@ -370,8 +363,7 @@ def test_a_folder_of_one_kind_of_images(tmp_path):
     maps = {"video": "split_part(path, '/', 1)", "sensor": "'DIGIT'"}
     result = import_dataset(root, tmp_path / "out2", side="vision", columns=maps)
     assert rows_of(result, "video", "sensor") == [(v, "DIGIT") for v in ("a.jpg", "b", "b")]
-    with pytest.raises(PalpateError, match="say what they show"):
-        import_dataset(root, tmp_path / "out3")
+    fails("say what they show", import_dataset, root, tmp_path / "out3")
 
 
 def test_formats_are_recognized_or_all_that_were_looked_for_are_listed(tmp_path):
@@ -383,16 +375,13 @@ def test_formats_are_recognized_or_all_that_were_looked_for_are_listed(tmp_path)
     assert (result.facts["dataset"], len(result.manifest)) == ("Touch and Go", 1)
     (tmp_path / "what").mkdir()
     (tmp_path / "what" / "readme.txt").write_text("x")
-    with pytest.raises(PalpateError) as caught:
-        import_dataset(tmp_path / "what", tmp_path / "out2")
-    assert all(name in str(caught.value) for name in FORMATS)
-    assert "readme.txt" in caught.value.got
+    error = fails("", import_dataset, tmp_path / "what", tmp_path / "out2")
+    assert all(name in str(error) for name in FORMATS)
+    assert "readme.txt" in error.got
     for options, word in (
         ({"format": "zip"}, r"one of auto, touch-and-go, .*pairs"),
         ({"columns": {"a": "b"}}, "columns"),
     ):
-        with pytest.raises(PalpateError, match=word):
-            import_dataset(tmp_path / "tag", tmp_path / "out2", **options)
-    with pytest.raises(PalpateError, match="nothing at"):
-        import_dataset(tmp_path / "none", tmp_path / "out2")
+        fails(word, import_dataset, tmp_path / "tag", tmp_path / "out2", **options)
+    fails("nothing at", import_dataset, tmp_path / "none", tmp_path / "out2")
     assert not (tmp_path / "out2").exists()

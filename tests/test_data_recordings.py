@@ -1,9 +1,8 @@
 """Recordings: raw videos decoded by a validation, stray numbers, backgrounds, custom classes."""
 
-import pytest
-
+from forge.errors import fails
 from forge.pictures import tree, write_image
-from palpate.core import ProblemsError, Split
+from palpate.core import Split
 from palpate.data.importing import import_dataset, validate, write_lists
 from palpate.data.manifest import Manifest
 from palpate.data.reading import read_samples
@@ -25,9 +24,8 @@ def test_validation_decodes_raw_videos_as_an_import_does(tmp_path):
     before = tree(root)
     validation = validate(root)
     assert [p.kind for p in validation.invalid] == ["bad-video"]
-    with pytest.raises(ProblemsError) as caught:
-        import_dataset(root, tmp_path / "out", format="touch-and-go")
-    assert list(caught.value.problems) == list(validation.invalid)
+    error = fails("", import_dataset, root, tmp_path / "out", format="touch-and-go")
+    assert list(error.problems) == list(validation.invalid)
     imported = import_dataset(root, tmp_path / "out", skip_bad=True, format="touch-and-go")
     assert validation.samples == len(imported.manifest) < 18
     assert validate(root, check="header").ok

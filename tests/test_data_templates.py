@@ -2,7 +2,7 @@
 
 import pytest
 
-from palpate.core import PalpateError
+from forge.errors import fails
 from palpate.data.templates import Template, assign, join, walk
 
 
@@ -55,8 +55,7 @@ def test_templates_match_paths(template, path, fields):
     ],
 )
 def test_malformed_templates_are_errors(text):
-    with pytest.raises(PalpateError):
-        Template.parse(text)
+    fails("", Template.parse, text)
 
 
 def test_walking_skips_hidden_files_and_follows_links_once(tmp_path):
@@ -102,8 +101,7 @@ def test_one_file_may_serve_many_but_many_serve_many_only_by_a_field():
     assert [row["object"] for row in rows] == ["mug"]
     assert [p.kind for p in problems] == ["ambiguous"] * 2
     assert problems[0].text.startswith("2 tactile and 2 vision images with object=cup")
-    with pytest.raises(PalpateError, match="must share a field"):
-        join(sides(tactile="*/t/{frame}.png", vision="{object}/v/*.jpg"))
+    fails("must share a field", join, sides(tactile="*/t/{frame}.png", vision="{object}/v/*.jpg"))
 
 
 def test_a_file_belongs_to_the_template_that_spells_out_most():

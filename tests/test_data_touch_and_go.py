@@ -6,8 +6,9 @@ import pytest
 from PIL import Image
 
 import palpate.data.formats.recordings as recordings
+from forge.errors import fails
 from forge.pictures import number, tree, write_frames, write_image, write_video
-from palpate.core import PalpateError, ProblemsError, Split
+from palpate.core import PalpateError, Split
 from palpate.data.formats.layout import find_videos
 from palpate.data.formats.touch_and_go import write_lists
 from palpate.data.images import read_image
@@ -126,9 +127,8 @@ def spoil(root):
 
 def test_everything_bad_is_reported_at_once_or_skipped_alone(tmp_path):
     expected = spoil(tmp_path / "tag")
-    with pytest.raises(ProblemsError) as caught:
-        import_touch_and_go(tmp_path / "tag", tmp_path / "out")
-    for problem, (where, kind, word) in zip(caught.value.problems, expected, strict=True):
+    error = fails("", import_touch_and_go, tmp_path / "tag", tmp_path / "out")
+    for problem, (where, kind, word) in zip(error.problems, expected, strict=True):
         assert (problem.where, problem.kind) == (where, kind)
         assert word in problem.text
     assert not (tmp_path / "out").exists()
@@ -152,9 +152,8 @@ def test_failing_while_decoding_removes_what_this_run_wrote(tmp_path, monkeypatc
 
     monkeypatch.setattr(recordings.VideoFrames, "extract", fail)
     (tmp_path / "out").mkdir()
-    with pytest.raises(ProblemsError) as caught:
-        import_touch_and_go(root, tmp_path / "out")
-    places = {(p.where, p.kind) for p in caught.value.problems}
+    error = fails("", import_touch_and_go, root, tmp_path / "out")
+    places = {(p.where, p.kind) for p in error.problems}
     assert places == {(f"{root / 'label.txt'}:10", "bad-video")}
     assert tree(tmp_path / "out") == set()
     result = import_touch_and_go(root, tmp_path / "out", skip_bad=True)
@@ -189,11 +188,9 @@ def test_cached_frames_of_other_settings_are_rejected(tmp_path):
     assert read_image(result.manifest.paths("tactile")[0]).size == (32, 32)
     assert result.manifest.column("tactile")[0].endswith("0000000010.jpg")
     before = tree(tmp_path / "out")
-    with pytest.raises(PalpateError, match="same settings"):
-        import_touch_and_go(root, tmp_path / "out")
+    fails("same settings", import_touch_and_go, root, tmp_path / "out")
     write_video(root / "dataset" / "a" / "gelsight.mp4", 41)
-    with pytest.raises(PalpateError, match="a/tactile"):
-        import_touch_and_go(root, tmp_path / "out", size=32)
+    fails("a/tactile", import_touch_and_go, root, tmp_path / "out", size=32)
     assert tree(tmp_path / "out") == before
 
 
@@ -248,22 +245,17 @@ def test_max_per_contact_takes_evenly_spaced_frames(tmp_path):
     assert take(max_per_contact=1) == [20, 35]
     assert take(max_per_contact=4) == [12, 17, 22, 27, 35]
     assert take(max_per_contact=100) == [*range(10, 30), 35]
-    with pytest.raises(PalpateError, match="at least 1"):
-        take(max_per_contact=0)
+    fails("at least 1", take, max_per_contact=0)
 
 
 def test_missing_root_list_and_recordings_are_named(tmp_path):
-    with pytest.raises(PalpateError, match="nothing at"):
-        import_touch_and_go(tmp_path / "none", tmp_path / "out")
-    with pytest.raises(PalpateError, match=r"nor in dataset/ or final_dataset/"):
-        import_touch_and_go(tmp_path, tmp_path / "out")
+    fails("nothing at", import_touch_and_go, tmp_path / "none", tmp_path / "out")
+    fails(r"nor in dataset/ or final_dataset/", import_touch_and_go, tmp_path, tmp_path / "out")
     write_image(tmp_path / "dataset" / "a" / "video_frame" / "0.jpg", 1)
-    with pytest.raises(PalpateError, match=r"label\.txt"):
-        import_touch_and_go(tmp_path, tmp_path / "out")
+    fails(r"label\.txt", import_touch_and_go, tmp_path, tmp_path / "out")
     (tmp_path / "label.txt").write_text("a/0.jpg,-1")
     write_image(tmp_path / "dataset" / "a" / "gelsight_frame" / "0.jpg", 1)
-    with pytest.raises(PalpateError, match="at least one usable sample"):
-        import_touch_and_go(tmp_path, tmp_path / "out")
+    fails("at least one usable sample", import_touch_and_go, tmp_path, tmp_path / "out")
     assert not (tmp_path / "out").exists()
 
 
@@ -274,9 +266,8 @@ def test_links_out_of_the_data_set_are_reported(tmp_path, what):
     path = path / "gelsight_frame" / "0000000010.jpg" if what == "frame" else path
     path.rename(tmp_path / "outside")
     path.symlink_to(tmp_path / "outside")
-    with pytest.raises(ProblemsError) as caught:
-        import_touch_and_go(root, tmp_path / "out")
-    assert [p.kind for p in caught.value.problems] == ["outside-root"]
+    error = fails("", import_touch_and_go, root, tmp_path / "out")
+    assert [p.kind for p in error.problems] == ["outside-root"]
 
 
 @pytest.mark.slow

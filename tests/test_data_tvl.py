@@ -10,10 +10,11 @@ import numpy as np
 import polars as pl
 import pytest
 
+from forge.errors import fails
 from forge.formats import TVL_COLUMNS as COLUMNS
 from forge.formats import kinds, make_hct, make_ssvtp
 from forge.pictures import gel, photo, put, write_csv
-from palpate.core import PalpateError, ProblemsError, Split
+from palpate.core import Split
 from palpate.data.formats import ssvtp, tvl
 from palpate.data.importing import import_dataset as read
 from palpate.data.importing import write_lists
@@ -172,8 +173,7 @@ def test_the_source_may_be_any_of_three_folders(tree, tmp_path, monkeypatch):
     shutil.rmtree(tree)
     assert read(tree.parent, tmp_path / "g").facts["format"] == "ssvtp"
     for name in ("hct", "ssvtp"):
-        with pytest.raises(PalpateError, match="none of these"):
-            read(tmp_path, tmp_path / "out", format=name)
+        fails("none of these", read, tmp_path, tmp_path / "out", format=name)
 
 
 # --- Writing lists
@@ -247,10 +247,9 @@ def test_ssvtp_counts_its_losses(ssvtp_tree, tmp_path):
     lines = ["images_rgb/photo.jpg,x,y", "../image_1_rgb.jpg,x,y", ",x,y"]
     with (ssvtp_tree / "train.csv").open("a") as file:
         file.write("\n".join([*lines, "images_rgb/image_3_rgb.jpg,,again\n"]))
-    with pytest.raises(ProblemsError) as caught:
-        read(ssvtp_tree, tmp_path / "out")
+    error = fails("", read, ssvtp_tree, tmp_path / "out")
     wrong = ("bad-image", "bad-path", "outside-root", "duplicate-id", "empty-cell")
-    assert kinds(caught.value.problems) == {"missing-file": 2, **dict.fromkeys(wrong, 1)}
+    assert kinds(error.problems) == {"missing-file": 2, **dict.fromkeys(wrong, 1)}
     result = read(ssvtp_tree, tmp_path / "out", skip_bad=True)
     assert len(result.manifest) == 6
     assert result.suspicious == []
@@ -258,9 +257,8 @@ def test_ssvtp_counts_its_losses(ssvtp_tree, tmp_path):
     assert text == "fabric, coarse, deformable"
     for name in ("train", "test"):
         (ssvtp_tree / f"{name}.csv").unlink()
-    with pytest.raises(ProblemsError) as caught:
-        read(ssvtp_tree, tmp_path / "out2")
-    assert kinds(caught.value.problems) == {"unpaired": 2, "bad-image": 1}
+    error = fails("", read, ssvtp_tree, tmp_path / "out2")
+    assert kinds(error.problems) == {"unpaired": 2, "bad-image": 1}
 
 
 def test_an_ssvtp_sample_of_two_lists_is_reported_and_is_in_no_part(ssvtp_tree, tmp_path):

@@ -4,12 +4,13 @@ import shutil
 
 import pytest
 
+from forge.errors import fails
 from forge.formats import TVL_COLUMNS as COLUMNS
 from forge.formats import kinds, make_hct, name_of
 from forge.formats import make_trajectory as trajectory
 from forge.pictures import PHOTO, gel, photo, put, write_csv
 from forge.pictures import TACTILE as SENSOR
-from palpate.core import PalpateError, ProblemsError, Split
+from palpate.core import Split
 from palpate.data.formats import hct
 from palpate.data.formats.hct import TRAJECTORY
 from palpate.data.importing import import_dataset as read
@@ -112,8 +113,7 @@ def test_swapped_folders_are_reported_and_fixed(tmp_path, swapped):
         assert background == (f"{video}/background.png" if right else "digit_background.png")
     write_lists(fixed, Split(dict.fromkeys(fixed.ids, "train")), tmp_path / "hct")
     assert named(read(tmp_path, tmp_path / "c").suspicious) == set()
-    with pytest.raises(PalpateError, match="must be one of report, fix"):
-        read(tmp_path, tmp_path / "out", swap="yes")
+    fails("must be one of report, fix", read, tmp_path, tmp_path / "out", swap="yes")
 
 
 def test_sides_of_one_size_and_unreadable_ones_are_not_called_swapped(tmp_path):
@@ -155,9 +155,8 @@ def test_every_bad_row_of_hct_is_reported(tree, tmp_path):
     path = tree / "data1" / "val.csv"
     text = "\n".join([",".join(COLUMNS), *(line for line, _ in lines)])
     path.write_bytes(text.encode("latin-1"))
-    with pytest.raises(ProblemsError) as caught:
-        read(tree, tmp_path / "out")
-    reported = caught.value.problems
+    error = fails("", read, tree, tmp_path / "out")
+    reported = error.problems
     of_list = [(p.where, p.kind) for p in reported if p.where.startswith(str(path))]
     assert of_list == [(f"{path}:{n}", k) for n, (_, some) in enumerate(lines, 2) for k in some]
     texts = {p.text for p in reported if p.kind == "missing-folder"}
@@ -191,9 +190,8 @@ def test_names_with_spaces_commas_and_other_scripts(tmp_path):
 @pytest.mark.parametrize("text", ["", "\n\n", "a,b,c\nx,y,z\n"])
 def test_lists_without_anything_usable(tree, tmp_path, text):
     (tree / "data1" / "train.csv").write_text(text)
-    with pytest.raises(ProblemsError) as caught:
-        read(tree, tmp_path / "out")
-    assert kinds(caught.value.problems) == {"missing-column" if text.strip() else "empty-list": 1}
+    error = fails("", read, tree, tmp_path / "out")
+    assert kinds(error.problems) == {"missing-column" if text.strip() else "empty-list": 1}
 
 
 def test_pairs_across_trajectories_are_suspicious(tree, tmp_path):

@@ -5,6 +5,7 @@ import sys
 import numpy as np
 import pytest
 
+from forge.errors import fails
 from forge.pictures import number, write_video
 from palpate.core import MissingExtraError, PalpateError
 from palpate.data.video import VideoReader
@@ -62,8 +63,7 @@ def test_cut_files_are_rejected_with_counts(tmp_path):
     counts = {len(data) // 2: "of 60 declared", len(data) - 1: "59 readable of 60"}
     for length, message in {0: "0 bytes", 40: "cut short", **counts}.items():
         cut.write_bytes(data[:length])
-        with pytest.raises(PalpateError, match=message):
-            VideoReader(cut)
+        fails(message, VideoReader, cut)
     # The index at the end of the file, as a camera writes it, and lost with the end.
     with av.open(str(tmp_path / "v.mp4")) as source, av.open(str(tmp_path / "end.mp4"), "w") as out:
         stream = out.add_stream_from_template(source.streams.video[0])
@@ -75,13 +75,10 @@ def test_cut_files_are_rejected_with_counts(tmp_path):
     with VideoReader(tmp_path / "end.mp4") as reader:
         assert number(reader[41]) == 41
     cut.write_bytes(data[: len(data) // 2])
-    with pytest.raises(PalpateError, match="cut short"):
-        VideoReader(cut)
-    with pytest.raises(PalpateError, match="no file"):
-        VideoReader(tmp_path / "none.mp4")
+    fails("cut short", VideoReader, cut)
+    fails("no file", VideoReader, tmp_path / "none.mp4")
     cut.write_bytes(b"words")
-    with pytest.raises(PalpateError, match="whole and readable"):
-        VideoReader(cut)
+    fails("whole and readable", VideoReader, cut)
 
 
 def test_media_overwritten_in_the_middle_is_reported_while_decoding(tmp_path):

@@ -5,11 +5,11 @@ import pytest
 from PIL import Image
 
 import palpate.data.frames as frames
+from forge.errors import fails
 from forge.pictures import write_image
 from palpate.cli import main
-from palpate.core import PalpateError, ProblemsError
+from palpate.core import PalpateError
 from palpate.data.importing import import_dataset, validate
-from palpate.data.reading import load
 from palpate.data.stacks import StackReader
 from test_data_contacts import EVENTS, gel_video, photos
 
@@ -105,9 +105,8 @@ def test_the_layout_of_two_sides_is_found(layouts, tmp_path, name):
 
 
 def test_videos_without_a_word_for_what_they_show_are_a_choice(layouts, tmp_path):
-    with pytest.raises(PalpateError, match="must say what they show") as caught:
-        import_dataset(layouts / "flat", tmp_path / "out")
-    assert {"tactile": "{object}_{video}.mov"} in caught.value.choices
+    error = fails("must say what they show", import_dataset, layouts / "flat", tmp_path / "out")
+    assert {"tactile": "{object}_{video}.mov"} in error.choices
     imported = import_dataset(layouts / "flat", tmp_path / "out", side="tactile")
     assert imported.manifest.table["video"].n_unique() == 4
 
@@ -128,8 +127,7 @@ def test_every_takes_whole_videos_and_contacts_are_thinned(layouts, tmp_path):
 
 def test_videos_of_the_scene_alone_need_a_step(layouts, tmp_path):
     scene = {"vision": "{object}_{video}_rgb.npy"}
-    with pytest.raises(PalpateError, match="every"):
-        import_dataset(layouts / "stacks", tmp_path / "out", **scene)
+    fails("every", import_dataset, layouts / "stacks", tmp_path / "out", **scene)
     table = import_dataset(layouts / "stacks", tmp_path / "out", every=35, **scene).manifest.table
     assert len(table) == 8
     assert table["tactile"].null_count() == table["contact"].null_count() == 8
@@ -190,8 +188,7 @@ def test_what_is_wrong_with_videos_is_told(layouts, tmp_path):
     assert [p.kind for p in report.invalid] == ["bad-video"]
     kinds = {(p.where, p.kind) for p in report.suspicious}
     assert kinds == {("pot/1", "no-contact"), ("pot/1", "frozen-stream")}
-    with pytest.raises(ProblemsError):
-        import_dataset(root, tmp_path / "out", **options)
+    fails("", import_dataset, root, tmp_path / "out", **options)
     assert not (tmp_path / "out").exists()
     imported = import_dataset(root, tmp_path / "out", skip_bad=True, **options)
     assert sorted(set(imported.manifest.table["video"])) == ["big_mug/1", "big_mug/2"]
@@ -226,19 +223,12 @@ def test_validation_tells_lag_and_dropped_frames(tmp_path):
     ],
 )
 def test_options_that_cannot_be_met_are_errors(layouts, tmp_path, options, text):
-    with pytest.raises(PalpateError, match=text):
-        import_dataset(layouts / "stacks", tmp_path / "out", **options)
+    fails(text, import_dataset, layouts / "stacks", tmp_path / "out", **options)
 
 
 def test_one_file_is_not_both_sides(layouts, tmp_path):
     same = dict.fromkeys(("vision", "tactile"), "{object}_{video}_gel.npy")
-    with pytest.raises(ProblemsError, match="4 same-image"):
-        import_dataset(layouts / "stacks", tmp_path / "out", **same)
-
-
-def test_frames_inside_videos_are_to_be_imported_first(layouts):
-    with pytest.raises(PalpateError, match="palpate import"):
-        load(layouts / "stacks")
+    fails("4 same-image", import_dataset, layouts / "stacks", tmp_path / "out", **same)
 
 
 @pytest.mark.parametrize(
@@ -279,5 +269,4 @@ def test_other_stacks_are_errors(tmp_path, images):
 @pytest.mark.parametrize("data", [b"", b"PK\x03\x04zip", b"\x93NUMPY\x01\x00v\x00{'descr'"])
 def test_files_that_are_no_stacks_are_errors(tmp_path, data):
     (tmp_path / "x.npy").write_bytes(data)
-    with pytest.raises(PalpateError, match="The stack"):
-        StackReader(tmp_path / "x.npy")
+    fails("The stack", StackReader, tmp_path / "x.npy")

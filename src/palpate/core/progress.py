@@ -15,7 +15,7 @@ T = TypeVar("T")
 class Progress(Protocol):
     """Called with the task, the amount done, the total (0 = unknown), and a short remark."""
 
-    def __call__(self, task: str, done: int, total: int, remark: str = "") -> None:
+    def __call__(self, task: str, done: int, total: int, remark: str = "", /) -> None:
         """Report once."""
         ...
 

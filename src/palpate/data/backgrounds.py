@@ -32,6 +32,7 @@ from palpate.core import (
     plain,
     problem_lines,
     quiet,
+    require,
 )
 from palpate.data.contacts import (
     LEAST,
@@ -114,31 +115,30 @@ def propose_backgrounds(
             the output holds a manifest.
     """
     path = Path(output) / "manifest.parquet"
-    if path.exists():
-        fix = "Choose another folder"
-        raise PalpateError("must hold no manifest yet", str(output), fix, argument="output")
+    fix = "Choose another folder"
+    require(not path.exists(), "output", "must hold no manifest yet", str(output), fix=fix)
     manifest = load(source, progress=progress, **options)
     table = manifest.table
-    given: list[str | None] = table["background"].to_list()
-    if not table["tactile"].count() or None not in given:
-        got = "a background for every sample" if table["tactile"].count() else "no tactile images"
-        must = "must have tactile images without a background"
-        raise PalpateError(must, got, "Nothing is to be done", argument="source")
-    chosen, before, methods, problems = list(given), 0, dict[str, str](), list[Problem]()
-    groups = _videos(table, given)
+    recorded: list[str | None] = table["background"].to_list()
+    got = "a background for every sample" if table["tactile"].count() else "no tactile images"
+    must = "must have tactile images without a background"
+    fix = "Nothing is to be done"
+    require(table["tactile"].count() > 0 and None in recorded, "source", must, got, fix=fix)
+    chosen, before, methods, problems = list(recorded), 0, dict[str, str](), list[Problem]()
+    groups = _videos(table, recorded)
     for done, (name, rows) in enumerate(groups.items()):
         progress("finding backgrounds", done, len(groups), name)
         video = _Video.read(manifest, rows, problems)
         methods[name], backgrounds = video.backgrounds(name, problems)
-        for k, place, before_contact in backgrounds:
-            if given[k] is None:
-                chosen[k] = os.path.relpath(place, manifest.root).replace(os.sep, "/")
+        for k, source_path, before_contact in backgrounds:
+            if recorded[k] is None:
+                chosen[k] = os.path.relpath(source_path, manifest.root).replace(os.sep, "/")
                 before += before_contact
     progress("finding backgrounds", len(groups), len(groups))
     facts = {**manifest.facts, "backgrounds": "proposed"}
     column = pl.Series("background", chosen, dtype=pl.String)
     proposed = Manifest(table.with_columns(column), manifest.root, facts)
-    kept, without = len(given) - given.count(None), chosen.count(None)
+    kept, without = len(recorded) - recorded.count(None), chosen.count(None)
     with locked(path.parent), removing_on_error(path.parent) as created:
         # Splits name samples, so those of an import hold for the new manifest, too.
         splits = splits_of(Path(source)) if isinstance(source, (str, Path)) else {}
@@ -180,29 +180,29 @@ class _Video:
         problems += [Problem(str(paths[k]), "bad-image", text) for k, text in failed.items()]
         good = [k for k in range(len(paths)) if k not in failed]
         kept = [paths[k] for k in good]
-        shown = [samples.get(path, []) for path in kept]
+        samples_of = [samples.get(path, []) for path in kept]
         return cls(
             kept,
             images[good],
-            [[row["row"] for row in some] for some in shown],
-            [some[0]["contact"] if some else None for some in shown],
+            [[row["row"] for row in some] for some in samples_of],
+            [some[0]["contact"] if some else None for some in samples_of],
         )
 
     def backgrounds(
         self, name: str, problems: list[Problem]
     ) -> tuple[str, list[tuple[int, Path, bool]]]:
         """How they were found, and (row, its background, whether it is the gel before it)."""
-        known = self._known()
-        touched = {k for first, last in known for k in range(first, last + 1)}
+        recorded = self._known()
+        touched = {k for first, last in recorded for k in range(first, last + 1)}
         free = np.array([k for k in range(len(self.paths)) if k not in touched], np.int64)
         if not len(free):
             text = "all its images are in contact" if self.paths else "no image can be read"
             problems.append(Problem(name, "no-background", text))
             return "none", []
         reference = int(free[find_reference(self.thumbnails[free])])
-        if known:
+        if recorded:
             energy = contact_energy(self.thumbnails, self.thumbnails[reference])
-            runs, method = known, "contacts of the manifest"
+            runs, method = recorded, "contacts of the manifest"
         else:
             contacts = find_contacts(self.thumbnails, reference)
             energy, runs = contacts.energy, contacts.runs
@@ -234,7 +234,7 @@ class _Video:
         return sorted(ends.values())
 
 
-def _videos(table: pl.DataFrame, given: Sequence[str | None]) -> dict[str, list[dict[str, Any]]]:
+def _videos(table: pl.DataFrame, recorded: Sequence[str | None]) -> dict[str, list[dict[str, Any]]]:
     """Video -> its rows with a tactile image in the order of frames, if one lacks a background.
 
     Without a column of videos the folder of the images is one.
@@ -244,7 +244,7 @@ def _videos(table: pl.DataFrame, given: Sequence[str | None]) -> dict[str, list[
     rows = (
         table.select(*columns)
         .with_row_index("row")
-        .with_columns(video=pl.coalesce("video", folder), lacks=pl.Series(given).is_null())
+        .with_columns(video=pl.coalesce("video", folder), lacks=pl.Series(recorded).is_null())
         .filter(pl.col("tactile").is_not_null())
         .sort("video", "frame", "row", nulls_last=True)
     )

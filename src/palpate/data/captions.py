@@ -60,10 +60,10 @@ def caption(material: str, sample_id: str, seed: int = 0) -> str:
         sample_id: the sample; equal ids get equal captions.
         seed: of the draw.
     """
-    known = next((n for n in ADJECTIVES if n.lower() == material.strip().lower()), None)
+    name = next((n for n in ADJECTIVES if n.lower() == material.strip().lower()), None)
     rng = rng_for(seed, "caption", sample_id)
-    if known is None:
+    if name is None:
         return UNKNOWN[int(rng.integers(len(UNKNOWN)))].format(" ".join(material.split()))
-    words = [ADJECTIVES[known][k] for k in rng.permutation(len(ADJECTIVES[known]))[:3]]
+    words = [ADJECTIVES[name][k] for k in rng.permutation(len(ADJECTIVES[name]))[:3]]
     template = TEMPLATES[int(rng.integers(len(TEMPLATES)))]
     return template.format(*words, a="an" if words[0][0] in "aeiou" else "a")

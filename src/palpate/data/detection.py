@@ -24,7 +24,7 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Literal
 
-from palpate.core import PalpateError, few
+from palpate.core import PalpateError, few, require
 from palpate.data.captions import ADJECTIVES
 from palpate.data.manifest import DIGITS, PART_NAMES, SCHEMA
 from palpate.data.scanning import Cells, Scan
@@ -77,8 +77,8 @@ def detect_layout(files: Sequence[str], folder: str) -> dict[str, str]:
 
 def _alike(templates: dict[str, str], sides: Mapping[str, Sequence[str]]) -> dict[str, str]:
     """The templates, with one name for the only field that two sides do not share but equal."""
-    first, *others = templates
-    for side in others:
+    first, *further = templates
+    for side in further:
         one, two = (Template.parse(templates[s]) for s in (first, side))
         own = [n for n in one.fields if n not in two.fields]
         other = [n for n in two.fields if n not in one.fields]
@@ -107,9 +107,9 @@ def _by_role(stems: dict[str, str]) -> dict[str, list[str]]:
     words = {path: _words(stem) for path, stem in stems.items()}
     shared = set.intersection(*map(set, words.values()))
     sides: dict[str, list[str]] = defaultdict(list)
-    for path, known in words.items():
-        strong = [_ROLE_OF[word] for word in known if word in _ROLE_OF and word not in shared]
-        weak = [_WEAK[word] for word in known if word in _WEAK and word not in shared]
+    for path, own in words.items():
+        strong = [_ROLE_OF[word] for word in own if word in _ROLE_OF and word not in shared]
+        weak = [_WEAK[word] for word in own if word in _WEAK and word not in shared]
         # The picture of an empty gel may lie in the folder of the tactile images.
         role = "background" if "background" in strong else (strong or weak or [""])[-1]
         sides[role].append(path)
@@ -120,12 +120,12 @@ def _by_role(stems: dict[str, str]) -> dict[str, list[str]]:
         }
         return {min(roles): list(stems)} if len(roles) == 1 else {}
     if plain and len(named := sides.keys() & {"vision", "tactile"}) == 1:
-        (known,) = named
-        partners = set[object]().union(*(_partners(stems[path], known) for path in sides[known]))
+        (side,) = named
+        partners = set[object]().union(*(_partners(stems[path], side) for path in sides[side]))
         places = {key[0] for key in partners if isinstance(key, tuple)}
         if 2 * sum(_has_partner(stems[path], partners, places) for path in plain) < len(plain):
             return {}
-        sides["tactile" if known == "vision" else "vision"] = plain
+        sides["tactile" if side == "vision" else "vision"] = plain
     return dict(sides)
 
 
@@ -160,8 +160,8 @@ def template_of(files: Sequence[str], several: bool | None = None) -> str:
     """
     several = _several(files) if several is None else several
     places = [path.split("/") for path in files]
-    folders = [place[:-1] for place in places]
-    names = [posixpath.splitext(place[-1]) for place in places]
+    folders = [parts[:-1] for parts in places]
+    names = [posixpath.splitext(parts[-1]) for parts in places]
     suffixes = {suffix for _, suffix in names}
     fields: set[str] = set()
     pieces = _folders(folders, fields)
@@ -210,13 +210,9 @@ def _folders(folders: Sequence[Sequence[str]], fields: set[str]) -> list[str | N
     return pieces
 
 
-def _common(folders: Sequence[Sequence[str]], step: int) -> list[str]:
+def _common(folders: Sequence[Sequence[str]], step: int) -> Sequence[str]:
     """The folders that all paths begin (step 1) or end (-1) with."""
-    common: list[str] = []
-    for values in zip(*(names[::step] for names in folders), strict=False):
-        if len(set(values)) > 1:
-            break
-        common.append(values[0])
+    common = posixpath.commonprefix([list(names[::step]) for names in folders])
     shortest = min(map(len, folders))
     return common if step == 1 else common[: max(0, shortest - len(_common(folders, 1)))]
 
@@ -292,7 +288,7 @@ def _affixes(values: Sequence[str]) -> tuple[str, list[str], str]:
     distinct = [_TOKEN.findall(value) for value in dict.fromkeys(values)]
     if len(distinct) == 1:
         return _literal(values[0]), [], ""
-    p, s = (_shared([tokens[::step] for tokens in distinct]) for step in (1, -1))
+    p, s = (len(posixpath.commonprefix([t[::step] for t in distinct])) for step in (1, -1))
     for first, last in ((p, s), (0, s), (p, 0), (0, 0)):
         middles = ["".join(tokens[first : len(tokens) - last]) for tokens in distinct]
         if all(len(tokens) > first + last for tokens in distinct):
@@ -300,16 +296,6 @@ def _affixes(values: Sequence[str]) -> tuple[str, list[str], str]:
             after = "".join(tokens[len(tokens) - last :])
             return _literal("".join(tokens[:first])), middles, _literal(after)
     return "", list(values), ""
-
-
-def _shared(lists: Sequence[Sequence[str]]) -> int:
-    """How many first items are equal in all lists."""
-    count = 0
-    for items in zip(*lists, strict=False):
-        if len(set(items)) > 1:
-            break
-        count += 1
-    return count
 
 
 def _literal(text: str) -> str:
@@ -340,17 +326,17 @@ def joined(
     files: Sequence[str],
     templates: Mapping[str, Template],
     matches: Mapping[str, Matches],
-    what: str,
+    kind: str,
 ) -> tuple[list[Fields], tuple[str, ...]]:
     """Rows of the files of all templates, and their fields; what is odd is reported.
 
-    ``files`` should all be of a template; ``what`` they are is for messages.
+    ``files`` should all be of a template; ``kind``, what they are, is for messages.
     """
     rows, problems = join({column: matches[column] for column in templates})
     result.problems += problems
     used = {path for found in matches.values() for path, _ in found}
     unmatched = [path for path in files if path not in used]
-    result.suspect(result.base, "unmatched", f"{what} of no template", unmatched)
+    result.suspect(result.base, "unmatched", f"{kind} of no template", unmatched)
     result.facts |= {f"template_{column}": template.text for column, template in templates.items()}
     fields = tuple(dict.fromkeys(name for t in templates.values() for name in t.fields))
     result.more = tuple(name for name in fields if name not in TARGETS)
@@ -361,15 +347,14 @@ def templates_of(
     files: Sequence[str],
     folder: Path,
     side: Side | None,
-    what: str = "images",
+    kind: str = "images",
     renamed: Callable[[Mapping[str, str]], dict[str, str]] = dict,
 ) -> dict[str, str]:
     """The templates that the names of files below a folder suggest; ``side`` if all show one thing.
 
-    ``what`` the files are is for errors; ``renamed`` changes the names of fields.
+    ``kind``, what the files are, is for errors; ``renamed`` changes the names of fields.
     """
-    if not files:
-        raise PalpateError(f"{folder} must hold {what}", "none", "Check the path")
+    require(bool(files), None, f"{folder} must hold {kind}", "none", fix="Check the path")
     if side is not None:
         return renamed({side: template_of(files)})
     templates = detect_layout(files, folder.resolve().name)
@@ -382,7 +367,7 @@ def templates_of(
         every = template_of(files)
         choices = [{"tactile": every}, {"vision": every}]
         got = f"{few(files)}, without a word like {ROLES['vision'][0]} or {ROLES['tactile'][0]}"
-    must = f"The names of the {what} in {folder} must say what they show"
+    must = f"The names of the {kind} in {folder} must say what they show"
     raise PalpateError(must, got, "Choose one of these", choices=[*map(renamed, choices)])
 
 

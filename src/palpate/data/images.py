@@ -97,26 +97,26 @@ def read_image(path: Path, at_least: tuple[int, int] | None = None) -> Image.Ima
         raise PalpateError(must, _reason(path, error), "Fetch the file again") from None
 
 
-def check_image(path: Path, how: Check = "decode") -> str | None:
+def check_image(path: Path, check: Check = "decode") -> str | None:
     """Return why an image file is unusable, or None.
 
     Args:
         path: the file.
-        how: ``decode`` reads every byte (a JPEG at an eighth of its size, which detects truncation
-            as well), ``header`` reads the first bytes only.
+        check: ``decode`` reads every byte (a JPEG at an eighth of its size, which detects
+            truncation as well), ``header`` reads the first bytes only.
     """
     path = Path(path)
     try:
-        form_of(path, how)
+        form_of(path, check)
     except BROKEN as error:
         return _reason(path, error)
     return None
 
 
-def form_of(source: Path | BinaryIO, how: Check) -> str:
+def form_of(source: Path | BinaryIO, check: Check) -> str:
     """What Pillow calls the form of an image that is usable; raises one of ``BROKEN`` if not."""
     with opened(source) as image:
-        if how == "decode":
+        if check == "decode":
             image.draft("L", (max(1, image.width // 8), max(1, image.height // 8)))
             image.load()
         return str(image.format)
@@ -233,7 +233,7 @@ def square(image: Image.Image, size: int) -> NDArray[np.uint8]:
 def in_threads(
     function: Callable[[T], R],
     items: Collection[T],
-    what: str = "",
+    task: str = "",
     progress: Progress = quiet,
     *,
     threads: int | None = None,
@@ -244,7 +244,7 @@ def in_threads(
     Args:
         function: the work.
         items: what to work on.
-        what: name of the work for ``progress``; work without a name is not reported.
+        task: name of the work for ``progress``; work without a name is not reported.
         progress: progress callback.
         threads: how many; default: the number of cores, 16 at most.
         stop: set when the caller leaves early, for functions that run long and look at it.
@@ -252,9 +252,9 @@ def in_threads(
     require(threads is None or threads >= 1, "threads", "must be at least 1", threads)
     threads = threads or min(16, os.cpu_count() or 1)
     remaining = iter(items)
-    report = progress if what else None
+    report = progress if task else None
     if report:
-        report(what, 0, len(items))
+        report(task, 0, len(items))
     running: dict[Future[R], T] = {}
     ended: SimpleQueue[Future[R]] = SimpleQueue()  # quicker than to wait for any of several
     with ThreadPoolExecutor(threads) as pool:
@@ -273,7 +273,7 @@ def in_threads(
                 yield running.pop(future), future.result()
                 done += 1
                 if report:
-                    report(what, done, len(items))
+                    report(task, done, len(items))
                 submit(1)
         finally:
             if stop is not None:

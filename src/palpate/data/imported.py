@@ -145,8 +145,8 @@ def words_of(table: pl.DataFrame) -> str:
     without = table.filter(pl.col("text").is_null())
     names = pl.coalesce(*(pl.when(pl.col(c).is_not_null()).then(pl.lit(c)) for c in NAMED))
     counts = without.select(names.alias("of")).group_by("of", maintain_order=True).len().iter_rows()
-    made = ", ".join(f"{count} of the {'sample' if c == 'id' else c}" for c, count in counts)
-    return f"made from the name: {made}" if made else ""
+    sources = ", ".join(f"{count} of the {'sample' if c == 'id' else c}" for c, count in counts)
+    return f"made from the name: {sources}" if sources else ""
 
 
 def readable(facts: Facts) -> dict[str, Any]:

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from palpate.core import PalpateError, Progress, Split, locked, quiet
-from palpate.data.formats import FORMATS, recognized, scan_options
+from palpate.data.formats import FORMATS, recognized, require_options
 from palpate.data.images import Check
 from palpate.data.imported import Imported, Validation, removing_on_error, templates_of
 from palpate.data.listing import write_table
@@ -71,28 +71,23 @@ def import_dataset(
         must, fix = "must hold no manifest yet", "Choose another folder, or replace this one"
         example = {"overwrite": True}
         raise PalpateError(must, str(output), fix, argument="output", example=example)
-    common: dict[str, Any] = {"check": check, "progress": progress}
     texts = None if text is None else read_texts(Path(text))
     with locked(output), removing_on_error(output) as created:
         if text is not None and format == "auto" and is_manifest(source):
             imported = reimported(source)
         else:
-            into = Into(output, created, skip_bad)
-            imported = _imported(source, format, into, common, options)
+            name, form = recognized(source, format, options)
+            options |= {"check": check, "progress": progress}
+            options["into"] = Into(output, created, skip_bad)
+            scan = form.read(source, require_options(name, form, options))
+            facts = {**form.facts.of_manifest(), "format": name}
+            check = "none" if form.writes else check  # they were checked on the way
+            imported = imported_of(
+                scan, source, facts, skip_bad=skip_bad, check=check, progress=progress
+            )
         if text is not None and texts is not None:
             imported = with_texts(imported, texts, Path(text))
         return imported.save(output, created)
-
-
-def _imported(
-    source: Path, given: str, into: Into, common: dict[str, Any], options: dict[str, Any]
-) -> Imported:
-    name, form = recognized(source, given, options)
-    scanning = scan_options(name, form, options | common)
-    scan = form.scan(source, **scanning, **({"into": into} if form.writes else {}))
-    facts = {**form.facts.of_manifest(), "format": name}
-    common = common | ({"check": "none"} if form.writes else {})  # they were checked on the way
-    return imported_of(scan, source, facts, skip_bad=into.skip_bad, **common)
 
 
 def validate(
@@ -121,7 +116,7 @@ def validate(
     source, world = Path(source), world_facts(Path(source))
     name, form = recognized(source, format, options)
     options = options | {"check": check, "progress": progress}
-    scan = form.scan(source, **scan_options(name, form, options))
+    scan = form.read(source, require_options(name, form, options))
     # palpate's own world has the layouts of real sets and must not be shown as one of them.
     facts = WORLD if world else form.facts
     rows = finished(scan, check, progress)

@@ -87,8 +87,8 @@ def read_lists(
     names = contact_names(rows["video"], rows["frame"], rows["label"])
     label = pl.col("label").cast(pl.String)
     if categories is not None:
-        known = {str(k): name for k, name in categories.items()}
-        label = label.replace(list(known), list(known.values()))
+        names_by_label = {str(k): name for k, name in categories.items()}
+        label = label.replace(list(names_by_label), list(names_by_label.values()))
     table = rows.select("id", "video", "frame", material=label).with_columns(
         contact=pl.Series(names, dtype=pl.String)
     )
@@ -232,13 +232,13 @@ def _with_known_labels(
     rows: pl.DataFrame, categories: Mapping[int, str] | None, problems: list[Problem]
 ) -> pl.DataFrame:
     """Drop rows whose label is no class."""
-    known, what = pl.col("label") >= 0, "is negative, but not -1 (inconclusive)"
+    valid, reason = pl.col("label") >= 0, "is negative, but not -1 (inconclusive)"
     if categories is not None:
-        known, what = pl.col("label").is_in(list(categories)), "is not in the category table"
-    for source, line, label in rows.filter(~known).select("source", "line", "label").iter_rows():
-        text = f"the label {label} {what}"
+        valid, reason = pl.col("label").is_in(list(categories)), "is not in the category table"
+    for source, line, label in rows.filter(~valid).select("source", "line", "label").iter_rows():
+        text = f"the label {label} {reason}"
         problems.append(Problem(f"{source}:{line}", "unknown-label", text))
-    return rows.filter(known)
+    return rows.filter(valid)
 
 
 def _without_duplicates(rows: pl.DataFrame, problems: list[Problem]) -> pl.DataFrame:
@@ -254,8 +254,8 @@ def _without_duplicates(rows: pl.DataFrame, problems: list[Problem]) -> pl.DataF
             kind, text = "duplicate-row", f"is listed at {places[0]} already"
             if two:
                 pairs = zip(labels, places, strict=True)
-                others = ", ".join(f"{o} at {p}" for o, p in pairs if o != labels[k])
-                kind, text = "two-labels", f"has two labels: {labels[k]} here, {others}"
+                elsewhere = ", ".join(f"{o} at {p}" for o, p in pairs if o != labels[k])
+                kind, text = "two-labels", f"has two labels: {labels[k]} here, {elsewhere}"
             problems.append(Problem(places[k], kind, f"frame {frame} of {video!r} {text}"))
             drop.append(group["row"][k])
     return rows.filter(~pl.col("row").is_in(drop)).drop("row")

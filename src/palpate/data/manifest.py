@@ -47,6 +47,7 @@ from palpate.core import (
     digest_lines,
     fact_lines,
     inside,
+    require,
     require_rows,
 )
 
@@ -130,9 +131,8 @@ class Manifest:
         Raises:
             PalpateError: if there is no such column.
         """
-        if name not in self.table.columns:
-            must = f"A column must be one of {', '.join(self.table.columns)}"
-            raise PalpateError(must, repr(name), "Choose one of these")
+        must = f"A column must be one of {', '.join(self.table.columns)}"
+        require(name in self.table.columns, None, must, repr(name), fix="Choose one of these")
         return self.table[name].to_list()
 
     @cached_property
@@ -220,8 +220,8 @@ class Manifest:
 
     def ref(self, row: Mapping[str, Any]) -> SampleRef:
         """A row of the table as a reference with absolute image paths, for reports."""
-        full = {n: os.path.realpath(self.path(row[n])) if row[n] else None for n in IMAGE_COLUMNS}
-        return SampleRef(row["id"], row["video"], row["frame"], row["material"], **full)
+        images = (os.path.realpath(self.path(row[n])) if row[n] else None for n in IMAGE_COLUMNS)
+        return SampleRef(row["id"], row["video"], row["frame"], row["material"], *images)
 
     def problems(self) -> list[Problem]:
         """Everything wrong with the rows: bad ids, paths outside the root, missing files."""
@@ -282,8 +282,7 @@ class Manifest:
         path = Path(path)
         path = path / "manifest.parquet" if path.is_dir() else path
         fix = "Write one with: palpate import"
-        if not path.is_file():
-            raise PalpateError("The manifest must exist", f"no file {path}", fix)
+        require(path.is_file(), None, "The manifest must exist", f"no file {path}", fix=fix)
         try:
             meta = _metadata(path)
             with reading_parquet():
@@ -294,10 +293,10 @@ class Manifest:
         written = meta.get("palpate.format")
         columns = list(table.schema.items())
         further = table.schema.dtypes()[len(SCHEMA) :]
-        known = columns[: len(SCHEMA)] == list(SCHEMA.items()) and {pl.String}.issuperset(further)
-        if written != FORMAT or not known:
-            got = written or "a Parquet file of another program"
-            raise PalpateError(f"The manifest {path} must have the format {FORMAT}", got, fix)
+        typed = columns[: len(SCHEMA)] == list(SCHEMA.items()) and {pl.String}.issuperset(further)
+        got = written or "a Parquet file of another program"
+        must = f"The manifest {path} must have the format {FORMAT}"
+        require(written == FORMAT and typed, None, must, got, fix=fix)
         for name in IMAGE_COLUMNS:
             climbing = table[name].filter(table[name].str.contains(CLIMBS))
             if len(climbing):
@@ -306,9 +305,8 @@ class Manifest:
         facts = {k.removeprefix(FACT): v for k, v in meta.items() if k.startswith(FACT)}
         home = Path(root) if root else Path(os.path.normpath(path.parent / meta["palpate.root"]))
         manifest = cls(table, home, facts)
-        if manifest.digest != meta["palpate.digest"]:
-            must, got = f"The digest in {path} must match its rows", "rows of another program"
-            raise PalpateError(must, got, fix)
+        must, got = f"The digest in {path} must match its rows", "rows of another program"
+        require(manifest.digest == meta["palpate.digest"], None, must, got, fix=fix)
         return manifest
 
 

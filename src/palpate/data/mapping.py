@@ -85,11 +85,11 @@ def compile_maps(
     pending = {target: _parsed(target, text, columns) for target, text in texts.items()}
     ordered: dict[str, pl.Expr] = {}
     while pending:
-        known = {*columns, *ordered}
-        ready = {t: e for t, e in pending.items() if known.issuperset(e.meta.root_names())}
+        available = {*columns, *ordered}
+        ready = {t: e for t, e in pending.items() if available.issuperset(e.meta.root_names())}
         if not ready:
             target, expression = next(iter(pending.items()))
-            missing = next(n for n in expression.meta.root_names() if n not in known)
+            missing = next(n for n in expression.meta.root_names() if n not in available)
             circular = f"{missing}, which depends on {target} itself"
             got = circular if missing in maps else f"no {missing} among {', '.join(columns)}"
             raise _unusable(target, texts[target], got)

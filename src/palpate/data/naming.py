@@ -98,10 +98,10 @@ def name_together(
     lists = [
         next((name for name, p in KNOWN.items() if re.fullmatch(p, path)), "") for path in paths
     ]
-    known = [] if "" in lists or template else [name for name in KNOWN if name in lists]
-    text = ", ".join(known) or template or template_of(paths)
-    patterns = [re.compile(KNOWN[name]) for name in known]
-    parsed = None if known else Template.parse(text)
+    published = [] if "" in lists or template else [name for name in KNOWN if name in lists]
+    text = ", ".join(published) or template or template_of(paths)
+    patterns = [re.compile(KNOWN[name]) for name in published]
+    parsed = None if published else Template.parse(text)
     rows = [_fields(path, patterns, parsed) for path in paths]
     if parsed is not None:
         name_apart(rows, parsed.fields)
@@ -110,7 +110,7 @@ def name_together(
         replace(m, table=_filled(m.table, fields)) if any(m.table is t for t in unread) else m
         for m in manifests
     ]
-    if "HCT" in known:
+    if "HCT" in published:
         sessions = hct.sessions_of(v for m in named for v in m.table["video"].drop_nulls())
         session = pl.col("video").replace_strict(sessions, default=None, return_dtype=pl.String)
         named = [replace(m, table=m.table.with_columns(session=session)) for m in named]
@@ -156,8 +156,8 @@ def _intervals(path: Path) -> tuple[Manifest, list[Problem], None]:
     for number, line in enumerate(lines, 1):
         cells = re.split(r"[\s,;]+", line.strip())
         video, first, last, label = (cells[k] if k < len(cells) else None for k in order)
-        whole = all(re.fullmatch(r"\d{1,18}", cell or "") for cell in (first, last))
-        if video and whole and int(first or 0) <= int(last or 0):
+        numeric = all(re.fullmatch(r"\d{1,18}", cell or "") for cell in (first, last))
+        if video and numeric and int(first or 0) <= int(last or 0):
             rows.append((video, int(first or 0), int(last or 0), label))
         elif line.strip():
             text = f"{line!r} is not {' '.join(ORDER)} with a start up to the end"
@@ -198,8 +198,8 @@ def _items(data: Any, split: str | None = None, *, row: bool = False) -> Iterato
     if isinstance(data, Mapping):
         lists = {key: value for key, value in data.items() if isinstance(value, (list, Mapping))}
         below = [item for value in lists.values() for item in value if isinstance(value, list)]
-        whole = split is None and not row and lists and len(lists) == len(data)
-        if whole and not _scalars(below):
+        is_list = split is None and not row and lists and len(lists) == len(data)
+        if is_list and not _scalars(below):
             rows = _any_value_beside(data.values(), (list, Mapping))
             for key, value in lists.items():
                 yield from _items(value, PART_NAMES.get(str(key).lower()), row=rows)
@@ -267,10 +267,10 @@ def _paths(
     require_some(len(rows), path, table.problems)
     template = Template.parse(options[side], side) if side and options.get(side) else None
     for k, row in rows:
-        if place := paths[k] if paths else None:
-            row[PATH] = place
-            if template and template.match(place) is None:
-                text = f"{place!r} is not like the template {options[side]}"
+        if image := paths[k] if paths else None:
+            row[PATH] = image
+            if template and template.match(image) is None:
+                text = f"{image!r} is not like the template {options[side]}"
                 table.problems.append(Problem(table.where(k), "no-match", text))
         if "frame" in row:
             row["frame"] = int(row["frame"])
@@ -290,10 +290,10 @@ def _paths(
     return manifest, table.problems, split
 
 
-def _id(row: Mapping[str, Any], place: str) -> str:
+def _id(row: Mapping[str, Any], where: str) -> str:
     if "video" in row and "frame" in row:
         return f"{row['video']}/{row['frame']}"
-    return str(row.get(PATH, place)).rpartition(".")[0] or place
+    return str(row.get(PATH, where)).rpartition(".")[0] or where
 
 
 def _path_columns(names: Sequence[str], side: str = "") -> list[str]:

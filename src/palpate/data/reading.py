@@ -7,8 +7,8 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from palpate.core import PalpateError, Problem, Progress, quiet, require_regular
-from palpate.data.formats import Format, recognized, scan_options
+from palpate.core import PalpateError, Problem, Progress, quiet, require, require_regular
+from palpate.data.formats import Format, recognized, require_options
 from palpate.data.listing import LINE, read_list
 from palpate.data.manifest import IMAGE_COLUMNS, SCHEMA, Manifest, is_manifest
 from palpate.data.mapping import compile_maps
@@ -95,7 +95,7 @@ def read_samples(
         return _of_table(open_table(path, names), path.parent, skip_bad, options)
     # Images are not decoded here: broken ones are reported when they are read.
     more = {"check": "none", "progress": progress}
-    scan = _scanned(form, path, scan_options(name, form, options | more))
+    scan = _scanned(form, path, require_options(name, form, options | more))
     facts = {**form.facts.of_manifest(), "format": name, **scan.facts}
     return _of_scan(scan, path, facts, skip_bad, progress)
 
@@ -108,20 +108,20 @@ def is_list(path: Path) -> bool:
     return re.match(LINE, line) is not None
 
 
-def _require_left_out(options: Mapping[str, Any], known: set[str], what: str) -> None:
+def _require_left_out(options: Mapping[str, Any], accepted: set[str], kind: str) -> None:
     """Raise for an option that a kind of source does not take."""
-    for name in sorted(set(options) - known):
-        raise PalpateError(f"must be left out for {what}", repr(options[name]), "", argument=name)
+    for name in sorted(set(options) - accepted):
+        raise PalpateError(f"must be left out for {kind}", repr(options[name]), "", argument=name)
 
 
 def _scanned(form: Format, path: Path, options: dict[str, Any]) -> Scan:
     """Scan a source; a folder whose names do not say what its images show is one of photos."""
     try:
-        return form.scan(path, **options)
+        return form.read(path, options)
     except PalpateError as error:
         if not error.choices:
             raise
-        scan = form.scan(path, **options, side="vision")
+        scan = form.read(path, options | {"side": "vision"})
         scan.facts["side_assumed"] = "vision"
         return scan
 
@@ -132,10 +132,10 @@ def _of_table(
     """Samples of a data frame, or of a table without images."""
     _require_left_out(options, {"columns", "root", "classes"}, "a table")
     maps = compile_maps(options.get("columns", {}), table.names, [*SCHEMA, "split"])
-    if not any(name in maps.expressions for name in NAMING):
-        must = f"must have at least one of the columns {', '.join(NAMING)}"
-        got = ", ".join(table.names) or "no columns"
-        raise PalpateError(must, got, "Map a column to one of them", argument="source")
+    must = f"must have at least one of the columns {', '.join(NAMING)}"
+    got = ", ".join(table.names) or "no columns"
+    fix = "Map a column to one of them"
+    require(any(name in maps.expressions for name in NAMING), "source", must, got, fix=fix)
     classes = None if "classes" not in options else read_classes(Path(options["classes"]))
     cells = maps.apply(table.read(maps.columns))
     rows, _ = manifest_rows(cells, len(table.lines), table.where, classes, table.problems)

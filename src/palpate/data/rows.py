@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from palpate.core import PARTS, PalpateError, Problem
+from palpate.core import PARTS, Problem, require
 from palpate.data.manifest import PART_NAMES
 from palpate.data.tables import INCONCLUSIVE, read_categories, whole
 
@@ -39,7 +39,7 @@ def manifest_rows(
     Returns:
         (row number, its cells that are not null) of the good rows, and how many were inconclusive.
     """
-    known = set(classes.values()) if classes is not None else set[str]()
+    names = set(classes.values()) if classes is not None else set[str]()
     rows: list[tuple[int, Row]] = []
     inconclusive = 0
     for k in range(count):
@@ -48,7 +48,7 @@ def manifest_rows(
         wrong = [("bad-map", f"the expression for {name} is empty here") for name in empty]
         wrong += _make_integers(row)
         material = row.get("material")
-        if classes is not None and material is not None and material not in known:
+        if classes is not None and material is not None and material not in names:
             number = whole(material)
             if number == INCONCLUSIVE:
                 inconclusive += 1
@@ -81,9 +81,8 @@ def _make_integers(row: Row) -> Iterator[tuple[str, str]]:
 
 def read_classes(path: Path) -> dict[int, str]:
     """Read a table of classes, as :func:`read_categories`."""
-    if not path.is_file():
-        must, got = "must be a table of classes", f"no file {path}"
-        raise PalpateError(must, got, "Check the path", argument="classes")
+    must, got = "must be a table of classes", f"no file {path}"
+    require(path.is_file(), "classes", must, got, fix="Check the path")
     return read_categories(path)
 
 

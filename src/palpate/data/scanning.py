@@ -12,13 +12,12 @@ import inspect
 import posixpath
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from functools import cache
 from pathlib import Path
 from typing import Any
 
 from palpate.core import (
-    PalpateError,
     Problem,
     ProblemsError,
     Progress,
@@ -27,6 +26,7 @@ from palpate.core import (
     inside,
     quiet,
     read_json,
+    require,
 )
 from palpate.data.images import Check, check_image, in_threads
 from palpate.data.manifest import IMAGE_COLUMNS, Manifest
@@ -81,7 +81,7 @@ def world_facts(folder: Path) -> dict[str, str]:
     The blank entries replace the license, citation and address of the real set.
     """
     places = (folder / "world.json", folder.parent / "world.json")  # HCT's rigs are one level down
-    path = next((place for place in places if place.is_file()), None)
+    path = next((file for file in places if file.is_file()), None)
     world = read_json(path, "world record") if path else {}
     if not str(world.get("format", "")).startswith("palpate-world/"):
         return {}
@@ -141,21 +141,32 @@ class Format:
     #: Whether a source looks like it; must be quick and must not raise.
     detect: Callable[[Path], bool]
     looks_for: str  # what ``detect`` expects, for the error message
-    #: ``scan(source, *, progress, ...) -> Scan``; further keywords are the format's options. A
-    #: format that writes images has ``into: Into | None``, None where nothing is written, and
-    #: ``check``.
+    #: ``scan(source, *, progress, ...) -> Scan``; further keywords are the format's options, or the
+    #: second argument is their ``record``. A format that writes images has ``into: Into | None``,
+    #: None where nothing is written, and ``check``.
     scan: Callable[..., Scan]
     #: ``write_lists(manifest, split, folder) -> files``: a split in the data set's own form, if it
     #: has one.
     write_lists: Callable[[Manifest, Split, Path], list[Path]] | None = None
     remote: bool = False  # the source may be a name instead of a path on disk
+    record: type[Any] | None = None  # the options as one dataclass, where they are many
 
     @property
     def options(self) -> list[str]:
         """The format's own keywords and the common ones."""
         parameters = inspect.signature(self.scan).parameters.values()
         names = [p.name for p in parameters if p.kind is p.KEYWORD_ONLY and p.name != "into"]
+        names += [f.name for f in fields(self.record)] if self.record else []
         return list(dict.fromkeys([*names, "skip_bad", "check", "progress"]))
+
+    def read(self, source: Path, values: Mapping[str, Any]) -> Scan:
+        """Scan a source with those of the option values that the scan takes."""
+        names = inspect.signature(self.scan).parameters
+        if self.record is None:
+            return self.scan(source, **{k: v for k, v in values.items() if k in names})
+        own = {f.name for f in fields(self.record)}
+        record = self.record(**{k: v for k, v in values.items() if k in own})
+        return self.scan(source, record, **{k: v for k, v in values.items() if k in names})
 
     @property
     def writes(self) -> bool:
@@ -173,14 +184,13 @@ def finished(scan: Scan, check: Check, progress: Progress = quiet) -> list[Row]:
 
     The cells ``split`` of the rows that remain become the split ``scan.split_name``.
     """
-    rows = _checked_images(scan, _two_images(scan, _checked_paths(scan)), check, progress)
-    rows = _unique(scan, rows)
+    rows = _unique(scan, _checked_images(scan, _checked_paths(scan), check, progress))
     scan.problems.sort(key=Problem.sort_key)
     return rows
 
 
 def _checked_paths(scan: Scan) -> list[Row]:
-    """Rows whose images exist inside the root, with paths relative to it."""
+    """Rows whose images exist inside the root and are two, with paths relative to it."""
     root = scan.base.resolve()
 
     @cache
@@ -188,21 +198,23 @@ def _checked_paths(scan: Scan) -> list[Row]:
         return inside(root, folder) is None
 
     @cache
-    def checked(given: str) -> tuple[str, str]:
+    def checked(written: str) -> tuple[str, str]:
         """(path relative to the root, ""), or (kind of problem, its text)."""
-        folder, _, name = given.rpartition("/")
-        path = root / given
+        folder, _, name = written.rpartition("/")
+        path = root / written
         # Resolving is slow, so only unusual paths and links are resolved one by one.
-        unusual = posixpath.normpath(given) != given or Path(given).is_absolute() or "\\" in name
-        resolved = inside(root, given) if unusual or path.is_symlink() else path
+        unusual = (
+            posixpath.normpath(written) != written or Path(written).is_absolute() or "\\" in name
+        )
+        resolved = inside(root, written) if unusual or path.is_symlink() else path
         if resolved is None or leaves(folder):
-            return "outside-root", f"the path {given!r} leaves the root {scan.base}"
+            return "outside-root", f"the path {written!r} leaves the root {scan.base}"
         try:
             if not path.is_file():
-                return "missing-file", f"no file {given!r} in {scan.base}"
+                return "missing-file", f"no file {written!r} in {scan.base}"
         except OSError as error:  # e.g. a name that is too long for the disk
-            return "missing-file", f"{given!r} cannot be a file: {error.strerror}"
-        return resolved.relative_to(root).as_posix() if unusual else given, ""
+            return "missing-file", f"{written!r} cannot be a file: {error.strerror}"
+        return resolved.relative_to(root).as_posix() if unusual else written, ""
 
     good: list[Row] = []
     for where, row in scan.rows:
@@ -211,25 +223,19 @@ def _checked_paths(scan: Scan) -> list[Row]:
             if text:
                 scan.problem(where, path, f"{column}: {text}")
             row[column] = path
-        if not any(text for _, text in results.values()):
-            good.append((where, row))
-    return good
-
-
-def _two_images(scan: Scan, rows: list[Row]) -> list[Row]:
-    """Rows whose photo is not their tactile image."""
-    good: list[Row] = []
-    for where, row in rows:
-        if (path := row.get("vision")) is not None and path == row.get("tactile"):
+        path = row.get("vision")
+        if any(text for _, text in results.values()):
+            continue
+        if path is not None and path == row.get("tactile"):
             scan.problem(where, "same-image", f"{path!r} is both its photo and its tactile image")
         else:
             good.append((where, row))
     return good
 
 
-def _checked_images(scan: Scan, rows: list[Row], how: Check, progress: Progress) -> list[Row]:
+def _checked_images(scan: Scan, rows: list[Row], check: Check, progress: Progress) -> list[Row]:
     """Rows whose images are whole; each file is checked and reported once, at its first row."""
-    if how == "none":
+    if check == "none":
         return rows
     uses: Counter[str] = Counter()
     first: dict[str, str] = {}
@@ -238,8 +244,8 @@ def _checked_images(scan: Scan, rows: list[Row], how: Check, progress: Progress)
             uses[path] += 1
             first.setdefault(path, where)
     bad: set[str] = set()
-    check = lambda path: check_image(scan.base / path, how)
-    for path, reason in in_threads(check, first, "checking images", progress):
+    reason_of = lambda path: check_image(scan.base / path, check)
+    for path, reason in in_threads(reason_of, first, "checking images", progress):
         if reason:
             bad.add(path)
             users = f" (used by {uses[path]} rows)" if uses[path] > 1 else ""
@@ -297,6 +303,5 @@ def require_some(samples: int, source: object, skipped: Sequence[Problem]) -> No
     """Reject an import without samples."""
     if samples == 0 and skipped:
         raise ProblemsError(skipped, "No sample is left without these: correct the data set")
-    if samples == 0:
-        must = f"{source} must hold at least one usable sample"
-        raise PalpateError(must, "none", "Check the labels and the folder")
+    must = f"{source} must hold at least one usable sample"
+    require(samples != 0, None, must, "none", fix="Check the labels and the folder")

@@ -105,22 +105,20 @@ def lag_of(tactile: NDArray[np.float64], vision: NDArray[np.float64]) -> list[Fi
     count = min(len(tactile), len(vision))
     if count < LEAST_FRAMES:
         return []
-    x, y = (_quick(changes[:count]) for changes in (tactile, vision))
+    smooth = ndimage.gaussian_filter1d
+    # Changes over a frame or two, without the level of the second around.
+    quick = lambda changes: smooth(changes, 1.5) - smooth(changes, 20)
+    x, y = (quick(changes[:count]) for changes in (tactile, vision))
     most = min(LONGEST_LAG, count // 3)
     lags = np.arange(-most, most + 1)
     values = np.array([_correlation(x, y, int(lag)) for lag in lags])
     best = int(values.argmax())
-    lag, others = int(lags[best]), values[np.abs(lags - lags[best]) > NEAR]
-    second = max(float(others.max(initial=-1)), float(values[most]))
+    lag, elsewhere = int(lags[best]), values[np.abs(lags - lags[best]) > NEAR]
+    second = max(float(elsewhere.max(initial=-1)), float(values[most]))
     if abs(lag) < LEAST_LAG or values[best] < max(CORRELATION, second + MARGIN):
         return []
     text = f"tactile changes {abs(lag)} frames {'after' if lag > 0 else 'before'} vision does "
     return [("lag", f"{text}(correlation {values[best]:.2f}; {values[most]:.2f} as they are)")]
-
-
-def _quick(changes: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Changes over a frame or two, without the level of the second around."""
-    return ndimage.gaussian_filter1d(changes, 1.5) - ndimage.gaussian_filter1d(changes, 20)
 
 
 def _correlation(x: NDArray[np.float64], y: NDArray[np.float64], lag: int) -> float:

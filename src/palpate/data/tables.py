@@ -22,7 +22,7 @@ from typing import Any
 
 import polars as pl
 
-from palpate.core import PalpateError, Problem, ProblemsError
+from palpate.core import PalpateError, Problem, ProblemsError, require
 from palpate.data.manifest import reading_parquet
 from palpate.data.mapping import text_of
 
@@ -90,18 +90,16 @@ def open_table(path: Path, names: Sequence[str] | None = None) -> Table:
     """
     path = Path(path)
     suffix = path.suffix.lower()
-    if not path.is_file():
-        raise PalpateError("The table must be a file", f"no file {path}", "Check the path")
-    if names and suffix in TABLES[2:]:
-        must = "must be left out for tables that name their columns"
-        raise PalpateError(must, path.name, "", argument="names")
+    fix = "Check the path"
+    require(path.is_file(), None, "The table must be a file", f"no file {path}", fix=fix)
+    must = "must be left out for tables that name their columns"
+    require(not names or suffix not in TABLES[2:], "names", must, path.name)
     if suffix == ".parquet":
         return _parquet(path)
     if suffix in (".jsonl", ".json"):
         return _json(path)
-    if not names and suffix not in TABLES:
-        must = f"A table must be one of {', '.join(TABLES)}"
-        raise PalpateError(must, path.name, "Convert it, or rename it")
+    must = f"A table must be one of {', '.join(TABLES)}"
+    require(bool(names) or suffix in TABLES, None, must, path.name, fix="Convert it, or rename it")
     return _csv(path, names)
 
 
@@ -286,11 +284,10 @@ def _of_frame(
     def records(columns: Sequence[str]) -> Iterator[Record]:
         for column in columns:
             kind = schema[column]
-            if kind.is_nested() or kind.base_type() in (pl.Binary, pl.Object):
-                must = f"Columns of {name} must hold texts or numbers"
-                got = f"{column} of type {kind}"
-                fix = "For images inside the table use the format hf on its folder"
-                raise PalpateError(must, got, fix)
+            plain = not kind.is_nested() and kind.base_type() not in (pl.Binary, pl.Object)
+            must, got = f"Columns of {name} must hold texts or numbers", f"{column} of type {kind}"
+            fix = "For images inside the table use the format hf on its folder"
+            require(plain, None, must, got, fix=fix)
         yield from enumerate(read(columns).iter_rows(), 1)
 
     return Table(name, list(schema), [], records)
@@ -330,8 +327,7 @@ def read_categories(path: Path) -> dict[int, str]:
     fix = "Write one 'Name: id' or 'id,name' a line"
     if problems:
         raise ProblemsError(problems, fix)
-    if not names:
-        raise PalpateError(f"{path} must list classes", "none; is it empty?", fix)
+    require(bool(names), None, f"{path} must list classes", "none; is it empty?", fix=fix)
     return names
 
 
@@ -344,7 +340,6 @@ def whole(text: str) -> int | None:
 def text_in(path: Path) -> str:
     """The file as text; what is neither UTF-8 nor UTF-16 becomes U+FFFD."""
     path = Path(path)
-    if not path.is_file():
-        got = f"the folder {path}" if path.is_dir() else f"no file {path}"
-        raise PalpateError("The list must be a file", got, "Check the path")
+    got = f"the folder {path}" if path.is_dir() else f"no file {path}"
+    require(path.is_file(), None, "The list must be a file", got, fix="Check the path")
     return decoded(path.read_bytes())

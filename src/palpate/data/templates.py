@@ -22,7 +22,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from palpate.core import PalpateError, Problem
+from palpate.core import PalpateError, Problem, require
 from palpate.data.manifest import CLIMBS, DIGITS, IMAGE_COLUMNS
 
 _TOKEN = re.compile(
@@ -72,8 +72,8 @@ class Template:
         for token in _TOKEN.finditer(path):
             name, spec = token["deep"] or token["field"], "**" if token["deep"] else token["spec"]
             spec = "d" if name == "frame" and not spec else spec or ""
-            known = spec in ("", "d", "**") and (not name or name.isidentifier())
-            if token["wrong"] or not known:
+            readable = spec in ("", "d", "**") and (not name or name.isidentifier())
+            if token["wrong"] or not readable:
                 raise wrong("must have fields that can be read", f"{token[0]!r} in {text!r}")
             if name in IMAGE_COLUMNS:
                 must = f"must have fields other than {', '.join(IMAGE_COLUMNS)}"
@@ -134,10 +134,11 @@ def walk(root: Path, suffixes: tuple[str, ...] = ("",)) -> tuple[list[str], list
     seen: set[str] = set()
     home = os.path.realpath(root)
     for folder, below, names in os.walk(root, followlinks=True):
-        real, place = os.path.realpath(folder), os.path.relpath(folder, root).replace(os.sep, "/")
-        prefix = "" if place == "." else f"{place}/"
+        real = os.path.realpath(folder)
+        relative = os.path.relpath(folder, root).replace(os.sep, "/")
+        prefix = "" if relative == "." else f"{relative}/"
         if real in seen or os.path.commonpath((real, home)) != home:
-            outside += [] if real in seen else [place]
+            outside += [] if real in seen else [relative]
             below.clear()
             continue
         seen.add(real)
@@ -175,16 +176,16 @@ def join(
     Returns:
         Rows with all fields and the path of each column, and what has no partner or too many.
     """
-    (first, matches), *others = sides.items()
+    (first, matches), *further = sides.items()
     rows = [fields | {first: path} for path, fields in matches]
     problems: list[Problem] = []
-    for side, matches in others:
-        known = {name for row in rows for name in row} - set(sides)
-        keys = tuple(sorted(known & {name for _, fields in matches for name in fields}))
-        if not keys and len(rows) > 1 and len(matches) > 1:
-            must = "Templates must share a field, which says what belongs together"
-            got = f"none for {len(rows)} files of {first} and {len(matches)} of {side}"
-            raise PalpateError(must, got, "Give one part of both paths the same field")
+    for side, matches in further:
+        shared = {name for row in rows for name in row} - set(sides)
+        keys = tuple(sorted(shared & {name for _, fields in matches for name in fields}))
+        must = "Templates must share a field, which says what belongs together"
+        got = f"none for {len(rows)} files of {first} and {len(matches)} of {side}"
+        fix = "Give one part of both paths the same field"
+        require(bool(keys) or len(rows) <= 1 or len(matches) <= 1, None, must, got, fix=fix)
         partners = _by_key([(fields, path) for path, fields in matches], keys)
         alone = _by_key([(row, row[first]) for row in rows], keys)
         for key in partners.keys() - alone.keys() if side not in optional else ():

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import polars as pl
 
-from palpate.core import PalpateError, Problem, ProblemsError, digest_lines, short
+from palpate.core import PalpateError, Problem, ProblemsError, digest_lines, require, short
 from palpate.data.images import file_digest
 from palpate.data.imported import Imported, splits_of
 from palpate.data.manifest import Manifest, write_parquet
@@ -29,7 +29,7 @@ WITNESSES = 64
 class Texts:
     """Texts by sample id."""
 
-    of: dict[str, str]  # id -> text, only where there is one
+    by_id: dict[str, str]  # id -> text, only where there is one
     ids: frozenset[str]  # all ids of the table
     source: str  # where they come from, with a digest: kept in manifests and in models
     #: :func:`image_digests` of the samples that they were made for.
@@ -108,11 +108,11 @@ def joined(manifest: Manifest, texts: Texts, where: Path, *, keep: bool = True) 
         got = f"{where}, with ids as {min(texts.ids, default='')!r} instead of {ids[0]!r}"
         raise PalpateError(must, got, fix)
     for name, digest in image_digests(manifest, texts.images).items():
-        if digest != texts.images[name]:
-            got = f"{where}, made for another image of {name!r}"
-            raise PalpateError(must, got, f"{fix}; a table of only id and text joins by id alone")
+        got = f"{where}, made for another image of {name!r}"
+        by_id = f"{fix}; a table of only id and text joins by id alone"
+        require(digest == texts.images[name], None, must, got, fix=by_id)
     old = manifest.column("text") if keep else [None] * len(ids)
-    new = [texts.of.get(name, text) for name, text in zip(ids, old, strict=True)]
+    new = [texts.by_id.get(name, text) for name, text in zip(ids, old, strict=True)]
     table = manifest.table.with_columns(text=pl.Series(new, dtype=pl.String))
     return replace(manifest, table=table, facts={**manifest.facts, "text_source": texts.source})
 
@@ -121,7 +121,7 @@ def with_texts(imported: Imported, texts: Texts, where: Path) -> Imported:
     """An import with texts from a table; samples without one there keep theirs."""
     manifest = joined(imported.manifest, texts, where)
     suspicious = list(imported.suspicious)
-    if absent := [name for name in manifest.ids if name not in texts.of]:
+    if absent := [name for name in manifest.ids if name not in texts.by_id]:
         text = f"{len(absent)} of {len(manifest)} samples have no text there, first {absent[0]!r}"
         suspicious.append(Problem(str(where), "no-text", text))
     if unknown := sorted(texts.ids.difference(manifest.ids)):

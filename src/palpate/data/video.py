@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from palpate.core import MissingExtraError, PalpateError
+from palpate.core import MissingExtraError, PalpateError, require
 
 REWRITE = "Write it as MP4 again: ffmpeg -i FILE -c copy NEW.mp4"
 
@@ -45,8 +45,8 @@ class VideoReader:
             raise MissingExtraError("av", "video", "Reading video files") from None
         self.path = Path(path)
         self._errors: tuple[type[Exception], ...] = (FFmpegError, OSError)
-        if not self.path.is_file():
-            raise PalpateError("The video must exist", f"no file {self.path}", "Check the path")
+        fix = "Check the path"
+        require(self.path.is_file(), None, "The video must exist", f"no file {self.path}", fix=fix)
         try:
             self._container: Any = av.open(str(self.path), metadata_errors="replace")
         except self._errors as error:
@@ -74,9 +74,9 @@ class VideoReader:
         Raises:
             PalpateError: if ``k`` lies outside the video, or the file breaks off before it.
         """
-        if not 0 <= k < len(self):
-            must = f"A frame of {self.path} must lie between 0 and {len(self) - 1}"
-            raise PalpateError(must, str(k), "Take the numbers from this video's list")
+        must = f"A frame of {self.path} must lie between 0 and {len(self) - 1}"
+        fix = "Take the numbers from this video's list"
+        require(0 <= k < len(self), None, must, str(k), fix=fix)
         if self._last is None or self._last[0] != k:
             self._last = (k, self._reach(k))
         return self._last[1]
@@ -96,20 +96,20 @@ class VideoReader:
         from av.video.reformatter import Interpolation, VideoReformatter
 
         images = np.empty((len(self), size[1], size[0], 3), np.uint8)
-        resize, place = VideoReformatter().reformat, {pts: k for k, pts in enumerate(self._pts)}
+        resize, position = VideoReformatter().reformat, {pts: k for k, pts in enumerate(self._pts)}
         area = Interpolation.AREA
         self._last = None
         self._seek(self._keys[0][1] if self._keys else self._pts[0])
         assert self._decoded is not None
         try:
             for frame in self._decoded:
-                if (k := place.pop(frame.pts, None)) is not None:
+                if (k := position.pop(frame.pts, None)) is not None:
                     image = resize(frame, *size, "rgb24", interpolation=area)
                     images[k] = image.to_ndarray()
         except self._errors as error:
             raise self._broken(f"a frame that cannot be decoded ({_reason(error)})") from None
-        if place:
-            k = min(place.values())
+        if position:
+            k = min(position.values())
             raise self._broken(f"frame {k} of {len(self)} cannot be decoded")
         return images
 

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import inspect
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from palpate.core import PalpateError, few, require_choice, require_regular
+from palpate.core import PalpateError, few, require, require_choice, require_regular
 from palpate.data.formats import (
     hct,
     huggingface,
@@ -47,16 +46,15 @@ __all__ = [
     "Row",
     "Scan",
     "recognized",
+    "require_options",
     "require_source",
-    "scan_options",
 ]
 
 
 def require_source(source: Path) -> None:
     """Raise ``PalpateError`` if there is nothing at the path of a data set."""
-    if not source.exists():
-        fix = "Check the path; a data set on the hub needs the format hf"
-        raise PalpateError("must exist", f"nothing at {source}", fix, argument="source")
+    fix = "Check the path; a data set on the hub needs the format hf"
+    require(source.exists(), "source", "must exist", f"nothing at {source}", fix=fix)
 
 
 def recognized(
@@ -68,10 +66,10 @@ def recognized(
     if name == "auto" or not FORMATS[name].remote:
         require_source(source)
     if name == "auto":
-        given = {c: text for c in IMAGE_COLUMNS if (text := (options or {}).get(c))}
+        templates = {c: text for c in IMAGE_COLUMNS if (text := (options or {}).get(c))}
         looks = (n for n, form in FORMATS.items() if form.detect(source))
-        templated = "videos" if given and is_templated(source, given) else "pairs"
-        name = templated if given else next(looks, "")
+        templated = "videos" if templates and is_templated(source, templates) else "pairs"
+        name = templated if templates else next(looks, "")
     if not name:
         must = f"must hold images, videos, a table or a known data set ({', '.join(FORMATS)})"
         fix = "Check the path, or write a table of its images"
@@ -81,21 +79,20 @@ def recognized(
     return name, FORMATS[name]
 
 
-def scan_options(name: str, form: Format, options: dict[str, Any]) -> dict[str, Any]:
-    """The given options that the scan of a format takes; some matter to an import alone.
+def require_options(name: str, form: Format, options: dict[str, Any]) -> dict[str, Any]:
+    """The options of a format that are not None; some matter to an import alone.
 
     Raises:
         PalpateError: if an option does not belong to the format.
     """
-    given = {key: value for key, value in options.items() if value is not None}
-    known = {*form.options, "size"}  # which may be without use
-    if unknown := sorted(set(given) - known):
+    values = {key: value for key, value in options.items() if value is not None}
+    accepted = {*form.options, "size", "into"}  # the last two may be without use
+    if unknown := sorted(set(values) - accepted):
         takes = ", ".join(k for k in form.options if k not in ("skip_bad", "check", "progress"))
-        must, got = f"must be left out for the format {name}", repr(given[unknown[0]])
+        must, got = f"must be left out for the format {name}", repr(values[unknown[0]])
         fix = f"This format takes {takes or 'no options'}"
         raise PalpateError(must, got, fix, argument=unknown[0])
-    names = inspect.signature(form.scan).parameters
-    return {key: value for key, value in given.items() if key in names}
+    return values
 
 
 def _contents(source: Path) -> str:

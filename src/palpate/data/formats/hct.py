@@ -37,7 +37,7 @@ from functools import cache
 from pathlib import Path, PurePosixPath
 from typing import Literal
 
-from palpate.core import PalpateError, Progress, Split, quiet, require_choice
+from palpate.core import Progress, Split, quiet, require, require_choice
 from palpate.data.formats import tvl
 from palpate.data.formats.layout import report_missing_folders, subfolders, suspect_rows
 from palpate.data.images import BROKEN, in_threads, opened
@@ -93,9 +93,8 @@ def scan(source: Path, *, swap: Swap = "report", progress: Progress = quiet) -> 
     """
     require_choice("swap", swap, ("report", "fix"))
     root, rigs = find(Path(source))
-    if not rigs:
-        must = f"{source} must be HCT: {LOOKS_FOR}"
-        raise PalpateError(must, "none of these", f"Unpack it from {tvl.URL}")
+    must = f"{source} must be HCT: {LOOKS_FOR}"
+    require(bool(rigs), None, must, "none of these", fix=f"Unpack it from {tvl.URL}")
     result = Scan(root, {"layout": f"hct: {', '.join(rigs)}"} | world_facts(root))
     files = _read_lists(result, rigs)
     keys = sorted({_key(row) for _, row in result.rows})

@@ -24,7 +24,7 @@ from typing import Any
 import polars as pl
 from PIL import Image
 
-from palpate.core import PalpateError, Progress, atomic_path, inside, quiet
+from palpate.core import PalpateError, Progress, atomic_path, inside, quiet, require
 from palpate.data.formats.huggingface_source import Source, first_line, open_source
 from palpate.data.images import BROKEN, Check, form_of
 from palpate.data.manifest import IMAGE_COLUMNS, PART_NAMES, SCHEMA
@@ -54,7 +54,7 @@ def detect(source: Path) -> bool:
     saved = (("dataset_dict.json",), ("state.json", "dataset_info.json"))
     if any(all((source / name).is_file() for name in names) for names in saved):
         return True
-    shards = any(any((source / place).glob("*.parquet")) for place in (".", "data"))
+    shards = any(any((source / folder).glob("*.parquet")) for folder in (".", "data"))
     return source.is_dir() and shards and not (source / "manifest.parquet").is_file()
 
 
@@ -96,7 +96,7 @@ class _Store:
 
     folder: Path | None
     created: list[Path]
-    how: Check
+    check: Check
     checked: dict[bytes, tuple[str, str | None]] = field(default_factory=dict)
     paths: dict[bytes, str] = field(default_factory=dict)
 
@@ -108,7 +108,7 @@ class _Store:
         """
         digest = hashlib.blake2b(data, digest_size=16).digest()
         if digest not in self.checked:
-            self.checked[digest] = _checked(data, self.how)
+            self.checked[digest] = _checked(data, self.check)
         kind, reason = self.checked[digest]
         if reason:
             return "bad-image", reason
@@ -122,15 +122,15 @@ class _Store:
             self.created.append(path)
             with atomic_path(path) as part:
                 part.write_bytes(data)
-        elif path.read_bytes() != data:
-            must = "Images of an earlier import must be the same"
-            raise PalpateError(must, f"another one at {path}", "Choose another folder")
+        else:
+            must, fix = "Images of an earlier import must be the same", "Choose another folder"
+            require(path.read_bytes() == data, None, must, f"another one at {path}", fix=fix)
 
 
-def _checked(data: bytes, how: Check) -> tuple[str, str | None]:
+def _checked(data: bytes, check: Check) -> tuple[str, str | None]:
     """(format of an image, why it is unusable or None)."""
     try:
-        return form_of(io.BytesIO(data), how), None
+        return form_of(io.BytesIO(data), check), None
     except Image.UnidentifiedImageError:
         return "", "not an image" if data else "an empty file (0 bytes)"
     except BROKEN as error:
@@ -203,8 +203,8 @@ class _BatchReader:
         sources = {target: self.maps.source(target) for target in IMAGE_COLUMNS}
         stored = {t: c for t, c in sources.items() if c and c in self.source.images}
         plain = self.maps.without(list(stored))
-        texts = {n: pl.Series(self._texts(n), dtype=pl.String) for n in plain.columns}
-        cells = plain.apply(pl.DataFrame({LINE: range(count)}).with_columns(**texts))
+        texts = [pl.Series(n, self._texts(n), dtype=pl.String) for n in plain.columns]
+        cells = plain.apply(pl.DataFrame({LINE: range(count)}).with_columns(texts))
         problems = self.result.problems
         usable, inconclusive = manifest_rows(cells, count, self.where, classes, problems)
         self.result.inconclusive += inconclusive
@@ -265,8 +265,8 @@ def _bytes(source: Source, value: Any) -> bytes | tuple[str, str] | None:
     path = value.get("path") if isinstance(value, dict) else value
     if not path:
         return None
-    place = None if source.folder is None else inside(source.folder, str(path))
-    if place is None:
+    inner = None if source.folder is None else inside(source.folder, str(path))
+    if inner is None:
         text = f"the path {path!r} leaves the data set, and the image is not stored in it"
         return "outside-root", text
-    return place.read_bytes() if place.is_file() else ("missing-file", f"no file {path!r}")
+    return inner.read_bytes() if inner.is_file() else ("missing-file", f"no file {path!r}")

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from palpate.core import MissingExtraError, PalpateError
+from palpate.core import MissingExtraError, PalpateError, require
 
 #: Kinds of local folders and of hub data sets that are opened; none of them runs code of others.
 LOCAL, REMOTE = ("parquet", "arrow", "imagefolder"), ("parquet",)
@@ -41,15 +41,15 @@ def open_source(source: Path, config: str | None = None, revision: str | None = 
     name = source.name if local else source.as_posix()
     loaded = _loaded(source, name, config, revision)
     splits: dict[str, Any] = dict(loaded) if isinstance(loaded, dict) else {"": loaded}
-    if not splits:
-        raise PalpateError(f"The data set {name} must hold rows", "none", "Check what wrote it")
+    fix = "Check what wrote it"
+    require(bool(splits), None, f"The data set {name} must hold rows", "none", fix=fix)
     features = dict(next(iter(splits.values())).features or {})
     images = [n for n, f in features.items() if isinstance(f, datasets.Image)]
     for split, data in splits.items():
-        if list(data.features or {}) != list(features):
-            must = f"All parts of {name} must have the columns {', '.join(features)}"
-            got = f"{split} with {', '.join(data.features or {}) or 'none'}"
-            raise PalpateError(must, got, "Import the parts one by one")
+        must = f"All parts of {name} must have the columns {', '.join(features)}"
+        got = f"{split} with {', '.join(data.features or {}) or 'none'}"
+        fix = "Import the parts one by one"
+        require(list(data.features or {}) == list(features), None, must, got, fix=fix)
         for image in images:
             data = data.cast_column(image, datasets.Image(decode=False))
         splits[split] = data.with_format(None)
@@ -121,17 +121,17 @@ def _require_hub(name: str, revision: str | None) -> None:
         raise PalpateError(must, first_line(error), fix) from None
 
 
-def _streamed(place: str, config: str | None, revision: str | None, local: bool) -> Any:
+def _streamed(name: str, config: str | None, revision: str | None, local: bool) -> Any:
     """Parquet shards or an image folder."""
     import datasets
 
     options: dict[str, Any] = {} if local else {"revision": revision}
     if "trust_remote_code" in inspect.signature(datasets.load_dataset_builder).parameters:
         options["trust_remote_code"] = False  # versions that have the option differ in its default
-    builder = datasets.load_dataset_builder(place, config, **options)
+    builder = datasets.load_dataset_builder(name, config, **options)
     kinds = LOCAL if local else REMOTE
     if builder.name not in kinds:
-        must = f"{place} must be made of {' or '.join(kinds)} files"
+        must = f"{name} must be made of {' or '.join(kinds)} files"
         fix = "Convert it to Parquet" if local else "The hub keeps a copy in Parquet"
         example = None if local else {"revision": "refs/convert/parquet"}
         raise PalpateError(must, str(builder.name), fix, example=example)

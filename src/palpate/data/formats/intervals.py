@@ -67,22 +67,11 @@ def detect(source: Path) -> bool:
     return _is_bare(header) or set(NEEDED) <= set(header)
 
 
-def scan(
-    source: Path,
-    *,
-    root: Path | None = None,
-    columns: Mapping[str, str] | None = None,
-    classes: Path | None = None,
-    every: int = 1,
-    sensor: str | None = None,
-    size: int | None = None,
-    check: Check = "decode",
-    into: Into | None = None,
-    progress: Progress = quiet,
-) -> Scan:
-    """Read a list and its recordings; without ``into`` nothing is written.
+@dataclass(frozen=True, kw_only=True)
+class Options:
+    """What a list and its recordings are read by.
 
-    Options:
+    Attributes:
         root: folder of the recordings (default: that of the list).
         columns: ``video``, ``start``, ``end``, ``material`` ... -> map expression.
         classes: table of classes, whose numbers are the labels.
@@ -90,14 +79,33 @@ def scan(
         sensor: the tactile sensor.
         size: their shorter side is reduced to so many pixels.
     """
+
+    root: Path | None = None
+    columns: Mapping[str, str] | None = None
+    classes: Path | None = None
+    every: int = 1
+    sensor: str | None = None
+    size: int | None = None
+
+
+def scan(
+    source: Path,
+    options: Options,
+    *,
+    check: Check = "decode",
+    into: Into | None = None,
+    progress: Progress = quiet,
+) -> Scan:
+    """Read a list and its recordings; without ``into`` nothing is written."""
+    every, columns = options.every, options.columns
     require(every >= 1, "every", "must be at least 1", every)
-    source, base = Path(source), Path(source).parent if root is None else Path(root)
-    if not base.is_dir():
-        must = "must be the folder of the recordings"
-        raise PalpateError(must, f"no folder {base}", "Check the path", argument="root")
+    source = Path(source)
+    base = source.parent if options.root is None else Path(options.root)
+    must = "must be the folder of the recordings"
+    require(base.is_dir(), "root", must, f"no folder {base}", fix="Check the path")
     result = Scan(base, {"dataset": source.stem})
-    work = Recordings(result, into, require_videos(base), {}, size)
-    listed = _read(result, source, columns, classes)
+    work = Recordings(result, into, require_videos(base), {}, options.size)
+    listed = _read(result, source, columns, options.classes)
     result.inconclusive = sum(i.inconclusive for i in listed)
     contacts = _contacts(work, listed, progress)
     rows = [row for name in contacts for row in _frames(work, name, contacts[name], every)]
@@ -109,11 +117,11 @@ def scan(
             words[name].values[row.video, row.frame] = word
     column = f"column {(columns or {}).get('text', 'text')}"
     result.facts["text_source"] = column if words["text"].values else "none"
-    work.add(rows, check=check, progress=progress, sensor=sensor, words=words)
+    work.add(rows, check=check, progress=progress, sensor=options.sensor, words=words)
     return result
 
 
-FORMAT = Format(FACTS, detect, LOOKS_FOR, scan)
+FORMAT = Format(FACTS, detect, LOOKS_FOR, scan, record=Options)
 
 
 def _is_bare(header: list[str]) -> bool:

@@ -17,7 +17,7 @@ from functools import cache
 from pathlib import Path, PurePosixPath
 from typing import Any, Generic, TypeGuard, TypeVar
 
-from palpate.core import PARTS, PalpateError, Split, few, inside
+from palpate.core import PARTS, PalpateError, Split, few, inside, require
 from palpate.data.images import SUFFIXES
 from palpate.data.manifest import CLIMBS, DIGITS
 from palpate.data.scanning import Facts, Row, Scan
@@ -38,43 +38,43 @@ Key = tuple[str, int] | tuple[str, str]
 class Images(Generic[K]):
     """The images of one folder."""
 
-    place: str  # the folder, relative to the root
+    folder: str  # the folder, relative to the root
     #: Key (frame number or stem) -> file name, in order.
     files: dict[K, str] = field(default_factory=dict)
 
     def path(self, key: K) -> str:
         """Path of an image, relative to the root."""
-        return f"{self.place}/{self.files[key]}"
+        return f"{self.folder}/{self.files[key]}"
 
 
 def numbered(
-    scan: Scan, place: str, pattern: str = NUMBER, *, suffixes: Sequence[str] = SUFFIXES
+    scan: Scan, folder: str, pattern: str = NUMBER, *, suffixes: Sequence[str] = SUFFIXES
 ) -> Images[int]:
     """The images of a folder by number; an absent folder has none.
 
     Args:
         scan: duplicate numbers become its problems, images without a number are suspicious.
-        place: folder relative to the root; its subfolders are not read.
+        folder: relative to the root; its subfolders are not read.
         pattern: of the whole stem, with one group: the number.
         suffixes: of images, in lower case; other files are not images.
     """
     files: dict[int, str] = {}
     unnumbered: list[str] = []
-    for name in file_names(scan.base / place, suffixes):
+    for name in file_names(scan.base / folder, suffixes):
         match = re.fullmatch(pattern, name.rpartition(".")[0])
         if match is None or len(match[1]) > DIGITS:
             unnumbered.append(name)
         elif (before := files.setdefault(int(match[1]), name)) != name:
-            scan.problem(f"{place}/{name}", "duplicate-frame", f"{before} has the same number")
-    scan.suspect(place, "unknown-name", "images that carry no frame number", unnumbered)
-    return Images(place, {k: files[k] for k in sorted(files)})
+            scan.problem(f"{folder}/{name}", "duplicate-frame", f"{before} has the same number")
+    scan.suspect(folder, "unknown-name", "images that carry no frame number", unnumbered)
+    return Images(folder, {k: files[k] for k in sorted(files)})
 
 
-def named(scan: Scan, place: str) -> Images[str]:
+def named(scan: Scan, folder: str) -> Images[str]:
     """The images of a folder by stem, in natural order; a PNG goes before another form."""
-    names = sorted(file_names(scan.base / place), key=lambda n: n.lower().endswith(".png"))
+    names = sorted(file_names(scan.base / folder), key=lambda n: n.lower().endswith(".png"))
     files = {name.rpartition(".")[0]: name for name in names}
-    return Images(place, {stem: files[stem] for stem in sorted(files, key=natural)})
+    return Images(folder, {stem: files[stem] for stem in sorted(files, key=natural)})
 
 
 def paired(scan: Scan, tactile: Images[K], vision: Images[K]) -> list[K]:
@@ -84,12 +84,12 @@ def paired(scan: Scan, tactile: Images[K], vision: Images[K]) -> list[K]:
     """
     for images, partner, side in ((tactile, vision, "vision"), (vision, tactile, "tactile")):
         if images.files and not partner.files:
-            kind = "missing-frames" if (scan.base / partner.place).is_dir() else "missing-folder"
-            text = f"no {side} images here, for {len(images.files)} in {images.place}"
-            scan.problem(partner.place, kind, text)
+            kind = "missing-frames" if (scan.base / partner.folder).is_dir() else "missing-folder"
+            text = f"no {side} images here, for {len(images.files)} in {images.folder}"
+            scan.problem(partner.folder, kind, text)
         elif partner.files:
             for key in images.files.keys() - partner.files.keys():
-                text = f"no {side} image {key!r} in {partner.place}"
+                text = f"no {side} image {key!r} in {partner.folder}"
                 scan.problem(images.path(key), "unpaired", text)
     return [key for key in tactile.files if key in vision.files]
 
@@ -106,9 +106,9 @@ def report_missing_folders(scan: Scan) -> None:
         if inside(scan.base, folder) is None:
             return "outside-root", f"the folder {folder!r} leaves the root {scan.base}"
         parents = PurePosixPath(folder).parents
-        for place in (*map(str, reversed(parents)), folder):
-            if not (scan.base / place).is_dir():
-                return "missing-folder", f"no folder {place!r} in {scan.base}"
+        for name in (*map(str, reversed(parents)), folder):
+            if not (scan.base / name).is_dir():
+                return "missing-folder", f"no folder {name!r} in {scan.base}"
         return None
 
     places: dict[tuple[str, str], list[str]] = {}
@@ -159,17 +159,16 @@ def natural(name: str) -> tuple[int, int, str]:
 def require_folder(source: Path, name: str) -> Path:
     """The source of a data set, which must be a folder."""
     source = Path(source)
-    if not source.is_dir():
-        got = f"the file {source}" if source.exists() else f"nothing at {source}"
-        raise PalpateError(f"The source of {name} must be a folder", got, "Check the path")
+    got = f"the file {source}" if source.exists() else f"nothing at {source}"
+    fix = "Check the path"
+    require(source.is_dir(), None, f"The source of {name} must be a folder", got, fix=fix)
     return source
 
 
 def require_layout(root: Path, looks_for: str, facts: Facts, *, complete: object) -> None:
     """Raise an error that lists the folders of a source, unless ``complete`` is true."""
-    if not complete:
-        fix = f"Fetch the data from {facts.url}"
-        raise PalpateError(f"{root} must hold {looks_for}", few(subfolders(root)), fix)
+    fix = f"Fetch the data from {facts.url}"
+    require(bool(complete), None, f"{root} must hold {looks_for}", few(subfolders(root)), fix=fix)
 
 
 def read_json_file(scan: Scan, path: Path) -> Any:
@@ -261,11 +260,11 @@ def has_listed_videos(source: Path) -> bool:
 def find_videos(root: Path) -> dict[str, Mapping[str, Path | None]]:
     """Recordings by name; extracted frames go before the raw video."""
     videos: dict[str, Mapping[str, Path | None]] = {}
-    for place in PLACES:
-        for name in subfolders(root / place):
+    for parent in PLACES:
+        for name in subfolders(root / parent):
             paths: dict[str, Path | None] = {}
             for modality, (frames, video) in RECORDED.items():
-                folder, file = (root / place / name / part for part in (frames, video))
+                folder, file = (root / parent / name / part for part in (frames, video))
                 paths[modality] = folder if folder.is_dir() else file if file.is_file() else None
             if any(paths.values()):
                 videos.setdefault(name, paths)

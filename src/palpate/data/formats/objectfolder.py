@@ -29,7 +29,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from palpate.core import PalpateError, Progress, quiet
+from palpate.core import Progress, quiet, require
 from palpate.data.formats.layout import (
     is_split,
     named,
@@ -95,30 +95,30 @@ def _numbers(folder: Path) -> list[str]:
     return [name for name in subfolders(folder) if name.isdecimal()]
 
 
-def _suspect_unnumbered(result: Scan, place: str) -> None:
-    odd = [name for name in subfolders(result.base / place) if not name.isdecimal()]
-    result.suspect(place, "unknown-folder", "skipped, as not a number", odd)
+def _suspect_unnumbered(result: Scan, folder: str) -> None:
+    odd = [name for name in subfolders(result.base / folder) if not name.isdecimal()]
+    result.suspect(folder, "unknown-folder", "skipped, as not a number", odd)
 
 
 def _object(result: Scan, name: str, material: str | None) -> None:
     """Add the images of one object's trials."""
-    place = f"{name}/tactile_data"
-    trials = _numbers(result.base / place)
-    _suspect_unnumbered(result, place)
+    parent = f"{name}/tactile_data"
+    trials = _numbers(result.base / parent)
+    _suspect_unnumbered(result, parent)
     if not trials:
-        result.problem(place, "missing-folder", "the object has no trial")
+        result.problem(parent, "missing-folder", "the object has no trial")
     single: list[str] = []
     for trial in trials:
-        folder = f"{place}/{trial}/0/gelsight"
+        folder = f"{parent}/{trial}/0/gelsight"
         images = numbered(result, folder, suffixes=(".png",))
         if not images.files:
             kind = "frames" if (result.base / folder).is_dir() else "folder"
             result.problem(folder, f"missing-{kind}", "the trial has no PNG images")
             continue
-        first, *others = images.files
-        if not others:  # an image cannot be its own background
+        first, *further = images.files
+        if not further:  # an image cannot be its own background
             single.append(trial)
-        for k in others or [first]:
+        for k in further or [first]:
             row = {
                 "id": f"{name}/{trial}/{k}",
                 "video": f"{name}/{trial}",
@@ -126,11 +126,11 @@ def _object(result: Scan, name: str, material: str | None) -> None:
                 "object": name,
                 "material": material,
                 "tactile": images.path(k),
-                "background": images.path(first) if others else None,
+                "background": images.path(first) if further else None,
                 "sensor": SENSOR,
             }
             result.rows.append((images.path(k), row))
-    result.suspect(place, "no-background", "trials of one image, which is a sample", single)
+    result.suspect(parent, "no-background", "trials of one image, which is a sample", single)
 
 
 def _materials(result: Scan) -> dict[int, str]:
@@ -139,9 +139,10 @@ def _materials(result: Scan) -> dict[int, str]:
     if not path.is_file():
         return {}
     table = open_table(path)
-    if not {"Index", "Material"} <= set(table.names):
-        must = f"{path} must have the columns Index, Name, Material"
-        raise PalpateError(must, ", ".join(table.names) or "none", "Fetch it again")
+    must = f"{path} must have the columns Index, Name, Material"
+    fix = "Fetch it again"
+    got = ", ".join(table.names) or "none"
+    require({"Index", "Material"} <= set(table.names), None, must, got, fix=fix)
     materials: dict[int, str] = {}
     for line, index, material in table.read(["Index", "Material"]).iter_rows():
         where = f"{path}:{line}"

@@ -24,12 +24,13 @@ from __future__ import annotations
 import os
 import posixpath
 from collections.abc import Mapping
+from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
 
 import polars as pl
 
-from palpate.core import PalpateError, Progress, few, quiet
+from palpate.core import PalpateError, Progress, few, quiet, require
 from palpate.data.detection import (
     SIDES,
     TARGETS,
@@ -71,22 +72,11 @@ def detect(source: Path) -> bool:
     return any(name.lower().endswith(SUFFIXES) for name in files)
 
 
-def scan(
-    source: Path,
-    *,
-    vision: str | None = None,
-    tactile: str | None = None,
-    background: str | None = None,
-    root: Path | None = None,
-    columns: Mapping[str, str] | None = None,
-    names: str | None = None,
-    classes: Path | None = None,
-    side: Side | None = None,
-    progress: Progress = quiet,
-) -> Scan:
-    """Read the rows of a table, or the images of a folder.
+@dataclass(frozen=True, kw_only=True)
+class Options:
+    """What a table or a folder of images is read by.
 
-    Options:
+    Attributes:
         vision: template of the photos of a folder; without any template the names are searched.
         tactile: template of its tactile images.
         background: template of its tactile images without contact.
@@ -98,26 +88,40 @@ def scan(
             skipped as inconclusive.
         side: what the images of a folder show, if all show one thing.
     """
+
+    vision: str | None = None
+    tactile: str | None = None
+    background: str | None = None
+    root: Path | None = None
+    columns: Mapping[str, str] | None = None
+    names: str | None = None
+    classes: Path | None = None
+    side: Side | None = None
+
+
+def scan(source: Path, options: Options, *, progress: Progress = quiet) -> Scan:
+    """Read the rows of a table, or the images of a folder."""
     source = Path(source)
-    maps = dict(columns or {})
-    labels = None if classes is None else read_classes(Path(classes))
+    maps = dict(options.columns or {})
+    labels = None if options.classes is None else read_classes(Path(options.classes))
     is_table = source.is_file()
     if not is_table:
         require_folder(source, FACTS.name)
-    given = {"vision": vision, "tactile": tactile, "background": background}
-    foreign = {"side": side, **given} if is_table else {"root": root, "names": names}
+    texts = {column: getattr(options, column) for column in (*SIDES, "background")}
+    foreign = {"side": options.side, **texts}
+    foreign = foreign if is_table else {"root": options.root, "names": options.names}
     if wrong := [name for name, value in foreign.items() if value is not None]:
         must = f"must come with a {'folder' if is_table else 'table'}"
         raise PalpateError(must, str(source), "Leave it out", argument=wrong[0])
     base = source.parent if is_table else source
-    result = Scan(base if root is None else Path(root))
+    result = Scan(base if options.root is None else Path(options.root))
     progress("reading rows", 0, 1)
     if is_table:
         result.facts["layout"] = f"table {source.suffix.lower()[1:] or 'csv'}"
-        _read_table(result, source, maps, names, labels)
+        _read_table(result, source, maps, options.names, labels)
     else:
-        templates = {column: text for column, text in given.items() if text is not None}
-        _read_folder(result, templates, side, maps, labels)
+        templates = {column: text for column, text in texts.items() if text is not None}
+        _read_folder(result, templates, options.side, maps, labels)
     progress("reading rows", 1, 1)
     result.suspicious += odd_groups(source, result.rows)
     absent = [name for name in SIDES if result.rows and name not in result.rows[0][1]]
@@ -133,7 +137,7 @@ def scan(
     return result
 
 
-FORMAT = Format(FACTS, detect, LOOKS_FOR, scan)
+FORMAT = Format(FACTS, detect, LOOKS_FOR, scan, record=Options)
 
 
 def _read_table(
@@ -173,7 +177,7 @@ def _read_table(
 
 def _read_folder(
     result: Scan,
-    given: Mapping[str, str],
+    texts: Mapping[str, str],
     side: Side | None,
     maps: Mapping[str, str],
     classes: Mapping[int, str] | None,
@@ -184,12 +188,11 @@ def _read_folder(
     text = "videos, which are read with a template of their own"
     result.suspect(result.base, "unmatched", text, videos)
     files = [path for path in files if path.lower().endswith(SUFFIXES)]
-    templates = parsed(given or templates_of(files, result.base, side))
+    templates = parsed(texts or templates_of(files, result.base, side))
     matches = {s: _distinct(result, found) for s, found in assign(files, templates).items()}
     for side_, template in templates.items():
-        if not matches[side_]:
-            got = f"{template.text}, which matches none of {few(files)}"
-            raise PalpateError("must match images", got, FIX, argument=side_)
+        got = f"{template.text}, which matches none of {few(files)}"
+        require(bool(matches[side_]), side_, "must match images", got, fix=FIX)
     rows, fields = joined(result, files, templates, matches, "images")
     first = next(iter(templates))
     if "background" in templates:

@@ -199,13 +199,13 @@ class Recordings:
                 self.background_frames[contact] = k
                 self.backgrounds[contact] = frames.path(k)
 
-    def _whole(self, rows: list[Row], how: Check, progress: Progress) -> list[Row]:
+    def _whole(self, rows: list[Row], check: Check, progress: Progress) -> list[Row]:
         """Check every image of folders in use once; keep the rows whose images are whole."""
-        if how == "none":
+        if check == "none":
             return rows
         first = {path: row for row in reversed(rows) for path in self._folder_images(row)}
         bad: set[Path] = set()
-        checked = in_threads(lambda p: check_image(p, how), first, "checking images", progress)
+        checked = in_threads(lambda p: check_image(p, check), first, "checking images", progress)
         for path, reason in checked:
             if reason:
                 bad.add(path)
@@ -250,17 +250,19 @@ class Recordings:
 
     def _decode(self, rows: list[Row], progress: Progress) -> list[Row]:
         """Decode what ``extract`` would; keep the rows whose images are whole."""
-        whole: set[tuple[str, str, int]] = set()
+        decoded: set[tuple[str, str, int]] = set()
 
         def work(job: _Job, stop: Event) -> None:
             video, modality, needed = job
             for k, _ in self.frames[video][modality].read(sorted(needed)):
                 if stop.is_set():
                     return
-                whole.add((video, modality, k))
+                decoded.add((video, modality, k))
 
         self._run("decoding frames", self._jobs(rows), work, rows, progress)
-        return [r for r in rows if all((r.video, m, r.frame) in whole for m in self._videos_of(r))]
+        return [
+            r for r in rows if all((r.video, m, r.frame) in decoded for m in self._videos_of(r))
+        ]
 
     def _check_streams(self, progress: Progress) -> None:
         """Report what looks wrong with whole recordings: lag, frozen streams, another gel ..."""
@@ -327,7 +329,7 @@ class Recordings:
 
     def _run(
         self,
-        what: str,
+        task: str,
         jobs: Sequence[_Job],
         work: Callable[[_Job, Event], None],
         rows: Sequence[Row],
@@ -344,7 +346,7 @@ class Recordings:
                 return f"{self.frames[job[0]][job[1]].source}: {error.got}"
             return None
 
-        for (video, _, _), text in in_threads(attempt, jobs, what, progress, stop=stop):
+        for (video, _, _), text in in_threads(attempt, jobs, task, progress, stop=stop):
             if text:
                 self.scan.problem(first[video].where, "bad-video", text)
 
@@ -359,14 +361,14 @@ class Recordings:
         sizes = {f"{v}/{m}": source(v, m).stat().st_size for v, m in sorted(videos)}
         if path.is_file():
             earlier = read_json(path, "record of the extracted frames")
-            known: dict[str, int] = earlier.pop("videos")
-            changed = [name for name, size in sizes.items() if known.get(name, size) != size]
-            if earlier != settings or changed:
-                must = f"Frames in {path.parent} must be of the same videos and the same settings"
-                got = f"other videos: {', '.join(changed)}"
-                got = got if changed else f"{earlier} there, {settings} here"
-                raise PalpateError(must, got, "Choose another folder, or remove that one")
-            sizes = known | sizes
+            sizes_before: dict[str, int] = earlier.pop("videos")
+            changed = [name for name, size in sizes.items() if sizes_before.get(name, size) != size]
+            must = f"Frames in {path.parent} must be of the same videos and the same settings"
+            got = f"other videos: {', '.join(changed)}"
+            got = got if changed else f"{earlier} there, {settings} here"
+            fix = "Choose another folder, or remove that one"
+            require(earlier == settings and not changed, None, must, got, fix=fix)
+            sizes = sizes_before | sizes
         else:
             into.created.append(path)
         write_json(path, {**settings, "videos": sizes})

@@ -98,12 +98,12 @@ FORMAT = Format(FACTS, detect, LOOKS_FOR, scan)
 
 def _images(result: Scan, side: str) -> Images[str]:
     """Id -> file of the images of one side."""
-    place = f"images_{side}"
-    names = file_names(result.base / place)
+    folder = f"images_{side}"
+    names = file_names(result.base / folder)
     matches = [(re.fullmatch(rf"image_(.+)_{side}\.\w+", name), name) for name in names]
     misnamed = [name for match, name in matches if not match]
-    result.suspect(place, "unknown-name", f"not named image_<id>_{side}", misnamed)
-    return Images(place, {match[1]: name for match, name in matches if match})
+    result.suspect(folder, "unknown-name", f"not named image_<id>_{side}", misnamed)
+    return Images(folder, {match[1]: name for match, name in matches if match})
 
 
 def _read_list(

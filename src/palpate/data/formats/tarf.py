@@ -20,7 +20,7 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
-from palpate.core import PalpateError, Progress, quiet
+from palpate.core import Progress, quiet, require
 from palpate.data.formats.layout import (
     is_split,
     natural,
@@ -77,9 +77,9 @@ def scan(source: Path, *, progress: Progress = quiet) -> Scan:
         progress("reading scenes", done, len(tactile))
         scales = vision.get(scene, [])
         scale = scales[0] if len(scales) == 1 else TACTILE_SCALE
-        if scales and scale not in scales:
-            must, got = f"The views of {scene!r} must have the scale {scale}", ", ".join(scales)
-            raise PalpateError(must, got, "Keep one scale, or fetch that one")
+        must, got = f"The views of {scene!r} must have the scale {scale}", ", ".join(scales)
+        fix = "Keep one scale, or fetch that one"
+        require(not scales or scale in scales, None, must, got, fix=fix)
         used |= {scale} if scene in tactile and scales else set()
         _scene(result, scene, scale, ids)
     names = [name for side in ("touch", "vision") for name in subfolders(root / side)]
@@ -118,7 +118,7 @@ def _scene(result: Scan, scene: str, view_scale: str, ids: dict[tuple[str, int],
     paths = [f"touch_bg/{name}/bg.jpg" for name in names]
     background = next((path for path in paths if (result.base / path).exists()), None)
     if background is None and tactile.files:
-        result.suspect(tactile.place, "no-background", "no touch_bg/ image of this scene")
+        result.suspect(tactile.folder, "no-background", "no touch_bg/ image of this scene")
     for k in paired(result, tactile, vision):
         row = {
             "id": ids[scene, k],

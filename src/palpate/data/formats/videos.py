@@ -89,24 +89,11 @@ def is_templated(source: Path, templates: Mapping[str, str]) -> bool:
     return any(assign(files, parsed).values())
 
 
-def scan(  # noqa: PLR0913 (a public verb)
-    source: Path,
-    *,
-    vision: str | None = None,
-    tactile: str | None = None,
-    background: str | None = None,
-    side: Side | None = None,
-    every: int | None = None,
-    max_per_contact: int | None = None,
-    sensor: str | None = None,
-    size: int | None = None,
-    check: Check = "decode",
-    into: Into | None = None,
-    progress: Progress = quiet,
-) -> Scan:
-    """Read a folder of videos; without ``into`` nothing is written.
+@dataclass(frozen=True, kw_only=True)
+class Options:
+    """What a folder of videos is read by.
 
-    Options:
+    Attributes:
         vision: template of the videos (or photos) of the scene; without any template the names are
             searched.
         tactile: template of the tactile videos.
@@ -117,14 +104,34 @@ def scan(  # noqa: PLR0913 (a public verb)
         sensor: the tactile sensor.
         size: their shorter side is reduced to so many pixels.
     """
-    given = {"vision": vision, "tactile": tactile, "background": background}
-    videos, result = _videos(require_folder(source, FACTS.name), given, side)
+
+    vision: str | None = None
+    tactile: str | None = None
+    background: str | None = None
+    side: Side | None = None
+    every: int | None = None
+    max_per_contact: int | None = None
+    sensor: str | None = None
+    size: int | None = None
+
+
+def scan(
+    source: Path,
+    options: Options,
+    *,
+    check: Check = "decode",
+    into: Into | None = None,
+    progress: Progress = quiet,
+) -> Scan:
+    """Read a folder of videos; without ``into`` nothing is written."""
+    every = options.every
+    videos, result = _videos(require_folder(source, FACTS.name), options)
     decoded = check == "decode" or into is not None
-    _require_amounts(videos, every if decoded else 1, max_per_contact)
-    work = _opened(result, into, videos, progress, size)
+    _require_amounts(videos, every if decoded else 1, options.max_per_contact)
+    work = _opened(result, into, videos, progress, options.size)
     contacts = _contacts(work, videos, progress) if decoded else {}
     rows = _rows(work, videos, contacts, every if decoded else 1)
-    rows = thin(rows, max_per_contact)
+    rows = thin(rows, options.max_per_contact)
     hidden: Cells = dict.fromkeys(ORDER)
     if into is not None:
         _require_contact(result, rows)
@@ -132,7 +139,7 @@ def scan(  # noqa: PLR0913 (a public verb)
         _copy_images(result.base, into, rows, videos)
         result.base, hidden = work.out, {}
         result.facts["frames"] = "in contact" if every is None else f"every {every} of whole videos"
-    for row, cell in zip(rows, _cells(work, rows, videos, sensor), strict=True):
+    for row, cell in zip(rows, _cells(work, rows, videos, options.sensor), strict=True):
         if "split" in cell:
             cell["split"] = PART_NAMES[cell["split"]]
             result.split_name, result.split_rule = "Orig", {"method": "official", "column": "split"}
@@ -140,30 +147,27 @@ def scan(  # noqa: PLR0913 (a public verb)
     return result
 
 
-FORMAT = Format(FACTS, detect, LOOKS_FOR, scan)
+FORMAT = Format(FACTS, detect, LOOKS_FOR, scan, record=Options)
 
 
-def _videos(
-    root: Path, given: Mapping[str, str | None], side: Side | None
-) -> tuple[dict[str, _Video], Scan]:
+def _videos(root: Path, options: Options) -> tuple[dict[str, _Video], Scan]:
     """The recordings by name, and a scan without rows that holds what was wrong or odd."""
     result = Scan(root, {"layout": "videos", "dataset": root.resolve().stem, "text_source": "none"})
-    texts = {column: text for column, text in given.items() if text is not None}
+    texts = {column: text for column in ORDER if (text := getattr(options, column)) is not None}
     files = walked(result, (*MOVING, *SUFFIXES))
     moving = [path for path in files if path.lower().endswith(MOVING)]
-    templates = parsed(texts or templates_of(moving, root, side, "videos", _naming_videos))
+    templates = parsed(texts or templates_of(moving, root, options.side, "videos", _naming_videos))
     matches = assign(files, templates)
     for column, template in templates.items():
         kinds = {path.lower().endswith(MOVING) for path, _ in matches[column]}
         images = column == "background" or (column == "vision" and "tactile" in templates)
-        if kinds not in ({True}, {False}) or (kinds == {False} and not images):
-            got = f"{template.text}, which matches none of {few(files)}"
-            got = got if not kinds else f"{template.text}, which matches images, too"
-            must = "must match images or videos" if images else "must match videos"
-            raise PalpateError(must, got, FIX, argument=column)
-        if "frame" in template.fields:
-            got, fix = f"{template.text} with the field frame", "Name it video"
-            raise PalpateError("must say which video, not frame", got, fix, argument=column)
+        got = f"{template.text}, which matches none of {few(files)}"
+        got = got if not kinds else f"{template.text}, which matches images, too"
+        must = "must match images or videos" if images else "must match videos"
+        require(kinds == {True} or (kinds == {False} and images), column, must, got, fix=FIX)
+        got, fix = f"{template.text} with the field frame", "Name it video"
+        must = "must say which video, not frame"
+        require("frame" not in template.fields, column, must, got, fix=fix)
     rows, fields = joined(result, moving, templates, matches, "videos")
     name_apart(rows, fields)
     return _named(rows, fields, result), result
@@ -204,9 +208,9 @@ def _require_amounts(
     videos: Mapping[str, _Video], every: int | None, max_per_contact: int | None
 ) -> None:
     require(every is None or every >= 1, "every", "must be at least 1", every)
-    if every is not None and max_per_contact is not None:
-        must, got = "must come without every", str(max_per_contact)
-        raise PalpateError(must, got, "Choose one", argument="max_per_contact")
+    must, got = "must come without every", str(max_per_contact)
+    fix = "Choose one"
+    require(every is None or max_per_contact is None, "max_per_contact", must, got, fix=fix)
     if every is None and videos and not any("tactile" in v.moving for v in videos.values()):
         must, got = "must be given", "videos without touch, in which no contact is found"
         raise PalpateError(must, got, "", argument="every", example={"every": 10})

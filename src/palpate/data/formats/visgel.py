@@ -32,7 +32,7 @@ from functools import lru_cache
 from itertools import islice
 from pathlib import Path
 
-from palpate.core import PalpateError, Progress, Split, few, quiet
+from palpate.core import Progress, Split, few, quiet, require
 from palpate.data.formats.layout import (
     Images,
     natural,
@@ -73,7 +73,7 @@ def detect(source: Path) -> bool:
     if _lists(source):
         return True
     folders = islice(_walk(source), PEEKS)
-    return any(place != "." and "frame0000.jpg" in names for place, names in folders)
+    return any(folder != "." and "frame0000.jpg" in names for folder, names in folders)
 
 
 def scan(source: Path, *, root: Path | None = None, progress: Progress = quiet) -> Scan:
@@ -98,9 +98,9 @@ FORMAT = Format(FACTS, detect, LOOKS_FOR, scan)
 
 def _lists(source: Path) -> dict[tuple[str, str], Path]:
     """(part, direction) -> list, from ``data_lst/`` or the folder itself."""
-    for place in (source / LISTS, source):
+    for folder in (source / LISTS, source):
         keys = [(part, way) for part in WORDS for way in DIRECTIONS]
-        paths = {(part, way): place / f"{WORDS[part]}_{way}.txt" for part, way in keys}
+        paths = {(part, way): folder / f"{WORDS[part]}_{way}.txt" for part, way in keys}
         if lists := {key: path for key, path in paths.items() if path.is_file()}:
             return lists
     return {}
@@ -193,9 +193,9 @@ def _read_recordings(result: Scan, progress: Progress) -> None:
         if any(re.fullmatch(FRAME, name.rpartition(".")[0]) for name in names):
             side = next((p.lower() for p in folder.split("/") if p.lower() in SIDES), "touch")
             places[side][_recording(folder)] = folder
-    if not places["touch"]:
-        got = few(sorted(places["vision"])) + " of vision"
-        raise PalpateError(f"{result.base} must hold {LOOKS_FOR}", got, f"See {FACTS.url}")
+    got = few(sorted(places["vision"])) + " of vision"
+    fix = f"See {FACTS.url}"
+    require(bool(places["touch"]), None, f"{result.base} must hold {LOOKS_FOR}", got, fix=fix)
     if not places["vision"]:
         result.facts["vision"] = "none in this layout"
     videos = sorted(places["touch"], key=lambda video: [natural(p) for p in video.split("/")])
@@ -204,12 +204,12 @@ def _read_recordings(result: Scan, progress: Progress) -> None:
         progress("reading recordings", done, len(videos))
         tactile = numbered(result, places["touch"][video], FRAME)
         reference = tactile.files.pop(0, None)
-        background = f"{tactile.place}/{reference}" if reference else None
+        background = f"{tactile.folder}/{reference}" if reference else None
         bare += [] if reference else [video]
         vision: Images[int] | None = None
         if places["vision"]:
-            place = places["vision"].get(video, f"vision of {video}")
-            vision = numbered(result, place, FRAME)
+            source = places["vision"].get(video, f"vision of {video}")
+            vision = numbered(result, source, FRAME)
             vision.files.pop(0, None)
         for k in tactile.files if vision is None else paired(result, tactile, vision):
             view = vision.path(k) if vision else None
@@ -224,7 +224,7 @@ def _read_recordings(result: Scan, progress: Progress) -> None:
 def _walk(root: Path) -> Iterator[tuple[str, list[str]]]:
     """(folder relative to the root, its files), in order, to a limited depth."""
     for folder, below, names in os.walk(root):
-        place = Path(folder).relative_to(root)
-        deeper = len(place.parts) < DEPTH
+        relative = Path(folder).relative_to(root)
+        deeper = len(relative.parts) < DEPTH
         below[:] = sorted((n for n in below if deeper and not n.startswith(".")), key=natural)
-        yield place.as_posix(), names
+        yield relative.as_posix(), names

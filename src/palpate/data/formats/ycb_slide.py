@@ -91,30 +91,30 @@ def scan(source: Path, *, part: Part | None = None, progress: Progress = quiet) 
 FORMAT = Format(FACTS, detect, LOOKS_FOR, scan)
 
 
-def _logs(place: Path, part: str) -> list[tuple[str, int, str]]:
+def _logs(parent: Path, part: str) -> list[tuple[str, int, str]]:
     """(object, number of the log, its folder), in order."""
     pattern, tactile, _ = LAYOUT[part]
     logs: list[tuple[str, int, str]] = []
-    for name in subfolders(place):
-        for folder in subfolders(place / name):
+    for name in subfolders(parent):
+        for folder in subfolders(parent / name):
             match = re.fullmatch(pattern, folder)
-            if match and (part == "real" or (place / name / folder / tactile).is_dir()):
+            if match and (part == "real" or (parent / name / folder / tactile).is_dir()):
                 logs.append((name, int(match[1]), folder))
     return sorted(logs)
 
 
-def _log(result: Scan, part: str, name: str, place: str, sparsh: str | None) -> None:
+def _log(result: Scan, part: str, name: str, parent: str, sparsh: str | None) -> None:
     """Add the frames of one log."""
     _, folder, pattern = LAYOUT[part]
-    tactile = numbered(result, f"{place}/{folder}", pattern)
+    tactile = numbered(result, f"{parent}/{folder}", pattern)
     if not tactile.files:
-        result.problem(place, "missing-frames", f"no images in {folder}/")
+        result.problem(parent, "missing-frames", f"no images in {folder}/")
         return
-    vision = numbered(result, f"{place}/{WEBCAM}", pattern) if part == "real" else Images[int]("")
+    vision = numbered(result, f"{parent}/{WEBCAM}", pattern) if part == "real" else Images[int]("")
     if part == "real" and not vision.files:
         text = f"no frames in {WEBCAM}/: {len(tactile.files)} samples have no vision"
-        result.suspect(place, "no-vision", text)
-    video = place.partition("/")[2]
+        result.suspect(parent, "no-vision", text)
+    video = parent.partition("/")[2]
     for k in paired(result, tactile, vision) if vision.files else tactile.files:
         row = {
             "id": f"{video}/{k}",

@@ -1,0 +1,12 @@
+"""What a bad input is answered with."""
+
+import pytest
+
+from palpate.core import PalpateError
+
+
+def fails(words, function, *args, **options):
+    """The error of a call, whose message must match ``words``."""
+    with pytest.raises(PalpateError, match=words or None) as caught:
+        function(*args, **options)
+    return caught.value
