@@ -3,14 +3,15 @@
 import dataclasses
 import json
 import re
+import shlex
 from importlib import import_module
 from pathlib import Path
 
 import pytest
 
 from forge.commands import call
-from palpate.cli import VERBS, main, terminal
-from palpate.cli.terminal import error_line, join_help_lines
+from palpate.cli import VERBS, main, running
+from palpate.cli.running import error_line, join_help_lines
 from palpate.core import PalpateError, Split
 
 
@@ -51,6 +52,14 @@ def test_fail_over_is_a_limit(capsys, lists, limit, status):
     ("args", "words"),
     [
         (["audti"], "Did you mean: palpate audit"),
+        (["scor", "--generated"], "Did you mean: palpate score"),
+        (["train", "generatr"], "Did you mean: palpate train generator"),
+        (["score"], "--generated and --reference must be given. Got none"),
+        (["preference", "serve"], "PATH must be given"),
+        (["audit", "a", "b", "--split"], "--split must have its values"),
+        (["audit", "a", "b", "--near-frames=x"], "--near-frames must be INT. Got x"),
+        (["audit", "a", "b", "--by", "tree"], "--by must be one of auto, contact, domain"),
+        (["split", "a", "b", "-o", "s", "--lists", "x", "y", "z", "--folds"], "--folds must"),
         (["validate", "--formats"], "Did you mean: --format."),
         (["validate", "--listt"], "Did you mean: --list."),
         (["audit", "no.txt", "such.txt"], "no.txt"),
@@ -110,6 +119,35 @@ def test_help_is_wrapped_by_the_terminal_and_not_by_the_source(capsys):
         join_help_lines(options)
         helps = [f.metadata.get("help", "") for f in dataclasses.fields(options)]
         assert not any("\n" in text for text in helps)
+
+
+@pytest.mark.parametrize(
+    ("argv", "arguments"),
+    [
+        (
+            "score --generated a b --reference r --sigma 10 median --no-controls",
+            {"generated": ("a", "b"), "sigma": (10.0, "median"), "controls": False, "names": None},
+        ),
+        (
+            "import d -o m --map vision=rgb 'video=substr(rgb, 1, 2)' --map id=n --every 0",
+            {"columns": {"vision": "rgb", "video": "substr(rgb, 1, 2)", "id": "n"}, "every": 0},
+        ),
+        ("validate d --as vision", {"source": "d", "side": "vision", "columns": None}),
+        ("split a b -o s --by object session", {"paths": ("a", "b"), "by": ("object", "session")}),
+        ("train encoder d -o e --device cpu", {"data": "d", "device": "cpu", "clip": None}),
+        ("generate -o t.png --text soft", {"photos": None, "text": "soft", "part": "test"}),
+    ],
+)
+def test_words_become_arguments(argv, arguments):
+    words = shlex.split(argv)
+    name = next(n for n in (" ".join(words[:2]), words[0]) if n in VERBS)
+    options = import_module(f"palpate.cli.{VERBS[name].module}").Options
+    parsed = running.parse(name, options, words[len(name.split()) :]).keywords()
+    plain = lambda v: str(v) if isinstance(v, Path) else v
+    flat = {
+        k: tuple(map(plain, v)) if isinstance(v, tuple) else plain(v) for k, v in parsed.items()
+    }
+    assert {k: flat[k] for k in arguments} == arguments
 
 
 def test_a_group_of_verbs_lists_them(capsys):
@@ -220,11 +258,11 @@ def test_an_error_of_all_processes_is_printed_by_the_first(monkeypatch, capsys):
     def fails(name, args):
         raise error
 
-    monkeypatch.setattr(terminal, "_call", fails)
+    monkeypatch.setattr(running, "_call", fails)
     error = PalpateError("It must hold", "not", "")
     printed = []
     for first, error.shared in ((False, False), (True, True), (False, True)):
-        monkeypatch.setattr(terminal, "FIRST", first)
+        monkeypatch.setattr(running, "FIRST", first)
         assert main(["split", "x"]) == 2
         printed.append(capsys.readouterr().err != "")
     assert printed == [True, True, False]

@@ -18,7 +18,8 @@ from palpate.data.manifest import Manifest
 
 
 def run(capsys, *args):
-    status = main(["audit", *map(str, args), "--json"])
+    words = [word for arg in args for word in shlex.split(str(arg))]
+    status = main(["audit", *words, "--json"])
     out, err = capsys.readouterr()
     return status, json.loads(out) if out else {}, err
 
@@ -31,8 +32,9 @@ def texture(seed, size=96):
 
 
 @pytest.fixture
-def folders(tmp_path):
-    """Two folders of 30 pairs without metadata: test 3 is train 5 brighter and moved."""
+def folders(tmp_path, monkeypatch):
+    """Two folders of 30 pairs without metadata, here: test 3 is train 5 brighter and moved."""
+    monkeypatch.chdir(tmp_path)
     for part, first in (("a", 0), ("b", 1000)):
         for k in range(30):
             for side, shift in (("vision", 0), ("tactile", 5000)):
@@ -48,17 +50,11 @@ def folders(tmp_path):
 
 
 def test_folders_without_metadata_are_compared_by_their_pictures(folders, capsys):
-    status, data, _ = run(
-        capsys, folders / "a", folders / "b", "--table", folders / "t.parquet", "--fail-over", 0.01
-    )
+    status, data, _ = run(capsys, "a b --table t.parquet --fail-over 0.01")
     assert status == 1
     kinds = {s["kind"]: s for s in data["signals"]}
-    assert set(kinds) == {
-        "identical sample",
-        "identical bytes",
-        "near-duplicate vision",
-        "near-duplicate tactile",
-    }
+    modalities = {"near-duplicate vision", "near-duplicate tactile"}
+    assert set(kinds) == {"identical sample", "identical bytes"} | modalities
     assert data["group"] == "none"
     assert kinds["identical bytes"]["flagged"] == 1
     # Without videos nothing is known to be unrelated: images are ranked, copied files flagged.
@@ -140,53 +136,35 @@ def test_the_next_commands_of_tactile_data_work_on_it(tmp_path, capsys, monkeypa
 
 
 def test_a_damaged_picture_is_named_and_the_others_are_compared(folders, capsys):
-    (folders / "b" / "vision" / "b1.png").write_bytes(b"")
-    path = folders / "b" / "vision" / "b2.png"
-    path.write_bytes(path.read_bytes()[:-40])
-    Image.open(folders / "b" / "vision" / "b4.png").convert("L").resize((200, 50)).save(
-        folders / "b" / "vision" / "b4.png"
-    )
-    Image.open(folders / "a" / "vision" / "a4.png").convert("RGBA").save(
-        folders / "a" / "vision" / "a4.png"
-    )
-    status, data, _ = run(capsys, folders / "a", folders / "b")
+    of_a, of_b = Path("a/vision"), Path("b/vision")
+    (of_b / "b1.png").write_bytes(b"")
+    (of_b / "b2.png").write_bytes((of_b / "b2.png").read_bytes()[:-40])
+    Image.open(of_b / "b4.png").convert("L").resize((200, 50)).save(of_b / "b4.png")
+    Image.open(of_a / "a4.png").convert("RGBA").save(of_a / "a4.png")
+    status, data, _ = run(capsys, "a", "b")
     assert status == 1
     vision = next(s for s in data["signals"] if s["kind"] == "near-duplicate vision")
     assert vision["checked"] == 28
     assert vision["worst"][0]["test"]["id"] == "3"
-    assert any(
-        note["code"] == "images-unreadable" and note["params"]["count"] == 2
-        for note in vision["notes"]
-    )
+    unreadable = [n["params"] for n in vision["notes"] if n["code"] == "images-unreadable"]
+    assert [params["count"] for params in unreadable] == [2]
 
 
 def test_a_page_a_table_and_json_are_written_whole(folders, capsys):
-    status, data, _ = run(
-        capsys,
-        folders / "a",
-        folders / "b",
-        "--page",
-        folders / "p.html",
-        "-o",
-        folders / "a.json",
-        "--table",
-        folders / "t.csv",
-    )
+    status, data, _ = run(capsys, "a b --page p.html -o a.json --table t.csv")
     assert status == 1
-    page = (folders / "p.html").read_text()
+    page = Path("p.html").read_text()
     assert "near-duplicate vision" in page
     assert len(page) < 10_000_000
-    assert (
-        json.loads((folders / "a.json").read_text())["leaking_samples"] == data["leaking_samples"]
-    )
-    assert (folders / "t.csv").read_text().startswith("id,video,frame,material,leaking")
+    assert json.loads(Path("a.json").read_text())["leaking_samples"] == data["leaking_samples"]
+    assert Path("t.csv").read_text().startswith("id,video,frame,material,leaking")
     assert not list(folders.glob(".*.work"))
-    for flags in (
-        ["--table", folders / "a.json"],
-        ["-o", folders / "a" / "vision" / "a1.png"],
-        ["--table", folders / "x.txt"],
-    ):
-        assert run(capsys, folders / "a", folders / "b", *flags)[0] == 2
+    # A page never replaces what lies beside it.
+    Path("q.json").write_text('{"a": 1}')
+    for flags in ("--table a.json", "-o a/vision/a1.png", "--table x.txt", "--page q.html"):
+        assert run(capsys, "a", "b", flags)[0] == 2, flags
+    assert run(capsys, "a b --page r.html -o r.json")[0] == 2
+    assert Path("q.json").read_text() == '{"a": 1}'
 
 
 def test_test_samples_that_an_encoder_has_seen_are_told_apart_from_train(tmp_path, capsys):
@@ -197,23 +175,15 @@ def test_test_samples_that_an_encoder_has_seen_are_told_apart_from_train(tmp_pat
     status, data, _ = run(capsys, *args)
     assert (status, data["leaking_samples"], data["against"]) == (1, 0, "train")
     (other,) = data["others"]
-    assert (other["against"], other["identical_samples"], other["leaking_samples"]) == (
-        "pretraining",
-        1,
-        2,
-    )
+    names = ("against", "identical_samples", "leaking_samples")
+    assert [other[name] for name in names] == ["pretraining", 1, 2]
     assert [run(capsys, *args, "--fail-over", limit)[0] for limit in (0.5, 1)] == [1, 0]
 
 
 def test_the_published_rough_lists_were_seen_in_pretraining(real_data, capsys):
     lists = real_data / "touch_and_go" / "lists"
-    _, data, _ = run(
-        capsys,
-        lists / "train_rough.txt",
-        lists / "test_rough.txt",
-        "--pretrain",
-        lists / "train.txt",
-    )
+    rough = (lists / "train_rough.txt", lists / "test_rough.txt")
+    _, data, _ = run(capsys, *rough, "--pretrain", lists / "train.txt")
     assert (data["leaked_fraction"], data["others"][0]["identical_samples"]) == (0.0, 3289)
 
 
@@ -221,22 +191,15 @@ def test_lists_of_windows_with_a_mark_odd_names_and_no_last_line_end(tmp_path, c
     (tmp_path / "train.txt").write_bytes("\ufeffmy video, 1/5.jpg,0\r\nküche/7.jpg,1\r\n".encode())
     (tmp_path / "test.txt").write_bytes("my video, 1/9.jpg,0\r\nküche/7.jpg,1".encode())
     status, data, _ = run(capsys, tmp_path / "train.txt", tmp_path / "test.txt")
-    assert (
-        status,
-        data["groups_shared"],
-        data["gap_min"],
-        data["gap_max"],
-        data["identical_samples"],
-    ) == (1, 2, 0, 4, 1)
+    names = ("groups_shared", "gap_min", "gap_max", "identical_samples")
+    assert (status, [data[name] for name in names]) == (1, [2, 0, 4, 1])
 
 
 def test_rows_without_a_video_are_told_and_a_table_is_read_as_it_is(tmp_path, capsys):
     for k in range(4):
         texture(k).save(tmp_path / f"{k}.png")
-    rows = [
-        {"tactile": f"{k}.png", "video": v, "frame": k}
-        for k, v in enumerate(["v", None, "v", None])
-    ]
+    videos = enumerate(["v", None, "v", None])
+    rows = [{"tactile": f"{k}.png", "video": v, "frame": k} for k, v in videos]
     pl.DataFrame(rows[:2]).write_csv(tmp_path / "a.csv")
     pl.DataFrame(rows[2:]).write_csv(tmp_path / "b.csv")
     status, data, _ = run(capsys, tmp_path / "a.csv", tmp_path / "b.csv", "--no-images")
@@ -247,11 +210,8 @@ def test_rows_without_a_video_are_told_and_a_table_is_read_as_it_is(tmp_path, ca
 def test_touches_of_lists_are_numbered_together(real_data, capsys):
     lists = real_data / "touch_and_go" / "lists"
     _, data, _ = run(capsys, lists / "train.txt", lists / "test.txt", "--by", "contact")
-    assert (data["groups_train"], data["groups_test"], data["groups_shared"]) == (
-        3378,
-        1113,
-        0,
-    )  # as measured: no touch mixes the lists
+    counts = [data[f"groups_{name}"] for name in ("train", "test", "shared")]
+    assert counts == [3378, 1113, 0]  # as measured: no touch mixes the lists
 
 
 def test_frames_that_are_time_stamps_do_not_overflow(tmp_path, capsys):
@@ -263,24 +223,6 @@ def test_frames_that_are_time_stamps_do_not_overflow(tmp_path, capsys):
     assert (data["gap_min"], data["gap_median"], data["gap_max"]) == (gap, gap, gap)
 
 
-def test_a_page_never_replaces_what_lies_beside_it(folders, capsys):
-    (folders / "p.json").write_text('{"a": 1}')
-    assert run(capsys, folders / "a", folders / "b", "--page", folders / "p.html")[0] == 2
-    assert (folders / "p.json").read_text() == '{"a": 1}'
-    assert (
-        run(
-            capsys,
-            folders / "a",
-            folders / "b",
-            "--page",
-            folders / "q.html",
-            "-o",
-            folders / "q.json",
-        )[0]
-        == 2
-    )
-
-
 def test_an_impact_that_cannot_be_measured_does_not_lose_the_audit(
     small_manifest, tmp_path, capsys
 ):
@@ -289,15 +231,8 @@ def test_an_impact_that_cannot_be_measured_does_not_lose_the_audit(
     parts = {i: "test" if v in ("v4", "v5") else "train" for i, v in videos.items()}
     one = {i: p for i, p in parts.items() if videos[i] in ("v0", "v4")}  # a material in one video
     Split(one).save(tmp_path / "s.json")
-    status, data, _ = run(
-        capsys,
-        tmp_path / "m",
-        "--split",
-        tmp_path / "s.json",
-        "--impact",
-        "-o",
-        tmp_path / "a.json",
-    )
+    files = ("--split", tmp_path / "s.json", "-o", tmp_path / "a.json")
+    status, data, _ = run(capsys, tmp_path / "m", "--impact", *files)
     assert status == 0
     assert "impact-failed" in [note["code"] for note in data["notes"]]
     assert json.loads((tmp_path / "a.json").read_text())["test_samples"] == 8
@@ -330,25 +265,24 @@ def test_mistakes_are_one_line_each(tmp_path, small_manifest, capsys):
 
 
 def test_plain_folders_of_pictures_are_photos(folders, capsys):
-    status, data, _ = run(capsys, folders / "a" / "vision", folders / "b" / "vision")
+    status, data, _ = run(capsys, "a/vision", "b/vision")
     assert (status, data["verdict"]) == (0, "cannot tell")
     (worst,) = (s["worst"] for s in data["signals"] if s["kind"] == "near-duplicate vision")
     assert (worst[0]["test"]["id"], worst[0]["train"]["id"]) == ("3", "5")
-    shutil.rmtree(folders / "b" / "tactile")
-    status, data, _ = run(capsys, folders / "a", folders / "b")
+    shutil.rmtree("b/tactile")
+    status, data, _ = run(capsys, "a", "b")
     assert (status, data["leaking_samples"]) == (0, 0)
     assert {"code": "images-of-one-part", "params": {"modality": "tactile"}} in data["notes"]
-    (folders / "empty").mkdir()
-    assert run(capsys, folders / "a", folders / "empty")[0] == 2
+    Path("empty").mkdir()
+    assert run(capsys, "a", "empty")[0] == 2
 
 
 def test_a_small_tree_whose_backgrounds_are_all_unlike_is_audited(tmp_path, capsys):
     source = TREES["touch-and-go"](tmp_path / "forged").source
     assert main(["import", str(source), "-o", str(tmp_path / "m"), "-q"]) == 0
     capsys.readouterr()
-    status, found, err = run(
-        capsys, tmp_path / "m", "--split", tmp_path / "m" / "splits" / "Orig.json"
-    )
+    split = tmp_path / "m" / "splits" / "Orig.json"
+    status, found, err = run(capsys, tmp_path / "m", "--split", split)
     assert "Traceback" not in err
     assert status == (found["leaked_fraction"] > 0)
 

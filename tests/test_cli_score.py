@@ -2,6 +2,7 @@
 
 import errno
 import json
+import shlex
 import subprocess
 import sys
 import time
@@ -19,16 +20,7 @@ from palpate.evaluation import scoring
 from palpate.report.labels import label_of, subject_of
 from palpate.report.results import Results
 
-PAIR = (
-    "--generated",
-    "near.npz",
-    "--reference",
-    "real.npz",
-    "--companions",
-    "none",
-    "--permutations",
-    "0",
-)
+PAIR = "--generated near.npz --reference real.npz --companions none --permutations 0"
 
 
 @pytest.fixture
@@ -43,7 +35,7 @@ def sets(tmp_path, monkeypatch):
 
 
 def call(capsys, *args, verb="score"):
-    return commands.call(capsys, verb, *args)
+    return commands.call(capsys, verb, *(word for arg in args for word in shlex.split(str(arg))))
 
 
 def run(*args, **options):
@@ -58,7 +50,7 @@ def test_options_reach_the_function_and_json_is_its_result(capsys, sets):
     Split.from_ids(train=IDS[24:], test=IDS[:24], rule={}, manifest="m").save(Path("s.json"))
     options = ("--sigma", "10", "median", "--normalize", "yes", "--presets", "paper", "--seed", "3")
     files = ("--labels", "labels.csv", "--split", "s.json", "--names", "ours")
-    status, out, err = call(capsys, *PAIR, *options, *files, "--json")
+    status, out, err = call(capsys, PAIR, *options, *files, "--json")
     assert status == 0, err
     scores = by_key(Results.from_json(json.loads(out)))
     want = scoring.score(
@@ -79,17 +71,8 @@ def test_options_reach_the_function_and_json_is_its_result(capsys, sets):
 
 
 def test_the_terminal_shows_scores_and_differences(capsys, sets):
-    args = (
-        "--generated",
-        "near.npz",
-        "far.npz",
-        "--reference",
-        "real.npz",
-        "--names",
-        "ours [x]",
-        "theirs",
-    )
-    status, out, err = call(capsys, *args)
+    files = "--generated near.npz far.npz --reference real.npz"
+    status, out, err = call(capsys, files, "--names 'ours [x]' theirs")
     assert status == 0, err
     head, tail = out.split("Paired differences", 1)
     assert "ours [x]" in head
@@ -136,19 +119,19 @@ def test_scores_of_pixels_need_no_torch(tmp_path):
 @pytest.mark.parametrize(
     ("args", "words"),
     [
-        ((*PAIR, "--sigma", "ten"), ("--sigma must be positive", "'ten'", "--sigma 10")),
-        ((*PAIR, "--names", "a", "b"), ("--names must name every generator",)),
-        ((*PAIR, "--group", "contact"), ("--group must be known for every input",)),
-        ((*PAIR, "--encoder", "palpate/mini"), ("--encoder must go with images",)),
-        ((*PAIR, "--labels", "absent.csv"), ("absent.csv",)),
-        ((*PAIR, "--companions", "none", "fid"), ("--companions must be none, or names",)),
+        ((PAIR, "--sigma", "ten"), ("--sigma must be NUMBER|median|multi", "Got ten")),
+        ((PAIR, "--names", "a", "b"), ("--names must name every generator",)),
+        ((PAIR, "--group", "contact"), ("--group must be known for every input",)),
+        ((PAIR, "--encoder", "palpate/mini"), ("--encoder must go with images",)),
+        ((PAIR, "--labels", "absent.csv"), ("absent.csv",)),
+        ((PAIR, "--companions", "none", "fid"), ("--companions must be none, or names",)),
         (("--generated", "near.npz", "--reference", "nowhere"), ("nothing at nowhere",)),
-        ((*PAIR, "-o", "s.x", "--latex", "s.x"), ("--latex must not be the file of the results",)),
-        ((*PAIR, "-o", "near.npz"), ("must not replace an input",)),
-        ((*PAIR, "-o", "folder"), ("folder must be writable",)),
-        ((*PAIR, "--latex", "mine"), ("mine must be new",)),
-        ((*PAIR, "--page", "mine"), ("--page must end in .html",)),
-        ((*PAIR, "--cache", "real.npz"), ("--cache must not be an input",)),
+        ((PAIR, "-o", "s.x", "--latex", "s.x"), ("--latex must not be the file of the results",)),
+        ((PAIR, "-o", "near.npz"), ("must not replace an input",)),
+        ((PAIR, "-o", "folder"), ("folder must be writable",)),
+        ((PAIR, "--latex", "mine"), ("mine must be new",)),
+        ((PAIR, "--page", "mine"), ("--page must end in .html",)),
+        ((PAIR, "--cache", "real.npz"), ("--cache must not be an input",)),
     ],
 )
 def test_mistakes_are_one_line_with_status_2(capsys, sets, monkeypatch, args, words):
@@ -165,7 +148,7 @@ def test_a_full_disk_loses_no_scores(capsys, sets, monkeypatch):
         raise OSError(errno.ENOSPC, "No space left on device", "o.json")
 
     monkeypatch.setattr(Results, "save", fail)
-    status, out, err = call(capsys, *PAIR, "-o", "o.json", "-q")
+    status, out, err = call(capsys, PAIR, "-o", "o.json", "-q")
     assert (status, "TMMD" in out, "The disk must have room for o.json" in err) == (2, True, True)
 
 
@@ -198,16 +181,8 @@ def test_probe_scores_material_and_retrieval(capsys, tmp_path, small_manifest):
         train=ids[:24], test=ids[24:], rule={"group": "video"}, manifest=small_manifest.digest
     )
     split.save(tmp_path / "s.json")
-    args = (
-        tmp_path / "m",
-        "--split",
-        tmp_path / "s.json",
-        "--encoder",
-        "palpate/mini",
-        "-o",
-        tmp_path / "p.json",
-    )
-    status, out, err = call(capsys, *args, verb="probe")
+    args = ("--split", tmp_path / "s.json", "--encoder", "palpate/mini", "-o", tmp_path / "p.json")
+    status, out, err = call(capsys, tmp_path / "m", *args, verb="probe")
     assert status == 0, err
     results = Results.load(tmp_path / "p.json")
     assert [label_of(s) for s in results.scores] == [
@@ -225,7 +200,7 @@ def test_probe_scores_material_and_retrieval(capsys, tmp_path, small_manifest):
 
 
 def test_verify_counts_prints_what_differs_and_exits_1(capsys, sets):
-    assert call(capsys, *PAIR, "-o", "s.json", "-q")[0] == 0
+    assert call(capsys, PAIR, "-o", "s.json", "-q")[0] == 0
     status, out, err = call(capsys, "s.json", verb="verify")
     assert (status, err) == (0, "")
     scores = len(json.loads(Path("s.json").read_text())["scores"])

@@ -5,7 +5,7 @@ import dataclasses
 import pytest
 
 from palpate.cli import main
-from palpate.cli.terminal import join_help_lines, parse
+from palpate.cli.running import join_help_lines, parse
 from palpate.cli.world import Options, world_options
 from palpate.sim import MATERIALS, PRESETS, WorldOptions
 

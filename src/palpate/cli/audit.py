@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import shlex
-import shutil
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -13,15 +12,17 @@ import tyro
 from palpate._version import __version__
 from palpate.cli.importing import Reading
 from palpate.cli.terminal import (
-    FAILED_CHECK,
     Common,
     OptionalOutPath,
     Switch,
     Terminal,
     guard_output,
+    guard_results,
     require_extra,
+    working_folder,
 )
-from palpate.core import PalpateError, is_stream, require, write_text
+from palpate.cli.verbs import FAILED_CHECK
+from palpate.core import require, write_text
 from palpate.report.results import Audit
 
 TABLE_FORMAT = "palpate-audit-table/1"
@@ -72,6 +73,10 @@ class Outputs:
     fail_over: float = 0.0
     """Exit with status 1 if more than this fraction of the test samples leaks (1: never)."""
 
+    def keywords(self) -> dict[str, Any]:
+        """As arguments of the audit."""
+        return {"worst": self.worst}
+
 
 @dataclass(frozen=True, kw_only=True)
 class Options(Common):
@@ -101,78 +106,49 @@ def run(options: Options, terminal: Terminal) -> tuple[dict[str, Any], int]:
     from palpate.evaluation.auditing import audit
 
     _check(options)
-    cache, temporary = options.cache, None
-    written = options.outputs.output or options.outputs.page or options.outputs.table
-    if cache is None and written is not None and not is_stream(written):
-        # An interrupted run resumes from it.
-        cache = temporary = written.absolute().parent / f".{written.name}.work"
-    with terminal.progress() as progress:
-        result = audit(
-            *options.paths,
-            split=options.split,
-            pretrain=options.pretrain,
-            reading=options.reading.options(),
-            skip_bad=options.skip_bad,
-            cache=cache,
-            worst=options.outputs.worst,
-            progress=progress,
-            **vars(options.comparison),
-        )
-    result = replace(result, commands=_next_commands(options, result))
-    _write(options.outputs, result, terminal)
-    if temporary is not None:
-        shutil.rmtree(temporary, ignore_errors=True)
+    outputs = options.outputs
+    output = outputs.output or outputs.page or outputs.table
+    with working_folder(options.cache, output) as cache:
+        with terminal.progress() as progress:
+            result = audit(
+                *options.paths, progress=progress, **options.keywords("paths", cache=cache)
+            )
+        result = replace(result, commands=_next_commands(options, result))
+        _write(outputs, result, terminal)
     terminal.show(result)
     for command in result.commands:
         terminal.print_line(f"Next: {command}")
     leaked = max(a.leaked_fraction for a in (result, *result.others))
-    limit = options.outputs.fail_over
-    failed = leaked > limit
-    if failed and limit:
-        terminal.print_line(f"FAIL: leaked fraction {leaked} is over {limit}")
+    failed = leaked > outputs.fail_over
+    if failed and outputs.fail_over:
+        terminal.print_line(f"FAIL: leaked fraction {leaked} is over {outputs.fail_over}")
     return result.to_json() | {"failed": failed}, FAILED_CHECK if failed else 0
 
 
 def _check(options: Options) -> None:
-    """Reject outputs in the way before any work.
+    """Reject a number of paths that makes no audit and outputs in the way, before any work.
 
     Raises:
-        PalpateError: on a number of paths that makes no audit, or an output in the way.
+        PalpateError: saying which.
     """
-    outputs = options.outputs
-    if len(options.paths) not in ((1,) if options.split is not None else (1, 2)):
-        raise PalpateError(
-            "An audit takes TRAIN and TEST, or all samples with a split",
-            f"{len(options.paths)} path(s) {'with' if options.split else 'without'} a split",
-            "E.g. palpate audit train.txt test.txt",
-        )
-    share = outputs.fail_over
-    require(0 <= share <= 1, "fail_over", "must lie in [0, 1]", share)
-    for argument, path, suffixes in (
-        ("table", outputs.table, (".parquet", ".csv")),
-        ("page", outputs.page, (".html",)),
-    ):
-        if path is not None and path.suffix.lower() not in suffixes:
-            must = f"must end in {' or '.join(suffixes)}"
-            raise PalpateError(must, path.name, "", argument=argument)
+    outputs, table = options.outputs, options.outputs.table
+    require(
+        len(options.paths) in ((1,) if options.split is not None else (1, 2)),
+        None,
+        "An audit takes TRAIN and TEST, or all samples with a split",
+        f"{len(options.paths)} path(s) {'with' if options.split else 'without'} a split",
+        fix="E.g. palpate audit train.txt test.txt",
+    )
+    require(0 <= outputs.fail_over <= 1, "fail_over", "must lie in [0, 1]", outputs.fail_over)
     if options.comparison.encoder is not None:
         require_extra("palpate audit --encoder")
     inputs = [*options.paths, *(p for p in (options.split, options.pretrain) if p)]
-    pages = [outputs.page.with_suffix(s) for s in (".html", ".json", ".md")] if outputs.page else []
-    if outputs.output in pages:
-        raise PalpateError(
-            "must not be a file that the page writes",
-            str(outputs.output),
-            "Choose another file",
-            argument="output",
-        )
-    for output, marks in (
-        *((path, (b'"format": "palpate-', b"Audit of", b"palpate")) for path in pages),
-        (outputs.output, (b'"format": "palpate-',)),
-        (outputs.table, (TABLE_FORMAT.encode(), b"id,video,frame,material,leaking")),
-    ):
-        if output is not None:
-            guard_output(output, inputs, marks)
+    guard_results(inputs, outputs.output, outputs.page)
+    if table is not None:
+        suffixes = (".parquet", ".csv")
+        must = f"must end in {' or '.join(suffixes)}"
+        require(table.suffix.lower() in suffixes, "table", must, table.name)
+        guard_output(table, inputs, (TABLE_FORMAT.encode(), b"id,video,frame,material,leaking"))
 
 
 def _next_commands(options: Options, audit: Audit) -> list[str]:

@@ -31,19 +31,9 @@ def run(options: Options, terminal: Terminal) -> dict[str, Any]:
     options.require_data()
     from palpate.diffusion.autoencoders import train_autoencoder
 
-    machine = options.machine
     with terminal.progress() as progress:
         model = train_autoencoder(
-            options.data,
-            options.split,
-            preset=preset,
-            start=options.start,
-            judge=options.judge,
-            output=options.output,
-            seed=options.seed,
-            device=machine.device,
-            compute=machine.compute,
-            progress=progress,
+            preset=preset, progress=progress, **options.keywords("preset", "settings")
         )
     facts: dict[str, Any] = {"folder": str(options.output), "digest": model.digest}
     facts |= {"images": model.card["images"], "split": model.card["split"]}

@@ -10,7 +10,9 @@ from typing import Annotated, Any, Literal
 
 import tyro
 
-from palpate.cli.terminal import FAILED_CHECK, Common, OutPath, Switch, Terminal, error_line
+from palpate.cli.running import error_line
+from palpate.cli.terminal import Common, OutPath, Switch, Terminal
+from palpate.cli.verbs import FAILED_CHECK
 from palpate.core import PalpateError
 
 
@@ -71,17 +73,14 @@ def run(options: Options, terminal: Terminal) -> tuple[dict[str, Any], int]:
     from palpate.captions import Captions, StoppedError, caption
 
     template = options.source.template
-    arguments = vars(options.source) | vars(options.requests)
-    arguments["body"] = _object(options.requests.body)
-    arguments["template"] = None if template is None else " ".join(template)
     try:
         with terminal.progress() as progress:
             result = caption(
-                options.data,
-                options.output,
-                dry_run=options.dry_run,
                 progress=progress,
-                **arguments,
+                **options.keywords(
+                    body=_object(options.requests.body),
+                    template=None if template is None else " ".join(template),
+                ),
             )
     except StoppedError as stop:
         sys.stderr.write(f"palpate caption: {error_line('caption', stop)}\n")

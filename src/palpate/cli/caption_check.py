@@ -9,7 +9,8 @@ from typing import Annotated, Any
 import tyro
 
 from palpate.cli.importing import Maps, columns_of
-from palpate.cli.terminal import FAILED_CHECK, Common, OptionalOutPath, Terminal, guard_output
+from palpate.cli.terminal import Common, OptionalOutPath, Terminal, guard_results
+from palpate.cli.verbs import FAILED_CHECK
 from palpate.core import require
 
 
@@ -47,9 +48,8 @@ def run(options: Options, terminal: Terminal) -> tuple[dict[str, Any], int]:
 
     limit = options.fail_over
     require(limit is None or 0 <= limit <= 1, "fail_over", "must lie in [0, 1]", limit)
-    for path in filter(None, (options.output, options.page)):
-        inputs = [p for p in (options.captions, options.data, options.split) if p is not None]
-        guard_output(path, inputs, (b'"format": "palpate-', b"palpate"))
+    inputs = [p for p in (options.captions, options.data, options.split) if p is not None]
+    guard_results(inputs, options.output, options.page)
     extra = {"columns": columns} if (columns := columns_of(options.columns)) else {}
     with terminal.progress() as progress:
         results = check_captions(

@@ -29,21 +29,18 @@ def run(options: Options, terminal: Terminal) -> dict[str, Any]:
     options.require_data()
     from palpate.encoders.contrastive import plan_encoder, train_encoder
 
-    data, machine = (options.data, options.split), options.machine
     if options.dry_run:
-        plan = plan_encoder(*data, preset=preset, epochs=options.epochs, device=machine.device)
+        plan = plan_encoder(
+            options.data,
+            options.split,
+            preset=preset,
+            epochs=options.epochs,
+            device=options.machine.device,
+        )
         return print_plan(terminal, f"Plan of {options.output}", plan)
     with terminal.progress() as progress:
         encoders = train_encoder(
-            *data,
-            preset=preset,
-            clip=options.clip,
-            output=options.output,
-            epochs=options.epochs,
-            seed=options.seed,
-            device=machine.device,
-            compute=machine.compute,
-            progress=progress,
+            preset=preset, progress=progress, **options.keywords("preset", "settings", "dry_run")
         )
     facts: dict[str, Any] = {
         "folder": str(options.output),

@@ -55,27 +55,26 @@ def run(options: Options, terminal: Terminal) -> dict[str, Any]:
     require_extra("palpate generate")
     from palpate.diffusion.generation import generate
 
-    arguments = dict(vars(options))
-    for name in ("as_json", "quiet", "photos"):
-        arguments.pop(name)
     photos: Any = (options.photos[0] if len(options.photos) == 1 else options.photos) or None
     with terminal.progress() as progress:
-        made = generate(photos, progress=progress, **arguments)
-    for note in made.notes:
+        images = generate(photos, progress=progress, **options.keywords("photos"))
+    for note in images.notes:
         terminal.note(note)
     if options.dry_run:
-        terminal.print(f"{made.missing:,} images to make, {made.evaluations:,} network evaluations")
-        return {"missing": made.missing, "evaluations": made.evaluations}
+        terminal.print(
+            f"{images.missing:,} images to make, {images.evaluations:,} network evaluations"
+        )
+        return {"missing": images.missing, "evaluations": images.evaluations}
     facts: dict[str, Any] = {
-        "image" if made.folder is None else "folder": str(options.output),
-        "images": len(made.ids),
-        "made_now": made.made,
-        "skipped": len(made.skipped),
+        "image" if images.folder is None else "folder": str(options.output),
+        "images": len(images.ids),
+        "made_now": images.made,
+        "skipped": len(images.skipped),
         "model": options.model,
-        "pipeline": made.settings["pipeline"],
-        "notice": made.notice or None,
+        "pipeline": images.settings["pipeline"],
+        "notice": images.notice or None,
     }
     terminal.facts(f"Tactile images {options.output}", facts)
-    terminal.skipped(made.skipped)
-    notes = [note.to_json() for note in made.notes]
-    return facts | {"skipped": [asdict(p) for p in made.skipped], "notes": notes}
+    terminal.skipped(images.skipped)
+    notes = [note.to_json() for note in images.notes]
+    return facts | {"skipped": [asdict(p) for p in images.skipped], "notes": notes}

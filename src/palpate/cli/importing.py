@@ -7,14 +7,14 @@ folders also with ``palpate audit`` and ``palpate split``.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import tyro
 
 from palpate.cli.terminal import Common, OutPath, Switch, Terminal
-from palpate.core import PalpateError
+from palpate.core import require
 
 Maps = Annotated[
     tuple[tuple[str, ...], ...],
@@ -48,10 +48,10 @@ class Reading:
     names: str | None = None
     """Columns of a table without a header line, separated by commas."""
 
-    def options(self) -> dict[str, Any]:
-        """As keywords."""
-        given = vars(self) | {"columns": columns_of(self.columns)}
-        return {name: value for name, value in given.items() if value}
+    def keywords(self) -> dict[str, Any]:
+        """As the argument of what reads samples."""
+        options = vars(self) | {"columns": columns_of(self.columns)}
+        return {"reading": {name: value for name, value in options.items() if value}}
 
     def arguments(self) -> list[str]:
         """As they were written on the command line."""
@@ -78,6 +78,10 @@ class TableOptions(Reading):
     """Configuration of a Hugging Face data set."""
     revision: str | None = None
     """Branch, tag or commit of a data set on the hub."""
+
+    def keywords(self) -> dict[str, Any]:
+        """As arguments of an import, each by its name."""
+        return vars(self) | {"columns": columns_of(self.columns) or None}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -143,25 +147,11 @@ def run(options: Options, terminal: Terminal) -> dict[str, Any]:
         imported = import_dataset(
             options.source,
             options.output,
-            format=options.format,
-            check=options.check,
-            skip_bad=options.skip_bad,
-            overwrite=options.overwrite,
-            text=options.text,
             progress=progress,
-            **format_options(options),
+            **options.keywords("source", "output"),
         )
     terminal.print(str(imported))
     return imported.to_json()
-
-
-def format_options(options: SourceOptions) -> dict[str, Any]:
-    """The options of formats that were given, as keywords."""
-    groups = (options.table, options.formats)
-    given = {field.name: getattr(group, field.name) for group in groups for field in fields(group)}
-    given |= {"columns": columns_of(options.table.columns)}
-    unset = (None, (), {})
-    return {k: v for k, v in given.items() if v is not False and v not in unset}  # 0 is a value
 
 
 def columns_of(items: Sequence[Sequence[str]]) -> dict[str, str]:
@@ -173,12 +163,8 @@ def columns_of(items: Sequence[Sequence[str]]) -> dict[str, str]:
     columns: dict[str, str] = {}
     for item in (item for group in items for item in group):
         name, _, expression = (part.strip() for part in item.partition("="))
-        if not name or not expression or name in columns:
-            raise PalpateError(
-                "must name each column once, as COLUMN=EXPRESSION",
-                repr(item),
-                "E.g. vision=rgb_path tactile=gel_path",
-                argument="columns",
-            )
+        must, fix = "must name each column once, as COLUMN=EXPRESSION", "E.g. vision=rgb_path"
+        once = bool(name and expression) and name not in columns
+        require(once, "columns", must, repr(item), fix=fix)
         columns[name] = expression
     return columns

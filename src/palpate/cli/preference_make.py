@@ -64,16 +64,8 @@ def run(options: Options, terminal: Terminal) -> dict[str, Any]:
     if options.output and any(p.resolve() == options.output.resolve() for p in inputs):
         got, fix = str(options.output), "Choose another folder"
         raise PalpateError("An output must not replace an input", got, fix)
-    names = "items raters task question design labels size title until seed dry_run"
     with terminal.progress() as progress:
-        plan = make(
-            options.reference,
-            list(options.generated),
-            options.output,
-            names=options.names or None,
-            progress=progress,
-            **{name: getattr(options, name) for name in names.split()},
-        )
+        plan = make(progress=progress, **options.keywords())
     for note in plan.notes:
         terminal.note(note)
     trials = len(plan.trials)

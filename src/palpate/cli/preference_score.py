@@ -8,7 +8,7 @@ from typing import Annotated, Any
 
 import tyro
 
-from palpate.cli.terminal import Common, OptionalOutPath, Terminal, guard_output
+from palpate.cli.terminal import Common, OptionalOutPath, Terminal, guard_results
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -40,12 +40,7 @@ class Options(Common):
 def run(options: Options, terminal: Terminal) -> dict[str, Any]:
     """Score, print the tables, write."""
     inputs = [options.study, options.study / "plan.json", *options.votes, *options.metrics]
-    if options.output:
-        guard_output(options.output, inputs)
-    if options.latex:
-        guard_output(options.latex, inputs, (b"% palpate",))
-    if options.page:
-        guard_output(options.page, inputs, (b"palpate",))
+    guard_results(inputs, options.output, options.page, options.latex)
     from palpate.preference import score
 
     with terminal.progress() as progress:
@@ -57,5 +52,4 @@ def run(options: Options, terminal: Terminal) -> dict[str, Any]:
             seed=options.seed,
             progress=progress,
         )
-    files = {"output": options.output, "page": options.page, "latex": options.latex}
-    return terminal.deliver(results, **files)
+    return terminal.deliver(results, output=options.output, page=options.page, latex=options.latex)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -13,11 +13,34 @@ from palpate.cli.terminal import (
     OptionalOutPath,
     Switch,
     Terminal,
-    guard_output,
+    guard_results,
     require_extra,
 )
 from palpate.cli.training import Machine
-from palpate.core import PalpateError
+from palpate.core import require
+
+
+@dataclass(frozen=True, kw_only=True)
+class Probing:
+    """What is predicted, and what counts as right."""
+
+    modality: Literal["tactile", "vision"] = "tactile"
+    """Whose encoder."""
+    label: tuple[str, ...] = ("material",)
+    """Columns to predict."""
+    group: Literal["auto", "video", "contact", "object"] = "auto"
+    """What stays together in cross-validation and intervals; `auto` takes what the split kept
+    whole, else the video."""
+    top: tuple[int, ...] = (1, 5, 10)
+    """Ranks within which retrieval must find a right key."""
+    pool: int | None = None
+    """Rank among so many test samples drawn at random. Default: all; of several splits as many as
+    the smallest test part has."""
+    text_threshold: float = 0.6356
+    """Cosine from which another text counts as right, next to strict retrieval; the default is
+    TVL's."""
+    seed: int = 0
+    """Of the folds of the cross-validation, pools and the queries on the page."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -54,29 +77,13 @@ class Options(Common):
     """Split files; their order is that of the differences: `--splits orig.json noleak.json`."""
     encoder: tuple[str, ...] = ()
     """Folders of `palpate train encoder`, hub ids, or palpate/mini."""
-    modality: Literal["tactile", "vision"] = "tactile"
-    """Whose encoder."""
-    label: tuple[str, ...] = ("material",)
-    """Columns to predict."""
-    group: Literal["auto", "video", "contact", "object"] = "auto"
-    """What stays together in cross-validation and intervals; `auto` takes what the split kept
-    whole, else the video."""
-    top: tuple[int, ...] = (1, 5, 10)
-    """Ranks within which retrieval must find a right key."""
-    pool: int | None = None
-    """Rank among so many test samples drawn at random. Default: all; of several splits as many as
-    the smallest test part has."""
-    text_threshold: float = 0.6356
-    """Cosine from which another text counts as right, next to strict retrieval; the default is
-    TVL's."""
     allow_seen: Switch = False
     """Probe an encoder that was trained on some of the test images; every score says so."""
     output: OptionalOutPath = None
     """Write the results as JSON, for `palpate report`, or as a page (.html)."""
     cache: Path | None = None
     """Folder for embeddings, which an interrupted run finds again."""
-    seed: int = 0
-    """Of the folds of the cross-validation, pools and the queries on the page."""
+    probing: Probing = field(default_factory=Probing)
     training: Training = field(default_factory=Training)
     machine: Machine = field(default_factory=Machine)
     """How to train on the machine at hand."""
@@ -85,41 +92,44 @@ class Options(Common):
 def run(options: Options, terminal: Terminal) -> dict[str, Any]:
     """Probe, print the scores, write JSON or a page."""
     require_extra("palpate probe")
-    output, training = options.output, options.training
-    if bool(options.encoder) == training.train:
-        must, fix = "Either an encoder or training must be chosen", "Name one of the two"
-        example = {"encoder": "palpate/mini"}
-        raise PalpateError(must, "both" if training.train else "neither", fix, example=example)
-    page = output is not None and output.suffix == ".html"
-    if output:
-        marks = (b"palpate",) if page else (b'"format": "palpate-',)
-        guard_output(output, [options.manifest, *options.split], marks)
+    training, output = options.training, options.output
+    got, fix = "both" if training.train else "neither", "E.g. --encoder palpate/mini"
+    must = "Either an encoder or training must be chosen"
+    require(bool(options.encoder) != training.train, None, must, got, fix=fix)
+    json, page = (None, output) if output and output.suffix == ".html" else (output, None)
+    guard_results([options.manifest, *options.split], json, page)
     one_or_all = lambda values: values[0] if len(values) == 1 else list(values)
-    names = ("modality", "label", "group", "top", "pool", "text_threshold", "seed")
-    arguments: dict[str, Any] = {name: getattr(options, name) for name in names}
     with terminal.progress() as progress:
         if training.train:
             from palpate.studies.split_study import compare_splits
 
-            more = ("preset", "clip", "epochs", "seeds", "work")
-            arguments |= {name: getattr(training, name) for name in more}
-            arguments |= {name: getattr(options.machine, name) for name in ("device", "compute")}
-            arguments["print_line"] = terminal.print_line
             results = compare_splits(
-                options.manifest, list(options.split), progress=progress, **arguments
+                options.manifest,
+                list(options.split),
+                preset=training.preset,
+                clip=training.clip,
+                epochs=training.epochs,
+                seeds=training.seeds,
+                work=training.work,
+                device=options.machine.device,
+                compute=options.machine.compute,
+                print_line=terminal.print_line,
+                progress=progress,
+                **vars(options.probing),
             )
         else:
             from palpate.evaluation.probing import probe
 
-            arguments |= {"encoder": one_or_all(options.encoder), "cache": options.cache}
-            arguments["allow_seen"] = options.allow_seen
             results = probe(
-                options.manifest, one_or_all(options.split), progress=progress, **arguments
+                options.manifest,
+                one_or_all(options.split),
+                encoder=one_or_all(options.encoder),
+                cache=options.cache,
+                allow_seen=options.allow_seen,
+                progress=progress,
+                **vars(options.probing),
             )
-    results = replace(results, commands=[terminal.command])
-    terminal.show(results)
+    report = terminal.deliver(results, output=json, page=page)
     for fact in results.facts:
         terminal.print(fact)
-    if output:
-        results.to_html(output) if page else results.save(output)
-    return results.to_json()
+    return report

@@ -2,16 +2,24 @@
 
 from __future__ import annotations
 
-import shutil
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import tyro
 
-from palpate.cli.terminal import Common, OptionalOutPath, Switch, Terminal, guard_output
-from palpate.core import PalpateError, is_stream
+from palpate.cli.terminal import (
+    Common,
+    OptionalOutPath,
+    Switch,
+    Terminal,
+    guard_results,
+    working_folder,
+)
+from palpate.core import require
 
+#: What the word of an option means.
+NORMALIZE = {"check": "check", "yes": True, "no": False}
 Companion = Literal[
     "fid", "kid", "cmmd", "prdc", "ssim", "psnr", "ms-ssim", "contact", "lpips", "none"
 ]
@@ -39,7 +47,10 @@ class Metrics:
     """Readings of the TMMD family: `paper` is the formula to the letter, `grouped` keeps whole
     videos together. Default: both; without groups `paper`, and `grouped` for TMMD of images whose
     ids are those of the reference."""
-    sigma: tuple[str, ...] = ()
+    sigma: Annotated[
+        tuple[float | Literal["median", "multi"], ...],
+        tyro.conf.arg(metavar="NUMBER|median|multi ..."),
+    ] = ()
     """Bandwidths: numbers, `median` (of the reference's distances), `multi` (five around it).
     Default: 10, comparable with the literature; for TMMD also `multi`, which sees more than the
     mean."""
@@ -101,77 +112,38 @@ class Options(Common):
 
 def run(options: Options, terminal: Terminal) -> dict[str, Any]:
     """Score, print the tables, write JSON and LaTeX."""
-    _check_outputs(options)
+    inputs = _inputs(options)
+    guard_results(inputs, options.output, options.page, options.latex)
+    if (cache := options.cache) is not None:
+        must, fix = "must not be an input", "Choose a folder outside what is read"
+        apart = not any(cache.resolve().is_relative_to(path.resolve()) for path in inputs)
+        require(apart, "cache", must, str(cache), fix=fix)
+    companions = options.metrics.companions
+    alone = companions is None or "none" not in companions or len(companions) == 1
+    require(alone, "companions", "must be none, or names", " ".join(companions or ()))
     from palpate.evaluation.scoring import score
 
-    cache, metrics = _cache(options), options.metrics
-    arguments: dict[str, Any] = {
-        "encoder": options.encoder,
-        "allow_seen": options.allow_seen,
-        "split": options.split,
-        "background": options.background,
-        "train": options.train,
-        **vars(options.samples),
-        **vars(metrics),
-        "names": options.samples.names or None,
-        "presets": metrics.presets or None,
-        "sigma": [_number_or_word(text) for text in metrics.sigma] or None,
-        "normalize": {"check": "check", "yes": True, "no": False}[metrics.normalize],
-        "companions": _companions(metrics.companions),
-        "cache": cache,
-    }
-    with terminal.progress() as progress:
-        results = score(list(options.generated), options.reference, progress=progress, **arguments)
-    files = {"output": options.output, "page": options.page, "latex": options.latex}
-    shown = terminal.deliver(results, **files)
-    if cache is not None and options.cache is None:
-        shutil.rmtree(cache, ignore_errors=True)
-    return shown
-
-
-def _check_outputs(options: Options) -> None:
-    """Raise before anything is computed if an output cannot be written."""
-    samples = options.samples
-    given = (options.split, options.train)
-    labels = Path(samples.labels) if samples.labels else None
-    read = (options.reference, *given, labels, *options.generated)
-    inputs = [path for path in read if path]
-    if options.output:
-        guard_output(options.output, inputs)
-    if options.page:
-        if options.page.suffix != ".html":
-            raise PalpateError("must end in .html", options.page.name, "", argument="page")
-        for suffix in (".html", ".json", ".md"):
-            guard_output(options.page.with_suffix(suffix), inputs, (b"palpate",))
-    if options.latex:
-        guard_output(options.latex, inputs, (b"% palpate",))
-        if options.output and options.latex.resolve() == options.output.resolve():
-            got, fix = str(options.latex), "Choose another file for one of them"
-            raise PalpateError("must not be the file of the results", got, fix, argument="latex")
-    if options.cache and any(options.cache.resolve().is_relative_to(p.resolve()) for p in inputs):
-        fix = "Choose a folder outside what is read"
-        raise PalpateError("must not be an input", str(options.cache), fix, argument="cache")
-
-
-def _cache(options: Options) -> Path | None:
     output = options.output or options.page or options.latex
-    images = options.reference.is_dir() or options.encoder
-    if options.cache or output is None or is_stream(output) or not images:
-        return options.cache
-    return output.absolute().parent / f".{output.name}.work"
+    has_images = options.reference.is_dir() or options.encoder
+    with working_folder(cache, output if has_images else None) as folder:
+        with terminal.progress() as progress:
+            results = score(
+                list(options.generated),
+                options.reference,
+                progress=progress,
+                **options.keywords(
+                    *("generated", "reference", "output", "latex", "page"),
+                    companions=() if companions == ("none",) else companions,
+                    normalize=NORMALIZE[options.metrics.normalize],
+                    cache=folder,
+                ),
+            )
+        return terminal.deliver(
+            results, output=options.output, page=options.page, latex=options.latex
+        )
 
 
-def _companions(names: tuple[str, ...] | None) -> tuple[str, ...] | None:
-    if names is None or "none" not in names:
-        return names
-    if len(names) > 1:
-        got = " ".join(names)
-        raise PalpateError("must be none, or names", got, "Drop none", argument="companions")
-    return ()
-
-
-def _number_or_word(text: str) -> float | str:
-    try:
-        return float(text)
-    except ValueError:
-        return text
+def _inputs(options: Options) -> list[Path]:
+    labels = options.samples.labels
+    paths = (options.reference, options.split, options.train, labels and Path(labels))
+    return [path for path in (*paths, *options.generated) if path]

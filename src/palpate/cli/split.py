@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -10,11 +12,11 @@ import tyro
 
 from palpate.cli.importing import Reading
 from palpate.cli.terminal import Common, OutPath, Switch, Terminal, guard_output
-from palpate.core import PalpateError, Split, atomic_folder, require, require_new_folder
+from palpate.core import Split, atomic_folder, require, require_new_folder
 
 Column = Literal["auto", "video", "object", "session", "contact", "domain", "sensor"]
 #: Facts of the rule that are printed.
-SHOWN = ("group", "by", "groups", "deviation", "bound", "status", "limiting", "rare", "missing")
+PRINTED = ("group", "by", "groups", "deviation", "bound", "status", "limiting", "rare", "missing")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -26,6 +28,10 @@ class Groups:
     set names, or the coarsest known: object, session, video, contact)."""
     near: Literal["vision", "tactile", "both"] | None = None
     """Keep near-duplicate images together as well."""
+
+    def keywords(self) -> dict[str, Any]:
+        """As arguments of the split."""
+        return {"by": "auto" if self.by == ("auto",) else self.by, "near": self.near}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -69,25 +75,23 @@ def run(options: Options, terminal: Terminal) -> dict[str, Any]:
     from palpate.leakage import split
     from palpate.leakage.inputs import read
 
-    _check(options)
+    several = options.folds is not None or options.seeds is not None
+    _check(options, several)
     data = list(options.paths) or None
-    by = "auto" if options.together.by == ("auto",) else options.together.by
-    common: dict[str, Any] = {"by": by, "train": options.train, "val": options.val}
-    common |= {"near": options.together.near, "noleak": options.noleak, "cache": options.cache}
-    common |= {"reading": options.reading.options(), "skip_bad": options.skip_bad}
+    names = ("paths", "output", "seed", "seeds", "folds", "lists")
+    make: Callable[..., Any] = partial(split, data, **options.keywords(*names))
     with terminal.progress() as progress:
-        common["progress"] = progress
         if options.folds is None:
             seeds = range(options.seed, options.seed + (options.seeds or 1))
             names = [f"seed-{seed}" for seed in seeds]
-            splits = [split(data, seed=seed, **common) for seed in seeds]
+            splits = [make(seed=seed, progress=progress) for seed in seeds]
         else:
             names = [f"fold-{k}" for k in range(options.folds)]
-            splits = split(data, seed=options.seed, folds=options.folds, **common)
+            splits = make(seed=options.seed, folds=options.folds, progress=progress)
     for note in splits[0].notes:
         terminal.note(note)
     rows = [_facts(s) for s in splits]
-    if not _several(options):
+    if not several:
         splits[0].save(options.output)
         terminal.facts(f"Split {options.output}", rows[0])
         files: list[str] = []
@@ -104,44 +108,38 @@ def run(options: Options, terminal: Terminal) -> dict[str, Any]:
     return {"splits": rows, "path": str(options.output)}
 
 
-def _several(options: Options) -> bool:
-    return options.folds is not None or options.seeds is not None
-
-
-def _check(options: Options) -> None:
+def _check(options: Options, several: bool) -> None:
     """Reject options that exclude each other and outputs in the way, before any work.
 
     Raises:
         PalpateError: saying which.
     """
-    folds, several = options.folds is not None, _several(options)
-    if folds and options.seeds is not None:
-        raise PalpateError("must go without --folds", "both", "Choose one", argument="seeds")
-    require(
-        options.seeds is None or options.seeds >= 1, "seeds", "must be at least 1", options.seeds
+    seeds, folds = options.seeds, options.folds is not None
+    must = "must go without --folds"
+    require(not folds or seeds is None, "seeds", must, "both", fix="Choose one")
+    require(seeds is None or seeds >= 1, "seeds", "must be at least 1", seeds)
+    some, fix = (
+        options.paths or options.noleak == "touch-and-go",
+        "E.g. palpate split tag/ -o s.json",
     )
-    if not options.paths and options.noleak != "touch-and-go":
-        raise PalpateError(
-            "A split needs samples", "no path", "E.g. palpate split tag/ -o noleak.json"
+    require(bool(some), None, "A split needs samples", "no path", fix=fix)
+    free = not options.noleak or (not folds and options.together == Groups())
+    must, got = "A published split has its rule", "--by, --near or --folds with --noleak"
+    require(free, None, must, got, fix="Leave them out, or leave out --noleak")
+    if options.lists is not None:
+        must, got = (
+            "must go with one split of samples",
+            "several splits" if several else "no samples",
         )
-    if options.noleak and (folds or options.together != Groups()):
-        raise PalpateError(
-            "A published split has its rule",
-            "--by, --near or --folds with --noleak",
-            "Leave them out, or leave out --noleak",
-        )
-    if options.lists is not None and (several or not options.paths):
-        got = "several splits" if several else "no samples"
-        raise PalpateError(
-            "must go with one split of samples", got, "Make the split alone", argument="lists"
-        )
+        one = not several and bool(options.paths)
+        require(one, "lists", must, got, fix="Make the split alone")
     if not several:
-        guard_output(options.output, options.paths, (b'"format": "palpate-',))
+        guard_output(options.output, options.paths)
     for folder in (options.output if several else None, options.lists):
         if folder is not None:
             require_new_folder(folder)
 
 
 def _facts(split: Split) -> dict[str, Any]:
-    facts = {name: split.rule[name] for name in SHOWN if name in split.rule}
+    facts = {name: split.rule[name] for name in PRINTED if name in split.rule}
     return {"digest": split.digest, "counts": split.counts(), **facts}

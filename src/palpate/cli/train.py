@@ -53,34 +53,24 @@ def run(options: Options, terminal: Terminal) -> dict[str, Any]:
     options.require_data()
     from palpate.diffusion.training import plan_generator, train_generator
 
-    data, machine = (options.data, options.split), options.machine
     if options.dry_run:
         plan = plan_generator(
-            *data,
+            options.data,
+            options.split,
             options.clip,
             preset=preset,
             autoencoder=options.autoencoder,
             start=options.start,
             background=options.background,
             steps=options.steps,
-            device=machine.device,
+            device=options.machine.device,
         )
         return print_plan(terminal, f"Plan of {options.output}", plan)
     with terminal.progress() as progress:
         pipeline = train_generator(
-            *data,
-            options.clip,
             preset=preset,
-            autoencoder=options.autoencoder,
-            start=options.start,
-            output=options.output,
-            background=options.background,
-            judge=options.judge,
-            steps=options.steps,
-            seed=options.seed,
-            device=machine.device,
-            compute=machine.compute,
             progress=progress,
+            **options.keywords("preset", "settings", "epochs", "dry_run"),
         )
     record = pipeline.training
     facts = {

@@ -66,6 +66,10 @@ class Machine:
         """The settings as the rooms take them."""
         return Compute(**{k: v for k, v in vars(self).items() if k != "device"})
 
+    def keywords(self) -> dict[str, Any]:
+        """What the functions that train take of it."""
+        return {"device": self.device, "compute": self.compute}
+
 
 @dataclass(frozen=True, kw_only=True)
 class Training(Common):

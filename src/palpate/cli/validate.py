@@ -8,14 +8,10 @@ from typing import Annotated, Any
 
 import tyro
 
-from palpate.cli.importing import SourceOptions, format_options
-from palpate.cli.terminal import FAILED_CHECK, Switch, Terminal
-from palpate.core import PalpateError
-
-ShowList = Annotated[
-    Switch,
-    tyro.conf.arg(name="list", help="Show the known formats, their facts and their options."),
-]
+from palpate.cli.importing import SourceOptions
+from palpate.cli.terminal import Switch, Terminal
+from palpate.cli.verbs import FAILED_CHECK
+from palpate.core import require
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -27,7 +23,8 @@ class Options(SourceOptions):
 
     source: Annotated[Path | None, tyro.conf.Positional] = None
     """Root of the data set, a table, or with `--format hf` a name on the hub."""
-    show_list: ShowList = False
+    show_list: Annotated[Switch, tyro.conf.arg(name="list")] = False
+    """Show the known formats, their facts and their options."""
 
 
 def run(options: Options, terminal: Terminal) -> tuple[dict[str, Any], int]:
@@ -36,21 +33,10 @@ def run(options: Options, terminal: Terminal) -> tuple[dict[str, Any], int]:
 
     if options.show_list:
         return _formats(terminal), 0
-    if options.source is None:
-        raise PalpateError(
-            "must be named",
-            "none",
-            "E.g. palpate validate touch_and_go/, or palpate validate --list",
-            argument="source",
-        )
+    fix = "E.g. palpate validate touch_and_go/, or palpate validate --list"
+    require(options.source is not None, "source", "must be named", "none", fix=fix)
     with terminal.progress() as progress:
-        result = validate(
-            options.source,
-            format=options.format,
-            check=options.check,
-            progress=progress,
-            **format_options(options),
-        )
+        result = validate(progress=progress, **options.keywords("show_list"))
     terminal.print(str(result))
     return result.to_json(), 0 if result.ok else FAILED_CHECK
 

@@ -8,7 +8,8 @@ from typing import Annotated, Any
 
 import tyro
 
-from palpate.cli.terminal import FAILED_CHECK, Common, Terminal
+from palpate.cli.terminal import Common, Terminal
+from palpate.cli.verbs import FAILED_CHECK
 
 
 @dataclass(frozen=True, kw_only=True)
