@@ -52,6 +52,14 @@ def small_manifest(tmp_path: Path) -> Manifest:
 
 
 @pytest.fixture(scope="session")
+def rated(tmp_path_factory):
+    """Folders of a reference and three methods, with materials and videos."""
+    from forge.people import write_folders
+
+    return write_folders(tmp_path_factory.mktemp("rated"))
+
+
+@pytest.fixture(scope="session")
 def chromium():
     """Debian's chromium, driven by playwright; tests that need it skip where it is absent."""
     sync_api = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")

@@ -14,7 +14,7 @@ import pytest
 from PIL import Image
 
 from forge import commands
-from forge.people import Crowd, write_folders
+from forge.people import Crowd
 from palpate.cli import main
 from palpate.data.manifest import Manifest
 from palpate.preference import Plan
@@ -22,31 +22,26 @@ from palpate.report.results import Results
 from palpate.sim import WorldOptions, write_world
 
 
-@pytest.fixture(scope="module")
-def folders(tmp_path_factory):
-    return write_folders(tmp_path_factory.mktemp("folders"))
-
-
 def call(capsys, *args):
     return commands.call(capsys, "preference", *args)
 
 
-def make(folders, output, *more):
-    sources = ("--reference", folders.reference, "--generated", *folders.methods)
-    options = ("--labels", folders.labels, "--size", "32", "--items", "12", "--raters", "6")
+def make(rated, output, *more):
+    sources = ("--reference", rated.reference, "--generated", *rated.methods)
+    options = ("--labels", rated.labels, "--size", "32", "--items", "12", "--raters", "6")
     return ("make", *sources, *options, "-o", output, *more)
 
 
 @pytest.fixture(scope="module")
-def study(folders, tmp_path_factory):
+def study(rated, tmp_path_factory):
     output = tmp_path_factory.mktemp("cli") / "study"
-    assert main(["preference", *map(str, make(folders, output, "-q"))]) == 0
+    assert main(["preference", *map(str, make(rated, output, "-q"))]) == 0
     return output
 
 
-def test_from_folders_to_a_row(capsys, folders, tmp_path):
+def test_from_folders_to_a_row(capsys, rated, tmp_path):
     study = tmp_path / "study"
-    status, out, err = call(capsys, *make(folders, study))
+    status, out, err = call(capsys, *make(rated, study))
     assert status == 0
     assert re.search(r"methods +ours, gvst, wbg", out)
     assert "at most one a video" in err
@@ -66,8 +61,8 @@ def test_from_folders_to_a_row(capsys, folders, tmp_path):
     assert "human preference" in (tmp_path / "page.html").read_text()
 
 
-def test_dry_run_writes_nothing_and_says_how_wide_intervals_are(capsys, folders, tmp_path):
-    status, out, _ = call(capsys, *make(folders, tmp_path / "no", "--dry-run", "--json"))
+def test_dry_run_writes_nothing_and_says_how_wide_intervals_are(capsys, rated, tmp_path):
+    status, out, _ = call(capsys, *make(rated, tmp_path / "no", "--dry-run", "--json"))
     assert status == 0
     facts = json.loads(out)
     assert 0.05 < facts["half_width"] < 0.3
@@ -75,16 +70,16 @@ def test_dry_run_writes_nothing_and_says_how_wide_intervals_are(capsys, folders,
     assert not (tmp_path / "no").exists()
 
 
-def test_the_smallest_study_is_expected_to_say_little(capsys, folders, tmp_path):
+def test_the_smallest_study_is_expected_to_say_little(capsys, rated, tmp_path):
     few = ("--items", "2", "--raters", "1", "--dry-run", "--json")
-    status, out, _ = call(capsys, *make(folders, tmp_path / "no", *few))
+    status, out, _ = call(capsys, *make(rated, tmp_path / "no", *few))
     assert status == 0
     assert json.loads(out)["half_width"] > 0.3
 
 
-def test_two_raters_are_told_from_people_before_the_study(capsys, folders, tmp_path):
+def test_two_raters_are_told_from_people_before_the_study(capsys, rated, tmp_path):
     options = ("--design", "paper", "--dry-run")
-    sources = ("--reference", folders.reference, "--generated", *folders.methods)
+    sources = ("--reference", rated.reference, "--generated", *rated.methods)
     status, _, err = call(capsys, "make", *sources, *options)
     assert status == 0
     assert "For these 2 raters only" in err
@@ -101,16 +96,16 @@ def test_two_raters_are_told_from_people_before_the_study(capsys, folders, tmp_p
         (("--names", "a"), "--names must name every generator"),
     ],
 )
-def test_mistakes_of_make_are_one_line(capsys, folders, tmp_path, args, words):
-    status, _, err = call(capsys, *make(folders, tmp_path / "s", *args))
+def test_mistakes_of_make_are_one_line(capsys, rated, tmp_path, args, words):
+    status, _, err = call(capsys, *make(rated, tmp_path / "s", *args))
     assert status == 2
     assert words in err
     assert err.count("\n") == 1
     assert not (tmp_path / "s").exists()
 
 
-def test_a_study_is_not_replaced(capsys, folders, study):
-    status, _, err = call(capsys, *make(folders, study))
+def test_a_study_is_not_replaced(capsys, rated, study):
+    status, _, err = call(capsys, *make(rated, study))
     assert (status, "must be absent or an empty folder" in err) == (2, True)
 
 

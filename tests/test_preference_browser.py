@@ -31,10 +31,14 @@ STORED = "JSON.stringify(Object.entries(localStorage).sort())"
 @pytest.fixture(scope="module")
 def pairs(tmp_path_factory):
     """A study of six pairs and two raters on disk."""
-    file = tmp_path_factory.mktemp("pairs") / "study.html"
     public, ours = pair_study(6, 2)
-    file.write_text(study_page(public), encoding="utf-8")
-    return file.as_uri(), public, ours
+    return on_disk(tmp_path_factory.mktemp("pairs"), public), public, ours
+
+
+def on_disk(folder, public):
+    """The URL of a study's page that is written to a folder."""
+    (folder / "study.html").write_text(study_page(public), encoding="utf-8")
+    return (folder / "study.html").as_uri()
 
 
 def orders(public, code):
@@ -52,12 +56,8 @@ def test_keys_mouse_and_touch_vote(chromium, pairs):
         person.next(lambda: person.page.tap("[data-choice=left] img"))
         assert person.done()
         votes = person.download()
-    assert [vote["choice"] for vote in votes["votes"]] == [
-        *public["choices"],
-        "right",
-        "same",
-        "left",
-    ]
+    choices = [*public["choices"], "right", "same", "left"]
+    assert [vote["choice"] for vote in votes["votes"]] == choices
     assert [vote["trial"] for vote in votes["votes"]] == orders(public, "r01")
     assert all(0 <= vote["ms"] < 60000 and vote["undone"] == 0 for vote in votes["votes"])
 
@@ -185,14 +185,9 @@ def test_two_tabs_of_one_rater_count_a_vote_once(chromium, pairs):
         # A tab that slept through the vote of the other does not vote on the same trial.
         other.evaluate("addEventListener('storage', e => e.stopImmediatePropagation(), true)")
         trial = one.trial
-        stale = f"palpate/{public['study']}/r01/{trial}"
-        other.evaluate(
-            "([key, vote]) => localStorage.setItem(key, vote)",
-            [
-                stale,
-                json.dumps({"choice": "same", "ms": 1, "at": "2030-01-01T00:00:00Z", "undone": 0}),
-            ],
-        )
+        vote = {"choice": "same", "ms": 1, "at": "2030-01-01T00:00:00Z", "undone": 0}
+        stored = [f"palpate/{public['study']}/r01/{trial}", json.dumps(vote)]
+        other.evaluate("([key, vote]) => localStorage.setItem(key, vote)", stored)
         two.press("1")
         assert other.inner_text("#message") == "Answered in another tab: here is the next."
         assert list(two.choices().values()) == ["left", "right", "same"]
@@ -242,10 +237,10 @@ def test_a_browser_that_closes_its_database_still_takes_every_vote(chromium, pai
 def test_the_start_says_what_to_do_how_long_it_takes_and_what_is_recorded(
     chromium, tmp_path, public, words
 ):
-    (tmp_path / "study.html").write_text(study_page(public), encoding="utf-8")
+    url = on_disk(tmp_path, public)
     with opened(chromium) as context:
         page = context.new_page()
-        page.goto((tmp_path / "study.html").as_uri())
+        page.goto(url)
         page.wait_for_selector("#start:not([hidden])")
         text = page.inner_text("#start")
     assert all(word in text for word in (*words, "a touch sensor", "Recorded", "nothing else"))
@@ -273,13 +268,12 @@ def test_screen_readers_hear_names(chromium, pairs):
 @pytest.mark.parametrize("task", ["pair", "sort"])
 def test_the_page_fits_the_screen(chromium, tmp_path, task, width, height, scheme):
     public = pair_study(6, 2)[0] if task == "pair" else sort_study(materials=MANY)
-    (tmp_path / "study.html").write_text(study_page(public), encoding="utf-8")
+    url = on_disk(tmp_path, public)
     folder = Path(os.environ.get("PALPATE_ARTIFACTS", "artifacts"))
     viewport = {"width": width, "height": height}
     with opened(chromium, viewport=viewport, color_scheme=scheme) as context:
         page = context.new_page()
         code = "r01" if task == "pair" else None
-        url = (tmp_path / "study.html").as_uri()
         page.goto(url)
         assert not page.evaluate(OVERFLOW)
         person = Person(page, url, code)
@@ -303,9 +297,9 @@ MANY = ["Brick", "Grass", "A material with a long name", *(f"Material {k}" for k
 
 def test_sorting_takes_a_key_a_material(chromium, tmp_path):
     public = sort_study(materials=MANY)
-    (tmp_path / "study.html").write_text(study_page(public), encoding="utf-8")
+    url = on_disk(tmp_path, public)
     with opened(chromium) as context:
-        person = Person(context.new_page(), (tmp_path / "study.html").as_uri())
+        person = Person(context.new_page(), url)
         assert person.page.locator(".examples img").count() == 3 * len(MANY)
         person.press("1")
         person.press("0")  # the tenth
@@ -318,11 +312,11 @@ def test_sorting_takes_a_key_a_material(chromium, tmp_path):
 def test_names_of_strangers_run_no_script(chromium, tmp_path):
     evil = "</script><img src=x onerror=alert(1)><script>alert(2)</script>"
     public = sort_study(materials=[evil, "Wood"], title=evil, question=evil)
-    (tmp_path / "study.html").write_text(study_page(public), encoding="utf-8")
+    url = on_disk(tmp_path, public)
     with opened(chromium) as context:
         page = context.new_page()
         page.on("dialog", lambda dialog: context.messages.append(dialog.message))
-        person = Person(page, (tmp_path / "study.html").as_uri() + "#<img src=x onerror=alert(3)>")
+        person = Person(page, url + "#<img src=x onerror=alert(3)>")
         assert person.page.inner_text("#question") == evil
         person.press("1")
         assert set(person.choices().values()) == {evil}
@@ -330,11 +324,11 @@ def test_names_of_strangers_run_no_script(chromium, tmp_path):
 
 
 def test_a_script_that_gets_into_the_page_is_stopped_by_the_policy(chromium, tmp_path):
-    page_text = study_page(pair_study(2, 1)[0])
-    planted = page_text.replace("<footer", "<script>document.title = 'taken'</script><footer")
-    (tmp_path / "study.html").write_text(planted, encoding="utf-8")
+    url, file = on_disk(tmp_path, pair_study(2, 1)[0]), tmp_path / "study.html"
+    planted = "<script>document.title = 'taken'</script><footer"
+    file.write_text(file.read_text("utf-8").replace("<footer", planted), encoding="utf-8")
     page = chromium.new_page()
-    page.goto((tmp_path / "study.html").as_uri())
+    page.goto(url)
     page.wait_for_selector("#start:not([hidden])")
     assert page.title() == "Tactile images"
     page.close()
@@ -342,10 +336,10 @@ def test_a_script_that_gets_into_the_page_is_stopped_by_the_policy(chromium, tmp
 
 def test_after_the_last_day_nothing_is_asked(chromium, tmp_path):
     public = pair_study(3, 1, until="2020-01-31")[0]
-    (tmp_path / "study.html").write_text(study_page(public), encoding="utf-8")
+    url = on_disk(tmp_path, public)
     with opened(chromium) as context:
         page = context.new_page()
-        page.goto((tmp_path / "study.html").as_uri())
+        page.goto(url)
         page.click("#begin button")
         page.wait_for_selector("#end:not([hidden])")
         assert page.inner_text("#thanks") == "This study ended on 2020-01-31."

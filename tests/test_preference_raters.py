@@ -29,16 +29,9 @@ CROWD = Crowd(STRENGTHS, item_sd=1.0, rater_sd=0.5, left_bias=0.2, lapses=0.03, 
 def study(tmp_path_factory):
     top = tmp_path_factory.mktemp("raters")
     folders = write_folders(top)
-    options = {
-        "items": 6,
-        "raters": RATERS,
-        "labels": folders.labels,
-        "size": 48,
-        "names": [*STRENGTHS],
-    }
     with pytest.MonkeyPatch.context() as patch:  # of 100 secrets some leave a truth outside
         patch.setattr("palpate.preference.making.secrets.token_hex", lambda size: "07" * size)
-        preference.make(folders.reference, folders.methods, top / "study", **options)
+        folders.make(top / "study", items=6, raters=RATERS, size=48, names=[*STRENGTHS])
     return top / "study"
 
 

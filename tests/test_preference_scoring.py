@@ -25,16 +25,9 @@ CROWD = Crowd({"ours": 2.0, "gvst": 0.5, "wbg": -1.0})
 
 
 @pytest.fixture(scope="module")
-def folders(tmp_path_factory):
-    return write_folders(tmp_path_factory.mktemp("folders"))
-
-
-@pytest.fixture(scope="module")
-def study(folders, tmp_path_factory):
+def study(rated, tmp_path_factory):
     top = tmp_path_factory.mktemp("study") / "study"
-    preference.make(
-        folders.reference, folders.methods, top, items=24, raters=12, labels=folders.labels, size=32
-    )
+    rated.make(top, items=24, raters=12, size=32)
     return top
 
 
@@ -182,9 +175,8 @@ def test_two_raters_stand_for_themselves(plan, study, downloads, count):
 
 
 def test_four_raters_are_few(study, downloads):
-    assert codes(preference.score(study, sorted(downloads.iterdir())[:4]))["few-raters"] == {
-        "count": 4
-    }
+    results = preference.score(study, sorted(downloads.iterdir())[:4])
+    assert codes(results)["few-raters"] == {"count": 4}
 
 
 def test_raters_are_excluded_by_rules_that_were_fixed_before(plan, study, tmp_path):
@@ -236,9 +228,8 @@ def test_one_rater_agrees_with_nobody_known(study, downloads):
 
 def test_left_bias_is_noticed(plan, study, tmp_path):
     crowd = Crowd(CROWD.strengths, left_bias=1.5)
-    agreement = preference.score(study, crowd.write(plan, tmp_path / "votes")).settings[
-        "preference"
-    ]["agreement"]
+    results = preference.score(study, crowd.write(plan, tmp_path / "votes"))
+    agreement = results.settings["preference"]["agreement"]
     assert agreement["left"] > 0.6
     assert agreement["p_left"] < 0.001
 
@@ -300,11 +291,8 @@ def test_tau_by_image_is_scipys_of_repeated_items(plan, downloads):
         x, y = [], []
         for a, b in combinations(plan.methods, 2):
             for item, count in zip(plan.items, items, strict=True):
-                net = sum(
-                    w
-                    * ((chosen[r.code, a, b, item.id] == a) - (chosen[r.code, a, b, item.id] == b))
-                    for r, w in zip(plan.raters, raters, strict=True)
-                )
+                votes = [chosen[r.code, a, b, item.id] for r in plan.raters]
+                net = sum(w * ((v == a) - (v == b)) for v, w in zip(votes, raters, strict=True))
                 x += [q[item.id, a] - q[item.id, b]] * int(count)
                 y += [net / sum(raters)] * int(count)
         return stats.kendalltau(np.r_[x, np.negative(x)], np.r_[y, np.negative(y)]).statistic
@@ -383,40 +371,31 @@ def test_torn_and_edited_votes_are_said(plan, tmp_path, change, words):
     assert "download the votes again" in str(error.value)
 
 
+def with_vote(**fields):
+    """A change of the fourth vote."""
+    return lambda f: f | {"votes": [*f["votes"][:3], f["votes"][3] | fields, *f["votes"][4:]]}
+
+
 @pytest.mark.parametrize(
-    ("changes", "words"),
+    ("change", "words"),
     [
-        ({"study": "0123456789ab"}, "of study"),
-        ({"rater": "r99"}, "r01 to r12"),
-        ({"rater": "r02"}, "a trial of this rater"),
-        ({"votes": [{"trial": "x"}]}, "a trial of this rater"),
-        ({"votes": 3}, "a trial of this rater"),
+        (lambda f: f | {"study": "0123456789ab"}, "of study"),
+        (lambda f: f | {"rater": "r99"}, "r01 to r12"),
+        (lambda f: f | {"rater": "r02"}, "a trial of this rater"),
+        (lambda f: f | {"votes": [{"trial": "x"}]}, "a trial of this rater"),
+        (lambda f: f | {"votes": 3}, "a trial of this rater"),
+        (with_vote(choice="both"), "a trial of this rater"),
+        (with_vote(ms=-1), "a trial of this rater"),
+        (with_vote(ms=10**400), "a trial of this rater"),
+        (with_vote(at="soon"), "a trial of this rater"),
+        (with_vote(undone=None), "a trial of this rater"),
+        (with_vote(undone=1000), "a trial of this rater"),
     ],
 )
-def test_votes_of_another_plan_are_said(plan, tmp_path, changes, words):
+def test_votes_of_another_plan_or_of_no_page_are_said(plan, tmp_path, change, words):
     path = tmp_path / "votes.json"
-    path.write_text(json.dumps(changed(plan, **changes)))
+    path.write_text(json.dumps(signed(change(CROWD.download(plan, "r01")))))
     with pytest.raises(PalpateError, match=words):
-        read_votes(plan, [path])
-
-
-@pytest.mark.parametrize(
-    ("field", "value"),
-    [
-        ("choice", "both"),
-        ("ms", -1),
-        ("ms", 10**400),
-        ("at", "soon"),
-        ("undone", None),
-        ("undone", 1000),
-    ],
-)
-def test_a_vote_that_no_page_gives_is_said(plan, tmp_path, field, value):
-    download = changed(plan)
-    download["votes"][3][field] = value
-    path = tmp_path / "votes.json"
-    path.write_text(json.dumps(signed(download)))
-    with pytest.raises(PalpateError, match="a trial of this rater"):
         read_votes(plan, [path])
 
 
@@ -449,10 +428,8 @@ def test_different_answers_under_one_code_are_said(plan, tmp_path):
     assert notes["votes-differ"]["count"] > 5
 
 
-def test_votes_after_the_last_day_do_not_count(folders, tmp_path):
-    plan = preference.make(
-        folders.reference, folders.methods, items=4, raters=1, until="2026-10-01", dry_run=True
-    )
+def test_votes_after_the_last_day_do_not_count(rated, tmp_path):
+    plan = rated.make(items=4, raters=1, until="2026-10-01")
     path = tmp_path / "votes.json"
     path.write_text(json.dumps(CROWD.download(plan, "r01")))
     with pytest.raises(PalpateError, match=f"{len(plan.trials)} after 2026-10-01"):
@@ -481,10 +458,8 @@ def test_what_the_server_took_counts_whatever_the_clock_of_the_rater(plan, tmp_p
 
 
 @pytest.mark.parametrize("until", ["20301231", "2030-12-31"])
-def test_the_last_day_is_kept_in_one_form(folders, until):
-    plan = preference.make(
-        folders.reference, folders.methods, items=4, raters=1, until=until, dry_run=True
-    )
+def test_the_last_day_is_kept_in_one_form(rated, until):
+    plan = rated.make(items=4, raters=1, until=until)
     assert plan.until == plan.public()["until"] == "2030-12-31"
 
 
@@ -509,18 +484,9 @@ def test_a_plan_that_was_edited_is_another_study(plan, study, downloads, tmp_pat
         preference.score(tmp_path, downloads)
 
 
-def test_sorting_is_accuracy_by_material_against_chance(folders, tmp_path):
+def test_sorting_is_accuracy_by_material_against_chance(rated, tmp_path):
     study = tmp_path / "study"
-    plan = preference.make(
-        folders.reference,
-        folders.methods[:1],
-        study,
-        items=15,
-        raters=6,
-        task="sort",
-        labels=folders.labels,
-        size=32,
-    )
+    plan = rated.make(study, 1, items=15, raters=6, task="sort", size=32)
     crowd = Crowd({}, skill=0.8)
     for rater in plan.raters:
         download = crowd.download(plan, rater.code)
@@ -551,8 +517,7 @@ def test_sorting_is_accuracy_by_material_against_chance(folders, tmp_path):
 def test_a_material_may_be_called_left(tmp_path):
     """It is no side: nobody is excluded for it."""
     folders = write_folders(tmp_path, videos=24, frames=1, materials=("left", "moss"))
-    options = {"task": "sort", "labels": folders.labels, "items": 12, "raters": 3, "size": 32}
-    plan = preference.make(folders.reference, folders.methods[:1], tmp_path / "s", **options)
+    plan = folders.make(tmp_path / "s", 1, task="sort", items=12, raters=3, size=32)
     votes = Crowd({}, skill=0.9).write(plan, tmp_path / "votes")
     agreement = preference.score(tmp_path / "s", votes).settings["preference"]["agreement"]
     assert (agreement["raters"], agreement["sides"]) == (3, 0)
@@ -561,8 +526,7 @@ def test_a_material_may_be_called_left(tmp_path):
 def test_a_material_that_was_not_shown_has_no_accuracy(tmp_path):
     materials = tuple(f"m{k}" for k in range(6))
     folders = write_folders(tmp_path, videos=12, frames=1, materials=materials)
-    options = {"task": "sort", "labels": folders.labels, "items": 4, "raters": 4, "size": 32}
-    plan = preference.make(folders.reference, folders.methods[:1], tmp_path / "s", **options)
+    plan = folders.make(tmp_path / "s", 1, task="sort", items=4, raters=4, size=32)
     crowd = Crowd({}, skill=0.9)
     results = preference.score(tmp_path / "s", crowd.write(plan, tmp_path / "votes"))
     details = results["human accuracy of material", "ours"].details
@@ -580,12 +544,12 @@ def test_a_material_that_was_not_shown_has_no_accuracy(tmp_path):
     results.to_html(tmp_path / "page.html")
 
 
-def test_neither_torch_nor_the_server_is_loaded(study, downloads, folders, tmp_path):
+def test_neither_torch_nor_the_server_is_loaded(study, downloads, rated, tmp_path):
     code = f"""
 import sys
 from palpate import preference
 from palpate.report.labels import label_of, subject_of
-preference.make({str(folders.reference)!r}, {[str(m) for m in folders.methods]!r}, dry_run=True)
+preference.make({str(rated.reference)!r}, {[str(m) for m in rated.methods]!r}, dry_run=True)
 preference.score({str(study)!r}, {str(downloads)!r}, replicates=100)
 assert not {{"torch", "starlette", "uvicorn", "diffusers"}} & set(sys.modules)
 """

@@ -15,6 +15,7 @@ import numpy as np
 from PIL import Image
 
 from forge.pictures import paint
+from palpate import preference
 from palpate.core import digest_json, rng_for
 from palpate.preference.votes import Vote, Votes
 
@@ -109,6 +110,11 @@ class Folders:
     reference: Path
     methods: list[Path]
     labels: Path
+
+    def make(self, output=None, count=3, **options):
+        """The plan of a study of the first methods; without a folder nothing is written."""
+        options = {"labels": self.labels, "dry_run": output is None} | options
+        return preference.make(self.reference, self.methods[:count], output, **options)
 
 
 def write_folders(top, videos=30, frames=2, materials=("brick", "grass", "wood")):
