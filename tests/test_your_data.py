@@ -18,6 +18,7 @@ from palpate.data import Manifest, import_dataset, load
 from palpate.data.detection import detect_layout, template_of
 from palpate.data.frames import MOVING
 from palpate.data.templates import Template, assign, join
+from palpate.report.results import Results
 from test_data_contacts import gel_video, photos
 from test_data_videos import save
 
@@ -318,7 +319,7 @@ def test_a_strangers_layout_reaches_every_verb_with_one_import(name, tmp_path, m
 
     run(f"import {source} -o m", *options)
     run("split m -o s.json")
-    run("audit m --split s.json")
+    run("audit m --split s.json -o audit.json")
     if name not in EVERY_VERB:
         return
     run("train encoder m --split s.json --preset tiny --device cpu -o e")
@@ -329,5 +330,11 @@ def test_a_strangers_layout_reaches_every_verb_with_one_import(name, tmp_path, m
     run("train generator m --split s.json --clip e --preset tiny --steps 2 --device cpu -o g")
     run("generate m --model g --split s.json --device cpu -o made")
     run("score --generated made --reference m --split s.json --encoder e -o score.json")
-    run("report score.json -o page.html")
-    assert (tmp_path / "page.html").stat().st_size > 10_000
+    run("report audit.json score.json -o page.html")
+    assert not list(tmp_path.glob(".*.work"))
+    results = Results.load(tmp_path / "page.json")
+    assert results.audits[0].leaked_fraction == 0
+    assert results.scores
+    assert results.gallery
+    assert results.settings["digests"]["split"] == results.audits[0].split
+    assert any(command.startswith("palpate score") for command in results.commands)
