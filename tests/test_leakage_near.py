@@ -1,5 +1,6 @@
 """Near-duplicates: the similarity against a slow one, calibration, causes, groups, bad files."""
 
+from itertools import product
 from pathlib import Path
 
 import numpy as np
@@ -19,25 +20,28 @@ DROPPED = ("video", "contact", "object", "session", "material", "sensor", "domai
 
 
 def anonymous(manifest):
-    table = manifest.table.with_columns(
-        pl.lit(None, pl.String).alias(c) for c in DROPPED
-    ).with_columns(frame=pl.lit(None, pl.Int64))
-    return Manifest(table, manifest.root)
+    nulls = {c: pl.lit(None, pl.String) for c in DROPPED}
+    return Manifest(
+        manifest.table.with_columns(frame=pl.lit(None, pl.Int64), **nulls), manifest.root
+    )
+
+
+def photo(*seed, side=72):
+    """A photo of smooth noise, 8 pixels smaller than ``side``."""
+    return crop(NoiseVideo(np.random.default_rng(seed), side).photo(0))
 
 
 @pytest.fixture(scope="module")
 def leaky(tmp_path_factory):
-    return make_leaky(
-        tmp_path_factory.mktemp("leaky"), 5, materials=MATERIALS[:6], kinds=("near-duplicate",)
-    )
+    folder = tmp_path_factory.mktemp("leaky")
+    return make_leaky(folder, 5, materials=MATERIALS[:6], kinds=("near-duplicate",))
 
 
 @pytest.mark.parametrize("modality", ["vision", "tactile"])
 @pytest.mark.parametrize("known", [True, False])
 def test_planted_copies_are_found_and_others_are_not(leaky, modality, known):
-    train, test = (
-        (leaky.train, leaky.test) if known else (anonymous(leaky.train), anonymous(leaky.test))
-    )
+    parts = leaky.train, leaky.test
+    train, test = parts if known else map(anonymous, parts)
     flags = near_duplicates(train, test, modality, false_positives=0.01)
     truth = leaky.truth("near-duplicate")
     found, copies = truth & flags.flag, np.flatnonzero(truth)
@@ -69,33 +73,21 @@ def test_groups_join_copies_and_nothing_else(leaky):
     label = dict(zip(both.ids, near_groups(both, "vision").tolist(), strict=True))
     pairs = leaky.planted["near-duplicate"].items()
     assert all(label[a] == label[b] >= 0 for a, b in pairs)
-    allowed = {
-        frozenset(i.split("/")[0] for i in pair) for pair in pairs
-    }  # videos that a planted pair joins
+    video = lambda i: i.split("/")[0]
+    allowed = {frozenset(map(video, pair)) for pair in pairs}  # that a planted pair joins
     joined = {
-        frozenset((a.split("/")[0], b.split("/")[0]))
-        for a in label
-        for b in label
-        if label[a] == label[b] >= 0
+        frozenset((video(a), video(b))) for a in label for b in label if label[a] == label[b] >= 0
     }
-    assert (
-        sum(len(pair) == 2 and pair not in allowed for pair in joined) <= 4
-    )  # a video between two others joins them
+    # A video between two others joins them.
+    assert sum(len(pair) == 2 and pair not in allowed for pair in joined) <= 4
 
 
-def rows(root, name, images, background=None):
+def rows(root, name, images):
     out = []
     for k, image in enumerate(images):
         save(root / f"{name}{k}.jpg", image)
         out.append(
-            {
-                "id": f"{name}/{k}",
-                "video": name,
-                "frame": 10 * k,
-                "vision": f"{name}{k}.jpg",
-                "tactile": f"{name}{k}.jpg",
-                "background": background,
-            }
+            {"id": f"{name}/{k}", "video": name, "frame": 10 * k, "vision": f"{name}{k}.jpg"}
         )
     return out
 
@@ -109,32 +101,18 @@ def gels(root, count=6):
         for t in range(8):
             save(root / f"v{v}b{t}.jpg", crop(video.background()))
             save(root / f"v{v}t{t}.jpg", crop(video.touch(t)))
-            samples.append(
-                {
-                    "id": f"v{v}/{t}",
-                    "video": f"v{v}",
-                    "frame": 10 * t,
-                    "tactile": f"v{v}t{t}.jpg",
-                    "background": f"v{v}b{t}.jpg",
-                }
-            )
+            files = {"tactile": f"v{v}t{t}.jpg", "background": f"v{v}b{t}.jpg"}
+            samples.append({"id": f"v{v}/{t}", "video": f"v{v}", "frame": 10 * t, **files})
     return made, samples
 
 
 def test_untouched_gel_is_named_and_is_no_leak(tmp_path):
     videos, samples = gels(tmp_path)
+    blank = []
     for k in range(2):
         save(tmp_path / f"blank{k}.jpg", crop(videos[0].background()))
-    blank = [
-        {
-            "id": f"blank{k}",
-            "video": f"v{k}",
-            "frame": 500,
-            "tactile": f"blank{k}.jpg",
-            "background": "v0b0.jpg",
-        }
-        for k in range(2)
-    ]
+        files = {"tactile": f"blank{k}.jpg", "background": "v0b0.jpg"}
+        blank.append({"id": f"blank{k}", "video": f"v{k}", "frame": 500, **files})
     train = Manifest.from_rows([*samples[:24], blank[0]], tmp_path)
     test = Manifest.from_rows([*samples[24:], blank[1]], tmp_path)
     flags = near_duplicates(train, test, "tactile")
@@ -147,40 +125,23 @@ def test_untouched_gel_is_named_and_is_no_leak(tmp_path):
 
 def test_black_photos_show_nothing(tmp_path):
     black = rows(tmp_path, "black", [np.full((64, 64, 3), 3, np.uint8)] * 4)
-    others = [
-        rows(
-            tmp_path,
-            f"n{v}",
-            [crop(NoiseVideo(np.random.default_rng([v, 1]), 72).photo(0)) for _ in range(4)],
-        )
-        for v in range(12)
-    ]
-    train = Manifest.from_rows(
-        [*black[:2], *(row for rows_ in others[:6] for row in rows_)], tmp_path
-    )
-    test = Manifest.from_rows(
-        [*black[2:], *(row for rows_ in others[6:] for row in rows_)], tmp_path
-    )
+    parts = [black[:2], black[2:]]
+    for v in range(12):
+        parts[v // 6] += rows(tmp_path, f"n{v}", [photo(v, 1) for _ in range(4)])
+    train, test = (Manifest.from_rows(part, tmp_path) for part in parts)
     flags = near_duplicates(train, test, "vision")
     assert list(flags.cause[:2]) == ["nothing touched"] * 2
     assert not flags.flag.any()
 
 
 def test_rubbish_files_and_modes_are_told_and_never_raised(tmp_path):
-    image = crop(NoiseVideo(np.random.default_rng(3), 72).photo(0))
-    image = Image.fromarray(image)
+    image = Image.fromarray(photo(3))
     image.save(tmp_path / "a.jpg", quality=95)
-    for mode, name in (
-        ("L", "gray.png"),
-        ("RGBA", "alpha.png"),
-        ("P", "palette.gif"),
-        ("CMYK", "cmyk.jpg"),
-        ("L", "gray.jpg"),
-    ):
+    modes = {"gray.png": "L", "alpha.png": "RGBA", "palette.gif": "P", "cmyk.jpg": "CMYK"}
+    for name, mode in {**modes, "gray.jpg": "L"}.items():
         image.convert(mode).save(tmp_path / name)
-    Image.fromarray(np.asarray(image.convert("L")).astype(np.uint16) * 257).save(
-        tmp_path / "deep.png"
-    )
+    deep = np.asarray(image.convert("L")).astype(np.uint16) * 257
+    Image.fromarray(deep).save(tmp_path / "deep.png")
     image.resize((301, 97)).save(tmp_path / "wide.jpg")
     (tmp_path / "empty.jpg").write_bytes(b"")
     (tmp_path / "cut.jpg").write_bytes((tmp_path / "a.jpg").read_bytes()[:600])
@@ -192,9 +153,8 @@ def test_rubbish_files_and_modes_are_told_and_never_raised(tmp_path):
         assert seen.shape == (32, 32, 3)
         luma = [x @ [0.299, 0.587, 0.114] for x in (seen, thumbnail(tmp_path / "a.jpg"))]
         assert np.abs(luma[0] - luma[1]).mean() < 6
-    manifest = Manifest.from_rows(
-        [*({"id": n, "vision": n} for n in [*names, "absent.jpg"]), {"id": "none"}], tmp_path
-    )
+    cells = [*({"id": n, "vision": n} for n in [*names, "absent.jpg"]), {"id": "none"}]
+    manifest = Manifest.from_rows(cells, tmp_path)
     flags = near_duplicates(manifest, manifest, "vision")
     bad = [i in ("empty.jpg", "cut.jpg", "text.jpg", "absent.jpg", "none") for i in manifest.ids]
     assert np.array_equal(np.isnan(flags.score), bad)
@@ -205,21 +165,11 @@ def test_rubbish_files_and_modes_are_told_and_never_raised(tmp_path):
 def test_cache_and_processes_change_nothing(tmp_path, monkeypatch):
     paths = [tmp_path / f"{k}.jpg" for k in range(6)]
     for k, path in enumerate(paths):
-        save(path, crop(NoiseVideo(np.random.default_rng(k % 5), 72).photo(0)))
+        save(path, photo(k % 5))
     order: list[Path | None] = [paths[2], paths[0], None, paths[2], *paths]
     plain = thumbnails(order)
-    assert list(plain.row) == [
-        2,
-        0,
-        -1,
-        2,
-        0,
-        1,
-        2,
-        3,
-        4,
-        0,
-    ]  # the last file is the first one's image again
+    # The last file is the first one's image again.
+    assert list(plain.row) == [2, 0, -1, 2, 0, 1, 2, 3, 4, 0]
     assert len(plain.pixels) == 5
     monkeypatch.setattr("palpate.leakage.thumbnails.PIECE", 2)
     cached = thumbnails(order, cache=tmp_path / "cache")
@@ -235,34 +185,25 @@ def test_cache_and_processes_change_nothing(tmp_path, monkeypatch):
 
 
 def test_many_rows_of_one_image_and_tiny_sets_are_answered(tmp_path):
-    save(tmp_path / "a.jpg", crop(NoiseVideo(np.random.default_rng(0), 72).photo(0)))
-    table = pl.DataFrame({"id": [str(k) for k in range(20_000)]}).with_columns(
-        vision=pl.lit("a.jpg"), video=pl.lit("v")
-    )
-    many = Manifest(
-        Manifest.from_rows([], tmp_path)
-        .table.clear(20_000)
-        .with_columns(id=table["id"], vision=table["vision"], video=table["video"]),
-        tmp_path,
-    )
+    save(tmp_path / "a.jpg", photo(0))
+    cells = [{"id": str(k), "vision": "a.jpg", "video": "v"} for k in range(20_000)]
+    many = Manifest.from_rows(cells, tmp_path)
     flags = near_duplicates(many, many, "vision")
     assert flags.flag.all()
     assert flags.verdict == "leaks"
     assert "cannot-tell-no-null" in [note.code for note in flags.notes]
     empty = Manifest(many.table.clear(), tmp_path)
     assert len(near_duplicates(many, empty, "vision").score) == 0
-    assert np.isnan(
-        near_duplicates(empty, Manifest(many.table.head(3), tmp_path), "vision").score
-    ).all()
+    few = Manifest(many.table.head(3), tmp_path)
+    assert np.isnan(near_duplicates(empty, few, "vision").score).all()
 
 
 @pytest.mark.slow
 def test_real_clips_without_metadata(real_data, tmp_path):
     from palpate.data.importing import import_dataset
 
-    manifest = import_dataset(
-        real_data / "touch_and_go" / "clips", tmp_path, format="touch-and-go"
-    ).manifest
+    clips = real_data / "touch_and_go" / "clips"
+    manifest = import_dataset(clips, tmp_path, format="touch-and-go").manifest
     odd = np.arange(len(manifest)) % 2 == 1
     hidden = anonymous(manifest)
     part = lambda keep: Manifest(hidden.table.filter(pl.Series(keep)), hidden.root)
@@ -273,58 +214,44 @@ def test_real_clips_without_metadata(real_data, tmp_path):
         same = videos[~odd][flags.nearest[flags.flag]] == videos[odd][flags.flag]
         assert same.all()
         for clip in np.unique(videos):
-            assert not near_duplicates(
-                part(videos != clip), part(videos == clip), modality
-            ).flag.any()
+            parts = part(videos != clip), part(videos == clip)
+            assert not near_duplicates(*parts, modality).flag.any()
 
 
-def uploads(
-    folder: Path, seeds: range, name: str, count: int, *, copied: bool = False
-) -> list[dict[str, str]]:
+def uploads(folder, seeds, name, count, *, copied=False):
     """``count`` images of each video, copies brighter and saved again at quality 60."""
-    rows: list[dict[str, str]] = []
+    rows = []
     for seed in seeds:
         video = NoiseVideo(np.random.default_rng(seed), 72)
         for k in range(count):
             path = folder / f"{name}{seed}-{k}.{'jpg' if copied else 'png'}"
             image = crop(video.photo(40 * k))
             if copied:
-                Image.fromarray(np.clip(image * 1.05, 0, 255).astype(np.uint8)).save(
-                    path, quality=60
-                )
+                brighter = np.clip(image * 1.05, 0, 255).astype(np.uint8)
+                Image.fromarray(brighter).save(path, quality=60)
             else:
                 save(path, image)
             rows.append({"id": path.stem, "video": f"{name}{seed}", "vision": path.name})
     return rows
 
 
-@pytest.mark.parametrize(
-    "case", ["eleven videos", "one video", "train twice", "most of train twice"]
-)
+#: Images a video, videos of train, and those that train and that test copies.
+COPIES = {
+    "eleven videos": (4, range(11), (), range(11)),  # fewer than a hundred images, all copied
+    "one video": (20, range(1), (), range(1)),
+    "train twice": (5, range(8), range(3), range(3)),  # what test copies has two names in train
+    "most of train twice": (4, range(12), range(4, 12), range(4)),
+}
+
+
+@pytest.mark.parametrize("case", COPIES)
 def test_copies_are_found_however_many_they_are(tmp_path, case):
-    if case == "eleven videos":  # fewer than a hundred train images, and all of test copies
-        train, test = (
-            uploads(tmp_path, range(11), "a", 4),
-            uploads(tmp_path, range(11), "b", 4, copied=True),
-        )
-    elif case == "one video":
-        train, test = (
-            uploads(tmp_path, range(1), "a", 20),
-            uploads(tmp_path, range(1), "b", 20, copied=True),
-        )
-    elif case == "train twice":  # what test copies stands in train under two names
-        train = uploads(tmp_path, range(8), "a", 5) + uploads(
-            tmp_path, range(3), "c", 5, copied=True
-        )
-        test = uploads(tmp_path, range(3), "b", 5, copied=True)
-    else:
-        train = uploads(tmp_path, range(12), "a", 4) + uploads(
-            tmp_path, range(4, 12), "c", 4, copied=True
-        )
-        test = uploads(tmp_path, range(4), "b", 4, copied=True)
-    flags = near_duplicates(
-        Manifest.from_rows(train, tmp_path), Manifest.from_rows(test, tmp_path), "vision"
-    )
+    count, videos, again, copies = COPIES[case]
+    train = uploads(tmp_path, videos, "a", count)
+    train += uploads(tmp_path, again, "c", count, copied=True)
+    test = uploads(tmp_path, copies, "b", count, copied=True)
+    parts = (Manifest.from_rows(part, tmp_path) for part in (train, test))
+    flags = near_duplicates(*parts, "vision")
     if case in ("one video", "most of train twice"):  # what is chance cannot be known
         assert flags.verdict == "cannot tell"
         assert flags.expected is None
@@ -336,13 +263,10 @@ def test_copies_are_found_however_many_they_are(tmp_path, case):
 
 
 def test_equal_pictures_score_one_however_many_there_are(tmp_path):
-    save(tmp_path / "still.png", crop(NoiseVideo(np.random.default_rng(0), 72).photo(0)))
-    rows = [
-        {"id": f"{v}/{k}", "video": f"v{v}", "vision": "still.png"}
-        for v in range(40)
-        for k in range(500)
-    ]
-    whole = Manifest.from_rows(rows, tmp_path)
+    save(tmp_path / "still.png", photo(0))
+    names = product(range(40), range(500))
+    cells = [{"id": f"{v}/{k}", "video": f"v{v}", "vision": "still.png"} for v, k in names]
+    whole = Manifest.from_rows(cells, tmp_path)
     train, test = (Manifest(whole.table[a:b], tmp_path) for a, b in ((0, 16_000), (16_000, 20_000)))
     flags = near_duplicates(train, test, "vision")
     assert flags.flag.all()
@@ -351,12 +275,11 @@ def test_equal_pictures_score_one_however_many_there_are(tmp_path):
 
 def test_a_changed_file_is_decoded_again_and_cameras_may_be_held_upright(tmp_path):
     path = tmp_path / "a.jpg"
-    save(path, crop(NoiseVideo(np.random.default_rng(0), 72).photo(0)))
+    save(path, photo(0))
     before = thumbnails([path], cache=tmp_path / "cache").pixels.copy()
-    save(path, crop(NoiseVideo(np.random.default_rng(1), 72).photo(0)))
-    assert (
-        np.abs(thumbnails([path], cache=tmp_path / "cache").pixels.astype(int) - before).mean() > 5
-    )
+    save(path, photo(1))
+    after = thumbnails([path], cache=tmp_path / "cache").pixels
+    assert np.abs(after.astype(int) - before).mean() > 5
     image = Image.open(path).convert("RGB")
     exif = Image.Exif()
     exif[0x0112] = 6  # the camera was turned: shown rotated by a quarter, clockwise
