@@ -161,8 +161,7 @@ def screenshot(page, name):
     page.screenshot(path=folder / f"{name}.png", full_page=True)
 
 
-@pytest.mark.parametrize("scheme", ["light", "dark"])
-@pytest.mark.parametrize("width", [1280, 360])
+@pytest.mark.parametrize(("width", "scheme"), [(1280, "light"), (360, "dark")])
 def test_the_page_fits_and_decodes_every_image(chromium, page_file, width, scheme):
     with opened(chromium, page_file, width, scheme) as page:
         for state in ("folded", "open"):
@@ -177,8 +176,7 @@ def test_the_page_fits_and_decodes_every_image(chromium, page_file, width, schem
     assert all(complete and natural > 0 and alt > 0 for complete, natural, alt in decoded)
 
 
-@pytest.mark.parametrize("scheme", ["light", "dark"])
-@pytest.mark.parametrize("width", [1280, 360])
+@pytest.mark.parametrize(("width", "scheme"), [(1280, "light"), (360, "dark")])
 def test_audits_fit_and_no_label_lies_on_another(chromium, audit_page, width, scheme):
     with opened(chromium, audit_page, width, scheme) as page:
         screenshot(page, f"audits-{width}-{scheme}")

@@ -46,8 +46,7 @@ def pages(tmp_path_factory):
     }
 
 
-@pytest.mark.parametrize("scheme", ["light", "dark"])
-@pytest.mark.parametrize("width", [1280, 390])
+@pytest.mark.parametrize(("width", "scheme"), [(1280, "light"), (390, "dark")])
 @pytest.mark.parametrize("name", ["study", "long"])
 def test_claims_and_tables_fit(chromium, pages, name, width, scheme):
     with opened(chromium, pages[name], width, scheme) as page:
