@@ -2,10 +2,16 @@
 
 from __future__ import annotations
 
+import atexit
+import copy
+import shutil
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import numpy as np
+import pytest
 import torch
 from torch import Tensor
 from torch.nn.functional import conv2d, group_norm, interpolate, pad, silu
@@ -100,6 +106,22 @@ def make_encoders(seed: int = 0) -> EncoderSet:
 
 def write_shipped(root: Path, monkeypatch) -> TactilePipeline:
     """Write ``root/mini``, make ``palpate/mini`` refer to it, and return the generator."""
+    folder, pipeline = _shipped()
+    shutil.copytree(folder, root, dirs_exist_ok=True)
+    monkeypatch.setattr(models, "shipped_root", lambda: root)
+    return copy.deepcopy(pipeline)
+
+
+@cache
+def _shipped() -> tuple[str, TactilePipeline]:
+    """A folder like that of the package, written once a process, and its generator."""
+    folder = TemporaryDirectory(prefix="palpate-shipped-")
+    atexit.register(folder.cleanup)
+    with pytest.MonkeyPatch.context() as patch:
+        return folder.name, _build(Path(folder.name), patch)
+
+
+def _build(root: Path, monkeypatch) -> TactilePipeline:
     monkeypatch.setattr(models, "shipped_root", lambda: root)
     encoders = make_encoders()
     encoders.save(root / "mini" / "encoders", half=True)
