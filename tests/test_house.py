@@ -22,7 +22,6 @@ LINT = Path(sys.executable).parent / "lint-imports"
 
 #: What runs -> libraries that it loads none of.
 LIGHT = {
-    "import palpate": "torch polars numpy tyro rich",
     "from palpate.cli import main; assert main(['--help']) == 0": "torch polars numpy tyro rich",
     "import palpate.data": "polars",
     "import palpate.data.listing": "PIL av torch",
