@@ -87,9 +87,3 @@ def test_public_signatures(name):
     for part in name.split("."):
         function = getattr(function, part)
     assert parameters(function) == SIGNATURES[name]
-
-
-def test_tower_is_no_word_of_palpate():
-    for path in (TOP / "src").rglob("*"):
-        if path.suffix in (".py", ".json", ".md"):
-            assert "tower" not in path.read_text(encoding="utf-8").lower(), path
