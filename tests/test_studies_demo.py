@@ -99,13 +99,6 @@ def test_the_demo_ends_in_a_page_with_everything_on_it(whole):
     assert page.count("data:image/") >= 3 * len(results.gallery)
 
 
-def test_the_leak_of_the_world_is_what_the_audit_reports(whole):
-    leak = json.loads((whole / "world" / "tree" / "world.json").read_text())["leak"]
-    orig = Results.load(whole / "page.json").audits[0]
-    shared = leak["test_frames_in_shared_videos"]
-    assert (orig.test_samples_in_shared_groups, orig.test_samples) == (shared, leak["test_frames"])
-
-
 @pytest.mark.parametrize(
     "stage", ["generator", pytest.param("generated", marks=pytest.mark.nightly)]
 )
@@ -171,20 +164,6 @@ def test_an_encoder_and_a_generator_of_another_split_are_noted(whole, tmp_path, 
     assert "generator-of-other-split" in [n.code for n in made.notes]
     own = Results.load(whole / "page.json")
     assert not [n for s in own for n in s.notes if n.code.endswith("-of-other-split")]
-
-
-def test_unreadable_photos_stop_generating_unless_skipped(whole, tmp_path):
-    photos = next((whole / "world" / "tree" / "dataset").iterdir()) / "video_frame"
-    (tmp_path / "photos").mkdir()
-    for path in sorted(photos.iterdir())[:3]:
-        (tmp_path / "photos" / path.name).write_bytes(path.read_bytes())
-    (tmp_path / "photos" / "broken.jpg").write_bytes(path.read_bytes()[:200])
-    args = ["generate", str(tmp_path / "photos"), "-o", str(tmp_path / "a"), "-q"]
-    args += ["--model", str(whole / "generator" / "model")]
-    assert main(args) == 2
-    assert not (tmp_path / "a").exists()
-    assert main([*args, "--skip-bad"]) == 0
-    assert len(list((tmp_path / "a" / "images").iterdir())) == 3
 
 
 @pytest.mark.nightly
