@@ -3,36 +3,17 @@
 from __future__ import annotations
 
 import dataclasses
-from dataclasses import dataclass, field, make_dataclass
-from typing import Annotated, Any, Literal
-
-import tyro
+from dataclasses import dataclass
+from typing import Any, Literal
 
 from palpate.cli.terminal import Common, OutPath, Terminal
 from palpate.sim import DEFAULT, PRESETS, SEEN_WARNING, WorldOptions, seen_by_mini, write_world
 
-
-def _fields() -> list[tuple[str, Any, Any]]:
-    """Return the options of a world, each None unless given."""
-    fields: list[tuple[str, Any, Any]] = []
-    for option in dataclasses.fields(WorldOptions):
-        limits = option.metadata
-        text = f"{limits['help'][0].upper()}{limits['help'][1:]}."
-        if "choices" in limits:
-            of, metavar = Literal[limits["choices"]], "|".join(limits["choices"])
-        elif "low" in limits:
-            of, metavar = type(limits["low"]), "X"
-        else:
-            of, metavar = tuple[str, ...], "NAME ..."
-        value = getattr(PRESETS[DEFAULT], option.name)
-        value = " ".join(map(str, value)) if isinstance(value, tuple) else value
-        default = f"(default: the preset's; {DEFAULT}: {value})"
-        argument = tyro.conf.arg(help=text, metavar=metavar, help_behavior_hint=default)
-        fields.append((option.name, Annotated[of | None, argument], field(default=None)))
-    return fields
-
-
-_World = make_dataclass("World", _fields(), frozen=True, kw_only=True)
+#: Options of the preset that can be given; those of the class have the same names.
+FIELDS = (
+    *("seed", "size", "look", "materials", "objects_per_material", "videos_per_object"),
+    *("leak", "layout"),
+)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -47,21 +28,35 @@ class Options(Common):
     preset: Literal["tiny", "demo", "pretrain", "small", "full"] = DEFAULT
     """What to start from; small has 8,000 contact frames at 64 px, full 36,000 at
     128 px."""
+    seed: int | None = None
+    """Worlds of different seeds share no object, video, text."""
+    size: int | None = None
+    """Side of the images in pixels, 16 to 256 (default: 64; of full 128)."""
+    look: Literal["gelsight", "digit"] | None = None
+    """Sensor: a GelSight with markers (default), or a darker DIGIT without."""
+    materials: tuple[str, ...] | None = None
+    """Names, or how many of the 20, evenly spaced (default: all; of tiny 4)."""
+    objects_per_material: int | None = None
+    """Objects of each material that have videos (default: 20; of tiny 2, demo 5, full 60)."""
+    videos_per_object: int | None = None
+    """Videos of each object (default: 1; of small and full 2 for a quarter of them)."""
+    leak: Literal["contact", "frame", "none"] | None = None
+    """What test may share with train: videos (contact, default), contacts (frame), or neither."""
+    layout: Literal["frames", "videos"] | None = None
+    """Touch and Go as JPEG frames (default) or as H.264 videos."""
     workers: int = 2
     """Processes; the files do not depend on it."""
-    world: _World = field(default_factory=_World)  # pyright: ignore[reportInvalidTypeForm]
-    """What is simulated, and the train and test lists."""
 
 
 def run(options: Options, terminal: Terminal) -> dict[str, Any]:
     """Write the world and print what it holds."""
     world = world_options(options)
-    if seen_by_mini(world):
+    seen = {"seen_by_shipped_models": SEEN_WARNING} if seen_by_mini(world) else {}
+    if seen:
         terminal.print_line(f"Seed {world.seed}: {SEEN_WARNING}")
     with terminal.progress() as progress:
         record = write_world(options.output, world, workers=options.workers, progress=progress)
-    facts = {"folder": str(record.folder), "digest": record.digest, **record.counts}
-    facts |= {"seen_by_shipped_models": SEEN_WARNING} if seen_by_mini(world) else {}
+    facts = {"folder": str(record.folder), "digest": record.digest, **record.counts, **seen}
     leak = {f"leak: {k}": v for k, v in record.leak.items()}
     terminal.facts(f"World {options.output} (synthetic)", facts | leak)
     return facts | {"leak": record.leak}
@@ -73,7 +68,10 @@ def world_options(options: Options) -> WorldOptions:
     Raises:
         PalpateError: if an option is out of range.
     """
-    given = {k: v for k, v in vars(options.world).items() if v is not None}
-    if (names := given.get("materials")) and len(names) == 1 and names[0].lstrip("-").isdecimal():
-        given["materials"] = int(names[0])
-    return dataclasses.replace(PRESETS[options.preset], **given)
+    changes: dict[str, Any] = {
+        name: value for name in FIELDS if (value := getattr(options, name)) is not None
+    }
+    match options.materials:
+        case (count,) if count.lstrip("-").isdecimal():
+            changes["materials"] = int(count)
+    return dataclasses.replace(PRESETS[options.preset], **changes)

@@ -104,6 +104,22 @@ def sample_periodic(field: Array, y: Array, x: Array) -> Array:
     return _bilinear([flat.take(k, axis=-1) for k in indices], y - low_y, x - low_x)
 
 
+def window(
+    field: Array, at: tuple[Array, Array], angle: float, reach: float, center: tuple[float, float]
+) -> Array:
+    """Look a periodic field up in a turned window.
+
+    Args:
+        field: (n, n) or (k, n, n).
+        at: y and x in half widths of the window.
+        angle: of the window in radians.
+        reach: half its width in pixels of the field.
+        center: x and y of its middle in pixels.
+    """
+    (y, x), c, s = at, math.cos(angle) * reach, math.sin(angle) * reach
+    return sample_periodic(field, s * x + c * y + center[1], c * x - s * y + center[0])
+
+
 def resample(field: Array, size: int) -> Array:
     """Resize (n, n) or (n, n, k) to (size, size[, k]): means over the area of each output pixel.
 

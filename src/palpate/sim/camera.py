@@ -8,24 +8,13 @@ with the sensor, blur and noise.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 
 import numpy as np
 from scipy import ndimage
 
-from palpate.sim.arrays import (
-    Array,
-    blend,
-    f32,
-    grid,
-    hsv,
-    over,
-    sample_periodic,
-    smoothstep,
-    turned,
-)
+from palpate.sim.arrays import Array, blend, f32, grid, hsv, over, smoothstep, turned, window
+from palpate.sim.materials import Surface
 from palpate.sim.motion import State
-from palpate.sim.objects import WorldObject
 from palpate.sim.options import WorldOptions
 from palpate.sim.tile import TILE_MM, wrapped_offset
 
@@ -39,157 +28,133 @@ ELEVATION_DEG = (18.0, 75.0)
 HAND, SHADOW, EDGE = 0.6, 0.5, 0.35
 #: Blurs in pixels at 128 px, one drawn a video.
 BLUR_PX = (0.35, 0.6, 1.1)
-
-
-@dataclass(frozen=True)
-class Camera:
-    """Light and camera of one video; angles in radians, distances in the view in half widths."""
-
-    view: float  # width of the view in mm
-    turn: float
-    tilt: tuple[float, float]
-    sun_to: tuple[float, float, float]  # unit vector towards the sun
-    sun: float  # strength of the sun
-    ambient: float  # strength of the ambient light
-    light: Array  # its RGB
-    exposure: float  # error of the auto-exposure, a factor
-    blur: float  # deviation in pixels at 128 px
-    noise: float  # deviation
-    hand: float | None  # direction it enters from
-    skin: Array  # color of the hand
-    shadow: tuple[float, float, float] | None  # direction, offset and factor of a cast shadow
-    edge: tuple[float, float] | None  # direction and distance of the object's edge
-    beyond: Array  # color behind the edge
-
-
-@dataclass(frozen=True)
-class Scene:
-    """An object in the light of a video: its tile (3, n, n), pixel size in mm, and exposure."""
-
-    tile: Array
-    px: float
-    exposure: float
-
-
-def make_camera(options: WorldOptions, video: int) -> Camera:
-    """Draw light and camera; ``options.hard`` scales everything that is irrelevant to contact."""
-    rng = options.rng("camera", video)
-    draw, scale, circle = rng.uniform, 2.0 * options.hard, 2.0 * math.pi
-    happens = lambda share: bool(rng.random() < min(0.95, share * scale))
-    lean = lambda: max(-0.5, min(0.5, rng.normal(0.0, 0.2 * min(1.4, scale) + 1e-9)))
-    elevation, azimuth = math.radians(draw(*ELEVATION_DEG)), draw(0.0, circle)
-    warm = draw(-1.0, 1.0) * scale
-    near, far = (math.log(end) for end in VIEW_MM)
-    view = math.exp(
-        (near + far) / 2.0 + draw(-0.5, 0.5) * (far - near) * min(1.0, 0.4 + 0.6 * scale)
-    )
-    hand, hand_from = happens(HAND), draw(0.0, circle)
-    shadow = happens(SHADOW)
-    shadow_at = (draw(0.0, math.pi), draw(-0.6, 0.6), draw(0.35, 0.75))
-    edge, edge_at = happens(EDGE), (draw(0.0, circle), draw(0.25, 0.75))
-    bare = rng.random() < 0.6
-    skin = hsv(draw(0.03, 0.08), draw(0.25, 0.55), draw(0.25, 0.9))
-    glove = hsv(rng.random(), 0.2, draw(0.08, 0.5))
-    flat, warmth = math.cos(elevation), np.array([1.0 + 0.13 * warm, 1.0, 1.0 - 0.13 * warm])
-    return Camera(
-        view=view,
-        turn=draw(0.0, circle),
-        tilt=(lean(), lean()),
-        sun_to=(math.cos(azimuth) * flat, math.sin(azimuth) * flat, math.sin(elevation)),
-        sun=draw(0.25, 1.0),
-        ambient=draw(0.35, 0.8),
-        light=f32(warmth * np.exp(rng.normal(0.0, 0.03 * scale + 1e-9, 3))),
-        exposure=math.exp(rng.normal(0.0, 0.2 * scale + 1e-9)),
-        blur=BLUR_PX[int(rng.integers(len(BLUR_PX)))],
-        noise=draw(0.004, 0.01 + 0.018 * options.hard),
-        hand=hand_from if hand else None,
-        skin=skin if bare else glove,
-        shadow=shadow_at if shadow else None,
-        edge=edge_at if edge else None,
-        beyond=hsv(rng.random(), draw(0.05, 0.6), draw(0.15, 0.85)),
-    )
-
-
-def _stained(options: WorldOptions, albedo: Array, video: int, number: int) -> Array:
-    """Add stains and stickers to an albedo: elliptic spots that are seen but not felt."""
-    rng = options.rng("stains", video, number)
-    draw, at = rng.uniform, f32(np.arange(options.tile) * (TILE_MM / options.tile))
-    count = round((0, 0, 1, 2, 5)[int(rng.integers(5))] * 2.0 * options.hard)
-    for _ in range(count):
-        y, x = draw(0.0, TILE_MM), draw(0.0, TILE_MM)
-        radius, aspect, angle = draw(1.0, 6.0), draw(0.4, 1.6), draw(0.0, math.pi)
-        color = hsv(rng.random(), draw(0.2, 1.0), draw(0.1, 1.0))
-        u, v = turned(wrapped_offset(at[:, None], y), wrapped_offset(at[None], x), angle)
-        spot = smoothstep(np.hypot(u * (1.0 / aspect), v), radius, radius * 0.9)
-        albedo = blend(albedo, color, spot * draw(0.4, 1.0))
-    return albedo
-
-
-def light_object(
-    options: WorldOptions, camera: Camera, body: WorldObject, video: int, number: int
-) -> Scene:
-    """Light the tile of ``body``, object ``number`` of the video, blurred to the view's pixels."""
-    height, px, surface = body.surface.height, body.px, body.surface
-    softened = ndimage.gaussian_filter(height, 0.6, mode="wrap")
-    slope_y = (np.roll(softened, -1, 0) - np.roll(softened, 1, 0)) * (0.5 / px)
-    slope_x = (np.roll(softened, -1, 1) - np.roll(softened, 1, 1)) * (0.5 / px)
-    upright = 1.0 / np.sqrt(1.0 + slope_x * slope_x + slope_y * slope_y)
-    lx, ly, lz = camera.sun_to
-    direct = np.maximum((lz - slope_x * lx - slope_y * ly) * upright, 0.0)
-    pit = height - ndimage.gaussian_filter(height, 1.2 / px, mode="wrap")
-    open_sky = np.clip(1.0 + 0.55 * pit * (1.0 / (0.35 + float(height.std()))), 0.35, 1.25)
-    albedo = _stained(options, surface.albedo, video, number)
-    half_way = ((lz + 1.0) - slope_x * lx - slope_y * ly) * upright
-    norm = math.sqrt(lx * lx + ly * ly + (lz + 1.0) ** 2)
-    mirror = np.maximum(half_way * (1.0 / norm), 0.0) ** 60
-    rgb = albedo * (camera.ambient * open_sky + camera.sun * direct)[..., None] * camera.light
-    rgb += (mirror * (surface.gloss * 0.55 * camera.sun))[..., None]
-    # The power makes the auto-exposure imperfect, so that dark objects stay darker.
-    exposure = (0.40 * camera.exposure / (0.12 + float(rgb.mean()))) ** 0.75
-    blur = max(0.3, 0.42 * camera.view / options.size / px)
-    lit = np.ascontiguousarray(np.moveaxis(rgb * exposure, 2, 0))
-    tile = ndimage.gaussian_filter(lit, (0.0, blur, blur), mode="wrap", truncate=3.0)
-    return Scene(tile, px, exposure)
-
-
 #: Frequency, phase factor of the slow drift: tilt along x and y, rotation, distance.
-_SWAY = ((0.31, 1.0), (0.23, 2.0), (0.17, 3.0), (0.11, 5.0))
+SWAY = ((0.31, 1.0), (0.23, 2.0), (0.17, 3.0), (0.11, 5.0))
 
 
-def photo(
-    options: WorldOptions, camera: Camera, scene: Scene, state: State, at: tuple[int, int]
-) -> Array:
-    """Render the photo at (video, frame), shape (n, n, 3), about [0, 1], from no other frame."""
-    video, frame = at
-    rng, size = options.rng("photo", video, frame), options.size
-    y, x = grid(size)
-    sway = [0.012 * math.sin(w * frame + video * p) for w, p in _SWAY]
-    depth = 1.0 + x * (camera.tilt[0] + sway[0]) + y * (camera.tilt[1] + sway[1])
-    wy, wx = y / depth, x / depth
-    reach = camera.view / 2.0 * (1.0 + sway[3]) / scene.px
-    c, s = math.cos(camera.turn + sway[2]) * reach, math.sin(camera.turn + sway[2]) * reach
-    shift_x, shift_y = rng.normal(0.0, 0.004) * reach, rng.normal(0.0, 0.004) * reach
-    rows = s * wx + c * wy + (state.place[1] / scene.px + shift_y)
-    columns = c * wx - s * wy + (state.place[0] / scene.px + shift_x)
-    image = sample_periodic(scene.tile, rows, columns)
-    if camera.edge is not None:
-        angle, distance = camera.edge
-        past = smoothstep(turned(wy, wx, angle)[0], distance, distance + 0.03)
-        shading = 0.8 + 0.25 * np.sin(5.0 * wx + 3.0 * wy + float(video))
-        image = over(image, camera.beyond[:, None, None] * shading, past)
-    if camera.shadow is not None:
-        angle, offset, factor = camera.shadow
-        dark = smoothstep(turned(y, x, angle)[0], offset, offset + 0.12)
-        image *= 1.0 - (1.0 - factor) * dark
-    if camera.hand is not None:
-        angle, tip = camera.hand + 0.02 * math.sin(0.2 * frame), 0.10 + 0.55 * state.lift
-        image = _hand(image, camera.skin * min(1.2, scene.exposure * 0.9), angle, tip)
-    blur = camera.blur * size / 128.0
-    if blur > 0.2:
-        image = ndimage.gaussian_filter(image, (0.0, blur, blur), truncate=2.5)
-    image = np.ascontiguousarray(np.moveaxis(image, 0, 2))
-    image += rng.standard_normal((size, size, 3), dtype=np.float32) * np.float32(camera.noise)
-    return np.clip(image, 0.0, 1.0) ** 0.8
+class Camera:
+    """Light and camera of one video, and its photos.
+
+    Everything that is irrelevant to contact is scaled by ``options.hard``. Angles are in radians,
+    distances in the view in half widths.
+
+    Attributes:
+        view: width of the view in mm.
+        turn, tilt: of the camera.
+        sun_to: unit vector towards the sun.
+        sun, ambient: strengths of the sun and of the ambient light.
+        light: RGB of the light.
+        exposure: error of the auto-exposure, a factor.
+        blur: deviation in pixels at 128 px.
+        noise: deviation.
+        hand: direction it enters from, or None.
+        skin: color of the hand.
+        shadow: direction, offset and factor of a cast shadow, or None.
+        edge: direction and distance of the object's edge, or None.
+        beyond: color behind the edge.
+    """
+
+    def __init__(self, options: WorldOptions, video: int) -> None:
+        rng = options.rng("camera", video)
+        draw, scale, circle = rng.uniform, 2.0 * options.hard, 2.0 * math.pi
+        happens = lambda share: rng.random() < min(0.95, share * scale)
+        lean = lambda: max(-0.5, min(0.5, rng.normal(0.0, 0.2 * min(1.4, scale) + 1e-9)))
+        self.options, self.video = options, video
+        elevation, azimuth = math.radians(draw(*ELEVATION_DEG)), draw(0.0, circle)
+        warm = draw(-1.0, 1.0) * scale
+        near, far = map(math.log, VIEW_MM)
+        reach = draw(-0.5, 0.5) * (far - near) * min(1.0, 0.4 + 0.6 * scale)
+        self.view = math.exp((near + far) / 2.0 + reach)
+        hand, hand_from = happens(HAND), draw(0.0, circle)
+        self.hand = hand_from if hand else None
+        shadow = happens(SHADOW)
+        shadow_at = (draw(0.0, math.pi), draw(-0.6, 0.6), draw(0.35, 0.75))
+        self.shadow = shadow_at if shadow else None
+        edge, edge_at = happens(EDGE), (draw(0.0, circle), draw(0.25, 0.75))
+        self.edge = edge_at if edge else None
+        bare = rng.random() < 0.6
+        skin = hsv(draw(0.03, 0.08), draw(0.25, 0.55), draw(0.25, 0.9))
+        glove = hsv(rng.random(), 0.2, draw(0.08, 0.5))
+        self.skin = skin if bare else glove
+        flat, warmth = math.cos(elevation), np.array([1.0 + 0.13 * warm, 1.0, 1.0 - 0.13 * warm])
+        self.turn, self.tilt = draw(0.0, circle), (lean(), lean())
+        self.sun_to = math.cos(azimuth) * flat, math.sin(azimuth) * flat, math.sin(elevation)
+        self.sun, self.ambient = draw(0.25, 1.0), draw(0.35, 0.8)
+        self.light = f32(warmth * np.exp(rng.normal(0.0, 0.03 * scale + 1e-9, 3)))
+        self.exposure = math.exp(rng.normal(0.0, 0.2 * scale + 1e-9))
+        self.blur = BLUR_PX[int(rng.integers(len(BLUR_PX)))]
+        self.noise = draw(0.004, 0.01 + 0.018 * options.hard)
+        self.beyond = hsv(rng.random(), draw(0.05, 0.6), draw(0.15, 0.85))
+
+    def _stained(self, albedo: Array, number: int) -> Array:
+        """Add stains and stickers to an albedo: elliptic spots that are seen but not felt."""
+        rng = self.options.rng("stains", self.video, number)
+        draw, at = rng.uniform, f32(np.arange(len(albedo)) * (TILE_MM / len(albedo)))
+        count = round((0, 0, 1, 2, 5)[int(rng.integers(5))] * 2.0 * self.options.hard)
+        for _ in range(count):
+            y, x = draw(0.0, TILE_MM), draw(0.0, TILE_MM)
+            radius, aspect, angle = draw(1.0, 6.0), draw(0.4, 1.6), draw(0.0, math.pi)
+            color = hsv(rng.random(), draw(0.2, 1.0), draw(0.1, 1.0))
+            u, v = turned(wrapped_offset(at[:, None], y), wrapped_offset(at[None], x), angle)
+            spot = smoothstep(np.hypot(u * (1.0 / aspect), v), radius, radius * 0.9)
+            albedo = blend(albedo, color, spot * draw(0.4, 1.0))
+        return albedo
+
+    def light_object(self, surface: Surface, number: int) -> tuple[Array, float]:
+        """Light object ``number`` of the video: its tile (3, n, n) as seen, and the exposure."""
+        height, px = surface.height, surface.px
+        softened = ndimage.gaussian_filter(height, 0.6, mode="wrap")
+        slope_y, slope_x = (
+            (np.roll(softened, -1, axis) - np.roll(softened, 1, axis)) * (0.5 / px)
+            for axis in (0, 1)
+        )
+        upright = 1.0 / np.sqrt(1.0 + slope_x * slope_x + slope_y * slope_y)
+        lx, ly, lz = self.sun_to
+        direct = np.maximum((lz - slope_x * lx - slope_y * ly) * upright, 0.0)
+        pit = height - ndimage.gaussian_filter(height, 1.2 / px, mode="wrap")
+        open_sky = np.clip(1.0 + 0.55 * pit * (1.0 / (0.35 + float(height.std()))), 0.35, 1.25)
+        half_way = ((lz + 1.0) - slope_x * lx - slope_y * ly) * upright
+        norm = math.sqrt(lx * lx + ly * ly + (lz + 1.0) ** 2)
+        mirror = np.maximum(half_way * (1.0 / norm), 0.0) ** 60
+        albedo = self._stained(surface.albedo, number)
+        rgb = albedo * (self.ambient * open_sky + self.sun * direct)[..., None] * self.light
+        rgb += (mirror * (surface.gloss * 0.55 * self.sun))[..., None]
+        # The power makes the auto-exposure imperfect, so that dark objects stay darker.
+        exposure = (0.40 * self.exposure / (0.12 + float(rgb.mean()))) ** 0.75
+        blur = max(0.3, 0.42 * self.view / self.options.size / px)
+        lit = np.ascontiguousarray(np.moveaxis(rgb * exposure, 2, 0))
+        return ndimage.gaussian_filter(lit, (0, blur, blur), mode="wrap", truncate=3.0), exposure
+
+    def photo(self, tile: Array, exposure: float, state: State, frame: int) -> Array:
+        """Render a frame, (n, n, 3), about [0, 1], from no other; see :meth:`light_object`."""
+        rng, size = self.options.rng("photo", self.video, frame), self.options.size
+        y, x = grid(size)
+        sway = [0.012 * math.sin(w * frame + self.video * p) for w, p in SWAY]
+        depth = 1.0 + x * (self.tilt[0] + sway[0]) + y * (self.tilt[1] + sway[1])
+        wy, wx = y / depth, x / depth
+        px = TILE_MM / tile.shape[-1]
+        reach = self.view / 2.0 * (1.0 + sway[3]) / px
+        shift_x, shift_y = rng.normal(0.0, 0.004) * reach, rng.normal(0.0, 0.004) * reach
+        center = state.position[0] / px + shift_x, state.position[1] / px + shift_y
+        image = window(tile, (wy, wx), self.turn + sway[2], reach, center)
+        if self.edge is not None:
+            angle, distance = self.edge
+            past = smoothstep(turned(wy, wx, angle)[0], distance, distance + 0.03)
+            shading = 0.8 + 0.25 * np.sin(5.0 * wx + 3.0 * wy + float(self.video))
+            image = over(image, self.beyond[:, None, None] * shading, past)
+        if self.shadow is not None:
+            angle, offset, factor = self.shadow
+            dark = smoothstep(turned(y, x, angle)[0], offset, offset + 0.12)
+            image *= 1.0 - (1.0 - factor) * dark
+        if self.hand is not None:
+            angle, tip = self.hand + 0.02 * math.sin(0.2 * frame), 0.10 + 0.55 * state.lift
+            image = _hand(image, self.skin * min(1.2, exposure * 0.9), angle, tip)
+        blur = self.blur * size / 128.0
+        if blur > 0.2:
+            image = ndimage.gaussian_filter(image, (0, blur, blur), truncate=2.5)
+        image = np.ascontiguousarray(np.moveaxis(image, 0, 2))
+        image += rng.standard_normal((size, size, 3), dtype=np.float32) * np.float32(self.noise)
+        return np.clip(image, 0.0, 1.0) ** 0.8
 
 
 def _hand(image: Array, skin: Array, angle: float, tip: float) -> Array:

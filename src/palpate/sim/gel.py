@@ -38,7 +38,8 @@ from palpate.sim.arrays import (
     smoothstep,
     turned,
 )
-from palpate.sim.objects import WorldObject
+from palpate.sim.materials import Surface
+from palpate.sim.motion import State
 from palpate.sim.options import VERSION, WorldOptions
 
 #: Points a side that a unit is drawn on.
@@ -100,69 +101,128 @@ _LOOKS = {
 }
 
 
-@dataclass(frozen=True)
 class Sensor:
-    """One gel unit at one image size n."""
+    """One gel unit at one image size n. The family is the same in every world, the unit is not.
 
-    size: int
-    px: float  # pixel size in mm
-    field: Array  # near-field factor of each light, (3, n, n)
-    color: Array  # RGB of each light, (3, 3)
-    light: Array  # unit vectors towards the lights, (3, 3)
-    ambient: Array  # RGB, (3,)
-    veil: Array  # vignette times dirt, (n, n)
-    texture: Array  # fine relief of the gel in mm, (n, n)
-    dome: Array  # its doming in mm, (n, n)
-    ink: Array | None  # opacity of the markers in [0, 1], (n, n)
-    dim: float  # loss of light for each mm of indentation
-    gamma: float
-    noise: float  # deviation of the image noise
+    Attributes:
+        size, px: n, and the pixel size in mm.
+        field: near-field factor of each light, (3, n, n).
+        color: RGB of each light, (3, 3).
+        light: unit vectors towards the lights, (3, 3).
+        ambient: RGB, (3,).
+        veil: vignette times dirt, (n, n).
+        texture, dome: fine relief of the gel, and its doming, in mm, (n, n).
+        ink: opacity of the markers in [0, 1], (n, n), or None.
+        dim: loss of light for each mm of indentation.
+        gamma, noise: of the image; the noise as a deviation.
+    """
+
+    def __init__(self, seed: int, name: str, size: int, markers: int, unit: int) -> None:
+        self.size, self.px, look = size, PAD_MM / size, _LOOKS[name]
+        family: np.random.Generator = rng_for(0, "sensor family", VERSION, name)
+        rng = rng_for(seed, "world", VERSION, "sensor", name, unit)
+        down = lambda a: resample(f32(a), size)
+        spread = [math.exp(s * rng.normal()) for s in look.spread]
+        azimuth = [a + rng.normal(0.0, 0.05) for a in look.azimuth]
+        elevation = np.deg2rad(family.uniform(*look.elevation, 3))
+        mixed = look.mixed * spread[0]
+        gain = np.exp(rng.normal(0.0, 0.05, (3, 1))) * np.asarray(look.gain)[:, None] * spread[1]
+        flat = np.cos(elevation)
+        light = np.stack([np.cos(azimuth) * flat, np.sin(azimuth) * flat, np.sin(elevation)], 1)
+        self.color, self.light = f32((_PURE * (1.0 - mixed) + mixed) * gain), f32(light)
+        y, x = grid(DRAWN)
+        square = x * x + y * y
+        field: list[Array] = []
+        for angle, fall, hump in zip(azimuth, look.fall, look.hump, strict=True):
+            a = turned(y, x, angle)[0] * (fall * spread[2])
+            field.append(down(np.clip(1.0 + a + 0.35 * a * a - hump * square, 0.08, None)))
+        self.field = np.stack(field)
+        self.veil = down((1.0 - rng.uniform(*VIGNETTE) * square) * (1.0 + _dirt(rng)))
+        texture = ndimage.gaussian_filter(_white(rng), 0.3 / (PAD_MM / DRAWN))
+        self.texture = down(texture * (0.0022 / float(texture.std())))
+        self.dome = down(square * ((PAD_MM / 2.0) ** 2 / (2.0 * rng.uniform(*DOME_MM))))
+        inked = name == "gelsight" and markers > 0
+        self.ink = down(_markers(markers, rng)) if inked else None
+        self.ambient = f32(np.asarray(look.ambient) * spread[3] * rng.uniform(0.97, 1.03, 3))
+        self.dim, self.gamma = rng.normal(0.03, 0.06), rng.uniform(0.9, 1.1)
+        self.noise = rng.uniform(*NOISE)
+
+    def gap(self, surface: Surface, relief: Array, state: State) -> Array:
+        """Return the relief minus the gel's dome, tilted and curved, in mm, shape (n, n).
+
+        Soft objects flatten under the load.
+        """
+        y, x = grid(self.size)
+        half, (along, across) = PAD_MM / 2.0, state.tilt
+        if surface.softness:
+            relief = relief * (1.0 - 0.5 * surface.softness * min(1.0, state.load / 0.3))
+        slope = x * (half * along) + y * (half * across)
+        return relief - self.dome - slope - x * x * (surface.curvature / 2.0 * half * half)
+
+    def press(self, gap: Array, load: float) -> tuple[Array, Array]:
+        """Press the gel until the mean penetration equals ``load`` mm.
+
+        Returns:
+            Membrane displacement in mm and the contact mask, both of shape (n, n).
+        """
+        penetration = gap + solve_approach(gap, load)
+        indented = np.maximum(penetration, 0.0)
+        grip = indented / (indented + GRIP_MM)
+        membrane = indented = np.tanh(indented * (1.0 / GEL_MM)) * GEL_MM
+        for blur in RELAX_MM:
+            membrane = smooth(membrane, blur / self.px)
+            membrane += grip * (indented - membrane)
+        return smooth(membrane, OPTICAL_MM / self.px), penetration > 0.0
+
+    def shift(self, membrane: Array, shear: tuple[float, float]) -> tuple[Array, Array]:
+        """Displace the markers: (dy, dx) in pixels.
+
+        They are dragged by ``shear`` (mm per mm of depth) and pushed apart where the gel is deep.
+        """
+        depth = smooth(np.minimum(membrane, 1.0), self.size / 10)
+        slope_y, slope_x = np.gradient(depth, self.px)
+        unit = 1.0 / self.px
+        dy = f32(depth * (shear[1] * unit) - slope_y * (0.107 * unit))
+        return dy, f32(depth * (shear[0] * unit) - slope_x * (0.107 * unit))
+
+    def shade(
+        self, membrane: Array, gain: Array, shift: tuple[Array, Array] | None = None
+    ) -> Array:
+        """Render the gel, shape (n, n, 3), in [0, 1.2]^gamma, without noise.
+
+        Args:
+            membrane: displacement in mm, (n, n); zeros give the background image.
+            gain: white balance of the recording, RGB, (3,).
+            shift: displacement of the markers in pixels, or None.
+        """
+        slope_y, slope_x = np.gradient(membrane + self.texture, self.px)
+        upright = 1.0 / np.sqrt(1.0 + slope_x * slope_x + slope_y * slope_y)
+        light = [
+            np.maximum((slope_x * float(lx) + slope_y * float(ly) + float(lz)) * upright, 0.0)
+            * field
+            for (lx, ly, lz), field in zip(self.light, self.field, strict=True)
+        ]
+        veil = self.veil * (1.0 - self.dim * membrane)
+        if self.ink is not None:
+            ink = self.ink
+            if shift is not None:
+                at = f32(np.arange(self.size))
+                ink = sample_clipped(ink, at[:, None] - shift[0], at - shift[1])
+            veil = veil * (1.0 - 0.96 * ink)
+        image = np.empty((self.size, self.size, 3), np.float32)
+        for c in range(3):
+            total = sum(light[k] * float(self.color[k, c]) for k in range(3))
+            image[..., c] = (total + float(self.ambient[c])) * veil * float(gain[c])
+        return np.clip(image, 0.0, 1.2) ** self.gamma
+
+
+#: A unit is made once for all worlds of its seed, look, size and markers.
+_unit = lru_cache(maxsize=64)(Sensor)
 
 
 def make_sensor(options: WorldOptions, unit: int) -> Sensor:
-    """Make a unit of ``options.look``: the family is the same in every world, the unit is not."""
-    return _make(options.seed, options.look, options.size, options.markers, unit)
-
-
-@lru_cache(maxsize=64)
-def _make(seed: int, name: str, size: int, markers: int, unit: int) -> Sensor:
-    look, px = _LOOKS[name], PAD_MM / size
-    family: np.random.Generator = rng_for(0, "sensor family", VERSION, name)
-    rng = rng_for(seed, "world", VERSION, "sensor", name, unit)
-    spread = [math.exp(s * rng.normal()) for s in look.spread]
-    azimuth = [a + rng.normal(0.0, 0.05) for a in look.azimuth]
-    elevation = np.deg2rad(family.uniform(*look.elevation, 3))
-    mixed = look.mixed * spread[0]
-    gain = np.exp(rng.normal(0.0, 0.05, (3, 1))) * np.asarray(look.gain)[:, None] * spread[1]
-    flat = np.cos(elevation)
-    light = np.stack([np.cos(azimuth) * flat, np.sin(azimuth) * flat, np.sin(elevation)], 1)
-    y, x = grid(DRAWN)
-    square = x * x + y * y
-    field: list[Array] = []
-    for angle, fall, hump in zip(azimuth, look.fall, look.hump, strict=True):
-        a = turned(y, x, angle)[0] * (fall * spread[2])
-        field.append(np.clip(1.0 + a + 0.35 * a * a - hump * square, 0.08, None))
-    veil = (1.0 - rng.uniform(*VIGNETTE) * square) * (1.0 + _dirt(rng))
-    texture = ndimage.gaussian_filter(_white(rng), 0.3 / (PAD_MM / DRAWN))
-    texture *= 0.0022 / float(texture.std())
-    dome = square * ((PAD_MM / 2.0) ** 2 / (2.0 * rng.uniform(*DOME_MM)))
-    ink = _markers(markers, rng) if name == "gelsight" and markers else None
-    down = lambda a: resample(f32(a), size)
-    return Sensor(
-        size=size,
-        px=px,
-        field=np.stack([down(f) for f in field]),
-        color=f32((_PURE * (1.0 - mixed) + mixed) * gain),
-        light=f32(light),
-        ambient=f32(np.asarray(look.ambient) * spread[3] * rng.uniform(0.97, 1.03, 3)),
-        veil=down(veil),
-        texture=down(texture),
-        dome=down(dome),
-        ink=None if ink is None else down(ink),
-        dim=rng.normal(0.03, 0.06),
-        gamma=rng.uniform(0.9, 1.1),
-        noise=rng.uniform(*NOISE),
-    )
+    """Make a unit of ``options.look``."""
+    return _unit(options.seed, options.look, options.size, options.markers, unit)
 
 
 def _white(rng: np.random.Generator) -> Array:
@@ -171,20 +231,20 @@ def _white(rng: np.random.Generator) -> Array:
 
 def _dirt(rng: np.random.Generator) -> Array:
     """Draw uneven coating, specks and scratches: a change of brightness around 0."""
-    y, x = grid(DRAWN)
+    draw, (y, x) = rng.uniform, grid(DRAWN)
     low = ndimage.gaussian_filter(_white(rng), DRAWN / 7, mode="reflect")
     fine = ndimage.gaussian_filter(_white(rng), 1.6)
     dirt = low * (0.018 / float(low.std())) + fine * (0.004 / float(fine.std()))
     for _ in range(int(rng.integers(2, 9))):
-        cx, cy, width = rng.uniform(-1.0, 1.0), rng.uniform(-1.0, 1.0), rng.uniform(0.008, 0.03)
+        cx, cy, width = draw(-1.0, 1.0), draw(-1.0, 1.0), draw(0.008, 0.03)
         square = (x - cx) ** 2 + (y - cy) ** 2
-        dirt -= rng.uniform(0.03, 0.18) * np.exp(square * (-0.5 / width**2))
+        dirt -= draw(0.03, 0.18) * np.exp(square * (-0.5 / width**2))
     for _ in range(int(rng.integers(0, 4))):
-        angle, offset = rng.uniform(0.0, math.pi), rng.uniform(-1.0, 1.0)
-        middle = rng.uniform(-0.5, 0.5)
+        angle, offset = draw(0.0, math.pi), draw(-1.0, 1.0)
+        middle = draw(-0.5, 0.5)
         across, length = turned(y, x, angle)
         across, length = (across - offset) * (1.0 / 0.012), length - middle
-        dirt += rng.uniform(0.01, 0.05) * np.exp(-across * across) * (np.abs(length) < 0.35)
+        dirt += draw(0.01, 0.05) * np.exp(-across * across) * (np.abs(length) < 0.35)
     return dirt
 
 
@@ -195,37 +255,37 @@ def _markers(rows: int, rng: np.random.Generator) -> Array:
     one more a side. A small dot has a radius of 0.2 mm at the pitch of 8 rows on 14 mm and shrinks
     with a finer pitch. Worn dots are large and round.
     """
-    ink = np.zeros((DRAWN, DRAWN), np.float32)
+    draw, ink = rng.uniform, np.zeros((DRAWN, DRAWN), np.float32)
     step, mm = 2.0 * 0.96 / rows, 2.0 / PAD_MM
     scale = min(1.0, step / 0.24) * mm
-    first = -1.0 - step * rng.uniform(0.0, 1.0, 2)
-    wear_x, wear_y, wear = rng.uniform(-1.0, 1.0), rng.uniform(-1.0, 1.0), rng.uniform(0.15, 0.5)
+    first = -1.0 - step * draw(0.0, 1.0, 2)
+    wear_x, wear_y, wear = draw(-1.0, 1.0), draw(-1.0, 1.0), draw(0.15, 0.5)
     for i, j in np.ndindex(rows + 3, rows + 3):
         cy = first[0] + (i * step + rng.normal(0.0, 0.012))
         cx = first[1] + (j * step + rng.normal(0.0, 0.012))
         square = (cx - wear_x) ** 2 + (cy - wear_y) ** 2
         worn = rng.random() < 0.07 + 0.75 * math.exp(-square / (2.0 * wear * wear))
-        radius = (rng.uniform(0.26, 0.40) if worn else rng.uniform(0.16, 0.215)) * scale
-        shape = (rng.uniform(0.85, 1.2), rng.uniform(0.93, 1.0), 2.0 if worn else 4.0)
+        radius = (draw(0.26, 0.40) if worn else draw(0.16, 0.215)) * scale
+        shape = (draw(0.85, 1.2), draw(0.93, 1.0), 2.0 if worn else 4.0)
         _dot(ink, (cy, cx), radius, shape)
     for _ in range(int(rng.integers(0, 14))):
-        place = (rng.uniform(-1.0, 1.0), rng.uniform(-1.0, 1.0))
-        radius = rng.uniform(0.03, 0.09) * mm
-        _dot(ink, place, radius, (rng.uniform(0.6, 1.6), rng.uniform(0.4, 0.9), 2.0))
+        center = (draw(-1.0, 1.0), draw(-1.0, 1.0))
+        radius = draw(0.03, 0.09) * mm
+        _dot(ink, center, radius, (draw(0.6, 1.6), draw(0.4, 0.9), 2.0))
     return ink
 
 
-def _dot(ink: Array, place: tuple[float, float], radius: float, shape: _Triple) -> None:
-    """Draw |x / aspect|^power + |y|^power < radius^power at ``place`` (y, x) in [-1, 1].
+def _dot(ink: Array, center: tuple[float, float], radius: float, shape: _Triple) -> None:
+    """Draw |x / aspect|^power + |y|^power < radius^power at ``center`` (y, x) in [-1, 1].
 
     ``shape`` is the aspect, the opacity and the power.
     """
     aspect, dark, power = shape
     y, x = grid(DRAWN)
     reach = 1.3 * radius + 0.02
-    rows, columns = (slice(*np.searchsorted(y[:, 0], (c - reach, c + reach))) for c in place)
+    rows, columns = (slice(*np.searchsorted(y[:, 0], (c - reach, c + reach))) for c in center)
     part = ink[rows, columns]
-    dx, dy = np.abs((x[:, columns] - place[1]) / aspect), np.abs(y[rows] - place[0])
+    dx, dy = np.abs((x[:, columns] - center[1]) / aspect), np.abs(y[rows] - center[0])
     distance = (dx**power + dy**power) ** (1.0 / power)
     np.maximum(part, smoothstep(distance, radius + 0.006, radius - 0.006) * dark, out=part)
 
@@ -240,79 +300,3 @@ def solve_approach(gap: Array, load: float) -> float:
     d = (load * ordered.size - np.cumsum(ordered)) / np.arange(1, ordered.size + 1)
     consistent = np.append(ordered[1:] + d[:-1] <= 0.0, True)
     return float(d[int(np.argmax(consistent))])
-
-
-def gap_of(
-    body: WorldObject, sensor: Sensor, relief: Array, load: float, tilt: tuple[float, float]
-) -> Array:
-    """Return the relief minus the gel's dome, tilted and curved, in mm, shape (n, n).
-
-    Soft objects flatten under the load.
-    """
-    y, x = grid(sensor.size)
-    half = PAD_MM / 2.0
-    if body.surface.softness:
-        relief = relief * (1.0 - 0.5 * body.surface.softness * min(1.0, load / 0.3))
-    slope = x * (half * tilt[0]) + y * (half * tilt[1])
-    return relief - sensor.dome - slope - x * x * (body.curvature / 2.0 * half * half)
-
-
-def press(sensor: Sensor, gap: Array, load: float) -> tuple[Array, Array]:
-    """Press the gel until the mean penetration equals ``load`` mm.
-
-    Returns:
-        Membrane displacement in mm and the contact mask, both of shape (n, n).
-    """
-    penetration = gap + solve_approach(gap, load)
-    indented = np.maximum(penetration, 0.0)
-    grip = indented / (indented + GRIP_MM)
-    membrane = indented = np.tanh(indented * (1.0 / GEL_MM)) * GEL_MM
-    for blur in RELAX_MM:
-        membrane = smooth(membrane, blur / sensor.px)
-        membrane += grip * (indented - membrane)
-    return smooth(membrane, OPTICAL_MM / sensor.px), penetration > 0.0
-
-
-def marker_shift(
-    sensor: Sensor, membrane: Array, shear: tuple[float, float]
-) -> tuple[Array, Array]:
-    """Displace the markers: (dy, dx) in pixels.
-
-    They are dragged by ``shear`` (mm per mm of depth) and pushed apart where the gel is deep.
-    """
-    depth = smooth(np.minimum(membrane, 1.0), sensor.size / 10)
-    slope_y, slope_x = np.gradient(depth, sensor.px)
-    unit = 1.0 / sensor.px
-    dy = f32(depth * (shear[1] * unit) - slope_y * (0.107 * unit))
-    return dy, f32(depth * (shear[0] * unit) - slope_x * (0.107 * unit))
-
-
-def shade(
-    sensor: Sensor, membrane: Array, gain: Array, shift: tuple[Array, Array] | None = None
-) -> Array:
-    """Render the gel, shape (n, n, 3), in [0, 1.2]^gamma, without noise.
-
-    Args:
-        sensor: gel unit.
-        membrane: displacement in mm, (n, n); zeros give the background image.
-        gain: white balance of the recording, RGB, (3,).
-        shift: displacement of the markers in pixels, or None.
-    """
-    slope_y, slope_x = np.gradient(membrane + sensor.texture, sensor.px)
-    upright = 1.0 / np.sqrt(1.0 + slope_x * slope_x + slope_y * slope_y)
-    light = [
-        np.maximum((slope_x * float(lx) + slope_y * float(ly) + float(lz)) * upright, 0.0) * field
-        for (lx, ly, lz), field in zip(sensor.light, sensor.field, strict=True)
-    ]
-    veil = sensor.veil * (1.0 - sensor.dim * membrane)
-    if sensor.ink is not None:
-        ink = sensor.ink
-        if shift is not None:
-            at = f32(np.arange(sensor.size))
-            ink = sample_clipped(ink, at[:, None] - shift[0], at - shift[1])
-        veil = veil * (1.0 - 0.96 * ink)
-    image = np.empty((sensor.size, sensor.size, 3), np.float32)
-    for c in range(3):
-        total = sum(light[k] * float(sensor.color[k, c]) for k in range(3))
-        image[..., c] = (total + float(sensor.ambient[c])) * veil * float(gain[c])
-    return np.clip(image, 0.0, 1.2) ** sensor.gamma

@@ -22,28 +22,13 @@ from PIL import Image
 from palpate.data.tables import csv_text
 from palpate.sim.materials import MATERIALS
 from palpate.sim.options import BACKGROUND_OFFSET, WorldOptions
-from palpate.sim.plan import Row, VideoPlan, contact_rows, first_contact, written_frames
+from palpate.sim.plan import Row, first_contact, written_frames
 from palpate.sim.video import Video
 
 #: Frames a second of videos.
 FPS = 30
 #: Rows of the lists of train and test.
 Parts = Mapping[str, Sequence[Row]]
-
-
-def sample_id(plan: VideoPlan, frame: int) -> str:
-    """Return the id of a contact frame."""
-    return f"{plan.name}/{frame:010d}"
-
-
-def contact_id(plan: VideoPlan, contact: int) -> str:
-    """Return the contact as the manifest names it; unique across videos, counted from 1."""
-    return f"{plan.name}#{contact + 1:04d}"
-
-
-def video_folder(root: Path, plan: VideoPlan) -> Path:
-    """Return the folder of a video."""
-    return root / "dataset" / plan.name
 
 
 def image_paths(options: WorldOptions, row: Row) -> dict[str, str]:
@@ -59,17 +44,16 @@ def image_paths(options: WorldOptions, row: Row) -> dict[str, str]:
     }
 
 
-def write_video_files(options: WorldOptions, video: Video, folder: Path) -> None:
+def write_video_files(video: Video, folder: Path) -> None:
     """Render all written frames of a video into its folder."""
-    frames, renders = written_frames(options), (video.vision, video.tactile)
-    if options.layout == "videos":
-        for name, render in zip(("video.mp4", "gelsight.mp4"), renders, strict=True):
-            _write_mp4(folder / name, map(render, frames), options.size)
-        return
-    for name, render in zip(("video_frame", "gelsight_frame"), renders, strict=True):
-        (folder / name).mkdir()
+    frames = written_frames(video.options)
+    for name, render in (("video", video.vision), ("gelsight", video.tactile)):
+        if video.options.layout == "videos":
+            _write_mp4(folder / f"{name}.mp4", map(render, frames), video.options.size)
+            continue
+        (folder / f"{name}_frame").mkdir()
         for frame in frames:
-            path = folder / name / f"{frame:010d}.jpg"
+            path = folder / f"{name}_frame" / f"{frame:010d}.jpg"
             Image.fromarray(render(frame)).save(path, "JPEG", quality=95, subsampling=0)
 
 
@@ -95,24 +79,18 @@ def _write_mp4(path: Path, images: Iterable[np.ndarray], size: int) -> None:
 
 
 def list_files(
-    options: WorldOptions,
-    plans: list[VideoPlan],
-    parts: Parts,
-    captions: Mapping[str, Sequence[str]],
+    rows: Sequence[Row], parts: Parts, captions: Mapping[str, Sequence[str]]
 ) -> dict[str, str]:
     """Return the lists of a world by name.
 
     Args:
-        options: the world's.
-        plans: all videos.
+        rows: all contact frames.
         parts: rows of ``train`` and ``test`` in the order of the lists.
         captions: video name -> a caption for each contact.
     """
-    rows = list(contact_rows(options, plans))
-    paths = {row: f"{sample_id(row.video, row.frame)}.jpg" for row in rows}
-    line = {row: f"{path},{MATERIALS[row.object.material].label}" for row, path in paths.items()}
-    objects = ((path, row.object.name) for row, path in paths.items())
-    texts = ((path, captions[row.video.name][row.contact]) for row, path in paths.items())
+    line = {row: f"{row.id}.jpg,{row.material.label}" for row in rows}
+    objects = ((f"{row.id}.jpg", row.object.name) for row in rows)
+    texts = ((f"{row.id}.jpg", captions[row.video.name][row.contact]) for row in rows)
     return {
         "label.txt": "".join(f"{text}\n" for text in line.values()),
         "category_reference.txt": "".join(f"{n}: {m.label}\n" for n, m in MATERIALS.items()),

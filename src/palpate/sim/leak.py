@@ -7,17 +7,17 @@ of the same video.
 
 from __future__ import annotations
 
-import statistics
 from collections.abc import Sequence
-from dataclasses import dataclass
+
+import polars as pl
 
 from palpate.core import require
-from palpate.data.tables import csv_text
-from palpate.sim.layouts import Parts, sample_id
+from palpate.sim.layouts import Parts
 from palpate.sim.options import WorldOptions
-from palpate.sim.plan import Row, VideoPlan, spread
+from palpate.sim.plan import Row, spread
 
-LEAK_COLUMNS = ("id", "video_in_train", "contact_in_train", "object_in_train", "gap", "nearest")
+#: Columns of ``leak.csv``, with the id first.
+LEAK_COLUMNS = ("video_in_train", "contact_in_train", "object_in_train", "gap", "nearest")
 _UNITS = {"frame": "contact frames", "contact": "contacts", "none": "videos"}
 
 
@@ -27,81 +27,70 @@ def _unit(options: WorldOptions, row: Row) -> tuple[int, ...]:
     return (row.video.index, *key[options.leak])
 
 
-def cut(options: WorldOptions, plans: Sequence[VideoPlan], rows: Sequence[Row]) -> Parts:
+def cut(options: WorldOptions, rows: Sequence[Row]) -> Parts:
     """Cut rows into train and test, both shuffled; it leaks as ``options.leak`` says."""
     rng = options.rng("cut", "touch" if options.leak == "contact" else options.leak)
-    units = list(dict.fromkeys(_unit(options, row) for row in rows))
+    material = {_unit(options, row): row.video.objects[0].material for row in rows}
     must = f"must have at least two {_UNITS[options.leak]} to cut: choose a larger world"
-    require(len(units) >= 2, "leak", must, len(units))
+    require(len(material) >= 2, "leak", must, len(material))
+    units = list(material)
     order = [units[k] for k in rng.permutation(len(units))]
     if options.leak == "none":  # material by material
-        materials = [options.names.index(plan.objects[0].material) for plan in plans]
-        order.sort(key=lambda unit: materials[unit[0]])
+        order.sort(key=lambda unit: options.names.index(material[unit]))
     # A share too small or too large for a whole unit still gives each list at least one.
     chosen = {order[k] for k in spread(len(order), options.test)} or {order[0]}
     if len(chosen) == len(order):
         chosen.discard(order[-1])
-    shuffled = [rows[k] for k in rng.permutation(len(rows))]
-    train = [row for row in shuffled if _unit(options, row) not in chosen]
-    return {"train": train, "test": [row for row in shuffled if _unit(options, row) in chosen]}
+    parts: dict[str, list[Row]] = {"train": [], "test": []}
+    for k in rng.permutation(len(rows)):
+        parts["test" if _unit(options, rows[k]) in chosen else "train"].append(rows[k])
+    return parts
 
 
-@dataclass(frozen=True)
-class Leak:
-    """What a test row shares with train."""
+def leak_table(parts: Parts) -> pl.DataFrame:
+    """Return the exact leak of every test row, by video and frame.
 
-    row: Row
-    contact: bool  # whether train has frames of the same contact
-    object: bool  # whether train has frames of the same object
-    nearest: int | None  # nearest train frame of the same video (of two, the earlier)
-
-    @property
-    def gap(self) -> int | None:
-        """Frames to the nearest train frame."""
-        return None if self.nearest is None else abs(self.nearest - self.row.frame)
-
-
-def leaks(parts: Parts) -> list[Leak]:
-    """Return the exact leak of every test row, by video and frame."""
-    frames: dict[int, list[int]] = {}
+    Returns:
+        ``id``, ``LEAK_COLUMNS``, and the ``video``, ``contact`` and ``object`` of each row.
+    """
+    frames: dict[str, list[int]] = {}
     for row in parts["train"]:
-        frames.setdefault(row.video.index, []).append(row.frame)
-    contacts = {(row.video.index, row.contact) for row in parts["train"]}
+        frames.setdefault(row.video.name, []).append(row.frame)
+    contacts = {row.contact_id for row in parts["train"]}
     objects = {row.object for row in parts["train"]}
-    result: list[Leak] = []
-    for row in sorted(parts["test"], key=lambda row: (row.video.index, row.frame)):
-        video, at = row.video.index, row.frame
-        nearest = min(frames.get(video, ()), key=lambda f: (abs(f - at), f), default=None)
-        result.append(Leak(row, (video, row.contact) in contacts, row.object in objects, nearest))
-    return result
+    cells: list[dict[str, object]] = []
+    for row in sorted(parts["test"], key=lambda row: row.id):
+        video, at = row.video, row.frame
+        # Of two frames as near, the earlier.
+        near = min(frames.get(video.name, ()), key=lambda f: (abs(f - at), f), default=None)
+        cells.append(
+            {
+                "id": row.id,
+                "video_in_train": int(near is not None),
+                "contact_in_train": int(row.contact_id in contacts),
+                "object_in_train": int(row.object in objects),
+                "gap": None if near is None else abs(near - at),
+                "nearest": None if near is None else video.sample_id(near),
+                "video": video.name,
+                "contact": row.contact_id,
+                "object": row.object.name,
+            }
+        )
+    return pl.DataFrame(cells, schema_overrides={"gap": pl.Int64, "nearest": pl.String})
 
 
-def leak_counts(parts: Parts) -> dict[str, int | float | None]:
+def leak_counts(table: pl.DataFrame) -> dict[str, int | float | None]:
     """Count the test frames that share a video, contact or object with train, and the gaps."""
-    rows = leaks(parts)
-    gaps = [leak.gap for leak in rows if leak.gap is not None]
-    in_contacts = [(leak.row.video.index, leak.row.contact) for leak in rows if leak.contact]
-    in_objects = [leak.row.object for leak in rows if leak.object]
+    level = ("video", "contact", "object")
+    shared = {name: table.filter(pl.col(f"{name}_in_train") == 1)[name] for name in level}
+    gap = table["gap"]
     return {
-        "test_frames": len(parts["test"]),
-        "test_frames_in_shared_videos": len(gaps),
-        "test_frames_in_shared_contacts": len(in_contacts),
-        "test_frames_of_shared_objects": len(in_objects),
-        "videos_shared": len({leak.row.video.index for leak in rows if leak.nearest is not None}),
-        "contacts_shared": len(set(in_contacts)),
-        "objects_shared": len(set(in_objects)),
-        "gap_min": min(gaps, default=None),
-        "gap_median": statistics.median(gaps) if gaps else None,
-        "gap_max": max(gaps, default=None),
-    }
-
-
-def leak_file(parts: Parts) -> str:
-    """Return the text of ``leak.csv``."""
-    rows: list[tuple[object, ...]] = []
-    for leak in leaks(parts):
-        video, at = leak.row.video, leak.nearest
-        gap, nearest = ("", "") if at is None else (leak.gap, sample_id(video, at))
-        flags = (int(at is not None), int(leak.contact), int(leak.object))
-        rows.append((sample_id(video, leak.row.frame), *flags, gap, nearest))
-    return csv_text(LEAK_COLUMNS, rows)
+        "test_frames": len(table),
+        "test_frames_in_shared_videos": len(shared["video"]),
+        "test_frames_in_shared_contacts": len(shared["contact"]),
+        "test_frames_of_shared_objects": len(shared["object"]),
+        **{f"{name}s_shared": rows.n_unique() for name, rows in shared.items()},
+        "gap_min": gap.min(),
+        "gap_median": gap.median(),
+        "gap_max": gap.max(),
+    }  # pyright: ignore[reportReturnType]

@@ -8,7 +8,7 @@ of a contact the load follows (0.45 + 0.55 sin(pi (0.12 + 0.76 p)))^2.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from palpate.sim.options import WorldOptions
 from palpate.sim.plan import VideoPlan
@@ -26,73 +26,66 @@ Pair = tuple[float, float]
 
 
 @dataclass(frozen=True)
-class Contact:
-    """A contact: place (x, y) on the tile, slide and peak load in mm, rotation in radians."""
-
-    place: Pair
-    slide: Pair
-    rotation: float
-    load: float
-    tilt: Pair
-    shear: Pair
-
-
-@dataclass(frozen=True)
 class State:
-    """The sensor at a frame."""
+    """The sensor at a frame; of a contact as a whole, as it begins and with its peak load."""
 
     contact: int  # number of the contact in the video
-    in_contact: bool
-    place: Pair  # middle of the pad on the tile in mm
+    position: Pair  # middle of the pad on the tile in mm
+    slide: Pair  # way of the whole contact in mm
     rotation: float  # of the pad in radians
     load: float  # mean indentation in mm, 0 without contact
     tilt: Pair  # slope of the pad
     shear: Pair  # drag in mm per mm of depth
-    lift: float  # 0 in contact to 1 far away
+    lift: float = 0.0  # 0 in contact to 1 far away
+
+    @property
+    def in_contact(self) -> bool:
+        """Whether the sensor touches the object."""
+        return self.lift == 0.0
 
 
-def make_contacts(options: WorldOptions, plan: VideoPlan) -> list[Contact]:
+def make_contacts(options: WorldOptions, plan: VideoPlan) -> list[State]:
     """Draw the contacts of a video."""
-    contacts: list[Contact] = []
-    rng = options.rng("motion", plan.index)
-    normal, draw = rng.normal, rng.uniform
+    rng, contacts = options.rng("motion", plan.index), list[State]()
+    draw = rng.uniform
+    normal = lambda spread: (spread * rng.normal(), spread * rng.normal())
+    anywhere = lambda: (draw(0.0, TILE_MM), draw(0.0, TILE_MM))
     home, turn, last = (0.0, 0.0), 0.0, -1
-    lightest, heaviest = map(math.log, LOAD_MM)
-    for number in plan.object_index:
+    for contact, number in enumerate(plan.object_index):
         first = number != last  # on this object
         if first:
-            home, last = (draw(0.0, TILE_MM), draw(0.0, TILE_MM)), number
+            home, last = anywhere(), number
             turn = draw(0.0, 2.0 * math.pi)
-        far = bool(rng.random() < JUMP) and not first
-        away = (draw(0.0, TILE_MM), draw(0.0, TILE_MM))
-        near = (home[0] + REVISIT_MM * normal(), home[1] + REVISIT_MM * normal())
-        reach = SLIDE_MM[int(rng.integers(len(SLIDE_MM)))]
-        contact = Contact(
-            place=away if far else near,
-            slide=(reach * normal(), reach * normal()),
-            rotation=turn + normal(0.0, 0.5 if far else 0.1),
-            load=math.exp(draw(lightest, heaviest)),
-            tilt=(TILT * normal(), TILT * normal()),
-            shear=(SHEAR * normal(), SHEAR * normal()),
+        far = rng.random() < JUMP and not first
+        away, near = anywhere(), normal(REVISIT_MM)
+        state = State(
+            contact,
+            position=away if far else (home[0] + near[0], home[1] + near[1]),
+            slide=normal(SLIDE_MM[int(rng.integers(len(SLIDE_MM)))]),
+            rotation=turn + rng.normal(0.0, 0.5 if far else 0.1),
+            load=math.exp(draw(*map(math.log, LOAD_MM))),
+            tilt=normal(TILT),
+            shear=normal(SHEAR),
         )
-        contacts.append(contact)
+        contacts.append(state)
     return contacts
 
 
-def state_at(options: WorldOptions, plan: VideoPlan, contacts: list[Contact], frame: int) -> State:
+def state_at(options: WorldOptions, plan: VideoPlan, contacts: list[State], frame: int) -> State:
     """Return the state of the sensor at ``frame``; it depends on no other frame."""
     number, step = divmod(frame, options.free_frames + options.frames_per_contact)
-    contact = contacts[number]
-    rng = options.rng("state", plan.index, frame)
-    x, y = contact.place[0] + rng.normal(0.0, 0.02), contact.place[1] + rng.normal(0.0, 0.02)
+    contact, rng = contacts[number], options.rng("state", plan.index, frame)
+    x, y = (at + rng.normal(0.0, 0.02) for at in contact.position)
     if step < options.free_frames:
         lift = 1.0 - 0.85 * step / (options.free_frames - 1)
-        return State(number, False, (x, y), contact.rotation, 0.0, contact.tilt, (0.0, 0.0), lift)
+        return replace(contact, position=(x, y), load=0.0, shear=(0.0, 0.0), lift=lift)
     step, last = step - options.free_frames, options.frames_per_contact - 1
     phase = step / last if last else 0.5
-    ramp = 0.45 + 0.55 * math.sin(math.pi * (0.12 + 0.76 * phase))
-    load = contact.load * ramp * ramp * math.exp(0.03 * rng.normal())
-    place = (x + contact.slide[0] * phase, y + contact.slide[1] * phase)
-    rotation, drag = contact.rotation + 0.04 * phase, 0.3 + phase
-    shear = (contact.shear[0] * drag, contact.shear[1] * drag)
-    return State(number, True, place, rotation, load, contact.tilt, shear, 0.0)
+    ramp, drag = 0.45 + 0.55 * math.sin(math.pi * (0.12 + 0.76 * phase)), 0.3 + phase
+    return replace(
+        contact,
+        position=(x + contact.slide[0] * phase, y + contact.slide[1] * phase),
+        rotation=contact.rotation + 0.04 * phase,
+        load=contact.load * ramp * ramp * math.exp(0.03 * rng.normal()),
+        shear=(contact.shear[0] * drag, contact.shear[1] * drag),
+    )

@@ -1,99 +1,103 @@
-"""What a world is made of: every option with its range and meaning, checked once."""
+"""What a world consists of: every option with its range and meaning, checked once."""
 
 from __future__ import annotations
 
 import dataclasses
-from dataclasses import dataclass, field
-from typing import Any, Literal
+from dataclasses import dataclass
+from typing import Any, Literal, get_args, get_origin, get_type_hints
 
 import numpy as np
 
-from palpate.core import PalpateError, digest_json, require, require_choice, rng_for
+from palpate.core import digest_json, few, require, require_choice, rng_for
 from palpate.sim.materials import MATERIALS, check_material
 
 #: Raised at every change of the images, texts or lists; enters every random draw and the digest.
 VERSION = 2
 #: The background of a contact is the frame this many before its first.
 BACKGROUND_OFFSET = 4
-
-
-def _number(default: float, low: float, high: float, meaning: str) -> Any:
-    """A number in [low, high]; a whole one where ``low`` is an int."""
-    return field(default=default, metadata={"low": low, "high": high, "help": meaning})
-
-
-def _share(default: float, meaning: str) -> Any:
-    return _number(default, 0.0, 1.0, meaning)
-
-
-def _choice(meaning: str, *choices: str) -> Any:
-    """One of a few words, by default the first."""
-    return field(default=choices[0], metadata={"choices": choices, "help": meaning})
+#: Least and largest value of each number; whole ones where these are.
+RANGES: dict[str, tuple[float, float]] = {
+    "seed": (0, 2**31 - 1),
+    "size": (16, 256),
+    "test": (0.01, 0.99),
+    "tile": (64, 1024),
+    "objects_per_material": (1, 10_000),
+    "videos_per_object": (1, 100),
+    "two_videos": (0.0, 1.0),
+    "contacts_per_video": (1, 100),
+    "frames_per_contact": (1, 200),
+    "free_frames": (BACKGROUND_OFFSET + 1, 200),
+    "mixed": (0.0, 1.0),
+    "sensors": (1, 100),
+    "markers": (0, 40),
+    "hard": (0.0, 1.0),
+}
 
 
 @dataclass(frozen=True)
 class WorldOptions:
     """Everything that decides a world; equal options give equal bytes.
 
-    Every field has its range and meaning in its metadata, from which the command line and the
-    documentation are made.
+    Attributes:
+        seed: 0 .. 2^31 - 1; worlds of different seeds share no object, video, text.
+        size: side of the images in pixels, 16 .. 256; even for the layout videos.
+        materials: names, or how many of them, evenly spaced.
+        look: sensor: a GelSight with markers, or a darker DIGIT without.
+        leak: what test may share with train: videos (contact), contacts (frame), or neither.
+        layout: Touch and Go as JPEG frames or as H.264 videos.
+        test: share of the contact frames in the test list, 0.01 .. 0.99.
+        tile: pixels along the 64 mm of a surface, 64 .. 1024; 512 for images of 128.
+        objects_per_material: objects of each material that have videos, 1 .. 10,000.
+        videos_per_object: videos of each object, 1 .. 100.
+        two_videos: share of the objects with an additional video.
+        contacts_per_video: contacts in a video, 1 .. 100.
+        frames_per_contact: frames of a contact, 1 .. 200.
+        free_frames: frames without contact before each contact, 5 .. 200.
+        free_written: frames without contact to write as JPEG: all, or one background.
+        mixed: share of the videos with two or three objects.
+        sensors: gel units, 1 .. 100; each video uses one of them.
+        markers: rows of markers a side of a gelsight pad, 0 (none) .. 40.
+        hard: how much photos vary in what cannot be felt (light, hands ...), 0 .. 1.
 
     Raises:
         PalpateError: if an option is out of range.
     """
 
-    seed: int = _number(0, 0, 2**31 - 1, "worlds of different seeds share no object, video, text")
-    size: int = _number(64, 16, 256, "side of the images in pixels; even for the layout videos")
-    materials: tuple[str, ...] | int = field(
-        default=20, metadata={"help": "names, or how many of them, evenly spaced"}
-    )
-    look: Literal["gelsight", "digit"] = _choice(
-        "sensor: a GelSight with markers, or a darker DIGIT without", "gelsight", "digit"
-    )
-    leak: Literal["contact", "frame", "none"] = _choice(
-        "what test may share with train: videos (contact), contacts (frame), or neither",
-        *("contact", "frame", "none"),
-    )
-    layout: Literal["frames", "videos"] = _choice(
-        "Touch and Go as JPEG frames or as H.264 videos", "frames", "videos"
-    )
-    test: float = _number(0.25, 0.01, 0.99, "share of the contact frames in the test list")
-    tile: int = _number(256, 64, 1024, "pixels along the 64 mm of a surface; 512 for images of 128")
-    objects_per_material: int = _number(5, 1, 10_000, "objects of each material that have videos")
-    videos_per_object: int = _number(1, 1, 100, "videos of each object")
-    two_videos: float = _share(0.0, "share of the objects with an additional video")
-    contacts_per_video: int = _number(4, 1, 100, "contacts in a video")
-    frames_per_contact: int = _number(3, 1, 200, "frames of a contact")
-    free_frames: int = _number(
-        5, BACKGROUND_OFFSET + 1, 200, "frames without contact before each contact"
-    )
-    free_written: Literal["all", "background"] = _choice(
-        "frames without contact to write as JPEG: all, or one background", *("all", "background")
-    )
-    mixed: float = _share(0.12, "share of the videos with two or three objects")
-    sensors: int = _number(3, 1, 100, "gel units; each video uses one of them")
-    markers: int = _number(8, 0, 40, "rows of markers a side of a gelsight pad; 0 for none")
-    hard: float = _share(0.5, "how much photos vary in what cannot be felt (light, hands ...)")
+    seed: int = 0
+    size: int = 64
+    materials: tuple[str, ...] | int = 20
+    look: Literal["gelsight", "digit"] = "gelsight"
+    leak: Literal["contact", "frame", "none"] = "contact"
+    layout: Literal["frames", "videos"] = "frames"
+    test: float = 0.25
+    tile: int = 256
+    objects_per_material: int = 5
+    videos_per_object: int = 1
+    two_videos: float = 0.0
+    contacts_per_video: int = 4
+    frames_per_contact: int = 3
+    free_frames: int = 5
+    free_written: Literal["all", "background"] = "all"
+    mixed: float = 0.12
+    sensors: int = 3
+    markers: int = 8
+    hard: float = 0.5
 
     def __post_init__(self) -> None:
-        if type(self.materials) is int and 1 <= self.materials <= len(MATERIALS):
-            names = list(MATERIALS)
-            some = tuple(names[k * len(names) // self.materials] for k in range(self.materials))
-            object.__setattr__(self, "materials", some)
-        for option in dataclasses.fields(self):
-            name, limits, value = option.name, option.metadata, getattr(self, option.name)
-            if "choices" in limits:
-                require_choice(name, value, limits["choices"])
-            elif "low" in limits:
-                low, high = limits["low"], limits["high"]
-                whole = isinstance(low, int)
-                fits = isinstance(value, int if whole else (int, float)) and low <= value <= high
-                must = f"must be a {'whole ' * whole}number from {low:g} to {high:g}"
-                require(fits, name, must, repr(value))
-                object.__setattr__(self, name, value if whole else float(value))
-        _require_materials(self.materials)
-        if self.layout == "videos":
-            require(self.size % 2 == 0, "size", "must be even for the layout videos", self.size)
+        for name, (low, high) in RANGES.items():
+            kind, value = type(low), getattr(self, name)
+            fits = isinstance(value, int if kind is int else (int, float)) and low <= value <= high
+            must = f"must be a {'whole ' * (kind is int)}number from {low:g} to {high:g}"
+            require(fits, name, must, repr(value))
+            object.__setattr__(self, name, kind(value))  # 1 and 1.0 are one world
+        for name, hint in get_type_hints(WorldOptions).items():
+            if get_origin(hint) is Literal:
+                require_choice(name, getattr(self, name), get_args(hint))
+        odd = self.layout == "videos" and self.size % 2 == 1
+        require(not odd, "size", "must be even for the layout videos", self.size)
+        object.__setattr__(self, "materials", _names(self.materials))
+        for name in self.names:
+            check_material(name)
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -115,13 +119,15 @@ class WorldOptions:
         return rng_for(self.seed, "world", VERSION, purpose, *ids)
 
 
-def _require_materials(names: Any) -> None:
-    """Check names of materials, and their entries."""
-    known = f"Known: {', '.join(MATERIALS)}"
-    if not isinstance(names, tuple) or not names or len(set(names)) < len(names):
-        must = f"must be different names, or a count from 1 to {len(MATERIALS)}"
-        raise PalpateError(must, repr(names), known, argument="materials")
-    for name in names:
-        if name not in MATERIALS:
-            raise PalpateError("must be names of materials", name, known, argument="materials")
-        check_material(name)
+def _names(materials: Any) -> tuple[str, ...]:
+    """Return the names of materials, of a count evenly spaced ones."""
+    names = tuple(MATERIALS)
+    if type(materials) is int and 1 <= materials <= len(names):
+        return tuple(names[k * len(names) // materials] for k in range(materials))
+    differ = isinstance(materials, tuple) and len({*materials}) == len(materials) > 0
+    must, fix = f"must be different names, or a count from 1 to {len(names)}", "Names: "
+    fix += ", ".join(names)
+    require(differ, "materials", must, repr(materials), fix=fix)
+    unknown = [name for name in materials if name not in MATERIALS]
+    require(not unknown, "materials", "must be names of materials", few(unknown), fix=fix)
+    return materials

@@ -12,7 +12,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 from palpate.core import seed_for
-from palpate.sim.materials import object_prefix
+from palpate.sim.materials import MATERIALS, Material, object_prefix
 from palpate.sim.options import BACKGROUND_OFFSET, VERSION, WorldOptions
 
 #: A mixed video has 2 to this many objects.
@@ -46,6 +46,10 @@ class VideoPlan:
         """Return the object of a contact."""
         return self.objects[self.object_index[contact]]
 
+    def sample_id(self, frame: int) -> str:
+        """Return the id of a contact frame."""
+        return f"{self.name}/{frame:010d}"
+
 
 @dataclass(frozen=True)
 class Row:
@@ -59,6 +63,21 @@ class Row:
     def object(self) -> ObjectRef:
         """The object in contact."""
         return self.video.object_of(self.contact)
+
+    @property
+    def material(self) -> Material:
+        """The entry of its material."""
+        return MATERIALS[self.object.material]
+
+    @property
+    def id(self) -> str:
+        """The sample's id."""
+        return self.video.sample_id(self.frame)
+
+    @property
+    def contact_id(self) -> str:
+        """The contact as the manifest names it; unique across videos, counted from 1."""
+        return f"{self.video.name}#{self.contact + 1:04d}"
 
 
 def first_contact(options: WorldOptions, contact: int) -> int:

@@ -13,12 +13,15 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from itertools import product
+from typing import TypeVar
 
 import numpy as np
 from scipy import ndimage
 
 from palpate.sim.arrays import Array, f32, sample_periodic, smoothstep, turned
 
+T = TypeVar("T")
 #: Side of the tile in mm.
 TILE_MM = 64.0
 
@@ -37,19 +40,20 @@ class Cells:
     far: Array  # distance F2 to the second nearest seed in mm, (n, n)
     index: np.ndarray  # the cell of each pixel, in 0 .. count - 1, (n, n)
     seeds: Array  # (y, x) of the seeds in mm, (count, 2)
+    rng: np.random.Generator  # the tile's
 
     @property
     def count(self) -> int:
         """How many there are."""
         return len(self.seeds)
 
-    def keep(self, rng: np.random.Generator, share: float) -> Array:
+    def keep(self, share: float) -> Array:
         """Return 1 in a random ``share`` of the cells, 0 in the others; shape (n, n)."""
-        return f32(rng.random(self.count) < share)[self.index]
+        return f32(self.rng.random(self.count) < share)[self.index]
 
-    def each(self, rng: np.random.Generator, mean: float, spread: float) -> Array:
+    def each(self, mean: float, spread: float) -> Array:
         """Draw one normal number a cell, shape (n, n)."""
-        return f32(rng.normal(mean, spread, self.count))[self.index]
+        return f32(self.rng.normal(mean, spread, self.count))[self.index]
 
     def walls(self, width: float) -> Array:
         """Return 0 on the walls between cells, rising to 1 over ``width`` mm; shape (n, n)."""
@@ -65,19 +69,32 @@ class Tile:
 
     Attributes:
         px: pixel size in mm.
+        draw: uniform numbers, as of ``rng.uniform``.
         y, x: pixel positions in mm, shapes (n, 1) and (1, n).
     """
 
     def __init__(self, n: int, rng: np.random.Generator) -> None:
-        self.n, self.rng, self.px = n, rng, TILE_MM / n
+        self.n, self.rng, self.px, self.draw = n, rng, TILE_MM / n, rng.uniform
         at = f32(np.arange(n) * self.px)
         self.y, self.x = at[:, None], at[None]
         self._fy = f32(np.fft.fftfreq(n, self.px))[:, None]
         self._fx = f32(np.fft.rfftfreq(n, self.px))[None]
 
-    def zeros(self) -> Array:
-        """Return a flat field."""
-        return np.zeros((self.n, self.n), np.float32)
+    def pick(self, *choices: T) -> T:
+        """Draw one of ``choices`` with equal probability."""
+        return choices[int(self.rng.integers(len(choices)))]
+
+    def flip(self, share: float) -> bool:
+        """Return True with probability ``share``."""
+        return self.draw() < share
+
+    def angle(self) -> float:
+        """Draw a direction in [0, pi)."""
+        return self.draw(0.0, math.pi)
+
+    def ones(self) -> Array:
+        """Return a field of ones."""
+        return np.ones((self.n, self.n), np.float32)
 
     def noise(
         self, low: float, high: float, beta: float = 2.0, stretch: float = 1.0, angle: float = 0.0
@@ -100,11 +117,9 @@ class Tile:
         z = np.fft.irfft2(np.fft.rfft2(white) * weight, s=(self.n, self.n))
         return f32(z * (1.0 / (float(z.std()) + 1e-12)))
 
-    def ridged(
-        self, low: float, high: float, beta: float = 2.0, stretch: float = 1.0, angle: float = 0.0
-    ) -> Array:
-        """Fold noise at zero, so that it has sharp crests; zero mean, unit deviation."""
-        z = -np.abs(self.noise(low, high, beta, stretch, angle))
+    def ridged(self, *spectrum: float) -> Array:
+        """Fold :meth:`noise` at zero, so that it has sharp crests; zero mean, unit deviation."""
+        z = -np.abs(self.noise(*spectrum))
         return (z - float(z.mean())) * (1.0 / float(z.std()))
 
     def warp(self, field: Array, amount: float, low: float = 4.0, high: float = 20.0) -> Array:
@@ -121,7 +136,7 @@ class Tile:
         cell, part = np.floor(q).astype(np.intp), q - np.floor(q)
         near = np.full((self.n, self.n), 9.0, np.float32)
         far, index = near.copy(), np.zeros((self.n, self.n), np.int32)
-        for dy, dx in ((dy, dx) for dy in (-1, 0, 1) for dx in (-1, 0, 1)):
+        for dy, dx in product((-1, 0, 1), repeat=2):
             row, column = ((cell + dy) % k)[:, None], ((cell + dx) % k)[None]
             seed = offsets[row, column]
             down, right = seed[..., 0] + (dy - part)[:, None], seed[..., 1] + (dx - part)[None]
@@ -130,9 +145,9 @@ class Tile:
             far = np.where(closer, near, np.minimum(far, distance))
             near = np.where(closer, distance, near)
             index = np.where(closer, row * k + column, index)
-        corner = np.stack(np.meshgrid(np.arange(k), np.arange(k), indexing="ij"), -1)
+        corner = np.moveaxis(np.indices((k, k)), 0, -1)
         seeds = f32((corner + offsets).reshape(-1, 2) * side)
-        return Cells(np.sqrt(near) * side, np.sqrt(far) * side, index, seeds)
+        return Cells(np.sqrt(near) * side, np.sqrt(far) * side, index, seeds, self.rng)
 
     def grains(
         self, size: float, spread: float = 0.35, cover: float = 1.0, edge: float = 0.6
@@ -150,12 +165,12 @@ class Tile:
         """
         cells = self.cells(size)
         dome = np.clip(1.0 - (cells.near / (cells.near + cells.far) * 2.0) ** 2, 0.0, 1.0) ** edge
-        z = dome * np.clip(cells.each(self.rng, 1.0, spread), 0.25, 2.0)
+        z = dome * np.clip(cells.each(1.0, spread), 0.25, 2.0)
         lean = f32(self.rng.normal(0.0, 0.25, (cells.count, 2)))[cells.index]
         seed = cells.seeds[cells.index]
         dy, dx = wrapped_offset(self.y, seed[..., 0]), wrapped_offset(self.x, seed[..., 1])
         z = z + (lean[..., 0] * dy + lean[..., 1] * dx) * (2.0 / size) * dome
-        return z * cells.keep(self.rng, cover), cells
+        return z * cells.keep(cover), cells
 
     def _periods(self, period: float, angle: float) -> tuple[int, int]:
         """Return the whole periods along x and y of a wave, at least one."""

@@ -6,13 +6,14 @@ from functools import cached_property
 
 import numpy as np
 
-from palpate.core import PalpateError
-from palpate.sim.arrays import Array, f32, grid, sample_periodic, to_bytes
-from palpate.sim.camera import Scene, light_object, make_camera, photo
+from palpate.core import require
+from palpate.sim.arrays import Array, f32, grid, to_bytes, window
+from palpate.sim.camera import Camera
 from palpate.sim.felt import caption, measure
-from palpate.sim.gel import PAD_MM, gap_of, make_sensor, marker_shift, press, shade
+from palpate.sim.gel import PAD_MM, make_sensor
+from palpate.sim.materials import Surface
 from palpate.sim.motion import State, make_contacts, state_at
-from palpate.sim.objects import WorldObject, make_object
+from palpate.sim.objects import make_object
 from palpate.sim.options import BACKGROUND_OFFSET, WorldOptions
 from palpate.sim.plan import VideoPlan, first_contact, plan_world
 
@@ -31,73 +32,63 @@ class Video:
     def __init__(self, options: WorldOptions, plan: VideoPlan | int) -> None:
         if isinstance(plan, int):
             plans = plan_world(options)
-            if not 0 <= plan < len(plans):
-                must = f"A video of this world must be 0 to {len(plans) - 1}"
-                raise PalpateError(must, str(plan), "Choose another video")
+            _require_number(plan, len(plans), "A video of this world")
             plan = plans[plan]
         self.options, self.plan = options, plan
         self.sensor = make_sensor(options, plan.sensor)
         self.contacts = make_contacts(options, plan)
-        self.camera = make_camera(options, plan.index)
+        self.camera, self._lit = Camera(options, plan.index), dict[int, tuple[Array, float]]()
         rng, spread = options.rng("gain", plan.index), 2.0 * options.hard
         balance, exposure = rng.standard_normal(3), rng.standard_normal()
         self.gain: Array = f32(np.exp(0.03 * spread * balance + 0.05 * spread * exposure))
-        self._scenes: dict[int, Scene] = {}
 
     def state(self, frame: int) -> State:
         """Return the state of the sensor at ``frame``."""
-        if not 0 <= frame < self.options.video_length:
-            must = f"A frame of {self.plan.name} must be 0 to {self.options.video_length - 1}"
-            raise PalpateError(must, str(frame), "Choose another frame")
+        _require_number(frame, self.options.video_length, f"A frame of {self.plan.name}")
         return state_at(self.options, self.plan, self.contacts, frame)
 
-    def object_of(self, contact: int) -> WorldObject:
+    def surface(self, contact: int) -> Surface:
         """Return the object of a contact."""
         return make_object(self.options, self.plan.object_of(contact))
 
     def text(self, contact: int) -> str:
         """Return the caption of a contact."""
-        index, surface = self.plan.index, self.object_of(contact).surface
+        surface = self.surface(contact)
         relief = self.relief(self.state(first_contact(self.options, contact)))
         felt = measure(relief, self.sensor.px, surface.softness, surface.gloss)
-        return caption(self.options, index, contact, felt)
+        return caption(self.options, self.plan.index, contact, felt)
 
     def vision(self, frame: int) -> np.ndarray:
         """Render the photo: uint8, shape (n, n, 3)."""
-        state, index = self.state(frame), self.plan.index
+        state = self.state(frame)
         number = self.plan.object_index[state.contact]
-        if number not in self._scenes:
-            body = self.object_of(state.contact)
-            self._scenes[number] = light_object(self.options, self.camera, body, index, number)
-        image = photo(self.options, self.camera, self._scenes[number], state, (index, frame))
-        return to_bytes(image)
+        if number not in self._lit:
+            self._lit[number] = self.camera.light_object(self.surface(state.contact), number)
+        return to_bytes(self.camera.photo(*self._lit[number], state, frame))
 
     def tactile(self, frame: int) -> np.ndarray:
         """Render the tactile image: uint8, shape (n, n, 3)."""
         state, sensor, image = self.state(frame), self.sensor, self._passive
         if state.in_contact:
             membrane = self.membrane(state)[0]
-            shift = marker_shift(sensor, membrane, state.shear) if sensor.ink is not None else None
-            image = shade(sensor, membrane, self.gain, shift)
+            shift = sensor.shift(membrane, state.shear) if sensor.ink is not None else None
+            image = sensor.shade(membrane, self.gain, shift)
         rng = self.options.rng("noise", self.plan.index, frame)
         noise = rng.standard_normal(image.shape, dtype=np.float32)
         return to_bytes(image + noise * np.float32(sensor.noise))
 
     def membrane(self, state: State) -> tuple[Array, Array]:
         """Press: displacement of the gel in mm and contact mask, both (n, n)."""
-        body = self.object_of(state.contact)
-        gap = gap_of(body, self.sensor, self.relief(state), state.load, state.tilt)
-        return press(self.sensor, gap, state.load * (1.0 - 0.3 * body.surface.softness))
+        surface = self.surface(state.contact)
+        gap = self.sensor.gap(surface, self.relief(state), state)
+        return self.sensor.press(gap, state.load * (1.0 - 0.3 * surface.softness))
 
     def relief(self, state: State) -> Array:
         """Return the object's relief under the pad in mm, (n, n)."""
-        body = self.object_of(state.contact)
-        y, x = grid(self.options.size)
-        half = PAD_MM / 2.0 / body.px
-        c, s = float(np.cos(state.rotation)) * half, float(np.sin(state.rotation)) * half
-        rows = s * x + c * y + state.place[1] / body.px
-        columns = c * x - s * y + state.place[0] / body.px
-        return sample_periodic(body.surface.height, rows, columns)
+        surface = self.surface(state.contact)
+        center = state.position[0] / surface.px, state.position[1] / surface.px
+        reach = PAD_MM / 2.0 / surface.px
+        return window(surface.height, grid(self.options.size), state.rotation, reach, center)
 
     def background(self) -> np.ndarray:
         """Render the sensor without contact and without noise: uint8, shape (n, n, 3)."""
@@ -110,4 +101,9 @@ class Video:
     @cached_property
     def _passive(self) -> Array:
         flat = np.zeros((self.options.size, self.options.size), np.float32)
-        return shade(self.sensor, flat, self.gain)
+        return self.sensor.shade(flat, self.gain)
+
+
+def _require_number(number: int, count: int, name: str) -> None:
+    must, fix = f"{name} must be 0 to {count - 1}", "Choose another"
+    require(0 <= number < count, None, must, number, fix=fix)

@@ -15,10 +15,11 @@ from functools import cached_property, lru_cache, partial
 from pathlib import Path
 from typing import Any, SupportsIndex
 
-from palpate.core import PalpateError, Split, require
+from palpate.core import PalpateError, Split, require, require_choice
 from palpate.data.formats.touch_and_go import CATEGORIES
 from palpate.data.manifest import Manifest
-from palpate.sim.layouts import Parts, contact_id, image_paths, sample_id
+from palpate.sim.layouts import Parts, image_paths
+from palpate.sim.leak import cut
 from palpate.sim.materials import MATERIALS
 from palpate.sim.options import VERSION, WorldOptions
 from palpate.sim.plan import Row, VideoPlan, contact_rows, plan_world
@@ -43,9 +44,8 @@ class World:
     """
 
     def __init__(self, options: WorldOptions | str | None = None, *, cache: int = 4) -> None:
-        if isinstance(options, str) and options not in PRESETS:
-            must = f"must be options, or one of {', '.join(PRESETS)}"
-            raise PalpateError(must, repr(options), "Choose a preset", argument="options")
+        if isinstance(options, str):
+            require_choice("options", options, PRESETS)
         require(cache >= 1, "cache", "must be at least 1", cache)
         self.options = PRESETS[options] if isinstance(options, str) else options or WorldOptions()
         self.cache = cache
@@ -56,9 +56,23 @@ class World:
         return partial(World, self.options, cache=self.cache), ()
 
     @cached_property
+    def plans(self) -> list[VideoPlan]:
+        """All videos."""
+        return plan_world(self.options)
+
+    @cached_property
     def rows(self) -> list[Row]:
         """The samples in order."""
-        return list(contact_rows(self.options, plan_world(self.options)))
+        return list(contact_rows(self.options, self.plans))
+
+    @cached_property
+    def parts(self) -> Parts:
+        """The samples of ``train`` and ``test``, in the order of the lists.
+
+        Raises:
+            PalpateError: if the world is too small for its cut.
+        """
+        return cut(self.options, self.rows)
 
     def __len__(self) -> int:
         """Count the contact frames."""
@@ -67,7 +81,7 @@ class World:
     @property
     def ids(self) -> list[str]:
         """The ids in order: those of the manifest."""
-        return [sample_id(row.video, row.frame) for row in self.rows]
+        return [row.id for row in self.rows]
 
     def __getitem__(self, k: SupportsIndex) -> dict[str, Any]:
         """Render a sample; negative numbers count from the end.
@@ -87,71 +101,61 @@ class World:
             raise NoSampleError(must, str(number), "Choose another sample")
         row = self.rows[number]
         video = self.video(row.video)
-        return _cells(self.options, row, video.text(row.contact)) | {
-            "label": MATERIALS[row.object.material].label,
+        return self._cells(row, video.text(row.contact)) | {
+            "label": row.material.label,
             "vision": video.vision(row.frame),
             "tactile": video.tactile(row.frame),
             "background": video.background_of(row.contact),
         }
 
+    def _cells(self, row: Row, text: str) -> dict[str, Any]:
+        """Return what the world knows of a contact frame, in the manifest's columns."""
+        return {
+            "id": row.id,
+            "video": row.video.name,
+            "frame": row.frame,
+            "contact": row.contact_id,
+            "object": row.object.name,
+            "material": row.object.material,
+            "text": text,
+            "sensor": f"{self.options.look}-{row.video.sensor}",
+        }
 
-def _cells(options: WorldOptions, row: Row, text: str) -> dict[str, Any]:
-    """Return what the world knows of a contact frame, in the manifest's columns."""
-    return {
-        "id": sample_id(row.video, row.frame),
-        "video": row.video.name,
-        "frame": row.frame,
-        "contact": contact_id(row.video, row.contact),
-        "object": row.object.name,
-        "material": row.object.material,
-        "text": text,
-        "sensor": f"{options.look}-{row.video.sensor}",
-    }
+    def manifest(self, captions: Mapping[str, Sequence[str]], folder: Path) -> Manifest:
+        """Return the manifest of all contact frames, by video and frame.
 
+        It has the ids, videos, contacts and image paths that ``palpate import`` reads from the
+        tree, and more: the object and the gel unit.
 
-def world_manifest(
-    options: WorldOptions,
-    plans: list[VideoPlan],
-    captions: Mapping[str, Sequence[str]],
-    folder: Path,
-) -> Manifest:
-    """Make the manifest of all contact frames, by video and frame.
+        Args:
+            captions: video name -> a caption for each contact.
+            folder: of the world, where the manifest is rooted.
+        """
+        rows = [
+            self._cells(row, captions[row.video.name][row.contact]) | image_paths(self.options, row)
+            for row in self.rows
+        ]
+        facts = {  # it must never pass for a real data set
+            "dataset": "palpate's procedural world",
+            "synthetic": "yes",
+            "world_version": str(VERSION),
+            "world_options": self.options.digest,
+            "text_source": "measured surface",
+            "layout": self.options.layout,
+            "format": "touch-and-go",
+        }
+        classes = {material.label: name for name, material in MATERIALS.items()}
+        if classes != CATEGORIES:
+            facts["classes"] = json.dumps({str(label): name for label, name in classes.items()})
+        return Manifest.from_rows(rows, folder, facts)
 
-    It has the ids, videos, contacts and image paths that ``palpate import`` reads from the tree,
-    and more: the object and the gel unit.
-
-    Args:
-        options: the world's.
-        plans: all videos.
-        captions: video name -> a caption for each contact.
-        folder: of the world, where the manifest is rooted.
-    """
-    rows = [
-        _cells(options, row, captions[row.video.name][row.contact]) | image_paths(options, row)
-        for row in contact_rows(options, plans)
-    ]
-    return Manifest.from_rows(rows, folder, _facts(options))
-
-
-def _facts(options: WorldOptions) -> dict[str, str]:
-    """Return what the data set is; it must never pass for a real one."""
-    facts = {
-        "dataset": "palpate's procedural world",
-        "synthetic": "yes",
-        "world_version": str(VERSION),
-        "world_options": options.digest,
-        "text_source": "measured surface",
-        "layout": options.layout,
-        "format": "touch-and-go",
-    }
-    classes = {material.label: name for name, material in MATERIALS.items()}
-    if classes != CATEGORIES:
-        facts["classes"] = json.dumps({str(label): name for label, name in classes.items()})
-    return facts
-
-
-def world_split(options: WorldOptions, parts: Parts, manifest: str) -> Split:
-    """Return ``Orig``: the cut over the ids of the manifest of that digest, in list order."""
-    ids = {name: [sample_id(row.video, row.frame) for row in rows] for name, rows in parts.items()}
-    rule = {"method": "world", "leak": options.leak, "test": options.test, "seed": options.seed}
-    return Split.from_ids(rule=rule | {"world_version": VERSION}, manifest=manifest, **ids)
+    def split(self, manifest: str) -> Split:
+        """Return ``Orig``: the cut over the ids of the manifest of that digest, in list order."""
+        names = ("leak", "test", "seed")
+        rule = {"method": "world"} | {name: getattr(self.options, name) for name in names}
+        return Split.from_ids(
+            rule=rule | {"world_version": VERSION},
+            manifest=manifest,
+            train=[row.id for row in self.parts["train"]],
+            test=[row.id for row in self.parts["test"]],
+        )

@@ -18,7 +18,7 @@ from __future__ import annotations
 import dataclasses
 import importlib.util
 import shutil
-from collections.abc import Iterator, Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -26,7 +26,6 @@ from typing import Any
 
 from palpate.core import (
     MissingExtraError,
-    PalpateError,
     Progress,
     atomic_folder,
     digest_json,
@@ -40,14 +39,14 @@ from palpate.core import (
     write_text,
 )
 from palpate.core.processes import worker_pool
-from palpate.sim.layouts import Parts, list_files, video_folder, write_video_files
-from palpate.sim.leak import cut, leak_counts, leak_file
+from palpate.sim.layouts import list_files, write_video_files
+from palpate.sim.leak import LEAK_COLUMNS, leak_counts, leak_table
 from palpate.sim.materials import MATERIALS, Material
 from palpate.sim.options import VERSION, WorldOptions
-from palpate.sim.plan import VideoPlan, contact_rows, plan_world, written_frames
+from palpate.sim.plan import VideoPlan, written_frames
 from palpate.sim.presets import SEEN_WARNING, seen_by_mini
 from palpate.sim.video import Video
-from palpate.sim.world import world_manifest, world_split
+from palpate.sim.world import World
 
 WORLD_FORMAT = "palpate-world/1"
 NOTE = (
@@ -107,15 +106,14 @@ def write_world(
     if (folder / "world.json").is_file():
         return _finished(output, options)
     require_new_folder(output)
-    plans = plan_world(options)
-    # Raises for a world that is too small, before anything is rendered.
-    parts = cut(options, plans, list(contact_rows(options, plans)))
+    world = World(options)
+    _ = world.parts  # raises for a world that is too small, before anything is rendered
     unfinished = folder.parent / f".{folder.name}.{options.digest[:12]}.part"
     with locked(unfinished, output):
         (unfinished / WORK).mkdir(exist_ok=True)
         if not (folder / "world.json").is_file():  # else an equal run ended meanwhile
-            _render(unfinished, options, plans, workers, progress)
-            _finish(unfinished, options, plans, parts)
+            _render(unfinished, world, workers, progress)
+            _finish(unfinished, world)
             if folder.exists():
                 folder.rmdir()
             unfinished.replace(folder)
@@ -127,39 +125,26 @@ def write_world(
 def _finished(output: Path, options: WorldOptions) -> WorldRecord:
     """Return the record of the finished world in ``output``."""
     data = read_json(output / "world.json", "world record")
-    if data.get("format") != WORLD_FORMAT or data.get("options_digest") != options.digest:
-        must, fix = f"{output} must hold the requested world", "Choose another folder, or remove it"
-        raise PalpateError(must, "a world of other options or of another version", fix)
+    same = (data.get("format"), data.get("options_digest")) == (WORLD_FORMAT, options.digest)
+    must, fix = f"{output} must hold the requested world", "Choose another folder, or remove it"
+    require(same, None, must, "a world of other options or of another version", fix=fix)
     return WorldRecord(output, data["digest"], data["counts"], data["leak"])
 
 
-def _captions_path(unfinished: Path, plan: VideoPlan) -> Path:
-    return unfinished / WORK / f"{plan.name}.json"
-
-
-def _render(
-    unfinished: Path,
-    options: WorldOptions,
-    plans: list[VideoPlan],
-    workers: int,
-    progress: Progress,
-) -> None:
-    """Render the videos that are missing."""
-    todo = [plan for plan in plans if not video_folder(unfinished, plan).is_dir()]
+def _render(unfinished: Path, world: World, workers: int, progress: Progress) -> None:
+    """Render the videos that are missing; materials that a user added go to the workers too."""
+    plans = world.plans
+    todo = [plan for plan in plans if not (unfinished / "dataset" / plan.name).is_dir()]
     finished = len(plans) - len(todo)
     progress("rendering videos", finished, len(plans))
-    job = partial(_write_video, options, unfinished)
-    for count, name in enumerate(_in_order(job, todo, workers), finished + 1):
-        progress("rendering videos", count, len(plans), name)
-
-
-def _in_order(job: partial[str], plans: Sequence[VideoPlan], workers: int) -> Iterator[str]:
-    """Yield ``job(plan)`` for all plans; materials that a user added go to the workers too."""
-    if min(workers, len(plans)) < 2:
-        yield from map(job, plans)
-        return
-    with worker_pool(workers, _set_materials, (dict(MATERIALS),)) as pool:
-        yield from pool.map(job, plans, chunksize=max(1, min(4, len(plans) // (2 * workers))))
+    job = partial(_write_video, world.options, unfinished)
+    alone = min(workers, len(todo)) < 2
+    share = max(1, min(4, len(todo) // (2 * workers)))
+    pool = nullcontext() if alone else worker_pool(workers, _set_materials, (dict(MATERIALS),))
+    with pool as processes:
+        names = map(job, todo) if processes is None else processes.map(job, todo, chunksize=share)
+        for count, name in enumerate(names, finished + 1):
+            progress("rendering videos", count, len(plans), name)
 
 
 def _set_materials(materials: dict[str, Material]) -> None:
@@ -171,51 +156,48 @@ def _write_video(options: WorldOptions, unfinished: Path, plan: VideoPlan) -> st
     """Render a video into ``unfinished``, whole or not at all; return its name."""
     video = Video(options, plan)
     captions = [video.text(contact) for contact in range(options.contacts_per_video)]
-    write_json(_captions_path(unfinished, plan), captions)
-    with atomic_folder(video_folder(unfinished, plan)) as folder:
-        write_video_files(options, video, folder)
+    write_json(unfinished / WORK / f"{plan.name}.json", captions)
+    with atomic_folder(unfinished / "dataset" / plan.name) as folder:
+        write_video_files(video, folder)
     return plan.name
 
 
-def _finish(unfinished: Path, options: WorldOptions, plans: list[VideoPlan], parts: Parts) -> None:
+def _finish(unfinished: Path, world: World) -> None:
     """Write the lists of train and test and, last, ``world.json``."""
     for stray in (unfinished / "dataset").glob(".*"):  # unfinished videos of a killed process
         shutil.rmtree(stray, ignore_errors=True)
+    options, leak = world.options, leak_table(world.parts)
     captions = {
-        p.name: read_json(_captions_path(unfinished, p), "captions of a video") for p in plans
+        plan.name: read_json(unfinished / WORK / f"{plan.name}.json", "captions of a video")
+        for plan in world.plans
     }
-    manifest = world_manifest(options, plans, captions, unfinished)
-    files = {"leak.csv": leak_file(parts), **list_files(options, plans, parts, captions)}
+    manifest = world.manifest(captions, unfinished)
+    files = list_files(world.rows, world.parts, captions)
+    files = {"leak.csv": leak.select("id", *LEAK_COLUMNS).write_csv(), **files}
     for name, text in files.items():
         write_text(unfinished / name, text)
-    world_split(options, parts, manifest.digest).save(unfinished / "splits" / "Orig.json")
+    world.split(manifest.digest).save(unfinished / "splits" / "Orig.json")
     manifest.save(unfinished / "manifest.parquet")
     lists = {name: digest_lines(text.splitlines()) for name, text in files.items()}
-    content = {"options": options.digest, "lists": lists}
     record = {
         "format": WORLD_FORMAT,
         "version": VERSION,
         "note": NOTE,
         **({"seen_by_shipped_models": SEEN_WARNING} if seen_by_mini(options) else {}),
-        "digest": digest_json(content),
+        "digest": digest_json({"options": options.digest, "lists": lists}),
         "options_digest": options.digest,
         "manifest_digest": manifest.digest,
-        "counts": _counts(options, plans, parts),
-        "leak": {"rule": options.leak, **leak_counts(parts)},
+        "counts": {
+            "videos": len(world.plans),
+            "mixed_videos": sum(len(plan.objects) > 1 for plan in world.plans),
+            "objects": len({ref for plan in world.plans for ref in plan.objects}),
+            "contacts": len(world.plans) * options.contacts_per_video,
+            "contact_frames": len(world),
+            "written_frames": len(world.plans) * len(written_frames(options)),
+            "train_frames": len(world.parts["train"]),
+            "test_frames": len(world.parts["test"]),
+        },
+        "leak": {"rule": options.leak, **leak_counts(leak)},
         "options": dataclasses.asdict(options),
     }
     write_json(unfinished / "world.json", record)
-
-
-def _counts(options: WorldOptions, plans: Sequence[VideoPlan], parts: Parts) -> dict[str, int]:
-    train, test = (len(parts[name]) for name in ("train", "test"))
-    return {
-        "videos": len(plans),
-        "mixed_videos": sum(len(plan.objects) > 1 for plan in plans),
-        "objects": len({ref for plan in plans for ref in plan.objects}),
-        "contacts": len(plans) * options.contacts_per_video,
-        "contact_frames": train + test,
-        "written_frames": len(plans) * len(written_frames(options)),
-        "train_frames": train,
-        "test_frames": test,
-    }

@@ -1,6 +1,6 @@
 """The table of materials: Touch and Go's twenty, with their label ids.
 
-A custom material is one function ``(tile, rng) -> Surface`` in one file, and one line that adds
+A custom material is one function ``(tile) -> Surface`` in one file, and one line that adds
 it::
 
     from palpate.sim import MATERIALS, Material, Surface
@@ -13,7 +13,7 @@ write another one.
 
 from __future__ import annotations
 
-from palpate.core import PalpateError, few
+from palpate.core import few, require
 from palpate.sim.materials.made import glass, metal, other, paper, plastic, rubber
 from palpate.sim.materials.mineral import brick, ceramic_tile, concrete, gravel, rock, sand, soil
 from palpate.sim.materials.plant import grass, plants, tree, wood
@@ -57,9 +57,9 @@ def check_material(name: str) -> None:
         PalpateError: if one has.
     """
     label = MATERIALS[name].label
-    if len(names := [n for n, material in MATERIALS.items() if material.label == label]) > 1:
-        got, fix = f"label {label} of {few(names)}", "Give the new one 20 or more"
-        raise PalpateError("Materials must differ in label", got, fix)
+    names = [n for n, material in MATERIALS.items() if material.label == label]
+    got, fix = f"label {label} of {few(names)}", "Give the new one 20 or more"
+    require(len(names) == 1, None, "Materials must differ in label", got, fix=fix)
 
 
 __all__ = ["MATERIALS", "Material", "Surface", "check_material", "draw_surface", "object_prefix"]

@@ -4,20 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import TypeAlias, TypeVar
+from typing import TypeAlias
 
 import numpy as np
 
-from palpate.core import PalpateError
+from palpate.core import require
 from palpate.sim.arrays import Array, f32
-from palpate.sim.tile import Tile
-
-T = TypeVar("T")
+from palpate.sim.tile import TILE_MM, Tile
 
 
 @dataclass(frozen=True)
 class Surface:
-    """A piece of a material, as a periodic tile.
+    """A piece of a material, as a periodic tile, on the body that it covers.
 
     Attributes:
         height: relief in mm, shape (n, n), float32.
@@ -26,6 +24,8 @@ class Surface:
         subtype: the kind that was drawn.
         gloss: 0 matt to 1 mirror-like.
         softness: 0 rigid to 1 (yields under the gel).
+        curvature: 1 / radius of the body in 1/mm along x of the pad, positive for a bulge; 0 for
+            flat. An object draws it, no material.
     """
 
     height: Array
@@ -33,10 +33,16 @@ class Surface:
     subtype: str
     gloss: float = 0.0
     softness: float = 0.0
+    curvature: float = 0.0
+
+    @property
+    def px(self) -> float:
+        """Pixel size in mm."""
+        return TILE_MM / len(self.height)
 
 
-#: Draws a piece of a material on a tile; all randomness comes from the generator, also the tile's.
-Draw: TypeAlias = Callable[[Tile, np.random.Generator], Surface]
+#: Draws a piece of a material on a tile; all randomness comes from the tile's generator.
+Draw: TypeAlias = Callable[[Tile], Surface]
 
 
 @dataclass(frozen=True)
@@ -52,25 +58,15 @@ class Material:
     draw: Draw
 
 
-def pick(rng: np.random.Generator, *choices: T) -> T:
-    """Draw one of ``choices`` with equal probability."""
-    return choices[int(rng.integers(len(choices)))]
-
-
-def flip(rng: np.random.Generator, share: float) -> bool:
-    """Return True with probability ``share``."""
-    return bool(rng.random() < share)
-
-
 def rising(height: Array) -> Array:
     """Scale heights to [0, 1]."""
     low, high = float(height.min()), float(height.max())
     return (height - low) * (1.0 / (high - low + 1e-9))
 
 
-def plain(tile: Tile, color: Array) -> Array:
-    """Return an albedo of a single color."""
-    return np.broadcast_to(color, (tile.n, tile.n, 3))
+def of_top(height: Array) -> Array:
+    """Divide heights by the largest and clip them to [0, 1]."""
+    return np.clip(height * (1.0 / float(height.max())), 0.0, 1.0)
 
 
 def draw_surface(name: str, material: Material, n: int, rng: np.random.Generator) -> Surface:
@@ -83,14 +79,16 @@ def draw_surface(name: str, material: Material, n: int, rng: np.random.Generator
         PalpateError: naming the material, if its function returned a wrong shape or numbers that
             are not finite.
     """
-    surface = material.draw(Tile(n, rng), rng)
+    surface = material.draw(Tile(n, rng))
     height, albedo = f32(surface.height), f32(surface.albedo)
-    must, fix = f"The material {name!r} must return a height and an albedo of", "Correct it"
-    shapes, wanted = (height.shape, albedo.shape), ((n, n), (n, n, 3))
-    if shapes != wanted:
-        raise PalpateError(f"{must} shapes {wanted}", str(shapes), fix)
-    if not (np.isfinite(height).all() and np.isfinite(albedo).all()):
-        raise PalpateError(f"{must} finite numbers", "NaN or infinity", fix)
+    must, shapes = (
+        f"The material {name!r} must return a height and an albedo of",
+        ((n, n), (n, n, 3)),
+    )
+    got = (height.shape, albedo.shape)
+    require(got == shapes, None, f"{must} shapes {shapes}", got, fix="Correct it")
+    finite = bool(np.isfinite(height).all() and np.isfinite(albedo).all())
+    require(finite, None, f"{must} finite numbers", "NaN or infinity", fix="Correct it")
     return replace(
         surface,
         height=np.ascontiguousarray(height - float(np.median(height))),
