@@ -9,7 +9,6 @@ size of the files, since the noise of a sensor does not compress.
 from __future__ import annotations
 
 import argparse
-import dataclasses
 from collections.abc import Callable, Sequence
 from functools import partial
 from itertools import count
@@ -22,7 +21,7 @@ from PIL import Image, ImageDraw, ImageFont
 from palpate.core import atomic_path
 from palpate.sim import MATERIALS, Video, WorldOptions
 from palpate.sim.arrays import f32, resample, to_bytes
-from palpate.sim.gel import PAD_MM, gap_of, solve_approach
+from palpate.sim.gel import PAD_MM, solve_approach
 from palpate.sim.objects import make_object
 from palpate.sim.plan import ObjectRef, VideoPlan, first_contact
 
@@ -89,7 +88,7 @@ def sheet(look: Literal["gelsight", "digit"], names: Sequence[str]) -> Board:
         video = video_of(options, ObjectRef(name, 0), 10**6 + k, k % 3)
         pair = [small(image, 96) for image in (video.vision(frame), video.tactile(frame))]
         place = GAP + k % 5 * (2 * 96 + 3 * GAP), GAP + LINE + k // 5 * (96 + LINE + 2 * GAP)
-        label = f"{name} ({video.object_of(0).surface.subtype})"
+        label = f"{name} ({video.surface(0).subtype})"
         board.row(*place, [np.concatenate(pair, 1)], [label])
     return board
 
@@ -98,11 +97,11 @@ def steps() -> Board:
     """One contact with a tread plate, from the photo to the image of the gel."""
     options, board = WorldOptions(size=128, tile=512), Board()
     refs = (ObjectRef("Metal", number) for number in count())
-    of_kind = (r for r in refs if make_object(options, r).surface.subtype == "tread plate")
+    of_kind = (r for r in refs if make_object(options, r).subtype == "tread plate")
     video, frame = video_of(options, next(of_kind), 2), first_contact(options, 0) + 1
-    video.camera = dataclasses.replace(video.camera, hand=None, edge=None, shadow=None)
+    video.camera.hand = video.camera.edge = video.camera.shadow = None
     state, relief = video.state(frame), video.relief(video.state(frame))
-    gap = gap_of(video.object_of(0), video.sensor, relief, state.load, state.tilt)
+    gap = video.sensor.gap(video.surface(0), relief, state)
     pressed = np.maximum(gap + solve_approach(gap, state.load), 0.0)
     fields = [gray(f, float(f.min()), float(f.max())) for f in (relief, gap)]
     fields += [gray(f, 0.0, float(pressed.max())) for f in (pressed, video.membrane(state)[0])]

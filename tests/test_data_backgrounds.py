@@ -12,6 +12,7 @@ from palpate.cli import main
 from palpate.core import Split
 from palpate.data import load, propose_backgrounds
 from palpate.data.manifest import Manifest
+from palpate.sim import WorldOptions, write_world
 from test_data_contacts import gel_video
 
 PRESSES = ((20, 30), (45, 55))
@@ -121,9 +122,8 @@ def test_splits_follow_and_an_existing_manifest_stays(folder, tmp_path, capsys):
 
 @pytest.mark.parametrize("look", ["gelsight", "digit"])
 def test_contacts_of_a_world_take_a_frame_that_is_free(tmp_path, look):
-    sizes = ["--materials", "2", "--objects-per-material", "1", "--size", "48", "--tile", "64"]
-    args = ["world", "-q", "-o", str(tmp_path / "w"), "--look", look, "--workers", "1", *sizes]
-    assert main([*args, "--frames-per-contact", "8", "--free-frames", "8"]) == 0
+    few = {"materials": 2, "objects_per_material": 1, "frames_per_contact": 8, "free_frames": 8}
+    write_world(tmp_path / "w", WorldOptions(look=look, size=48, tile=64, **few))
     lines = (tmp_path / "w" / "label.txt").read_text().split()
     labeled = {(line[:15], int(line[16:26])) for line in lines}
     world = load(tmp_path / "w")

@@ -14,7 +14,7 @@ FLAT = np.zeros((64, 64))
 
 
 def piece(**changes):
-    def draw(tile, rng):
+    def draw(tile):
         height, albedo = np.zeros((tile.n, tile.n)), np.full((tile.n, tile.n, 3), 0.5)
         content = {"height": height, "albedo": albedo, "subtype": "only"}
         return Surface(**{**content, **changes})
@@ -22,7 +22,7 @@ def piece(**changes):
     return draw
 
 
-def springy(tile, rng):
+def springy(tile):
     albedo = np.full((tile.n, tile.n, 3), 0.5, np.float32)
     return Surface(tile.noise(1.0, 8.0) * 0.1, albedo, "only")
 

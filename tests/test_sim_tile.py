@@ -16,8 +16,7 @@ def tile(n=64, name="tile"):
 
 
 def draw(name, k, n=64):
-    rng = rng_for(0, "test", name, k)
-    return MATERIALS[name].draw(Tile(n, rng), rng)
+    return MATERIALS[name].draw(Tile(n, rng_for(0, "test", name, k)))
 
 
 def seam(field):

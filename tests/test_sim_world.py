@@ -16,7 +16,6 @@ from palpate.data.importing import import_dataset
 from palpate.data.manifest import Manifest
 from palpate.leakage import audit
 from palpate.sim import MATERIALS, PRESETS, Video, World, WorldOptions, plan_world, write_world
-from palpate.sim.leak import cut
 from palpate.sim.plan import contact_frames, contact_rows
 
 TINY = dataclasses.replace(PRESETS["tiny"], size=32, tile=64, mixed=0.3, two_videos=0.25)
@@ -103,8 +102,7 @@ def test_an_audit_reports_exactly_the_leak_of_the_world(leak, tmp_path):
 
 
 def cut_of(options):
-    plans = plan_world(options)
-    return cut(options, plans, list(contact_rows(options, plans))).values()
+    return World(options).parts.values()
 
 
 @pytest.mark.parametrize("leak", ["frame", "contact", "none"])

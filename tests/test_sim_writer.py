@@ -16,7 +16,7 @@ from palpate.core import PalpateError, digest_folder
 from palpate.sim import MINI_SEEDS, PRESETS, WorldOptions, write_world
 
 TINY = dataclasses.replace(PRESETS["tiny"], size=16, tile=64)
-RUN = ["world", "--preset", "tiny", "--size", "16", "--tile", "64", "--workers", "1", "-q", "-o"]
+RUN = ["world", "--preset", "tiny", "--size", "16", "--workers", "1", "-q", "-o"]
 
 
 @pytest.fixture(scope="module")
@@ -157,7 +157,7 @@ def test_a_full_disk_is_one_line_and_the_same_command_continues(
 ):
     place, enlarge = small_disk
     args = ["world", "--preset", "tiny", "--objects-per-material", "4", "--layout", layout, "-q"]
-    args += ["--workers", "1", "--tile", "64", "-o"]
+    args += ["--workers", "1", "-o"]
     assert main([*args, str(place / "w")]) == 2
     message = capsys.readouterr().err
     assert "No space left" in message

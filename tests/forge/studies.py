@@ -17,9 +17,7 @@ from palpate.data.manifest import Manifest
 from palpate.leakage.noleak import load_record, record_split
 from palpate.report.results import Results
 from palpate.sim import PRESETS as WORLDS
-from palpate.sim import Video, WorldOptions, plan_world, write_world
-from palpate.sim.leak import cut
-from palpate.sim.plan import contact_rows
+from palpate.sim import Video, World, WorldOptions, plan_world, write_world
 from palpate.studies.methods import METHODS, OURS
 from palpate.studies.reproduce import Plan, run_study
 from palpate.studies.study import PRESETS, Study
@@ -80,7 +78,7 @@ def forge_touch_and_go(folder: Path) -> Path:
 def forge_hct(folder: Path) -> Path:
     """Rigs with trajectories, lists with captions and no materials."""
     root, options = folder / "hct", WorldOptions(look="digit", leak="frame", **FORGED)
-    plans = plan_world(options)
+    world, plans = World(options), plan_world(options)
     places = {
         p: f"data{p.sensor + 1}/{p.index % 7 + 1}-{1702596295 + 97 * p.index}.{p.index % 100:02d}"
         for p in plans
@@ -93,8 +91,7 @@ def forge_hct(folder: Path) -> Path:
                 image = Image.fromarray(render(frame))
                 image.save(root / place / side / f"{frame}-0.0207.jpg", quality=95)
         Image.fromarray(video.background()).save(root / place / "background.png")
-    every = list(contact_rows(options, plans))
-    for name, part in cut(options, plans, every).items():
+    for name, part in world.parts.items():
         for rig in sorted({f"data{plan.sensor + 1}" for plan in plans}):
             lines = ["url,tactile,tactile_background,caption"]
             for row in part:
@@ -109,7 +106,7 @@ def forge_hct(folder: Path) -> Path:
             (root / rig / f"{name}.csv").write_text("\n".join(lines))
     for rig in root.iterdir():
         for name, wanted in (("contact", True), ("not_contact", False)):
-            in_contact = {row.frame for row in every}
+            in_contact = {row.frame for row in world.rows}
             frames = [k for k in range(options.video_length) if (k in in_contact) is wanted]
             of_rig = [Path(place).name for place in places.values() if place.startswith(rig.name)]
             lists = {

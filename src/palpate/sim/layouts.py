@@ -12,6 +12,7 @@ additional ``objects.csv`` and ``captions.csv``.
 
 from __future__ import annotations
 
+import io
 from collections.abc import Iterable, Mapping, Sequence
 from fractions import Fraction
 from pathlib import Path
@@ -53,8 +54,9 @@ def write_video_files(video: Video, folder: Path) -> None:
             continue
         (folder / f"{name}_frame").mkdir()
         for frame in frames:
-            path = folder / f"{name}_frame" / f"{frame:010d}.jpg"
-            Image.fromarray(render(frame)).save(path, "JPEG", quality=95, subsampling=0)
+            file = io.BytesIO()  # written at once: PIL does not notice a disk that is full
+            Image.fromarray(render(frame)).save(file, "JPEG", quality=95, subsampling=0)
+            (folder / f"{name}_frame" / f"{frame:010d}.jpg").write_bytes(file.getvalue())
 
 
 def _write_mp4(path: Path, images: Iterable[np.ndarray], size: int) -> None:
