@@ -20,9 +20,16 @@ import polars as pl
 from palpate._version import __version__
 from palpate.captions.columns import template_texts
 from palpate.captions.prompts import Description, Prompt
-from palpate.captions.querying import Photos, Question, query_all
-from palpate.captions.replies import Replies, ReplyLog, read_replies
-from palpate.captions.server import Server
+from palpate.captions.querying import (
+    Photo,
+    all_problems,
+    descriptions_of,
+    pending,
+    photos_of,
+    query_all,
+)
+from palpate.captions.reading import SCHEMA
+from palpate.captions.replies import Question, Replies, ReplyLog, read_replies
 from palpate.captions.units import Per, Units, units_of
 from palpate.core import (
     Note,
@@ -42,7 +49,6 @@ from palpate.data.manifest import Manifest
 from palpate.data.reading import load
 from palpate.data.texts import TABLE, TEXTS_FORMAT, image_digests, texts_digest, write_texts
 
-LIST = pl.List(pl.String)
 RECORD, REPLIES = "record.json", "replies.jsonl"
 
 
@@ -163,49 +169,52 @@ def caption(  # noqa: PLR0913 (a public verb)
     for name, limit in limits.items():
         require(0 < limit < inf, name, "must be a positive number", limit)
     manifest, output = load(data, progress=progress), Path(output)
-    if template is None and not manifest.table["vision"].count():
-        must, fix = "must have vision images", "Map the column vision to the photos"
-        raise PalpateError(must, "samples without any", fix, argument="data")
+    must, fix = "must have vision images", "Map the column vision to the photos"
+    usable = server is None or manifest.table["vision"].count() > 0
+    require(usable, "data", must, "samples without any", fix=fix)
     units = units_of(manifest, per)
     if server is None:
         require(not dry_run, "dry_run", "must be of a model", "a template, which needs no model")
         return _of_columns(template or "", manifest, units, output, per=per, seed=seed)
     instruction = prompt if isinstance(prompt, Prompt) else Prompt.load(prompt)
-    service = Server(server, model, body=body, timeout=timeout, connections=concurrency)
+    from palpate.captions.server import Server
+
+    service = Server(server, model, timeout=timeout, connections=concurrency)
     with closing(service):
         question = Question(service.model, instruction, max_tokens, seed, body or {})
+        photos = photos_of(manifest, units, question, progress)
+        total = sum(photo.path is not None for photo in photos)
         if dry_run:
-            photos = Photos.of(manifest, units, question, progress)
             replies, _ = read_replies(output / REPLIES)
-            return Estimate(len(photos), len(photos.pending(replies)))
+            return Estimate(total, len(pending(photos, replies)))
         with locked(output), closing(ReplyLog(output / REPLIES)) as log:
-            photos = Photos.of(manifest, units, question, progress)
-            answers = log.replies.answers
-            pending = photos.pending(log.replies)
+            answers, left = log.replies.answers, pending(photos, log.replies)
             try:
                 problems = query_all(
-                    pending,
+                    left,
                     question,
                     service,
                     log,
-                    threads=min(concurrency, len(pending)),
+                    threads=min(concurrency, len(left)),
                     progress=progress,
-                    answered=any(key in answers for key in photos.keys),
+                    answered=any(photo.key in answers for photo in photos),
                 )
             except PalpateError as error:
                 if not log.answered:
                     raise
-                done = sum(key in answers for key in photos.keys)
-                raise StoppedError(error, done, len(photos), output) from None
-            made = _made(question, photos, log.replies, server) | {"per": per}
-            problems = photos.problems(problems)
-            descriptions = photos.descriptions(answers, instruction, problems)
-            return _write(manifest, units, descriptions, output, made, problems=problems)
+                done = sum(photo.key in answers for photo in photos)
+                raise StoppedError(error, done, total, output) from None
+            source = _source(question, photos, log.replies, server) | {"per": per}
+            problems = all_problems(photos, problems)
+            descriptions = descriptions_of(photos, log.replies, instruction, problems)
+            return _write(manifest, units, descriptions, output, source, problems=problems)
 
 
-def _made(question: Question, photos: Photos, replies: Replies, server: str) -> dict[str, Any]:
+def _source(
+    question: Question, photos: Sequence[Photo], replies: Replies, server: str
+) -> dict[str, Any]:
     """What the record says of the model and of its replies."""
-    prompt, keys = question.prompt, photos.distinct
+    prompt, keys = question.prompt, sorted({photo.key for photo in photos if photo.key})
     answers = [replies.answers[key] for key in keys if key in replies.answers]
     unused = [reply for key in keys for reply in replies.unused.get(key, ())]
     inward, outward = (sum(reply.tokens[k] for reply in [*answers, *unused]) for k in (0, 1))
@@ -226,14 +235,13 @@ def _of_columns(
     template: str, manifest: Manifest, units: Units, output: Path, *, per: str, seed: int
 ) -> Captions:
     """Captions from a template; never over those of a model, which cost something."""
-    if (output / REPLIES).exists():
-        must, fix = "must hold no replies of a model", "Choose another folder"
-        raise PalpateError(must, str(output), fix, argument="output")
+    must, free = "must hold no replies of a model", not (output / REPLIES).exists()
+    require(free, "output", must, str(output), fix="Choose another folder")
     texts = template_texts(template, manifest, units, seed)
     descriptions = [Description(text, flags=() if text else ("no-column",)) for text in texts]
-    made = {"model": None, "template": template or "adjectives of the material", "prompt": None}
+    source = {"model": None, "template": template or "adjectives of the material", "prompt": None}
     with locked(output):
-        return _write(manifest, units, descriptions, output, {"per": per, "seed": seed, **made})
+        return _write(manifest, units, descriptions, output, {"per": per, "seed": seed, **source})
 
 
 def _write(
@@ -241,55 +249,46 @@ def _write(
     units: Units,
     descriptions: Sequence[Description],
     output: Path,
-    made: Mapping[str, Any],
+    source: Mapping[str, Any],
     *,
     problems: Sequence[Problem] = (),
 ) -> Captions:
     """Write the table and the record: every sample has the caption of its unit."""
-    rows = [descriptions[k] for k in units.of]
+    rows = [descriptions[number] for number in units.numbers]
+    cells = [(row.text, list(row.adjectives), list(row.flags)) for row in rows]
     table = pl.DataFrame(
-        {
-            "id": manifest.ids,
-            "text": [row.text for row in rows],
-            "adjectives": [list(row.adjectives) for row in rows],
-            "flags": [list(row.flags) for row in rows],
-        },
-        schema={"id": pl.String, "text": pl.String, **dict.fromkeys(("adjectives", "flags"), LIST)},
+        [(name, *row) for name, row in zip(manifest.ids, cells, strict=True)], SCHEMA, orient="row"
     )
     digest, flags = texts_digest(table), Counter(f for d in descriptions for f in d.flags)
     texts = [d.text for d in descriptions if d.text]
+    flagged = dict(sorted(flags.items()))
     record = {
         "format": TEXTS_FORMAT,
         "digest": digest,
         "manifest": manifest.digest,
         "data": dict(manifest.facts),
-        **made,
+        **source,
         "counts": {
             "samples": len(manifest),
             "photos": len(descriptions),
             "texts": len(texts),
             "different": len(set(texts)),
-            "flags": dict(sorted(flags.items())),
+            "flags": flagged,
         },
         "palpate": __version__,
     }
-    prompt = (made["prompt"] or {}).get("name")
-    source = [made["model"] or f"template {made['template']!r}", prompt, f"per {made['per']}"]
-    source = ", ".join([*filter(None, source), f"captions {short(digest)}"])
+    prompt = (source["prompt"] or {}).get("name")
+    origin = [source["model"] or f"template {source['template']!r}", prompt]
+    origin = [*filter(None, origin), f"per {source['per']}", f"captions {short(digest)}"]
     path = output / TABLE
-    write_texts(table, path, source, image_digests(manifest))
+    write_texts(table, path, ", ".join(origin), image_digests(manifest))
     write_json(output / RECORD, record)
-    notes = _notes(manifest, units, made)
-    if not texts:
-        notes.append(Note("captions-none", {"flags": dict(sorted(flags.items()))}))
-    return Captions(table, record, path, problems, notes)
-
-
-def _notes(manifest: Manifest, units: Units, made: Mapping[str, Any]) -> list[Note]:
     notes: list[Note] = []
     if units.alone:
-        params = {"count": units.alone, "of": len(manifest), "per": made["per"]}
+        params = {"count": units.alone, "of": len(manifest), "per": source["per"]}
         notes.append(Note("captions-alone", params))
-    if made["model"] is None:
-        notes.append(Note("captions-of-columns", {"template": made["template"]}))
-    return notes
+    if source["model"] is None:
+        notes.append(Note("captions-of-columns", {"template": source["template"]}))
+    if not texts:
+        notes.append(Note("captions-none", {"flags": flagged}))
+    return Captions(table, record, path, problems, notes)

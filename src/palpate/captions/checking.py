@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from palpate.captions.prompts import REFUSAL
 from palpate.captions.reading import read_captions
 from palpate.captions.vocabulary import Vocabulary, visual_in, words_of
-from palpate.core import FeatureSet, Note, PalpateError, Progress, Score, Split, quiet, rng_for
+from palpate.core import FeatureSet, Note, Progress, Score, Split, quiet, require, rng_for, track
 from palpate.data.manifest import Manifest
 from palpate.metrics.means import mean_of
 from palpate.metrics.probe import fit_probe
@@ -35,28 +35,12 @@ LONGEST = 40
 #: which the text is a code of the label.
 COMMON, CODE = 0.05, 0.9
 FOLDS, PENALTY, WORDS = 5, 1e-2, 500
+SETTINGS = {"words": WORDS, "penalty": PENALTY, "folds": FOLDS}
 SHOWN_WORDS = 12
 SHARE, FLAGGED, NAMING = "share of captions", "flagged", "naming a material"
 LABEL, VISUAL = "naming their label", "visual words"
 #: Shares whose words a note lists.
 LISTED = (NAMING, LABEL, VISUAL)
-
-
-@dataclass(frozen=True)
-class _Rows:
-    """Captions, one a contact and text.
-
-    Attributes:
-        texts, labels, groups: of each; ``""`` for no text or label.
-        parts: part of the split, ``""`` without one.
-        refused: marked as a refusal when they were made.
-    """
-
-    texts: list[str]
-    labels: list[str]
-    groups: list[str]
-    parts: list[str]
-    refused: list[bool]
 
 
 def check_captions(
@@ -87,17 +71,17 @@ def check_captions(
     Raises:
         PalpateError: if there are no captions, or they are of other samples.
     """
-    given = {"captions": captions, "data": data, "split": split, "seed": seed, **options}
-    call = Call.of("caption check", check_captions, given)
+    arguments = {"captions": captions, "data": data, "split": split, "seed": seed} | options
+    call = Call.of("caption check", check_captions, arguments)
     manifest, table = read_captions(captions, data, **options)
     flags = dict(table.select("id", "flags").iter_rows())
     split = None if split is None else Split.load(split)
     rows = _rows(manifest, flags, split)
-    vocabulary = Vocabulary(sorted(set(rows.labels) - {""}))
+    vocabulary = Vocabulary(sorted({*rows["label"]} - {""}))
     scores, notes = _shares(rows, vocabulary), list[Note]()
     if split is not None:
         scores.append(_shared(rows))
-    if not any(rows.labels):
+    if not any(rows["label"]):
         notes.append(Note("captions-no-labels"))
     else:
         accuracies, notes = _accuracies(rows, vocabulary, seed, progress)
@@ -110,30 +94,34 @@ def check_captions(
         settings={
             "digests": digests,
             "text source": manifest.facts.get("text_source", "unknown"),
-            "options": {"seed": seed, "folds": FOLDS, "words": WORDS, "penalty": PENALTY},
+            "options": {"seed": seed} | SETTINGS,
         },
         calls=[call.with_digests(digests)],
     )
 
 
-def _rows(manifest: Manifest, flags: dict[str, list[str]], split: Split | None) -> _Rows:
-    table = manifest.table.with_columns(
+def _rows(manifest: Manifest, flags: dict[str, list[str]], split: Split | None) -> pl.DataFrame:
+    """Captions, one a contact and text.
+
+    Returns:
+        ``text``, ``label`` and ``part`` of the split, ``""`` for none; ``group``, the recording;
+        and ``refused``, whether it was marked as a refusal when it came.
+    """
+    parts = {} if split is None else split.parts
+    rows = manifest.table.select(
+        "id",
         unit=pl.coalesce(pl.col("contact"), pl.col("id")),
-        group=pl.coalesce(*(pl.col(c) for c in ("video", "session", "object", "contact", "id"))),
         text=pl.col("text").fill_null("").str.strip_chars(),
-        material=pl.col("material").fill_null(""),
+        label=pl.col("material").fill_null(""),
+        group=pl.coalesce(*(pl.col(c) for c in ("video", "session", "object", "contact", "id"))),
     ).unique(["unit", "text"], keep="first", maintain_order=True)
-    ids = table["id"].to_list()
-    return _Rows(
-        table["text"].to_list(),
-        table["material"].to_list(),
-        table["group"].to_list(),
-        ["" if split is None else split.parts.get(name, "") for name in ids],
-        ["refusal" in flags.get(name, ()) for name in ids],
+    return rows.with_columns(
+        part=pl.Series([parts.get(name, "") for name in rows["id"]], dtype=pl.String),
+        refused=pl.Series(["refusal" in flags.get(name, ()) for name in rows["id"]]),
     )
 
 
-def _shares(rows: _Rows, vocabulary: Vocabulary) -> list[Score]:
+def _shares(rows: pl.DataFrame, vocabulary: Vocabulary) -> list[Score]:
     """Shares of captions that have something wrong; the union of most comes first."""
     kinds: dict[str, Callable[[str], Sequence[str]]] = {
         NAMING: vocabulary.naming,
@@ -143,72 +131,70 @@ def _shares(rows: _Rows, vocabulary: Vocabulary) -> list[Score]:
         "empty": lambda text: [] if text else ["empty"],
         f"over {LONGEST} words": lambda text: ["long"] * (len(words_of(text)) > LONGEST),
     }
-    hits = {name: [function(text) for text in rows.texts] for name, function in kinds.items()}
-    named = zip(rows.texts, rows.labels, strict=True)
-    label = [vocabulary.naming(text, name) if name else [] for text, name in named]
-    hits = {LABEL: label} | hits if any(rows.labels) else hits
-    pairs = zip(hits["refusals"], rows.refused, strict=True)
+    texts, labels = rows["text"].to_list(), rows["label"].to_list()
+    hits = {name: [function(text) for text in texts] for name, function in kinds.items()}
+    if any(labels):
+        pairs = zip(texts, labels, strict=True)
+        named = [vocabulary.naming(text, label) if label else [] for text, label in pairs]
+        hits = {LABEL: named, **hits}
+    pairs = zip(hits["refusals"], rows["refused"], strict=True)
     hits["refusals"] = [words or ["refusal"] * refused for words, refused in pairs]
     counted = [words for name, words in hits.items() if name != NAMING]
     flagged = [[word for words in row for word in words] for row in zip(*counted, strict=True)]
     scores = [_share(name, words, rows) for name, words in {FLAGGED: flagged, **hits}.items()]
-    text, count = Counter(rows.texts).most_common(1)[0]
-    common = _share("the commonest text", [[t] * (t == text) for t in rows.texts], rows)
-    if count > max(1, COMMON * len(rows.texts)) and text:
+    text, count = Counter(texts).most_common(1)[0]
+    common = _share("the commonest text", [[t] * (t == text) for t in texts], rows)
+    if count > max(1, COMMON * len(texts)) and text:
         common = replace(common, notes=[Note("captions-common", {"text": text, "count": count})])
     return [*scores, common]
 
 
-def _share(name: str, words: Sequence[Sequence[str]], rows: _Rows) -> Score:
+def _share(name: str, words: Sequence[Sequence[str]], rows: pl.DataFrame) -> Score:
     """The share of captions with words of a kind, and those words."""
     hits = np.array([bool(row) for row in words])
-    score = mean_of(SHARE, hits, rows.groups, estimator="mean", subject=name).score
+    score = mean_of(SHARE, hits, rows["group"].to_list(), estimator="mean", a=name).score
     counts = Counter(word for row in words for word in set(row))
     listed = dict(counts.most_common(SHOWN_WORDS))
     notes = [Note("captions-words", {"words": listed})] if name in LISTED and listed else []
     return replace(score, higher_is_better=False, details={"words": listed}, notes=notes)
 
 
-def _shared(rows: _Rows) -> Score:
+def _shared(rows: pl.DataFrame) -> Score:
     """The share of test captions that train has word for word."""
-    parts = zip(rows.parts, rows.texts, strict=True)
-    train = {text.lower() for part, text in parts if part == "train" and text}
-    test = [k for k, part in enumerate(rows.parts) if part == "test"]
-    if not train or not test:
-        must, got = "must have captions in train and test", f"{len(train)} and {len(test)}"
-        raise PalpateError(must, got, "Use the split of these samples", argument="split")
-    columns = (rows.texts, rows.labels, rows.groups, rows.parts, rows.refused)
-    part = _Rows(*([column[k] for k in test] for column in columns))  # type: ignore[arg-type]
-    words = [[text] * (text.lower() in train) for text in part.texts]
-    return _share("test captions that train has", words, part)
+    train, test = (rows.filter(pl.col("part") == part) for part in ("train", "test"))
+    texts = {text.lower() for text in train["text"] if text}
+    must, got = "must have captions in train and test", f"{len(texts)} and {len(test)}"
+    both = bool(texts) and len(test) > 0
+    require(both, "split", must, got, fix="Use the split of these samples")
+    words = [[text] * (text.lower() in texts) for text in test["text"]]
+    return _share("test captions that train has", words, test)
 
 
 def _accuracies(
-    rows: _Rows, vocabulary: Vocabulary, seed: int, progress: Progress
+    rows: pl.DataFrame, vocabulary: Vocabulary, seed: int, progress: Progress
 ) -> tuple[list[Score], list[Note]]:
     """Material accuracy from the text alone on new groups, without names, and of the majority."""
-    keep = [k for k, label in enumerate(rows.labels) if label and rows.texts[k]]
-    labels, groups = ([column[k] for k in keep] for column in (rows.labels, rows.groups))
+    rows = rows.filter((pl.col("label") != "") & (pl.col("text") != ""))
+    labels, groups, lines = (rows[name].to_list() for name in ("label", "group", "text"))
     names, number = np.unique(np.array(groups), return_inverse=True)
     if len(names) < 2 * FOLDS or len(set(labels)) < 2:
         few = Note("captions-few", {"groups": len(names), "materials": len(set(labels))})
         return [], [few]
     fold = np.argsort(rng_for(seed, "caption folds").permutation(len(names)))[number] % FOLDS
-    texts = {
-        "text": [rows.texts[k] for k in keep],
-        "text without names of materials": [vocabulary.masked(rows.texts[k]) for k in keep],
-    }
-    hits: dict[str, NDArray[np.bool_]] = {}
-    for done, (subject, lines) in enumerate(texts.items()):
-        progress("predicting materials from texts", done, len(texts))
-        hits[subject] = _predicted(lines, labels, groups, fold) == np.array(labels)
-    progress("predicting materials from texts", len(texts), len(texts))
-    hits["commonest material"] = _majority(labels, fold) == np.array(labels)
-    settings = {"words": WORDS, "penalty": PENALTY, "folds": FOLDS}
-    common: dict[str, Any] = {"estimator": "mean", "settings": settings, "seed": seed}
-    metric = "material accuracy from the text"
-    scores = [mean_of(metric, h, groups, subject=s, **common).score for s, h in hits.items()]
-    scores = [replace(score, higher_is_better=False) for score in scores]
+    masked = [vocabulary.masked(text) for text in lines]
+    predicted: dict[str, NDArray[Any]] = {}
+    texts = {"text": lines, "text without names of materials": masked}
+    for subject, used in track(list(texts.items()), "predicting materials from texts", progress):
+        predicted[subject] = _predicted(used, labels, groups, fold)
+    predicted["commonest material"] = _majority(labels, fold)
+    scores: list[Score] = []
+    for subject, materials in predicted.items():
+        hits = materials == np.array(labels)
+        metric, settings = "material accuracy from the text", dict(SETTINGS)
+        result = mean_of(
+            metric, hits, groups, a=subject, estimator="mean", settings=settings, seed=seed
+        )
+        scores.append(replace(result.score, higher_is_better=False))
     bare = scores[1].value or 0.0
     notes = [Note("captions-code", {"accuracy": bare})] if bare > CODE else []
     return [replace(scores[0], notes=notes), *scores[1:]], []
@@ -228,9 +214,9 @@ def _predicted(
         features = np.zeros((len(texts), len(words) + 1))
         for row, bag in enumerate(bags):
             features[row, [column[word] for word in bag if word in column]] = 1
-        known = [[items[row] for row in train.tolist()] for items in (labels, groups)]
+        columns = ([str(items[row]) for row in train] for items in (labels, groups))
         names = [str(row) for row in train]
-        probe = fit_probe(FeatureSet(names, features[train], known[0], known[1]), l2=PENALTY)
+        probe = fit_probe(FeatureSet(names, features[train], *columns), l2=PENALTY)
         predicted[test] = probe.predict(features[test])
     return predicted
 

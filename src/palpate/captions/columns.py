@@ -4,8 +4,10 @@ from __future__ import annotations
 
 from string import Formatter
 
+import polars as pl
+
 from palpate.captions.units import Units
-from palpate.core import PalpateError
+from palpate.core import PalpateError, require
 from palpate.data.captions import caption
 from palpate.data.manifest import SCHEMA, Manifest
 
@@ -21,20 +23,19 @@ def template_texts(template: str, manifest: Manifest, units: Units, seed: int) -
     """
     columns = list(dict.fromkeys(_columns(template))) if template else ["material"]
     for column in columns:
-        if not manifest.table[column].count():
-            must, got = "must name columns that have values", f"{column}, which is empty"
-            raise PalpateError(must, got, "Choose another column", argument="template")
-    first = {unit: row for row, unit in reversed(list(enumerate(units.of)))}
-    rows = manifest.table.select("id", *columns).rows(named=True)
+        must, got = "must name columns that have values", f"{column}, which is empty"
+        values = manifest.table[column].count()
+        require(values > 0, "template", must, got, fix="Choose another column")
+    units_of_rows = pl.Series("unit", units.numbers)
+    first = manifest.table.select("id", *columns).filter(units_of_rows.is_first_distinct())
     texts: list[str | None] = []
-    for unit in range(len(units.described)):
-        cells = {column: rows[first[unit]][column] for column in columns}
+    for cells in first.iter_rows(named=True):
         if None in cells.values():
             texts.append(None)
         elif template:
             texts.append(template.format(**cells))
         else:
-            texts.append(caption(cells["material"], rows[first[unit]]["id"], seed))
+            texts.append(caption(cells["material"], cells["id"], seed))
     return texts
 
 
@@ -45,15 +46,13 @@ def _columns(template: str) -> list[str]:
         PalpateError: if there is none, or anything else in braces.
     """
     must = "must be a text with columns in braces"
-    example = {"template": "{material} of {object}"}
+    example, fix = {"template": "{material} of {object}"}, f"Columns are {', '.join(SCHEMA)}"
     try:
-        parts = list(Formatter().parse(template))
+        fields = [field[1:] for field in Formatter().parse(template) if field[1] is not None]
     except ValueError as error:
         raise PalpateError(must, str(error), "", argument="template", example=example) from None
-    names = [name for _, name, _, _ in parts if name is not None]
-    unknown = [n for _, n, form, how in parts if n is not None and (n not in SCHEMA or form or how)]
-    if unknown or not names:
-        got = f"{{{unknown[0]}}}" if unknown else f"{template!r}, which names none"
-        fix = f"Columns are {', '.join(SCHEMA)}"
+    odd = [str(name) for name, *form in fields if name not in SCHEMA or any(form)]
+    if odd or not fields:
+        got = f"{{{odd[0]}}}" if odd else f"{template!r}, which names none"
         raise PalpateError(must, got, fix, argument="template", example=example)
-    return names
+    return [str(name) for name, *_ in fields]

@@ -25,7 +25,7 @@ from importlib import resources
 from pathlib import Path
 from typing import Any
 
-from palpate.core import PalpateError, digest_json
+from palpate.core import PalpateError, digest_json, require
 
 #: Fields that a reply may have, as JSON schemas.
 FIELDS: dict[str, dict[str, Any]] = {
@@ -99,9 +99,8 @@ class Prompt:
         if str(source) in shipped:
             return shipped[str(source)]
         path = Path(source)
-        if not path.is_file():
-            must = f"must be one of {', '.join(shipped)}, or a prompt file"
-            raise PalpateError(must, str(source), "Check the name", argument="prompt")
+        must = f"must be one of {', '.join(shipped)}, or a prompt file"
+        require(path.is_file(), "prompt", must, str(source), fix="Check the name")
         try:
             return cls.parse(path.read_text(encoding="utf-8"))
         except (UnicodeDecodeError, ValueError) as error:
@@ -126,8 +125,8 @@ class Prompt:
             raise ValueError(f"the reply field {unknown[0]!r} is none of {', '.join(FIELDS)}")
         if values["text"] not in fields or values["text"] not in TEXTS:
             choices = [name for name in fields if name in TEXTS]
-            known = f"one of {', '.join(choices)}" if choices else "a reply field with a text"
-            raise ValueError(f"text: {values['text']} is not {known}")
+            one = f"one of {', '.join(choices)}" if choices else "a reply field with a text"
+            raise ValueError(f"text: {values['text']} is not {one}")
         if absent := [name for name in fields if name not in body]:
             raise ValueError(f"the text does not request the field {absent[0]!r}")
         return cls(values["name"], body.strip(), fields, values["text"])
@@ -158,27 +157,27 @@ class Prompt:
             refused: the server itself calls it a refusal.
         """
         plain = _THOUGHT.sub("", raw[:LONGEST]).strip()
-        for whole, answer in _objects(plain):
-            description = self._describe(answer, whole)
+        for alone, answer in _objects(plain):
+            description = self._describe(answer, alone)
             if description is not None:
                 return description
         refusal = refused or REFUSAL.search(plain)
         return Description(None, flags=("refusal" if refusal else "invalid",))
 
-    def _describe(self, answer: Mapping[str, Any], whole: bool) -> Description | None:
+    def _describe(self, answer: Mapping[str, Any], alone: bool) -> Description | None:
         """The description in a JSON object; None if it lacks the caption."""
-        given = answer.get("adjectives")
-        given = given if isinstance(given, list) and all(isinstance(a, str) for a in given) else []
-        adjectives = tuple(dict.fromkeys(a for a in map(_bare, given) if a))
+        words = answer.get("adjectives")
+        words = words if isinstance(words, list) and all(isinstance(a, str) for a in words) else []
+        adjectives = tuple(dict.fromkeys(a for a in map(_bare, words) if a))
         value: Any = ", ".join(adjectives) if self.text == "adjectives" else answer.get(self.text)
         if not isinstance(value, str) or not _bare(value) or len(adjectives) > MOST_ADJECTIVES:
             return None
         if REFUSAL.search(value):
             return Description(None, flags=("refusal",))
         limits = FIELDS["adjectives"]
-        exact = whole and set(answer) == set(self.fields)
+        exact = alone and set(answer) == set(self.fields)
         if "adjectives" in self.fields:
-            exact = exact and limits["minItems"] <= len(given) <= limits["maxItems"]
+            exact = exact and limits["minItems"] <= len(words) <= limits["maxItems"]
         flags = [] if exact else ["schema-ignored"]
         flags += ["surface-hidden"] if answer.get("surface_visible") is False else []
         text = " ".join(valid(value).split()).rstrip(".")

@@ -3,20 +3,23 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from queue import Empty, SimpleQueue
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, TypeVar
 
-from palpate.captions.photos import QUALITY, SIDE, prepared
+from palpate.captions.photos import prepared
 from palpate.captions.prompts import Description, Prompt
-from palpate.captions.replies import RejectedError, Replies, Reply, ReplyLog, Request
-from palpate.captions.server import Server
+from palpate.captions.replies import Question, RejectedError, Replies, Reply, ReplyLog
 from palpate.captions.units import Units
-from palpate.core import PalpateError, Problem, Progress, digest_json
+from palpate.core import PalpateError, Problem, Progress, require
 from palpate.data.images import file_digest, in_threads
 from palpate.data.manifest import Manifest
+
+if TYPE_CHECKING:
+    from palpate.captions.server import Server
 
 #: Requests until a reply can be used; from the second on the model samples.
 ATTEMPTS = 3
@@ -30,112 +33,67 @@ R = TypeVar("R")
 
 
 @dataclass(frozen=True)
-class Question:
-    """What is the same for all photos of a run.
+class Photo:
+    """The photo of a unit.
 
     Attributes:
-        model: its name, as it was requested.
-        prompt: the instruction, with the schema of its reply.
-        max_tokens: longest reply.
-        seed: of the first try.
-        body: further fields of every request to a server.
+        sample: id of the described sample.
+        path: its photo; None without one.
+        key: of the reply about it; None without a photo that can be read.
     """
 
-    model: str
-    prompt: Prompt
-    max_tokens: int
-    seed: int
-    body: Mapping[str, Any]
-
-    @property
-    def parameters(self) -> dict[str, Any]:
-        """Everything next to model and prompt that a reply depends on."""
-        sent = {"side": SIDE, "quality": QUALITY}
-        return {"max_tokens": self.max_tokens, "seed": self.seed, "body": dict(self.body), **sent}
-
-    def key(self, image: str) -> str:
-        """Key of the reply about an image file with this digest."""
-        return digest_json([self.model, self.prompt.digest, image, self.parameters])
-
-
-@dataclass(frozen=True)
-class Pending:
-    """A photo without an answer: the answer's key, the sample's id, and the file."""
-
-    key: str
     sample: str
-    path: Path
+    path: Path | None
+    key: str | None
 
 
-@dataclass(frozen=True)
-class Photos:
-    """The photos of all units, and the keys of the replies about them.
+def photos_of(
+    manifest: Manifest, units: Units, question: Question, progress: Progress
+) -> list[Photo]:
+    """Read the photos' bytes; one photo a unit."""
+    ids, vision = manifest.ids, manifest.column("vision")
+    paths = [None if row is None else manifest.path(vision[row]) for row in units.described]
+    distinct = list(dict.fromkeys(path for path in paths if path is not None))
+    digests = dict(in_threads(file_digest, distinct, "reading photos", progress))
+    photos: list[Photo] = []
+    for row, path in zip(units.described, paths, strict=True):
+        digest = None if path is None else digests[path]
+        sample = "" if row is None else ids[row]
+        photos.append(Photo(sample, path, None if digest is None else question.key(digest)))
+    return photos
 
-    Attributes:
-        samples: id of the described sample of every unit.
-        paths: its photo; None without one.
-        keys: key of the reply; None without a photo that can be read.
-    """
 
-    samples: Sequence[str]
-    paths: Sequence[Path | None]
-    keys: Sequence[str | None]
+def pending(photos: Sequence[Photo], replies: Replies) -> list[Photo]:
+    """Photos without an answer, each once."""
+    first = {photo.key: photo for photo in reversed(photos) if photo.key is not None}
+    return [photo for key, photo in reversed(first.items()) if key not in replies.answers]
 
-    @classmethod
-    def of(cls, manifest: Manifest, units: Units, question: Question, progress: Progress) -> Photos:
-        """Read the photos' bytes."""
-        ids, vision = manifest.ids, manifest.column("vision")
-        paths = [None if row is None else manifest.path(vision[row]) for row in units.described]
-        distinct = list(dict.fromkeys(path for path in paths if path is not None))
-        digests = dict(in_threads(file_digest, distinct, "reading photos", progress))
-        of_paths = [None if path is None else digests[path] for path in paths]
-        keys = [None if digest is None else question.key(digest) for digest in of_paths]
-        samples = ["" if row is None else ids[row] for row in units.described]
-        return cls(samples, paths, keys)
 
-    def __len__(self) -> int:
-        """The number of photos."""
-        return sum(path is not None for path in self.paths)
+def all_problems(photos: Sequence[Photo], queried: Sequence[Problem]) -> list[Problem]:
+    """Photos whose files cannot be read, and those of requests with a problem or equal ones."""
+    keys = {str(photo.path): photo.key for photo in photos if photo.path is not None}
+    causes = {keys[problem.where]: problem for problem in queried}
+    causes |= {None: Problem("", "bad-image", "cannot be read")}
+    return [replace(causes[k], where=path) for path, k in sorted(keys.items()) if k in causes]
 
-    @property
-    def distinct(self) -> list[str]:
-        """The keys, each once, in a fixed order."""
-        return sorted({key for key in self.keys if key is not None})
 
-    def pending(self, replies: Replies) -> list[Pending]:
-        """Photos without an answer, each once."""
-        pending: dict[str, Pending] = {}
-        for key, sample, path in zip(self.keys, self.samples, self.paths, strict=True):
-            if key is not None and path is not None and key not in replies.answers:
-                pending.setdefault(key, Pending(key, sample, path))
-        return list(pending.values())
-
-    def problems(self, queried: Sequence[Problem]) -> list[Problem]:
-        """Photos whose files cannot be read, and those of requests with a problem or equal ones."""
-        pairs = zip(self.paths, self.keys, strict=True)
-        keys = {str(path): key for path, key in pairs if path is not None}
-        of = {keys[problem.where]: problem for problem in queried}
-        of |= {None: Problem("", "bad-image", "cannot be read")}
-        return [replace(of[key], where=path) for path, key in sorted(keys.items()) if key in of]
-
-    def descriptions(
-        self, answers: Mapping[str, Reply], prompt: Prompt, problems: Iterable[Problem]
-    ) -> list[Description]:
-        """What the answers say of every unit."""
-        kinds = {problem.where: problem.kind for problem in problems}
-        result: list[Description] = []
-        for path, key in zip(self.paths, self.keys, strict=True):
-            if key is not None and key in answers:
-                description = answers[key].read(prompt)
-            else:
-                kind = "no-photo" if path is None else kinds[str(path)]
-                description = Description(None, flags=(kind,))
-            result.append(description)
-        return result
+def descriptions_of(
+    photos: Sequence[Photo], replies: Replies, prompt: Prompt, problems: Iterable[Problem]
+) -> list[Description]:
+    """What the answers say of every unit."""
+    kinds = {problem.where: problem.kind for problem in problems}
+    descriptions: list[Description] = []
+    for photo in photos:
+        if photo.key in replies.answers:
+            descriptions.append(replies.answers[photo.key].read(prompt))
+        else:
+            kind = "no-photo" if photo.path is None else kinds[str(photo.path)]
+            descriptions.append(Description(None, flags=(kind,)))
+    return descriptions
 
 
 def query_all(
-    pending: list[Pending],
+    photos: list[Photo],
     question: Question,
     server: Server,
     log: ReplyLog,
@@ -155,36 +113,35 @@ def query_all(
         PalpateError: if the server fails, or takes no request at all.
     """
 
-    def work(photo: Pending) -> Problem | None:
+    def work(photo: Photo) -> Problem | None:
+        name, log_reply = question.prompt.name, partial(log.append, str(photo.key), photo.sample)
         try:
-            image = prepared(photo.path)
+            image = prepared(Path(str(photo.path)))
         except PalpateError as error:
             return Problem(str(photo.path), "bad-image", error.got)
         try:
             for reply in _replies(image, question, server):
-                log.append(photo.key, photo.sample, question.prompt.name, reply)
+                log_reply(name, reply)
         except RejectedError as error:
-            reply = Reply(str(error), question.model, finish="rejected", unused="rejected")
-            log.append(photo.key, photo.sample, question.prompt.name, reply)
+            log_reply(name, Reply(str(error), question.model, finish="rejected", unused="rejected"))
             return Problem(str(photo.path), "rejected", str(error))
         return None
 
     problems: list[Problem] = []
-    done, step = 0, -(-len(pending) // PROBES) or 1
-    progress("describing", done, len(pending))
-    rest = [photo for k, photo in enumerate(pending) if k % step]
-    for photos in (pending[::step], rest):
-        for result in in_daemons(work, photos, threads):
+    done, step = 0, -(-len(photos) // PROBES) or 1
+    progress("describing", done, len(photos))
+    later = [photo for k, photo in enumerate(photos) if k % step]
+    for part in (photos[::step], later):
+        for result in in_daemons(work, part, threads):
             if isinstance(result, BaseException):
                 raise result
             answered |= result is None
             problems += [] if result is None else [result]
             done += 1
-            progress("describing", done, len(pending))
-        rejected = [problem for problem in problems if problem.kind == "rejected"]
-        if rejected and not answered:
-            must, fix = "The model must take the requests", "Check it and the further fields"
-            raise PalpateError(must, rejected[0].text, fix)
+            progress("describing", done, len(photos))
+        rejected = [problem.text for problem in problems if problem.kind == "rejected"]
+        must, fix = "The model must take the requests", "Check it and the further fields"
+        require(answered or not rejected, None, must, "".join(rejected[:1]), fix=fix)
     return problems
 
 
@@ -193,17 +150,19 @@ def _replies(image: bytes, question: Question, server: Server) -> Iterator[Reply
 
     The request after a reply that cannot be used samples, with more room if that was cut.
     """
-    request = Request(image, question.prompt, question.max_tokens, 0.0, question.seed)
     for attempt in range(1, ATTEMPTS + 1):
-        reply = server.describe(request)
+        reply = server.describe(image, question)
         description = reply.read(question.prompt)
         if description.answered or attempt == ATTEMPTS:
             yield reply
             return
         yield replace(reply, unused=description.flags[0])
-        room = request.max_tokens * (2 if reply.finish == "length" else 1)
-        seed = request.seed + 1
-        request = replace(request, max_tokens=room, temperature=AGAIN_TEMPERATURE, seed=seed)
+        question = replace(
+            question,
+            max_tokens=question.max_tokens * (2 if reply.finish == "length" else 1),
+            temperature=AGAIN_TEMPERATURE,
+            seed=question.seed + 1,
+        )
 
 
 def in_daemons(

@@ -7,7 +7,7 @@ from typing import Any
 
 import polars as pl
 
-from palpate.core import PalpateError
+from palpate.core import PalpateError, require
 from palpate.data.manifest import Manifest
 from palpate.data.reading import load
 from palpate.data.texts import TABLE, joined, read_texts
@@ -35,9 +35,9 @@ def read_captions(captions: Any, data: Any = None, **options: Any) -> tuple[Mani
     else:
         must = "must be a folder or a table next to samples"
         raise PalpateError(must, type(captions).__name__, "", argument="captions")
-    if not manifest.table["text"].count():
-        must, fix = "must hold captions", "Map the column text, or caption the samples first"
-        raise PalpateError(must, f"{captions} without any text", fix, argument="captions")
+    must, fix = "must hold captions", "Map the column text, or caption the samples first"
+    texts, got = manifest.table["text"].count(), f"{captions} without any text"
+    require(texts > 0, "captions", must, got, fix=fix)
     if isinstance(captions, Path) and captions.suffix == ".parquet":
         table = pl.read_parquet(captions, glob=False)
         if table.schema == pl.Schema(SCHEMA):

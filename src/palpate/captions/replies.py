@@ -19,30 +19,44 @@ import json
 import os
 import threading
 from collections import defaultdict
-from dataclasses import asdict, dataclass, replace
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
-from typing import BinaryIO
+from typing import Any, BinaryIO
 
+from palpate.captions.photos import QUALITY, SIDE
 from palpate.captions.prompts import Description, Prompt
-from palpate.core import PalpateError
+from palpate.core import PalpateError, digest_json
 
 
 @dataclass(frozen=True)
-class Request:
-    """One question to a model.
+class Question:
+    """What a model is asked about a photo; the same for all photos of a run, until it is repeated.
 
     Attributes:
-        image: JPEG file.
+        model: its name, as it was requested.
         prompt: the instruction, with the schema of its reply.
         max_tokens: longest reply.
-        temperature, seed: of the sampling.
+        seed, temperature: of the sampling.
+        body: further fields of the request to a server; null removes a default one.
     """
 
-    image: bytes
+    model: str
     prompt: Prompt
     max_tokens: int
-    temperature: float
     seed: int
+    body: Mapping[str, Any]
+    temperature: float = 0.0
+
+    @property
+    def parameters(self) -> dict[str, Any]:
+        """Everything next to model and prompt that the reply to the first request depends on."""
+        sent = {"side": SIDE, "quality": QUALITY}
+        return {"max_tokens": self.max_tokens, "seed": self.seed, "body": dict(self.body), **sent}
+
+    def key(self, image: str) -> str:
+        """Key of the reply about an image file with this digest."""
+        return digest_json([self.model, self.prompt.digest, image, self.parameters])
 
 
 @dataclass(frozen=True)
@@ -116,8 +130,8 @@ def read_replies(path: Path) -> tuple[Replies, int]:
             end += len(line)
             try:
                 row = json.loads(line)
-                fields = {name: row[name] for name in Reply.__dataclass_fields__}
-                replies.add(row["key"], Reply(**fields))
+                reply = Reply(*(row[each.name] for each in fields(Reply)))
+                replies.add(row["key"], reply)
             except (ValueError, TypeError, LookupError):
                 must, got = f"{path} must hold replies only", f"another line {number}"
                 fix = "Choose another folder, or remove the line"

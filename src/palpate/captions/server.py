@@ -18,8 +18,13 @@ from collections.abc import Mapping
 from typing import Any
 
 from palpate.captions.prompts import LONGEST, valid
-from palpate.captions.replies import RejectedError, Reply, Request
-from palpate.core import MissingExtraError, PalpateError, few
+from palpate.captions.replies import Question, RejectedError, Reply
+from palpate.core import MissingExtraError, PalpateError, few, require
+
+try:
+    import httpx2
+except ImportError:
+    raise MissingExtraError("httpx2", "caption", "Asking a server for captions") from None
 
 #: Where the key is looked for.
 KEY_VARIABLE = "PALPATE_CAPTION_KEY"
@@ -41,13 +46,11 @@ class Server:
     Args:
         url: the API's base, mostly ending in ``/v1``.
         model: its name there; None for the only one that the server has.
-        body: further fields of every request; null removes a default one.
         timeout: longest silence of the server, in seconds.
         pause: seconds before the second try; doubles with every further one.
         connections: requests at once.
 
     Raises:
-        MissingExtraError: without httpx2.
         PalpateError: if the URL or the key is none, or the model is unknown.
     """
 
@@ -56,27 +59,18 @@ class Server:
         url: str,
         model: str | None = None,
         *,
-        body: Mapping[str, Any] | None = None,
         timeout: float = 120.0,
         pause: float = 1.0,
         connections: int = 8,
     ) -> None:
-        try:
-            import httpx2
-        except ImportError:
-            raise MissingExtraError("httpx2", "caption", "Asking a server for captions") from None
-        self._errors = httpx2.RequestError
-        self._refused = httpx2.ConnectError
-        self._answered = False
-        self.url = _checked_url(url)
-        self._key = _key()
-        self._pause, self._body = pause, dict(body or {})
-        headers = {"Authorization": f"Bearer {self._key}"} if self._key else {}
-        limits = httpx2.Limits(max_connections=connections, keepalive_expiry=60)
+        self.url, self._key, self._pause = _checked_url(url), _key(), pause
+        self._answered, self._closed = False, threading.Event()
         self._client = httpx2.Client(
-            base_url=self.url, headers=headers, timeout=timeout, limits=limits
+            base_url=self.url,
+            headers={"Authorization": f"Bearer {self._key}"} if self._key else {},
+            timeout=timeout,
+            limits=httpx2.Limits(max_connections=connections, keepalive_expiry=60),
         )
-        self._closed = threading.Event()
         self.model = model or self._only_model()
 
     def close(self) -> None:
@@ -84,14 +78,14 @@ class Server:
         self._closed.set()
         self._client.close()
 
-    def describe(self, request: Request) -> Reply:
-        """Answer a request; called from several threads.
+    def describe(self, image: bytes, question: Question) -> Reply:
+        """Answer a question about a JPEG file; called from several threads.
 
         Raises:
             RejectedError: if this one request cannot be answered.
             PalpateError: if none can.
         """
-        answer = self._answer(self._payload(request))
+        answer = self._answer(self._payload(image, question))
         try:
             choice = answer["choices"][0]
             message, usage = choice["message"], answer.get("usage") or {}
@@ -110,20 +104,23 @@ class Server:
             got = f"{type(error).__name__} at {str(error)[:80]}"
             raise RejectedError(f"the reply is no chat completion ({got})") from None
 
-    def _payload(self, request: Request) -> dict[str, Any]:
-        url = f"data:image/jpeg;base64,{base64.b64encode(request.image).decode()}"
-        image = {"type": "image_url", "image_url": {"url": url}}
-        content = [{"type": "text", "text": request.prompt.body}, image]
-        schema = {"name": "description", "schema": request.prompt.schema, "strict": True}
-        body: dict[str, Any] = {
+    def _payload(self, image: bytes, question: Question) -> dict[str, Any]:
+        url = {"url": f"data:image/jpeg;base64,{base64.b64encode(image).decode()}"}
+        content = [
+            {"type": "text", "text": question.prompt.body},
+            {"type": "image_url", "image_url": url},
+        ]
+        schema = {"name": "description", "schema": question.prompt.schema, "strict": True}
+        body = {
             "model": self.model,
             "messages": [{"role": "user", "content": content}],
             "response_format": {"type": "json_schema", "json_schema": schema},
-            "max_tokens": request.max_tokens,
-            "temperature": request.temperature,
-            "seed": request.seed,
+            "max_tokens": question.max_tokens,
+            "temperature": question.temperature,
+            "seed": question.seed,
+            **question.body,
         }
-        return {k: v for k, v in (body | self._body).items() if v is not None}
+        return {name: value for name, value in body.items() if value is not None}
 
     def _answer(self, payload: Mapping[str, Any]) -> dict[str, Any]:
         """The JSON of the reply, after as many tries as it takes.
@@ -139,9 +136,9 @@ class Server:
             wait = min(LONGEST_PAUSE, self._pause * 2**k)
             try:
                 response = self._request("POST", "chat/completions", json=payload)
-            except self._errors as error:
+            except httpx2.RequestError as error:
                 failure = self._gone(self._reason(error))
-                if isinstance(error, self._refused) and not self._answered:
+                if isinstance(error, httpx2.ConnectError) and not self._answered:
                     break  # nobody is there, and nobody was
                 continue
             self._answered = True
@@ -199,7 +196,7 @@ class Server:
             response = self._request("GET", "models")
             listed = _parsed(response)["data"] if response.status_code == 200 else []
             return [self._cleaned(str(model["id"])) for model in listed]
-        except (self._errors, LookupError, TypeError, ValueError):
+        except (httpx2.RequestError, LookupError, TypeError, ValueError):
             return []
 
     def _only_model(self) -> str:
@@ -210,7 +207,7 @@ class Server:
         """
         try:
             response = self._request("GET", "models")
-        except self._errors as error:
+        except httpx2.RequestError as error:
             raise self._gone(self._reason(error)) from None
         if response.status_code in (401, 403):
             raise self._refusal(response.status_code, _parsed(response))
@@ -247,20 +244,19 @@ def _checked_url(url: str) -> str:
     Raises:
         PalpateError: if it is no http(s) URL, or holds a password or a query, which would be kept.
     """
-    if not re.fullmatch(r"https?://[\w.\-\[\]:]+(/[^?#\s]*)?", url):
-        must = "must be http://HOST:PORT or https://HOST and a path, without password or query"
-        shown = re.sub(r"//[^/]*@", "//***@", url.partition("?")[0])
-        fix = "Most servers: http://localhost:8000/v1"
-        raise PalpateError(must, repr(shown), fix, argument="server")
+    must = "must be http://HOST:PORT or https://HOST and a path, without password or query"
+    bare = re.sub(r"//[^/]*@", "//***@", url.partition("?")[0])
+    valid_url = re.fullmatch(r"https?://[\w.\-\[\]:]+(/[^?#\s]*)?", url) is not None
+    require(valid_url, "server", must, repr(bare), fix="Most servers: http://localhost:8000/v1")
     return url.rstrip("/").removesuffix("/chat/completions")
 
 
 def _key() -> str:
     """The key; empty without one."""
     key = os.environ.get(KEY_VARIABLE, "").strip()
-    if not re.fullmatch(r"[\x21-\x7e]*", key):
-        must, got = f"{KEY_VARIABLE} must hold a key", "signs that no key has"
-        raise PalpateError(must, got, f"export {KEY_VARIABLE}=...")
+    must, got = f"{KEY_VARIABLE} must hold a key", "signs that no key has"
+    printable = re.fullmatch(r"[\x21-\x7e]*", key) is not None
+    require(printable, None, must, got, fix=f"export {KEY_VARIABLE}=...")
     return key
 
 

@@ -4,15 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, get_args
 
 import polars as pl
 
-from palpate.core import PalpateError, require_choice
+from palpate.core import require, require_choice
 from palpate.data.manifest import Manifest
 
 Per = Literal["frame", "contact", "object"]
-PER: tuple[Per, ...] = ("frame", "contact", "object")
 
 
 @dataclass(frozen=True)
@@ -20,12 +19,12 @@ class Units:
     """Groups of samples that share one caption, and the photo that it is written from.
 
     Attributes:
-        of: (n samples) number of the unit of each sample.
+        numbers: (n samples) number of the unit of each sample.
         described: (n units) row of the sample whose photo goes to the model; None without a photo.
         alone: number of samples without a value in the requested column, each a unit by itself.
     """
 
-    of: Sequence[int]
+    numbers: Sequence[int]
     described: Sequence[int | None]
     alone: int
 
@@ -38,16 +37,14 @@ def units_of(manifest: Manifest, per: Per) -> Units:
     Raises:
         PalpateError: if no sample has a value in the requested column.
     """
-    require_choice("per", per, PER)
+    require_choice("per", per, get_args(Per))
     table = manifest.table.with_row_index("row")
     column = "id" if per == "frame" else per
-    known = pl.col(column)
-    alone = table[column].null_count()
-    if alone == len(table):
-        must, got = "must be what the samples have", f"{per}, of which none is known"
-        raise PalpateError(must, got, "", argument="per", example={"per": "frame"})
-    name = pl.when(known.is_null()).then(pl.struct(pl.lit(""), "id"))
-    table = table.with_columns(unit=name.otherwise(pl.struct(known, pl.lit(""))).rank("dense"))
+    value, alone = pl.col(column), table[column].null_count()
+    got = f"{per}, of which none is known"
+    require(alone < len(table), "per", "must be what the samples have", got, "frame")
+    name = pl.when(value.is_null()).then(pl.struct(pl.lit(""), "id"))
+    table = table.with_columns(unit=name.otherwise(pl.struct(value, pl.lit(""))).rank("dense"))
     seen = table.filter(pl.col("vision").is_not_null()).sort("video", "frame", "row")
     middle = pl.col("row").get(pl.len() // 2)
     rows = dict(seen.group_by("unit").agg(middle).iter_rows())

@@ -13,7 +13,7 @@ import tyro
 from palpate.cli.running import error_line
 from palpate.cli.terminal import Common, OutPath, Switch, Terminal
 from palpate.cli.verbs import FAILED_CHECK
-from palpate.core import PalpateError
+from palpate.core import require
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -110,7 +110,6 @@ def _object(text: str | None) -> dict[str, Any] | None:
         value = None if text is None else json.loads(text)
     except ValueError:
         value = text
-    if value is not None and not isinstance(value, dict):
-        must, example = "must be a JSON object", {"body": '{"temperature": null}'}
-        raise PalpateError(must, str(text), "", argument="body", example=example)
+    must, example = "must be a JSON object", '{"temperature": null}'
+    require(isinstance(value, dict | None), "body", must, str(text), example)
     return value

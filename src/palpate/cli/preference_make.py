@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from palpate.cli.terminal import Common, OptionalOutPath, Switch, Terminal
-from palpate.core import PalpateError
+from palpate.core import require
 
 #: Seconds that a trial takes, for the time a study will take.
 SECONDS = 5
@@ -61,9 +61,9 @@ def run(options: Options, terminal: Terminal) -> dict[str, Any]:
     from palpate.preference import make
 
     inputs = [options.reference, *options.generated]
-    if options.output and any(p.resolve() == options.output.resolve() for p in inputs):
-        got, fix = str(options.output), "Choose another folder"
-        raise PalpateError("An output must not replace an input", got, fix)
+    apart = not options.output or options.output.resolve() not in [p.resolve() for p in inputs]
+    must, fix = "An output must not replace an input", "Choose another folder"
+    require(apart, None, must, str(options.output), fix=fix)
     with terminal.progress() as progress:
         plan = make(progress=progress, **options.keywords())
     for note in plan.notes:

@@ -15,10 +15,10 @@ if TYPE_CHECKING:
     from palpate.preference.making import make
     from palpate.preference.plan import Plan
     from palpate.preference.scoring import score
-    from palpate.preference.serving import serve
+    from palpate.preference.server import serve
 
 __all__ = ["Plan", "make", "score", "serve"]
 
-_MODULES = {"Plan": "plan", "make": "making", "score": "scoring", "serve": "serving"}
+_MODULES = {"Plan": "plan", "make": "making", "score": "scoring", "serve": "server"}
 
 __getattr__ = partial(import_name, __name__, _MODULES)

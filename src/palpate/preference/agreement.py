@@ -18,7 +18,7 @@ from typing import Any, Literal
 import numpy as np
 from PIL import Image
 
-from palpate.core import PalpateError, Progress, Score, track
+from palpate.core import Progress, Score, require, track
 from palpate.metrics.images import per_image
 from palpate.preference.arrays import FEWER, VoteArrays
 from palpate.preference.plan import REFERENCE, Plan
@@ -83,9 +83,9 @@ def metrics_of_files(plan: Plan, paths: Sequence[str | Path]) -> list[Metric]:
     found: list[Metric] = []
     for path in paths:
         metrics = _of_results(plan, Results.load(path))
-        if not metrics:
-            got, fix = f"none of {', '.join(plan.methods)}", "Name methods as the study does"
-            raise PalpateError(f"{path} must hold metrics of the study's methods", got, fix)
+        got, fix = f"none of {', '.join(plan.methods)}", "Name methods as the study does"
+        must = f"{path} must hold metrics of the study's methods"
+        require(bool(metrics), None, must, got, fix=fix)
         found += metrics
     return found
 
@@ -125,19 +125,19 @@ def _by_image(metric: Metric, arrays: VoteArrays) -> Score:
     ).ravel()
     x = np.clip(x, -1e300, 1e300)  # infinite differences have an order too
     cells, weights = np.nan_to_num(arrays.values), np.isfinite(arrays.values)
-    known = np.isfinite(x) & weights.any(axis=0).ravel()
+    compared = np.isfinite(x) & weights.any(axis=0).ravel()
 
     def tau(of_raters: Array, of_items: Array) -> float:
         total = np.tensordot(of_raters, weights.astype(np.float64), 1).ravel()
         net = np.tensordot(of_raters, cells, 1).ravel() / np.maximum(total, 1e-12)
-        keep = known & (total > 0)
+        keep = compared & (total > 0)
         each = np.tile(of_items, len(arrays.columns))[keep]
         return tau_b(x[keep], net[keep], each, mirrored=True)
 
     value = tau(arrays.once.raters[0], arrays.once.items[0])
     drawn = zip(arrays.resampled.raters[:FEWER], arrays.resampled.items[:FEWER], strict=True)
     replicates = np.array([tau(*weights) for weights in drawn])
-    return arrays.score(BY_IMAGE, metric.name, value, replicates, known.sum())
+    return arrays.score(BY_IMAGE, metric.name, value, replicates, compared.sum())
 
 
 def _by_method(metric: Metric, arrays: VoteArrays) -> Score:
@@ -148,9 +148,9 @@ def _by_method(metric: Metric, arrays: VoteArrays) -> Score:
     if metric.images:
         drawn = np.vstack([arrays.once.items, arrays.resampled.items[:FEWER]])
         cells = np.array([[metric.images.get((i.id, n), np.nan) for n in names] for i in items])
-        known = np.isfinite(cells)
+        finite = np.isfinite(cells)
         with np.errstate(invalid="ignore"):
-            x = drawn @ np.where(known, cells, 0) / (drawn @ known)
+            x = drawn @ np.where(finite, cells, 0) / (drawn @ finite)
     pairs = zip(x, strength, strict=True)
-    value, *replicates = (tau_b(row, of[:-1], np.ones(len(names))) for row, of in pairs)
+    value, *replicates = (tau_b(row, theta[:-1], np.ones(len(names))) for row, theta in pairs)
     return arrays.score(BY_METHOD, metric.name, value, np.array(replicates), len(names))

@@ -48,8 +48,8 @@ class VoteArrays:
     @cached_property
     def columns(self) -> list[tuple[str, str]]:
         """The comparisons; in the task ``sort`` the shown methods."""
-        kinds = ("pair", "sort")
-        return list(dict.fromkeys((t.left, t.right) for t in self.plan.trials if t.kind in kinds))
+        kind = self.plan.task
+        return list(dict.fromkeys((t.left, t.right) for t in self.plan.trials if t.kind == kind))
 
     @cached_property
     def pairs(self) -> list[tuple[int, int]]:
@@ -57,36 +57,33 @@ class VoteArrays:
         at = {name: k for k, name in enumerate(self.plan.methods)}
         return [(at[a], at[b]) for a, b in self.columns]
 
-    @cached_property
-    def chosen(self) -> NDArray[np.object_]:
-        """(R, C, N) the chosen slot, or None."""
-        items = {item.id: k for k, item in enumerate(self.plan.items)}
-        column = {pair: k for k, pair in enumerate(self.columns)}
-        cells = np.full((len(self.raters), len(column), len(items)), None, dtype=object)
-        for r, rater in enumerate(self.raters):
-            for vote in self.votes.of[rater].values():
-                if vote.trial.kind in ("pair", "sort"):
-                    place = column[vote.trial.left, vote.trial.right], items[vote.trial.item]
-                    cells[r, *place] = vote.chosen
-        return cells
+    @property
+    def slots(self) -> list[str]:
+        """What can be chosen: the methods and ``SAME``; in the task ``sort`` the materials."""
+        return [*self.plan.methods, SAME] if self.plan.task == "pair" else self.plan.choices
 
     @cached_property
     def codes(self) -> NDArray[np.intp]:
         """(R, C, N) the chosen slot as a number, -1 for none."""
-        names = dict.fromkeys(name for name in self.chosen.ravel() if name is not None)
-        codes = np.full(self.chosen.shape, -1)
-        for k, name in enumerate(names):
-            codes[self.chosen == name] = k
+        items, column, slot = (
+            {name: k for k, name in enumerate(names)}
+            for names in ((item.id for item in self.plan.items), self.columns, self.slots)
+        )
+        codes = np.full((len(self.raters), len(column), len(items)), -1)
+        for r, rater in enumerate(self.raters):
+            for vote in self.votes.by_rater[rater].values():
+                trial = vote.trial
+                if trial.kind == self.plan.task:
+                    c = column[trial.left, trial.right]
+                    codes[r, c, items[trial.item]] = slot[vote.chosen]
         return codes
 
     @cached_property
     def values(self) -> Array:
         """(R, C, N) votes as :mod:`palpate.preference.statistics` has them."""
-        cells = np.full(self.chosen.shape, np.nan)
-        for c, (a, b) in enumerate(self.columns):
-            for name, value in ((a, 1.0), (SAME, 0.0), (b, -1.0)):
-                cells[:, c][self.chosen[:, c] == name] = value
-        return cells
+        first, second = np.array(self.pairs).T[:, :, None]
+        values = 1.0 * (self.codes == first) - (self.codes == second)
+        return np.where(self.codes < 0, np.nan, values)
 
     @cached_property
     def once(self) -> Weights:

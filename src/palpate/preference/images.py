@@ -8,15 +8,119 @@ from __future__ import annotations
 
 import base64
 import io
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageFilter
 
+from palpate.core import Note, Progress, require, track
 from palpate.data.images import read_image, square
+from palpate.evaluation.inputs import (
+    Samples,
+    complete,
+    keywords_of,
+    named_sources,
+    read,
+    with_known_ids,
+)
+from palpate.preference.plan import COPY, EXAMPLE, GEL, REFERENCE, SAME, Item, Plan
 
 QUALITY = 92
+
+
+@dataclass(frozen=True)
+class Sources:
+    """Images by id: of the reference, its gel where known, and the methods."""
+
+    items: list[Item]
+    paths: Mapping[str, Mapping[str, Path]]
+    notes: list[Note]
+
+    def path(self, item: str, slot: str) -> Path | None:
+        """File of an image of the study; None for a gel that is not known."""
+        slot = REFERENCE if slot in (COPY, EXAMPLE) else slot
+        return self.paths.get(slot, {}).get(item)
+
+
+def read_sources(
+    reference: Any, generated: Any, names: Sequence[str] | None, labels: Any
+) -> Sources:
+    """Read reference and methods; items are the ids that all have.
+
+    Raises:
+        PalpateError: if one has no image files, or no id is common.
+    """
+    keywords = keywords_of(labels, "video", exact=False)
+    real = complete(_files(read(reference, REFERENCE)), keywords)
+    reserved = (REFERENCE, GEL, COPY, EXAMPLE, SAME)
+    sources = named_sources(generated, names, reserved).items()
+    methods = {name: with_known_ids(_files(read(s, name)), real.ids) for name, s in sources}
+    ids = {name: {*samples.ids} for name, samples in methods.items()}
+    every = {*real.ids}
+    common = every.intersection(*ids.values())
+    counts = ", ".join(f"{name} has {len(every & own):,}" for name, own in ids.items())
+    got = f"of the {len(real):,} {counts}, and none is in all"
+    fix = "Ids are paths below each folder, without suffix: give them equal names"
+    must = "Methods must have images of the reference's ids"
+    require(bool(common), None, must, got, fix=fix)
+    notes = [
+        Note("items-left-out", {"name": n, "missing": len(every - i), "unknown": len(i - every)})
+        for n, i in ids.items()
+        if i != every
+    ]
+    columns = (real.labels or [""] * len(real), real.groups or [""] * len(real))
+    rows = zip(real.ids, *columns, strict=True)
+    items = [Item(i, label or None, group or None) for i, label, group in rows if i in common]
+    notes += [Note("videos-unknown")] * (not any(item.video for item in items))
+    paths = {name: _paths(samples) for name, samples in [(REFERENCE, real), *methods.items()]}
+    if real.has_background and real.manifest is not None:
+        paths[GEL] = dict(zip(real.ids, real.manifest.paths("background"), strict=True))
+    return Sources(items, paths, notes)
+
+
+def _files(samples: Samples) -> Samples:
+    """Samples that are image files.
+
+    Raises:
+        PalpateError: if they are embeddings or arrays.
+    """
+    got = f"{samples.source}, {'arrays' if samples.features is None else 'embeddings'}"
+    fix = "Pass a folder of images or a manifest"
+    require(samples.manifest is not None, None, "People look at image files", got, fix=fix)
+    return samples
+
+
+def _paths(samples: Samples) -> dict[str, Path]:
+    assert samples.manifest is not None
+    return dict(zip(samples.ids, samples.manifest.paths("tactile"), strict=True))
+
+
+def encoded(plan: Plan, sources: Sources, progress: Progress) -> dict[str, str]:
+    """Name -> data URI of every image that a trial or strip shows.
+
+    Raises:
+        PalpateError: if one is broken.
+    """
+    wanted = {(t.item, side) for t in plan.trials for side in (t.left, t.right) if side}
+    if plan.task == "pair":
+        wanted |= {(item.id, REFERENCE) for item in plan.items}
+    wanted |= {(item.id, EXAMPLE) for item in plan.examples}
+    files = {key: path for key in sorted(wanted) if (path := sources.path(*key)) is not None}
+    read_files = track(list(files.items()), "reading images", progress)
+    images = {key: load_square(path, plan.size) for key, path in read_files}
+    if missing := wanted - set(images):  # no background is known
+        reference = [load_square(sources.paths[REFERENCE][i.id], plan.size) for i in plan.items]
+        gel = estimated_gel(np.stack(reference))
+        images |= dict.fromkeys(missing, gel)
+    # The copy in a catch is another file than the reference above it.
+    return {
+        plan.name(*key): data_uri(image, QUALITY - (key[1] in (COPY, GEL)))
+        for key, image in images.items()
+    }
 
 
 def load_square(path: Path, size: int) -> NDArray[np.uint8]:

@@ -8,14 +8,13 @@ from __future__ import annotations
 
 import re
 import secrets
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
-from itertools import combinations, zip_longest
+from collections.abc import Sequence
+from dataclasses import replace
+from itertools import combinations, product, zip_longest
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from palpate.core import (
     Note,
@@ -26,28 +25,17 @@ from palpate.core import (
     require,
     require_choice,
     rng_for,
-    track,
     write_text,
 )
 from palpate.core.records import LARGEST
-from palpate.evaluation.inputs import (
-    Samples,
-    complete,
-    keywords_of,
-    named_sources,
-    read,
-    with_known_ids,
-)
-from palpate.preference.images import QUALITY, data_uri, estimated_gel, load_square
+from palpate.preference.images import encoded, read_sources
 from palpate.preference.page import study_page
 from palpate.preference.plan import (
     COPY,
-    EXAMPLE,
     GEL,
     PAGE,
     PLAN,
     REFERENCE,
-    SAME,
     Item,
     Plan,
     Rater,
@@ -73,20 +61,6 @@ EXTRA, FEWEST = 0.1, 5
 EXAMPLES = 4
 #: Of ``design="paper"``: items, commonest materials, raters; the first method against each other.
 PAPER_ITEMS, PAPER_MATERIALS, PAPER_RATERS = 40, 13, 2
-
-
-@dataclass(frozen=True)
-class Sources:
-    """Images by id: of the reference, its gel where known, and the methods."""
-
-    items: list[Item]
-    paths: Mapping[str, Mapping[str, Path]]
-    notes: list[Note]
-
-    def path(self, item: str, slot: str) -> Path | None:
-        """File of an image of the study; None for a gel that is not known."""
-        slot = REFERENCE if slot in (COPY, EXAMPLE) else slot
-        return self.paths.get(slot, {}).get(item)
 
 
 def make(  # noqa: PLR0913
@@ -144,10 +118,9 @@ def make(  # noqa: PLR0913
     require(1 <= raters <= 999, "raters", "must lie in 1 .. 999", raters, 10)
     require(32 <= size <= 1024, "size", "must lie in 32 .. 1024", size, 256)
     require(abs(seed) < LARGEST, "seed", "must lie between -2^63 and 2^63", seed, 0)
-    until = None if until is None else last_day(until)
-    if output is None and not dry_run:
-        fix, example = "Name a new folder", {"output": "study/"}
-        raise PalpateError("A study needs a folder", "none", fix, example=example)
+    until = last_day(until)
+    must, fix = "A study needs a folder", "Name a new folder"
+    require(output is not None or dry_run, None, must, "none", {"output": "study/"}, fix=fix)
     sources = read_sources(reference, generated, names, labels)
     methods = [name for name in sources.paths if name not in (REFERENCE, GEL)]
     if task == "pair" and len(methods) < 2:
@@ -163,9 +136,13 @@ def make(  # noqa: PLR0913
         examples=task == "sort",
     )
     few = [Note("these-raters", {"count": raters})] * (raters <= FEW_RATERS)
-    secret = secrets.token_hex(32)
+    expected: dict[str, Any] = {}
+    if task == "pair":
+        width = round(expected_half_width(len(chosen), raters), 3)
+        facts = {"items": len(chosen), "raters": raters, "assumed": ASSUMED}
+        expected = {"half_width": width, **facts}
     plan = Plan(
-        secret=secret,
+        secret=secrets.token_hex(32),
         task=task,
         question=code,
         text=text,
@@ -176,20 +153,18 @@ def make(  # noqa: PLR0913
         raters=[],
         examples=examples,
         seed=seed,
+        expected=expected,
         until=until,
         size=size,
         notes=[*sources.notes, *notes, *few],
     )
-    codes = [f"r{k:0{max(2, len(str(raters)))}d}" for k in range(1, raters + 1)]
     plan = replace(plan, trials=trials_of(plan, first=paper))
+    digits = max(2, len(str(raters)))
+    codes = [f"r{k:0{digits}d}" for k in range(1, raters + 1)]
     plan = replace(plan, raters=[rater_of(plan, code) for code in codes])
-    if task == "pair":
-        width = expected_half_width(len(chosen), raters)
-        facts = {"items": len(chosen), "raters": raters, "assumed": ASSUMED}
-        plan = replace(plan, expected={"half_width": round(width, 3), **facts})
     if dry_run:
         return plan
-    plan = replace(plan, images=_images(plan, sources, progress))
+    plan = replace(plan, images=encoded(plan, sources, progress))
     with atomic_folder(Path(str(output))) as part:
         plan.save(part / PLAN)
         write_text(part / PAGE, study_page(plan.public()))
@@ -211,60 +186,6 @@ def _question(
             raise PalpateError(must, got, "Pass other names", argument="names")
         require(not named, argument, "must not name a method", repr(words))
     return (question if question in QUESTIONS else ""), text
-
-
-def read_sources(
-    reference: Any, generated: Any, names: Sequence[str] | None, labels: Any
-) -> Sources:
-    """Read reference and methods; items are the ids that all have.
-
-    Raises:
-        PalpateError: if one has no image files, or no id is common.
-    """
-    known = keywords_of(labels, "video", exact=False)
-    real = complete(_files(read(reference, REFERENCE)), known)
-    taken = (REFERENCE, GEL, COPY, EXAMPLE, SAME)
-    sources = named_sources(generated, names, taken)
-    made = {n: with_known_ids(_files(read(s, n)), real.ids) for n, s in sources.items()}
-    common = {*real.ids}.intersection(*(s.ids for s in made.values()))
-    if not common:
-        counts = (f"{n} has {len({*real.ids} & {*s.ids}):,}" for n, s in made.items())
-        got = f"of the {len(real):,} {', '.join(counts)}, and none is in all"
-        fix = "Ids are paths below each folder, without suffix: give them equal names"
-        raise PalpateError("Methods must have images of the reference's ids", got, fix)
-    notes = [
-        Note("items-left-out", {"name": name, "missing": missing, "unknown": unknown})
-        for name, samples in made.items()
-        for missing in [len({*real.ids} - {*samples.ids})]
-        for unknown in [len({*samples.ids} - {*real.ids})]
-        if missing or unknown
-    ]
-    labels_of = dict(zip(real.ids, real.labels or [""] * len(real), strict=True))
-    groups_of = dict(zip(real.ids, real.groups or [""] * len(real), strict=True))
-    items = [Item(i, labels_of[i] or None, groups_of[i] or None) for i in real.ids if i in common]
-    notes += [Note("videos-unknown")] if not any(item.video for item in items) else []
-    paths = {name: _paths(samples) for name, samples in [(REFERENCE, real), *made.items()]}
-    if real.has_background and real.manifest is not None:
-        paths[GEL] = dict(zip(real.ids, real.manifest.paths("background"), strict=True))
-    return Sources(items, paths, notes)
-
-
-def _files(samples: Samples) -> Samples:
-    """Samples that are image files.
-
-    Raises:
-        PalpateError: if they are embeddings or arrays.
-    """
-    if samples.manifest is None:
-        got = f"{samples.source}, {'arrays' if samples.features is None else 'embeddings'}"
-        fix = "Pass a folder of images or a manifest"
-        raise PalpateError("People look at image files", got, fix)
-    return samples
-
-
-def _paths(samples: Samples) -> dict[str, Path]:
-    assert samples.manifest is not None
-    return dict(zip(samples.ids, samples.manifest.paths("tactile"), strict=True))
 
 
 Piles = dict[str, list[Item]]
@@ -297,34 +218,35 @@ def choose_items(
     for item in videos.values():
         piles.setdefault(item.material or "", []).append(item)
     single = sorted(name for name, pile in piles.items() if name and len(pile) == 1)
-    notes, shown = list[Note](), list[Item]()
+    notes, strips = list[Note](), list[Item]()
     if examples:
-        piles, shown = _with_examples(piles)
+        piles, strips = _with_examples(piles)
     if set(piles) == {""}:
         notes.append(Note("materials-unknown"))
     elif single:
         code = "one-video-materials" if examples else "one-video-classes"
         notes.append(Note(code, {"materials": single}))
     taken = _in_turn(piles, n, materials)
-    if len(taken) < 2:
-        got, fix = f"{len(taken)} of {len(candidates):,} images", "Add images of other videos"
-        raise PalpateError("A study needs two items, at most one a video", got, fix)
+    must, got = (
+        "A study needs two items, at most one a video",
+        f"{len(taken)} of {len(candidates):,}",
+    )
+    require(len(taken) >= 2, None, must, f"{got} images", fix="Add images of other videos")
     facts = {"n": len(taken), "candidates": len(candidates), "videos": len(videos)}
     if len(taken) < n:
         notes.append(Note("fewer-items", facts | {"wanted": n}))
     elif len(taken) < len(candidates):
         notes.append(Note("sampled-items", facts))
-    return taken, shown, notes
+    return taken, strips, notes
 
 
 def _with_examples(piles: Piles) -> tuple[Piles, list[Item]]:
     """What remains of the materials of two videos and more, and up to half of each as examples."""
     counts = {m: min(EXAMPLES, len(pile) // 2) for m, pile in piles.items() if m and len(pile) > 1}
-    if len(counts) < 2:
-        got, fix = str(len(counts)), "Pass labels with the columns id, material, video"
-        raise PalpateError("Sorting needs two materials with two videos each", got, fix)
-    shown = [item for name, count in counts.items() for item in piles[name][:count]]
-    return {name: piles[name][count:] for name, count in counts.items()}, shown
+    must, fix = "Sorting needs two materials with two videos each", "Pass labels with the columns "
+    require(len(counts) >= 2, None, must, len(counts), fix=f"{fix}id, material, video")
+    examples = [item for name, count in counts.items() for item in piles[name][:count]]
+    return {name: piles[name][count:] for name, count in counts.items()}, examples
 
 
 def _in_turn(piles: Piles, n: int, materials: int | None) -> list[Item]:
@@ -342,23 +264,21 @@ def trials_of(plan: Plan, *, first: bool) -> list[Trial]:
     methods, rng = plan.methods, rng_for(plan.seed, plan.secret, "trials")
     if plan.task == "sort":  # real images show how much people can know
         pairs = [(name, "") for name in (REFERENCE, *methods)]
-        kind, known, sides = "sort", plan.examples, (COPY, "")
+        answered, sides = plan.examples, (COPY, "")
     else:
         pairs = [p for p in combinations(methods, 2) if p[0] == methods[0] or not first]
-        kind, known, sides = "pair", plan.items, (COPY, GEL)
-    each = ((pair, item) for pair in pairs for item in plan.items)
-    base = [Trial(f"t{k:04d}", kind, item.id, *pair) for k, (pair, item) in enumerate(each)]
+        answered, sides = plan.items, (COPY, GEL)
+    each = enumerate(product(pairs, plan.items))
+    base = [Trial(f"t{k:04d}", plan.task, item.id, *pair) for k, (pair, item) in each]
     extra = min(len(base), max(FEWEST, round(EXTRA * len(base))))
-    again = [base[k] for k in rng.permutation(len(base))[:extra]]
-    repeats = [_repeat(f"r{k:04d}", trial) for k, trial in enumerate(again)]
-    caught = [known[k % len(known)] for k in rng.permutation(max(extra, len(known)))[:extra]]
-    catches = [Trial(f"c{k:04d}", "catch", item.id, *sides) for k, item in enumerate(caught)]
+    again = enumerate(base[k] for k in rng.permutation(len(base))[:extra])
+    repeats = [
+        Trial(f"r{k:04d}", "repeat", trial.item, *trial.sides(plan.task == "pair"), trial.id)
+        for k, trial in again
+    ]
+    some = rng.permutation(max(extra, len(answered)))[:extra] % len(answered)
+    catches = [Trial(f"c{k:04d}", "catch", answered[n].id, *sides) for k, n in enumerate(some)]
     return [*base, *repeats, *catches]
-
-
-def _repeat(name: str, trial: Trial) -> Trial:
-    sides = (trial.right, trial.left) if trial.right else (trial.left, "")
-    return Trial(name, "repeat", trial.item, *sides, repeats=trial.id)
 
 
 def rater_of(plan: Plan, code: str) -> Rater:
@@ -369,37 +289,11 @@ def rater_of(plan: Plan, code: str) -> Rater:
         members = [t.id for t in plan.trials if t.kind != "repeat" and (t.left, t.right) == pair]
         half = (np.arange(len(members)) + rng.integers(2)) % 2 == 0
         swapped |= dict(zip(members, rng.permutation(half).tolist(), strict=True))
-    place = dict(zip(plan.trial, rng.random(len(plan.trial)).tolist(), strict=True))
+    position = dict(zip(plan.trial, rng.random(len(plan.trial)).tolist(), strict=True))
     for trial in plan.trials:
         if trial.kind == "repeat":  # a third of the study or more after the first time
             swapped[trial.id] = swapped[trial.repeats]
-            place[trial.repeats] = rng.uniform(0, 0.6)
-            place[trial.id] = rng.uniform(place[trial.repeats] + 0.3, 1)
-    order = sorted(place, key=place.__getitem__)
+            position[trial.repeats] = rng.uniform(0, 0.6)
+            position[trial.id] = rng.uniform(position[trial.repeats] + 0.3, 1)
+    order = sorted(position, key=position.__getitem__)
     return Rater(code, order, [swapped[name] and plan.task == "pair" for name in order])
-
-
-def _images(plan: Plan, sources: Sources, progress: Progress) -> dict[str, str]:
-    """Name -> data URI of every image that a trial or strip shows.
-
-    Raises:
-        PalpateError: if one is broken.
-    """
-    wanted = {(t.item, side) for t in plan.trials for side in (t.left, t.right) if side}
-    if plan.task == "pair":
-        wanted |= {(item.id, REFERENCE) for item in plan.items}
-    wanted |= {(item.id, EXAMPLE) for item in plan.examples}
-    files = {key: path for key in sorted(wanted) if (path := sources.path(*key)) is not None}
-    images: dict[tuple[str, str], NDArray[np.uint8]] = {
-        key: load_square(path, plan.size)
-        for key, path in track(list(files.items()), "reading images", progress)
-    }
-    if missing := wanted - set(images):  # no background is known
-        reference = [load_square(sources.paths[REFERENCE][i.id], plan.size) for i in plan.items]
-        gel = estimated_gel(np.stack(reference))
-        images |= dict.fromkeys(missing, gel)
-    # The copy in a catch is another file than the reference above it.
-    return {
-        plan.name(*key): data_uri(image, QUALITY - (key[1] in (COPY, GEL)))
-        for key, image in images.items()
-    }

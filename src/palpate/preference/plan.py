@@ -23,6 +23,7 @@ from palpate.core import (
     plain,
     read_record,
     reading_entry,
+    require,
     short,
 )
 from palpate.core.records import from_plain
@@ -68,6 +69,10 @@ class Trial:
     left: str
     right: str = ""
     repeats: str = ""
+
+    def sides(self, swapped: bool) -> tuple[str, str]:
+        """Left and right as a rater sees them."""
+        return (self.right, self.left) if swapped else (self.left, self.right)
 
 
 @dataclass(frozen=True)
@@ -202,8 +207,7 @@ class Plan:
             if self.task == "sort":
                 rows.append({"trial": name, "image": self.name(trial.item, trial.left)})
                 continue
-            sides = (trial.right, trial.left) if swapped else (trial.left, trial.right)
-            left, right = (self.name(trial.item, side) for side in sides)
+            left, right = (self.name(trial.item, side) for side in trial.sides(swapped))
             reference = self.name(trial.item, REFERENCE)
             rows.append({"trial": name, "reference": reference, "left": left, "right": right})
         return rows
@@ -237,14 +241,14 @@ class Plan:
             return plan
 
 
-def last_day(until: str) -> str:
-    """The last day of a study as ``2030-12-31``, so that texts compare as days do.
+def last_day(until: str | None) -> str | None:
+    """The last day of a study, if any, as ``2030-12-31``, so that texts compare as days do.
 
     Raises:
         PalpateError: if it is no ISO date.
     """
     try:
-        return datetime.date.fromisoformat(until).isoformat()
+        return None if until is None else datetime.date.fromisoformat(until).isoformat()
     except ValueError:
         must, example = "must be a date", {"until": "2030-12-31"}
         raise PalpateError(must, repr(until), "", argument="until", example=example) from None
@@ -257,6 +261,5 @@ def require_rater(plan: Plan, code: str) -> None:
         PalpateError: if it has not.
     """
     codes = [rater.code for rater in plan.raters]
-    if code not in codes:
-        must = f"A rater of study {plan.study} must be one of {codes[0]} to {codes[-1]}"
-        raise PalpateError(must, repr(code), "Check the code")
+    must = f"A rater of study {plan.study} must be one of {codes[0]} to {codes[-1]}"
+    require(code in codes, None, must, repr(code), fix="Check the code")

@@ -51,7 +51,7 @@ class RaterFacts:
 def rater_facts(plan: Plan, votes: Votes) -> list[RaterFacts]:
     """Facts of every rater with votes, in the order of the plan."""
     codes = (rater.code for rater in plan.raters)
-    return [_facts(plan, code, votes.of[code]) for code in codes if votes.of.get(code)]
+    return [_facts(plan, code, votes.by_rater[code]) for code in codes if votes.by_rater.get(code)]
 
 
 def _facts(plan: Plan, code: str, votes: Mapping[str, Vote]) -> RaterFacts:

@@ -12,9 +12,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from palpate.core import Note, PalpateError, Progress, Score, few, plain, quiet, require
+from palpate.core import Note, Progress, Score, few, plain, quiet, require
 from palpate.metrics.paired import holm
 from palpate.preference.agreement import agreement_scores, metrics_of_files, shown_metrics
 from palpate.preference.arrays import VoteArrays
@@ -80,13 +79,13 @@ def score(
     folder = folder if folder.is_dir() else folder.parent
     files = [Path(votes)] if isinstance(votes, str | Path) else [Path(path) for path in votes]
     files += [folder / DATABASE] * (folder / DATABASE).is_file()
-    known = read_votes(plan, files)
-    everyone = rater_facts(plan, known)
+    read = read_votes(plan, files)
+    everyone = rater_facts(plan, read)
     kept = [rater.code for rater in everyone if not rater.excluded]
-    if not kept:
-        got = few(f"{r.code} excluded by the rule {r.excluded}" for r in everyone)
-        raise PalpateError("There must be votes to score", got, "Pass votes of further raters")
-    arrays = VoteArrays(plan, known, kept, seed, replicates)
+    got = few(f"{r.code} excluded by the rule {r.excluded}" for r in everyone)
+    fix = "Pass votes of further raters"
+    require(bool(kept), None, "There must be votes to score", got, fix=fix)
+    arrays = VoteArrays(plan, read, kept, seed, replicates)
     agreement = agreement_of(arrays, everyone)
     settings: dict[str, Any] = {
         "study": plan.study,
@@ -111,7 +110,7 @@ def score(
         settings={"preference": plain(settings)},
         notes=[
             *(note for note in plan.notes if note.code != "these-raters"),  # of those who voted
-            *known.notes,
+            *read.notes,
             *_unshown(plan),
             *_rater_notes(plan, everyone, len(kept)),
             Note("human-agreement", agreement),
@@ -183,46 +182,43 @@ def preference_scores(arrays: VoteArrays) -> list[Score]:
     """The preference of each method, and the differences of all comparisons."""
     methods, votes = arrays.plan.methods, arrays.counts.sum(axis=1)
     shares, replicates = preferences(arrays.counts), preferences(arrays.replicated)
-    of_method = method_preferences(shares, arrays.pairs, len(methods))
+    means = method_preferences(shares, arrays.pairs, len(methods))
     spread = method_preferences(replicates, arrays.pairs, len(methods))
-    scores = [
-        arrays.score(PREFERENCE, name, of_method[k], spread[:, k], sum(votes[own]), items=items)
-        for k, name in enumerate(methods)
-        for own in [[c for c, pair in enumerate(arrays.pairs) if k in pair]]
-        for items in [arrays.answered(*own)]
-    ]
+    scores: list[Score] = []
+    for k, name in enumerate(methods):
+        own = [c for c, pair in enumerate(arrays.pairs) if k in pair]
+        items, n = arrays.answered(*own), sum(votes[own])
+        scores.append(arrays.score(PREFERENCE, name, means[k], spread[:, k], n, items=items))
     differences: list[Score] = []
     for c, (a, b) in enumerate(arrays.columns):
         items = arrays.answered(c)
-        made = _net(arrays.score(PREFERENCE, a, shares[c], replicates[:, c], votes[c], items=items))
-        verdict = _verdict(made, (a, b), 2 * replicates[:, c] - 1, items)
-        differences.append(replace(made, kind="difference", b=b, details=verdict))
+        share = arrays.score(PREFERENCE, a, shares[c], replicates[:, c], votes[c], items=items)
+        net = 2 * replicates[:, c] - 1
+        difference = share
+        if share.value is not None:
+            interval = share.interval and tuple(2 * end - 1 for end in share.interval)
+            difference = replace(share, value=2 * share.value - 1, interval=interval)
+        verdict = _verdict(difference, (a, b), net, items)
+        differences.append(replace(difference, kind="difference", b=b, details=verdict))
     return [*scores, *holm(differences)]
 
 
-def _net(share: Score) -> Score:
-    """A share as the difference of two."""
-    if share.value is None:
-        return share
-    low, high = share.interval or (np.nan, np.nan)
-    interval = (2 * low - 1, 2 * high - 1) if share.interval else None
-    return replace(share, value=2 * share.value - 1, interval=interval)
-
-
-def _verdict(made: Score, pair: tuple[str, str], replicates: Array, items: int) -> dict[str, Any]:
+def _verdict(
+    difference: Score, pair: tuple[str, str], replicates: Array, items: int
+) -> dict[str, Any]:
     """Which of two is ahead, and how sure that is; of unanimous votes by the sign test."""
-    a, b = pair
-    sure = made.interval is not None
-    known = replicates[np.isfinite(replicates)]
-    above = float((known > 0).mean() + (known == 0).mean() / 2) if sure else np.nan
-    if sure and made.notes:
-        above = 0.5 + np.sign(float(made)) * (0.5 - 0.5**items)
-    return {
-        "better": a if float(made) > 0 else b if float(made) < 0 else None,
-        "p_better": above if sure else None,
-        "p_value": max(2 * min(above, 1 - above), 1 / len(replicates)) if sure else None,
-        "decided": made.interval is not None and not made.interval[0] <= 0 <= made.interval[1],
-    }
+    sign = np.sign(float(difference))
+    better = pair[int(sign < 0)] if abs(sign) == 1 else None
+    verdict = {"better": better, "p_better": None, "p_value": None, "decided": False}
+    if difference.interval is None:
+        return verdict
+    finite = replicates[np.isfinite(replicates)]
+    above = float((finite > 0).mean() + (finite == 0).mean() / 2)
+    if difference.notes:
+        above = 0.5 + sign * (0.5 - 0.5**items)
+    low, high = difference.interval
+    p = max(2 * min(above, 1 - above), 1 / len(replicates))
+    return verdict | {"p_better": above, "p_value": p, "decided": not low <= 0 <= high}
 
 
 def strength_scores(arrays: VoteArrays) -> list[Score]:
@@ -242,30 +238,39 @@ def strength_scores(arrays: VoteArrays) -> list[Score]:
 
 def accuracy_scores(arrays: VoteArrays) -> list[Score]:
     """How often people name the material of real images and of each method's: all, then each."""
-    names = arrays.plan.choices
-    truth = np.array([item.material for item in arrays.plan.items], dtype=object)
-    right = np.where(arrays.chosen == truth, 1.0, -1.0)  # as a vote without ties
-    right[arrays.codes < 0] = np.nan
-
-    def made(subject: str, c: int, own: NDArray[np.bool_]) -> Score:
-        votes = np.where(own, right[:, [c]], np.nan)
-        known = np.isfinite(votes)
-        share = preferences(outcome_counts(votes, arrays.once))[0, 0]
-        spread = preferences(outcome_counts(votes, arrays.resampled))[:, 0]
-        items = int(known.any(axis=(0, 1)).sum())
-        return arrays.score(ACCURACY, subject, share, spread, known.sum(), items=items)
-
+    names, codes = arrays.slots, arrays.codes
+    truth = np.array([names.index(str(item.material)) for item in arrays.plan.items])
+    right = np.where(codes == truth, 1.0, -1.0)  # as a vote without ties
+    right[codes < 0] = np.nan
     scores: list[Score] = []
     for c, (name, _) in enumerate(arrays.columns):
-        cells = arrays.chosen[:, c]
-        counts = np.array([[(cells[:, truth == m] == n).sum() for n in names] for m in names])
+        counts = np.zeros((len(names), len(names)), int)
+        for row in codes[:, c]:
+            np.add.at(counts, (truth[row >= 0], row[row >= 0]), 1)
         with np.errstate(invalid="ignore"):
-            matrix = plain((counts / counts.sum(axis=1, keepdims=True)).tolist())
+            shares = counts / counts.sum(axis=1, keepdims=True)
+        by_material = dict(zip(names, plain(shares.diagonal().tolist()), strict=True))
+        details: dict[str, Any] = {
+            "chance": 1 / len(names),
+            "classes": names,
+            "matrix": plain(shares.tolist()),
+            "counts": counts.tolist(),
+            "by_material": by_material,
+        }
         subject = "real images" if name == REFERENCE else name
-        by_material = {m: matrix[k][k] for k, m in enumerate(names)}
-        details: dict[str, Any] = {"chance": 1 / len(names), "classes": names}
-        details |= {"matrix": matrix, "counts": counts.tolist(), "by_material": by_material}
-        scores.append(replace(made(subject, c, truth == truth), details=details))
-        shown = [m for m, share in by_material.items() if share is not None]
-        scores += [made(f"{subject}, {m}", c, truth == m) for m in shown]
+        score = _accuracy(arrays, subject, right[:, [c]])
+        scores.append(replace(score, details=details))
+        for k, material in enumerate(names):
+            if by_material[material] is not None:
+                own = np.where(truth == k, right[:, [c]], np.nan)
+                scores.append(_accuracy(arrays, f"{subject}, {material}", own))
     return scores
+
+
+def _accuracy(arrays: VoteArrays, subject: str, votes: Array) -> Score:
+    """The accuracy of votes (R, 1, N): 1 right, -1 wrong, NaN for none."""
+    answered = np.isfinite(votes)
+    share = preferences(outcome_counts(votes, arrays.once))[0, 0]
+    spread = preferences(outcome_counts(votes, arrays.resampled))[:, 0]
+    items = int(answered.any(axis=(0, 1)).sum())
+    return arrays.score(ACCURACY, subject, share, spread, answered.sum(), items=items)

@@ -16,30 +16,33 @@ from __future__ import annotations
 
 import asyncio
 import datetime
-import hashlib
 import json
 import re
-import secrets
 import socket
 import sqlite3
 import time
-from collections.abc import AsyncGenerator, Callable, Generator, Mapping, Sequence
+from collections.abc import AsyncGenerator, Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import asynccontextmanager, closing, contextmanager, suppress
+from contextlib import asynccontextmanager, closing, suppress
 from pathlib import Path
 from typing import Any
 
-import uvicorn
-from starlette.applications import Starlette
-from starlette.exceptions import HTTPException
-from starlette.requests import ClientDisconnect, Request
-from starlette.responses import HTMLResponse, JSONResponse, Response
-from starlette.routing import Route
-
-from palpate.core import PalpateError, require
+from palpate.core import MissingExtraError, PalpateError
 from palpate.preference.page import policy, study_page
-from palpate.preference.plan import last_day
-from palpate.preference.votes import LONGEST_MS, MOST_UNDONE
+from palpate.preference.plan import Plan, last_day
+from palpate.preference.store import Vote, VoteStore, hashed
+from palpate.preference.votes import DATABASE, LONGEST_MS, MOST_UNDONE
+
+try:
+    import uvicorn
+    from starlette.applications import Starlette
+    from starlette.exceptions import HTTPException
+    from starlette.requests import ClientDisconnect, Request
+    from starlette.responses import HTMLResponse, JSONResponse, Response
+    from starlette.routing import Route
+except ImportError as error:
+    name = str(error.name).partition(".")[0]
+    raise MissingExtraError(name, "preference", "The server of a study") from None
 
 #: Longest body of a request, in bytes, and the longest wait for it, in seconds.
 LARGEST_BODY, LONGEST_WAIT = 4096, 10.0
@@ -57,130 +60,13 @@ FIELDS = dict.fromkeys(("study", "rater", "trial", "choice", "at"), str) | {
     "ms": int,
     "undone": int,
 }
-Vote = Mapping[str, Any]
-
-_TABLES = """
-PRAGMA journal_mode=WAL;
-CREATE TABLE IF NOT EXISTS study (name TEXT PRIMARY KEY) WITHOUT ROWID;
-CREATE TABLE IF NOT EXISTS invitations (token TEXT PRIMARY KEY, rater TEXT UNIQUE) WITHOUT ROWID;
-CREATE TABLE IF NOT EXISTS votes (
-    rater TEXT, trial TEXT, choice TEXT, ms INTEGER, at TEXT, undone INTEGER, received TEXT,
-    PRIMARY KEY (rater, trial)
-) WITHOUT ROWID;
-"""
-_STORE = """
-INSERT INTO votes VALUES (:rater, :trial, :choice, :ms, :at, :undone, :received)
-ON CONFLICT (rater, trial) DO UPDATE SET choice = excluded.choice, ms = excluded.ms,
-    at = excluded.at, undone = excluded.undone, received = excluded.received
-WHERE excluded.undone > votes.undone
-"""
-
-
-class VoteStore:
-    """The votes and invitations of one study in a SQLite file; used by one thread at a time.
-
-    Args:
-        path: the file; it is made where there is none.
-        study: name of the study, which the file keeps.
-
-    Raises:
-        PalpateError: if the file is of another study, or cannot be written.
-    """
-
-    def __init__(self, path: Path, study: str) -> None:
-        self._path = path
-        with _writing(path):
-            self._disk = sqlite3.connect(path, isolation_level=None, check_same_thread=False)
-            self._disk.executescript(_TABLES)
-            self._disk.execute("PRAGMA synchronous=FULL")
-            self._disk.execute("INSERT OR IGNORE INTO study VALUES (?)", (study,))
-            (names,) = zip(*self._disk.execute("SELECT name FROM study"), strict=True)
-        if names != (study,):
-            self._disk.close()
-            fix = "Serve the study that they belong to, or move the file away"
-            raise PalpateError(f"The votes in {path} must be of study {study}", names[0], fix)
-
-    def close(self) -> None:
-        """Close the file."""
-        self._disk.close()
-
-    def invite(
-        self, raters: Sequence[str], count: int, again: Sequence[str] = ()
-    ) -> dict[str, str]:
-        """Make tokens for the next ``count`` raters that have none, and new ones for ``again``.
-
-        Returns:
-            Rater -> token, which is kept nowhere.
-
-        Raises:
-            PalpateError: if the study has too few raters, or not those named, or the disk is full.
-        """
-        require(count >= 0, "invite", "must be 0 or more", count, 10)
-        for rater in again:
-            must = f"must be raters of the study, {raters[0]} to {raters[-1]}"
-            require(rater in raters, "reinvite", must, repr(rater), raters[0])
-        taken = {*self.raters().values(), *again}
-        free = [rater for rater in raters if rater not in taken]
-        if count > len(free):
-            must = f"must be at most {len(free)}: the study has {len(raters)} raters"
-            got = f"{count} more, and {len(taken)} are invited"
-            raise PalpateError(must, got, "Plan a study with more raters", argument="invite")
-        tokens = {rater: secrets.token_urlsafe(16) for rater in [*again, *free[:count]]}
-        rows = [(_hash(token), rater) for rater, token in tokens.items()]
-        with _writing(self._path):
-            self._disk.execute("BEGIN IMMEDIATE")
-            self._disk.executemany("INSERT OR REPLACE INTO invitations VALUES (?, ?)", rows)
-            self._disk.execute("COMMIT")
-        return tokens
-
-    def raters(self) -> dict[str, str]:
-        """Hash of a token -> rater."""
-        return dict(self._disk.execute("SELECT token, rater FROM invitations").fetchall())
-
-    def store(self, votes: Sequence[Vote]) -> list[bool]:
-        """Put votes on disk, all or none; whether each is new.
-
-        Raises:
-            sqlite3.OperationalError: if the disk is full.
-        """
-        self._disk.execute("BEGIN IMMEDIATE")
-        try:
-            new = [self._disk.execute(_STORE, vote).rowcount == 1 for vote in votes]
-            self._disk.execute("COMMIT")
-        except BaseException:
-            if self._disk.in_transaction:
-                self._disk.execute("ROLLBACK")
-            raise
-        return new
-
-    def votes(self, rater: str) -> list[dict[str, Any]]:
-        """The votes of a rater."""
-        names = ("trial", "choice", "ms", "at", "undone")
-        rows = self._disk.execute(f"SELECT {', '.join(names)} FROM votes WHERE rater = ?", (rater,))
-        return [dict(zip(names, row, strict=True)) for row in rows]
-
-
-@contextmanager
-def _writing(path: Path) -> Generator[None]:
-    """Raise what SQLite raises inside as an error of the file."""
-    try:
-        yield
-    except sqlite3.Error as error:
-        must, fix = f"{path} must be a file of votes that can be written", "Choose another file"
-        raise PalpateError(must, str(error), fix) from None
-
-
-def _hash(token: str) -> str:
-    """A token has 128 random bits, so that a plain hash cannot be turned back."""
-    return hashlib.sha256(token.encode()).hexdigest()
 
 
 class _Study:
     """One study being served: routes, and the thread that alone uses the file."""
 
-    def __init__(self, public: Mapping[str, Any], store: VoteStore, until: str | None) -> None:
-        self.public: dict[str, Any] = {**public, "until": until}
-        self.store, self.raters = store, store.raters()
+    def __init__(self, public: Mapping[str, Any], store: VoteStore) -> None:
+        self.public, self.store, self.raters = public, store, store.raters()
         self.page = study_page(self.public, served=True)
         common = {k: v for k, v in self.public.items() if k != "raters"}
         self.common = json.dumps(common, separators=(",", ":"))[:-1]
@@ -231,8 +117,8 @@ class _Study:
                 for (_, answer), first in zip(batch, new, strict=True):
                     answer.set_result(first)
 
-    async def _on_disk(self, function: Callable[..., Any], *given: Any) -> Any:
-        return await asyncio.get_running_loop().run_in_executor(self.disk, function, *given)
+    async def _on_disk(self, function: Callable[..., Any], argument: Any) -> Any:
+        return await asyncio.get_running_loop().run_in_executor(self.disk, function, argument)
 
     def rater(self, token: str | None) -> str:
         """Return whose token it is.
@@ -240,7 +126,7 @@ class _Study:
         Raises:
             HTTPException: 403 for no invitation, 429 for too many requests.
         """
-        rater = self.raters.get(_hash(token)) if token else None
+        rater = self.raters.get(hashed(token)) if token else None
         if rater is None:
             raise HTTPException(403, "no such invitation")
         left, since = self.budget[rater]
@@ -348,8 +234,7 @@ def _error(request: Request, error: HTTPException) -> Response:
 
 
 def serve(
-    public: Mapping[str, Any],
-    database: Path,
+    study: str | Path,
     *,
     host: str = "127.0.0.1",
     port: int = 8080,
@@ -358,12 +243,11 @@ def serve(
     until: str | None = None,
     ready: Callable[[str, Mapping[str, str]], None] = lambda url, tokens: None,
 ) -> None:
-    """Serve a study until it is stopped (Ctrl-C, SIGTERM).
+    """Serve a study until it is stopped (Ctrl-C, SIGTERM); votes go to ``study.db`` in its folder.
 
     Args:
-        public: the public form of a plan; its images are all that is ever sent.
-        database: SQLite file of the votes; made where there is none.
-        host: address to listen at. The default is reached from this machine alone.
+        study: its folder; the images of its plan are all that is ever sent.
+        host: address to listen at; the default is reached from this machine alone.
         port: 0 for any free one.
         invite: number of raters to invite now, in the order of the plan.
         reinvite: raters whose link is lost: they get another, and the former opens nothing.
@@ -372,18 +256,20 @@ def serve(
             are kept nowhere else.
 
     Raises:
-        PalpateError: if the file is of another study, a rater cannot be invited, ``until`` is no
-            date, or the address is taken.
+        MissingExtraError: without the extra ``preference``.
+        PalpateError: if the file of votes is of another study, a rater cannot be invited, ``until``
+            is no date, or the address is taken.
     """
-    until = public["until"] if until is None else until
-    until = None if until is None else last_day(until)
+    folder, public = Path(study), Plan.load(study).public()
+    public["until"] = last_day(public["until"] if until is None else until)
+    database = (folder if folder.is_dir() else folder.parent) / DATABASE
     with closing(VoteStore(database, public["study"])) as store, _listening(host, port) as listener:
         tokens = store.invite(list(public["raters"]), invite, reinvite)
-        study = _Study(public, store, until)
-        shown = f"[{host}]" if ":" in host else host
-        ready(f"http://{shown}:{listener.getsockname()[1]}/", tokens)
+        address = f"[{host}]" if ":" in host else host
+        app = _Study(public, store).application()
+        ready(f"http://{address}:{listener.getsockname()[1]}/", tokens)
         config = uvicorn.Config(
-            study.application(),
+            app,
             access_log=False,  # it would hold the tokens
             log_level="warning",
             server_header=False,

@@ -77,10 +77,10 @@ def _resampled(n: int, rng: np.random.Generator, count: int) -> Array:
 
 def percentiles(replicates: Array, level: float = 0.95) -> Interval | None:
     """The central interval of replicates; None if they do not vary or fewer than half are known."""
-    known = replicates[np.isfinite(replicates)]
-    if 2 * len(known) < len(replicates) or np.ptp(known) < 1e-12:
+    finite = replicates[np.isfinite(replicates)]
+    if 2 * len(finite) < len(replicates) or np.ptp(finite) < 1e-12:
         return None
-    low, high = np.quantile(known, [(1 - level) / 2, (1 + level) / 2])
+    low, high = np.quantile(finite, [(1 - level) / 2, (1 + level) / 2])
     return float(low), float(high)
 
 

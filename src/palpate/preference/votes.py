@@ -7,15 +7,15 @@ that of all else. Of several votes of one rater on one trial the last undone cou
 from __future__ import annotations
 
 import datetime
-import sqlite3
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from palpate.core import Note, PalpateError, digest_json, read_record
+from palpate.core import Note, PalpateError, digest_json, read_record, require
 from palpate.preference.plan import PLAN, SAME, Plan, Trial, require_rater
+from palpate.preference.store import VoteStore, require_study
 
 FORMAT = "palpate/preference-votes@1"
 #: The server's file in the folder of a study.
@@ -52,18 +52,18 @@ class Vote:
         """The chosen slot: a method, ``copy``, ``gel``, a material, or ``same``."""
         if not self.trial.right or self.choice == SAME:
             return self.choice
-        return self.trial.right if (self.choice == "left") is self.swapped else self.trial.left
+        return self.trial.sides(self.swapped)[self.choice == "right"]
 
 
 @dataclass(frozen=True)
 class Votes:
     """Rater -> id of a trial -> vote, and what was skipped."""
 
-    of: Mapping[str, Mapping[str, Vote]]
+    by_rater: Mapping[str, Mapping[str, Vote]]
     notes: list[Note] = field(default_factory=list)
 
     def __len__(self) -> int:
-        return sum(map(len, self.of.values()))
+        return sum(map(len, self.by_rater.values()))
 
 
 def read_votes(plan: Plan, paths: Iterable[str | Path]) -> Votes:
@@ -77,16 +77,15 @@ def read_votes(plan: Plan, paths: Iterable[str | Path]) -> Votes:
         PalpateError: if a file is torn, edited, or of another study, or all votes are late.
     """
     files = _files(paths)
-    given = [v for path in files if path.suffix != ".db" for v in _of_download(plan, path)]
+    downloaded = [v for path in files if path.suffix != ".db" for v in _of_download(plan, path)]
     last = datetime.date.fromisoformat(plan.until) if plan.until else None
     # By the clocks of raters, with a day for time zones; the server refused late votes by its own.
-    in_time = [v for v in given if last is None or (v.at.date() - last).days <= 1]
-    late = len(given) - len(in_time)
+    in_time = [v for v in downloaded if last is None or (v.at.date() - last).days <= 1]
+    late = len(downloaded) - len(in_time)
     in_time += [v for path in files if path.suffix == ".db" for v in _of_server(plan, path)]
-    if late and not in_time:
-        got = f"{late:,} after {plan.until}, the last day, by the clocks of the raters"
-        fix = "Pass votes that were given in time"
-        raise PalpateError("There must be votes to score", got, fix)
+    got = f"{late:,} after {plan.until}, the last day, by the clocks of the raters"
+    fix = "Pass votes that were given in time"
+    require(bool(in_time) or not late, None, "There must be votes to score", got, fix=fix)
     kept: dict[str, dict[str, Vote]] = {}
     twice = differing = 0
     for vote in sorted(in_time, key=lambda v: (v.undone, v.at)):
@@ -112,39 +111,20 @@ def _of_download(plan: Plan, path: Path) -> list[Vote]:
     except PalpateError as error:
         raise PalpateError(error.must, error.got, AGAIN) from None
     rest = {name: value for name, value in record.items() if name != "digest"}
-    _require_study(plan, record["study"], path)
-    if record.get("digest") != digest_json(rest):
-        got = "other content: it was edited, or a part is lost"
-        raise PalpateError(f"The digest in {path} must match its votes", got, AGAIN)
+    require_study(path, plan.study, record["study"])
+    must, got = f"The digest in {path} must match its votes", "other content: it was edited, or a "
+    require(record.get("digest") == digest_json(rest), None, must, f"{got}part is lost", fix=AGAIN)
     require_rater(plan, record["rater"])
     rows = record["votes"] if isinstance(record["votes"], list) else [None]
     return _checked(plan, record["rater"], rows, path)
 
 
 def _of_server(plan: Plan, path: Path) -> list[Vote]:
-    names = ("trial", "choice", "ms", "at", "undone")
-    try:
-        uri = f"{path.absolute().as_uri()}?mode=ro"
-        with closing(sqlite3.connect(uri, uri=True)) as disk:
-            (study,) = disk.execute("SELECT name FROM study").fetchone() or ("",)
-            rows = disk.execute(f"SELECT rater, {', '.join(names)} FROM votes").fetchall()
-    except sqlite3.Error as error:
-        fix = "Name the file that the server wrote, with the files next to it"
-        raise PalpateError(f"{path} must be a file of votes", str(error), fix) from None
-    _require_study(plan, study, path)
-    of_rater: dict[str, list[dict[str, Any]]] = {}
-    for rater, *values in rows:
-        of_rater.setdefault(rater, []).append(dict(zip(names, values, strict=True)))
-    for rater in of_rater:
+    with closing(VoteStore(path, plan.study, "ro")) as store:
+        rows = {rater: store.votes(rater) for rater in store.voters()}
+    for rater in rows:
         require_rater(plan, rater)
-    return [vote for rater, row in of_rater.items() for vote in _checked(plan, rater, row, path)]
-
-
-def _require_study(plan: Plan, study: Any, path: Path) -> None:
-    if study != plan.study:
-        fix = "Pass the votes with the plan that they were given for"
-        must = f"The votes in {path} must be of study {plan.study}"
-        raise PalpateError(must, f"study {study}", fix)
+    return [vote for rater, votes in rows.items() for vote in _checked(plan, rater, votes, path)]
 
 
 def _checked(plan: Plan, rater: str, rows: Sequence[Any], path: Path) -> list[Vote]:
@@ -153,10 +133,10 @@ def _checked(plan: Plan, rater: str, rows: Sequence[Any], path: Path) -> list[Vo
     Raises:
         PalpateError: naming the first that is none.
     """
-    shown, votes = plan.shown(rater), list[Vote]()
+    trials, votes = plan.shown(rater), list[Vote]()
     for row in rows:
         try:
-            trial, swapped = shown[row["trial"]]
+            trial, swapped = trials[row["trial"]]
             at = datetime.datetime.fromisoformat(row["at"])
             at = at if at.tzinfo else at.replace(tzinfo=datetime.UTC)
             ms, undone = int(row["ms"]), int(row["undone"])

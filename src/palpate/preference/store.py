@@ -1,0 +1,157 @@
+"""The votes and invitations of a served study, in one SQLite file.
+
+Its key is (rater, trial), so that a vote sent again counts once, and only a later ``undone``
+replaces it. Of an invitation a hash is kept.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import secrets
+import sqlite3
+from collections.abc import Generator, Mapping, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from palpate.core import PalpateError, require
+
+Vote = Mapping[str, Any]
+#: What a vote is, next to its rater.
+CELLS = ("trial", "choice", "ms", "at", "undone")
+_TABLES = """
+PRAGMA journal_mode=WAL;
+CREATE TABLE IF NOT EXISTS study (name TEXT PRIMARY KEY) WITHOUT ROWID;
+CREATE TABLE IF NOT EXISTS invitations (token TEXT PRIMARY KEY, rater TEXT UNIQUE) WITHOUT ROWID;
+CREATE TABLE IF NOT EXISTS votes (
+    rater TEXT, trial TEXT, choice TEXT, ms INTEGER, at TEXT, undone INTEGER, received TEXT,
+    PRIMARY KEY (rater, trial)
+) WITHOUT ROWID;
+"""
+_STORE = """
+INSERT INTO votes VALUES (:rater, :trial, :choice, :ms, :at, :undone, :received)
+ON CONFLICT (rater, trial) DO UPDATE SET choice = excluded.choice, ms = excluded.ms,
+    at = excluded.at, undone = excluded.undone, received = excluded.received
+WHERE excluded.undone > votes.undone
+"""
+
+
+class VoteStore:
+    """The votes and invitations of one study; used by one thread at a time.
+
+    Args:
+        path: the file.
+        study: name of the study, which the file keeps.
+        mode: ``rwc`` makes the file where there is none, ``ro`` only reads.
+
+    Raises:
+        PalpateError: if the file is of another study, or cannot be written or read.
+    """
+
+    def __init__(self, path: Path, study: str, mode: str = "rwc") -> None:
+        self._path, uri = path, f"{path.absolute().as_uri()}?mode={mode}"
+        with _usable(path):
+            self._disk = sqlite3.connect(
+                uri, uri=True, isolation_level=None, check_same_thread=False
+            )
+            if mode != "ro":
+                self._disk.executescript(_TABLES)
+                self._disk.execute("PRAGMA synchronous=FULL")
+                self._disk.execute("INSERT OR IGNORE INTO study VALUES (?)", (study,))
+            names = [name for (name,) in self._disk.execute("SELECT name FROM study")]
+        require_study(path, study, *names)
+
+    def close(self) -> None:
+        """Close the file."""
+        self._disk.close()
+
+    def invite(
+        self, raters: Sequence[str], count: int, again: Sequence[str] = ()
+    ) -> dict[str, str]:
+        """Make tokens for the next ``count`` raters that have none, and new ones for ``again``.
+
+        Returns:
+            Rater -> token, which is kept nowhere.
+
+        Raises:
+            PalpateError: if the study has too few raters, or not those named, or the disk is full.
+        """
+        require(count >= 0, "invite", "must be 0 or more", count, 10)
+        for rater in again:
+            must = f"must be raters of the study, {raters[0]} to {raters[-1]}"
+            require(rater in raters, "reinvite", must, repr(rater), raters[0])
+        taken = {*self.raters().values(), *again}
+        free = [rater for rater in raters if rater not in taken]
+        must = f"must be at most {len(free)}: the study has {len(raters)} raters"
+        got, fix = f"{count} more, and {len(taken)} are invited", "Plan a study with more raters"
+        require(count <= len(free), "invite", must, got, fix=fix)
+        tokens = {rater: secrets.token_urlsafe(16) for rater in [*again, *free[:count]]}
+        rows = [(hashed(token), rater) for rater, token in tokens.items()]
+        with _usable(self._path):
+            self._disk.execute("BEGIN IMMEDIATE")
+            self._disk.executemany("INSERT OR REPLACE INTO invitations VALUES (?, ?)", rows)
+            self._disk.execute("COMMIT")
+        return tokens
+
+    def raters(self) -> dict[str, str]:
+        """Hash of a token -> rater."""
+        return dict(self._disk.execute("SELECT token, rater FROM invitations").fetchall())
+
+    def store(self, votes: Sequence[Vote]) -> list[bool]:
+        """Put votes on disk, all or none; whether each is new.
+
+        Raises:
+            sqlite3.OperationalError: if the disk is full.
+        """
+        self._disk.execute("BEGIN IMMEDIATE")
+        try:
+            new = [self._disk.execute(_STORE, vote).rowcount == 1 for vote in votes]
+            self._disk.execute("COMMIT")
+        except BaseException:
+            if self._disk.in_transaction:
+                self._disk.execute("ROLLBACK")
+            raise
+        return new
+
+    def votes(self, rater: str) -> list[dict[str, Any]]:
+        """The votes of a rater."""
+        with _usable(self._path):
+            query = f"SELECT {', '.join(CELLS)} FROM votes WHERE rater = ?"
+            rows = self._disk.execute(query, (rater,)).fetchall()
+        return [dict(zip(CELLS, row, strict=True)) for row in rows]
+
+    def voters(self) -> list[str]:
+        """The raters who voted."""
+        with _usable(self._path):
+            return [r for (r,) in self._disk.execute("SELECT DISTINCT rater FROM votes")]
+
+
+@contextmanager
+def _usable(path: Path) -> Generator[None]:
+    """Raise what SQLite raises inside as an error of the file."""
+    try:
+        yield
+    except sqlite3.Error as error:
+        must = f"{path} must be a file of votes that can be written"
+        fix = "Choose another, and keep the files next to it"
+        raise PalpateError(must, str(error), fix) from None
+
+
+def require_study(path: Path, study: str, *names: Any) -> None:
+    """Check that votes are of a study.
+
+    Args:
+        path: their file, for the error.
+        study: name of the study.
+        names: what the file says.
+
+    Raises:
+        PalpateError: if they are not.
+    """
+    got, fix = ", ".join(map(str, names)) or "none", "Use the plan that they were given for"
+    require(names == (study,), None, f"The votes in {path} must be of study {study}", got, fix=fix)
+
+
+def hashed(token: str) -> str:
+    """A token has 128 random bits, so that a plain hash cannot be turned back."""
+    return hashlib.sha256(token.encode()).hexdigest()
