@@ -513,6 +513,7 @@ def test_a_dry_run_sends_and_writes_nothing(data, tmp_path, quick):
 
 def test_a_missing_client_is_one_line(data, tmp_path, monkeypatch, capsys):
     monkeypatch.setitem(sys.modules, "httpx2", None)
+    monkeypatch.delitem(sys.modules, "palpate.captions.server")
     args = ["caption", str(data), "-o", str(tmp_path / "c"), "--server", "http://localhost:1/v1"]
     assert main(args) == 2
     assert "pip install -e '.[caption]'" in capsys.readouterr().err

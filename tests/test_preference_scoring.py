@@ -66,8 +66,8 @@ def counted(plan, downloads):
     drawn = VoteArrays(plan, votes, [r.code for r in plan.raters], 0, 100).resampled
     chosen = {
         (r, v.trial.left, v.trial.right, v.trial.item): v.chosen
-        for r, of in votes.of.items()
-        for v in of.values()
+        for r, own in votes.by_rater.items()
+        for v in own.values()
         if v.trial.kind == "pair"
     }
     return list(zip(drawn.raters, drawn.items, strict=True)), chosen
@@ -415,7 +415,7 @@ def test_of_an_undone_vote_the_last_counts(plan, tmp_path):
     for path, content in zip(paths, (later, download), strict=True):
         path.write_text(json.dumps(content))
     votes = read_votes(plan, paths)
-    assert votes.of["r01"][plan.raters[0].order[0]].choice == other
+    assert votes.by_rater["r01"][plan.raters[0].order[0]].choice == other
     assert not votes.notes
 
 
@@ -453,7 +453,7 @@ def test_what_the_server_took_counts_whatever_the_clock_of_the_rater(plan, tmp_p
         ended = replace(plan, until=day)
         write_database(tmp_path / f"{day}.db", ended, rows)
         votes = read_votes(ended, [tmp_path / f"{day}.db"])
-        years = sorted(vote.at.year for vote in votes.of["r01"].values())
+        years = sorted(vote.at.year for vote in votes.by_rater["r01"].values())
         assert years == [2026, 2099]
 
 
@@ -500,7 +500,7 @@ def test_sorting_is_accuracy_by_material_against_chance(rated, tmp_path):
     material = {item.id: item.material for item in plan.items}
     for method, subject in (("ours", "ours"), ("reference", "real images")):
         right = {"brick": [], "grass": [], "wood": []}
-        for vote in (v for of in read_votes(plan, votes).of.values() for v in of.values()):
+        for vote in (v for own in read_votes(plan, votes).by_rater.values() for v in own.values()):
             if (vote.trial.kind, vote.trial.left) == ("sort", method):
                 right[material[vote.trial.item]].append(vote.choice == material[vote.trial.item])
         score = results["human accuracy of material", subject]

@@ -4,6 +4,7 @@ import json
 import resource
 import socket
 import sqlite3
+from types import SimpleNamespace
 
 import pytest
 
@@ -15,7 +16,8 @@ pytest.importorskip("uvicorn", reason="uvicorn is not installed")
 
 from preference_load import measure
 
-from palpate.preference.server import VoteStore, serve
+from palpate.preference import server as served
+from palpate.preference.store import VoteStore
 
 
 @pytest.fixture(scope="module")
@@ -237,14 +239,17 @@ def test_who_cannot_be_invited_is_said(tmp_path):
     store.close()
 
 
-def test_what_cannot_be_served_is_an_error(study, tmp_path):
-    VoteStore(tmp_path / "other.db", "another study").close()
-    (tmp_path / "text.db").write_text("no database" * 100)
+def test_what_cannot_be_served_is_an_error(study, tmp_path, monkeypatch):
+    monkeypatch.setattr(served.Plan, "load", lambda folder: SimpleNamespace(public=lambda: study))
+    for name in ("other", "text", "fresh"):
+        (tmp_path / name).mkdir()
+    VoteStore(tmp_path / "other" / "study.db", "another study").close()
+    (tmp_path / "text" / "study.db").write_text("no database" * 100)
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = taken.getsockname()[1]
         cases = {
-            "must be of study": {"database": tmp_path / "other.db"},
-            "must be a file of votes": {"database": tmp_path / "text.db"},
+            "must be of study": {"study": tmp_path / "other"},
+            "must be a file of votes": {"study": tmp_path / "text"},
             "must be at most 12": {"invite": 13},
             "must be a date. Got 'soon'": {"until": "soon", "port": port},
             "must be a date. Got '2026-11-5'": {"until": "2026-11-5", "port": port},
@@ -254,4 +259,4 @@ def test_what_cannot_be_served_is_an_error(study, tmp_path):
         }
         for message, options in cases.items():
             with pytest.raises(PalpateError, match=message):
-                serve(study, **{"database": tmp_path / "study.db"} | options)
+                served.serve(**{"study": tmp_path / "fresh"} | options)

@@ -176,14 +176,18 @@ class _Handler(BaseHTTPRequestHandler):
 
 
 _PROGRAM = """
-import json, pathlib, sys
-from palpate.preference.server import serve
+import json, pathlib, sys, types
+from palpate.preference import server
 
 def ready(url, tokens):
     print(json.dumps({"url": url, "tokens": dict(tokens)}), flush=True)
 
-public, database = map(pathlib.Path, sys.argv[1:3])
-serve(json.loads(public.read_text()), database, ready=ready, **json.loads(sys.argv[3]))
+def load(study):
+    public = json.loads((pathlib.Path(study) / "public.json").read_text())
+    return types.SimpleNamespace(public=lambda: public)
+
+server.Plan.load = load
+server.serve(sys.argv[1], ready=ready, **json.loads(sys.argv[2]))
 """
 #: A time as a browser writes it.
 AT = "2030-01-31T12:00:00.000Z"
@@ -205,8 +209,7 @@ class Serving:
         self.start(**{"port": 0, "invite": len(public["raters"])} | options)
 
     def start(self, **options):
-        files = [self.folder / "public.json", self.database]
-        command = [sys.executable, "-c", _PROGRAM, *files, json.dumps(options)]
+        command = [sys.executable, "-c", _PROGRAM, self.folder, json.dumps(options)]
         self.process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
         ready = json.loads(self.process.stdout.readline())
         self.url, self.tokens = ready["url"], self.tokens | ready["tokens"]

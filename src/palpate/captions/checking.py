@@ -152,7 +152,7 @@ def _shares(rows: pl.DataFrame, vocabulary: Vocabulary) -> list[Score]:
 def _share(name: str, words: Sequence[Sequence[str]], rows: pl.DataFrame) -> Score:
     """The share of captions with words of a kind, and those words."""
     hits = np.array([bool(row) for row in words])
-    score = mean_of(SHARE, hits, rows["group"].to_list(), estimator="mean", a=name).score
+    score = mean_of(SHARE, hits, rows["group"].to_list(), estimator="mean", subject=name).score
     counts = Counter(word for row in words for word in set(row))
     listed = dict(counts.most_common(SHOWN_WORDS))
     notes = [Note("captions-words", {"words": listed})] if name in LISTED and listed else []
@@ -192,7 +192,7 @@ def _accuracies(
         hits = materials == np.array(labels)
         metric, settings = "material accuracy from the text", dict(SETTINGS)
         result = mean_of(
-            metric, hits, groups, a=subject, estimator="mean", settings=settings, seed=seed
+            metric, hits, groups, subject=subject, estimator="mean", settings=settings, seed=seed
         )
         scores.append(replace(result.score, higher_is_better=False))
     bare = scores[1].value or 0.0
