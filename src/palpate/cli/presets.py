@@ -1,4 +1,4 @@
-"""``palpate presets``: complete configurations of trainings, and their fields."""
+"""``palpate presets``: complete configurations of trainings and worlds, and their fields."""
 
 from __future__ import annotations
 
@@ -10,14 +10,17 @@ from rich.box import SIMPLE_HEAD
 from rich.table import Table
 
 from palpate.cli.terminal import Common, Terminal
-from palpate.cli.training import PRESETS
+from palpate.cli.training import PRESETS as TRAININGS
+from palpate.cli.world import WORLDS
 from palpate.core import require_choice
+
+PRESETS = {**TRAININGS, "world": WORLDS}
 
 
 @dataclass(frozen=True, kw_only=True)
 class Options(Common):
-    """List the presets of the trainings with what they take and reach, or the fields of one, which
-    `--set field=value` changes.
+    """List the presets of trainings, with what they take and reach, and of worlds; or the fields of
+    one, which `--set field=value` changes.
     """
 
     name: Annotated[str | None, tyro.conf.Positional] = None
@@ -33,8 +36,9 @@ def run(options: Options, terminal: Terminal) -> dict[str, Any]:
     for verb, table in PRESETS.items():
         if options.name is None:
             rows = [
-                {"preset": preset.name, "cost": preset.cost, "score": preset.score}
-                for preset in table.presets.values()
+                {"preset": name}
+                | {about: getattr(preset, about, "") for about in ("cost", "score")}
+                for name, preset in table.presets.items()
             ]
         elif options.name in table.presets:
             rows = [

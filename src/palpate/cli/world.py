@@ -6,14 +6,16 @@ import dataclasses
 from dataclasses import dataclass
 from typing import Any, Literal
 
-from palpate.cli.terminal import Common, OutPath, Terminal
+from palpate.cli.settings import PresetTable, Settings
+from palpate.cli.terminal import Common, OutPath, Terminal, option_name
 from palpate.sim import DEFAULT, PRESETS, SEEN_WARNING, WorldOptions, seen_by_mini, write_world
 
-#: Options of the preset that can be given; those of the class have the same names.
+#: Fields of a preset that are options of their own.
 FIELDS = (
     *("seed", "size", "look", "materials", "objects_per_material", "videos_per_object"),
     *("leak", "layout"),
 )
+WORLDS = PresetTable(PRESETS, {name: option_name("world", name) for name in FIELDS})
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -28,6 +30,8 @@ class Options(Common):
     preset: Literal["tiny", "demo", "pretrain", "small", "full"] = DEFAULT
     """What to start from; small has 8,000 contact frames at 64 px, full 36,000 at
     128 px."""
+    settings: Settings = ()
+    """Further fields of the preset, as `contacts_per_video=6`; `palpate presets NAME` lists all."""
     seed: int | None = None
     """Worlds of different seeds share no object, video, text."""
     size: int | None = None
@@ -74,4 +78,4 @@ def world_options(options: Options) -> WorldOptions:
     match options.materials:
         case (count,) if count.lstrip("-").isdecimal():
             changes["materials"] = int(count)
-    return dataclasses.replace(PRESETS[options.preset], **changes)
+    return dataclasses.replace(WORLDS.preset(options.preset, options.settings), **changes)

@@ -40,13 +40,13 @@ class WorldOptions:
 
     Attributes:
         seed: 0 .. 2^31 - 1; worlds of different seeds share no object, video, text.
-        size: side of the images in pixels, 16 .. 256; even for the layout videos.
+        size: side of the images, 16 .. 256; even for the layout videos [px].
         materials: names, or how many of them, evenly spaced.
         look: sensor: a GelSight with markers, or a darker DIGIT without.
         leak: what test may share with train: videos (contact), contacts (frame), or neither.
         layout: Touch and Go as JPEG frames or as H.264 videos.
         test: share of the contact frames in the test list, 0.01 .. 0.99.
-        tile: pixels along the 64 mm of a surface, 64 .. 1024; 512 for images of 128.
+        tile: points along the 64 mm of a surface, 64 .. 1024; 512 for images of 128 [px].
         objects_per_material: objects of each material that have videos, 1 .. 10,000.
         videos_per_object: videos of each object, 1 .. 100.
         two_videos: share of the objects with an additional video.
