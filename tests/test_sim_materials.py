@@ -46,9 +46,8 @@ def test_what_a_material_draws_is_checked(changes, message):
     assert "'Cork'" in error.value.must
 
 
-def test_lists_and_whole_numbers_are_converted():
-    height = np.arange(64 * 64).reshape(64, 64) // 100
-    draw = piece(height=height, albedo=np.full((64, 64, 3), 1.5), gloss=np.float32(0.5))
+def test_whole_numbers_are_converted():
+    draw = piece(height=FLAT.astype(int), albedo=np.full((64, 64, 3), 1.5))
     surface = draw_surface("Cork", Material(20, draw), 64, np.random.default_rng(0))
     assert surface.height.dtype == surface.albedo.dtype == np.float32
     assert float(surface.albedo.max()) == 1.0

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from palpate.core import rng_for
+from palpate.data.formats.touch_and_go import CATEGORIES
 from palpate.sim.arrays import f32, hsv, resample, sample_periodic, smooth, smoothstep
 from palpate.sim.materials import MATERIALS
 from palpate.sim.tile import TILE_MM, Tile
@@ -30,16 +31,11 @@ def seam(field):
     return max(across), max(inside)
 
 
-def test_the_seam_measure_can_fail():
-    at = np.arange(64) / 64
-    across, inside = seam(np.sin(2 * math.pi * 1.4 * at)[:, None] + np.zeros((64, 64)))
-    assert across > 3 * inside
-
-
 @pytest.mark.parametrize("name", MATERIALS)
 def test_materials_are_float32_finite_periodic_tiles(name):
-    for k in range(6):
-        surface = draw(name, k)
+    surfaces = [draw(name, k) for k in range(25)]
+    assert 2 <= len({surface.subtype for surface in surfaces}) <= 5
+    for surface in surfaces[:6]:
         assert surface.height.shape == (64, 64)
         assert surface.albedo.shape == (64, 64, 3)
         assert surface.height.dtype == surface.albedo.dtype == np.float32
@@ -50,16 +46,8 @@ def test_materials_are_float32_finite_periodic_tiles(name):
             assert across <= 1.3 * inside + 1e-6, (surface.subtype, across, inside)
 
 
-@pytest.mark.parametrize("name", MATERIALS)
-def test_every_material_has_a_few_subtypes(name):
-    assert 2 <= len({draw(name, k, 64).subtype for k in range(40)}) <= 5
-
-
 def test_twenty_materials_have_the_label_ids_of_touch_and_go():
-    assert [m.label for m in MATERIALS.values()] == list(range(20))
-    assert list(MATERIALS)[3] == "Wood"
-    assert list(MATERIALS)[12] == "Tree"
-    assert list(MATERIALS)[19] == "Others"
+    assert {name: m.label for name, m in MATERIALS.items()} == {n: k for k, n in CATEGORIES.items()}
 
 
 def test_cells_equal_brute_force_on_the_torus():

@@ -173,7 +173,7 @@ def test_a_world_is_a_data_set_for_loaders():
     assert world.video.cache_info().currsize == 2
 
 
-def test_missing_samples_and_presets_are_rejected():
+def test_missing_samples_frames_videos_and_presets_are_rejected():
     world = World("tiny")
     for k in (32, -33, 10**9):
         with pytest.raises(PalpateError, match="must be 0 to 31"):
@@ -184,3 +184,7 @@ def test_missing_samples_and_presets_are_rejected():
         World(cache=0)
     with pytest.raises(PalpateError, match="one of tiny, demo"):
         World("large")
+    with pytest.raises(PalpateError, match="0 to 15"):
+        Video(world.options, 0).vision(16)
+    with pytest.raises(PalpateError, match="0 to 7"):
+        Video(world.options, 8)
