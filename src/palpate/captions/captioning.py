@@ -20,16 +20,9 @@ import polars as pl
 from palpate._version import __version__
 from palpate.captions.columns import template_texts
 from palpate.captions.prompts import Description, Prompt
-from palpate.captions.querying import (
-    Photo,
-    all_problems,
-    descriptions_of,
-    pending,
-    photos_of,
-    query_all,
-)
+from palpate.captions.querying import Photo, outcomes, pending, photos_of, query_all
 from palpate.captions.reading import SCHEMA
-from palpate.captions.replies import Question, Replies, ReplyLog, read_replies
+from palpate.captions.replies import Question, ReplyLog
 from palpate.captions.units import Per, Units, units_of
 from palpate.core import (
     Note,
@@ -185,38 +178,36 @@ def caption(  # noqa: PLR0913 (a public verb)
         photos = photos_of(manifest, units, question, progress)
         total = sum(photo.path is not None for photo in photos)
         if dry_run:
-            replies, _ = read_replies(output / REPLIES)
-            return Estimate(total, len(pending(photos, replies)))
+            return Estimate(total, len(pending(photos, ReplyLog(output / REPLIES))))
         with locked(output), closing(ReplyLog(output / REPLIES)) as log:
-            answers, left = log.replies.answers, pending(photos, log.replies)
+            left = pending(photos, log)
             try:
-                problems = query_all(
+                failed = query_all(
                     left,
                     question,
                     service,
                     log,
                     threads=min(concurrency, len(left)),
                     progress=progress,
-                    answered=any(photo.key in answers for photo in photos),
+                    answered=any(photo.key in log.answers for photo in photos),
                 )
             except PalpateError as error:
                 if not log.answered:
                     raise
-                done = sum(photo.key in answers for photo in photos)
+                done = sum(photo.key in log.answers for photo in photos)
                 raise StoppedError(error, done, total, output) from None
-            source = _source(question, photos, log.replies, server) | {"per": per}
-            problems = all_problems(photos, problems)
-            descriptions = descriptions_of(photos, log.replies, instruction, problems)
+            source = _source(question, photos, log, server) | {"per": per}
+            descriptions, problems = outcomes(photos, log, instruction, failed)
             return _write(manifest, units, descriptions, output, source, problems=problems)
 
 
 def _source(
-    question: Question, photos: Sequence[Photo], replies: Replies, server: str
+    question: Question, photos: Sequence[Photo], log: ReplyLog, server: str
 ) -> dict[str, Any]:
     """What the record says of the model and of its replies."""
     prompt, keys = question.prompt, sorted({photo.key for photo in photos if photo.key})
-    answers = [replies.answers[key] for key in keys if key in replies.answers]
-    unused = [reply for key in keys for reply in replies.unused.get(key, ())]
+    answers = [log.answers[key] for key in keys if key in log.answers]
+    unused = [reply for key in keys for reply in log.unused.get(key, ())]
     inward, outward = (sum(reply.tokens[k] for reply in [*answers, *unused]) for k in (0, 1))
     return {
         "model": question.model,

@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
 from queue import Empty, SimpleQueue
 from typing import TYPE_CHECKING, TypeVar
 
 from palpate.captions.photos import prepared
 from palpate.captions.prompts import Description, Prompt
-from palpate.captions.replies import Question, RejectedError, Replies, Reply, ReplyLog
+from palpate.captions.replies import Question, RejectedError, Reply, ReplyLog
 from palpate.captions.units import Units
 from palpate.core import PalpateError, Problem, Progress, require
 from palpate.data.images import file_digest, in_threads
@@ -63,33 +62,35 @@ def photos_of(
     return photos
 
 
-def pending(photos: Sequence[Photo], replies: Replies) -> list[Photo]:
+def pending(photos: Sequence[Photo], log: ReplyLog) -> list[Photo]:
     """Photos without an answer, each once."""
     first = {photo.key: photo for photo in reversed(photos) if photo.key is not None}
-    return [photo for key, photo in reversed(first.items()) if key not in replies.answers]
+    return [photo for key, photo in reversed(first.items()) if key not in log.answers]
 
 
-def all_problems(photos: Sequence[Photo], queried: Sequence[Problem]) -> list[Problem]:
-    """Photos whose files cannot be read, and those of requests with a problem or equal ones."""
-    keys = {str(photo.path): photo.key for photo in photos if photo.path is not None}
-    causes = {keys[problem.where]: problem for problem in queried}
-    causes |= {None: Problem("", "bad-image", "cannot be read")}
-    return [replace(causes[k], where=path) for path, k in sorted(keys.items()) if k in causes]
+def outcomes(
+    photos: Sequence[Photo], log: ReplyLog, prompt: Prompt, failed: Mapping[str, Problem]
+) -> tuple[list[Description], list[Problem]]:
+    """What the answers say of every unit, and what is wrong with photos, by path.
 
-
-def descriptions_of(
-    photos: Sequence[Photo], replies: Replies, prompt: Prompt, problems: Iterable[Problem]
-) -> list[Description]:
-    """What the answers say of every unit."""
-    kinds = {problem.where: problem.kind for problem in problems}
+    Args:
+        photos: one a unit.
+        log: the answers.
+        prompt: what they answer.
+        failed: key -> what is wrong with the request.
+    """
     descriptions: list[Description] = []
+    problems: dict[str, Problem] = {}
     for photo in photos:
-        if photo.key in replies.answers:
-            descriptions.append(replies.answers[photo.key].read(prompt))
-        else:
-            kind = "no-photo" if photo.path is None else kinds[str(photo.path)]
-            descriptions.append(Description(None, flags=(kind,)))
-    return descriptions
+        if photo.key in log.answers:
+            descriptions.append(log.answers[photo.key].read(prompt))
+            continue
+        kind, path = "no-photo", str(photo.path)
+        if photo.path is not None:
+            problem = failed.get(photo.key or "", Problem("", "bad-image", "cannot be read"))
+            problems[path], kind = replace(problem, where=path), problem.kind
+        descriptions.append(Description(None, flags=(kind,)))
+    return descriptions, [problems[path] for path in sorted(problems)]
 
 
 def query_all(
@@ -101,33 +102,34 @@ def query_all(
     threads: int,
     progress: Progress,
     answered: bool,
-) -> list[Problem]:
+) -> dict[str, Problem]:
     """Send a request for every photo; replies go to the log as they arrive.
 
     Where some photo is ``answered`` already, the server is not to blame if it takes none of these.
 
     Returns:
-        The photos that cannot be read or that the server does not take.
+        Key -> what is wrong, of photos that cannot be read or that the server does not take.
 
     Raises:
         PalpateError: if the server fails, or takes no request at all.
     """
 
-    def work(photo: Photo) -> Problem | None:
-        name, log_reply = question.prompt.name, partial(log.append, str(photo.key), photo.sample)
+    def work(photo: Photo) -> tuple[str, Problem | None]:
+        key, path = str(photo.key), str(photo.path)
         try:
-            image = prepared(Path(str(photo.path)))
+            image = prepared(Path(path))
         except PalpateError as error:
-            return Problem(str(photo.path), "bad-image", error.got)
+            return key, Problem(path, "bad-image", error.got)
         try:
             for reply in _replies(image, question, server):
-                log_reply(name, reply)
+                log.append(key, photo.sample, question.prompt.name, reply)
         except RejectedError as error:
-            log_reply(name, Reply(str(error), question.model, finish="rejected", unused="rejected"))
-            return Problem(str(photo.path), "rejected", str(error))
-        return None
+            reply = Reply(str(error), question.model, finish="rejected", unused="rejected")
+            log.append(key, photo.sample, question.prompt.name, reply)
+            return key, Problem(path, "rejected", str(error))
+        return key, None
 
-    problems: list[Problem] = []
+    failed: dict[str, Problem] = {}
     done, step = 0, -(-len(photos) // PROBES) or 1
     progress("describing", done, len(photos))
     later = [photo for k, photo in enumerate(photos) if k % step]
@@ -135,14 +137,15 @@ def query_all(
         for result in in_daemons(work, part, threads):
             if isinstance(result, BaseException):
                 raise result
-            answered |= result is None
-            problems += [] if result is None else [result]
+            key, problem = result
+            answered |= problem is None
+            failed |= {} if problem is None else {key: problem}
             done += 1
             progress("describing", done, len(photos))
-        rejected = [problem.text for problem in problems if problem.kind == "rejected"]
+        rejected = [problem.text for problem in failed.values() if problem.kind == "rejected"]
         must, fix = "The model must take the requests", "Check it and the further fields"
         require(answered or not rejected, None, must, "".join(rejected[:1]), fix=fix)
-    return problems
+    return failed
 
 
 def _replies(image: bytes, question: Question, server: Server) -> Iterator[Reply]:

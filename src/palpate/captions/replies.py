@@ -16,7 +16,6 @@ their tokens count. A last line without its end was cut by a kill or a full disk
 from __future__ import annotations
 
 import json
-import os
 import threading
 from collections import defaultdict
 from collections.abc import Mapping
@@ -91,72 +90,45 @@ class RejectedError(Exception):
     """The server does not take this one request (too large, no valid image ...)."""
 
 
-class Replies:
-    """Replies by key.
-
-    Attributes:
-        answers: the one that counts.
-        unused: those that came before it.
-    """
-
-    def __init__(self) -> None:
-        self.answers: dict[str, Reply] = {}
-        self.unused: defaultdict[str, list[Reply]] = defaultdict(list)
-
-    def add(self, key: str, reply: Reply) -> None:
-        """Add the next reply to a key."""
-        if reply.unused is None:
-            self.answers[key] = reply
-        else:
-            self.unused[key].append(reply)
-
-
-def read_replies(path: Path) -> tuple[Replies, int]:
-    """Read a log.
-
-    Returns:
-        The replies, and the bytes of whole lines.
-
-    Raises:
-        PalpateError: if it is another program's file.
-    """
-    replies, end = Replies(), 0
-    if not path.exists():
-        return replies, end
-    with open(path, "rb") as file:
-        for number, line in enumerate(file, 1):
-            if not line.endswith(b"\n"):
-                break
-            end += len(line)
-            try:
-                row = json.loads(line)
-                reply = Reply(*(row[each.name] for each in fields(Reply)))
-                replies.add(row["key"], reply)
-            except (ValueError, TypeError, LookupError):
-                must, got = f"{path} must hold replies only", f"another line {number}"
-                fix = "Choose another folder, or remove the line"
-                raise PalpateError(must, got, fix) from None
-    return replies, end
-
-
 class ReplyLog:
-    """The replies of an output folder. The file begins with the first reply.
+    """The replies of an output folder; its file begins with the first one that is appended.
 
     Attributes:
-        replies: all of them.
-        answered: how many answers were added.
+        answers: key -> the reply that counts.
+        unused: key -> those that came before it.
+        answered: how many answers were appended.
 
     Raises:
         PalpateError: if the file is another program's.
     """
 
     def __init__(self, path: Path) -> None:
-        self.replies, end = read_replies(path)
-        self.answered = 0
+        self.answers: dict[str, Reply] = {}
+        self.unused: defaultdict[str, list[Reply]] = defaultdict(list)
+        self.answered = self._end = 0
         self._path, self._lock, self._open = path, threading.Lock(), True
         self._file: BinaryIO | None = None
-        if path.exists() and path.stat().st_size > end:
-            os.truncate(path, end)
+        if path.exists():
+            with open(path, "rb") as file:
+                for number, line in enumerate(file, 1):
+                    if line.endswith(b"\n"):
+                        self._end += len(line)
+                        self._read(line, number)
+
+    def _read(self, line: bytes, number: int) -> None:
+        try:
+            row = json.loads(line)
+            self._add(row["key"], Reply(*(row[each.name] for each in fields(Reply))))
+        except (ValueError, TypeError, LookupError):
+            must, got = f"{self._path} must hold replies only", f"another line {number}"
+            fix = "Choose another folder, or remove the line"
+            raise PalpateError(must, got, fix) from None
+
+    def _add(self, key: str, reply: Reply) -> None:
+        if reply.unused is None:
+            self.answers[key] = reply
+        else:
+            self.unused[key].append(reply)
 
     def append(self, key: str, sample: str, prompt: str, reply: Reply) -> None:
         """Keep a reply, on disk before anything else happens; does nothing once closed."""
@@ -165,10 +137,12 @@ class ReplyLog:
         with self._lock:
             if not self._open:
                 return
-            self._file = self._file or open(self._path, "ab")  # noqa: SIM115 (closed by close)
+            if self._file is None:
+                self._file = open(self._path, "ab")  # noqa: SIM115 (closed by close)
+                self._file.truncate(self._end)
             self._file.write(line)
             self._file.flush()
-            self.replies.add(key, reply)
+            self._add(key, reply)
             self.answered += reply.unused is None
 
     def close(self) -> None:

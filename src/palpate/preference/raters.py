@@ -70,13 +70,12 @@ def _facts(plan: Plan, code: str, votes: Mapping[str, Vote]) -> RaterFacts:
     left, right = sides.count("left"), sides.count("right")
     finished = len(votes) / len(plan.trials)
     catches = float(np.mean(caught)) if caught else None
-    excluded = ""
-    if finished < plan.rule.finished:
-        excluded = "finished"
-    elif catches is not None and catches < plan.rule.catches:
-        excluded = "catches"
-    elif left + right >= FEWEST_SIDES and max(left, right) / (left + right) > plan.rule.side:
-        excluded = "side"
+    one_side = max(left, right) / max(1, left + right)
+    broken = {
+        "finished": finished < plan.rule.finished,
+        "catches": catches is not None and catches < plan.rule.catches,
+        "side": left + right >= FEWEST_SIDES and one_side > plan.rule.side,
+    }
     return RaterFacts(
         code=code,
         votes=len(votes),
@@ -88,5 +87,5 @@ def _facts(plan: Plan, code: str, votes: Mapping[str, Vote]) -> RaterFacts:
         right=right,
         seconds=float(np.median([vote.ms for vote in votes.values()])) / 1000,
         undone=sum(vote.undone for vote in votes.values()),
-        excluded=excluded,
+        excluded=next((name for name, fails in broken.items() if fails), ""),
     )

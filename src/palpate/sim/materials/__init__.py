@@ -18,31 +18,32 @@ from palpate.sim.materials.made import glass, metal, other, paper, plastic, rubb
 from palpate.sim.materials.mineral import brick, ceramic_tile, concrete, gravel, rock, sand, soil
 from palpate.sim.materials.plant import grass, plants, tree, wood
 from palpate.sim.materials.soft import leather, natural_fabric, synthetic_fabric
-from palpate.sim.materials.surface import Material, Surface, draw_surface
+from palpate.sim.materials.surface import Draw, Material, Surface, draw_surface
 
-#: Name in ``category_reference.txt`` -> label, function.
-MATERIALS: dict[str, Material] = {
-    "Concrete": Material(0, concrete),
-    "Plastic": Material(1, plastic),
-    "Glass": Material(2, glass),
-    "Wood": Material(3, wood),
-    "Metal": Material(4, metal),
-    "Brick": Material(5, brick),
-    "Tile": Material(6, ceramic_tile),
-    "Leather": Material(7, leather),
-    "Synthetic Fabric": Material(8, synthetic_fabric),
-    "Natural Fabric": Material(9, natural_fabric),
-    "Rubber": Material(10, rubber),
-    "Paper": Material(11, paper),
-    "Tree": Material(12, tree),
-    "Grass": Material(13, grass),
-    "Soil": Material(14, soil),
-    "Rock": Material(15, rock),
-    "Gravel": Material(16, gravel),
-    "Sand": Material(17, sand),
-    "Plants": Material(18, plants),
-    "Others": Material(19, other),
+_DRAWS: dict[str, Draw] = {
+    "Concrete": concrete,
+    "Plastic": plastic,
+    "Glass": glass,
+    "Wood": wood,
+    "Metal": metal,
+    "Brick": brick,
+    "Tile": ceramic_tile,
+    "Leather": leather,
+    "Synthetic Fabric": synthetic_fabric,
+    "Natural Fabric": natural_fabric,
+    "Rubber": rubber,
+    "Paper": paper,
+    "Tree": tree,
+    "Grass": grass,
+    "Soil": soil,
+    "Rock": rock,
+    "Gravel": gravel,
+    "Sand": sand,
+    "Plants": plants,
+    "Others": other,
 }
+#: Name in ``category_reference.txt`` -> label, function.
+MATERIALS = {name: Material(label, draw) for label, (name, draw) in enumerate(_DRAWS.items())}
 
 
 def object_prefix(name: str) -> str:
