@@ -72,10 +72,9 @@ def world_options(options: Options) -> WorldOptions:
     Raises:
         PalpateError: if an option is out of range.
     """
-    changes: dict[str, Any] = {
-        name: value for name in FIELDS if (value := getattr(options, name)) is not None
-    }
-    match options.materials:
-        case (count,) if count.lstrip("-").isdecimal():
-            changes["materials"] = int(count)
-    return dataclasses.replace(WORLDS.preset(options.preset, options.settings), **changes)
+    materials: Any = options.materials
+    if materials and len(materials) == 1 and materials[0].lstrip("-").isdecimal():
+        materials = int(materials[0])
+    values = {name: getattr(options, name) for name in FIELDS} | {"materials": materials}
+    preset = WORLDS.preset(options.preset, options.settings)
+    return dataclasses.replace(preset, **{k: v for k, v in values.items() if v is not None})

@@ -144,10 +144,10 @@ def _plan_video(
     objects = [main]
     most = min(OBJECTS_PER_VIDEO, options.contacts_per_video, len(options.names))
     if rng.random() < options.mixed and most > 1:
-        others = [m for m in options.names if m != main.material]
-        for k in rng.permutation(len(others))[: int(rng.integers(1, most))]:
-            objects.append(ObjectRef(others[k], guests[others[k]]))
-            guests[others[k]] += 1
+        names = [m for m in options.names if m != main.material]
+        for k in rng.permutation(len(names))[: int(rng.integers(1, most))]:
+            objects.append(ObjectRef(names[k], guests[names[k]]))
+            guests[names[k]] += 1
     changes = rng.permutation(options.contacts_per_video - 1)[: len(objects) - 1]
     cuts = sorted(int(c) + 1 for c in changes)
     which = tuple(sum(c >= cut for cut in cuts) for c in range(options.contacts_per_video))
