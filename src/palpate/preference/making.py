@@ -227,11 +227,9 @@ def choose_items(
         code = "one-video-materials" if examples else "one-video-classes"
         notes.append(Note(code, {"materials": single}))
     taken = _in_turn(piles, n, materials)
-    must, got = (
-        "A study needs two items, at most one a video",
-        f"{len(taken)} of {len(candidates):,}",
-    )
-    require(len(taken) >= 2, None, must, f"{got} images", fix="Add images of other videos")
+    must = "A study needs two items, at most one a video"
+    got, fix = f"{len(taken)} of {len(candidates):,} images", "Add images of other videos"
+    require(len(taken) >= 2, None, must, got, fix=fix)
     facts = {"n": len(taken), "candidates": len(candidates), "videos": len(videos)}
     if len(taken) < n:
         notes.append(Note("fewer-items", facts | {"wanted": n}))
@@ -243,8 +241,9 @@ def choose_items(
 def _with_examples(piles: Piles) -> tuple[Piles, list[Item]]:
     """What remains of the materials of two videos and more, and up to half of each as examples."""
     counts = {m: min(EXAMPLES, len(pile) // 2) for m, pile in piles.items() if m and len(pile) > 1}
-    must, fix = "Sorting needs two materials with two videos each", "Pass labels with the columns "
-    require(len(counts) >= 2, None, must, len(counts), fix=f"{fix}id, material, video")
+    must = "Sorting needs two materials with two videos each"
+    fix = "Pass labels with the columns id, material, video"
+    require(len(counts) >= 2, None, must, len(counts), fix=fix)
     examples = [item for name, count in counts.items() for item in piles[name][:count]]
     return {name: piles[name][count:] for name, count in counts.items()}, examples
 

@@ -112,8 +112,8 @@ def _of_download(plan: Plan, path: Path) -> list[Vote]:
         raise PalpateError(error.must, error.got, AGAIN) from None
     rest = {name: value for name, value in record.items() if name != "digest"}
     require_study(path, plan.study, record["study"])
-    must, got = f"The digest in {path} must match its votes", "other content: it was edited, or a "
-    require(record.get("digest") == digest_json(rest), None, must, f"{got}part is lost", fix=AGAIN)
+    must, got = f"The digest in {path} must match its votes", "edited votes, or a part of them"
+    require(record.get("digest") == digest_json(rest), None, must, got, fix=AGAIN)
     require_rater(plan, record["rater"])
     rows = record["votes"] if isinstance(record["votes"], list) else [None]
     return _checked(plan, record["rater"], rows, path)

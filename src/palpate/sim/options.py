@@ -125,8 +125,8 @@ def _names(materials: Any) -> tuple[str, ...]:
     if type(materials) is int and 1 <= materials <= len(names):
         return tuple(names[k * len(names) // materials] for k in range(materials))
     differ = isinstance(materials, tuple) and len({*materials}) == len(materials) > 0
-    must, fix = f"must be different names, or a count from 1 to {len(names)}", "Names: "
-    fix += ", ".join(names)
+    must = f"must be different names, or a count from 1 to {len(names)}"
+    fix = f"Names: {', '.join(names)}"
     require(differ, "materials", must, repr(materials), fix=fix)
     unknown = [name for name in materials if name not in MATERIALS]
     require(not unknown, "materials", "must be names of materials", few(unknown), fix=fix)
