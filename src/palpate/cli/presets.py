@@ -13,6 +13,7 @@ from palpate.cli.terminal import Common, Terminal
 from palpate.cli.training import PRESETS as TRAININGS
 from palpate.cli.world import WORLDS
 from palpate.core import require_choice
+from palpate.sim.presets import COSTS
 
 PRESETS = {**TRAININGS, "world": WORLDS}
 
@@ -36,8 +37,8 @@ def run(options: Options, terminal: Terminal) -> dict[str, Any]:
     for verb, table in PRESETS.items():
         if options.name is None:
             rows = [
-                {"preset": name}
-                | {about: getattr(preset, about, "") for about in ("cost", "score")}
+                {"preset": name, "cost": getattr(preset, "cost", COSTS.get(name, ""))}
+                | ({"score": preset.score} if hasattr(preset, "score") else {})
                 for name, preset in table.presets.items()
             ]
         elif options.name in table.presets:

@@ -72,7 +72,7 @@ VERBS: dict[str, Verb] = {
     ),
     "presets": Verb(
         "presets",
-        "List complete configurations of the trainings, or the fields of one",
+        "List complete configurations of trainings and worlds, or the fields of one",
         "palpate presets mini",
     ),
     "generate": Verb(

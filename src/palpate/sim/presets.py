@@ -17,9 +17,6 @@ SEEN_WARNING = (
 _SMALL = WorldOptions(
     objects_per_material=20, two_videos=0.25, frames_per_contact=4, free_written="background"
 )
-#: Cost of ``palpate world --preset NAME --workers 1`` on one shared Intel Xeon core,
-#: 2026-11-21: tiny 32 contact frames, 1 s, 1 MB; demo 1,200, 9 s, 24 MB; pretrain 4,000, 23 s, 49
-#: MB; small 8,000, 34 s, 80 MB; full 36,000, 430 s, 870 MB (ten times a tenth of it).
 PRESETS: dict[str, WorldOptions] = {
     "tiny": WorldOptions(
         objects_per_material=2,
@@ -37,6 +34,14 @@ PRESETS: dict[str, WorldOptions] = {
     ),
     "small": _SMALL,
     "full": replace(_SMALL, size=128, tile=512, objects_per_material=60, contacts_per_video=6),
+}
+#: Size, and cost on one shared Intel Xeon core, 2026-11-21 (of full ten times a tenth).
+COSTS = {
+    "tiny": "32 contact frames: 1 s, 1 MB",
+    "demo": "1,200 contact frames: 9 s, 24 MB",
+    "pretrain": "4,000 contact frames: 23 s, 49 MB",
+    "small": "8,000 contact frames: 34 s, 80 MB",
+    "full": "36,000 contact frames: 430 s, 870 MB",
 }
 #: The preset of ``palpate world`` without options.
 DEFAULT = "small"
