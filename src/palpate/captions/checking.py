@@ -73,8 +73,7 @@ def check_captions(
     """
     arguments = {"captions": captions, "data": data, "split": split, "seed": seed} | options
     call = Call.of("caption check", check_captions, arguments)
-    manifest, table = read_captions(captions, data, **options)
-    flags = dict(table.select("id", "flags").iter_rows())
+    manifest, flags = read_captions(captions, data, **options)
     split = None if split is None else Split.load(split)
     rows = _rows(manifest, flags, split)
     vocabulary = Vocabulary(sorted({*rows["label"]} - {""}))

@@ -13,12 +13,14 @@ from palpate.data.reading import load
 from palpate.data.texts import TABLE, joined, read_texts
 
 #: Columns of a table of captions.
-LISTS = dict.fromkeys(("adjectives", "flags"), pl.List(pl.String))
-SCHEMA = {"id": pl.String(), "text": pl.String(), **LISTS}
+LIST = pl.List(pl.String)
+SCHEMA = {"id": pl.String(), "text": pl.String(), "adjectives": LIST, "flags": LIST}
 
 
-def read_captions(captions: Any, data: Any = None, **options: Any) -> tuple[Manifest, pl.DataFrame]:
-    """The samples with their captions as texts, and the captions with the columns of ``SCHEMA``.
+def read_captions(
+    captions: Any, data: Any = None, **options: Any
+) -> tuple[Manifest, dict[str, list[str]]]:
+    """The samples with their captions as texts, and the flags by id where they were kept.
 
     Arguments are those of :func:`palpate.captions.check_captions`.
 
@@ -41,7 +43,5 @@ def read_captions(captions: Any, data: Any = None, **options: Any) -> tuple[Mani
     if isinstance(captions, Path) and captions.suffix == ".parquet":
         table = pl.read_parquet(captions, glob=False)
         if table.schema == pl.Schema(SCHEMA):
-            return manifest, table
-    empty = pl.lit([], SCHEMA["flags"])
-    lists = dict.fromkeys(LISTS, empty)
-    return manifest, manifest.table.select("id", "text").with_columns(**lists)
+            return manifest, dict(table.select("id", "flags").iter_rows())
+    return manifest, {}
