@@ -184,7 +184,7 @@ def test_missing_samples_frames_videos_and_presets_are_rejected():
         World(cache=0)
     with pytest.raises(PalpateError, match="one of tiny, demo"):
         World("large")
-    with pytest.raises(PalpateError, match="0 to 15"):
-        Video(world.options, 0).vision(16)
+    with pytest.raises(PalpateError, match="0 to 13"):
+        Video(world.options, 0).vision(14)
     with pytest.raises(PalpateError, match="0 to 7"):
         Video(world.options, 8)
