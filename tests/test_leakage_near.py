@@ -12,7 +12,7 @@ from threadpoolctl import threadpool_limits
 from forge.leaks import MATERIALS, NoiseVideo, crop, make_leaky, save
 from palpate.data.manifest import Manifest
 from palpate.leakage.calibration import beyond_chance
-from palpate.leakage.descriptors import EditIndex, Whitened
+from palpate.leakage.descriptors import OFFSET, EditIndex, Whitened
 from palpate.leakage.near import near_duplicates, near_groups
 from palpate.leakage.thumbnails import thumbnail, thumbnails
 
@@ -319,3 +319,12 @@ def test_no_edit_is_more_than_equal(gray):
     descriptors = Whitened(pixels, rows, None, gray=gray, fit=rows)
     near, cosines = EditIndex(descriptors, rows[:60]).closest(rows, 3)
     assert np.abs(cosines[near >= 0]).max() <= 1 + 1e-5
+
+
+def test_gray_descriptors_see_the_luminance_of_an_image():
+    pixels = np.random.default_rng(0).integers(0, 256, (80, 32, 32, 3), dtype=np.uint8)
+    rows = np.arange(len(pixels))
+    logs = Whitened(pixels, rows, None, gray=True, fit=rows)._log(rows)
+    luminance = np.stack([np.asarray(Image.fromarray(image).convert("L")) for image in pixels])
+    apart = np.exp(logs.reshape(luminance.shape)) - luminance - OFFSET
+    assert np.abs(apart).max() < 0.51  # rounding to bytes

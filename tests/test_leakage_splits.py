@@ -190,6 +190,12 @@ def test_touch_and_go_in_folds_and_three_parts(published):
     assert three.rule["deviation"] == pytest.approx(0.096129, abs=1e-6)
 
 
+def test_what_a_version_of_the_rule_gives_does_not_change():
+    m = manifest_of([(f"v{v}", v, f"m{v % 3}") for v in range(30)])
+    made = split(m, by="video", seed=1)
+    assert (made.rule["version"], made.digest[:16]) == (3, "602c5d4535b211af")
+
+
 def test_folds_cover_every_sample_once_and_name_what_is_rare():
     m = filled({f"v{k}": {"Wood": 10, **({"Sand": 4} if k < 2 else {})} for k in range(9)})
     folds = split(m, folds=3)

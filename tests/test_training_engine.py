@@ -355,6 +355,7 @@ def test_no_clip_leaves_gradients_alone(tmp_path):
 def test_no_rows_no_parameters_bad_options(tmp_path):
     with pytest.raises(PalpateError, match="at least one sample"):
         fit(Net(), loss, 0, options(), tmp_path)
+    assert fit(Net(), loss, 1, options(), tmp_path / "one")[-1]["step"] == STEPS - 1
     with pytest.raises(PalpateError, match="parameters"):
         fit(Net().requires_grad_(False), loss, N, options(), tmp_path)
     for change in (
@@ -449,8 +450,9 @@ def held_out(**change):
 def test_held_out_loss_is_logged_and_its_best_weights_are_kept(tmp_path):
     last, steps, counted, how = held_out()
     log = fit(last, counted, N, how, tmp_path / "last", held_out=(9, load))
-    losses = [line["held_out"] for line in log if "held_out" in line]
+    losses = {line["step"]: line["held_out"] for line in log if "held_out" in line}
     assert len(losses) == 7
+    assert max(losses) == STEPS - 1
     assert steps.count(False) == 7 * 2  # two whole batches of nine rows
     assert same(weights(last), weights_of_a_plain_run(tmp_path))
     best, _, counted, how = held_out(keep="best", lr=0.5)
