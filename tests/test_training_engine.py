@@ -546,6 +546,12 @@ def test_a_full_disk_ends_in_one_line_and_keeps_the_last_checkpoint(tmp_path, wh
     net = Net()
     fit(net, loss, N, options(), tmp_path)
     assert same(weights(net), whole[0])
+    stop = StopAt(7, None, "progress")  # Ctrl-C, whose checkpoint is the fourth
+    calls[:] = [1] * 3
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(engine, "save_file", full)
+        with pytest.raises(PalpateError, match="must be writable"):
+            fit(Net(), loss, N, options(), tmp_path / "stopped", progress=stop.progress)
 
 
 @pytest.mark.parametrize(("precision", "lines"), [("bf16", 3), ("fp16", 2)])
