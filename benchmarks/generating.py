@@ -47,11 +47,12 @@ from palpate.core import quiet
 from palpate.data.images import load_images
 from palpate.data.manifest import Manifest
 from palpate.diffusion.autoencoder import LatentStats
-from palpate.diffusion.denoiser import Denoiser, build_unet
+from palpate.diffusion.denoiser import Denoiser, starting_noise
+from palpate.diffusion.denoiser_training import DiffusionLoss
 from palpate.diffusion.generation import generate
-from palpate.diffusion.pipeline import TactilePipeline, starting_noise
+from palpate.diffusion.pipeline import TactilePipeline
 from palpate.diffusion.presets import MINI
-from palpate.diffusion.training import DiffusionLoss
+from palpate.diffusion.unet import build_unet
 from palpate.encoders.embed import embed, embed_images, embed_texts, texts_of
 from palpate.encoders.encoder_set import EncoderSet, seeded
 from palpate.metrics import tmmd

@@ -26,12 +26,13 @@ from common import Line, Study, by_video, line, percents
 from palpate.core import digest_json, rng_for, short, write_json
 from palpate.data.images import cached_images
 from palpate.data.manifest import Manifest
-from palpate.diffusion.autoencoders import load_autoencoder
+from palpate.diffusion.autoencoder import load_autoencoder
 from palpate.diffusion.options import SamplerOptions
 from palpate.diffusion.pipeline import TactilePipeline
 from palpate.encoders.embed import texts_of
 from palpate.encoders.encoder_set import EncoderSet
 from palpate.studies.files import fresh
+from palpate.training.run import TrainingRun
 
 sys.path.append(str(Path(__file__).parents[1] / "recipes"))
 from mini import COMPUTE, GENERATOR, GENERATOR_ROUNDS, GENERATOR_STEPS, train_round
@@ -74,9 +75,10 @@ def trained(seed, world, work):
         folder = work / f"training-{short(digest_json(made_by))}"
         if not (folder / "model").is_dir():
             print(f"training {seed}, round {number + 1}, in {folder}", flush=True)
-            parts = world, encoders, autoencoder, folder / "training"
-            how = {"cache": work / "training cache", "progress": Line()}
-            made = train_round(*parts, seed + number, pipeline, GENERATOR_STEPS, **how)
+            cache = work / "training cache"
+            run = TrainingRun(folder / "training", seed + number, cache, progress=Line())
+            parts = world, encoders, autoencoder, pipeline
+            made = train_round(*parts, GENERATOR_STEPS, run)
             made.save(fresh(folder / "model"), half=True, shared=NAME)
         pipeline = TactilePipeline.from_pretrained(folder / "model")
     return replace(pipeline, sampler=GENERATOR.sampler)

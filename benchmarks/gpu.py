@@ -38,10 +38,11 @@ from transformers import CLIPTextConfig, CLIPTextModelWithProjection
 
 from palpate.core import write_json
 from palpate.diffusion.autoencoder import Autoencoder, LatentStats
-from palpate.diffusion.denoiser import Denoiser, build_unet
-from palpate.diffusion.pipeline import TactilePipeline, build_scheduler, starting_noise
-from palpate.diffusion.presets import preset_named
-from palpate.diffusion.training import DiffusionLoss
+from palpate.diffusion.denoiser import Denoiser, build_scheduler, starting_noise
+from palpate.diffusion.denoiser_training import DiffusionLoss
+from palpate.diffusion.pipeline import TactilePipeline
+from palpate.diffusion.presets import preset_of
+from palpate.diffusion.unet import build_unet
 from palpate.encoders.encoder_set import encode_tactile, new_tactile
 from palpate.encoders.losses import in_chunks, three_way
 from palpate.encoders.presets import preset as encoder_preset
@@ -336,7 +337,7 @@ class Bench:
 
     def preset(self):
         """The preset, or in a try a tiny one in its place."""
-        return preset_named("tiny" if self.small else "paper")
+        return preset_of("tiny" if self.small else "paper")
 
     def sample(self):
         """The generator in the requested modes, and by the plain loop."""

@@ -25,8 +25,8 @@ from torch.utils.flop_counter import FlopCounterMode
 from transformers import CLIPVisionConfig, CLIPVisionModelWithProjection
 
 from palpate.diffusion.autoencoder import BackgroundAutoencoder
-from palpate.diffusion.denoiser import build_unet
 from palpate.diffusion.presets import PAPER
+from palpate.diffusion.unet import build_unet
 from palpate.encoders.presets import PAPER as ENCODER
 from palpate.studies.reproduce import Plan
 from palpate.studies.study import ON_DISK, STUDIES

@@ -42,12 +42,12 @@ from numpy.typing import NDArray
 from palpate.core import PalpateError, Split, digest_json, read_json, write_json
 from palpate.data.images import cached_images
 from palpate.data.manifest import Manifest
-from palpate.diffusion.autoencoders import AnyAutoencoder, load_autoencoder
-from palpate.diffusion.background_training import train_background_autoencoder
+from palpate.diffusion.autoencoder import AnyAutoencoder, load_autoencoder
+from palpate.diffusion.autoencoder_training import fit_autoencoder
 from palpate.diffusion.options import BackgroundOptions, SamplerOptions
 from palpate.diffusion.pipeline import TactilePipeline
 from palpate.diffusion.presets import MINI as DIFFUSION
-from palpate.diffusion.training import train_pipeline
+from palpate.diffusion.training import Parts, train_pipeline
 from palpate.encoders.contrastive import train_clip, train_tactile
 from palpate.encoders.encoder_set import ClipEncoders, EncoderSet, load_clip
 from palpate.encoders.models import SHIPPED, shipped_root
@@ -56,6 +56,7 @@ from palpate.sim import PRESETS, VERSION, WorldOptions, write_world
 from palpate.studies.files import fresh
 from palpate.studies.stages import Stage, run_stage, stored_stage
 from palpate.training.options import Compute
+from palpate.training.run import TrainingRun
 
 NAME = "palpate/mini"
 #: Its table of scores is written from the cards.
@@ -124,16 +125,13 @@ def train_round(
     train: Manifest,
     encoders: EncoderSet,
     autoencoder: AnyAutoencoder,
-    folder: Path,
-    seed: int,
     start: TactilePipeline | None,
     steps: int,
-    **how: Any,
+    run: TrainingRun,
 ) -> TactilePipeline:
     """The generator after a round of training, from random weights or from those of ``start``."""
-    parts = train, everything(train), encoders, autoencoder, GENERATOR, folder
-    how |= {"seed": seed, "steps": steps, "start": start, "compute": COMPUTE}
-    made = train_pipeline(*parts, **how)
+    parts = Parts(GENERATOR.with_steps(steps), autoencoder, encoders, start=start)
+    made = train_pipeline(train, everything(train), parts, replace(run, compute=COMPUTE))
     # Nothing is left out of the training: the ceiling is that of the autoencoder's own card.
     return replace(made, training={**made.training, "ceiling": autoencoder.card.get("scores")})
 
@@ -241,9 +239,9 @@ class Recipe:
             return np.concatenate([cached_images(part, column, *how) for part in parts])
 
         def build(folder: Path) -> Mapping[str, Any]:
-            data = images("tactile"), images("background"), AUTOENCODER, folder / "training"
-            how: dict[str, Any] = {"seed": SEED, "key": digest_json(digests), "compute": COMPUTE}
-            model = train_background_autoencoder(*data, **how, progress=self.progress)
+            run = TrainingRun(folder / "training", SEED, compute=COMPUTE, progress=self.progress)
+            data = images("tactile"), images("background"), AUTOENCODER, run
+            model = fit_autoencoder(*data, key=digest_json(digests))
             model.save(fresh(folder / "autoencoder"))
             return {"digest": model.digest}
 
@@ -285,8 +283,9 @@ class Recipe:
             inputs["start"] = start.digest
 
         def build(folder: Path) -> Mapping[str, Any]:
-            parts = train, encoders, autoencoder, folder / "training"
-            pipeline = train_round(*parts, seed, start, GENERATOR_STEPS, **self.common)
+            parts = train, encoders, autoencoder
+            run = TrainingRun(folder / "training", seed, **self.common)
+            pipeline = train_round(*parts, start, GENERATOR_STEPS, run)
             pipeline.save(fresh(folder / "model"))
             return {"digest": pipeline.digest, "train": len(train)}
 

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from palpate.core import read_json, write_text
-from palpate.diffusion.autoencoders import AnyAutoencoder
+from palpate.diffusion.autoencoder import AnyAutoencoder
 from palpate.diffusion.pipeline import TactilePipeline
 from palpate.encoders.encoder_set import EncoderSet
 from palpate.sim import VERSION

@@ -20,9 +20,8 @@ from numpy.typing import NDArray
 from palpate.core import FeatureSet, Measure, Progress, Score, Split, digest_json
 from palpate.data.images import cached_images
 from palpate.data.manifest import Manifest
-from palpate.diffusion.autoencoder import BackgroundAutoencoder
-from palpate.diffusion.autoencoder_training import measure_reconstruction
-from palpate.diffusion.autoencoders import AnyAutoencoder
+from palpate.diffusion.autoencoder import AnyAutoencoder, BackgroundAutoencoder
+from palpate.diffusion.ceiling import measure_reconstruction
 from palpate.diffusion.generation import generate
 from palpate.diffusion.no_contact import gels_of
 from palpate.diffusion.pipeline import TactilePipeline

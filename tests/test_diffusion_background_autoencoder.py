@@ -14,15 +14,16 @@ from forge.models import StandInEncoders, arrays
 from forge.pictures import photos
 from palpate.core import PalpateError, Split
 from palpate.data.manifest import Manifest
-from palpate.diffusion.autoencoder import BackgroundAutoencoder, LatentStats
-from palpate.diffusion.autoencoders import load_autoencoder
-from palpate.diffusion.background_training import train_background_autoencoder
-from palpate.diffusion.denoiser import Denoiser, build_unet
+from palpate.diffusion.autoencoder import BackgroundAutoencoder, LatentStats, load_autoencoder
+from palpate.diffusion.autoencoder_training import fit_autoencoder
+from palpate.diffusion.denoiser import Denoiser
 from palpate.diffusion.generation import generate
 from palpate.diffusion.options import BackgroundOptions, SamplerOptions, Schedule
 from palpate.diffusion.pipeline import TactilePipeline
 from palpate.diffusion.presets import MINI, TINY
 from palpate.diffusion.training import train_generator
+from palpate.diffusion.unet import build_unet
+from palpate.training.run import TrainingRun
 
 SMALL = BackgroundOptions(channels=4, narrow=8, wide=16, steps=150, batch=8, crop=16)
 
@@ -50,7 +51,7 @@ def pressed(ground: np.ndarray) -> np.ndarray:
 def trained(tmp_path_factory) -> BackgroundAutoencoder:
     ground = gels(24)
     folder = tmp_path_factory.mktemp("autoencoder")
-    return train_background_autoencoder(pressed(ground), ground, SMALL, folder)
+    return fit_autoencoder(pressed(ground), ground, SMALL, TrainingRun(folder))
 
 
 def error(model, images, ground) -> float:
@@ -97,8 +98,8 @@ def test_it_goes_on_from_a_folder_in_its_own_shape(trained, tmp_path):
     trained.save(tmp_path / "a")
     start, ground = load_autoencoder(tmp_path / "a"), gels(8)
     other = replace(SMALL, channels=2, narrow=4, wide=8, steps=4)
-    model = train_background_autoencoder(
-        pressed(ground), ground, other, tmp_path / "b", start=start
+    model = fit_autoencoder(
+        pressed(ground), ground, other, TrainingRun(tmp_path / "b"), start=start
     )
     assert (model.channels, model.card["options"]["wide"]) == (4, 16)
     assert model.card["start"] == start.digest != model.digest
@@ -108,12 +109,12 @@ def test_it_goes_on_from_a_folder_in_its_own_shape(trained, tmp_path):
 def test_training_again_gives_the_same_weights(tmp_path):
     ground, options = gels(8), replace(SMALL, steps=4)
     a, b = (
-        train_background_autoencoder(pressed(ground), ground, options, tmp_path / name)
+        fit_autoencoder(pressed(ground), ground, options, TrainingRun(tmp_path / name))
         for name in "ab"
     )
     assert a.digest == b.digest
     with pytest.raises(PalpateError, match="multiple of 4"):
-        train_background_autoencoder(ground, ground, replace(options, crop=18), tmp_path / "c")
+        fit_autoencoder(ground, ground, replace(options, crop=18), TrainingRun(tmp_path / "c"))
 
 
 def pipeline(autoencoder, *, ground: int = 0) -> TactilePipeline:

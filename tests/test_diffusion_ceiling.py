@@ -13,7 +13,7 @@ from palpate.cli import main
 from palpate.core import PalpateError, Split
 from palpate.data.manifest import Manifest
 from palpate.diffusion.autoencoder import load_autoencoder
-from palpate.diffusion.autoencoders import train_autoencoder
+from palpate.diffusion.autoencoder_training import train_autoencoder
 from palpate.diffusion.ceiling import judge_of, measure_ceiling
 from palpate.diffusion.training import train_generator
 from palpate.encoders.encoder_set import EncoderSet
@@ -29,10 +29,10 @@ class Through:
     def __init__(self, change):
         self.change = change
 
-    def encode(self, images, batch=64):
+    def encode(self, images, background=None, batch=64):
         return torch.from_numpy(np.array(images))
 
-    def decode(self, latents, batch=64):
+    def decode(self, latents, background=None, batch=64):
         return self.change(latents.numpy())
 
 

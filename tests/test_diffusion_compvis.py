@@ -18,9 +18,10 @@ from palpate.cli import main
 from palpate.core import PalpateError
 from palpate.diffusion.autoencoder import Autoencoder, load_autoencoder, to_bytes
 from palpate.diffusion.presets import PAPER, TINY
-from palpate.diffusion.training import train_pipeline
+from palpate.diffusion.training import Parts, train_pipeline
 from palpate.encoders import EncoderSet
 from palpate.encoders.preprocess import to_unit
+from palpate.training.run import TrainingRun
 
 
 def images(n=2, size=32):
@@ -223,8 +224,9 @@ def test_an_autoencoder_that_does_not_fit_preset_or_start_is_rejected(small_mani
         pp.train_generator(*data, encoders, preset=TINY, autoencoder=path)
     start = replace(make_pipeline(width=encoders.dim), encoders=EncoderSet(encoders.clip))
     wider = Autoencoder(small_vq(latent_channels=4))
+    parts = Parts(TINY, wider, encoders, start=start)
     with pytest.raises(PalpateError, match=r"`start` must share autoenc.*another autoenc"):
-        train_pipeline(*data, encoders, wider, TINY, tmp_path, start=start, device="cpu")
+        train_pipeline(*data, parts, TrainingRun(tmp_path))
 
 
 @pytest.mark.slow

@@ -9,11 +9,13 @@ from safetensors.torch import load_file, save_file
 
 from palpate.core import PalpateError
 from palpate.diffusion.autoencoder import LatentStats
-from palpate.diffusion.denoiser import Denoiser, build_unet
+from palpate.diffusion.denoiser import Denoiser
+from palpate.diffusion.denoiser_training import DiffusionLoss, Rows, train_denoiser
 from palpate.diffusion.options import ConditionPolicy, Schedule, UNetOptions
-from palpate.diffusion.presets import MINI, PAPER, PRESETS, SMALL, preset_named
-from palpate.diffusion.training import DiffusionLoss, train_denoiser
+from palpate.diffusion.presets import MINI, PAPER, PRESETS, SMALL, TINY, preset_of
+from palpate.diffusion.unet import build_unet
 from palpate.training.options import LoopOptions
+from palpate.training.run import TrainingRun
 from palpate.training.steps import Step
 
 UNET = UNetOptions(widths=(8, 16), attention=(False, True), layers=1, head_width=8, groups=4)
@@ -64,9 +66,9 @@ def test_the_papers_preset_says_what_the_paper_says():
         width=768, dropout=0.1, gap="none", noise=0.0, source="text", photo_size=256, photo_width=64
     )
     assert PAPER.latent_scale == "one"
-    assert preset_named("mini") is MINI
+    assert preset_of("mini") is MINI
     with pytest.raises(PalpateError, match="tiny, mini, small, paper"):
-        preset_named("huge")
+        preset_of("huge")
 
 
 @pytest.mark.parametrize("name", PRESETS)
@@ -96,6 +98,9 @@ def test_tokens_are_normalized_scaled_and_shifted():
     plain = denoiser().tokens(c, "text")
     wanted = c / c.norm(dim=1, keepdim=True) * 12**0.5
     assert plain.shape == (5, 1, 12)
+    null = denoiser().null_tokens(5)
+    assert null.shape == plain.shape
+    assert not null.any()
     assert torch.allclose(plain[:, 0], wanted, atol=1e-6)
     m = torch.randn(12)
     shifted = denoiser(replace(POLICY, gap="pairs"), means={"text": m})
@@ -109,11 +114,6 @@ def test_tokens_are_normalized_scaled_and_shifted():
         shifted.tokens(c, "vision")
     with pytest.raises(PalpateError, match=r"\(n, 12\)"):
         shifted.tokens(torch.randn(5, 11), "text")
-
-
-def test_the_null_token_is_zeros():
-    assert denoiser().null_tokens(2).shape == (2, 1, 12)
-    assert not denoiser().null_tokens(2).any()
 
 
 def test_condition_and_background_reach_the_output():
@@ -308,32 +308,15 @@ def data(n: int = 24):
 
 def train(folder, **changes):
     z, conditions = data()
-    settings = {
-        "stats": LatentStats.of(z),
-        "unet": UNET,
-        "policy": POLICY,
-        "schedule": Schedule(),
-        "loop": LOOP,
-        "folder": folder,
-    }
-    changes.setdefault("conditions", conditions)
-    return train_denoiser(z, **settings | changes)
+    rows = Rows(z, changes.get("conditions", conditions))
+    preset = replace(TINY, unet=UNET, condition=changes.get("policy", POLICY), loop=LOOP)
+    return train_denoiser(rows, preset, LatentStats.of(z), TrainingRun(folder))
 
 
 def test_training_does_not_touch_global_randomness(tmp_path):
-    z, conditions = data()
-    torch.manual_seed(3)
+    data()
     before = torch.get_rng_state()
-    train_denoiser(
-        z,
-        conditions,
-        stats=PLAIN,
-        unet=UNET,
-        policy=POLICY,
-        schedule=Schedule(),
-        loop=LOOP,
-        folder=tmp_path,
-    )
+    train(tmp_path)  # draws the data anew
     assert torch.equal(torch.get_rng_state(), before)
 
 

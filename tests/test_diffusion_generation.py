@@ -13,7 +13,8 @@ from PIL import Image
 from forge.models import make_pipeline
 from palpate.core import PalpateError, ProblemsError, Split, inside
 from palpate.data.manifest import Manifest
-from palpate.diffusion.generation import Generated, file_name, generate, photo_ids
+from palpate.diffusion.generated import Generated, file_name
+from palpate.diffusion.generation import generate, photo_ids
 
 
 @pytest.fixture(scope="module")
@@ -54,7 +55,7 @@ def test_file_names_are_unique_to_the_id():
 def test_a_folder_has_an_index_and_the_images_of_the_pipeline(pipeline, tmp_path):
     paths = write_photos(tmp_path / "in", 5)
     made = generate(paths, model=pipeline, output=tmp_path / "out", seed=3)
-    assert (made.ids, made.made) == ([p.name for p in paths], 5)
+    assert (made.ids, made.new) == ([p.name for p in paths], 5)
     index = json.loads((tmp_path / "out" / "index.json").read_text())
     assert index["complete"]
     assert (index["settings"]["pipeline"], index["settings"]["seed"]) == (pipeline.digest, 3)
@@ -86,9 +87,9 @@ def test_a_resumed_folder_equals_an_uninterrupted_one(pipeline, tmp_path):
     there = len([*(tmp_path / "b" / "images").iterdir()])
     assert 4 <= there < 7  # writing is behind sampling
     resumed = generate(tmp_path / "in", output=tmp_path / "b", **common)
-    assert (whole.made, resumed.made) == (7, 7 - there)
+    assert (whole.new, resumed.new) == (7, 7 - there)
     assert contents(tmp_path / "a") == contents(tmp_path / "b")
-    assert generate(tmp_path / "in", output=tmp_path / "b", model=pipeline).made == 0
+    assert generate(tmp_path / "in", output=tmp_path / "b", model=pipeline).new == 0
 
 
 @pytest.mark.parametrize("change", [{}, {"guidance": 1.0}, {"high": 0.8}])
@@ -103,7 +104,7 @@ def test_evaluations_of_a_dry_run_are_those_of_the_call(tmp_path, change, method
         counts.append(len(x)) or forward(x, *args, **how)
     )
     generate(files, model=pipeline)
-    assert (planned.missing, planned.made, planned.evaluations) == (20, 0, sum(counts))
+    assert (planned.missing, planned.new, planned.evaluations) == (20, 0, sum(counts))
 
 
 def test_more_photos_extend_the_folder_and_a_changed_one_is_made_again(pipeline, tmp_path):
@@ -111,9 +112,9 @@ def test_more_photos_extend_the_folder_and_a_changed_one_is_made_again(pipeline,
     common = {"model": pipeline, "output": tmp_path / "out"}
     generate(paths[:2], **common)
     more = generate([paths[3], paths[1]], **common)
-    assert (more.made, set(more.ids)) == (1, {"0.png", "1.png", "3.png"})
+    assert (more.new, set(more.ids)) == (1, {"0.png", "1.png", "3.png"})
     Image.new("RGB", (20, 20), "red").save(paths[1])
-    assert generate(paths[1:2], **common).made == 1
+    assert generate(paths[1:2], **common).new == 1
     before = contents(tmp_path / "out")
     for change in ({"seed": 1}, {"guidance": 4.0}, {"steps": 3}):
         with pytest.raises(PalpateError, match="`output` must hold images of the same settings"):
@@ -154,8 +155,8 @@ def test_many_photos_are_read_while_others_are_sampled(pipeline, tmp_path):
     for k, content in zip((60, 70), good, strict=True):
         paths[k].write_bytes(content)
     whole = generate(order, **common)
-    assert (whole.made, whole.ids) == (48, [*order])
-    assert generate(order, **common).made == 0
+    assert (whole.new, whole.ids) == (48, [*order])
+    assert generate(order, **common).new == 0
 
 
 def test_a_manifest_with_backgrounds(tmp_path):
@@ -195,10 +196,10 @@ def test_one_photo_becomes_one_png_that_says_what_it_is(pipeline, tmp_path):
     assert "synthetic data alone" in text["palpate.notice"]
     assert text["palpate.notice"].endswith("knows only these materials: Brick, Wood.")
     # Again: nothing to do; another seed or another photo: made again.
-    assert generate(photo, output=file, **common).made == 0
-    assert generate(photo, output=file, model=synthetic, seed=4).made == 1
+    assert generate(photo, output=file, **common).new == 0
+    assert generate(photo, output=file, model=synthetic, seed=4).new == 1
     Image.new("RGB", (20, 20), "red").save(photo)
-    assert generate(photo, output=file, model=synthetic, seed=4).made == 1
+    assert generate(photo, output=file, model=synthetic, seed=4).new == 1
     assert list(file.parent.iterdir()) == [file]
     assert pipeline.notice == ""  # its record does not call the data synthetic
 

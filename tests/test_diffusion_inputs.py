@@ -18,13 +18,15 @@ from palpate.cli import main
 from palpate.core import PalpateError
 from palpate.diffusion.autoencoder import LatentStats
 from palpate.diffusion.denoiser import Denoiser, PhotoMap, inputs_of, lengths_of, slots_of
+from palpate.diffusion.denoiser_training import DiffusionLoss, Rows, train_denoiser
 from palpate.diffusion.generation import generate
 from palpate.diffusion.options import ConditionPolicy
 from palpate.diffusion.pipeline import TactilePipeline
 from palpate.diffusion.presets import TINY
-from palpate.diffusion.training import DiffusionLoss, train_denoiser, train_generator
+from palpate.diffusion.training import train_generator
 from palpate.encoders.encoder_set import EncoderSet
 from palpate.training.options import LoopOptions
+from palpate.training.run import TrainingRun
 from palpate.training.steps import Step
 
 GVST = ConditionPolicy(width=8, source="resnet", photo_size=16, photo_width=4)
@@ -47,15 +49,11 @@ def learned(folder, policy=GVST, **changes):
     bright = np.arange(32) % 2 == 1
     images = np.where(bright, 230, 20).astype(np.uint8)[:, None, None, None]
     z = torch.from_numpy(np.where(bright, 1.0, -1.0)).float().reshape(-1, 1, 1, 1)
-    return train_denoiser(
-        z.expand(-1, 3, 8, 8),
-        {"photos": np.broadcast_to(images, (32, 16, 16, 3))},
-        stats=LatentStats((0.0,) * 3, (1.0,) * 3, "one"),
-        policy=policy,
-        schedule=replace(TINY.schedule, prediction="flow"),
-        folder=folder,
-        **{"unet": TINY.unet, "loop": LoopOptions(60, 8, 3e-3, warmup=5, ema=0.9)} | changes,
-    )
+    rows = Rows(z.expand(-1, 3, 8, 8), {"photos": np.broadcast_to(images, (32, 16, 16, 3))})
+    schedule, loop = replace(TINY.schedule, prediction="flow"), LoopOptions(60, 8, 3e-3, 5, ema=0.9)
+    preset = replace(TINY, condition=policy, schedule=schedule, loop=loop)
+    stats = LatentStats((0.0,) * 3, (1.0,) * 3, "one")
+    return train_denoiser(rows, replace(preset, **changes), stats, TrainingRun(folder))
 
 
 @pytest.mark.parametrize("modulate", [False, True])
@@ -188,10 +186,10 @@ def test_patches_are_dropped_with_their_embedding_and_alone(source):
 
 
 def test_patches_from_training_to_a_saved_pipeline(small_manifest, tmp_path):
-    condition = replace(TINY.condition, patches=4)
+    condition = replace(TINY.condition, patches=4, source="both")
     preset = replace(TINY, condition=condition, loop=replace(TINY.loop, steps=2))
     encoders, split = make_encoders(), by_video(small_manifest)
-    options = {"preset": preset, "source": "both", "device": "cpu"}
+    options = {"preset": preset, "device": "cpu"}
     made = train_generator(small_manifest, split, encoders, output=tmp_path / "m", **options)
     again = TactilePipeline.from_pretrained(tmp_path / "m", device="cpu")
     assert again.digest == made.digest

@@ -14,11 +14,14 @@ from forge.worlds import by_video
 from palpate.cli import main
 from palpate.core import PalpateError
 from palpate.diffusion.autoencoder import LatentStats
-from palpate.diffusion.denoiser import load_unet
+from palpate.diffusion.denoiser import build_scheduler, sample, starting_noise
+from palpate.diffusion.denoiser_training import Rows, train_denoiser
 from palpate.diffusion.options import ConditionPolicy
-from palpate.diffusion.pipeline import TactilePipeline, sample
-from palpate.diffusion.presets import PAPER, SMALL
-from palpate.diffusion.training import train_denoiser, train_generator
+from palpate.diffusion.pipeline import TactilePipeline
+from palpate.diffusion.presets import MINI, PAPER, SMALL
+from palpate.diffusion.training import train_generator
+from palpate.diffusion.unet import load_unet
+from palpate.training.run import TrainingRun
 from test_training_presets import memory
 
 #: Weights, gradient, two moments, average; what a checkpoint copies; activations: of ``paper``.
@@ -52,16 +55,10 @@ def step_and_sample(preset, folder, channels):
     side, width = preset.size // 4, preset.condition.width
     torch.manual_seed(0)
     both = {s: torch.randn(2, width) for s in ("text", "vision")}
-    model = train_denoiser(
-        torch.randn(2, channels, side, side),
-        both,
-        stats=LatentStats((0.0,) * channels, (1.0,) * channels, preset.latent_scale),
-        unet=preset.unet,
-        policy=preset.condition,
-        schedule=preset.schedule,
-        loop=replace(preset.loop, steps=1, batch=2),
-        folder=folder,
-    )
+    stats = LatentStats((0.0,) * channels, (1.0,) * channels, preset.latent_scale)
+    rows = Rows(torch.randn(2, channels, side, side), both)
+    short = replace(preset, loop=replace(preset.loop, steps=1, batch=2))
+    model = train_denoiser(rows, short, stats, TrainingRun(folder))
     with safe_open(folder / "checkpoint.safetensors", "pt") as file:
         names = file.keys()
         kinds = {name.split(".")[0] for name in names}
@@ -69,16 +66,9 @@ def step_and_sample(preset, folder, channels):
     assert kinds >= {"model", "ema", "exp_avg", "exp_avg_sq"}
     shutil.rmtree(folder)  # gigabytes
     options = replace(preset.sampler, steps=1, batch=1)
-    made = sample(
-        model,
-        model.condition(both["vision"][:1]),
-        model.null_tokens(1),
-        ["a"],
-        shape=(channels, side, side),
-        schedule=preset.schedule,
-        options=options,
-        seed=0,
-    )
+    noise = starting_noise(["a"], (channels, side, side), 0)
+    scheduler = build_scheduler(preset.schedule, options.method)
+    made = sample(model, model.condition(both["vision"][:1]), noise, options, scheduler)
     assert made.shape == (1, channels, side, side)
     assert torch.isfinite(made).all()
 
@@ -126,5 +116,6 @@ def test_what_is_no_trained_unet_is_rejected(tag, tmp_path):
         ("nowhere", "no folder nowhere"),
         (tmp_path / "tag", "must hold a U-Net of diffusers"),
     ):
+        preset = replace(MINI, unet=str(unet))
         with pytest.raises(PalpateError, match=message):
-            train_generator(*tag, "palpate/mini", autoencoder="palpate/mini", unet=unet)
+            train_generator(*tag, "palpate/mini", autoencoder="palpate/mini", preset=preset)

@@ -13,7 +13,7 @@ import pytest
 from PIL import Image
 
 from forge.pictures import photos
-from palpate.diffusion.generation import Generated
+from palpate.diffusion.generated import Generated
 
 
 @pytest.mark.nightly

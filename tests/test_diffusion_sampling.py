@@ -5,9 +5,9 @@ from dataclasses import replace
 import pytest
 import torch
 
-from palpate.diffusion.denoiser import Denoiser, build_unet
+from palpate.diffusion.denoiser import Denoiser, build_scheduler, guided, sample, starting_noise
 from palpate.diffusion.options import ConditionPolicy, SamplerOptions, Schedule, UNetOptions
-from palpate.diffusion.pipeline import build_scheduler, guided, sample, starting_noise
+from palpate.diffusion.unet import build_unet
 
 SHAPE = (3, 4, 4)
 TOKENS = torch.zeros(1, 1, 1)
@@ -32,17 +32,9 @@ def exact(schedule: Schedule, mean, spread: float):
 def test_gaussian_data_come_out_with_their_mean_and_spread(method, steps, tolerance):
     schedule = Schedule()
     ids = [f"s{k}" for k in range(128)]
-    z = sample(
-        exact(schedule, MEAN, SPREAD),
-        TOKENS.expand(128, 1, 1),
-        TOKENS,
-        ids,
-        shape=SHAPE,
-        schedule=schedule,
-        options=SamplerOptions(method, steps, guidance=1.0, batch=64),
-        seed=0,
-    )
-    noise = starting_noise(ids, SHAPE, 0)
+    noise, options = starting_noise(ids, SHAPE, 0), SamplerOptions(method, steps, 1.0, batch=64)
+    predict, scheduler = exact(schedule, MEAN, SPREAD), build_scheduler(schedule, method)
+    z = sample(predict, TOKENS.expand(128, 1, 1), noise, options, scheduler)
     # The probability flow of a Gaussian is z^0 = mean + spread * z^T, up to the signal left at T.
     assert float(z.mean()) == pytest.approx(MEAN + SPREAD * float(noise.mean()), abs=tolerance)
     assert float(z.std()) == pytest.approx(SPREAD * float(noise.std()), rel=3 * tolerance)
@@ -53,19 +45,14 @@ def test_guidance_extrapolates_from_the_unconditional_prediction():
     """Equal spreads, means 0 (null) and m: the guided prediction is that of the mean s m."""
     schedule = Schedule()
     predict = exact(schedule, lambda tokens: tokens.reshape(-1, 1, 1, 1), 0.5)
-    ids = [f"s{k}" for k in range(32)]
+    noise, scheduler = (
+        starting_noise([*map(str, range(32))], SHAPE, 1),
+        build_scheduler(schedule, "ddim"),
+    )
     for s in (0.0, 1.0, 3.0):
-        z = sample(
-            predict,
-            torch.full((32, 1, 1), 0.8),
-            TOKENS,
-            ids,
-            shape=SHAPE,
-            schedule=schedule,
-            options=SamplerOptions("ddim", 200, guidance=s, batch=16),
-            seed=1,
-        )
-        expected = s * 0.8 + 0.5 * float(starting_noise(ids, SHAPE, 1).mean())
+        options = SamplerOptions("ddim", 200, guidance=s, batch=16)
+        z = sample(predict, torch.full((32, 1, 1), 0.8), noise, options, scheduler)
+        expected = s * 0.8 + 0.5 * float(noise.mean())
         assert float(z.mean()) == pytest.approx(expected, abs=0.03)
 
 
@@ -105,16 +92,8 @@ def network() -> Denoiser:
 
 def draw(model: Denoiser, conditions, ids, **changes) -> torch.Tensor:
     options = replace(SamplerOptions("dpm", 4, guidance=3.0, batch=4), **changes)
-    return sample(
-        model,
-        model.tokens(conditions, "vision"),
-        model.null_tokens(1),
-        ids,
-        shape=(3, 8, 8),
-        schedule=Schedule(),
-        options=options,
-        seed=0,
-    )
+    noise, scheduler = starting_noise(ids, (3, 8, 8), 0), build_scheduler(Schedule(), "dpm")
+    return sample(model, model.tokens(conditions, "vision"), noise, options, scheduler)
 
 
 def test_a_sample_does_not_depend_on_its_neighbors():
@@ -156,13 +135,7 @@ def test_rescaling_keeps_the_spread_of_the_conditional_prediction():
 
     z, t = torch.randn(2, 3, 4, 4), torch.tensor([5, 5])
     out = guided(
-        predict,
-        z,
-        t,
-        torch.ones(2, 1, 1),
-        torch.zeros(2, 1, 1),
-        None,
-        SamplerOptions(guidance=4.0, rescale=1.0),
+        predict, z, t, torch.ones(2, 1, 1), None, SamplerOptions(guidance=4.0, rescale=1.0)
     )
     assert torch.allclose(out.std((1, 2, 3)), z.std((1, 2, 3)), rtol=1e-5)
     assert torch.allclose(out / out.std(), z / z.std(), atol=1e-5)

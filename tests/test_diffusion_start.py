@@ -10,29 +10,23 @@ from forge.models import make_encoders, make_pipeline
 from palpate.core import PalpateError, Split
 from palpate.data.manifest import Manifest
 from palpate.diffusion.autoencoder import LatentStats
+from palpate.diffusion.denoiser_training import Rows, train_denoiser
 from palpate.diffusion.options import Schedule, UNetOptions
 from palpate.diffusion.presets import TINY
-from palpate.diffusion.training import train_denoiser, train_pipeline
+from palpate.diffusion.training import Parts, train_pipeline
 from palpate.encoders.encoder_set import EncoderSet
 from palpate.training.options import LoopOptions
+from palpate.training.run import TrainingRun
+
+PLAIN = LatentStats((0.0,) * 3, (1.0,) * 3)
 
 
 def train(folder: Path, steps: int, start=None, **changes):
     torch.manual_seed(3)
-    how = {
-        "stats": LatentStats((0.0,) * 3, (1.0,) * 3),
-        "unet": TINY.unet,
-        "policy": TINY.condition_for(6),
-        "schedule": TINY.schedule,
-        "loop": LoopOptions(steps=steps, batch=2, lr=1e-2, warmup=0),
-    }
-    return train_denoiser(
-        torch.randn(4, 3, 8, 8),
-        {"text": torch.randn(4, 6)},
-        folder=folder,
-        start=start,
-        **(how | changes),
-    )
+    loop = LoopOptions(steps=steps, batch=2, lr=1e-2, warmup=0)
+    preset = replace(TINY, condition=TINY.condition_for(6), loop=loop, **changes)
+    rows = Rows(torch.randn(4, 3, 8, 8), {"text": torch.randn(4, 6)})
+    return train_denoiser(rows, preset, PLAIN, TrainingRun(folder), start=start)
 
 
 def same(a, b) -> bool:
@@ -53,11 +47,9 @@ def test_it_begins_with_the_given_weights_and_leaves_those_alone(tmp_path):
     train(tmp_path / "d", 2)
     assert same(train(tmp_path / "d", 2, start), moved)
 
-
-def test_its_geometry_is_its_own(tmp_path):
-    start = make_pipeline().denoiser
+    # Its geometry is its own.
     wide = UNetOptions(widths=(16, 16), attention=(False, True), layers=1, head_width=16, groups=8)
-    assert same(train(tmp_path / "a", 0, start, unet=wide), start)
+    assert same(train(tmp_path / "e", 0, start, unet=wide), start)
 
 
 def test_other_encoders_autoencoders_and_schedules_are_rejected(small_manifest, tmp_path):
@@ -70,16 +62,8 @@ def test_other_encoders_autoencoders_and_schedules_are_rejected(small_manifest, 
     preset = replace(TINY, loop=replace(TINY.loop, steps=1))
 
     def run(encoders=encoders, autoencoder=start.autoencoder, preset=preset):
-        return train_pipeline(
-            manifest,
-            split,
-            encoders,
-            autoencoder,
-            preset,
-            tmp_path / "work",
-            start=start,
-            device="cpu",
-        )
+        parts = Parts(preset, autoencoder, encoders, start=start)
+        return train_pipeline(manifest, split, parts, TrainingRun(tmp_path / "work"))
 
     other = make_pipeline().autoencoder
     other.net.quantize.embedding.weight.data.add_(1)

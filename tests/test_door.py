@@ -40,7 +40,7 @@ SIGNATURES = {
     ),
     "train_autoencoder": "data split * preset start judge output seed device compute progress",
     "train_generator": (
-        "data split clip * preset autoencoder unet start output source background"
+        "data split clip * preset autoencoder start output background"
         " judge steps seed device compute progress"
     ),
     "validate": "source * format check progress **options",

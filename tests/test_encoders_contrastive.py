@@ -13,6 +13,7 @@ from transformers import Dinov2Config, Dinov2Model
 
 from palpate.core import PalpateError, Split, rng_for, seed_for
 from palpate.data.manifest import Manifest
+from palpate.diffusion.presets import TINY as DIFFUSION
 from palpate.diffusion.training import train_generator
 from palpate.encoders import contrastive
 from palpate.encoders.contrastive import (
@@ -196,7 +197,10 @@ def test_a_batch_of_one_and_one_sample_are_rejected(world, clip, tmp_path):
     one = Split.from_ids(train=world.ids[:1])
     with pytest.raises(PalpateError, match="must hold two samples"):
         train_tactile(world, one, clip, TINY, tmp_path, device="cpu")
-    for batch, must in ((1, "`batch` must be at least 2"), (0, "`batch` must be at least 1")):
+    for batch, must in (
+        (1, "`tactile_course.batch` must be at least 2"),
+        (0, "`batch` must be at least 1"),
+    ):
         preset = quick(tactile_course=replace(TINY.tactile_course, batch=batch))
         with pytest.raises(PalpateError, match=must):
             train_tactile(world, by_video(world), clip, preset, tmp_path, device="cpu")
@@ -210,7 +214,7 @@ def test_vision_and_text_are_not_trained_on_one_row(world, tmp_path):
     one = [{**r, "vision": None} if k else r for k, r in enumerate(world.table.to_dicts())]
     with pytest.raises(PalpateError, match=r"must hold two photos.*Got one, v0/0"):
         train("one", Manifest.from_rows(one, world.root))
-    with pytest.raises(PalpateError, match="`clip_batch_size` must be at least 2"):
+    with pytest.raises(PalpateError, match="`clip_course.batch` must be at least 2"):
         train("batch", course=replace(TINY.clip_course, batch=1))
     for change in ({"keep": "best"}, {"patience": 1}):
         with pytest.raises(PalpateError, match="must keep its last weights and run to its end"):
@@ -231,13 +235,15 @@ def test_a_test_part_without_materials_or_tactile_images_costs_no_training(world
 def test_what_needs_a_held_out_part_is_rejected_without_one(world, clip, tmp_path):
     for change in ({"keep": "best"}, {"patience": 1}):
         preset = quick(tactile_course=replace(TINY.tactile_course, **change))
-        with pytest.raises(PalpateError, match=f"`{next(iter(change))}` needs a part val"):
+        with pytest.raises(
+            PalpateError, match=f"`tactile_course.{next(iter(change))}` needs a part val"
+        ):
             train_tactile(world, by_video(world), clip, preset, tmp_path, device="cpu")
 
 
 @pytest.mark.parametrize("change", [{"crop": 5}, {"crop": -1}, {"gain": -0.1}])
 def test_views_out_of_range(change):
-    with pytest.raises(PalpateError, match=f"`augment_{next(iter(change))}` must lie in"):
+    with pytest.raises(PalpateError, match=f"`{next(iter(change))}` must lie in"):
         Augment(**change)
 
 
@@ -477,9 +483,8 @@ def test_a_vision_encoder_without_text_is_a_partner(world, tmp_path):
     assert encoders.modalities == ["vision", "tactile"]
     with pytest.raises(PalpateError, match=r"`clip` must have text and vision\. Got no text"):
         train_generator(world, by_video(world), encoders, preset="tiny", steps=1)
-    alone = train_generator(
-        world, by_video(world), encoders, preset="tiny", steps=1, source="vision"
-    )
+    photos = replace(DIFFUSION, condition=replace(DIFFUSION.condition, source="vision"))
+    alone = train_generator(world, by_video(world), encoders, preset=photos, steps=1)
     assert alone.training["text_source"] is None
     assert len(alone([str(p) for p in world.paths("vision")[:2]], gel=None).images) == 2
     vision, tactile = (embed(world, encoders, side).features for side in encoders.modalities)

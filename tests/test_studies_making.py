@@ -8,7 +8,7 @@ import polars as pl
 from palpate.core import Split
 from palpate.data.images import read_image
 from palpate.data.manifest import Manifest
-from palpate.diffusion.autoencoders import load_autoencoder
+from palpate.diffusion.autoencoder import load_autoencoder
 from palpate.encoders.embed import texts_of
 from palpate.studies import making
 from palpate.studies.graph import Work

@@ -18,10 +18,11 @@ from torch.nn.functional import conv2d, group_norm, interpolate, pad, silu
 
 from palpate.diffusion.autoencoder import LatentStats
 from palpate.diffusion.autoencoder_training import build_autoencoder
-from palpate.diffusion.denoiser import Denoiser, build_unet
+from palpate.diffusion.denoiser import Denoiser
 from palpate.diffusion.options import ConditionPolicy
 from palpate.diffusion.pipeline import TactilePipeline
 from palpate.diffusion.presets import TINY
+from palpate.diffusion.unet import build_unet
 from palpate.encoders import models
 from palpate.encoders.contrastive import new_clip
 from palpate.encoders.encoder_set import EncoderSet, Preprocess, new_tactile

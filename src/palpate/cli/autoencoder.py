@@ -29,7 +29,7 @@ def run(options: Options, terminal: Terminal) -> dict[str, Any]:
     require_extra("palpate train autoencoder")
     preset = PRESETS["train autoencoder"].preset(options.preset, options.settings)
     options.require_data()
-    from palpate.diffusion.autoencoders import train_autoencoder
+    from palpate.diffusion.autoencoder_training import train_autoencoder
 
     with terminal.progress() as progress:
         model = train_autoencoder(

@@ -67,8 +67,8 @@ def run(options: Options, terminal: Terminal) -> dict[str, Any]:
         return {"missing": images.missing, "evaluations": images.evaluations}
     facts: dict[str, Any] = {
         "image" if images.folder is None else "folder": str(options.output),
-        "images": len(images.ids),
-        "made_now": images.made,
+        "images": len(images.files),
+        "made_now": images.new,
         "skipped": len(images.skipped),
         "model": options.model,
         "pipeline": images.settings["pipeline"],

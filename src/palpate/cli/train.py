@@ -58,11 +58,10 @@ def run(options: Options, terminal: Terminal) -> dict[str, Any]:
             options.data,
             options.split,
             options.clip,
-            preset=preset,
+            preset=preset.with_steps(options.steps),
             autoencoder=options.autoencoder,
             start=options.start,
             background=options.background,
-            steps=options.steps,
             device=options.machine.device,
         )
         return print_plan(terminal, f"Plan of {options.output}", plan)

@@ -11,17 +11,18 @@ from typing import TYPE_CHECKING
 from palpate._lazy import import_name
 
 if TYPE_CHECKING:
-    from palpate.diffusion.autoencoders import train_autoencoder
-    from palpate.diffusion.generation import Generated, generate
+    from palpate.diffusion.autoencoder_training import train_autoencoder
+    from palpate.diffusion.generated import Generated
+    from palpate.diffusion.generation import generate
     from palpate.diffusion.pipeline import TactilePipeline
     from palpate.diffusion.training import train_generator
 
 __all__ = ["Generated", "TactilePipeline", "generate", "train_autoencoder", "train_generator"]
 _MODULES = {
-    "Generated": "generation",
+    "Generated": "generated",
     "TactilePipeline": "pipeline",
     "generate": "generation",
-    "train_autoencoder": "autoencoders",
+    "train_autoencoder": "autoencoder_training",
     "train_generator": "training",
 }
 

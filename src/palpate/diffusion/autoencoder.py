@@ -34,7 +34,15 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.nn.functional import pixel_shuffle, pixel_unshuffle, silu
 
-from palpate.core import PalpateError, digest_file, digest_json, read_json, read_record, write_json
+from palpate.core import (
+    PalpateError,
+    digest_file,
+    digest_json,
+    read_json,
+    read_record,
+    require,
+    write_json,
+)
 from palpate.diffusion.compvis import read_compvis
 from palpate.encoders.models import (
     architecture,
@@ -90,6 +98,11 @@ class Autoencoder(nn.Module):
         return int(config["vq_embed_dim"] or config["latent_channels"])
 
     @property
+    def gel_channels(self) -> int:
+        """Channels that a denoiser w/ BG sees of the gel: those of its latent."""
+        return self.channels
+
+    @property
     def digest(self) -> str:
         """SHA-256 of patch, architecture and weights."""
         weights = digest_tensors(self.net.state_dict())
@@ -103,23 +116,27 @@ class Autoencoder(nn.Module):
     def image(self, latents: Tensor, *, quantize: bool = True) -> tuple[Tensor, Tensor]:
         """Decode latents to images (n, 3, h, w) near [-1, 1]; return them and the codebook loss."""
         decode: Any = self.net.decode
-        made, loss = decode(latents, force_not_quantize=not quantize, return_dict=False)
-        return pixel_shuffle(made, self.patch), loss
+        patches, loss = decode(latents, force_not_quantize=not quantize, return_dict=False)
+        return pixel_shuffle(patches, self.patch), loss
 
     @torch.no_grad()
-    def encode(self, images: NDArray[np.uint8], batch: int = 32) -> Tensor:
+    def encode(
+        self,
+        images: NDArray[np.uint8],
+        background: NDArray[np.uint8] | None = None,
+        batch: int = 32,
+    ) -> Tensor:
         """Encode bytes (n, h, w, 3) to float32 unquantized latents on the CPU.
+
+        ``background``, the gels, is not read.
 
         Raises:
             PalpateError: if height or width is no multiple of the factor.
         """
         height, width = images.shape[1:3]
-        if height % self.factor or width % self.factor:
-            must, got = (
-                f"must have sides that are multiples of {self.factor}",
-                f"{height} x {width}",
-            )
-            raise PalpateError(must, got, "Resize or crop them first", argument="images")
+        fits = height % self.factor == width % self.factor == 0
+        must, got = f"must have sides that are multiples of {self.factor}", f"{height} x {width}"
+        require(fits, "images", must, got, fix="Resize or crop them first")
         device = next(self.parameters()).device
         parts = [torch.empty(0, self.channels, height // self.factor, width // self.factor)]
         for start in range(0, len(images), batch):
@@ -128,8 +145,10 @@ class Autoencoder(nn.Module):
         return torch.cat(parts)
 
     @torch.no_grad()
-    def decode(self, latents: Tensor, batch: int = 32) -> NDArray[np.uint8]:
-        """Latents (n, c, h, w), quantized first -> bytes (n, f h, f w, 3)."""
+    def decode(
+        self, latents: Tensor, background: NDArray[np.uint8] | None = None, batch: int = 32
+    ) -> NDArray[np.uint8]:
+        """Latents (n, c, h, w), quantized first -> bytes (n, f h, f w, 3); see :meth:`encode`."""
         device = next(self.parameters()).device
         height, width = (self.factor * side for side in latents.shape[2:])
         parts = [np.empty((0, height, width, 3), np.uint8)]
@@ -249,6 +268,11 @@ class BackgroundAutoencoder(ModelMixin, ConfigMixin):
         return int(self.config["channels"])
 
     @property
+    def gel_channels(self) -> int:
+        """Channels that a denoiser w/ BG sees of the gel, see :meth:`gel`."""
+        return 3 * self.factor**2
+
+    @property
     def digest(self) -> str:
         """SHA-256 of the weights."""
         return digest_tensors(self.state_dict())
@@ -270,9 +294,10 @@ class BackgroundAutoencoder(ModelMixin, ConfigMixin):
 
     @torch.no_grad()
     def encode(
-        self, images: NDArray[np.uint8], background: NDArray[np.uint8], batch: int = 32
+        self, images: NDArray[np.uint8], background: NDArray[np.uint8] | None, batch: int = 32
     ) -> Tensor:
-        """Encode bytes (n, h, w, 3) and their gels to float32 latents on the CPU."""
+        """Encode bytes (n, h, w, 3) and their gels, needed, to float32 latents on the CPU."""
+        assert background is not None
         parts = [
             torch.empty(0, self.channels, *(side // self.factor for side in images.shape[1:3]))
         ]
@@ -284,16 +309,17 @@ class BackgroundAutoencoder(ModelMixin, ConfigMixin):
 
     @torch.no_grad()
     def decode(
-        self, latents: Tensor, background: NDArray[np.uint8], batch: int = 32
+        self, latents: Tensor, background: NDArray[np.uint8] | None, batch: int = 32
     ) -> NDArray[np.uint8]:
-        """Latents (n, c, h, w) on gels (n, f h, f w, 3) -> bytes (n, f h, f w, 3)."""
+        """Latents (n, c, h, w) on gels (n, f h, f w, 3), needed -> bytes (n, f h, f w, 3)."""
+        assert background is not None
         parts = [np.empty((0, *background.shape[1:]), np.uint8)]
         for start in range(0, len(latents), batch):
             gray = _gray(background[start : start + batch], self.device)
-            made = self.residual(
+            residual = self.residual(
                 latents[start : start + batch].to(gray), self.inputs(gray, gray)[1]
             )
-            back = torch.einsum("ij,nihw->njhw", self.colors, made.float() * self.spread)
+            back = torch.einsum("ij,nihw->njhw", self.colors, residual.float() * self.spread)
             parts.append(to_bytes((gray + back) / 127.5 - 1))
         return np.concatenate(parts)
 
@@ -363,8 +389,8 @@ def load_autoencoder(source: str | Path) -> AnyAutoencoder:
     must = f"The autoencoder {source} must be a diffusers VQModel, or of palpate"
     if kind not in KINDS:
         raise PalpateError(must, f"{kind or 'no'} model in {config.name}", FIX)
-    options = {"low_cpu_mem_usage": False, "local_files_only": name == str(root)}
-    net = load_model(KINDS[kind], name, must, FIX, **options)
+    local = name == str(root)
+    net = load_model(KINDS[kind], name, must, FIX, low_cpu_mem_usage=False, local_files_only=local)
     if not note.is_file():
         called = str(source) if is_hub_id(source) else root.resolve().name
         return Autoencoder(net, card=_foreign(called, called, stated(root)["license"])).eval()
@@ -378,9 +404,8 @@ def load_autoencoder(source: str | Path) -> AnyAutoencoder:
     else:
         must, fix = f"patch in {note} must be a whole number from 1", "Copy the folder again"
         raise PalpateError(must, repr(about["patch"]), fix)
-    if model.digest != about["digest"]:
-        must, fix = f"The weights in {source} must match palpate.json", "Copy the folder again"
-        raise PalpateError(must, "other weights", fix)
+    must, fix = f"The weights in {source} must match palpate.json", "Copy the folder again"
+    require(model.digest == about["digest"], None, must, "other weights", fix=fix)
     return model
 
 

@@ -9,23 +9,24 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from contextlib import suppress
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
-from palpate.core import FeatureSet, PalpateError, Progress, Split, quiet
+from palpate.core import FeatureSet, PalpateError, Progress, Split, quiet, require
 from palpate.data.images import cached_images
 from palpate.data.manifest import Manifest
 from palpate.diffusion.autoencoder import AnyAutoencoder, BackgroundAutoencoder
-from palpate.diffusion.autoencoder_training import measure_reconstruction, some_whole
 from palpate.diffusion.no_contact import gels_of, has_gels
 from palpate.encoders.embed import embed_images
 from palpate.encoders.encoder_set import EncoderSet
 from palpate.encoders.models import pick_device
 from palpate.encoders.rows import evenly
+from palpate.metrics.images import per_image
 from palpate.metrics.probe import fit_probe, material_accuracy
 from palpate.metrics.tactile import tmmd
 from palpate.training.processes import place
@@ -34,7 +35,57 @@ from palpate.training.processes import place
 SCORED, FITTED = 1000, 4000
 
 
-def judge_of(judge: EncoderSet | str | Path | None, device: str = "cpu") -> EncoderSet | None:
+@dataclass(frozen=True)
+class Reconstruction:
+    """How well an autoencoder reconstructs images that it was not trained on.
+
+    Attributes:
+        n: images.
+        psnr: mean over images of 10 log10(1 / MSE), values in [0, 1].
+        ssim: mean structural similarity (Wang et al. 2004: Gaussian window of 11, sigma 1.5, range
+            1).
+    """
+
+    n: int
+    psnr: float
+    ssim: float
+
+
+@torch.no_grad()
+def measure_reconstruction(
+    autoencoder: AnyAutoencoder,
+    images: NDArray[np.uint8],
+    background: NDArray[np.uint8] | None = None,
+    batch: int = 64,
+) -> Reconstruction:
+    """Score reconstructions of bytes (n, h, w, 3), a batch at a time.
+
+    ``background`` holds the gel of each image, for an autoencoder that is given them.
+    """
+    rows: list[NDArray[np.float64]] = []
+    for start in range(0, len(images), batch):
+        part = slice(start, start + batch)
+        pixels = np.asarray(images[part])
+        gels = None if background is None else background[part]
+        z = autoencoder.encode(pixels, gels, batch=batch)
+        # Rounded to bytes first: what is scored is the image that a user gets.
+        decoded = autoencoder.decode(z, gels, batch=batch)
+        scored = [per_image(name, decoded, pixels) for name in ("PSNR", "SSIM")]
+        rows.append(np.stack([score.values for score in scored]))
+    psnr, ssim = map(float, np.concatenate(rows, axis=1).mean(axis=1))
+    return Reconstruction(len(images), psnr, ssim)
+
+
+def some_whole(part: Manifest, columns: Sequence[str], n: int) -> Manifest:
+    """Up to ``n`` samples, evenly, of those that have an image in each of these columns."""
+    cells = zip(part.ids, *(part.column(name) for name in columns), strict=True)
+    complete = [name for name, *images in cells if all(images)]
+    return part.take([complete[k] for k in evenly(len(complete), n)])
+
+
+def judge_of(
+    judge: EncoderSet | str | Path | None, device: str | torch.device = "cpu"
+) -> EncoderSet | None:
     """Load the encoders that judge, unless None or ``"none"``: before a training, not to lose it.
 
     Raises:
@@ -43,9 +94,8 @@ def judge_of(judge: EncoderSet | str | Path | None, device: str = "cpu") -> Enco
     if judge is None or judge == "none":
         return None
     judge = judge if isinstance(judge, EncoderSet) else EncoderSet.load(judge)
-    if "tactile" not in judge.modalities:
-        fix = "Choose others, palpate/mini, or none"
-        raise PalpateError("must have a tactile encoder", "none", fix, argument="judge")
+    fits, fix = "tactile" in judge.modalities, "Choose others, palpate/mini, or none"
+    require(fits, "judge", "must have a tactile encoder", "none", fix=fix)
     return judge.to(pick_device(device))
 
 
@@ -72,20 +122,19 @@ def measure_ceiling(
         progress: called while the work goes on.
 
     Returns:
-        The fields of :class:`~palpate.diffusion.autoencoder_training.Reconstruction`; with a judge
+        The fields of :class:`Reconstruction`; with a judge
         its digest, ``tmmd`` with its 95 % interval, and ``accuracy_real`` and ``accuracy`` of the
         material. What the data cannot give, for want of materials or of samples, is left out.
         ``not_judged`` counts the images that the judge was trained on, which it leaves out, and
         ``not_measured`` says what was wrong with a file. None also on all processes but the first.
     """
-    given = isinstance(autoencoder, BackgroundAutoencoder)
-    train, others = manifest.part(split, "train"), manifest.part(split, "val", "test")
-    needed = ["tactile", "background"] if given and has_gels(others) else ["tactile"]
-    others = some_whole(others, needed, SCORED)
-    if not len(others) or place()[0]:
+    train, held = manifest.part(split, "train"), manifest.part(split, "val", "test")
+    gels = isinstance(autoencoder, BackgroundAutoencoder) and has_gels(held)
+    held = some_whole(held, ["tactile", "background"] if gels else ["tactile"], SCORED)
+    if not len(held) or place()[0]:
         return None
     try:
-        return _measured(autoencoder, train, others, size, judge, cache, progress)
+        return _measured(autoencoder, train, held, size, judge, cache, progress)
     except PalpateError as error:  # of a file: no reason to lose the training
         return {"not_measured": str(error)}
 
@@ -93,50 +142,49 @@ def measure_ceiling(
 def _measured(  # noqa: PLR0917 - the arguments of measure_ceiling
     autoencoder: AnyAutoencoder,
     train: Manifest,
-    others: Manifest,
+    held: Manifest,
     size: int,
     judge: EncoderSet | None,
     cache: Path | None,
     progress: Progress,
 ) -> dict[str, Any]:
-    held = None
+    ground = None
     if isinstance(autoencoder, BackgroundAutoencoder):
         gels = gels_of(train, size, cache, progress)  # the stock gel is that of the training
-        held = gels_of(others, size, cache, progress, like=gels)
-    images = np.asarray(cached_images(others, "tactile", size, cache, progress))
-    found: dict[str, Any] = asdict(measure_reconstruction(autoencoder, images, held))
+        ground = gels_of(held, size, cache, progress, like=gels)
+    images = np.asarray(cached_images(held, "tactile", size, cache, progress))
+    scores: dict[str, Any] = asdict(measure_reconstruction(autoencoder, images, ground))
     if judge is None:
-        return found
-    found["judge"] = judge.digest("tactile")
-    seen = judge.saw("tactile", others, progress=progress)
+        return scores
+    scores["judge"] = judge.digest("tactile")
+    seen = judge.saw("tactile", held, progress=progress)
     if seen.any():
-        found["not_judged"] = int(seen.sum())
+        scores["not_judged"] = int(seen.sum())
         if seen.all():
-            return found
-        rest = [name for name, known in zip(others.ids, seen, strict=True) if not known]
-        others, images = others.take(rest), images[~seen]
-        held = None if held is None else held[~seen]
+            return scores
+        new = [name for name, old in zip(held.ids, seen, strict=True) if not old]
+        held, images = held.take(new), images[~seen]
+        ground = None if ground is None else ground[~seen]
 
     def features(part: Manifest, pixels: NDArray[np.uint8]) -> FeatureSet:
         labels, groups = _words(part.column("material")), _words(part.column("video"))
         rows = embed_images(pixels, judge, progress=progress)
-        return FeatureSet(part.ids, rows, labels, groups, found["judge"])
+        return FeatureSet(part.ids, rows, labels, groups, scores["judge"])
 
-    given: tuple[Any, ...] = () if held is None else (held,)
-    made = autoencoder.decode(autoencoder.encode(images, *given), *given)
-    real, ours = features(others, images), features(others, made)
+    decoded = autoencoder.decode(autoencoder.encode(images, ground), ground)
+    real, ours = features(held, images), features(held, decoded)
     with suppress(PalpateError):  # too few samples or videos
         score = tmmd(ours, real)
-        found |= {"tmmd": score.value, "tmmd_interval": score.interval}
+        scores |= {"tmmd": score.value, "tmmd_interval": score.interval}
     if len({*train.column("material")} - {None}) > 1:
         some = evenly(len(train), FITTED)
-        known = np.asarray(cached_images(train, "tactile", size, cache, progress)[some])
+        pixels = np.asarray(cached_images(train, "tactile", size, cache, progress)[some])
         with suppress(PalpateError):  # no material outside of train
-            fitted = features(train.take([train.ids[k] for k in some]), known)
+            fitted = features(train.take([train.ids[k] for k in some]), pixels)
             probe = fit_probe(fitted)
-            found["accuracy_real"] = material_accuracy(fitted, real, probe=probe).value
-            found["accuracy"] = material_accuracy(fitted, ours, probe=probe).value
-    return {name: value for name, value in found.items() if value is not None}
+            scores["accuracy_real"] = material_accuracy(fitted, real, probe=probe).value
+            scores["accuracy"] = material_accuracy(fitted, ours, probe=probe).value
+    return {name: value for name, value in scores.items() if value is not None}
 
 
 def _words(column: Sequence[Any]) -> list[str] | None:

@@ -30,7 +30,7 @@ import torch
 from diffusers.models.autoencoders.vq_model import VQModel
 from torch import Tensor
 
-from palpate.core import PalpateError
+from palpate.core import PalpateError, require
 from palpate.encoders.models import read_weights
 
 PREFIX = "first_stage_model."
@@ -100,9 +100,9 @@ def _geometry(path: Path, state: Mapping[str, Tensor]) -> dict[str, Any]:
 
     levels = max(1, count(r"encoder\.down\.(\d+)\."))
     widths = [size(f"encoder.down.{i}.block.0.conv1.weight", 0) for i in range(levels)]
-    if any(width % GROUPS for width in widths):
-        must = f"{path} must have levels whose widths are multiples of {GROUPS}"
-        raise PalpateError(must, ", ".join(map(str, widths)), FIX)
+    fits = not any(width % GROUPS for width in widths)
+    must = f"{path} must have levels whose widths are multiples of {GROUPS}"
+    require(fits, None, must, ", ".join(map(str, widths)), fix=FIX)
     attends = [f"encoder.down.{i}.attn.0.q.weight" in state for i in range(levels)]
     back = [f"decoder.up.{i}.attn.0.q.weight" in state for i in reversed(range(levels))]
     book = "quantize.embedding.weight"
@@ -152,8 +152,7 @@ def _require_equal(
         ],
     }
     problems = [
-        f"{len(names)} {what}: {', '.join(names[:SHOWN])}" for what, names in kinds.items() if names
+        f"{len(names)} {kind}: {', '.join(names[:SHOWN])}" for kind, names in kinds.items() if names
     ]
-    if problems:
-        must = f"{path} must hold the weights of one VQModel and no other"
-        raise PalpateError(must, "; ".join(problems), FIX)
+    must = f"{path} must hold the weights of one VQModel and no other"
+    require(not problems, None, must, "; ".join(problems), fix=FIX)

@@ -1,23 +1,118 @@
-"""Latents and patches of a data set, encoded once into memory maps that training reads."""
+"""A part of a data set, encoded once into memory maps that training reads: latents of its tactile
+images, and what conditions on its photos and texts.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
 from palpate.core import Progress, atomic_path, digest_json, quiet, read_json, short, write_json
-from palpate.data.images import image_stamp
+from palpate.data.images import cached_images, image_stamp
 from palpate.data.manifest import Manifest
-from palpate.diffusion.autoencoder import AnyAutoencoder
-from palpate.encoders.embed import exact
+from palpate.diffusion.autoencoder import AnyAutoencoder, BackgroundAutoencoder, LatentStats
+from palpate.diffusion.denoiser import inputs_of
+from palpate.diffusion.denoiser_training import Backgrounds
+from palpate.diffusion.no_contact import gels_of
+from palpate.diffusion.options import ConditionPolicy
+from palpate.encoders.embed import embed, exact
 from palpate.encoders.encoder_set import EncoderSet
+from palpate.encoders.models import digest_tensors
 from palpate.encoders.preprocess import prepared_images, to_unit
+from palpate.training.run import TrainingRun
 
 CACHE_FORMAT = "palpate-latents/1"
+
+
+@dataclass(frozen=True)
+class Encoded:
+    """A part of the data as the frozen models see it.
+
+    Attributes:
+        conditions: embeddings (n, d) by source; ``patches``, states (n, k, w); ``photos`` of GVST
+            (n, s, s, 3).
+        latents: (n, c, h, w), not normalized, in memory or mapped.
+        gels: the no-contact images (n, s, s, 3), where they are needed.
+        gel_latents: of an autoencoder that codes the gel with the image.
+    """
+
+    conditions: Mapping[str, NDArray[Any]]
+    latents: NDArray[np.float32]
+    gels: NDArray[np.uint8] | None = None
+    gel_latents: NDArray[np.float32] | None = None
+
+    def backgrounds(self, autoencoder: AnyAutoencoder, stats: LatentStats) -> Backgrounds:
+        """What the denoiser of the variant w/ BG sees."""
+        gels: Any = self.gels
+        latents: Any = self.gel_latents
+        if isinstance(autoencoder, BackgroundAutoencoder):
+            return lambda rows: autoencoder.gel(gels[rows])
+        return lambda rows: stats.normalize(torch.as_tensor(latents[rows]))
+
+
+def encode_part(
+    part: Manifest,
+    policy: ConditionPolicy,
+    size: int,
+    run: TrainingRun,
+    *,
+    encoders: EncoderSet | None,
+    autoencoder: AnyAutoencoder,
+    columns: Sequence[str],
+    like: NDArray[np.uint8] | None = None,
+) -> Encoded:
+    """Encode a part, or find it in the cache.
+
+    Args:
+        part: samples.
+        policy: says what conditions.
+        size: side of the tactile images [px].
+        run: its cache, else its folder, holds the memory maps.
+        encoders: of photos and texts, where the policy needs them.
+        autoencoder: of the tactile images.
+        columns: of the images: ``tactile``, and ``background`` where the gels are used.
+        like: gels of the train part, of which the first is the stock gel.
+    """
+    cache, progress = run.cache, run.progress
+    folder, own = cache or run.folder, isinstance(autoencoder, BackgroundAutoencoder)
+    gels = None
+    if own:
+        gels = gels_of(part, size, cache, progress, like)
+    elif "background" in columns:
+        gels = cached_images(part, "background", size, cache, progress)
+    images = cached_images(part, "tactile", size, cache, progress)
+    stamps = [image_stamp(part, column) for column in columns]
+    if own and gels is not None:  # the stock gel is that of train
+        stamps.append(digest_tensors({"gel": torch.from_numpy(np.array(gels[0]))}))
+    key = digest_json([part.digest, *stamps, size])
+    store = folder / f"latents-{short(digest_json([key, autoencoder.digest]))}"
+    conditions: dict[str, NDArray[Any]] = {}
+    if encoders is not None:
+        for s in policy.modalities:
+            conditions[s] = embed(part, encoders, s, cache=cache, progress=progress).features
+        if "patches" in inputs_of(policy):
+            conditions["patches"] = encode_patches(
+                part, encoders, policy.patches, folder=folder, progress=progress
+            )
+    if "photos" in inputs_of(policy):
+        conditions["photos"] = cached_images(part, "vision", policy.photo_size, cache, progress)
+
+    def code(pixels: NDArray[np.uint8], ground: NDArray[np.uint8] | None, name: str) -> Any:
+        target = store / name
+        return encode_latents(
+            autoencoder, pixels, ground, ids=part.ids, folder=target, key=key, progress=progress
+        )
+
+    latents = code(images, gels if own else None, "")
+    return Encoded(
+        conditions, latents, gels, None if gels is None or own else code(gels, None, "background")
+    )
 
 
 def encode_latents(
@@ -48,12 +143,12 @@ def encode_latents(
     """
 
     def code(rows: slice) -> NDArray[np.float32]:
-        gels = () if background is None else (background[rows],)
-        return autoencoder.encode(images[rows], *gels, batch=batch).numpy()
+        gels = None if background is None else background[rows]
+        return autoencoder.encode(images[rows], gels, batch=batch).numpy()
 
     about = {"key": digest_json([key, autoencoder.digest]), "ids": list(ids)}
-    how: dict[str, Any] = {"batch": batch, "progress": progress, "what": "encoding tactile images"}
-    return _mapped(folder / "latents", about, code, **how)
+    task = "encoding tactile images"
+    return _mapped(folder / "latents", about, code, batch=batch, progress=progress, task=task)
 
 
 def encode_patches(
@@ -75,7 +170,7 @@ def encode_patches(
     key = [encoders.digest("vision"), image_stamp(part, "vision"), count]
     about = {"key": digest_json(key), "ids": part.ids}
     file = folder / f"vision-states-{short(digest_json(about))}"
-    return _mapped(file, about, code, progress=progress, what="encoding vision")
+    return _mapped(file, about, code, progress=progress, task="encoding vision")
 
 
 def _mapped(
@@ -85,7 +180,7 @@ def _mapped(
     *,
     batch: int = 32,
     progress: Progress,
-    what: str,
+    task: str,
 ) -> NDArray[Any]:
     """What ``code`` gives for all rows, as a memory map; computed once, while ``about`` is so."""
     data, note, n = file.with_suffix(".npy"), file.with_suffix(".json"), len(about["ids"])
@@ -99,7 +194,7 @@ def _mapped(
             for start in range(0, n, batch):
                 rows = slice(start, min(start + batch, n))
                 store[rows] = code(rows) if start else first
-                progress(what, rows.stop, n)
+                progress(task, rows.stop, n)
             store.flush()
         write_json(note, about)
     return np.load(data, mmap_mode="r", allow_pickle=False)

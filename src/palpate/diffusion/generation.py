@@ -1,27 +1,18 @@
-"""Photos or a data set -> tactile images: in memory, as one PNG, or as a folder with an index.
-
-::
-
-    OUT/images/<name>.png   one image per id; the name is made from the id
-    OUT/index.json          {"format", "complete", "settings", "digest", "notice",
-                             "images": {id: name}, "skipped": [...]}
+"""Photos or a data set -> tactile images: in memory, as one PNG, or as a folder.
 
 Each PNG carries as text its id, the settings as JSON, their digest, the digest of its photo, and
 the pipeline's notice. So a folder that was left half done is continued: images of the same settings
-and photo are kept, and the result has the same bytes as one made at a stretch. ``settings`` holds
-the pipeline's digest, seed, sampler and image size; a folder made with others is rejected.
+and photo are kept, and the result has the same bytes as one made at a stretch.
 """
 
 from __future__ import annotations
 
-import hashlib
 import os
-import re
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager, nullcontext
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, replace
 from functools import lru_cache
 from itertools import chain, islice
 from pathlib import Path
@@ -41,17 +32,14 @@ from palpate.core import (
     atomic_path,
     digest_file,
     digest_json,
-    inside,
     locked,
     quiet,
-    read_json,
-    reading_entry,
-    short,
+    require,
     write_json,
 )
 from palpate.core.digest import canonical_json
-from palpate.core.records import from_plain
 from palpate.data.images import BROKEN, SUFFIXES, check_image, read_image, square
+from palpate.diffusion.generated import FORMAT, Generated, file_name, old_index
 from palpate.encoders.models import FIX_MODEL, find_model
 
 if TYPE_CHECKING:  # torch takes seconds to import, and what is checked first needs none of it
@@ -61,7 +49,6 @@ if TYPE_CHECKING:  # torch takes seconds to import, and what is checked first ne
     from palpate.diffusion.options import SamplerOptions
     from palpate.diffusion.pipeline import TactilePipeline
 
-FORMAT = "palpate-generated/1"
 T = TypeVar("T")
 R = TypeVar("R")
 Photos = str | Path | Sequence[str | Path] | Mapping[str, Path]
@@ -72,83 +59,6 @@ FEW = 64
 THREADS = max(2, min(16, os.cpu_count() or 1))
 #: Gels kept in memory.
 GELS = 64
-
-
-@dataclass(frozen=True)
-class Generated:
-    """Generated tactile images.
-
-    Attributes:
-        folder: holds ``index.json`` and ``images``; None for one PNG or images in memory.
-        files: id -> file name below ``images``, or the path of one PNG; empty for images in memory.
-        settings: what the images were made with.
-        skipped: inputs that could not be used.
-        made: how many images this call made (0 when loaded).
-        notice: what everyone who looks at the images must know; often empty.
-        notes: what the caller must know: of the gel and the text that were given.
-        memory: id -> image, where no output was given.
-        missing: images that a dry run would make.
-        evaluations: of the network, for these.
-    """
-
-    folder: Path | None
-    files: Mapping[str, str]
-    settings: Mapping[str, Any] = field(default_factory=dict)
-    skipped: Sequence[Problem] = ()
-    made: int = 0
-    notice: str = ""
-    notes: Sequence[Note] = ()
-    memory: Mapping[str, Image.Image] = field(default_factory=dict[str, Image.Image], repr=False)
-    missing: int = 0
-    evaluations: int = 0
-
-    @property
-    def ids(self) -> list[str]:
-        """The ids, in the order of the index."""
-        return list(self.memory or self.files)
-
-    @property
-    def paths(self) -> list[Path]:
-        """One file per id, in the order of :attr:`ids`."""
-        return [self.path(i) for i in self.files]
-
-    @property
-    def images(self) -> list[Image.Image]:
-        """One PIL image per id, in the order of :attr:`ids`."""
-        return list(self.memory.values()) or [read_image(path) for path in self.paths]
-
-    def path(self, sample_id: str) -> Path:
-        """The file of one id.
-
-        Raises:
-            PalpateError: if there is none.
-        """
-        if sample_id not in self.files:
-            fix = "Generate it into the same folder"
-            raise PalpateError("Every requested id must have been generated", repr(sample_id), fix)
-        name = self.files[sample_id]
-        return Path(name) if self.folder is None else self.folder / "images" / name
-
-    @classmethod
-    def load(cls, folder: Path) -> Generated:
-        """Read a finished folder.
-
-        Raises:
-            PalpateError: if it has no index, was left half done, or names a file that is missing or
-                outside.
-        """
-        folder = Path(folder)
-        index = _read_index(folder)
-        if not index["complete"]:
-            fix = "Run the same command again: it continues"
-            raise PalpateError(f"{folder} must be finished", "a folder left half done", fix)
-        files = {name: inside(folder / "images", name) for name in index["images"].values()}
-        if bad := [name for name, path in files.items() if path is None or not path.is_file()]:
-            must = f"Every image of {folder / 'index.json'} must lie in images/"
-            raise PalpateError(must, f"{len(bad)} that do not, first {bad[0]!r}", "Generate again")
-        skipped = [Problem(**problem) for problem in index["skipped"]]
-        notice = index.get("notice", "")
-        return cls(folder, index["images"], index["settings"], skipped, notice=notice)
 
 
 @dataclass(frozen=True)
@@ -226,11 +136,22 @@ def generate(  # noqa: PLR0913 - a public verb, step by step
         ProblemsError: naming every unreadable photo, unless ``skip_bad``; of up to 32 photos before
             any image is made.
     """
-    _require_condition(photos, text, weight)
+    must, fix = "There must be at least one photo, or a text", "Pass one of them"
+    require(photos is not None or text is not None, None, must, "none", fix=fix)
+    require(0 <= weight <= 1, "weight", "must lie in [0, 1]", f"{weight:g}", fix="1 is the photo")
     output = None if output is None else Path(output)
-    device = _connected(device)
-    manifest, table = _photos(photos, split, part)
+    if int(os.environ.get("WORLD_SIZE", "1")) > 1:
+        from palpate.training.processes import connect
+
+        device = connect(device)
+    manifest, table = None if photos is None else _manifest(photos), dict[str, Path]()
+    if manifest is not None:
+        manifest = manifest if split is None else manifest.part(Split.load(split), part)
+    elif photos is not None:
+        table = photo_ids(cast("Photos", photos))
     paths = [*table.values()] if manifest is None else manifest.paths("vision")
+    must, fix = "There must be at least one photo", "Check the folder, the split or the names"
+    require(bool(paths) or photos is None, None, must, "none", fix=fix)
     single = _is_single(output, paths or [Path(str(text))])
     if photos is not None and not skip_bad:
         _require_readable(paths)
@@ -243,97 +164,75 @@ def generate(  # noqa: PLR0913 - a public verb, step by step
     settings |= {"text": text, "weight": None if photos is None else weight} if text else {}
     target = _Target(output, single, settings, model.notice)
     inputs = _inputs(model, manifest, table or {str(text): None}, gel)
-    how: dict[str, Any] = {"weight": weight, "seed": seed, "sampler": sampler, "texts": words}
-    notes = [*_text_notes(model, text), *_gel_notes(model, gel)]
-    run = _Run(model, inputs, target, how, skip_bad, notes)
-    return run.plan() if dry_run else run.make(progress)
+    notes: list[Note] = []
+    if text is not None and model.encoders is not None:
+        length, most = model.encoders.clip.length(text)
+        notes += [Note("text-cut", {"tokens": length, "most": most})] if length > most else []
+    if gel is not None:
+        from palpate.diffusion.gels import gel_notes
 
+        notes += gel_notes(Path(gel), model.gel)
+    if dry_run:
+        missing, evaluations = _planned(model, inputs, target, sampler)
+        planned = Generated(target.folder, {}, settings, missing=missing, evaluations=evaluations)
+        return replace(planned, notes=notes)
 
-def _text_notes(model: TactilePipeline, text: str | None) -> list[Note]:
-    if text is None or model.encoders is None:
-        return []
-    length, most = model.encoders.clip.length(text)
-    return [Note("text-cut", {"tokens": length, "most": most})] if length > most else []
-
-
-def _gel_notes(model: TactilePipeline, gel: str | Path | None) -> list[Note]:
-    if gel is None:
-        return []
-    from palpate.diffusion.gels import gel_notes
-
-    return gel_notes(Path(gel), model.gel)
-
-
-@dataclass(frozen=True)
-class _Run:
-    """A call of :func:`generate` that has been checked.
-
-    Attributes:
-        model: the pipeline.
-        inputs: one an image.
-        target: where the images go.
-        how: the other arguments of :meth:`TactilePipeline.sample`.
-        skip_bad: whether unreadable photos are skipped.
-        notes: what the caller must know.
-    """
-
-    model: TactilePipeline
-    inputs: Sequence[_Input]
-    target: _Target
-    how: Mapping[str, Any]
-    skip_bad: bool
-    notes: Sequence[Note] = ()
-
-    def make(self, progress: Progress) -> Generated:
-        """Make the images that are not there."""
-        target, batch = self.target, self.how["sampler"].batch
-        rank, size = target.place
-        reader = _Reader(self.model, self.inputs[rank::size], target, skip_bad=self.skip_bad)
-        ready = iter(reader)
-        first = next(ready, None)  # few photos are all read before anything is written
-        bad = target.gathered(reader.bad)
-        self._require_none(bad)
-        made: dict[str, bool] = {}
-        with target.writing():
-            rows = self._sampled(ready if first is None else chain([first], ready))
-            for one in _ahead(lambda row: target.keep(*row), rows, batch, 1):
-                made[one.item.id] = True
-                done = len(made) + reader.found + len(reader.bad)
-                progress("generating", done, len(reader.inputs))
-            bad, made = target.gathered(bad | reader.bad), target.gathered(made)
-            self._require_none(bad)
-            ids = [i.id for i in self.inputs if i.id not in bad]
-            result = target.finish(ids, [*bad.values()], len(made))
-        return replace(result, notes=self.notes)
-
-    def plan(self) -> Generated:
-        """Count what :meth:`make` would make; guidance takes two evaluations a step."""
-        target, sampler, scheduler = self.target, self.how["sampler"], self.model.scheduler
-        paths = [target.path(i.id) for i in self.inputs]
-        there = [i for i, path in zip(self.inputs, paths, strict=True) if path and path.is_file()]
-        missing = len(self.inputs) - sum(target.has(i.id, i.digest()) for i in there)
-        scheduler.set_timesteps(sampler.steps)
-        times = [float(t) / self.model.schedule.steps for t in scheduler.timesteps]
-        guided = sampler.guidance not in (0.0, 1.0)
-        count = len(times) + sum(t <= sampler.high for t in times if guided)
-        how: dict[str, Any] = {"missing": missing, "evaluations": missing * count}
-        return Generated(target.folder, {}, target.settings, notes=self.notes, **how)
-
-    def _sampled(self, ready: Iterator[_Ready]) -> Generator[tuple[_Ready, NDArray[np.uint8]]]:
-        while chunk := [*islice(ready, self.how["sampler"].batch)]:
+    def draw(ready: Iterator[_Ready]) -> Generator[tuple[_Ready, NDArray[np.uint8]]]:
+        while chunk := [*islice(ready, sampler.batch)]:
             rows: list[Any] = [one.condition for one in chunk if one.condition is not None]
             grounds = [one.ground for one in chunk if one.ground is not None]
-            images = self.model.sample(
+            images = model.sample(
                 None if not rows else cast("Tensor", rows[0].new_tensor(np.stack(rows))),
                 [one.item.id for one in chunk],
+                seed=seed,
+                texts=words,
+                weight=weight,
+                sampler=sampler,
                 background=np.stack(grounds) if grounds else None,
-                **self.how,
             )
             yield from zip(chunk, images, strict=True)
 
-    def _require_none(self, bad: Mapping[str, Problem]) -> None:
-        if bad and not self.skip_bad:
-            raise ProblemsError([*bad.values()], FIX_PHOTOS, example={"skip_bad": True})
+    rank, size = target.place
+    reader = _Reader(model, inputs[rank::size], target, skip_bad=skip_bad)
+    return replace(_generated(inputs, reader, draw, sampler.batch, progress), notes=notes)
+
+
+def _generated(
+    inputs: Sequence[_Input],
+    reader: _Reader,
+    draw: Callable[[Iterator[_Ready]], Iterator[tuple[_Ready, NDArray[np.uint8]]]],
+    batch: int,
+    progress: Progress,
+) -> Generated:
+    """Draw the images that are not there, and keep them."""
+    target, ready = reader.target, iter(reader)
+    first = next(ready, None)  # few photos are all read before anything is written
+    bad = target.gathered(reader.bad)
+    reader.require_none(bad)
+    new: dict[str, bool] = {}
+    with target.writing():
+        rows = draw(ready if first is None else chain([first], ready))
+        for one in _ahead(lambda row: target.keep(*row), rows, batch, 1):
+            new[one.item.id] = True
+            done = len(new) + reader.found + len(reader.bad)
+            progress("generating", done, len(reader.inputs))
+        bad, new = target.gathered(bad | reader.bad), target.gathered(new)
+        reader.require_none(bad)
+        ids = [i.id for i in inputs if i.id not in bad]
+        return target.finish(ids, [*bad.values()], len(new))
+
+
+def _planned(
+    model: TactilePipeline, inputs: Sequence[_Input], target: _Target, sampler: SamplerOptions
+) -> tuple[int, int]:
+    """Images to make and network evaluations; guidance takes two of these a step."""
+    paths = [target.path(i.id) for i in inputs]
+    there = [i for i, path in zip(inputs, paths, strict=True) if path and path.is_file()]
+    missing = len(inputs) - sum(target.has(i.id, i.digest()) for i in there)
+    model.scheduler.set_timesteps(sampler.steps)
+    times = [float(t) / model.schedule.steps for t in model.scheduler.timesteps]
+    guided = sampler.guidance not in (0.0, 1.0)
+    return missing, missing * (len(times) + sum(t <= sampler.high for t in times if guided))
 
 
 def _ahead(
@@ -353,15 +252,6 @@ def _ahead(
             pool.shutdown(wait=True, cancel_futures=True)
 
 
-def _connected(device: str) -> str:
-    """Join the other processes of ``torchrun``, if any; the device of this one."""
-    if int(os.environ.get("WORLD_SIZE", "1")) == 1:
-        return device
-    from palpate.training.processes import connect
-
-    return connect(device)
-
-
 def loaded(model: TactilePipeline | str | Path, device: str, progress: Progress) -> TactilePipeline:
     """The pipeline, loaded where it is a name or a folder."""
     if isinstance(model, str | Path):
@@ -372,41 +262,6 @@ def loaded(model: TactilePipeline | str | Path, device: str, progress: Progress)
     if isinstance(model, TactilePipeline):
         return model
     return TactilePipeline.from_pretrained(model, device=device)
-
-
-def _require_condition(photos: object, text: str | None, weight: float) -> None:
-    if photos is None and text is None:
-        must, fix = "There must be at least one photo, or a text", "Pass one of them"
-        raise PalpateError(must, "none", fix)
-    if not 0 <= weight <= 1:
-        raise PalpateError("must lie in [0, 1]", f"{weight:g}", "1 is the photo", argument="weight")
-
-
-def _photos(
-    photos: Manifest | Photos | None, split: Split | str | Path | None, part: str
-) -> tuple[Manifest | None, dict[str, Path]]:
-    """The samples of a manifest, or the photos by id."""
-    if photos is None:
-        return None, {}
-    manifest = _manifest(photos, split, part)
-    table = {} if manifest is not None else photo_ids(cast("Photos", photos))
-    if not (manifest.ids if manifest is not None else table):
-        must, fix = "There must be at least one photo", "Check the folder, the split or the names"
-        raise PalpateError(must, "none", fix)
-    return manifest, table
-
-
-@dataclass(frozen=True)
-class _Index:
-    """What ``index.json`` holds."""
-
-    format: str
-    complete: bool
-    settings: Mapping[str, Any]
-    digest: str
-    images: Mapping[str, str]
-    skipped: Sequence[Problem]
-    notice: str = ""
 
 
 class _Target:
@@ -426,7 +281,7 @@ class _Target:
             self.place = place()
         self.index: dict[str, Any] = {}
         if self.folder is not None:
-            index = _old_index(self.folder, settings, self.digest)
+            index = old_index(self.folder, settings, self.digest)
             head = {"format": FORMAT, "complete": False, "settings": settings}
             new = head | {"digest": self.digest, "images": {}, "skipped": []}
             self.index = (index or new) | {"notice": notice}
@@ -458,13 +313,13 @@ class _Target:
                 write_json(self.folder / "index.json", self.index)
             yield
 
-    def gathered(self, found: dict[str, T]) -> dict[str, T]:
-        """What all processes found; each of them has come this far."""
+    def gathered(self, table: dict[str, T]) -> dict[str, T]:
+        """The entries of all processes; each of them has come this far."""
         if self.place[1] == 1:
-            return found
+            return table
         from palpate.training.processes import merged
 
-        return merged(found)
+        return merged(table)
 
     def keep(self, one: _Ready, array: NDArray[np.uint8]) -> _Ready:
         """Keep one image, as a PNG that says what it is."""
@@ -473,9 +328,8 @@ class _Target:
             self.memory[one.item.id] = image
             return one
         text = PngImagePlugin.PngInfo()
-        made_with = canonical_json(self.settings)
         values = {"id": one.item.id, "settings": self.digest, "input": one.stamp}
-        values |= {"made-with": made_with, "notice": self.notice}
+        values |= {"made-with": canonical_json(self.settings), "notice": self.notice}
         for name, value in values.items():  # their order decides the bytes
             if value:
                 text.add_itxt(f"palpate.{name}", value)
@@ -483,7 +337,7 @@ class _Target:
             image.save(part, format="PNG", pnginfo=text)
         return one
 
-    def finish(self, ids: Sequence[str], skipped: Sequence[Problem], made: int) -> Generated:
+    def finish(self, ids: Sequence[str], skipped: Sequence[Problem], new: int) -> Generated:
         """Complete the index; all images of the target, earlier ones included."""
         files = {} if self.file is None else {i: str(self.file) for i in ids}
         if self.folder is not None:
@@ -492,7 +346,7 @@ class _Target:
             self.index |= {"complete": True, "images": files, "skipped": skips}
             if not self.place[0]:
                 write_json(self.folder / "index.json", self.index)
-        common = (self.settings, skipped, made, self.notice)
+        common = (self.settings, skipped, new, self.notice)
         return Generated(self.folder, files, *common, memory=self.memory)
 
 
@@ -509,36 +363,21 @@ def photo_ids(photos: Photos) -> dict[str, Path]:
         files = sorted(p for p in folder.rglob("*") if p.suffix.lower() in SUFFIXES and p.is_file())
         return {p.relative_to(folder).as_posix(): p for p in files}
     listed: Sequence[Any] = [photos] if isinstance(photos, str | Path) else list(photos)
-    if not all(isinstance(photo, str | Path) for photo in listed):
-        must, fix = "must be files", "Pass images in memory to a TactilePipeline"
-        raise PalpateError(must, "images in memory", fix, argument="photos")
+    files = all(isinstance(photo, str | Path) for photo in listed)
+    fix = "Pass images in memory to a TactilePipeline"
+    require(files, "photos", "must be files", "images in memory", fix=fix)
     paths = [Path(photo) for photo in listed]
     if len(paths) == 1 and paths[0].is_dir():
         return photo_ids(paths[0])
     table = {path.name: path for path in paths}
-    if len(table) < len(paths):
-        names = [path.name for path in paths]
-        twice = next(name for name in names if names.count(name) > 1)
-        must, fix = "must differ in name in a list", "Pass their common folder instead"
-        raise PalpateError(must, f"{twice!r} twice", fix, argument="photos")
+    twice = [name for name, count in Counter(path.name for path in paths).items() if count > 1]
+    must, fix = "must differ in name in a list", "Pass their common folder instead"
+    require(not twice, "photos", must, f"{', '.join(map(repr, twice[:1]))} twice", fix=fix)
     return table
 
 
-def file_name(sample_id: str) -> str:
-    """Return a safe file name: the plain characters of the id and a part of its SHA-256."""
-    plain = re.sub(r"[^A-Za-z0-9_-]+", "_", sample_id).strip("_")[:80]
-    return f"{plain or 'sample'}-{short(hashlib.sha256(sample_id.encode()).hexdigest())}.png"
-
-
-def _manifest(photos: Any, split: Split | str | Path | None, part: str) -> Manifest | None:
-    """The part of the manifest that ``photos`` is or names, or None for photos."""
-    manifest = _whole_manifest(photos)
-    if manifest is None or split is None:
-        return manifest
-    return manifest.part(Split.load(split), part)
-
-
-def _whole_manifest(photos: Any) -> Manifest | None:
+def _manifest(photos: Any) -> Manifest | None:
+    """The manifest that ``photos`` is or names, or None for photos."""
     if hasattr(photos, "columns"):
         from palpate.data.reading import load
 
@@ -557,23 +396,20 @@ def _is_single(output: Path | None, paths: Sequence[Path]) -> bool:
     """Return whether the output is one image, in memory or a PNG; check that it may be written."""
     if output is None or output.suffix.lower() not in SUFFIXES:
         if output is not None:
-            _old_index(output)
+            old_index(output)
         return output is None and len(paths) == 1
-    if output.suffix.lower() != ".png":
-        fix = "PNG loses nothing"
-        raise PalpateError("must be a .png or a folder", str(output), fix, argument="output")
-    if output.is_dir() or len(paths) != 1:
-        got = f"the folder {output}" if output.is_dir() else f"{output} for {len(paths)} photos"
-        fix = f"Name a folder, e.g. {output.stem}/"
-        raise PalpateError("with .png must be the file of one image", got, fix, argument="output")
+    must, name, fix = "must be a .png or a folder", str(output), "PNG loses nothing"
+    require(output.suffix.lower() == ".png", "output", must, name, fix=fix)
+    got = f"the folder {output}" if output.is_dir() else f"{output} for {len(paths)} photos"
+    must, fix = "with .png must be the file of one image", f"Name a folder, e.g. {output.stem}/"
+    require(not output.is_dir() and len(paths) == 1, "output", must, got, fix=fix)
     if output.exists():
-        if paths[0].exists() and output.samefile(paths[0]):
-            fix = "Choose another name"
-            raise PalpateError("must not replace an input", str(output), fix, argument="output")
+        fix, replaces = "Choose another name", paths[0].exists() and output.samefile(paths[0])
+        require(not replaces, "output", "must not replace an input", name, fix=fix)
         with open(output, "rb") as file:
-            if b"palpate.settings" not in file.read(4096):
-                must, got = "must be new, or an image that palpate generated", f"{output}"
-                raise PalpateError(must, got, "Choose another name", argument="output")
+            own = b"palpate.settings" in file.read(4096)
+        must = "must be new, or an image that palpate generated"
+        require(own, "output", must, name, fix=fix)
     return True
 
 
@@ -582,14 +418,10 @@ def _require_readable(paths: Sequence[Path], argument: str = "photos") -> None:
         return
     reasons = ((path, check_image(path)) for path in paths)
     if bad := [Problem(str(path), "bad-image", reason) for path, reason in reasons if reason]:
-        if len(paths) == 1:
-            must, got = "must be an image that can be read", f"{paths[0]}: {bad[0].text}"
-            fix = (
-                "Save it anew, smaller if it is large, or pass another"
-                if paths[0].is_file()
-                else "Check the path"
-            )
-            raise PalpateError(must, got, fix, argument=argument)
+        fix = "Save it anew, smaller if it is large, or pass another"
+        fix = fix if paths[0].is_file() else "Check the path"
+        must, got = "must be an image that can be read", f"{paths[0]}: {bad[0].text}"
+        require(len(paths) > 1, argument, must, got, fix=fix)
         raise ProblemsError(bad, FIX_PHOTOS, example={"skip_bad": True})
 
 
@@ -613,19 +445,17 @@ def _inputs(
     pipeline: TactilePipeline,
     manifest: Manifest | None,
     photos: Mapping[str, Path | None],
-    given: str | Path | None,
+    gel: str | Path | None,
 ) -> list[_Input]:
     """One input per image; its gel where the pipeline uses one other than its stock gel."""
-    gel = None if given is None else Path(given)
-    if gel is not None and not pipeline.background:
-        must = "must be left out for a generator that codes the gel with the image"
-        raise PalpateError(must, str(gel), "Train one with the preset mini", argument="gel")
     if gel is not None:
+        gel, must = Path(gel), "must be left out for a generator that codes the gel with the image"
+        require(pipeline.background, "gel", must, str(gel), fix="Train one with the preset mini")
         _require_readable([gel], "gel")
     if manifest is None:
-        if pipeline.background and gel is None and pipeline.gel is None:
-            must, got = "must be given for a generator w/ BG", "photos alone"
-            raise PalpateError(must, got, "Or pass a manifest with backgrounds", argument="gel")
+        enough = not pipeline.background or gel is not None or pipeline.gel is not None
+        must, fix = "must be given for a generator w/ BG", "Or pass a manifest with backgrounds"
+        require(enough, "gel", must, "photos alone", fix=fix)
         return [_Input(i, path, gel) for i, path in photos.items()]
     grounds: Sequence[Path | None] = [gel] * len(manifest)
     if pipeline.background and gel is None:
@@ -633,38 +463,6 @@ def _inputs(
         grounds = manifest.paths("background") if own else grounds
     rows = zip(manifest.ids, manifest.paths("vision"), grounds, strict=True)
     return [_Input(*row) for row in rows]
-
-
-def _read_index(folder: Path) -> dict[str, Any]:
-    index = read_json(folder / "index.json", "index of generated images")
-    if not isinstance(index, dict) or index.get("format") != FORMAT:
-        must, fix = f"{folder} must hold generated images ({FORMAT})", "Choose another folder"
-        raise PalpateError(must, "another kind of folder", fix)
-    with reading_entry(folder / "index.json", "The index"):
-        from_plain(_Index, index)
-    return index
-
-
-def _old_index(
-    output: Path, settings: Mapping[str, Any] | None = None, digest: str = ""
-) -> dict[str, Any] | None:
-    """Return the index of an earlier run in ``output``; None where it is absent or empty.
-
-    Raises:
-        PalpateError: if other files are there, or images of other settings than those given.
-    """
-    if (output / "index.json").is_file():
-        index = _read_index(output)
-        if settings is not None and index["digest"] != digest:
-            old = index["settings"]
-            differ = [k for k in {**settings, **old} if settings.get(k) != old.get(k)]
-            must, got = "must hold images of the same settings", f"another {', '.join(differ)}"
-            raise PalpateError(must, got, "Choose another folder", argument="output")
-        return index
-    if output.exists() and (not output.is_dir() or any(output.iterdir())):
-        must, got = "must be empty or hold generated images", f"other files in {output}"
-        raise PalpateError(must, got, "Choose another folder", argument="output")
-    return None
 
 
 class _Reader:
@@ -689,6 +487,11 @@ class _Reader:
         self.bad: dict[str, Problem] = {}
         self.found = 0
         self._gel = lru_cache(GELS)(self._square)  # many samples share one
+
+    def require_none(self, bad: Mapping[str, Problem]) -> None:
+        """Raise ``ProblemsError`` for what could not be read and may not be skipped."""
+        if bad and not self.skip_bad:
+            raise ProblemsError([*bad.values()], FIX_PHOTOS, example={"skip_bad": True})
 
     def __iter__(self) -> Generator[_Ready]:
         from palpate.diffusion.pipeline import EMBED

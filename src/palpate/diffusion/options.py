@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, ClassVar, Literal
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -12,8 +12,6 @@ Source = Literal["text", "vision"]
 Sources = Literal["text", "vision", "both", "resnet"]
 SOURCES: tuple[Source, ...] = ("text", "vision")
 Method = Literal["ddim", "dpm"]
-#: Tokens of a photo: a map of 8 x 8.
-PHOTO_TOKENS = 64
 
 
 @dataclass(frozen=True)
@@ -46,6 +44,11 @@ class AutoencoderOptions:
     lr: float = 2e-3
     crop: int = 32
 
+    @property
+    def factor(self) -> int:
+        """Pixels of the image that a latent covers along one side."""
+        return self.patch * 2 ** (len(self.widths) - 1)
+
 
 @dataclass(frozen=True)
 class BackgroundOptions:
@@ -60,6 +63,8 @@ class BackgroundOptions:
         lr: peak learning rate.
         crop: side of the random crops, a multiple of 4; 0: whole images [px].
     """
+
+    factor: ClassVar[int] = 4
 
     channels: int = 8
     narrow: int = 48
@@ -133,6 +138,13 @@ class ConditionPolicy:
         if self.source == "resnet":
             return ()
         return SOURCES if self.source == "both" else (self.source,)
+
+    @property
+    def modalities(self) -> tuple[Source, ...]:
+        """The encoders that training needs: vision for the samples that it draws, at least."""
+        if not self.sources:
+            return ()
+        return SOURCES if "text" in self.sources else ("vision",)
 
 
 @dataclass(frozen=True)

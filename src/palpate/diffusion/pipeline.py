@@ -2,33 +2,11 @@
 
     c = vision encoder(photo);  z^T ~ N(0, 1);  z^0 = solver(guided eps_theta);  image = D(z^0)
 
-    eps = eps_theta(z, t, null) + s (eps_theta(z, t, c) - eps_theta(z, t, null))    (s = 7.5)
-
-Both passes of guidance run as one batch; s = 1 needs the conditional pass alone, s = 0 the
-unconditional one. The solvers are diffusers': DDIM without added noise (eta = 0; the paper's 200
-steps) and second-order DPM-Solver++ for few steps. The starting noise of a sample comes from
-``rng_for(seed, "noise", id)`` and batches always have one size (the last is filled up), so that an
-image depends on (seed, id) and not on what else is generated.
-
-::
-
-    model_index.json  the parts and their classes, as diffusers writes them
-    unet/          the denoiser, diffusers' format, and condition.safetensors (means, memory, maps)
-    autoencoder/   the autoencoder, diffusers' format, and its palpate.json
-    encoders/      the vision (and text) encoder whose embeddings the denoiser knows
-    scheduler/     scheduler_config.json, diffusers' format: for programs that read only the parts
-    gel.png        the stock gel without contact, of a generator that is given one
-    palpate.json   preset, condition policy, schedule, sampler, latent statistics, record, digest
-    README.md      the card for people
-
-A pipeline trained on the encoders and autoencoder of a shipped model may refer to them instead of
-carrying copies: ``"shared"`` in ``palpate.json`` names the model. Their digests are recorded in
-either case and checked on loading.
+Its folder is described in ``saving``.
 """
 
 from __future__ import annotations
 
-import inspect
 import json
 import math
 from collections.abc import Callable, Mapping, Sequence
@@ -39,16 +17,12 @@ from typing import Any
 
 import numpy as np
 import torch
-from diffusers.pipelines.pipeline_utils import DiffusionPipeline
-from diffusers.schedulers.scheduling_ddim import DDIMScheduler
-from diffusers.schedulers.scheduling_dpmsolver_multistep import DPMSolverMultistepScheduler
-from diffusers.utils.outputs import BaseOutput
+from diffusers.pipelines.pipeline_utils import DiffusionPipeline, ImagePipelineOutput
 from numpy.typing import NDArray
 from PIL import Image
 from torch import Tensor, nn
 
-from palpate._version import __version__
-from palpate.core import PalpateError, atomic_folder, digest_json, read_record, rng_for, write_json
+from palpate.core import PalpateError, digest_json, read_record, require, rng_for
 from palpate.data.images import read_image, square
 from palpate.diffusion.autoencoder import (
     AnyAutoencoder,
@@ -57,8 +31,16 @@ from palpate.diffusion.autoencoder import (
     LatentStats,
     load_autoencoder,
 )
-from palpate.diffusion.denoiser import Denoiser
-from palpate.diffusion.options import ConditionPolicy, Method, SamplerOptions, Schedule
+from palpate.diffusion.denoiser import (
+    Denoiser,
+    OnStep,
+    batches,
+    build_scheduler,
+    sample,
+    starting_noise,
+)
+from palpate.diffusion.options import ConditionPolicy, SamplerOptions, Schedule
+from palpate.diffusion.saving import FORMAT, KEYS, write_pipeline
 from palpate.encoders.embed import embed_texts
 from palpate.encoders.encoder import list_images, squares
 from palpate.encoders.encoder_set import EncoderSet, load_clip
@@ -73,11 +55,6 @@ from palpate.encoders.models import (
 from palpate.encoders.preprocess import Preprocess, to_unit
 from palpate.training.cards import write_model_cards
 
-FORMAT = "palpate-pipeline/1"
-KEYS = (
-    *("digest", "preset", "size", "condition", "schedule", "sampler", "latents"),
-    *("autoencoder", "encoders", "training"),
-)
 COPY_AGAIN = "Copy the whole folder again"
 SYNTHETIC = (
     "Made by a generator that was trained on synthetic data alone (palpate's procedural world), "
@@ -85,22 +62,7 @@ SYNTHETIC = (
 )
 #: Photos embedded at once, always: an embedding does not depend on the others of its batch.
 EMBED = 32
-#: (z_t (n, c, h, w), t (n,), tokens (n, k, d), background or None) -> prediction (n, c, h, w).
-Predictor = Callable[[Tensor, Tensor, Tensor, Tensor | None], Tensor]
-#: (index of the step, t, latents after it) -> the latents to go on with.
-OnStep = Callable[[int, Tensor, Tensor], Tensor]
 MODULES = ("autoencoder", "scheduler", "unet")
-
-
-@dataclass
-class TactileImages(BaseOutput):
-    """What a pipeline returns.
-
-    Attributes:
-        images: one PIL image per photo.
-    """
-
-    images: list[Image.Image]
 
 
 @dataclass(eq=False, repr=False)
@@ -147,16 +109,19 @@ class TactilePipeline(DiffusionPipeline):
             PalpateError: if the U-Net and the autoencoder do not fit.
         """
         code, unet = self.autoencoder, self.denoiser.unet.config
-        gel = 3 * code.factor**2 if isinstance(code, BackgroundAutoencoder) else code.channels
         seen = unet["in_channels"] - unet["out_channels"]
         latent = {self.denoiser.channels, len(self.stats.mean), len(self.stats.std)}
-        if latent != {code.channels} or seen not in (0, gel) or self.size % code.factor:
-            must = (
-                f"The denoiser must be one for the autoencoder: {code.channels} channels (and "
-                f"{gel} of the gel), sides that are multiples of {code.factor}"
-            )
-            got = f"{sorted(latent)} channels (and {seen}), sides of {self.size}"
-            raise PalpateError(must, got, "Use the autoencoder that it was trained on")
+        fits = (
+            latent == {code.channels}
+            and seen in (0, code.gel_channels)
+            and self.size % code.factor == 0
+        )
+        must = (
+            f"The denoiser must be one for the autoencoder: {code.channels} channels (and "
+            f"{code.gel_channels} of the gel), sides that are multiples of {code.factor}"
+        )
+        got = f"{sorted(latent)} channels (and {seen}), sides of {self.size}"
+        require(fits, None, must, got, fix="Use the autoencoder that it was trained on")
         self.scheduler = build_scheduler(self.schedule, self.sampler.method)
         parts = (code.net if isinstance(code, Autoencoder) else code, self.scheduler, self.unet)
         self.register_to_config(**dict(zip(MODULES, map(_class_of, parts), strict=True)))
@@ -194,8 +159,8 @@ class TactilePipeline(DiffusionPipeline):
         gel: Any = None,
         generator: torch.Generator | Sequence[torch.Generator] | None = None,
         callback_on_step_end: Callable[[Any, int, Tensor, dict[str, Any]], Any] | None = None,
-    ) -> TactileImages:
-        """Tactile images for photos.
+    ) -> ImagePipelineOutput:
+        """Tactile images for photos, as PIL images in ``images``.
 
         Args:
             photos: a file or a folder of them, a PIL image, a list of files or PIL images, a uint8
@@ -218,14 +183,14 @@ class TactilePipeline(DiffusionPipeline):
             PalpateError: if a photo is unreadable, a gel is missing, or settings do not fit.
         """
         images = [] if photos is None else list_images(photos)
-        if not images and (photos is not None or text is None):
-            must, fix = "There must be at least one photo, or a text alone", "Pass one of them"
-            raise PalpateError(must, "no photo", fix)
+        must, fix = "There must be at least one photo, or a text alone", "Pass one of them"
+        enough = bool(images) or (photos is None and text is not None)
+        require(enough, None, must, "no photo", fix=fix)
         if ids is None:
             ids = [i.name if isinstance(i, Path) else str(k) for k, i in enumerate(images)]
             ids = ids if images else [str(text)]
-        if images and len(ids) != len(images):
-            raise _not_one_each(ids, len(images))
+        if images:
+            _require_one_each(ids, len(images))
         sampler = self.sampler_with(guidance=guidance, steps=steps)
         if len(ids) == 1:  # not among the copies that fill a batch: a fraction of the time
             sampler = replace(sampler, batch=1)
@@ -237,7 +202,7 @@ class TactilePipeline(DiffusionPipeline):
         noise = None if generator is None else self._noise(generator, len(ids))
         self.scheduler.set_timesteps(sampler.steps)
         total = math.ceil(len(ids) / sampler.batch) * len(self.scheduler.timesteps)
-        made: list[Image.Image] = []
+        drawn: list[Image.Image] = []
         bars: Any = self.progress_bar  # wrongly typed in diffusers
         with bars(total=total) as bar:
             for start in range(0, len(ids), sampler.batch):
@@ -253,20 +218,19 @@ class TactilePipeline(DiffusionPipeline):
                     noise=None if noise is None else noise[rows],
                     on_step=partial(self._on_step, bar, callback_on_step_end),
                 )
-                made += map(Image.fromarray, arrays)
-        return TactileImages(images=made)
+                drawn += map(Image.fromarray, arrays)
+        return ImagePipelineOutput(images=drawn)
 
     def _on_step(self, bar: Any, callback: Any, step: int, t: Tensor, latents: Tensor) -> Tensor:
         bar.update()
-        given = callback(self, step, t, {"latents": latents}) if callback else None
-        return (given or {}).get("latents", latents)
+        answer = callback(self, step, t, {"latents": latents}) if callback else None
+        return (answer or {}).get("latents", latents)
 
     def _noise(self, generator: torch.Generator | Sequence[torch.Generator], n: int) -> Tensor:
         """The starting noise of n images, drawn on the generators' own device."""
         each = [generator] * n if isinstance(generator, torch.Generator) else generator
-        if len(each) != n:
-            must, fix = "must be one per image", "Pass one generator, or one per image"
-            raise PalpateError(must, f"{len(each)} for {n} images", fix, argument="generator")
+        must, fix = "must be one per image", "Pass one generator, or one per image"
+        require(len(each) == n, "generator", must, f"{len(each)} for {n} images", fix=fix)
         draws = [torch.randn(self._latent, generator=g, device=g.device) for g in each]
         return torch.stack([draw.cpu() for draw in draws])
 
@@ -274,8 +238,8 @@ class TactilePipeline(DiffusionPipeline):
     def other_scheduler(self) -> dict[str, Any] | None:
         """Class and settings of the scheduler, if it is not the one of the sampler."""
         own = build_scheduler(self.schedule, self.sampler.method)
-        shown = [json.loads(s.to_json_string()) for s in (own, self.scheduler)]
-        return None if shown[0] == shown[1] else shown[1]
+        default, used = (json.loads(s.to_json_string()) for s in (own, self.scheduler))
+        return None if default == used else used
 
     @property
     def _latent(self) -> tuple[int, int, int]:
@@ -337,9 +301,9 @@ class TactilePipeline(DiffusionPipeline):
         return Preprocess(self.denoiser.policy.photo_size, self.denoiser.policy.photo_size)
 
     def _encoders(self) -> EncoderSet:
-        if self.encoders is None:
-            must, got = "Photos need the pipeline's vision encoder", "a pipeline without encoders"
-            raise PalpateError(must, got, "Save it with its encoders")
+        must, got = "Photos need the pipeline's vision encoder", "a pipeline without encoders"
+        require(self.encoders is not None, None, must, got, fix="Save it with its encoders")
+        assert self.encoders is not None
         return self.encoders
 
     def sampler_with(
@@ -350,24 +314,22 @@ class TactilePipeline(DiffusionPipeline):
         Raises:
             PalpateError: on settings that this pipeline cannot sample with.
         """
-        requested = {"guidance": guidance, "steps": steps, "batch": batch}
-        given = {k: v for k, v in requested.items() if v is not None}
-        sampler = replace(self.sampler, **given)
-        most, dropout = self.schedule.steps, self.denoiser.policy.dropout
-        if not 1 <= sampler.steps <= most:
-            must, example = f"must lie in 1 to {most}", {"steps": 50}
-            raise PalpateError(must, str(sampler.steps), "", argument="steps", example=example)
-        if sampler.batch < 1:
-            example = {"batch": 16}
-            raise PalpateError(
-                "must be at least 1", str(batch), "", argument="batch", example=example
-            )
-        if not (math.isfinite(sampler.guidance) and sampler.guidance >= 0):
-            must, fix = "must be a finite number from 0 on", "Choose e.g. 2; 1 is none"
-            raise PalpateError(must, str(sampler.guidance), fix, argument="guidance")
-        if sampler.guidance != 1 and not dropout:
-            must, fix = "must be 1 for a generator trained without condition dropout", "Choose 1"
-            raise PalpateError(must, f"{sampler.guidance:g}", fix, argument="guidance")
+        default = self.sampler
+        sampler = replace(
+            default,
+            guidance=default.guidance if guidance is None else guidance,
+            steps=default.steps if steps is None else steps,
+            batch=default.batch if batch is None else batch,
+        )
+        most, scale = self.schedule.steps, sampler.guidance
+        fits = 1 <= sampler.steps <= most
+        require(fits, "steps", f"must lie in 1 to {most}", sampler.steps, 50)
+        require(sampler.batch >= 1, "batch", "must be at least 1", sampler.batch, 16)
+        must, fix = "must be a finite number from 0 on", "Choose e.g. 2; 1 is none"
+        require(math.isfinite(scale) and scale >= 0, "guidance", must, scale, fix=fix)
+        must = "must be 1 for a generator trained without condition dropout"
+        fits = scale == 1 or self.denoiser.policy.dropout > 0
+        require(fits, "guidance", must, f"{scale:g}", fix="Choose 1")
         return sampler
 
     def embed(self, photos: NDArray[np.uint8]) -> Tensor:
@@ -376,8 +338,10 @@ class TactilePipeline(DiffusionPipeline):
         L2-normalized vision embeddings (n, d), with tokens of their patches (n, 1 + p, d), or of
         GVST tokens (n, 64, d).
         """
-        batches = _batches(len(photos), EMBED)
-        parts = [self._embed(self._preprocess.fit(photos[rows]))[:n].cpu() for rows, n in batches]
+        parts = [
+            self._embed(self._preprocess.fit(photos[rows]))[:n].cpu()
+            for rows, n in batches(len(photos), EMBED)
+        ]
         return torch.cat(parts) if parts else self.denoiser.null_tokens(0)[:, 0]
 
     @torch.no_grad()
@@ -401,16 +365,14 @@ class TactilePipeline(DiffusionPipeline):
         Raises:
             PalpateError: if the pipeline has no text encoder, or the text is empty or no string.
         """
-        if not isinstance(text, str):
-            must, fix = "must be one string, for all images", "Call it once for each text"
-            raise PalpateError(must, type(text).__name__, fix, argument="text")
-        if self.encoders is None or "text" not in self.encoders.modalities:
-            must, fix = "must be left out for a generator without text encoder", "Pass a photo"
-            raise PalpateError(must, repr(text), fix, argument="text")
-        if not text.strip():
-            fix = "Say what is felt, e.g. rough, porous"
-            raise PalpateError("must not be empty", repr(text), fix, argument="text")
-        return torch.from_numpy(embed_texts([text], self.encoders))
+        must, fix = "must be one string, for all images", "Call it once for each text"
+        require(isinstance(text, str), "text", must, type(text).__name__, fix=fix)
+        fits = self.encoders is not None and "text" in self.encoders.modalities
+        must = "must be left out for a generator without text encoder"
+        require(fits, "text", must, repr(text), fix="Pass a photo")
+        fix = "Say what is felt, e.g. rough, porous"
+        require(bool(text.strip()), "text", "must not be empty", repr(text), fix=fix)
+        return torch.from_numpy(embed_texts([text], self._encoders()))
 
     def sample(
         self,
@@ -448,44 +410,40 @@ class TactilePipeline(DiffusionPipeline):
         )
         if words is not None and len(words) == 1:
             words = words.expand(len(ids), *words.shape[1:])
-        if bad := [c for c in (photos, words) if c is not None and len(c) != len(ids)]:
-            raise _not_one_each(ids, len(bad[0]))
+        for rows in (photos, words):
+            _require_one_each(ids, len(ids) if rows is None else len(rows))
         if background is None and self.gel is not None:
             background = np.broadcast_to(self.gel, (len(ids), *self.gel.shape))
-        if self.background != (background is not None):
-            must = "must be given for a generator that sees the gel, and only for one"
-            raise PalpateError(
-                must, "none" if self.background else "one", "", argument="background"
-            )
-        if background is not None and background.shape[:3] != (len(ids), self.size, self.size):
-            must = f"must hold one image of {self.size} pixels square per photo"
-            raise PalpateError(must, str(background.shape), "", argument="background")
+        must = "must be given for a generator that sees the gel, and only for one"
+        fits, got = (
+            self.background == (background is not None),
+            "none" if self.background else "one",
+        )
+        require(fits, "background", must, got)
+        must = f"must hold one image of {self.size} pixels square per photo"
+        shape = (len(ids), self.size, self.size)
+        fits = background is None or background.shape[:3] == shape
+        require(fits, "background", must, None if background is None else background.shape)
         code, ground = self.autoencoder, None
         if background is not None and self.denoiser.background:
             if isinstance(code, BackgroundAutoencoder):
                 ground = code.gel(background)
             else:
                 ground = self.stats.normalize(code.encode(background))
-        options = sampler or self.sampler_with()
+        options, scheduler = sampler or self.sampler_with(), self.scheduler
+        if options.method != self.sampler.method:
+            scheduler = build_scheduler(self.schedule, options.method)
         latents = sample(
             self.denoiser,
             self.denoiser.condition(photos, words, weight),
-            self.denoiser.null_tokens(1),
-            ids,
-            shape=self._latent,
-            schedule=self.schedule,
-            options=options,
-            seed=seed,
+            starting_noise(ids, self._latent, seed) if noise is None else noise,
+            options,
+            scheduler,
+            generator=lambda row: _step_noise(seed, ids[row]),
             background=ground,
-            scheduler=self.scheduler if options.method == self.sampler.method else None,
-            noise=noise,
             on_step=on_step,
         )
-        latents = self.stats.restore(latents)
-        if isinstance(code, BackgroundAutoencoder):
-            assert background is not None
-            return code.decode(latents, background)
-        return code.decode(latents)
+        return code.decode(self.stats.restore(latents), background)
 
     def to(  # pyright: ignore[reportIncompatibleMethodOverride] - its forms with one or two
         self, device: str | torch.device | torch.dtype | None = None, dtype: Any = None
@@ -511,8 +469,8 @@ class TactilePipeline(DiffusionPipeline):
         real = any(record.get("synthetic") is False for record in self.records)
         if real or not self.training.get("synthetic"):
             return ""
-        known = sorted({str(n) for record in self.records for n in record.get("materials", ())})
-        only = f" It knows only these materials: {', '.join(known)}." if known else ""
+        names = sorted({str(n) for record in self.records for n in record.get("materials", ())})
+        only = f" It knows only these materials: {', '.join(names)}." if names else ""
         return SYNTHETIC + only
 
     def save(self, folder: Path, *, half: bool = False, shared: str | None = None) -> None:
@@ -529,27 +487,15 @@ class TactilePipeline(DiffusionPipeline):
             PalpateError: if the folder is not empty, a weight is too large for 16 bits, the shared
                 model differs, or the scheduler is not the sampler's.
         """
-        if self.other_scheduler is not None:
-            must, fix = "A saved pipeline must have its sampler's scheduler", "Set it back"
-            raise PalpateError(must, type(self.scheduler).__name__, fix)
-        if shared is not None and self._digests() != _digests(*_shared_parts(shared)):
-            must = f"A pipeline that refers to {shared} must use its autoencoder and vision encoder"
-            raise PalpateError(must, "others", "Leave out shared, or train on these")
-        with atomic_folder(Path(folder)) as part:
-            self.denoiser.save(part / "unet", half=half)
-            if self.gel is not None:
-                Image.fromarray(self.gel).save(part / "gel.png")
-            if shared is None:
-                self.autoencoder.save(part / "autoencoder", half=half)
-                if self.encoders is not None:
-                    self.encoders.save(part / "encoders", half=half)
-            self.scheduler.save_pretrained(part / "scheduler")
-            index = json.loads(self.to_json_string())
-            absent = {} if shared is None else {"autoencoder": [None, None]}
-            write_json(part / "model_index.json", index | absent)
-            about = self.to_json() | ({} if shared is None else {"shared": shared})
-            write_json(part / "palpate.json", about)
-            write_model_cards(part)
+        must, got = (
+            "A saved pipeline must have its sampler's scheduler",
+            type(self.scheduler).__name__,
+        )
+        require(self.other_scheduler is None, None, must, got, fix="Set it back")
+        must = f"A pipeline that refers to {shared} must use its autoencoder and vision encoder"
+        same = shared is None or self._digests() == _digests(*_shared_parts(shared))
+        require(same, None, must, "others", fix="Leave out shared, or train on these")
+        write_pipeline(self, Path(folder), half=half, shared=shared)
 
     def save_pretrained(  # pyright: ignore[reportIncompatibleMethodOverride]
         self, save_directory: str | Path, **options: Any
@@ -569,25 +515,6 @@ class TactilePipeline(DiffusionPipeline):
 
     def _digests(self) -> tuple[str, str | None]:
         return _digests(self.autoencoder, self.encoders)
-
-    def to_json(self) -> dict[str, Any]:
-        """The content of ``palpate.json``."""
-        autoencoder, vision = self._digests()
-        return {
-            "format": FORMAT,
-            "digest": self.digest,
-            "preset": self.preset,
-            "size": self.size,
-            "background": self.background,
-            "condition": asdict(self.denoiser.policy),
-            "schedule": asdict(self.schedule),
-            "sampler": asdict(self.sampler),
-            "latents": asdict(self.stats) | {"factor": self.autoencoder.factor},
-            "autoencoder": autoencoder,
-            "encoders": vision,
-            "training": dict(self.training),
-            "palpate": __version__,
-        }
 
     @classmethod
     def from_pretrained(  # pyright: ignore[reportIncompatibleMethodOverride]
@@ -609,10 +536,10 @@ class TactilePipeline(DiffusionPipeline):
         about = read_record(note, "card of the pipeline", form=FORMAT, keys=KEYS)
         if "shared" in about:
             autoencoder, encoders = _shared_parts(str(about["shared"]))
-            if _digests(autoencoder, encoders) != (about["autoencoder"], about["encoders"]):
-                must = f"{folder} must find the parts of {about['shared']} that it was trained on"
-                fix = "Install the version that it names, or train again"
-                raise PalpateError(must, "those of another version of palpate", fix)
+            same = _digests(autoencoder, encoders) == (about["autoencoder"], about["encoders"])
+            must = f"{folder} must find the parts of {about['shared']} that it was trained on"
+            fix = "Install the version that it names, or train again"
+            require(same, None, must, "those of another version of palpate", fix=fix)
         else:
             autoencoder = load_autoencoder(folder / "autoencoder")
             encoders = EncoderSet.load(folder / "encoders") if about["encoders"] else None
@@ -634,15 +561,19 @@ class TactilePipeline(DiffusionPipeline):
         except (KeyError, TypeError, ValueError) as error:
             must = f"The entries of {note} must be as palpate writes them"
             raise PalpateError(must, f"{type(error).__name__}: {error}", COPY_AGAIN) from None
-        if pipeline.digest != about["digest"]:
-            must = f"The weights in {folder} must match its palpate.json"
-            raise PalpateError(must, "other weights", COPY_AGAIN)
+        must = f"The weights in {folder} must match its palpate.json"
+        require(pipeline.digest == about["digest"], None, must, "other weights", fix=COPY_AGAIN)
         return pipeline.to(device)
 
 
-def _not_one_each(ids: Sequence[str], n: int) -> PalpateError:
+def _require_one_each(ids: Sequence[str], n: int) -> None:
     got, fix = f"{len(ids)} ids, {n} conditions", "Pass one row per id"
-    return PalpateError("Every id needs one condition", got, fix)
+    require(len(ids) == n, None, "Every id needs one condition", got, fix=fix)
+
+
+def _step_noise(seed: int, sample_id: str) -> torch.Generator:
+    """The noise that a scheduler adds while it samples."""
+    return torch.Generator().manual_seed(int(rng_for(seed, "steps", sample_id).integers(2**62)))
 
 
 def _class_of(part: Any) -> tuple[str, str]:
@@ -657,135 +588,6 @@ def _digests(autoencoder: AnyAutoencoder, encoders: EncoderSet | None) -> tuple[
 
 def _shared_parts(name: str) -> tuple[AnyAutoencoder, EncoderSet]:
     """Load autoencoder and encoders of a shipped model; a folder would differ elsewhere."""
-    if name not in SHIPPED:
-        must, fix = f"must be one of {', '.join(SHIPPED)}", "Save the pipeline with its parts"
-        raise PalpateError(must, repr(name), fix, argument="shared")
+    must, fix = f"must be one of {', '.join(SHIPPED)}", "Save the pipeline with its parts"
+    require(name in SHIPPED, "shared", must, repr(name), fix=fix)
     return load_autoencoder(name), EncoderSet(load_clip(name))
-
-
-def build_scheduler(schedule: Schedule, method: Method) -> Any:
-    """The diffusers scheduler for a trained model; latents are not clipped.
-
-    Raises:
-        PalpateError: if the method is not one for the schedule.
-    """
-    steps: Any = {"num_train_timesteps": schedule.steps}
-    if schedule.prediction == "flow":
-        if method != "dpm":
-            must = "must be dpm for a model that predicts flow"
-            raise PalpateError(must, method, "Choose it", argument="method")
-        flow: Any = {"use_flow_sigmas": True, "prediction_type": "flow_prediction"}
-        return DPMSolverMultistepScheduler(**flow, **steps)
-    common: dict[str, Any] = {
-        **steps,
-        "beta_start": schedule.beta_start,
-        "beta_end": schedule.beta_end,
-        "beta_schedule": "scaled_linear",
-        "prediction_type": "epsilon",
-        # Trailing steps start at t = T, where the starting noise belongs, for any number of steps.
-        "timestep_spacing": "trailing",
-    }
-    if method == "ddim":
-        return DDIMScheduler(clip_sample=False, set_alpha_to_one=True, **common)
-    # Steps uniform in log(a / (1 - a)). Uniform in t, 20 steps leave one wide gap before t = 0
-    # under this schedule, and Gaussian data of spread 0.4 (0.2) come out with 80 % (55 %) of it;
-    # now with 100 % (99 %).
-    common |= {"algorithm_type": "dpmsolver++", "solver_order": 2, "use_lu_lambdas": True}
-    return DPMSolverMultistepScheduler(**common)
-
-
-def starting_noise(ids: Sequence[str], shape: tuple[int, int, int], seed: int) -> Tensor:
-    """z^T of each sample: float32 (n, c, h, w), a function of (seed, id) alone."""
-    draws = [rng_for(seed, "noise", i).standard_normal(shape, dtype=np.float32) for i in ids]
-    return torch.from_numpy(np.stack(draws))
-
-
-def _generator(seed: int, sample_id: str) -> torch.Generator:
-    """The noise that a scheduler adds while it samples."""
-    return torch.Generator().manual_seed(int(rng_for(seed, "steps", sample_id).integers(2**62)))
-
-
-@torch.no_grad()
-def sample(  # noqa: PLR0913 - one row per part
-    predict: Predictor,
-    tokens: Tensor,
-    null: Tensor,
-    ids: Sequence[str],
-    *,
-    shape: tuple[int, int, int],
-    schedule: Schedule,
-    options: SamplerOptions,
-    seed: int,
-    background: Tensor | None = None,
-    scheduler: Any = None,
-    noise: Tensor | None = None,
-    on_step: OnStep | None = None,
-) -> Tensor:
-    """Normalized latents (n, c, h, w) of ``ids``, on the CPU.
-
-    Args:
-        predict: the network, or any function of its form.
-        tokens: conditions (n, k, d), on the network's device.
-        null: the unconditional tokens (1, k, d).
-        ids: n sample ids.
-        shape: (c, h, w) of a latent.
-        schedule: the network's.
-        options: see :class:`SamplerOptions`.
-        seed: of the starting noise.
-        background: normalized background latents (n, c, h, w), or None.
-        scheduler: diffusers' scheduler; default: that of the method.
-        noise: starting noise (n, c, h, w); default: that of seed and ids.
-        on_step: called after each step of each batch.
-    """
-    parts = [torch.empty(0, *shape)]
-    scheduler = scheduler or build_scheduler(schedule, options.method)
-    scales = hasattr(scheduler, "scale_model_input")  # not those of flows
-    draws = "generator" in inspect.signature(scheduler.step).parameters
-    for rows, count in _batches(len(ids), options.batch):
-        names = [ids[k] for k in rows]
-        z = starting_noise(names, shape, seed) if noise is None else noise[rows]
-        more = {"generator": [_generator(seed, i) for i in names]} if draws else {}
-        ground = None if background is None else background[rows].to(tokens.device)
-        given = tokens[rows]
-        scheduler.set_timesteps(options.steps, device=tokens.device)
-        z = z.to(tokens.device) * getattr(scheduler, "init_noise_sigma", 1.0)
-        for k, t in enumerate(scheduler.timesteps):
-            times, empty = t.expand(len(z)), null.expand(given.shape)
-            inside = float(t) / schedule.steps <= options.high
-            here = options if inside else replace(options, guidance=1.0)
-            scaled = scheduler.scale_model_input(z, t) if scales else z
-            prediction = guided(predict, scaled, times, given, empty, ground, here)
-            z = scheduler.step(prediction, t, z, return_dict=False, **more)[0]
-            z = z if on_step is None else on_step(k, t, z)
-        parts.append(z[:count].cpu())
-    return torch.cat(parts)
-
-
-def guided(  # noqa: PLR0917 - in the order of the network's arguments
-    predict: Predictor,
-    z: Tensor,
-    t: Tensor,
-    tokens: Tensor,
-    null: Tensor,
-    background: Tensor | None,
-    options: SamplerOptions,
-) -> Tensor:
-    """Return the guided prediction; the formula holds for a velocity as well."""
-    s = options.guidance
-    if s in (0.0, 1.0):
-        return predict(z, t, tokens if s else null, background)
-    twice = None if background is None else torch.cat([background, background])
-    both = predict(torch.cat([z, z]), torch.cat([t, t]), torch.cat([null, tokens]), twice)
-    without, given = both.chunk(2)
-    prediction = without + s * (given - without)
-    if options.rescale:
-        std = given.std((1, 2, 3), keepdim=True) / prediction.std((1, 2, 3), keepdim=True)
-        prediction = options.rescale * prediction * std + (1 - options.rescale) * prediction
-    return prediction
-
-
-def _batches(n: int, size: int) -> list[tuple[list[int], int]]:
-    """Return the rows of each batch and how many count: the last batch repeats its last row."""
-    starts = range(0, n, size)
-    rows = [[min(k, n - 1) for k in range(start, start + size)] for start in starts]
-    return [(row, min(size, n - start)) for row, start in zip(rows, starts, strict=True)]

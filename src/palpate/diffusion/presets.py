@@ -29,8 +29,8 @@ objective of ``mini``; AdamW 3e-4, cosine, EMA 0.9995, 30,000 steps of 64; DPM-S
 2.5.
 
 ``mini`` is the geometry of the models that ship (docs/concepts/mini.md, with their scores and with
-what did not work): what is trained with it can go on from them. ``source="text"`` is the paper's
-training.
+what did not work): what is trained with it can go on from them. A condition whose source is
+``text`` is the paper's training.
 """
 
 from __future__ import annotations
@@ -88,8 +88,8 @@ class DiffusionPreset:
         """Raise ``PalpateError`` for settings out of range."""
         dropout, size = self.condition.dropout, self.condition.photo_size
         require(0 <= dropout < 1, "condition.dropout", "must lie in [0, 1)", dropout, 0.1)
-        whole = size >= 16 and size & (size - 1) == 0
-        require(whole, "condition.photo_size", "must be a power of 2 from 16 on", size, 64)
+        power = size >= 16 and size & (size - 1) == 0
+        require(power, "condition.photo_size", "must be a power of 2 from 16 on", size, 64)
         patches, width = self.condition.patches, self.condition.photo_width
         square = math.isqrt(patches) ** 2 == patches
         require(square, "condition.patches", "must be a square number", patches, 64)
@@ -104,8 +104,21 @@ class DiffusionPreset:
         return replace(self.loop, steps=steps, seed=self.loop.seed if seed is None else seed)
 
     def condition_for(self, width: int) -> ConditionPolicy:
-        """The policy for embeddings of ``width``."""
-        return replace(self.condition, width=width)
+        """The policy for embeddings of ``width``; photos alone need no memory of texts."""
+        gap = self.condition.gap if "text" in self.condition.sources else "none"
+        return replace(self.condition, width=width, gap=gap)
+
+    def with_steps(self, steps: int | None) -> DiffusionPreset:
+        """The same with so many optimizer steps; None: as it is.
+
+        Raises:
+            PalpateError: if they are none.
+        """
+        if steps is None:
+            return self
+        fix = "Leave it out for the preset's length"
+        require(steps >= 1, "steps", "must be at least 1", steps, fix=fix)
+        return replace(self, epochs=None, loop=replace(self.loop, steps=steps))
 
 
 TINY = DiffusionPreset(
@@ -203,11 +216,13 @@ SMALL = DiffusionPreset(
 PRESETS = {preset.name: preset for preset in (TINY, MINI, SMALL, PAPER)}
 
 
-def preset_named(name: str) -> DiffusionPreset:
-    """The preset of that name.
+def preset_of(preset: str | DiffusionPreset) -> DiffusionPreset:
+    """A preset as it is, or by name.
 
     Raises:
-        PalpateError: if there is none.
+        PalpateError: if there is none of that name.
     """
-    require_choice("preset", name, PRESETS)
-    return PRESETS[name]
+    if isinstance(preset, DiffusionPreset):
+        return preset
+    require_choice("preset", preset, PRESETS)
+    return PRESETS[preset]

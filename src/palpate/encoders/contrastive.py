@@ -59,15 +59,8 @@ from palpate.metrics.probe import material_accuracy
 from palpate.training.engine import Batch, Losses, Task, fit
 from palpate.training.estimate import estimate
 from palpate.training.options import Compute, LoopOptions
-from palpate.training.processes import (
-    connect,
-    first_alone,
-    gather_rows,
-    keep_logs,
-    place,
-    shared,
-    work_folder,
-)
+from palpate.training.processes import connect, first_alone, gather_rows, place, shared
+from palpate.training.run import keep_logs, work_folder
 from palpate.training.steps import Step
 
 

@@ -267,7 +267,7 @@ def _read_path(path: Path, group: str) -> Samples:
     index = path / "index.json"
     content = read_json(index, "index of generated images") if index.is_file() else None
     if isinstance(content, dict) and str(content.get("format")).startswith("palpate-generated/"):
-        from palpate.diffusion.generation import Generated
+        from palpate.diffusion.generated import Generated
 
         folder = Generated.load(path)
         rows = [{"id": i, "tactile": f"images/{file}"} for i, file in folder.files.items()]

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from palpate.core import Measure, Note, Score
-from palpate.diffusion.generation import Generated
+from palpate.diffusion.generated import Generated
 from palpate.evaluation.probing import results_of
 from palpate.report.labels import measured
 from palpate.report.numbers import percent

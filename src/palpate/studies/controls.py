@@ -30,8 +30,7 @@ from numpy.typing import NDArray
 
 from palpate.core import rng_for
 from palpate.data.manifest import Manifest
-from palpate.diffusion.autoencoder import BackgroundAutoencoder
-from palpate.diffusion.autoencoders import load_autoencoder
+from palpate.diffusion.autoencoder import BackgroundAutoencoder, load_autoencoder
 from palpate.encoders.embed import embed
 from palpate.encoders.encoder_set import EncoderSet, load_clip
 from palpate.evaluation.controls import matched_rows

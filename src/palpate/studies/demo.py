@@ -22,7 +22,7 @@ from palpate.core import Measure, Note, Progress, Score, Split, require, require
 from palpate.data.images import cached_images
 from palpate.data.importing import import_dataset
 from palpate.data.manifest import Manifest
-from palpate.diffusion.generation import Generated
+from palpate.diffusion.generated import Generated
 from palpate.diffusion.presets import MINI, DiffusionPreset
 from palpate.encoders.contrastive import train_tactile
 from palpate.encoders.encoder_set import EncoderSet, load_clip

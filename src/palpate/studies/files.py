@@ -27,7 +27,7 @@ from palpate.core import (
     write_json,
 )
 from palpate.data.manifest import Manifest
-from palpate.diffusion.generation import Generated
+from palpate.diffusion.generated import Generated
 from palpate.encoders.models import Part, shipped_folder
 from palpate.report.results import Audit, GalleryItem
 from palpate.sim.presets import MINI_SEEDS

@@ -176,7 +176,7 @@ def _compares(score: Score, methods: Mapping[str, str]) -> bool:
 def image_files(folder: Path, ids: Sequence[str]) -> list[Path]:
     """The files of images of either kind of folder, in the order of ``ids``."""
     if (folder / "index.json").is_file():
-        from palpate.diffusion.generation import Generated
+        from palpate.diffusion.generated import Generated
 
         generated = Generated.load(folder)
         return [generated.path(i) for i in ids]

@@ -17,14 +17,14 @@ import numpy as np
 
 from palpate.core import Split, require, write_json
 from palpate.data.manifest import Manifest
-from palpate.diffusion.autoencoder import BackgroundAutoencoder
-from palpate.diffusion.autoencoder_training import measure_reconstruction
-from palpate.diffusion.autoencoders import autoencoder_of, load_autoencoder
+from palpate.diffusion.autoencoder import BackgroundAutoencoder, load_autoencoder
+from palpate.diffusion.autoencoder_training import autoencoder_of
+from palpate.diffusion.ceiling import measure_reconstruction
 from palpate.diffusion.generation import generate
 from palpate.diffusion.options import AutoencoderOptions, BackgroundOptions
 from palpate.diffusion.pipeline import TactilePipeline
 from palpate.diffusion.presets import DiffusionPreset
-from palpate.diffusion.training import train_pipeline
+from palpate.diffusion.training import Parts, train_pipeline
 from palpate.encoders import train_encoder
 from palpate.encoders.embed import texts_of
 from palpate.encoders.encoder_set import EncoderSet, load_clip
@@ -40,7 +40,7 @@ from palpate.studies.methods import Images, Make, Setting
 from palpate.studies.names import NOLEAK, ORIG, slug
 from palpate.studies.stages import Facts
 from palpate.training.options import Compute, Precision
-from palpate.training.processes import keep_logs
+from palpate.training.run import TrainingRun, keep_logs
 
 
 def make_world(work: Work, *, options: WorldOptions) -> Facts:
@@ -118,16 +118,8 @@ def make_autoencoder(
     if isinstance(options, str):
         model = load_autoencoder(options)
     else:
-        model = autoencoder_of(
-            manifest,
-            parts,
-            options,
-            size,
-            training,
-            cache=work.cache,
-            device=work.device,
-            progress=work.progress,
-        )
+        run = TrainingRun(training, cache=work.cache, device=work.device, progress=work.progress)
+        model = autoencoder_of(manifest, parts, options, size, run)
     model.save(fresh(work.folder / "autoencoder"))
     setting = Setting(*_parts(manifest, parts), work, size)
     real, gels = setting.pixels(setting.test), None
@@ -171,23 +163,24 @@ def make_generator(
     """
     folder, diffusion = work.folder / "training", training.diffusion
     trained = work.after.get(autoencoder)
-    pipeline = train_pipeline(
-        *data_of(work, split),
+    parts = Parts(
+        diffusion.with_steps(training.steps),
+        load_autoencoder(autoencoder if trained is None else trained / "autoencoder"),
         None
         if diffusion.condition.source == "resnet"
         else EncoderSet(load_clip(clip, device=work.device)),
-        load_autoencoder(autoencoder if trained is None else trained / "autoencoder"),
-        diffusion,
+        background=training.background,
+        start=None if start is None else TactilePipeline.from_pretrained(start),
+    )
+    run = TrainingRun(
         folder,
         seed=seed,
-        steps=training.steps,
-        background=training.background,
-        start=start and TactilePipeline.from_pretrained(start),
         cache=work.cache,
         device=work.device,
         compute=Compute(precision=training.precision),
         progress=work.progress,
     )
+    pipeline = train_pipeline(*data_of(work, split), parts, run)
     pipeline.save(fresh(work.folder / "model"))
     keep_logs(folder, work.folder / "model")
     shutil.rmtree(folder)

@@ -25,7 +25,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from palpate.core import PalpateError, read_json, write_text
+from palpate.core import read_json, require, write_text
 
 PLACED = (
     *("title", "summary", "license", "tags", "data", "ceiling", "recipe", "scores", "limits"),
@@ -92,12 +92,12 @@ def model_card(about: Mapping[str, Any]) -> str:
     from huggingface_hub import ModelCardData
 
     form = _FORMATS.get(str(about.get("format")))
-    if form is None:
-        raise PalpateError(
-            f"A model card is made of one of {', '.join(_FORMATS)}",
-            repr(about.get("format")),
-            "Pass the JSON of palpate.json",
-        )
+    must, fix = (
+        f"A model card is made of one of {', '.join(_FORMATS)}",
+        "Pass the JSON of palpate.json",
+    )
+    require(form is not None, None, must, repr(about.get("format")), fix=fix)
+    assert form is not None
     card, pipeline = _card(about), "training" in about
     head = ModelCardData(
         license=card.get("license", "unknown" if pipeline else "apache-2.0"),
@@ -157,20 +157,20 @@ def write_model_cards(folder: Path) -> list[Path]:
     models = {
         file.parent: read_json(file, "model card") for file in sorted(folder.rglob("palpate.json"))
     }
-    pages = {place: model_card(about) for place, about in models.items()}
+    pages = {path: model_card(about) for path, about in models.items()}
     if pages and folder not in pages:
         pages[folder] = _contents(folder, models)
-    for place, text in pages.items():
-        write_text(place / "README.md", text)
-    return [place / "README.md" for place in pages]
+    for path, text in pages.items():
+        write_text(path / "README.md", text)
+    return [path / "README.md" for path in pages]
 
 
 def _contents(folder: Path, models: Mapping[Path, Mapping[str, Any]]) -> str:
     """List the models below ``folder`` with the size of their weights."""
     rows: list[dict[str, Any]] = []
-    for place, about in models.items():
-        name = place.relative_to(folder).as_posix()
-        size = sum(file.stat().st_size for file in place.rglob("*.safetensors"))
+    for path, about in models.items():
+        name = path.relative_to(folder).as_posix()
+        size = sum(file.stat().st_size for file in path.rglob("*.safetensors"))
         rows.append(
             {
                 "folder": f"[{name}]({name}/README.md)",
@@ -191,7 +191,7 @@ def _data(card: Mapping[str, Any]) -> Sequence[Mapping[str, Any]] | Mapping[str,
     if card.get("data"):
         return card["data"]
     names = {"split_rule": "split", "train_samples": "training samples", "materials": "materials"}
-    row = {shown: card[name] for name, shown in names.items() if card.get(name)}
+    row = {label: card[name] for name, label in names.items() if card.get(name)}
     return {k: json.dumps(v) if isinstance(v, Mapping) else v for k, v in row.items()}
 
 

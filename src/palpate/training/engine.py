@@ -37,6 +37,7 @@ from palpate.core import (
     atomic_path,
     digest_json,
     quiet,
+    require,
     rng_for,
     short,
 )
@@ -76,7 +77,7 @@ class Task:
     """What is trained on what.
 
     Attributes:
-        what: name for progress and errors.
+        name: of the training, for progress and errors.
         n: number of training rows.
         load: the data of a step.
         loss: the loss of what ``load`` gave, once it is on the module's device.
@@ -87,7 +88,7 @@ class Task:
             each checkpoint.
     """
 
-    what: str
+    name: str
     n: int
     load: Load
     loss: Loss
@@ -162,9 +163,11 @@ class _Run:
         self.module, self.task, self.options = module, task, options
         self.folder, self.compute = folder, compute
         self.parameters = {k: p for k, p in module.named_parameters() if p.requires_grad}
-        if not self.parameters:
-            fix = "Do not freeze the whole model"
-            raise PalpateError(f"{task.what} needs parameters that require gradients", "none", fix)
+        must, fix = (
+            f"{task.name} needs parameters that require gradients",
+            "Do not freeze all of it",
+        )
+        require(bool(self.parameters), None, must, "none", fix=fix)
         self.device = next(iter(self.parameters.values())).device
         self.dtype = DTYPES.get(compute.precision)
         if compute.precision == "bf16" and self.device.type == "cpu" and not has_bf16():
@@ -205,7 +208,7 @@ class _Run:
 
     def steps(self, start: int, progress: Progress) -> None:
         """Take the steps from ``start`` on, and write what comes of it."""
-        options, what = self.options, self.task.what
+        options = self.options
         if start >= options.steps or self.stopped:
             return
         self.open_log()
@@ -233,7 +236,7 @@ class _Run:
             if step + 1 in evaluations:
                 self.evaluate(step + 1)
             self.busy = False
-            progress(what, step + 1, options.steps, f"loss {smooth:.4f}")
+            progress(self.task.name, step + 1, options.steps, f"loss {smooth:.4f}")
             if self.stopped:
                 break
             if time.monotonic() - saved > 60 * self.compute.checkpoint_minutes:
@@ -312,7 +315,7 @@ class _Run:
         names = self.task.names
         listed = [str(names[r]) if names is not None else f"row {r}" for r in bad[:5]]
         more = f" and {len(bad) - 5} more" if len(bad) > 5 else ""
-        must = f"The {name} of {self.task.what} must be finite"
+        must = f"The {name} of {self.task.name} must be finite"
         got = f"{value} at step {step}, with {', '.join(listed)}{more}"
         kept = "; the last checkpoint is kept" if self.resumed or self.written else ""
         fix = f"Look at these samples, or lower the learning rate{kept}"
@@ -334,7 +337,7 @@ class _Run:
         with self.evaluating():
             loss = self.held_out_loss(*self.task.held_out)
             if not math.isfinite(loss):
-                must = f"The held-out loss of {self.task.what} must be finite"
+                must = f"The held-out loss of {self.task.name} must be finite"
                 self.busy = True
                 fix = "Lower the learning rate"
                 raise shared(PalpateError(must, f"{loss} after step {step - 1}", fix))
@@ -469,10 +472,12 @@ class _Run:
         if self.part[1] > 1:
             steps = torch.tensor([float(self.step)] * 2, device=self.device)
             average([steps[:1]])
-            if steps[0] != steps[1]:
-                must = f"All processes must read the same checkpoint {path}"
-                fix = "Put the output on a disk that all machines share"
-                raise PalpateError(must, f"step {self.step} in one of them", fix)
+            must = f"All processes must read the same checkpoint {path}"
+            got, fix = (
+                f"step {self.step} in one of them",
+                "Put it on a disk that all machines share",
+            )
+            require(bool(steps[0] == steps[1]), None, must, got, fix=fix)
         return self.step
 
     def _read(self, path: Path) -> None:
@@ -511,9 +516,8 @@ class _Values(NamedTuple):
 
 def _require(task: Task, options: LoopOptions, processes: int) -> int:
     """Check that there are rows, and that processes share a batch equally; return its size."""
-    if task.n < 1:
-        fix = "Check the split: is its train part empty?"
-        raise PalpateError(f"{task.what} needs at least one sample", "none", fix)
+    fix = "Check the split: is its train part empty?"
+    require(task.n >= 1, None, f"{task.name} needs at least one sample", "none", fix=fix)
     batch = min(options.batch, task.n)
     if batch % processes:
         must = f"must be a multiple of the {processes} processes"
@@ -572,8 +576,8 @@ def has_bf16() -> bool:
     """Whether the processor multiplies in bf16; an x86 one that emulates it takes ten times as long
     as in float32.
     """
-    known = torch.cpu.get_capabilities()
-    return known["architecture"] != "x86_64" or known["avx512_bf16"] or known["amx_bf16"]
+    able = torch.cpu.get_capabilities()
+    return able["architecture"] != "x86_64" or able["avx512_bf16"] or able["amx_bf16"]
 
 
 @contextmanager

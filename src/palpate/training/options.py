@@ -12,7 +12,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from palpate.core import PalpateError, rng_for
+from palpate.core import require, rng_for
 
 Precision = Literal["float32", "bf16", "fp16"]
 Tracker = Literal["tensorboard", "wandb"]
@@ -77,9 +77,7 @@ class LoopOptions:
             ),
         }
         for name, (holds, must) in valid.items():
-            if not holds:
-                got, fix = repr(getattr(self, name)), "Choose another value"
-                raise PalpateError(must, got, fix, argument=name)
+            require(holds, name, must, repr(getattr(self, name)), fix="Choose another value")
 
     @property
     def facts(self) -> dict[str, object]:
@@ -118,12 +116,13 @@ class Compute:
     trackers: tuple[Tracker, ...] = ()
 
     def __post_init__(self) -> None:
-        if self.chunk is not None and self.chunk < 1:
-            must, fix = "must be at least 1", "Leave it out for the whole batch at once"
-            raise PalpateError(must, str(self.chunk), fix, argument="chunk")
-        if not self.checkpoint_minutes >= 0:
-            got = str(self.checkpoint_minutes)
-            raise PalpateError("must be at least 0", got, "", argument="checkpoint_minutes")
+        fits, fix = (
+            self.chunk is None or self.chunk >= 1,
+            "Leave it out for the whole batch at once",
+        )
+        require(fits, "chunk", "must be at least 1", self.chunk, fix=fix)
+        minutes = self.checkpoint_minutes
+        require(minutes >= 0, "checkpoint_minutes", "must be at least 0", minutes)
 
 
 def learning_rate(step: int, options: LoopOptions) -> float:

@@ -8,13 +8,10 @@ from __future__ import annotations
 
 import atexit
 import os
-import shutil
 import signal
-import tempfile
 from collections.abc import Generator, Sequence
 from contextlib import contextmanager
 from datetime import timedelta
-from pathlib import Path
 from typing import Any, TypeVar
 
 import torch
@@ -24,7 +21,7 @@ from torch import (
 )
 from torch import distributed as dist
 
-from palpate.core import PalpateError, locked, require_new_folder
+from palpate.core import PalpateError, require
 
 T = TypeVar("T")
 #: How long a process waits for another: the first one may decode a whole data set meanwhile.
@@ -44,9 +41,8 @@ def connect(device: str = "auto") -> str:
     """
     if int(os.environ.get("WORLD_SIZE", "1")) == 1:
         return device
-    if not dist.is_available():
-        must, fix = "torch must be built with torch.distributed", "Run it in one process"
-        raise PalpateError(must, "a build without it", fix)
+    must, fix = "torch must be built with torch.distributed", "Run it in one process"
+    require(dist.is_available(), None, must, "a build without it", fix=fix)
     from accelerate import PartialState
 
     joined = dist.is_initialized()
@@ -157,50 +153,3 @@ def _ended(error: RuntimeError) -> PalpateError:
 def _terminated(*_: object) -> None:
     """Torchrun ends the others when a process has ended."""
     raise _ended(RuntimeError("SIGTERM"))
-
-
-@contextmanager
-def work_folder(output: Path | None) -> Generator[Path]:
-    """A folder for checkpoints and caches of a training whose result goes to ``output``.
-
-    ``.<name>.work`` next to the output, which the same call finds again after a stop and which is
-    removed on success; a temporary folder where there is no output. Of several processes the first
-    holds it, and all are given the same.
-
-    Raises:
-        PalpateError: if the output exists already or is written by another run, before any work is
-            done.
-    """
-    rank = place()[0]
-    if output is None:
-        with tempfile.TemporaryDirectory(prefix="palpate-") as name:
-            yield Path(merged({str(rank): name})["0"])
-            barrier()  # the first one is removed when nobody needs it
-        return
-    require_new_folder(output)
-    work = output.absolute().parent / f".{output.name}.work"
-    barrier()  # all have looked at the output before it is written
-    if rank:
-        yield work
-        barrier()
-        return
-    with locked(work, output):
-        try:
-            yield work
-        except PalpateError:
-            if not any(p.is_file() for p in work.rglob("*")):  # rejected before any work was done
-                shutil.rmtree(work)
-            raise
-    barrier()
-    shutil.rmtree(work, ignore_errors=True)
-
-
-def keep_logs(work: Path, output: Path) -> None:
-    """Copy what a training wrote to its result: ``log-<stage>.jsonl``, images of samples, and
-    TensorBoard's files.
-    """
-    for log in sorted(work.rglob("log.jsonl")):
-        shutil.copy(log, output / f"log-{log.parent.name}.jsonl")
-        for name in ("samples", "tensorboard"):
-            if (folder := log.parent / name).is_dir():
-                shutil.copytree(folder, output / name / log.parent.name)

@@ -1,0 +1,275 @@
+"""Training a denoiser (paper section 2), in the paper on Eq. 1,
+
+    L(theta) = E_{z, c, eps, t} || eps - eps_theta(z^t, t, c) ||^2,   t uniform on 1..T,
+    z^t = sqrt(a_t) z + sqrt(1 - a_t) eps.
+
+The condition c is dropped with probability p, which trains the unconditional model that guidance
+needs (Ho & Salimans 2022).
+
+Beyond the paper: flow matching (Lipman et al. 2023) with logit-normal time, whose target is ``eps -
+z``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from diffusers.models.unets.unet_2d_condition import UNet2DConditionModel
+from numpy.typing import NDArray
+from torch import Tensor, nn
+
+from palpate.core import digest_json, require
+from palpate.diffusion.autoencoder import LatentStats
+from palpate.diffusion.denoiser import Denoiser, inputs_of, lengths_of, slots_of
+from palpate.diffusion.options import SOURCES, ConditionPolicy, Schedule, Source, UNetOptions
+from palpate.diffusion.presets import DiffusionPreset
+from palpate.diffusion.unet import build_unet, load_unet
+from palpate.encoders.encoder_set import seeded
+from palpate.encoders.models import digest_tensors, pick_device
+from palpate.training.engine import Batch, Losses, Task, fit
+from palpate.training.run import TrainingRun
+from palpate.training.steps import Step
+
+#: Share of the rows that are trained without the patches of their photo, so that the embedding
+#: alone is known, too.
+DROP_PATCHES = 0.5
+#: Mean of the logit of the time of flow matching.
+TIME_MEAN = 0.5
+Backgrounds = Callable[[NDArray[np.int64]], Tensor]
+
+
+@dataclass(frozen=True)
+class Rows:
+    """What a denoiser is trained on.
+
+    Attributes:
+        latents: (n, c, h, w) of the autoencoder, not normalized; a memory map will do.
+        conditions: embeddings (n, d) by source; those of ``policy.sources`` are needed, others only
+            give their mean. By name ``inputs_of(policy)``, arrays or memory maps.
+        background: rows -> (n, g, h, w), what the variant w/ BG sees of the gel.
+        ids: of the rows, for errors.
+        key: digest of all of this, which is not read for it.
+    """
+
+    latents: Tensor | NDArray[Any]
+    conditions: Mapping[str, Tensor | NDArray[Any]]
+    background: Backgrounds | None = None
+    ids: Sequence[str] | None = None
+    key: str = ""
+
+
+def train_denoiser(
+    rows: Rows,
+    preset: DiffusionPreset,
+    stats: LatentStats,
+    run: TrainingRun,
+    *,
+    held_out: Rows | None = None,
+    start: Denoiser | None = None,
+    samples: Callable[[nn.Module], NDArray[np.uint8]] | None = None,
+) -> Denoiser:
+    """Train a denoiser; resume if the run's folder holds a checkpoint of the same run.
+
+    Args:
+        rows: of the train part.
+        preset: U-Net, condition, schedule and loop, whose seed also seeds the weights.
+        stats: normalize the latents of tactile and background images.
+        run: where, and how.
+        held_out: rows whose loss is measured in training.
+        start: go on from these weights and in their shape instead of random ones. The modality
+            means are those of ``rows`` all the same.
+        samples: see :class:`~palpate.training.engine.Task`.
+
+    Returns:
+        The denoiser with averaged weights, frozen.
+
+    Raises:
+        PalpateError: if a source is missing.
+    """
+    policy, conditions = preset.condition, rows.conditions
+    _require_conditions(policy, conditions)
+    tables = {s: _floats(conditions[s]) for s in SOURCES if s in conditions}
+    means = {s: table.double().mean(0).float() for s, table in tables.items()}
+    with seeded(preset.loop.seed, "denoiser"):
+        gel = 0 if rows.background is None else rows.background(np.arange(1)).shape[1]
+        channels, side = rows.latents.shape[1:3]
+        net = new_unet(start, preset.unet, policy, side, channels=channels, background=gel)
+        memory = _memory(tables) if policy.gap == "pairs" else None
+        width = conditions["patches"].shape[2] if "patches" in inputs_of(policy) else None
+        model = Denoiser(net, policy, means, memory, width)
+        model.to(pick_device(run.device))
+    if start is not None:
+        _copy_weights(start, model)
+
+    def loss_of(part: Rows) -> DiffusionLoss:
+        with torch.no_grad():
+            tokens = {
+                s: model.tokens(_floats(part.conditions[s]), s).to("cpu") for s in policy.sources
+            }
+        return DiffusionLoss(
+            part.latents,
+            tokens,
+            part.background,
+            stats=stats,
+            schedule=preset.schedule,
+            policy=policy,
+            inputs={name: part.conditions[name] for name in inputs_of(policy)},
+        )
+
+    loss, held = loss_of(rows), None
+    if held_out is not None:
+        held = (len(held_out.latents), loss_of(held_out).load)
+    records = (stats, preset.unet, policy, preset.schedule)
+    settings = [asdict(record) for record in records if not isinstance(record, str)]
+    trained = start is not None or isinstance(preset.unet, str)
+    begin = [digest_tensors(model.state_dict())] if trained else []
+    key = digest_json([rows.key, rows.background is not None, *settings, *begin])
+    n = len(rows.latents)
+    task = Task("generator", n, loss.load, loss, key, rows.ids, held, samples)
+    fit(model, task, preset.loop, run.folder, compute=run.compute, progress=run.progress)
+    return model.eval().requires_grad_(False)
+
+
+def new_unet(
+    start: Denoiser | None,
+    unet: UNetOptions | str,
+    policy: ConditionPolicy,
+    side: int,
+    *,
+    channels: int,
+    background: int,
+) -> UNet2DConditionModel:
+    """The network that trains: of the shape of ``start``, a trained one, or one of new weights.
+
+    Args:
+        start: goes on.
+        unet: geometry of the network, or a trained one, see :func:`load_unet`.
+        policy: gives the tokens.
+        side: of the latents.
+        channels: of the latents.
+        background: channels of the no-contact image.
+    """
+    if start is not None:
+        config: Any = UNet2DConditionModel.from_config(start.unet.config)
+        return config
+    if isinstance(unet, str):
+        return load_unet(unet, policy, channels=channels, background=background)
+    return build_unet(unet, policy, size=side, channels=channels, background=background)
+
+
+def _require_conditions(policy: ConditionPolicy, conditions: Mapping[str, Any]) -> None:
+    pairs = policy.gap == "pairs"
+    must = "must be text or both with gap='pairs': other photos would find their own text"
+    fits = not pairs or "text" in policy.sources
+    require(fits, "condition.source", must, policy.source, fix="Take gap='none'")
+    needed = [*dict.fromkeys((*policy.sources, *inputs_of(policy), *(SOURCES if pairs else ())))]
+    missing = [name for name in needed if name not in conditions]
+    settings = f"source={policy.source!r} and gap={policy.gap!r}"
+    must = f"{settings} need conditions of {', '.join(needed)}"
+    require(not missing, None, must, f"none of {', '.join(missing[:1])}")
+
+
+def _floats(table: Any) -> Tensor:
+    return torch.as_tensor(np.asarray(table), dtype=torch.float32)
+
+
+def _memory(tables: Mapping[Source, Tensor]) -> tuple[Tensor, Tensor]:
+    """The different training texts (m, d), and the mean of the photos of each."""
+    texts, which, counts = tables["text"].unique(dim=0, return_inverse=True, return_counts=True)
+    photos = torch.zeros_like(texts).index_add_(0, which, tables["vision"])
+    return texts, photos / counts[:, None]
+
+
+def _copy_weights(source: Denoiser, target: Denoiser) -> None:
+    """Copy the U-Net, and what else both have learned."""
+    weights = dict(source.named_parameters())
+    for name, own in target.named_parameters():
+        if name in weights:
+            own.data.copy_(weights[name].data)
+
+
+class DiffusionLoss:
+    """Eq. 1, or that of flow matching, for one batch; all draws are those of the step."""
+
+    def __init__(
+        self,
+        latents: Tensor | NDArray[Any],
+        tokens: Mapping[Source, Tensor],
+        background: Backgrounds | None,
+        *,
+        stats: LatentStats,
+        schedule: Schedule,
+        policy: ConditionPolicy,
+        inputs: Mapping[str, Any] | None = None,
+    ) -> None:
+        """Take latents (n, c, h, w), not normalized, tokens (n, k, d) by source, and inputs."""
+        self.latents, self.tokens, self.background = latents, dict(tokens), background
+        self.stats, self.schedule, self.policy = stats, schedule, policy
+        self.inputs = dict(inputs or {})
+        self.lengths = torch.tensor(lengths_of(policy))
+        self.alphas = schedule.alphas()
+
+    def load(self, step: Step) -> Batch:
+        """Noisy latents, their targets, tokens, and which of these are dropped."""
+        z = self.stats.normalize(_take(self.latents, step.rows))
+        if self.schedule.prediction == "flow":
+            time = torch.sigmoid(TIME_MEAN + step.randn())
+            keep, spread, t = 1 - time, time, self.schedule.steps * time
+        else:
+            t = step.randint(self.schedule.steps)
+            a = self.alphas[t].float()
+            keep, spread = a.sqrt(), (1 - a).sqrt()
+        keep, spread = keep.reshape(-1, 1, 1, 1), spread.reshape(-1, 1, 1, 1)
+        noise = step.randn(*z.shape[1:])
+        target = noise - z if self.schedule.prediction == "flow" else noise
+        tokens = self._tokens(step)
+        batch = {
+            "noisy": keep * z + spread * noise,
+            "target": target,
+            "t": t,
+            **({} if tokens is None else {"tokens": tokens}),
+            **{name: _take(table, step.rows) for name, table in self.inputs.items()},
+            "dropped": self._dropped(step).repeat_interleave(self.lengths, dim=1),
+        }
+        if self.background is not None:
+            batch["background"] = self.background(step.rows)
+        return batch
+
+    def __call__(self, module: nn.Module, batch: Batch) -> Losses:
+        """Return the squared error of a batch."""
+        assert isinstance(module, Denoiser)
+        null = module.null_tokens(len(batch["t"]))
+        parts = [batch["tokens"]] if "tokens" in batch else []
+        parts += [make(batch[name].float()) for name, make in module.maps.items()]
+        tokens = torch.where(batch["dropped"], null, torch.cat(parts, dim=1))
+        prediction = module(batch["noisy"], batch["t"], tokens, batch.get("background"))
+        error = (prediction.float() - batch["target"]).square().mean((1, 2, 3))
+        total = error.mean()
+        return Losses(total, {"mse": total.detach()}, error.detach())
+
+    def _tokens(self, step: Step) -> Tensor | None:
+        """Tokens of the embeddings, with noise."""
+        if not self.policy.sources:
+            return None
+        tokens = torch.cat([self.tokens[s][step.rows] for s in self.policy.sources], dim=1)
+        if self.policy.noise:
+            noise = step.randn(slots_of(self.policy), self.policy.width)
+            tokens = nn.functional.normalize(tokens + self.policy.noise * noise, dim=2)
+            tokens = tokens * self.policy.width**0.5
+        return tokens
+
+    def _dropped(self, step: Step) -> Tensor:
+        """Which embeddings and inputs (n, parts, 1) are dropped; patches also with their photo."""
+        draws = step.rand(len(self.lengths), 1)
+        dropped, slots = draws < self.policy.dropout, slots_of(self.policy)
+        if "patches" in self.inputs:
+            dropped[:, slots:] = dropped[:, slots - 1 : slots] | (draws[:, slots:] < DROP_PATCHES)
+        return dropped
+
+
+def _take(table: Tensor | NDArray[Any], rows: NDArray[np.int64]) -> Tensor:
+    return torch.as_tensor(table[rows])

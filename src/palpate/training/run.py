@@ -1,0 +1,109 @@
+"""Where a training works and how it is run, and what it leaves next to its result."""
+
+from __future__ import annotations
+
+import shutil
+import tempfile
+from collections.abc import Generator
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from palpate.core import PalpateError, Progress, locked, quiet, require_new_folder
+from palpate.training.options import Compute
+from palpate.training.processes import barrier, connect, merged, place
+
+
+@dataclass(frozen=True)
+class TrainingRun:
+    """A run of a training; of what is computed it decides the seed alone.
+
+    Attributes:
+        folder: for checkpoints and logs; nothing in it belongs to the result.
+        seed: of weights, order, augmentation and noise.
+        cache: folder for decoded pixels, latents and embeddings; None: memory, or ``folder``.
+        device: ``auto``, ``cpu``, ``cuda`` or ``mps``, or a device of torch.
+        compute: how to run it on the machine at hand.
+        progress: called while the work goes on.
+    """
+
+    folder: Path
+    seed: int = 0
+    cache: Path | None = None
+    device: str | torch.device = "cpu"
+    compute: Compute | None = None
+    progress: Progress = quiet
+
+    def stage(self, name: str) -> TrainingRun:
+        """The same with a folder of its own."""
+        return replace(self, folder=self.folder / name)
+
+    def keep(self, model: Any, output: Path | str | None) -> None:
+        """Save a result, with the logs of its training; of several processes the first one."""
+        if output is not None and place()[0] == 0:
+            model.save(Path(output))
+            keep_logs(self.folder, Path(output))
+
+
+@contextmanager
+def run_for(
+    output: Path | str | None, seed: int, device: str, compute: Compute | None, progress: Progress
+) -> Generator[TrainingRun]:
+    """The run of a training whose result goes to ``output``, together with other processes.
+
+    Raises:
+        PalpateError: as :func:`work_folder`.
+    """
+    device = connect(device)
+    with work_folder(None if output is None else Path(output)) as work:
+        yield TrainingRun(work, seed, work / "cache", device, compute, progress)
+
+
+@contextmanager
+def work_folder(output: Path | None) -> Generator[Path]:
+    """A folder for checkpoints and caches of a training whose result goes to ``output``.
+
+    ``.<name>.work`` next to the output, which the same call finds again after a stop and which is
+    removed on success; a temporary folder where there is no output. Of several processes the first
+    holds it, and all are given the same.
+
+    Raises:
+        PalpateError: if the output exists already or is written by another run, before any work is
+            done.
+    """
+    rank = place()[0]
+    if output is None:
+        with tempfile.TemporaryDirectory(prefix="palpate-") as name:
+            yield Path(merged({str(rank): name})["0"])
+            barrier()  # the first one is removed when nobody needs it
+        return
+    require_new_folder(output)
+    work = output.absolute().parent / f".{output.name}.work"
+    barrier()  # all have looked at the output before it is written
+    if rank:
+        yield work
+        barrier()
+        return
+    with locked(work, output):
+        try:
+            yield work
+        except PalpateError:
+            if not any(p.is_file() for p in work.rglob("*")):  # rejected before any work was done
+                shutil.rmtree(work)
+            raise
+    barrier()
+    shutil.rmtree(work, ignore_errors=True)
+
+
+def keep_logs(work: Path, output: Path) -> None:
+    """Copy what a training wrote to its result: ``log-<stage>.jsonl``, images of samples, and
+    TensorBoard's files.
+    """
+    for log in sorted(work.rglob("log.jsonl")):
+        shutil.copy(log, output / f"log-{log.parent.name}.jsonl")
+        for name in ("samples", "tensorboard"):
+            if (folder := log.parent / name).is_dir():
+                shutil.copytree(folder, output / name / log.parent.name)
