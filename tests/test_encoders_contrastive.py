@@ -214,7 +214,7 @@ def test_vision_and_text_are_not_trained_on_one_row(world, tmp_path):
     one = [{**r, "vision": None} if k else r for k, r in enumerate(world.table.to_dicts())]
     with pytest.raises(PalpateError, match=r"must hold two photos.*Got one, v0/0"):
         train("one", Manifest.from_rows(one, world.root))
-    with pytest.raises(PalpateError, match="`clip_course.batch` must be at least 2"):
+    with pytest.raises(PalpateError, match=r"`clip_course\.batch` must be at least 2"):
         train("batch", course=replace(TINY.clip_course, batch=1))
     for change in ({"keep": "best"}, {"patience": 1}):
         with pytest.raises(PalpateError, match="must keep its last weights and run to its end"):
@@ -235,9 +235,8 @@ def test_a_test_part_without_materials_or_tactile_images_costs_no_training(world
 def test_what_needs_a_held_out_part_is_rejected_without_one(world, clip, tmp_path):
     for change in ({"keep": "best"}, {"patience": 1}):
         preset = quick(tactile_course=replace(TINY.tactile_course, **change))
-        with pytest.raises(
-            PalpateError, match=f"`tactile_course.{next(iter(change))}` needs a part val"
-        ):
+        must = f"`tactile_course.{next(iter(change))}` needs a part val"
+        with pytest.raises(PalpateError, match=must):
             train_tactile(world, by_video(world), clip, preset, tmp_path, device="cpu")
 
 
