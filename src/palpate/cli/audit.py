@@ -13,11 +13,11 @@ from palpate._version import __version__
 from palpate.cli.importing import Reading
 from palpate.cli.terminal import (
     Common,
+    Files,
     OptionalOutPath,
     Switch,
     Terminal,
     guard_output,
-    guard_results,
     require_extra,
     working_folder,
 )
@@ -143,7 +143,7 @@ def _check(options: Options) -> None:
     if options.comparison.encoder is not None:
         require_extra("palpate audit --encoder")
     inputs = [*options.paths, *(p for p in (options.split, options.pretrain) if p)]
-    guard_results(inputs, outputs.output, outputs.page)
+    Files(output=outputs.output, page=outputs.page).guard(inputs)
     if table is not None:
         suffixes = (".parquet", ".csv")
         must = f"must end in {' or '.join(suffixes)}"

@@ -9,7 +9,7 @@ from typing import Annotated, Any
 import tyro
 
 from palpate.cli.importing import Maps, columns_of
-from palpate.cli.terminal import Common, OptionalOutPath, Terminal, guard_results
+from palpate.cli.terminal import Common, Files, OptionalOutPath, Terminal
 from palpate.cli.verbs import FAILED_CHECK
 from palpate.core import require
 
@@ -49,7 +49,8 @@ def run(options: Options, terminal: Terminal) -> tuple[dict[str, Any], int]:
     limit = options.fail_over
     require(limit is None or 0 <= limit <= 1, "fail_over", "must lie in [0, 1]", limit)
     inputs = [p for p in (options.captions, options.data, options.split) if p is not None]
-    guard_results(inputs, options.output, options.page)
+    files = Files(output=options.output, page=options.page)
+    files.guard(inputs)
     extra = {"columns": columns} if (columns := columns_of(options.columns)) else {}
     with terminal.progress() as progress:
         results = check_captions(
@@ -60,7 +61,7 @@ def run(options: Options, terminal: Terminal) -> tuple[dict[str, Any], int]:
             progress=progress,
             **extra,
         )
-    shown = terminal.deliver(results, output=options.output, page=options.page)
+    shown = terminal.deliver(results, files)
     flagged = float(results[SHARE, FLAGGED])
     failed = limit is not None and flagged > limit
     if failed:

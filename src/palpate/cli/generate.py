@@ -9,6 +9,7 @@ from typing import Annotated, Any, Literal
 import tyro
 
 from palpate.cli.terminal import Common, OutPath, Switch, Terminal, require_extra
+from palpate.core import problem_lines
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -75,6 +76,9 @@ def run(options: Options, terminal: Terminal) -> dict[str, Any]:
         "notice": images.notice or None,
     }
     terminal.facts(f"Tactile images {options.output}", facts)
-    terminal.skipped(images.skipped)
+    if images.skipped:
+        terminal.print_line(f"Skipped {len(images.skipped)}:")
+        for line in problem_lines(images.skipped):
+            terminal.print_line(line)
     notes = [note.to_json() for note in images.notes]
     return facts | {"skipped": [asdict(p) for p in images.skipped], "notes": notes}

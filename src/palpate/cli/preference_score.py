@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any
 
 import tyro
 
-from palpate.cli.terminal import Common, OptionalOutPath, Terminal, guard_results
+from palpate.cli.terminal import Common, Files, Terminal
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -29,18 +29,13 @@ class Options(Common):
     """Resamplings of an interval."""
     seed: int = 0
     """Of the resamplings."""
-    output: OptionalOutPath = None
-    """Write the scores as JSON, for `palpate report`, next to those of `palpate score`."""
-    latex: Path | None = None
-    """Write the tables as LaTeX (booktabs)."""
-    page: Path | None = None
-    """Write them as one self-contained page (.html)."""
+    files: Files = field(default_factory=Files)
 
 
 def run(options: Options, terminal: Terminal) -> dict[str, Any]:
     """Score, print the tables, write."""
     inputs = [options.study, options.study / "plan.json", *options.votes, *options.metrics]
-    guard_results(inputs, options.output, options.page, options.latex)
+    options.files.guard(inputs)
     from palpate.preference import score
 
     with terminal.progress() as progress:
@@ -52,4 +47,4 @@ def run(options: Options, terminal: Terminal) -> dict[str, Any]:
             seed=options.seed,
             progress=progress,
         )
-    return terminal.deliver(results, output=options.output, page=options.page, latex=options.latex)
+    return terminal.deliver(results, options.files)

@@ -8,14 +8,7 @@ from typing import Annotated, Any, Literal
 
 import tyro
 
-from palpate.cli.terminal import (
-    Common,
-    OptionalOutPath,
-    Switch,
-    Terminal,
-    guard_results,
-    require_extra,
-)
+from palpate.cli.terminal import Common, Files, OptionalOutPath, Switch, Terminal, require_extra
 from palpate.cli.training import Machine
 from palpate.core import require
 
@@ -96,8 +89,9 @@ def run(options: Options, terminal: Terminal) -> dict[str, Any]:
     got, fix = "both" if training.train else "neither", "E.g. --encoder palpate/mini"
     must = "Either an encoder or training must be chosen"
     require(bool(options.encoder) != training.train, None, must, got, fix=fix)
-    json, page = (None, output) if output and output.suffix == ".html" else (output, None)
-    guard_results([options.manifest, *options.split], json, page)
+    is_page = output is not None and output.suffix == ".html"
+    files = Files(page=output) if is_page else Files(output=output)
+    files.guard([options.manifest, *options.split])
     one_or_all = lambda values: values[0] if len(values) == 1 else list(values)
     with terminal.progress() as progress:
         if training.train:
@@ -129,7 +123,7 @@ def run(options: Options, terminal: Terminal) -> dict[str, Any]:
                 progress=progress,
                 **vars(options.probing),
             )
-    report = terminal.deliver(results, output=json, page=page)
+    report = terminal.deliver(results, files)
     for fact in results.facts:
         terminal.print(fact)
     return report

@@ -32,9 +32,9 @@ from tyro._errors import (
     on_parse_error,
 )
 
-from palpate.cli.terminal import CONFIG, FIRST, Terminal, list_problems
+from palpate.cli.terminal import CONFIG, FIRST, Terminal
 from palpate.cli.verbs import BUG, OK, USER_ERROR, VERBS
-from palpate.core import PalpateError, PalpateWarning, ProblemsError, require
+from palpate.core import PalpateError, PalpateWarning, ProblemsError, problem_lines, require
 from palpate.core.files import NO_ROOM
 
 #: Verb and argument of its function -> how the command line writes it, where that is not the
@@ -230,7 +230,8 @@ def run_verb(name: str, args: Sequence[str]) -> int:
             return USER_ERROR
         _print_error(f"palpate {name}: {error_line(name, error)}")
         if isinstance(error, ProblemsError):
-            list_problems(error.problems, _print_error)
+            for line in problem_lines(error.problems):
+                _print_error(line)
         for choice in error.choices:  # the same command with what it lacks
             more = [_option(name, argument, value) for argument, value in choice.items()]
             _print_error(f"  {' '.join([shlex.join(['palpate', *name.split(), *args]), *more])}")

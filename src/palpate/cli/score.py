@@ -8,14 +8,7 @@ from typing import Annotated, Any, Literal
 
 import tyro
 
-from palpate.cli.terminal import (
-    Common,
-    OptionalOutPath,
-    Switch,
-    Terminal,
-    guard_results,
-    working_folder,
-)
+from palpate.cli.terminal import Common, Files, Switch, Terminal, working_folder
 from palpate.core import require
 
 #: What the word of an option means.
@@ -97,23 +90,18 @@ class Options(Common):
     its images lie to these (memorization). Of a manifest that --split knows, its train part."""
     allow_seen: Switch = False
     """Score with an encoder that was trained on some of the real images; every score says so."""
-    output: OptionalOutPath = None
-    """Write scores, gallery and settings as JSON, for `palpate report`."""
-    latex: Path | None = None
-    """Write the tables as LaTeX (booktabs)."""
-    page: Path | None = None
-    """Write the same as one self-contained page (.html), with .json and .md next to it."""
     cache: Path | None = None
     """Folder for embeddings and decoded images. Default: one next to -o, for a run that is
     interrupted; removed at the end."""
+    files: Files = field(default_factory=Files)
     samples: Samples = field(default_factory=Samples)
     metrics: Metrics = field(default_factory=Metrics)
 
 
 def run(options: Options, terminal: Terminal) -> dict[str, Any]:
     """Score, print the tables, write JSON and LaTeX."""
-    inputs = _inputs(options)
-    guard_results(inputs, options.output, options.page, options.latex)
+    inputs, files = _inputs(options), options.files
+    files.guard(inputs)
     if (cache := options.cache) is not None:
         must, fix = "must not be an input", "Choose a folder outside what is read"
         apart = not any(cache.resolve().is_relative_to(path.resolve()) for path in inputs)
@@ -123,7 +111,7 @@ def run(options: Options, terminal: Terminal) -> dict[str, Any]:
     require(alone, "companions", "must be none, or names", " ".join(companions or ()))
     from palpate.evaluation.scoring import score
 
-    output = options.output or options.page or options.latex
+    output = files.output or files.page or files.latex
     has_images = options.reference.is_dir() or options.encoder
     with working_folder(cache, output if has_images else None) as folder:
         with terminal.progress() as progress:
@@ -132,15 +120,13 @@ def run(options: Options, terminal: Terminal) -> dict[str, Any]:
                 options.reference,
                 progress=progress,
                 **options.keywords(
-                    *("generated", "reference", "output", "latex", "page"),
+                    *("generated", "reference"),
                     companions=() if companions == ("none",) else companions,
                     normalize=NORMALIZE[options.metrics.normalize],
                     cache=folder,
                 ),
             )
-        return terminal.deliver(
-            results, output=options.output, page=options.page, latex=options.latex
-        )
+        return terminal.deliver(results, files)
 
 
 def _inputs(options: Options) -> list[Path]:

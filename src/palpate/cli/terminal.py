@@ -30,11 +30,9 @@ from palpate.core import (
     MissingExtraError,
     Note,
     PalpateError,
-    Problem,
     Progress,
     fact_lines,
     is_stream,
-    problem_lines,
     quiet,
     require,
     write_text,
@@ -92,6 +90,42 @@ def _keywords(options: Any) -> dict[str, Any]:
     return names
 
 
+@dataclass(frozen=True, kw_only=True)
+class Files:
+    """What is written."""
+
+    output: OptionalOutPath = None
+    """The results as JSON, for `palpate report`."""
+    page: Path | None = None
+    """The same as one self-contained page (.html), with .json and .md next to it."""
+    latex: Path | None = None
+    """The tables as LaTeX (booktabs)."""
+
+    def keywords(self) -> dict[str, Any]:
+        """No arguments of the verb's function."""
+        return {}
+
+    def guard(self, inputs: Sequence[Path]) -> None:
+        """Check what :meth:`Terminal.deliver` is to write, as :func:`guard_output`.
+
+        Raises:
+            PalpateError: if two of these are one file, or the page is no .html.
+        """
+        output, page, latex = self.output, self.page, self.latex
+        is_page = page is None or page.suffix.lower() == ".html"
+        require(is_page, "page", "must end in .html", page and page.name)
+        pages = [page.with_suffix(suffix) for suffix in (".html", ".json", ".md")] if page else []
+        must = "must not be a file that the page writes"
+        require(output not in pages, "output", must, str(output), fix="Choose another file")
+        same = output and latex and latex.resolve() == output.resolve()
+        must, fix = "must not be the file of the results", "Choose another file for one of them"
+        require(not same, "latex", must, str(latex), fix=fix)
+        marks = (output, JSON_MARK), (latex, b"% palpate"), *((path, b"palpate") for path in pages)
+        for path, mark in marks:
+            if path is not None:
+                guard_output(path, inputs, (mark,))
+
+
 class Terminal:
     """Where a verb writes: results on standard output, progress and notes on standard error."""
 
@@ -124,32 +158,19 @@ class Terminal:
 
         print_result(result, self.out)
 
-    def deliver(
-        self,
-        results: Results,
-        *,
-        output: Path | None = None,
-        page: Path | None = None,
-        latex: Path | None = None,
-    ) -> dict[str, Any]:
+    def deliver(self, results: Results, files: Files) -> dict[str, Any]:
         """Show results, write the files, and return what ``--json`` prints."""
         results = dataclasses.replace(results, commands=[self.command])
         try:
             self.show(results)  # before saving: a full disk loses nothing
         finally:
-            if output:
-                results.save(output)
-            if page:
-                results.to_html(page)
-            if latex:
-                write_text(latex, results.to_latex())
+            if files.output:
+                results.save(files.output)
+            if files.page:
+                results.to_html(files.page)
+            if files.latex:
+                write_text(files.latex, results.to_latex())
         return results.to_json() if self.json else {}
-
-    def skipped(self, problems: Sequence[Problem]) -> None:
-        """List on standard error what ``--skip-bad`` skipped."""
-        if problems:
-            self.print_line(f"Skipped {len(problems)}:")
-            list_problems(problems, self.print_line)
 
     def facts(self, title: str, rows: Mapping[str, Any]) -> None:
         """Print a two-column table of names and values."""
@@ -208,12 +229,6 @@ class _LogProgress:
             self.printed = self.printed - {task} if ended else self.printed | {task}
 
 
-def list_problems(problems: Sequence[Problem], print_line: Callable[[str], None]) -> None:
-    """Print the first problems, one a line."""
-    for line in problem_lines(problems):
-        print_line(line)
-
-
 def require_extra(purpose: str) -> None:
     """Check that the packages of the extra ``all`` are installed, before any work.
 
@@ -266,32 +281,6 @@ def guard_output(
         must = f"{output} must be new, or a file of the kind that this command writes"
         ours = not head or any(each in head for each in signatures)
         require(ours, None, must, "another file", fix="Choose another file, or remove it")
-
-
-def guard_results(
-    inputs: Sequence[Path], output: Path | None, page: Path | None = None, latex: Path | None = None
-) -> None:
-    """Check what :meth:`Terminal.deliver` is to write, as :func:`guard_output`.
-
-    Raises:
-        PalpateError: if two of these are one file, or the page is no .html.
-    """
-    if page is not None:
-        require(page.suffix.lower() == ".html", "page", "must end in .html", page.name)
-    pages = [page.with_suffix(suffix) for suffix in (".html", ".json", ".md")] if page else []
-    if output is not None:
-        fix, must = "Choose another file", "must not be a file that the page writes"
-        require(output not in pages, "output", must, str(output), fix=fix)
-        guard_output(output, inputs)
-    for path in pages:
-        guard_output(path, inputs, (b"palpate",))
-    if latex is not None:
-        same, must = (
-            output and latex.resolve() == output.resolve(),
-            "must not be the file of the results",
-        )
-        require(not same, "latex", must, str(latex), fix="Choose another file for one of them")
-        guard_output(latex, inputs, (b"% palpate",))
 
 
 @contextlib.contextmanager
