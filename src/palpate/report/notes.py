@@ -2,15 +2,17 @@
 
 Sentences are in the wording of Python or of the command line.
 
-A template is filled with the note's parameters. ``{arg:sigma=multi}`` in it becomes
-``sigma='multi'`` in Python and ``--sigma multi`` on the command line. Where one
-template cannot do (plurals, optional parts), the entry is a function of parameters and style.
+A template is filled with the note's parameters: ``{count:vote}`` is ``2 votes``, ``{files:few}``
+the first of a list, ``{arg:sigma=multi}`` ``sigma='multi'`` in Python and ``--sigma multi`` on the
+command line. Where a template cannot do, the entry is a function of parameters and style.
 """
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from string import Formatter
 from typing import Any
 
 from palpate.core import Note, few
@@ -43,14 +45,21 @@ class Style:
         """``name`` or ``name=value`` in this style."""
         name, equals, value = spec.partition("=")
         if self.command_line:
-            return f"--{_OPTIONS.get(name, name).replace('_', '-')}" + (
-                f" {value}" if value not in ("", "True") else ""
-            )
-        return (
-            f"{name}={value if value in ('True', 'False', 'None') else repr(value)}"
-            if equals
-            else name
-        )
+            option = f"--{_OPTIONS.get(name, name).replace('_', '-')}"
+            return option if value in ("", "True") else f"{option} {value}"
+        written = value if value in ("True", "False", "None") else repr(value)
+        return f"{name}={written}" if equals else name
+
+
+class _Template(Formatter):
+    """Lists as ``{materials}`` or ``{files:few}``, numbers as ``{count:vote}`` (2 votes)."""
+
+    def format_field(self, value: Any, format_spec: str) -> str:
+        if isinstance(value, list | tuple):
+            return few(value) if format_spec == "few" else ", ".join(map(str, value))
+        if isinstance(value, int) and re.fullmatch("[a-z ]{2,}", format_spec):
+            return plural(value, format_spec)
+        return super().format_field(value, format_spec)
 
 
 PYTHON, COMMAND_LINE = Style(), Style(command_line=True)
@@ -98,11 +107,9 @@ def _undefined(p: Mapping[str, Any], style: Style) -> str:
 
 
 def _unstable(p: Mapping[str, Any], _: Style) -> str:
-    known = p["known_errors"]
-    why = "within two standard errors of 0" if known else "of unknown error (too few groups)"
-    names, more = ", ".join(p["classes"][:5]), len(p["classes"]) - 5
-    tail = f" and {more} more" if more > 0 else ""
-    return f"Denominators {why}, so the ratio is unreliable: {names}{tail}"
+    unknown = "of unknown error (too few groups)"
+    why = "within two standard errors of 0" if p["known_errors"] else unknown
+    return f"Denominators {why}, so the ratio is unreliable: {few(p['classes'])}"
 
 
 def _excluded_classes(p: Mapping[str, Any], _: Style) -> str:
@@ -165,20 +172,13 @@ METRICS: dict[str, Sentence] = {
 }
 
 
-def _rows_skipped(params: Mapping[str, Any], _: Style) -> str:
-    return f"{params['count']} bad rows were skipped ({few(params['problems'])})"
-
-
-def _blank_images(params: Mapping[str, Any], _: Style) -> str:
-    what, shows = "photos", "nothing at all"
-    if params["modality"] == "tactile":
-        pairs = params["pairs"]
-        what = "tactile images"
-        shows = "untouched gel" + (f" (by {plural(pairs, 'pair')} of backgrounds)" if pairs else "")
-    return (
-        f"{params['count']} of {params['of']} {what} show {shows}, under"
-        f" {params['limit']:.2f} gray levels, and were not compared"
-    )
+def _blank_images(p: Mapping[str, Any], _: Style) -> str:
+    shows = "photos show nothing at all"
+    if p["modality"] == "tactile":
+        by = f" (by {plural(p['pairs'], 'pair')} of backgrounds)" if p["pairs"] else ""
+        shows = f"tactile images show untouched gel{by}"
+    limit = f"under {p['limit']:.2f} gray levels, and were not compared"
+    return f"{p['count']} of {p['of']} {shows}, {limit}"
 
 
 def _equal_names(p: Mapping[str, Any], style: Style) -> str:
@@ -190,32 +190,20 @@ def _equal_names(p: Mapping[str, Any], style: Style) -> str:
     )
 
 
-def _threshold(source: str) -> Sentence:
-    def write(params: Mapping[str, Any], _: Style) -> str:
-        known = plural(params["groups"], "group" if source == "videos" else "piece")
-        line = (
-            f"Threshold {params['threshold']:.3f} from the best matches of {params['samples']} "
-            f"train images {source_of[source]} ({known}), for {params['rate']:.2%} of unrelated "
-            "samples"
-        )
-        guess = "; with so few the rate is an extrapolation, by a factor of three or more"
-        return line + (guess if params["few"] else "")
-
-    source_of = {
-        "videos": "in other videos",
-        "order": "far from them in the order of the files, as no videos are known",
-    }
-    return write
+def _threshold(p: Mapping[str, Any], unit: str, source: str) -> str:
+    line = (
+        f"Threshold {p['threshold']:.3f} from the best matches of {p['samples']} train images "
+        f"{source} ({plural(p['groups'], unit)}), for {p['rate']:.2%} of unrelated samples"
+    )
+    guess = "; with so few the rate is an extrapolation, by a factor of three or more"
+    return line + guess * bool(p["few"])
 
 
-def _no_null(params: Mapping[str, Any], _: Style) -> str:
-    if params["threshold"] is None:
-        why = (
-            f"none of the {plural(params['images'], 'train image')} is known to be unrelated to "
-            "enough others, by video or by order"
-        )
-    else:
-        why = "train images of other videos are as similar as equal ones"
+def _no_null(p: Mapping[str, Any], _: Style) -> str:
+    why = "train images of other videos are as similar as equal ones"
+    if p["threshold"] is None:
+        images = plural(p["images"], "train image")
+        why = f"none of the {images} is known to be unrelated to enough others, by video or order"
     return f"Cannot tell which similarity is chance: {why}. The page and the table rank the pairs"
 
 
@@ -233,9 +221,9 @@ def question(shared: Mapping[str, Sequence[int]]) -> str:
     Args:
         shared: column -> (test groups that are in train, test groups).
     """
-    known = next((c for c in QUESTIONS if shared.get(c, (0, 0))[0]), "")
+    shared_by = next((c for c in QUESTIONS if shared.get(c, (0, 0))[0]), "")
     new = next((f"new {c}s" for c in ("object", "session") if c in shared), "")
-    return QUESTIONS.get(known, new)
+    return QUESTIONS.get(shared_by, new)
 
 
 def _question(p: Mapping[str, Any], style: Style) -> str:
@@ -244,29 +232,21 @@ def _question(p: Mapping[str, Any], style: Style) -> str:
     if other == "video":
         line += f". For {QUESTIONS['object']}: {style:by=video}"
     elif other:
-        count, of = shared[other]
-        line += f": {count} of {of} test {other}s are in train. For new {other}s: "
+        count, total = shared[other]
+        line += f": {count} of {total} test {other}s are in train. For new {other}s: "
         line += f"{style:{'by=' + other}}"
     return line
 
 
-def _near_frames(params: Mapping[str, Any], _: Style) -> str:
-    near = params["frames"]
-    if not near:
+def _near_frames(p: Mapping[str, Any], _: Style) -> str:
+    if not p["frames"]:
         return "Flagged at a gap of 0 frames only"
-    return f"Flagged up to {near} frames; the score is 2^(-gap/{near})"
-
-
-def _listed(template: str) -> Sentence:
-    """A template whose ``{materials}`` is a list."""
-    return lambda params, _: template.format(
-        **{**params, "materials": ", ".join(params["materials"])}
-    )
+    return f"Flagged up to {p['frames']} frames; the score is 2^(-gap/{p['frames']})"
 
 
 LEAKAGE: dict[str, Sentence] = {
-    "backgrounds-unreadable": lambda p, _: (
-        f"{p['count']} background images cannot be read ({few(p['files'])}); their tactile images "
+    "backgrounds-unreadable": (
+        "{count} background images cannot be read ({files:few}); their tactile images "
         "were compared as they are"
     ),
     "blank-images": _blank_images,
@@ -293,9 +273,8 @@ LEAKAGE: dict[str, Sentence] = {
     "group-of-data-set": "The data set says so: the {group} is kept whole",
     "images-absent": "{count} of {of} samples have no {modality} image and were not compared",
     "images-of-one-part": "Only one part has {modality} images: they were not compared",
-    "images-unreadable": lambda p, _: (
-        f"{p['count']} {p['modality']} images cannot be read and were not "
-        f"compared ({few(p['files'])})"
+    "images-unreadable": (
+        "{count} {modality} images cannot be read and were not compared ({files:few})"
     ),
     "shared-videos": (
         "Whole contacts are kept together, but train and test share videos: what a shared video is "
@@ -312,13 +291,9 @@ LEAKAGE: dict[str, Sentence] = {
             *(f"E.g. {style:{name}={value}}" for name, value in p.get("example", {}).items()),
         ]
     ),
-    "missing-materials": _listed(
-        "Could be in every part, but not together with the others: {materials}"
-    ),
+    "missing-materials": "Could be in every part, but not together with the others: {materials}",
     "names-only": "No image that {name} names is there: its names alone were compared",
-    "names-read": lambda p, style: (
-        f"Paths were read as {p['template']}; {style:tactile=TEMPLATE} reads them another way"
-    ),
+    "names-read": ("Paths were read as {template}; {arg:tactile=TEMPLATE} reads them another way"),
     "near-frames": _near_frames,
     "no-group": (
         "Neither videos nor objects, sessions or contacts are known: only samples and images "
@@ -334,14 +309,16 @@ LEAKAGE: dict[str, Sentence] = {
         "folder that its paths start from as {arg:root=FOLDER}"
     ),
     "question": _question,
-    "rare-materials": _listed("In fewer than {parts} groups, so not in every part: {materials}"),
-    "rows-skipped": _rows_skipped,
+    "rare-materials": "In fewer than {parts} groups, so not in every part: {materials}",
+    "rows-skipped": "{count} bad rows were skipped ({problems:few})",
     "samples-in-no-part": "{count} of {of} samples of the manifest are in no part of the split",
     "signal-not-counted": "Reported, but not counted as a leak: the audit is not by {group}",
     "signal-nulls": "{count} {part} samples have no {group}: nothing is known of them",
     "split-of-other-manifest": "The split was made for another manifest (the digests differ)",
-    "threshold-order": _threshold("order"),
-    "threshold-videos": _threshold("videos"),
+    "threshold-order": lambda p, _: _threshold(
+        p, "piece", "far from them in the order of the files, as no videos are known"
+    ),
+    "threshold-videos": lambda p, _: _threshold(p, "group", "in other videos"),
     "validation-leaks": (
         "{count} {group} groups of the validation part occur in train or test as well: "
         "choosing a checkpoint on it leaks"
@@ -531,26 +508,20 @@ RULES = {
 
 
 def _rater_excluded(p: Mapping[str, Any], _: Style) -> str:
-    value, limit = percent(p["value"] or 0.0), percent(p["limit"])
-    what = RULES[p["rule"]].format(value=value, limit=limit)
-    return f"Rater {p['rater']} is excluded by the rule {p['rule']}, fixed before the votes: {what}"
+    why = RULES[p["rule"]].format(value=percent(p["value"] or 0.0), limit=percent(p["limit"]))
+    return f"Rater {p['rater']} is excluded by the rule {p['rule']}, fixed before the votes: {why}"
 
 
 def _human_agreement(p: Mapping[str, Any], _: Style) -> str:
-    def known(name: str, write: Callable[[float], str]) -> str:
-        return "not known" if p[name] is None else write(p[name])
-
-    together = (
-        f"Raters agree in {known('agree', percent)} of their common trials (Cohen's kappa "
-        f"{known('kappa', number)}, Krippendorff's alpha {known('alpha', number)})"
-    )
-    parts = [
-        together
-        if p["agree"] is not None
-        else "No two raters answered the same trial: whether raters agree is not known",
-        *[f"with themselves in {percent(p['self'])} of {plural(p['repeats'], 'repeat')}"]
-        * bool(p["repeats"]),
-    ]
+    kappa, alpha = ("not known" if p[n] is None else number(p[n]) for n in ("kappa", "alpha"))
+    parts = ["No two raters answered the same trial: whether raters agree is not known"]
+    if p["agree"] is not None:
+        parts = [
+            f"Raters agree in {percent(p['agree'])} of their common trials (Cohen's kappa {kappa}, "
+            f"Krippendorff's alpha {alpha})"
+        ]
+    if p["repeats"]:
+        parts.append(f"with themselves in {percent(p['self'])} of {plural(p['repeats'], 'repeat')}")
     if p["left"] is not None:
         parts.append(
             f"{percent(p['left'])} of {p['sides']:,} votes for a side are for the left "
@@ -568,9 +539,9 @@ PREFERENCE: dict[str, Sentence] = {
         "at large, those of 40 items and two raters cover 73 % instead of 95 % in simulated "
         "studies; invite five raters or more, better ten"
     ),
-    "votes-agree": lambda p, _: (
+    "votes-agree": (
         "The votes do not vary: no resampled interval. The bound is of Clopper and Pearson, with "
-        f"{plural(p['items'], 'item')} as the sample"
+        "{items:item} as the sample"
     ),
     "one-item": "One item is no sample: no interval",
     "strength-of-prior": (
@@ -584,25 +555,21 @@ PREFERENCE: dict[str, Sentence] = {
     "few-raters": (
         "{count} raters are few to say how much people differ; invite five or more, better ten"
     ),
-    "votes-twice": lambda p, _: f"{plural(p['count'], 'vote')} given twice count once",
-    "votes-differ": lambda p, _: (
-        f"{plural(p['count'], 'trial')} answered twice by one rater with different answers: the "
+    "votes-twice": "{count:vote} given twice count once",
+    "votes-differ": (
+        "{count:trial} answered twice by one rater with different answers: the "
         "later one counts. Did two people use one code?"
     ),
-    "votes-late": lambda p, _: (
-        f"{plural(p['count'], 'vote')} after the end of the study are skipped"
-    ),
-    "items-left-out": lambda p, _: (
-        f"{p['name']}: {plural(p['missing'], 'item')} of the reference without an image, and "
-        f"{plural(p['unknown'], 'image')} without an item, are left out"
+    "votes-late": ("{count:vote} after the end of the study are skipped"),
+    "items-left-out": (
+        "{name}: {missing:item} of the reference without an image, and "
+        "{unknown:image} without an item, are left out"
     ),
     "videos-unknown": "No video is known: every image counts as one of its own",
     "materials-unknown": "No material is known: items are a random sample",
-    "one-video-classes": lambda p, _: (
-        f"Of {few(p['materials'])} there is one video, and so one item at most"
-    ),
-    "one-video-materials": lambda p, _: (
-        f"{few(p['materials'])} cannot be sorted: the examples would show the only video"
+    "one-video-classes": ("Of {materials:few} there is one video, and so one item at most"),
+    "one-video-materials": (
+        "{materials:few} cannot be sorted: the examples would show the only video"
     ),
     "sampled-items": (
         "{n} items are a sample of {candidates:,} images of {videos:,} videos, at most one a video"
@@ -622,7 +589,7 @@ def sentence(note: Note, style: Style = PYTHON) -> str:
         if callable(template):
             return template(note.params, style)
         if template is not None:
-            return template.format(arg=style, **note.params)
+            return _Template().vformat(template, (), {"arg": style, **note.params})
     except (ArithmeticError, AttributeError, LookupError, TypeError, ValueError):
         pass
     # A note of another version of palpate, or from a file that was edited.

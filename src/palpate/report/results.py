@@ -7,12 +7,13 @@ themselves: ``print(results)``, ``results.to_html("page.html")``, ``results.to_l
 
 from __future__ import annotations
 
+import html
 import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from importlib import import_module
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, overload
+from typing import TYPE_CHECKING, Any, ClassVar, Self, overload
 
 from palpate.core.digest import plain
 from palpate.core.errors import PalpateError
@@ -161,8 +162,37 @@ class Impact:
     notes: Sequence[Note] = ()
 
 
+class Shown:
+    """What audits and results share: they print themselves, and are JSON of a format."""
+
+    form: ClassVar[str]
+
+    def __str__(self) -> str:
+        """The tables, findings, notes and claims, as in the terminal."""
+        return _writer("terminal").as_text(self)
+
+    def _repr_html_(self) -> str:
+        """For notebooks: the same as :meth:`__str__`."""
+        return f'<pre style="line-height: 1.3">{html.escape(str(self))}</pre>'
+
+    def to_json(self) -> dict[str, Any]:
+        """A JSON object with its ``format``."""
+        return {"format": self.form, **plain(self)}
+
+    @classmethod
+    def from_json(cls, data: Mapping[str, Any]) -> Self:
+        """The inverse of :meth:`to_json`; keys that a command adds are ignored."""
+        return from_plain(cls, {k: v for k, v in data.items() if k not in COMMAND_KEYS})
+
+    @classmethod
+    def _read(cls, path: Path, role: str) -> Self:
+        data = read_record(path, f"{role} file", form=cls.form)
+        with reading_entry(path, f"The {role}"):
+            return cls.from_json(data)
+
+
 @dataclass(frozen=True)
-class Audit:
+class Audit(Shown):
     """The leaks of one split. Counts are samples; gaps are frames; fractions lie in [0, 1].
 
     Attributes:
@@ -195,6 +225,7 @@ class Audit:
         table: a polars frame with every signal of every test sample; not in the JSON.
     """
 
+    form: ClassVar[str] = AUDIT_FORMAT
     name: str
     group: str
     train_samples: int
@@ -233,14 +264,6 @@ class Audit:
             share = self.leaking_samples / self.test_samples
             object.__setattr__(self, "leaked_fraction", round(share, 5) or share)
 
-    def __str__(self) -> str:
-        """The finding, the signals, and the notes: a few lines."""
-        return _writer("terminal").as_text(self)
-
-    def _repr_html_(self) -> str:
-        """For notebooks: the same as :meth:`__str__`."""
-        return _preformatted(str(self))
-
     def to_html(self, path: str | Path) -> None:
         """Write a self-contained page, with images of the strongest pairs."""
         self.to_results().to_html(path)
@@ -263,15 +286,6 @@ class Audit:
             )
         return self.table
 
-    def to_json(self) -> dict[str, Any]:
-        """A JSON object with ``format: palpate-audit/1``."""
-        return {"format": AUDIT_FORMAT, **plain(self)}
-
-    @classmethod
-    def from_json(cls, data: Mapping[str, Any]) -> Audit:
-        """The inverse of :meth:`to_json`; keys that a command adds are ignored."""
-        return from_plain(cls, {k: v for k, v in data.items() if k not in COMMAND_KEYS})
-
     def save(self, path: str | Path) -> None:
         """Write the audit as JSON, atomically; paths of inputs become relative to its folder."""
         change = _from_folder(Path(path).parent, Path())
@@ -285,9 +299,7 @@ class Audit:
         Raises:
             PalpateError: if it is missing, or no audit.
         """
-        data = read_record(Path(path), "audit file", form=AUDIT_FORMAT)
-        with reading_entry(Path(path), "The audit"):
-            audit = cls.from_json(data)
+        audit = cls._read(Path(path), "audit")
         call = audit.call and audit.call.with_paths(_below(Path(path).parent))
         return replace(audit, call=call)
 
@@ -341,7 +353,7 @@ class Strip:
 
 
 @dataclass(frozen=True)
-class Results:
+class Results(Shown):
     """Scores, audits and images of a run: a table of scores that can also be drawn as a page.
 
     Iterates over its scores; ``results["TMMD"]`` lists those of a column, by its printed name (as
@@ -360,6 +372,7 @@ class Results:
         calls: what made the scores, for ``palpate verify``; audits have their own.
     """
 
+    form: ClassVar[str] = RESULTS_FORMAT
     title: str
     facts: Sequence[str] = ()
     audits: Sequence[Audit] = ()
@@ -412,14 +425,6 @@ class Results:
     def controls(self) -> set[str]:
         """The subjects that a table of the study names as controls."""
         return {name for table in self.tables for name in table.controls}
-
-    def __str__(self) -> str:
-        """The tables of scores and of a study, and the claims, as in the terminal."""
-        return _writer("terminal").as_text(self)
-
-    def _repr_html_(self) -> str:
-        """For notebooks: the tables of scores."""
-        return _preformatted(str(self))
 
     def to_html(self, path: str | Path) -> None:
         """Write a self-contained page and, next to it, the same as ``.json`` and ``.md``.
@@ -479,22 +484,12 @@ class Results:
 
     def with_paths(self, change: Callable[[str], str | None]) -> Results:
         """The results with ``change`` applied to the path of every image; None removes it."""
-
         return _with_paths(self, change)
 
     def with_call_paths(self, change: Callable[[str], str]) -> Results:
         """The results with ``change`` applied to the path of every input of their calls."""
         audits = [replace(a, call=a.call and a.call.with_paths(change)) for a in self.audits]
         return replace(self, audits=audits, calls=[c.with_paths(change) for c in self.calls])
-
-    def to_json(self) -> dict[str, Any]:
-        """A JSON object with ``format: palpate-results/1``."""
-        return {"format": RESULTS_FORMAT, **plain(self)}
-
-    @classmethod
-    def from_json(cls, data: Mapping[str, Any]) -> Results:
-        """The inverse of :meth:`to_json`; keys that a command adds are ignored."""
-        return from_plain(cls, {k: v for k, v in data.items() if k not in COMMAND_KEYS})
 
     def save(self, path: str | Path) -> None:
         """Write the results as JSON, atomically; paths become relative to its folder."""
@@ -508,11 +503,7 @@ class Results:
         Raises:
             PalpateError: if it is missing, or holds no results.
         """
-        path = Path(path)
-        data = read_record(path, "results file", form=RESULTS_FORMAT)
-        with reading_entry(path, "The results"):
-            results = cls.from_json(data)
-        change = _below(path.parent)
+        results, change = cls._read(Path(path), "results"), _below(Path(path).parent)
         return results.with_paths(change).with_call_paths(change)
 
 
@@ -557,9 +548,3 @@ def _writer(name: str) -> Any:
 
 def _key(score: Score) -> tuple[str, str, str]:
     return label_of(score), subject_of(score), str(score.settings.get("preset", ""))
-
-
-def _preformatted(text: str) -> str:
-    import html
-
-    return f'<pre style="line-height: 1.3">{html.escape(text)}</pre>'
