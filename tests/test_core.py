@@ -144,15 +144,6 @@ def test_a_split_comes_back_from_its_file_unless_edited(tmp_path):
         Split.load(tmp_path / "s.json")
 
 
-def test_splits_that_cannot_be(tmp_path):
-    with pytest.raises(PalpateError, match="one part only"):
-        Split.from_ids(train=["a"], test=["a"])
-    with pytest.raises(PalpateError, match="train, val, test"):
-        Split({"a": "holdout"})
-    with pytest.raises(PalpateError, match="must exist"):
-        Split.load(tmp_path / "absent.json")
-
-
 def test_a_score_is_a_number_that_prints_how_it_was_made():
     score = Score(
         "TMMD", "a", 1.23456, (1.0, 1.5), interval_method="jackknife", n=9, encoder="e" * 64
@@ -167,6 +158,11 @@ def test_a_score_is_a_number_that_prints_how_it_was_made():
     lost = Score("TMMD", "a", inf, interval=(0.0, inf), null=(nan, 1.0), floor=-inf)
     assert (lost.value, lost.interval, lost.null, lost.floor) == (None,) * 4
     assert Score.from_json(lost.to_json()) == lost
+    low, high = Score("TMMD", "a", 1.0), Score("TMMD", "a", 2.0)
+    assert max([low, high]) is high
+    assert low < 1.5 < high
+    assert not low < lost  # an undefined one compares with none
+    assert not low > lost
 
 
 @pytest.mark.parametrize("change", [{"bandwidth": 5.0}, {"encoder": "e2"}, {"settings": {"k": 1}}])
@@ -215,31 +211,21 @@ def test_the_digest_of_features_is_of_ids_and_values_in_any_order(tmp_path):
         FeatureSet(["v/0v/1", "", *ids[2:]], x),
     ]
     assert len({digest, *(s.digest for s in others)}) == 7
-
-
-def test_every_block_counts_in_the_digest():
+    two = [FeatureSet(["a", "b"], np.array([[z, 1.0], [1.0, z]])).digest for z in (0.0, -0.0)]
+    assert two[0] == two[1]  # equal numbers
+    assert FeatureSet([], np.zeros((0, 3))).digest != FeatureSet([], np.zeros((0, 4))).digest
     ids, x = [f"{k}" for k in range(8200)], np.arange(8200, dtype=np.float32)[:, None]
-    digest = FeatureSet(ids, x).digest
+    digest = FeatureSet(ids, x).digest  # of several blocks
     assert FeatureSet(ids[::-1], x[::-1]).digest == digest
     x[-1] += 1
     assert FeatureSet(ids, x).digest != digest
 
 
-def test_equal_numbers_have_one_digest():
-    ids = ["a", "b"]
-    digest = FeatureSet(ids, np.array([[0.0, 1.0], [1.0, 0.0]])).digest
-    assert FeatureSet(ids, np.array([[-0.0, 1.0], [1.0, -0.0]])).digest == digest
-    assert FeatureSet([], np.zeros((0, 3))).digest != FeatureSet([], np.zeros((0, 4))).digest
-
-
-def test_tensors_are_copied_to_the_host_and_bfloat16_is_widened():
+def test_features_come_back_from_their_file_and_from_tensors(tmp_path):
     torch = pytest.importorskip("torch")
-    rows = torch.eye(2, requires_grad=True)
+    rows = torch.eye(2, requires_grad=True)  # copied to the host, bfloat16 widened
     assert to_numpy(rows).tolist() == [[1, 0], [0, 1]]
     assert FeatureSet(["a", "b"], rows.bfloat16()).features.dtype == np.float32
-
-
-def test_features_come_back_from_their_file(tmp_path):
     x = np.eye(3, dtype=np.float32)
     features = FeatureSet(["a", "b", "c"], x, ["w", "w", "g"], ["v", "v", "u"], "e")
     features.save(tmp_path / "f.npz")
@@ -302,6 +288,12 @@ def test_a_killed_stage_resumes_for_the_same_inputs_only(tmp_path, inputs, resum
         (folder / "checkpoint").write_text("half")
         raise KeyboardInterrupt
 
+    def reject(folder):
+        raise PalpateError("a", "b", "c")
+
+    with pytest.raises(PalpateError):
+        run_stage(tmp_path / "a", {}, reject)
+    assert list(tmp_path.iterdir()) == []  # a rejected input leaves no partial folder
     with pytest.raises(KeyboardInterrupt):
         run_stage(tmp_path / "a", {"k": 1}, killed)
     assert not (tmp_path / "a").exists()
@@ -309,28 +301,16 @@ def test_a_killed_stage_resumes_for_the_same_inputs_only(tmp_path, inputs, resum
     assert run_stage(tmp_path / "a", inputs, build).facts == {"resumed": resumed}
 
 
-def test_a_rejected_input_leaves_no_partial_folder(tmp_path):
-    def reject(folder):
-        raise PalpateError("a", "b", "c")
-
-    with pytest.raises(PalpateError):
-        run_stage(tmp_path / "a", {}, reject)
-    assert list(tmp_path.iterdir()) == []
-
-
-def test_scores_are_sorted_by_value_and_an_undefined_one_compares_with_none():
-    low, high, undefined = (Score("TMMD", "a", value) for value in (1.0, 2.0, None))
-    assert max([low, high]) is high
-    assert min([high, low]) is low
-    assert low < 1.5 < high
-    assert not low < undefined
-    assert not low > undefined
-
-
 def test_a_split_is_loaded_from_a_split_or_a_file_and_nothing_else(tmp_path):
     split = Split.from_ids(train=["a"], test=["b"])
     split.save(tmp_path / "s.json")
     assert Split.load(split) is split
     assert Split.load(tmp_path / "s.json") == split
-    with pytest.raises(PalpateError, match="must be a split or its file"):
-        Split.load({"a": "train"})
+    for words, attempt in {
+        "must be a split or its file": lambda: Split.load({"a": "train"}),
+        "must exist": lambda: Split.load(tmp_path / "absent.json"),
+        "one part only": lambda: Split.from_ids(train=["a"], test=["a"]),
+        "train, val, test": lambda: Split({"a": "holdout"}),
+    }.items():
+        with pytest.raises(PalpateError, match=words):
+            attempt()

@@ -59,23 +59,6 @@ def test_controls_of_a_study_follow_the_methods_and_are_never_the_best():
     assert not any(mark for row in rows[1:] for mark in best(row.cells))
 
 
-def test_numbers_that_are_written_alike_are_equally_good():
-    up = {"higher_is_better": True}
-    rows = verdict([score("SSIM", s, v, **up) for s, v in (("a", 0.5004), ("b", 0.5), ("c", 0.4))])
-    assert [rows[name][0].best for name in "abc"] == [True, True, False]
-    near = {"higher_is_better": None, "floor": 0.25, "interval": (0.1, 0.3)}  # two decimals
-    values = (("a", 0.254), ("b", 0.246), ("c", 0.3))  # 0.25, 0.25, 0.30; the floor is 0.25
-    rows = verdict([score("I-TMMD", s, v, **near) for s, v in values])
-    assert [rows[name][0].best for name in "abc"] == [True, True, False]
-
-
-def test_one_method_alone_is_best_of_nothing():
-    rows = verdict([score()])
-    ((cell,), _) = rows.values()
-    assert (cell.score.value, cell.digits, cell.best) == (1.374, 2, False)
-    assert list(rows)[1] == "real images (floor)"
-
-
 def test_a_ratio_that_is_not_known_is_never_the_best_and_has_its_note():
     note = Note("unstable-denominators", {"known_errors": True, "classes": ["Brick"]})
     wild = score("D-TMMD", "wild", 0.05, higher_is_better=None, notes=[note])
@@ -110,49 +93,59 @@ def test_cards_hold_the_leak_the_distance_and_the_material():
     assert "chance, 10.0 %" in material.foot
 
 
-def test_the_card_of_the_material_always_holds_the_real_images():
-    accuracy = {"higher_is_better": True, "null": None, "floor": None}
-    scores = [score("material accuracy", f"m{k}", k / 10, **accuracy) for k in range(6)]
-    scores.append(score("material accuracy", "real", 0.9, **accuracy))
-    (card,) = cards(Results("T", scores=scores), telling_columns(families(scores)))
-    assert [row.label for row in card.rows] == ["m0", "m5", "m1", "real"]
-    assert "4 of 7 rows." in card.foot
+PHOTO = "real, nearest photo"
 
 
-def test_a_card_compares_the_first_method_with_the_best_other_and_a_control():
-    subjects = {"ours": 2.0, "variant": 3.0, "GVST": 1.0, "mean": 9.0, "real, nearest photo": 0.5}
-    scores = [score("TMMD", s, v) for s, v in subjects.items()]
-    columns = telling_columns(families(scores))
-    (card,) = cards(Results("T", scores=scores), columns, ["mean", "real, nearest photo"])
-    labels = ["ours", "GVST", "variant", "real, nearest photo (control)"]
-    assert [row.label for row in card.rows] == labels
-
-
-def test_cards_compare_the_same_subjects():
-    """A method that is first by distance and knows no material must not vanish from the second."""
-    distances = {"ours": 2.0, "near": 0.1, "other": 3.0, "real, nearest photo": 0.5}
-    shares = {"ours": 0.5, "other": 0.7, "near": 0.1, "real, nearest photo": 0.4, "real": 0.8}
+@pytest.mark.parametrize(
+    ("distances", "shares", "controls", "labels"),
+    [
+        # The first method, the best other one, others as they come, and a control.
+        (
+            {"ours": 2.0, "variant": 3.0, "GVST": 1.0, "mean": 9.0, PHOTO: 0.5},
+            {},
+            ["mean", PHOTO],
+            [["ours", "GVST", "variant", f"{PHOTO} (control)"]],
+        ),
+        # The card of the material always holds the real images.
+        (
+            {},
+            {**{f"m{k}": k / 10 for k in range(6)}, "real": 0.9},
+            [],
+            [["m0", "m5", "m1", "real"]],
+        ),
+        # A method that is first by distance and knows no material does not vanish.
+        (
+            {"ours": 2.0, "near": 0.1, "other": 3.0, PHOTO: 0.5},
+            {"ours": 0.5, "other": 0.7, "near": 0.1, PHOTO: 0.4, "real": 0.8},
+            [PHOTO],
+            [
+                ["ours", "near", "other", f"{PHOTO} (control)"],
+                ["ours", "near", f"{PHOTO} (control)", "real"],
+            ],
+        ),
+        # A card never loses its method to controls.
+        (
+            dict.fromkeys(["ours", "a", "b", "c"], 1.0),
+            dict.fromkeys(["ours", "a", "b", "c", "real"], 0.5),
+            ["a", "b", "c"],
+            [
+                ["ours", "b (control)", "c (control)", "a (control)"],
+                ["ours", "b (control)", "c (control)", "real"],
+            ],
+        ),
+    ],
+)
+def test_cards_compare_the_same_subjects(distances, shares, controls, labels):
     more = {"higher_is_better": True, "null": None, "floor": None}
     scores = [score("TMMD", s, v) for s, v in distances.items()]
     scores += [score("material accuracy", s, v, **more) for s, v in shares.items()]
-    columns = telling_columns(families(scores))
-    made = cards(Results("T", scores=scores), columns, ["real, nearest photo"])
-    photo = "real, nearest photo (control)"
-    assert [row.label for row in made[0].rows] == ["ours", "near", "other", photo]
-    assert [row.label for row in made[1].rows] == ["ours", "near", photo, "real"]
-    assert not made[0].rows[0].drawing  # the strip is of it
-    assert all("interval" in row.drawing for row in made[0].rows[1:])
-
-
-def test_a_card_never_loses_its_method_to_controls():
-    more = {"higher_is_better": True, "null": None, "floor": None}
-    names = ["ours", "a", "b", "c", "real"]
-    scores = [score("TMMD", s, 1.0) for s in names[:4]]
-    scores += [score("material accuracy", s, 0.5, **more) for s in names]
-    columns = telling_columns(families(scores))
-    made = cards(Results("T", scores=scores), columns, names[1:4])[1]
-    labels = [row.label for row in made.rows]
-    assert (labels[0], labels[-1], len(labels)) == ("ours", "real", 4)
+    drawn = cards(Results("T", scores=scores), telling_columns(families(scores)), controls)
+    assert [[row.label for row in card.rows] for card in drawn] == labels
+    assert [f"4 of {n} rows." in drawn[0].foot for n in (5, 7)] == [
+        len(distances) == 5,
+        not distances,
+    ]
+    assert all("interval" in row.drawing for row in drawn[0].rows[1:])
 
 
 @pytest.mark.parametrize("low", [0.2, 0.3])
@@ -188,22 +181,14 @@ def test_a_card_says_what_is_shown_against_real_images(values, words):
     assert ("real" in card.foot.partition("dashed: real images")[2]) == ("real" in words)
 
 
-def test_nothing_leaks_where_nothing_leaks():
-    (card,) = cards(Results("T", audits=[clean_audit()]), [])[:1]
-    assert (card.rows[0].text, card.foot) == ("0 %", "")
-
-
-def test_methods_are_explained_once_below_the_verdict(tmp_path):
-    scores = [score("TMMD", "Ours"), score("SSIM", "Ours")]
-    settings = {"methods": {"Ours": "By a photo."}}
-    tables = [StudyTable("T", "", ["", "v"], [["Ours", scores[0]]])]
-    results = Results("T", scores=[*scores, score("FID", "Ours")], tables=tables, settings=settings)
-    assert "By a photo." in Tree(render_page(results, tmp_path, max_bytes=200_000)).text
-
-
-def test_a_run_that_is_too_small_says_so():
+def test_what_is_said_of_small_runs_of_clean_splits_and_of_the_drawings():
     assert "can decide nothing" in caution(Results("T", settings={"preset": "smoke"}))
     assert caution(Results("T", settings={"preset": "mini"})) == ""
+    (card,) = cards(Results("T", audits=[clean_audit()]), [])[:1]
+    assert (card.rows[0].text, card.foot) == ("0 %", "")
+    column, chosen = annotated(families([score("SSIM", null=None), score()]))
+    assert (column.name, chosen.metric) == ("TMMD", "TMMD")
+    assert annotated(families([score(null=None)])) is None
 
 
 def test_what_a_page_is_about():
@@ -218,12 +203,6 @@ def test_what_a_page_is_about():
     assert about(Results("T", settings=made), "today", "1.0") == ["2026-01-02", "palpate 0.9"]
 
 
-def test_strips_are_explained_on_a_score_with_interval_null_and_floor():
-    column, chosen = annotated(families([score("SSIM", null=None), score()]))
-    assert (column.name, chosen.metric) == ("TMMD", "TMMD")
-    assert annotated(families([score(null=None)])) is None
-
-
 def test_a_page_opens_with_samples_and_cards_and_has_no_empty_heading(tmp_path):
     html = render_page(full_results(tmp_path), tmp_path, max_bytes=1_500_000)
     places = [html.index(part) for part in ('class="hero"', 'class="card"', 'id="scores"')]
@@ -234,5 +213,9 @@ def test_a_page_opens_with_samples_and_cards_and_has_no_empty_heading(tmp_path):
     assert "cd" * 7 not in html
     assert "@inproceedings{gungor2025towards" in Tree(html).text
     bare = render_page(Results("T", gallery=gallery(tmp_path, 1)), tmp_path, max_bytes=1_500_000)
-    headings = re.findall(r"<h2[^>]*>([^<]*)", bare)
-    assert headings == ["Cite"]
+    assert re.findall(r"<h2[^>]*>([^<]*)", bare) == ["Cite"]
+    scores = [score(metric, "Ours") for metric in ("TMMD", "SSIM", "FID")]
+    tables = [StudyTable("T", "", ["", "v"], [["Ours", scores[0]]])]
+    methods = {"methods": {"Ours": "By a photo."}}
+    results = Results("T", scores=scores, tables=tables, settings=methods)
+    assert "By a photo." in Tree(render_page(results, tmp_path, max_bytes=200_000)).text

@@ -44,17 +44,8 @@ def page_of(results, folder, **options):
 
 
 def test_near_duplicates_show_what_chance_explains(tmp_path):
-    calibrated = Signal(
-        "near-duplicate tactile",
-        100,
-        3,
-        0.4,
-        0.01,
-        verdict="none",
-        expected=1.0,
-        measured=0.012,
-        counts=False,
-    )
+    chance = {"verdict": "none", "expected": 1.0, "measured": 0.012, "counts": False}
+    calibrated = Signal("near-duplicate tactile", 100, 3, 0.4, 0.01, **chance)
     untold = Signal("near-duplicate vision", 100, 0, 1.0, 0.01, verdict="cannot tell")
     audit = small_audit(signals=[calibrated, untold])
     texts = str(audit), Tree(page_of(Results("T", audits=[audit]), tmp_path)).text
@@ -113,15 +104,18 @@ def shown_images(html):
     return [np.asarray(Image.open(io.BytesIO(base64.b64decode(d)))) for d in data]
 
 
-def test_a_page_in_a_new_folder_shows_images_of_another(tmp_path):
-    write_report(full_results(tmp_path), tmp_path / "new" / "page.html", base=tmp_path)
-    html = (tmp_path / "new" / "page.html").read_text(encoding="utf-8")
-    assert 'class="lost"' not in html
-    assert len(Tree(html).all("img")) > 6
-
-
-def test_a_page_is_well_formed_and_complete(tmp_path):
-    html = page_of(full_results(tmp_path), tmp_path)
+def test_a_page_is_well_formed_self_contained_and_complete(tmp_path):
+    results = full_results(tmp_path)
+    write_report(results, tmp_path / "new" / "page.html", base=tmp_path)  # images of another folder
+    other = (tmp_path / "new" / "page.html").read_text(encoding="utf-8")
+    assert 'class="lost"' not in other
+    html = page_of(results, tmp_path)
+    places = re.findall(r"""(?:src|href|srcset|action)\s*=\s*["']?([^"'\s>]*)""", html)
+    places += re.findall(r"url\(\s*[\"']?([^\"')]*)", html)
+    assert len(places) > 20
+    assert [p for p in places if not p.startswith(("data:", "#"))] == []
+    assert "@import" not in html
+    assert "default-src 'none'" in html
     tree = Tree(html)
     for text in (
         "A title",
@@ -150,6 +144,10 @@ def test_a_page_is_well_formed_and_complete(tmp_path):
     assert len(tree.all("img")) == 6 * 3 + 4
     assert len(tree.all("script")) == 1
     assert page_of(full_results(tmp_path), tmp_path) == html  # the same twice
+    scores = [score(subject="a"), score(subject="b"), difference("a", "b", better="a")]
+    text = Tree(page_of(Results("T", scores=scores), tmp_path)).text
+    assert "TMMD ↓ a b −1.00 [−1.50, −0.50] 97.5 % 0.05" in text
+    assert "1.37 best † [1.01, 1.75]" in text.replace("best†", "best †")
 
 
 def test_a_page_shows_every_part_of_an_audit(tmp_path):
@@ -171,23 +169,6 @@ def test_a_page_shows_every_part_of_an_audit(tmp_path):
         "Test against the pretraining data",
     ):
         assert part in text, part
-
-
-def test_a_page_has_paired_differences(tmp_path):
-    scores = [score(subject="a"), score(subject="b"), difference("a", "b", better="a")]
-    text = Tree(page_of(Results("T", scores=scores), tmp_path)).text
-    assert "TMMD ↓ a b −1.00 [−1.50, −0.50] 97.5 % 0.05" in text
-    assert "1.37 best † [1.01, 1.75]" in text.replace("best†", "best †")
-
-
-def test_a_page_refers_to_nothing_outside(tmp_path):
-    html = page_of(full_results(tmp_path), tmp_path)
-    places = re.findall(r"""(?:src|href|srcset|action)\s*=\s*["']?([^"'\s>]*)""", html)
-    places += re.findall(r"url\(\s*[\"']?([^\"')]*)", html)
-    assert len(places) > 20
-    assert [p for p in places if not p.startswith(("data:", "#"))] == []
-    assert "@import" not in html
-    assert "default-src 'none'" in html
 
 
 def test_text_is_escaped_everywhere(tmp_path):
@@ -290,35 +271,23 @@ def test_lists_of_pairs_take_turns_where_there_is_little_room(tmp_path):
 
 
 def test_empty_sections_name_the_command_that_fills_them(tmp_path):
-    tree = Tree(page_of(Results("Nothing yet"), tmp_path))
-    for text in ("palpate generate", "palpate score", "palpate audit", "nothing has been measured"):
-        assert text in tree.text
-    empty = {
-        "gap_min": None,
-        "gap_median": None,
-        "gap_max": None,
-        "gap_edges": (),
-        "gap_counts": (),
-    }
-    bare = small_audit(**empty, materials=(), test_samples=0, leaked_fraction=0.0)
-    html = page_of(Results("t", audits=[bare]), tmp_path)
-    assert "the test part is empty" in Tree(html).text
-    assert "histogram" not in html.partition("<body>")[2]
-
-
-def test_a_report_that_cannot_be_drawn_writes_nothing(tmp_path):
     with pytest.raises(PalpateError, match="must agree in bandwidth"):
         page_of(Results("t", scores=[score(), score(subject="b", bandwidth=1.0)]), tmp_path)
     with pytest.raises(PalpateError, match=r"must end in \.html"):
         write_report(Results("t"), tmp_path / "page.json")
-    assert list(tmp_path.iterdir()) == []
-
-
-def test_settings_of_any_type_are_written(tmp_path):
+    assert list(tmp_path.iterdir()) == []  # what cannot be drawn writes nothing
     settings = {"rate": float("nan"), "path": tmp_path, "array": np.arange(3), "x": np.float32(0.5)}
-    page_of(Results("t", settings=settings), tmp_path)
-    read = json.loads((tmp_path / "page.json").read_text())["settings"]
-    assert read == {"rate": None, "path": tmp_path.as_posix(), "array": [0, 1, 2], "x": 0.5}
+    tree = Tree(page_of(Results("Nothing yet", settings=settings), tmp_path))
+    written = json.loads((tmp_path / "page.json").read_text())["settings"]
+    assert written == {"rate": None, "path": str(tmp_path), "array": [0, 1, 2], "x": 0.5}
+    for text in ("palpate generate", "palpate score", "palpate audit", "nothing has been measured"):
+        assert text in tree.text
+    empty = dict.fromkeys(("gap_min", "gap_median", "gap_max"))
+    empty |= dict.fromkeys(("gap_edges", "gap_counts"), ())
+    bare = small_audit(**empty, materials=(), test_samples=0, leaked_fraction=0.0)
+    html = page_of(Results("t", audits=[bare]), tmp_path)
+    assert "the test part is empty" in Tree(html).text
+    assert "histogram" not in html.partition("<body>")[2]
 
 
 def test_headline_facts():
@@ -337,17 +306,12 @@ def test_headline_facts():
 
 
 @pytest.mark.parametrize(
-    ("span", "parts", "step"), [(1, 3, 0.5), (10, 3, 5), (0.07, 3, 0.05), (30, 3, 10), (31, 3, 20)]
-)
-def test_steps_of_an_axis_are_round(span, parts, step):
-    assert nice_step(span, parts) == pytest.approx(step)
-
-
-@pytest.mark.parametrize(
     ("values", "inside"),
     [([1.0, 4.0], 0.0), ([3.0, 4.0], 3.0), ([-4.0, -1.0], 0.0), ([2.0], 2.0), ([0.0], 0.0)],
 )
 def test_an_axis_holds_its_values_and_a_zero_nearby(values, inside):
+    for (span, parts), step in {(1, 3): 0.5, (10, 3): 5, (0.07, 3): 0.05, (31, 3): 20}.items():
+        assert nice_step(span, parts) == pytest.approx(step)
     axis = axis_over(values)
     assert axis.low <= min([*values, inside])
     assert axis.high >= max([*values, inside])

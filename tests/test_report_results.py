@@ -24,12 +24,11 @@ def test_results_are_a_table_of_scores():
     with pytest.raises(KeyError, match="there is TMMD, a; FID, b"):
         results["TMMD", "b"]
     assert results
-
-
-def test_results_become_a_frame():
     frame = Results("T", scores=[score(), score(value=None, interval=None)]).to_frame()
     assert frame["interval_low"].to_list() == [1.01, None]
     assert frame["value"].to_list() == [1.374, None]
+    assert "&lt;b&gt;" in Results("T", scores=[score(subject="<b>")])._repr_html_()
+    assert "<pre" in small_audit()._repr_html_()
 
 
 def test_results_and_audits_come_back_from_their_files(tmp_path):
@@ -59,11 +58,6 @@ def test_image_paths_in_a_file_are_relative_to_it(tmp_path, monkeypatch):
     assert Path(again.gallery[0].generated) == Path("moved/generated0.png")
     again.to_html("page.html")
     assert "data:image/webp" in Path("page.html").read_text()
-
-
-def test_showing_results_in_a_notebook_escapes_names():
-    assert "&lt;b&gt;" in Results("T", scores=[score(subject="<b>")])._repr_html_()
-    assert "<pre" in small_audit()._repr_html_()
 
 
 def test_the_command_merges_files_of_results_and_audits(capsys, tmp_path):

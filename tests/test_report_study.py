@@ -60,6 +60,10 @@ def test_the_best_of_a_column_follows_its_direction_and_is_no_control():
     assert best_of(table) == [{"accuracy", "D"}, {"TMMD"}, set()]
     assert best_of(dataclasses.replace(table, best=False)) == [set()] * 3
     assert best_of(dataclasses.replace(table, controls=["photo", "b"])) == [set()] * 3
+    directed = dataclasses.replace(table, best=False)  # controls are compared with
+    assert [h.arrow for h in of_study(directed).heads] == ["", "↓", "↑", "→"]
+    neither = dataclasses.replace(directed, controls=[])
+    assert [h.arrow for h in of_study(neither).heads] == [""] * 4
     heads = [(head.arrow, head.scores) for head in of_study(table).heads]
     assert heads == [("", False), ("↓", True), ("↑", True), ("→", True)]
 
@@ -108,25 +112,23 @@ def test_ranks_have_no_decimals_and_empty_columns_stand_with_the_scores():
     laid = of_study(StudyTable("T", "", ["", "rank", "k = 8"], rows))
     assert [row.cells[1].digits for row in laid.rows] == [0, 0]
     assert [head.scores for head in laid.heads] == [False, True, True]
+    table = StudyTable("T", "", ["", "a", "b"], [["x", up("x", 0.5)], ["y"]])  # rows may be short
+    assert [len(row.cells) for row in of_study(table).rows] == [3, 3]
     lost = [["a", score("rank", "a", math.nan, interval=None)], *rows]
     assert of_study(StudyTable("T", "", ["", "rank"], lost)).rows[1].cells[1].digits == 0
     shares = [["a", up("a", 1.0, interval=None)], ["b", up("b", 0.0, interval=None)]]
     assert of_study(StudyTable("T", "", ["", "share"], shares)).rows[0].cells[1].digits == 3
 
 
-def test_rows_may_be_short():
-    table = StudyTable("T", "", ["", "a", "b"], [["x", up("x", 0.5)], ["y"]])
-    assert [len(row.cells) for row in of_study(table).rows] == [3, 3]
-    assert "0.50 [" in str(Results("T", tables=[table]))
-
-
 def test_how_a_table_was_made_names_stages_sizes_and_intervals():
     rows = [["a", up("a", 0.5, n=40, details={"stage": "probe-0"})]]
-    rows.append(["b", up("b", 0.6, n=1200, details={"stage": "probe-1"}, seed=3)])
+    how = "jackknife, t, 14.8 df"
+    more = {"n": 1200, "details": {"stage": "probe-1"}, "seed": 3, "interval_method": how}
+    rows.append(["b", up("b", 0.6, **more)])
     made = dict(of_study(StudyTable("T", "", ["", "v"], rows)).facts)
     assert made == {
         "n": "40 to 1,200",
-        "interval": "95 %, jackknife, t, 9 df",
+        "interval": "95 %, jackknife, t, 9-14.8 df",
         "estimator": "unbiased",
         "seed": "3",
         "stages": "probe-0, probe-1",
@@ -154,9 +156,11 @@ def test_every_front_end_has_every_number_verdict_and_reason(study):
             assert part in text, part
         assert "Table 4: generators" in text
         assert "1 holds, 1 does not hold, 1 undecided" in text
-    assert (
-        Results.from_json(json.loads(json.dumps(results.to_json()))).to_json() == results.to_json()
-    )
+    again = Results.from_json(json.loads(json.dumps(results.to_json())))
+    assert again.to_json() == results.to_json()
+    assert "The 4 scores behind them" in str(results)
+    assert "1.37" not in str(results)  # the tables of a study instead of every score
+    assert "1.37" in str(dataclasses.replace(results, tables=[]))
 
 
 @pytest.mark.parametrize("width", [70, 90, 140])
@@ -173,14 +177,6 @@ def test_wide_tables_cut_no_number(study, width):
         Results("T", tables=[StudyTable("T", "", ["", "v"], [[LONG, up("a", 0.5)]])]), 40
     )
     assert names.splitlines()[1:3] == [LONG, "  v: 0.50 [1.01, 1.75]"]
-
-
-def test_the_terminal_shows_the_tables_of_a_study_instead_of_every_score(study):
-    results, _ = study
-    text = str(results)
-    assert "The 4 scores behind them" in text
-    assert "1.37" not in text
-    assert "1.37" in str(dataclasses.replace(results, tables=[]))
 
 
 def test_the_page_has_its_sections_in_order_and_folds_tables(study):
@@ -210,14 +206,6 @@ def test_the_first_claims_are_open_and_the_others_are_folded(tmp_path):
     assert tally(claims[:1]) == "1 holds"
 
 
-def test_numbers_of_a_reason_are_those_of_its_evidence(tmp_path):
-    scores = [up("a", 0.123456, interval=(0.12, 0.13)), up("b", 0.5, interval=(0.1, 0.9))]
-    why = f"Ours {in_words(scores[0])}, GVST {in_words(scores[1])}."
-    text = page_text(Results("T", claims=[Claim("C", "s", "holds", why, scores)]), tmp_path)[1]
-    for number in ("0.1235 [0.1200, 0.1300]", "0.50 [0.10, 0.90]"):
-        assert text.count(number) == 2
-
-
 def drawn(panels, name):
     """The elements of a kind in a drawing of strips: tag, class and text or position."""
     tree = ET.fromstring(strips_svg("T", panels))
@@ -238,23 +226,14 @@ def test_the_axis_of_strips_is_that_of_the_methods_and_a_control_beyond_it_an_ar
     assert "9.000" in ticks[1]
 
 
-def test_degrees_of_freedom_are_a_range():
-    how = [f"jackknife, t, {n} df" for n in ("11.0", "9", "14.8")]
-    rows = [[h, up(h, 0.5, interval_method=h)] for h in how]
-    made = dict(of_study(StudyTable("T", "", ["", "v"], rows)).facts)
-    assert made["interval"] == "95 %, jackknife, t, 9-14.8 df"
-
-
-def test_a_table_with_controls_shows_directions_and_one_of_differences_none():
-    rows = [["a", up("a", 0.5)], ["photo", up("photo", 0.6)]]
-    table = StudyTable("T", "", ["", "accuracy"], rows, controls=["photo"])
-    heads = [of_study(t).heads[1].arrow for t in (table, dataclasses.replace(table, controls=[]))]
-    assert heads == ["↑", ""]
-
-
 def test_a_long_reason_is_cut_where_a_clause_ends_and_is_whole_in_the_evidence(tmp_path):
     why = "; ".join(f"metric {k} puts Ours ahead by 0.0{k}" for k in range(20))
     claim = Claim("C", "paper", "holds", why, [up("a", 0.5)])
+    scores = [up("a", 0.123456, interval=(0.12, 0.13)), up("b", 0.5, interval=(0.1, 0.9))]
+    short = f"Ours {in_words(scores[0])}, GVST {in_words(scores[1])}."
+    text = page_text(Results("T", claims=[Claim("C", "s", "holds", short, scores)]), tmp_path)[1]
+    for number in ("0.1235 [0.1200, 0.1300]", "0.50 [0.10, 0.90]"):
+        assert text.count(number) == 2  # in the reason and in its evidence
     many = dataclasses.replace(claim, evidence=[up(f"a{k}", 0.5) for k in range(600)])
     assert "576 more in the JSON" in page_text(Results("T", claims=[many]), tmp_path)[1]
     assert brief(why) == f"{why[: why.index('; metric 6')]} …"
@@ -323,6 +302,13 @@ def test_strips_draw_value_interval_null_and_floor_and_hollow_controls(study):
     results, _ = study
     panels = panels_of(of_study(results.tables[0]))
     assert [p.title for p in panels] == ["TMMD ↓", "material accuracy ↑", "D-TMMD →", "LPIPS ↓"]
+    scores = [score("TMMD", name) for name in ("ours", "photo", "real")]
+    (known,) = panels_of(grid(telling_columns(families(scores)), {"photo", "real"}))
+    assert [control for *_, control in known.rows] == [False, True, True]
+    cells = [["Ours", split, up("a", 0.5), "note"] for split in ("Orig", "NoLeak")]
+    names = ["method", "split", "accuracy", "why"]
+    (named,) = panels_of(of_study(StudyTable("T", "", names, cells)))
+    assert [label for label, *_ in named.rows] == ["Ours, Orig", "Ours, NoLeak"]
     rows = [(label, s, False) for label, s, _ in panels[0].rows]  # all are on the axis
     rows.append(("inside " * 9, dataclasses.replace(rows[0][1], interval=None), True))
     panel = [Panel("TMMD", rows)]
@@ -339,22 +325,6 @@ def test_strips_draw_value_interval_null_and_floor_and_hollow_controls(study):
     assert "1.20 [1.08, 1.32]" in words
     assert "inside inside inside in..." in words
     assert "undefined" in texts(panels[2:3])
-
-
-def test_strips_of_scores_know_the_controls_of_the_study():
-    scores = [score("TMMD", name) for name in ("ours", "photo", "real")]
-    columns = telling_columns(families(scores))
-    (panel,) = panels_of(grid(columns, {"photo", "real"}))
-    assert [control for *_, control in panel.rows] == [False, True, True]
-    assert panel.title == "TMMD ↓"
-
-
-def test_labels_of_strips_are_all_words_before_the_scores():
-    rows = [["Ours", "Orig", up("a", 0.5), "note"], ["Ours", "NoLeak", up("a", 0.4), "note"]]
-    (panel,) = panels_of(
-        of_study(StudyTable("T", "", ["method", "split", "accuracy", "why"], rows))
-    )
-    assert [label for label, *_ in panel.rows] == ["Ours, Orig", "Ours, NoLeak"]
 
 
 # --- figures of images ----------------------------------------------------------------------
