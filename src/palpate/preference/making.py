@@ -226,7 +226,11 @@ def choose_items(
     elif single:
         code = "one-video-materials" if examples else "one-video-classes"
         notes.append(Note(code, {"materials": single}))
-    taken = _in_turn(piles, n, materials)
+    common = sorted(piles, key=lambda name: (-len(piles[name]), name))[:materials]
+    rounds = zip_longest(
+        *(piles[name] for name in common)
+    )  # one of each, then a second of each ...
+    taken = [item for each in rounds for item in each if item is not None][:n]
     must = "A study needs two items, at most one a video"
     got, fix = f"{len(taken)} of {len(candidates):,} images", "Add images of other videos"
     require(len(taken) >= 2, None, must, got, fix=fix)
@@ -246,13 +250,6 @@ def _with_examples(piles: Piles) -> tuple[Piles, list[Item]]:
     require(len(counts) >= 2, None, must, len(counts), fix=fix)
     examples = [item for name, count in counts.items() for item in piles[name][:count]]
     return {name: piles[name][count:] for name, count in counts.items()}, examples
-
-
-def _in_turn(piles: Piles, n: int, materials: int | None) -> list[Item]:
-    """Up to ``n`` items: one of each material, the commonest first, then a second of each ..."""
-    common = sorted(piles, key=lambda name: (-len(piles[name]), name))[:materials]
-    rounds = zip_longest(*(piles[name] for name in common))
-    return [item for each in rounds for item in each if item is not None][:n]
 
 
 def trials_of(plan: Plan, *, first: bool) -> list[Trial]:

@@ -19,7 +19,7 @@ from functools import cache
 from importlib import resources
 from typing import Any
 
-from jinja2 import Environment, FunctionLoader, StrictUndefined
+from jinja2 import StrictUndefined, Template
 from markupsafe import Markup
 
 
@@ -31,17 +31,14 @@ def study_page(public: Mapping[str, Any], *, served: bool = False) -> str:
         served: leave the study out; the page then requests the part of its rater from the server.
     """
     study = json.dumps(None if served else public, separators=(",", ":")).replace("<", "\\u003c")
-    return (
-        _environment()
-        .get_template("study.html.j2")
-        .render(
-            title=public["title"],
-            study=Markup(study),
-            style=Markup(_part("study.css")),
-            script=Markup(_part("study.js")),
-            policy=policy(served=served),
-            served=served,
-        )
+    template = Template(_part("study.html.j2"), autoescape=True, undefined=StrictUndefined)
+    return template.render(
+        title=public["title"],
+        study=Markup(study),
+        style=Markup(_part("study.css")),
+        script=Markup(_part("study.js")),
+        policy=policy(served=served),
+        served=served,
     )
 
 
@@ -68,10 +65,3 @@ def _source(name: str) -> str:
 @cache
 def _part(name: str) -> str:
     return (resources.files("palpate.preference") / "templates" / name).read_text(encoding="utf-8")
-
-
-@cache
-def _environment() -> Environment:
-    return Environment(
-        loader=FunctionLoader(_part), autoescape=True, undefined=StrictUndefined, auto_reload=False
-    )
