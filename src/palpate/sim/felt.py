@@ -125,16 +125,16 @@ def measure(relief: Array, px: float, softness: float, gloss: float) -> dict[str
     }
 
 
-def describe(felt: Mapping[str, float], rng: np.random.Generator) -> list[str]:
-    """Choose words for the most pronounced attributes.
+def caption(options: WorldOptions, video: int, contact: int, felt: Mapping[str, float]) -> str:
+    """Write the caption of a contact: three to five words or phrases of different attributes.
 
     Args:
+        options: the world's.
+        video: index of the video.
+        contact: number of the contact in it.
         felt: what :func:`measure` returns.
-        rng: draws the noise, how many attributes are named, their words and order.
-
-    Returns:
-        Three to five words, or phrases, of different attributes.
     """
+    rng = options.rng("felt text", video, contact)
     salience: dict[str, tuple[float, str]] = {}
     for name, scale in SCALES.items():
         level = scale.level(felt[name]) + DESCRIBER * float(rng.standard_normal())
@@ -142,13 +142,7 @@ def describe(felt: Mapping[str, float], rng: np.random.Generator) -> list[str]:
         if words:
             salience[name] = abs(level - 2.5), words[int(rng.integers(len(words)))]
     chosen = sorted(salience.values(), reverse=True)[: int(rng.integers(3, 6))]
-    return [chosen[k][1] for k in rng.permutation(len(chosen))]
-
-
-def caption(options: WorldOptions, video: int, contact: int, felt: Mapping[str, float]) -> str:
-    """Write the caption of a contact from what :func:`measure` returns."""
-    rng = options.rng("felt text", video, contact)
-    words = describe(felt, rng)
+    *first, last = (chosen[k][1] for k in rng.permutation(len(chosen)))
     template = TEMPLATES[int(rng.integers(len(TEMPLATES)))]
-    text = template.format(f"{', '.join(words[:-1])} and {words[-1]}")
+    text = template.format(f"{', '.join(first)} and {last}")
     return f"{text[0].upper()}{text[1:]}."

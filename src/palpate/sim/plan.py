@@ -112,18 +112,14 @@ def spread(count: int, share: float) -> list[int]:
     return [k for k in range(count) if int((k + 1) * share + 0.5) > int(k * share + 0.5)]
 
 
-def _with_two_videos(options: WorldOptions, objects: list[ObjectRef]) -> set[ObjectRef]:
-    """Return a share ``two_videos`` of the objects, about the same share of every material."""
-    order = [objects[k] for k in options.rng("two videos").permutation(len(objects))]
-    order.sort(key=lambda ref: options.names.index(ref.material))
-    return {order[k] for k in spread(len(order), options.two_videos)}
-
-
 def plan_world(options: WorldOptions) -> list[VideoPlan]:
     """Plan all videos of a world in the order of their names: object by object, shuffled."""
     counts = dict.fromkeys(options.names, options.objects_per_material)
     objects = [ObjectRef(m, k) for m, count in counts.items() for k in range(count)]
-    twice = _with_two_videos(options, objects)
+    # About the same share of every material has two videos.
+    order = [objects[k] for k in options.rng("two videos").permutation(len(objects))]
+    order.sort(key=lambda ref: options.names.index(ref.material))
+    twice = {order[k] for k in spread(len(order), options.two_videos)}
     guests = dict(counts)  # further objects of mixed videos, numbered behind the others
     days = seed_for(options.seed, "world", VERSION, "date") % 3650
     start = datetime.datetime(2026, 1, 1) + datetime.timedelta(days=days)
