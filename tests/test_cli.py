@@ -1,17 +1,19 @@
 """The command line: statuses, JSON, one-line errors, help, and how verbs connect."""
 
-import dataclasses
 import json
 import re
 import shlex
+import warnings
 from importlib import import_module
 from pathlib import Path
 
 import pytest
+import tyro
 
 from forge.commands import call
 from palpate.cli import VERBS, main, running
-from palpate.cli.running import error_line, join_help_lines
+from palpate.cli.running import error_line, polish_help
+from palpate.cli.terminal import CONFIG
 from palpate.core import PalpateError, Split
 
 
@@ -107,18 +109,19 @@ def test_errors_name_options(verb, error, line):
     assert error_line(verb, error) == line
 
 
-def test_help_is_wrapped_by_the_terminal_and_not_by_the_source(capsys):
+def test_help_is_wrapped_by_the_terminal_and_says_no_empty_default(capsys):
     with pytest.raises(SystemExit):
         main(["train", "generator", "--help"])
     text = " ".join(re.sub("[│╭╰─╮╯]", "", capsys.readouterr().out).split())
     assert "hub id, or palpate/mini." in text
-    sources = [
-        m.Options for m in (import_module(f"palpate.cli.{v.module}") for v in VERBS.values())
-    ]
-    for options in sources:
-        join_help_lines(options)
-        helps = [f.metadata.get("help", "") for f in dataclasses.fields(options)]
-        assert not any("\n" in text for text in helps)
+    assert "(default: mini)" in text
+    assert "(default: None)" not in text
+    for verb in VERBS.values():
+        options = import_module(f"palpate.cli.{verb.module}").Options
+        polish_help(options)
+        with warnings.catch_warnings(action="ignore", category=DeprecationWarning):
+            actions = tyro.extras.get_parser(options, config=CONFIG)._actions
+        assert not [action.dest for action in actions if "\n" in (action.help or "")]
 
 
 @pytest.mark.parametrize(

@@ -35,9 +35,9 @@ class Reading:
     tactile: str | None = None
     """Where the tactile images are, likewise."""
     columns: Maps = ()
-    """Manifest columns as columns of yours, or as polars SQL over them (over the fields and `path`
-    for a folder of images):
-    `--map vision=rgb tactile="replace(rgb, '_rgb', '_tac')" "video=substr(rgb, 1, 15)"`."""
+    """Manifest columns as columns of yours, or as polars SQL over them (for a folder of images over
+    the fields and `path`), e.g. `--map vision=rgb tactile="replace(rgb, '_rgb', '_tac')"
+    and "video=substr(rgb, 1, 15)"`."""
     root: Path | None = None
     """Folder that paths are relative to (default: the folder of the table)."""
     side: Annotated[Literal["vision", "tactile"] | None, tyro.conf.arg(name="as")] = None

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import dataclasses
 import difflib
 import importlib
@@ -72,7 +71,7 @@ def parse(name: str, options: type[Any], args: Sequence[str]) -> Any:
         raise _parse_error(name, options, event, args)
 
     if not {"-h", "--help"}.isdisjoint(args):
-        join_help_lines(options)
+        polish_help(options)
     about = inspect.cleandoc(options.__doc__ or "")
     with on_parse_error(refuse):
         return tyro.cli(
@@ -128,27 +127,25 @@ def option_strings(options: type[Any]) -> list[str]:
         return list(parser._option_string_actions)
 
 
-def join_help_lines(options: type[Any]) -> None:
+def polish_help(options: type[Any]) -> None:
     """Make the help of each option one paragraph with a default that says something.
 
-    tyro keeps some line breaks of a docstring, and shows ``None`` for what is not given.
+    tyro keeps the line breaks of a docstring, and shows ``None`` for what is not given.
     """
     for cls in filter(dataclasses.is_dataclass, options.__mro__):
-        hints = get_type_hints(cls, include_extras=True)
-        for name in set(hints) & set(cls.__annotations__):
-            own = getattr(hints[name], "__metadata__", ())
-            hint = hints[name].__origin__ if own else hints[name]
-            cls.__annotations__[name] = Annotated[hint, DEFAULT, *own]
-        with contextlib.suppress(TypeError):  # of a class without a source
-            for param in docstring_parser.parse_from_object(cls).params:
-                each: Any = cls.__dataclass_fields__[param.arg_name]
-                text = " ".join((param.description or "").split())
-                each.metadata = {**each.metadata, "help": text}
+        for name, hint in get_type_hints(cls, include_extras=True).items():
+            if name in cls.__annotations__:
+                own = getattr(hint, "__metadata__", ())
+                plain = hint.__origin__ if own else hint
+                cls.__annotations__[name] = Annotated[plain, DEFAULT, *own]
+        for param in docstring_parser.parse_from_object(cls).params:
+            text = " ".join((param.description or "").split())
+            cls.__dataclass_fields__[param.arg_name].metadata = {"help": text}  # type: ignore[misc]
     for each in dataclasses.fields(options):
         group: Any = each.default_factory
         group = type(each.default) if dataclasses.is_dataclass(each.default) else group
         if dataclasses.is_dataclass(group):
-            join_help_lines(group)  # type: ignore[arg-type]
+            polish_help(group)  # type: ignore[arg-type]
 
 
 def option_name(verb: str, argument: str) -> str:

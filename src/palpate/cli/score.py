@@ -25,8 +25,8 @@ class Samples:
     names: tuple[str, ...] = ()
     """Names of the generators in the tables, instead of those of their folders and files."""
     labels: str | None = None
-    """CSV or Parquet file with the columns id, material, video: instead of the inputs' own; or
-    `cluster:8`, eight clusters of the reference's photos (else features) for materials."""
+    """CSV or Parquet file with the columns id, material, video: instead of the inputs' own; or for
+    materials `cluster:8`, eight clusters of the reference's photos (else features)."""
     group: Literal["auto", "video", "contact", "object"] = "auto"
     """What stays together in halves and intervals; `auto` takes what the split kept whole, else the
     video."""
@@ -100,7 +100,9 @@ class Options(Common):
 
 def run(options: Options, terminal: Terminal) -> dict[str, Any]:
     """Score, print the tables, write JSON and LaTeX."""
-    inputs, files = _inputs(options), options.files
+    files, labels = options.files, options.samples.labels
+    paths = (options.reference, options.split, options.train, labels and Path(labels))
+    inputs = [path for path in (*paths, *options.generated) if path]
     files.guard(inputs)
     if (cache := options.cache) is not None:
         must, fix = "must not be an input", "Choose a folder outside what is read"
@@ -120,16 +122,11 @@ def run(options: Options, terminal: Terminal) -> dict[str, Any]:
                 options.reference,
                 progress=progress,
                 **options.keywords(
-                    *("generated", "reference"),
+                    "generated",
+                    "reference",
                     companions=() if companions == ("none",) else companions,
                     normalize=NORMALIZE[options.metrics.normalize],
                     cache=folder,
                 ),
             )
         return terminal.deliver(results, files)
-
-
-def _inputs(options: Options) -> list[Path]:
-    labels = options.samples.labels
-    paths = (options.reference, options.split, options.train, labels and Path(labels))
-    return [path for path in (*paths, *options.generated) if path]

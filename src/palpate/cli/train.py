@@ -18,8 +18,8 @@ class Options(Training):
     """Encoders that condition the generator: folder of `palpate train encoder` or of a CLIP, hub
     id, or palpate/mini. `--set condition.source=resnet` needs none."""
     autoencoder: str | None = None
-    """Pretrained autoencoder: folder or hub id of a diffusers VQModel, a .ckpt of latent diffusion
-    (vq-f4), or palpate/mini. Default: a small one, trained first on the train part."""
+    """Pretrained autoencoder: folder or hub id of a diffusers VQModel, a .ckpt of vq-f4 of latent
+    diffusion, or palpate/mini. Default: a small one, trained first on the train part."""
     start: str | None = None
     """Generator of palpate to go on from: its folder, or palpate/mini. Its encoders and autoencoder
     stand for those that are not given, and the preset gives the training loop alone. Default:

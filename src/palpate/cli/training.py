@@ -80,8 +80,8 @@ class Training(Common):
     output: OutPath
     """Folder for what is trained; must be new or empty."""
     split: Path | None = None
-    """Split file; only its train part is trained on. Default: the one that lies with the data, in
-    `splits/`."""
+    """Split file; only its train part is trained on. Default: the one that lies in `splits/` with
+    the data."""
     preset: str = "mini"
     """Size and course; `palpate presets` lists all, with what each takes."""
     settings: Settings = ()

@@ -29,8 +29,7 @@ class Options(Common):
     output: OutPath
     """Folder to write."""
     preset: Literal["tiny", "demo", "pretrain", "small", "full"] = DEFAULT
-    """What to start from; small has 8,000 contact frames at 64 px, full 36,000 at
-    128 px."""
+    """What to start from; small has 8,000 contact frames at 64 px, full 36,000 at 128 px."""
     settings: Settings = ()
     """Further fields of the preset, as `contacts_per_video=6`; `palpate presets NAME` lists all."""
     seed: int | None = None
