@@ -243,6 +243,10 @@ def test_a_page_keeps_within_its_size(tmp_path):
     assert re.search(rf"{rows} of 50 chosen samples, \d of them above, every material", tree.text)
     assert f"{50 - rows} rows of images were skipped" in tree.text
     assert len(json.loads((tmp_path / "page.json").read_text())["gallery"]) == 50
+    audits = [full_audit(images(tmp_path, 16, 128))]  # lists of pairs take turns
+    tree = Tree(page_of(Results("t", audits=audits), tmp_path, max_bytes=110_000))
+    assert len(tree.all("figure")) > 0
+    assert "rows of images were skipped" in tree.text
     with pytest.raises(PalpateError, match="`max_bytes` must hold at least the text"):
         page_of(results, tmp_path, max_bytes=2_000)
 
@@ -258,16 +262,6 @@ def test_the_gallery_is_folded_and_every_material_shows(tmp_path):
     captions = [f"{m} · <code>" for m in materials]
     assert [c in before for c in captions] == [True] * 11 + [False] * 19
     assert all(c in before + after for c in captions)
-
-
-def test_lists_of_pairs_take_turns_where_there_is_little_room(tmp_path):
-    names = images(tmp_path, 16, 128)
-    html = page_of(Results("t", audits=[full_audit(names)]), tmp_path, max_bytes=110_000)
-    shown = [
-        block.count('<figure class="pair">') for block in html.split("<details open><summary>")
-    ]
-    assert sum(shown) > 0
-    assert "rows of images were skipped" in Tree(html).text
 
 
 def test_empty_sections_name_the_command_that_fills_them(tmp_path):
@@ -318,29 +312,22 @@ def test_an_axis_holds_its_values_and_a_zero_nearby(values, inside):
     assert axis_over([None, float("inf")]) is None
 
 
-def test_bars_of_a_column_share_an_axis():
+def rects(svg, kind):
+    return [e for e in ET.fromstring(str(svg)).iter("rect") if e.get("class") == kind]
+
+
+def test_bars_and_histograms_draw_their_numbers_and_join_fine_bins():
     axis = axis_over([0.0, 10.0])
     tree = ET.fromstring(str(bar(axis, 5.0, (0.0, 10.0), (2.0, 4.0), 1.0)))
     assert {e.tag: e.get("class") for e in tree}["circle"] == "value"
     assert float(tree.find("circle").get("cx")) == pytest.approx(axis.x(5.0))
     assert bar(None, 1.0, None) == ""
-
-
-def rects(svg, kind):
-    return [e for e in ET.fromstring(str(svg)).iter("rect") if e.get("class") == kind]
-
-
-def test_the_histogram_of_gaps_has_a_bar_a_bin_and_the_median():
     svg = gap_histogram(full_audit())
     heights = [float(e.get("height")) for e in rects(svg, "column")]
-    assert len(heights) == 8  # bins that are not empty
-    assert max(heights) == pytest.approx(70)
+    assert (len(heights), max(heights)) == (8, pytest.approx(70))  # bins that are not empty
     assert "median 304" in svg
-    assert gap_histogram(small_audit(gap_counts=[0, 0, 0])) == ""
-    assert gap_histogram(small_audit(gap_counts=[0, 7, 0])) == ""  # one bar
-
-
-def test_the_histograms_of_scores_have_the_threshold_and_join_fine_bins():
+    for counts in ([0, 0, 0], [0, 7, 0]):  # nothing, or one bar
+        assert gap_histogram(small_audit(gap_counts=counts)) == ""
     signal = full_audit().signals[-1]
     _, unrelated, matches = bins_of(signal)
     assert len(matches) <= MAX_BARS

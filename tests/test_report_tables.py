@@ -29,19 +29,14 @@ from palpate.report.tables import grids, heat_tables, listing, of_differences, r
         (percent, (1.0,), "100 %"),
         (score_text, (1.0,), "1.000"),
         (score_text, (0.99996,), "0.99996"),
+        *((decimals, ([v],), d) for v, d in ((1234.0, 0), (12.0, 2), (0.5, 3), (0.0123, 4))),
+        (decimals, ([],), 1),
         (plural, (1, "video"), "1 video"),
         (plural, (1200, "match", "matches"), "1,200 matches"),
     ],
 )
 def test_numbers_are_written_for_people(function, args, text):
     assert function(*args) == text
-
-
-@pytest.mark.parametrize(
-    ("values", "digits"), [([], 1), ([1234.0], 0), ([12.0], 2), ([0.5], 3), ([0.0123], 4)]
-)
-def test_decimals_follow_the_largest_value(values, digits):
-    assert decimals(values) == digits
 
 
 @pytest.mark.parametrize(
@@ -71,18 +66,8 @@ def test_scores_of_a_family_are_one_table_with_what_they_share():
     assert [row.cells[2].below[-1] for row in grids(table)[0].rows[:2]] == ["n = 100", "n = 200"]
     assert ("bandwidth σ", "10") in table.facts
     assert ("TMMD, seed", "1, 2") in table.facts
-
-
-def test_several_seeds_of_a_subject_share_a_cell():
-    (table,) = families([score(seed=1), score(seed=2)])
-    (laid,) = grids(table)
+    (laid,) = grids(*families([score(seed=1), score(seed=2)]))
     assert [row.cells[0].value for row in laid.rows] == ["a", "a", "real images (floor)"]
-
-
-def test_scores_of_different_settings_raise():
-    for change in ({"bandwidth": 5.0}, {"encoder": "e"}, {"scale": 1.0}):
-        with pytest.raises(PalpateError, match="must agree in"):
-            families([score(), score(subject="b", **change)])
 
 
 @pytest.mark.parametrize(
@@ -115,11 +100,11 @@ def test_scores_without_reference_go_with_their_subject():
     subjects = [{s.a for c in t.columns for s in c.scores} for t in (first, second)]
     assert subjects == [{"a"}, {"b"}]
     assert [c.name for c in second.columns] == ["TMMD", "I-TMMD"]
-
-
-def test_features_of_several_networks_do_not_split_the_scores_of_one_run():
-    scores = [score("KID", "a", reference="r1", encoder="e"), score("CMMD", "a", reference="r2")]
-    assert len(families(scores)) == 1
+    networks = [score("KID", "a", reference="r1", encoder="e"), score("CMMD", "a", reference="r2")]
+    assert len(families(networks)) == 1  # features of several networks, of one run
+    for change in ({"bandwidth": 5.0}, {"encoder": "e"}, {"scale": 1.0}):
+        with pytest.raises(PalpateError, match="must agree in"):
+            families([score(), score(subject="b", **change)])
 
 
 @pytest.mark.parametrize(
@@ -152,6 +137,10 @@ def test_more_than_two_generators_are_ranked():
         return replace(d, details={**d.details, "p_better": p_better, "p_adjusted": p})
 
     pairs = [pair("a", "b", 0.01, 0.02), pair("a", "c", 0.3, 0.6), pair("b", "c", 0.9, 0.2)]
+    few = families([score(subject="a"), score(subject="b"), difference("a", "b")])[0]
+    assert rankings(few) is None
+    (row,) = of_differences(few).plain()[1]
+    assert row == ["TMMD ↓", "a", "b", "-1.00 [-1.50, -0.50]", "97.5 %", "0.05"]
     results = Results("Scores", scores=[*(score(subject=s) for s in "abc"), *pairs])
     (table,) = families(results.scores)
     assert rankings(table).plain()[1] == [["TMMD ↓", "b ~ c ~ a"]]  # b and a are no neighbors
@@ -160,7 +149,6 @@ def test_more_than_two_generators_are_ranked():
     decided = [pairs[0], pair("a", "c", 0.01, 0.001), pairs[2]]
     (other,) = families([*results.scores[:3], *decided])
     assert rankings(other).plain()[1] == [["TMMD ↓", "b ~ c > a"]]
-    assert rankings(families([score(subject="a"), score(subject="b"), pairs[0]])[0]) is None
 
 
 def test_a_table_is_headed_by_the_features_and_a_column_by_the_kernel():
@@ -214,12 +202,6 @@ def test_equal_notes_have_one_number():
 def test_what_follows_from_the_fields_of_a_score_is_a_note(changes, code):
     assert [note.code for note in listing(families([score(**changes)])[0]).notes] == [code]
     assert listing(families([score("FID", floor=None)])[0]).notes == []
-
-
-def test_differences_are_rows_below_their_scores():
-    family = families([score(subject="a"), score(subject="b"), difference("a", "b")])[0]
-    (row,) = of_differences(family).plain()[1]
-    assert row == ["TMMD ↓", "a", "b", "-1.00 [-1.50, -0.50]", "97.5 %", "0.05"]
 
 
 def test_only_square_matrices_of_numbers_are_drawn():

@@ -156,7 +156,7 @@ def _svg(
 
 
 @dataclass(frozen=True)
-class Panel:
+class Bars:
     """One histogram: a name, heights of its bars with what each is, and the top of its scale."""
 
     name: str
@@ -167,7 +167,7 @@ class Panel:
 
 
 def _histogram(
-    panels: Sequence[Panel],
+    panels: Sequence[Bars],
     positions: Sequence[float],
     *,
     ticks: Sequence[tuple[float, str]],
@@ -237,7 +237,7 @@ def gap_histogram(audit: Audit) -> Markup:
         f"{count(a)} to {count(b)} frames: {count(n)}"
         for (a, b), n in zip(pairwise(edges), counts, strict=True)
     ]
-    panel = Panel("test samples", counts, titles, ["column"] * len(counts), count(max(counts)))
+    panel = Bars("test samples", counts, titles, ["column"] * len(counts), count(max(counts)))
     return _histogram(
         [panel],
         positions,
@@ -286,7 +286,7 @@ def score_histogram(signal: Signal, label: str, data: str = "train") -> Markup:
         return (min(max(value, low), high) - low) / (high - low)
 
     strong = ["column" if a >= signal.threshold else "below" for a in edges[:-1]]
-    panels: list[Panel] = []
+    panels: list[Bars] = []
     rows = [(f"test against {data}", matches, strong)]
     if sum(unrelated):
         rows.insert(0, ("unrelated samples", unrelated, ["apart"] * len(unrelated)))
@@ -296,7 +296,7 @@ def score_histogram(signal: Signal, label: str, data: str = "train") -> Markup:
             for (a, b), n in zip(pairwise(edges), counts, strict=True)
         ]
         top = f"{100 * max(counts) / (sum(counts) or 1):.2g}\u00a0%"
-        panels.append(Panel(f"{name} ({count(sum(counts))})", counts, titles, kinds, top))
+        panels.append(Bars(f"{name} ({count(sum(counts))})", counts, titles, kinds, top))
     ticks, digits = ticks_of(low, high, 6)
     marker = (share(signal.threshold), f"flagged from {score_text(signal.threshold)}")
     xlabel = "score of the best match; 1 = the same"
