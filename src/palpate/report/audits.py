@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import NamedTuple
 
-from palpate.report.numbers import count, number, plural, score_text
+from palpate.report.numbers import count, interval, number, plural, score_text
 from palpate.report.results import Audit, ImpactRow, LeakPair
 
 
@@ -96,7 +96,7 @@ def impact_cells(row: ImpactRow) -> dict[str, tuple[str, str]]:
         "Cost, points": (row.cost, row.cost_interval),
     }
     result: dict[str, tuple[str, str]] = {}
-    for name, (value, interval) in cells.items():
-        pair = ", ".join(number(100 * limit, 1) for limit in interval or ())
-        result[name] = (number(100 * value, 1), f"[{pair}]" if pair else "")
+    for name, (value, pair) in cells.items():
+        limits = [100 * limit for limit in pair or ()]
+        result[name] = (number(100 * value, 1), interval(limits, 1))
     return result

@@ -11,7 +11,7 @@ from palpate.core import Measure, Score
 from palpate.report import plots
 from palpate.report.families import REAL, Column, Family, baselines, best_by_value, defined
 from palpate.report.notes import sentence
-from palpate.report.numbers import number, p_text, percent, plural
+from palpate.report.numbers import interval, number, p_text, percent, plural
 from palpate.report.results import Audit, Results
 from palpate.report.sentences import share_of
 
@@ -201,8 +201,8 @@ def strip_axis(scores: Sequence[Score], width: float) -> plots.Axis | None:
 def _strip_facts(score: Score, column: Column) -> str:
     facts: list[str] = []
     if score.interval:
-        low, high = (number(v, column.digits) for v in score.interval)
-        facts.append(f"{score.a}: {100 * score.level:g} % interval [{low}, {high}]")
+        limits = interval(score.interval, column.digits)
+        facts.append(f"{score.a}: {100 * score.level:g} % interval {limits}")
     if score.floor is not None:
         facts.append(f"dashed: real images {number(score.floor, column.digits)}")
     return "; ".join(filter(None, [*facts, _against_real(score)])) + "." * bool(facts)

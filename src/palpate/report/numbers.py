@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import statistics
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 
 from palpate.core import SampleRef, Score
 
@@ -73,6 +73,18 @@ def number(value: float | None, digits: int | None = None) -> str:
         return "–"
     digits = decimals([value]) if digits is None else digits
     return f"{value:z,.{digits}f}".replace("-", "−")
+
+
+def interval(pair: Sequence[float] | None, digits: int) -> str:
+    """Return ``"[1.01, 1.75]"``; '' for None."""
+    return f"[{', '.join(number(v, digits) for v in pair)}]" if pair else ""
+
+
+def with_interval(score: Score, digits: int) -> str:
+    """Return ``"1.37 [1.01, 1.75]"``, or ``"undefined"``."""
+    if score.value is None:
+        return "undefined"
+    return f"{number(score.value, digits)} {interval(score.interval, digits)}".rstrip()
 
 
 def score_text(value: float) -> str:

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from palpate.core import Note, Score
 from palpate.report.families import defined, families, family_of
 from palpate.report.notes import question
-from palpate.report.numbers import count, number, percent, plural, score_text
+from palpate.report.numbers import count, number, percent, plural, score_text, with_interval
 from palpate.report.results import CANNOT_TELL, Audit, Results, Signal
 
 #: Beginning of a kind of leak -> what it means ({thing} is the rest of the name, {data} what test
@@ -201,11 +201,7 @@ def score_line(scores: Sequence[Score]) -> str:
         scored = [score for score in column.scores if defined(score)]
         if not scored:
             continue
-        values: list[str] = []
-        for score in scored[:3]:
-            low_high = [number(v, column.digits) for v in score.interval or ()]
-            interval = f" [{', '.join(low_high)}]" if low_high else ""
-            values.append(f"{score.a} {number(score.value, column.digits)}{interval}")
+        values = [f"{score.a} {with_interval(score, column.digits)}" for score in scored[:3]]
         floors = [score.floor for score in scored if score.floor is not None]
         floor = f"; floor {number(floors[0], column.digits)}" if floors else ""
         return f"{column.name} ({column.better}): {', '.join(values)}{floor}."

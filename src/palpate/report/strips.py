@@ -9,7 +9,7 @@ from itertools import takewhile
 from markupsafe import Markup, escape
 
 from palpate.core import Score
-from palpate.report.numbers import digits_of, number
+from palpate.report.numbers import digits_of, with_interval
 from palpate.report.plots import HEIGHT, axis_of, axis_row, bar, ticks_of
 from palpate.report.tables import Row, Table
 
@@ -79,7 +79,7 @@ def strips_svg(title: str, panels: Sequence[Panel]) -> Markup:
             fields = score.value, score.interval, score.null, score.floor
             parts.append(_text(0, y + 15, label, LABEL, "ink"))
             parts.append(bar(axis, *fields, at=(LABEL, y), hollow=control))
-            text = _numbers(score, digits_of(scores))
+            text = with_interval(score, digits_of(scores))
             parts.append(_text(LABEL + AXIS + 12, y + 15, text, LABEL, "ink"))
             y += HEIGHT
         parts.append(axis_row(axis, at=(LABEL, y)))
@@ -97,13 +97,6 @@ def strips_svg(title: str, panels: Sequence[Panel]) -> Markup:
     about = f"<title>{label}</title><desc>Drawn by palpate</desc><style>{STYLE}</style>"
     paper = f'<rect width="100%" height="100%" fill="{COLORS["paper"]}"/>'
     return Markup(f"{head}{about}{paper}{''.join(parts)}</svg>\n")
-
-
-def _numbers(score: Score, digits: int) -> str:
-    if score.value is None:
-        return "undefined"
-    pair = ", ".join(number(v, digits) for v in score.interval or ())
-    return number(score.value, digits) + (f" [{pair}]" if pair else "")
 
 
 def _text(x: float, y: float, text: str, width: float, name: str) -> str:

@@ -12,7 +12,6 @@ from __future__ import annotations
 import re
 from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from itertools import count, pairwise, zip_longest
 from typing import Any
 
@@ -31,7 +30,15 @@ from palpate.report.families import (
     size_of,
 )
 from palpate.report.labels import label_of, measured, subject_of
-from palpate.report.numbers import confidence, decimals, digits_of, number, p_text
+from palpate.report.numbers import (
+    confidence,
+    decimals,
+    digits_of,
+    interval,
+    number,
+    p_text,
+    with_interval,
+)
 from palpate.report.numbers import count as count_text
 from palpate.report.study import StudyTable
 
@@ -98,8 +105,7 @@ class Cell:
         """The cell as plain text: ``1.37 [1.01, 1.75] * (1)``."""
         words = [self.value if isinstance(self.value, str) else ""]
         if self.score is not None:
-            words = [value_text(self.score.value, self.digits)]
-            words += [range_text(self.score.interval, self.digits)] * defined(self.score)
+            words = [with_interval(self.score, self.digits)]
         marks = ["*"] * self.best + ["†"] * self.decided + [f"({k})" for k in self.footnotes]
         return " ".join(filter(None, [*words, *marks]))
 
@@ -145,12 +151,17 @@ class Table:
         return marks + [f"† {DECIDED}"] * any(cell.decided for cell in cells)
 
     def plain(self) -> tuple[list[Head], list[list[str]]]:
-        """Heads and rows of plain text without the columns that are empty; controls say so."""
+        """Heads and rows of plain text without the columns that are empty; controls say so.
+
+        Numbers have an ASCII minus, as not every terminal has the true one.
+        """
         rows = [[cell.text() for cell in row.cells] for row in self.rows]
         for cells, row in zip(rows, self.rows, strict=True):
             cells[0] += " (control)" * row.control
         kept = [k for k in range(len(self.heads)) if any(row[k] for row in rows)]
-        return [self.heads[k] for k in kept], [[row[k] for k in kept] for row in rows]
+        ascii_minus = {k: str.maketrans("−", "-") if self.heads[k].scores else {} for k in kept}
+        texts = [[row[k].translate(ascii_minus[k]) for k in kept] for row in rows]
+        return [self.heads[k] for k in kept], texts
 
 
 class Footnotes:
@@ -164,16 +175,6 @@ class Footnotes:
         notes = list(notes)
         self.notes += [n for k, n in enumerate(notes) if n not in self.notes and n not in notes[:k]]
         return sorted({self.notes.index(note) + 1 for note in notes})
-
-
-def value_text(value: float | None, digits: int) -> str:
-    """Return a number with an ASCII minus, as not every terminal has the true one."""
-    return "undefined" if value is None else number(value, digits).replace("−", "-")
-
-
-def range_text(pair: Sequence[float] | None, digits: int) -> str:
-    """Return ``"[1.01, 1.75]"``, or '' for None."""
-    return f"[{', '.join(value_text(v, digits) for v in pair)}]" if pair else ""
 
 
 def of_study(table: StudyTable) -> Table:
@@ -325,21 +326,18 @@ def listing(family: Family) -> Table:
     """Return the scores of one family, a row each, so that names and notes have room."""
     footnotes, rows = Footnotes(), list[Row]()
     for column in family.columns:
-        best, text = column.best(), partial(value_text, digits=column.digits)
+        best, digits = column.best(), column.digits
         for k, score in enumerate(column.scores):
-            base = baselines(score)
-            words = [
-                range_text(score.interval, column.digits),
-                range_text(score.null, column.digits),
-                p_text(score.details.get("p_value")),
-                "" if score.floor is None else text(score.floor),
-                *(text(base[name]) if name in base else "" for name in BASELINES),
-                count_text(score.n) if score.n else "",
-            ]
-            value = Cell(text(score.value), best=k in best, decided=score.a == column.winner)
-            names = Cell(f"{column.name} {column.arrow}"), Cell(score.a)
+            text = number(score.value, digits) if defined(score) else "undefined"
+            value = Cell(text, best=k in best, decided=score.a == column.winner)
+            limits = [interval(pair, digits) for pair in (score.interval, score.null)]
+            further = (score.floor, *map(baselines(score).get, BASELINES))
+            words = ["" if v is None else number(v, digits) for v in further]
+            words = [*limits, p_text(score.details.get("p_value")), *words]
+            names = f"{column.name} {column.arrow}", score.a
+            size = count_text(score.n) if score.n else ""
             notes = Cell(None, footnotes=footnotes.numbers(notes_of(score)))
-            rows.append(Row([*names, value, *map(Cell, words), notes]))
+            rows.append(Row([*map(Cell, names), value, *map(Cell, (*words, size)), notes]))
     numbers = ("value", "95 % interval", "null", "p", "floor", *BASELINES, "n")
     heads = [Head("metric"), Head("subject"), *(Head(n, scores=True) for n in numbers)]
     heads.append(Head("notes"))

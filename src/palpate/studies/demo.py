@@ -33,7 +33,7 @@ from palpate.evaluation.scoring import score
 from palpate.leakage.auditing import audit
 from palpate.leakage.splitting import split as leak_free_split
 from palpate.report.families import families
-from palpate.report.numbers import number, percent
+from palpate.report.numbers import percent, with_interval
 from palpate.report.results import Results
 from palpate.sim import PRESETS as WORLDS
 from palpate.sim import WorldOptions
@@ -341,8 +341,7 @@ class Page:
             return "undefined"
         columns = (column for family in families(self.scores) for column in family.columns)
         digits = next(c.digits for c in columns if any(s is score for s in c.scores))
-        low_high = ", ".join(number(v, digits) for v in score.interval or ())
-        return number(score.value, digits) + (f" [{low_high}]" if low_high else "")
+        return with_interval(score, digits)
 
     def _distance(self) -> str:
         given_gels = self.stages["generator"].facts["background"]

@@ -17,7 +17,7 @@ from scipy import special
 
 from palpate.core import Note, PalpateError, Score, plain
 from palpate.report.labels import label_of, measured, subject_of
-from palpate.report.numbers import digits_of, number
+from palpate.report.numbers import digits_of, number, with_interval
 
 
 def over_seeds(scores: Sequence[Score]) -> Score:
@@ -200,6 +200,4 @@ def in_words(score: Score) -> str:
         return "undefined"
     if score.interval is None:
         return f"{number(score.value)} (no interval)"
-    digits = digits_of([score])
-    value, low, high = (number(v, digits) for v in (score.value, *score.interval))
-    return f"{value} [{low}, {high}]"
+    return with_interval(score, digits_of([score]))
