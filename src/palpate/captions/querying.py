@@ -174,22 +174,22 @@ def in_daemons(
     """Yield results, or what was raised, as they finish; a caller that leaves waits for nothing.
 
     Other than :func:`palpate.data.images.in_threads`, which waits for its threads: a request may
-    hang for minutes.
+    hang for minutes. No item and no result is None.
     """
     lock, stop, source = threading.Lock(), threading.Event(), iter(items)
-    results: SimpleQueue[R | BaseException | _End] = SimpleQueue()
+    results: SimpleQueue[R | BaseException | None] = SimpleQueue()  # None: a thread has ended
 
     def work() -> None:
         while not stop.is_set():
             with lock:
-                item = next(source, _END)
-            if isinstance(item, _End):
+                item = next(source, None)
+            if item is None:
                 break
             try:
                 results.put(function(item))
             except BaseException as error:
                 results.put(error)
-        results.put(_END)
+        results.put(None)
 
     for _ in range(threads):
         threading.Thread(target=work, daemon=True).start()
@@ -200,16 +200,9 @@ def in_daemons(
                 result = results.get(timeout=CTRL_C)
             except Empty:
                 continue
-            if isinstance(result, _End):
+            if result is None:
                 running -= 1
             else:
                 yield result
     finally:
         stop.set()
-
-
-class _End:
-    """The end of the items."""
-
-
-_END = _End()

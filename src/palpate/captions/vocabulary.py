@@ -9,7 +9,7 @@ words.
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from functools import cache
 from importlib import resources
 
@@ -101,13 +101,8 @@ def _names(label: str) -> frozenset[str]:
     synonyms = _synonyms()
     keys = {" ".join(words_of(label)), *(form for word in words for form in forms_of(word))}
     listed = [word for key in keys for word in synonyms.get(key, ())]
-    return frozenset(form for word in (*words, *listed) for form in (word, *_singular(word)))
-
-
-def _singular(word: str) -> Iterator[str]:
-    """``plant`` of ``plants``."""
-    if word.endswith("s") and len(word) > 3:
-        yield word.removesuffix("s")
+    plurals = [word for word in (*words, *listed) if word.endswith("s") and len(word) > 3]
+    return frozenset((*words, *listed, *(word.removesuffix("s") for word in plurals)))
 
 
 @cache
