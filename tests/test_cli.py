@@ -24,27 +24,6 @@ def lists(tmp_path: Path) -> tuple[str, str]:
     return str(tmp_path / "train.txt"), str(tmp_path / "test.txt")
 
 
-def test_official_lists_give_the_published_facts(capsys, real_data):
-    place = real_data / "touch_and_go" / "lists"
-    args = ("audit", place / "train.txt", place / "test.txt", "--json", "--fail-over", "0.01")
-    status, out, _ = call(capsys, *args)
-    facts = json.loads(out)
-    expected = {
-        "test_samples": 29879,
-        "groups_train": 120,
-        "groups_test": 106,
-        "groups_shared": 100,
-        "test_samples_in_shared_groups": 29597,
-        "leaked_fraction": 0.99056,
-        "gap_min": 31,
-        "gap_median": 304,
-        "gap_max": 2485,
-        "identical_samples": 0,
-    }
-    assert {name: facts[name] for name in expected} == expected
-    assert (status, facts["failed"]) == (1, True)
-
-
 @pytest.mark.parametrize(("limit", "status"), [("0.49", 1), ("0.5", 0), ("2", 2)])
 def test_fail_over_is_a_limit(capsys, lists, limit, status):
     assert call(capsys, "audit", *lists, "--fail-over", limit)[0] == status
@@ -240,21 +219,6 @@ def test_bad_lines_of_both_lists_are_reported_together_or_skipped(capsys, lists)
     assert (status, data["test_samples"]) == (1, 2)
     notes = [note["params"] for note in data["notes"] if note["code"] == "rows-skipped"]
     assert sum(params["count"] for params in notes) == 8
-
-
-def test_split_of_a_manifest_then_audit_then_report(capsys, small_manifest, tmp_path):
-    small_manifest.save(tmp_path / "m" / "manifest.parquet")
-    split, audit, page = (tmp_path / name for name in ("s.json", "audit.json", "page.html"))
-    args = [tmp_path / "m", "-o", split, "--train", "0.5", "--by", "auto"]
-    assert call(capsys, "split", *args)[0] == 0
-    args = ("audit", tmp_path / "m", "--split", split, "--json", "--fail-over", "0", "-o", audit)
-    status, out, _ = call(capsys, *args)
-    assert status == 0, out
-    assert json.loads(out)["groups_shared"] == 0
-    assert call(capsys, "report", audit, "-o", page, "-q")[0] == 0
-    assert "NoLeak" in page.read_text()
-    again = ("report", page.with_suffix(".json"), "-o", tmp_path / "again.html", "-q")
-    assert call(capsys, *again)[0] == 0
 
 
 def test_an_error_of_all_processes_is_printed_by_the_first(monkeypatch, capsys):

@@ -180,13 +180,6 @@ def test_test_samples_that_an_encoder_has_seen_are_told_apart_from_train(tmp_pat
     assert [run(capsys, *args, "--fail-over", limit)[0] for limit in (0.5, 1)] == [1, 0]
 
 
-def test_the_published_rough_lists_were_seen_in_pretraining(real_data, capsys):
-    lists = real_data / "touch_and_go" / "lists"
-    rough = (lists / "train_rough.txt", lists / "test_rough.txt")
-    _, data, _ = run(capsys, *rough, "--pretrain", lists / "train.txt")
-    assert (data["leaked_fraction"], data["others"][0]["identical_samples"]) == (0.0, 3289)
-
-
 def test_lists_of_windows_with_a_mark_odd_names_and_no_last_line_end(tmp_path, capsys):
     (tmp_path / "train.txt").write_bytes("\ufeffmy video, 1/5.jpg,0\r\nküche/7.jpg,1\r\n".encode())
     (tmp_path / "test.txt").write_bytes("my video, 1/9.jpg,0\r\nküche/7.jpg,1".encode())
@@ -205,13 +198,6 @@ def test_rows_without_a_video_are_told_and_a_table_is_read_as_it_is(tmp_path, ca
     status, data, _ = run(capsys, tmp_path / "a.csv", tmp_path / "b.csv", "--no-images")
     assert (status, data["leaked_fraction"], data["gap_min"]) == (1, 0.5, 2)
     assert [note["code"] for note in data["notes"]] == ["group-nulls"] * 2
-
-
-def test_touches_of_lists_are_numbered_together(real_data, capsys):
-    lists = real_data / "touch_and_go" / "lists"
-    _, data, _ = run(capsys, lists / "train.txt", lists / "test.txt", "--by", "contact")
-    counts = [data[f"groups_{name}"] for name in ("train", "test", "shared")]
-    assert counts == [3378, 1113, 0]  # as measured: no touch mixes the lists
 
 
 def test_frames_that_are_time_stamps_do_not_overflow(tmp_path, capsys):
