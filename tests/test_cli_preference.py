@@ -97,21 +97,15 @@ def test_two_raters_are_told_from_people_before_the_study(capsys, rated, tmp_pat
     ],
 )
 def test_mistakes_of_make_are_one_line(capsys, rated, tmp_path, args, words):
-    status, _, err = call(capsys, *make(rated, tmp_path / "s", *args))
-    assert status == 2
-    assert words in err
-    assert err.count("\n") == 1
+    commands.mistake(capsys, words, "preference", *make(rated, tmp_path / "s", *args))
     assert not (tmp_path / "s").exists()
 
 
 def test_a_study_is_not_replaced(capsys, rated, study):
-    status, _, err = call(capsys, *make(rated, study))
-    assert (status, "must be absent or an empty folder" in err) == (2, True)
-
-
-def test_scores_do_not_replace_the_plan(capsys, study):
-    status, _, err = call(capsys, "score", study, "-o", study / "plan.json")
-    assert (status, "must not replace an input" in err) == (2, True)
+    words = "must be absent or an empty folder"
+    commands.mistake(capsys, words, "preference", *make(rated, study))
+    plan = ("score", study, "-o", study / "plan.json")
+    commands.mistake(capsys, "must not replace an input", "preference", *plan)
 
 
 def test_serve_prints_each_link_once_and_stops_by_ctrl_c(study):

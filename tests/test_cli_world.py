@@ -4,7 +4,7 @@ import dataclasses
 
 import pytest
 
-from palpate.cli import main
+from forge.commands import mistake
 from palpate.cli.running import parse
 from palpate.cli.world import FIELDS, Options, world_options
 from palpate.sim import PRESETS, WorldOptions
@@ -54,7 +54,5 @@ def test_the_table_has_every_option():
 )
 def test_mistakes_are_one_line(arguments, words, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
-    assert main(["world", "-o", "w", *arguments.split()]) == 2
-    (line,) = (x for x in capsys.readouterr().err.splitlines() if x.startswith("palpate "))
-    assert words in line
+    mistake(capsys, words, "world", "-o", "w", *arguments.split())
     assert not list(tmp_path.iterdir())

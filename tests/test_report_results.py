@@ -6,6 +6,7 @@ from pathlib import Path
 
 import pytest
 
+from forge.commands import mistake
 from forge.results import full_audit, full_results, images, score, small_audit
 from palpate.cli import main
 from palpate.core import PalpateError
@@ -87,8 +88,5 @@ def test_the_command_merges_files_of_results_and_audits(capsys, tmp_path):
 def test_the_command_rejects_incomplete_files(capsys, tmp_path, change, words):
     path = tmp_path / "a.json"
     path.write_text(json.dumps(full_audit().to_json() | change))
-    assert main(["report", str(path), "-o", str(tmp_path / "page.html"), "-q"]) == 2
-    message = capsys.readouterr().err
-    assert words in message
-    assert "Traceback" not in message
+    mistake(capsys, words, "report", path, "-o", tmp_path / "page.html", "-q")
     assert not (tmp_path / "page.html").exists()

@@ -10,7 +10,7 @@ import numpy as np
 import polars as pl
 import pytest
 
-from forge.commands import call
+from forge.commands import call, mistake
 from forge.studies import TINY
 from palpate.cli import main
 from palpate.core import FeatureSet, Measure, PalpateError, Score, Split, digest_file
@@ -226,9 +226,7 @@ def test_a_dry_run_writes_nothing(tmp_path, capsys):
 def test_mistakes_are_reported_in_one_line(args, words, capsys, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     Results("t", scores=[Score("TMMD", "Ours", 0.1)]).save(tmp_path / "s.json")
-    status, _, lines = call(capsys, "reproduce", *args, "-o", "r")
-    assert status == 2
-    assert words in lines.splitlines()[0]
+    mistake(capsys, words, "reproduce", *args, "-o", "r")
     assert not (tmp_path / "r").exists()
 
 
