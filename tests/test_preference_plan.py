@@ -189,14 +189,14 @@ def test_a_material_of_one_video_gives_one_item_and_cannot_be_sorted(rated, tmp_
     assert sort.choices == ["brick", "grass", "wood"]
 
 
-def test_of_10000_images_a_sample_is_taken_and_said(tmp_path):
+def test_of_many_images_a_sample_is_taken_and_said(tmp_path):
     file = write_folder(tmp_path / "one", 0, ["x"]) / "x.png"
     for name in ("real", "a", "b"):
         (tmp_path / name).mkdir()
-        for k in range(10_000):
+        for k in range(1_000):
             (tmp_path / name / f"{k}.png").hardlink_to(file)
     plan = preference.make(tmp_path / "real", [tmp_path / "a", tmp_path / "b"], dry_run=True)
-    assert codes(plan)["sampled-items"] == {"n": 40, "candidates": 10_000, "videos": 10_000}
+    assert codes(plan)["sampled-items"] == {"n": 40, "candidates": 1_000, "videos": 1_000}
 
 
 def test_a_manifest_gives_materials_videos_and_the_gel_of_catches(small_manifest, tmp_path):
