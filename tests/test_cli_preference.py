@@ -50,7 +50,7 @@ def test_from_folders_to_a_row(capsys, rated, tmp_path):
     assert not re.search(r"\b(ours|gvst|wbg|brick|grass|wood)\b", page, re.IGNORECASE)
     crowd = Crowd({"ours": 2.0, "gvst": 0.0, "wbg": -1.0})
     votes = crowd.write(Plan.load(study), tmp_path / "votes")
-    outputs = [tmp_path / name for name in ("people.json", "people.tex", "people.html")]
+    outputs = [tmp_path / name for name in ("people.json", "people.tex", "raters.html")]
     options = ("-o", outputs[0], "--latex", outputs[1], "--page", outputs[2])
     status, out, _ = call(capsys, "score", study, votes, *options, "--replicates", "200")
     assert status == 0

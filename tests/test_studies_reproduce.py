@@ -206,7 +206,7 @@ def test_a_dry_run_writes_nothing(tmp_path, capsys):
 @pytest.mark.parametrize(
     ("args", "words"),
     [
-        (["world-gelsigt"], "study"),
+        (["world-gelsigt"], "must be one of clips, hct, tag, world-digit, world-gelsight"),
         (["world-gelsight", "--preset", "huge"], "--preset must be one of smoke, mini"),
         (["world-gelsight", "--seeds", "1", "1"], "--seeds must hold"),
         (["world-gelsight", "--root", "x"], "--root must be left out"),
