@@ -28,8 +28,7 @@ record:          ## RUN=runs/study: pack results, page, tables and figures of a 
 	mkdir -p dist
 	tar -czf dist/record-$(notdir $(RUN:/=)).tar.gz -C $(RUN) results.json page.html page.md tables.tex figures
 
-test: $(DEV)     ## all tests but the nightly ones, in one run
-	$(PYTEST) -m "not nightly"
+test: test-fast test-slow  ## all tests, fast ones first
 
 test-fast: $(DEV)  ## tests of under about five seconds each
 	$(PYTEST) -m "not slow and not browser and not nightly"
