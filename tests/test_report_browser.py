@@ -24,11 +24,13 @@ from forge.results import (
     pretraining_audit,
     score,
     small_audit,
+    study_results,
     text_note,
 )
 from palpate.core import SampleRef
 from palpate.report import write_report
 from palpate.report.results import GalleryItem, LeakPair, Results
+from palpate.report.study import Claim, StudyTable
 
 LONG = "a_recording_with_a_name_that_no_line_of_a_phone_can_hold_2024_11_21_rig_b"
 
@@ -64,6 +66,25 @@ def long_results(folder):
         settings=settings,
         commands=[f"palpate audit {LONG} -o {LONG}"],
     )
+
+
+def long_study(folder):
+    """A study whose every name is too long, with 20 rows."""
+    results = study_results(folder, 12)
+    rows = [[f"{LONG} {k}", score(value=k / 7), LONG, score(value=None)] for k in range(20)]
+    table = StudyTable(LONG, f"On {LONG}.", ["method", LONG, "words", "none"], rows, True, [])
+    claims = [Claim(f"{LONG} {k}", LONG, "undecided", LONG, [score()]) for k in range(12)]
+    tables, claims = [*results.tables, table], [*results.claims, *claims]
+    return dataclasses.replace(results, tables=tables, claims=claims)
+
+
+def all_audits(folder):
+    """Every kind of audit, and one of long names."""
+    names = images(folder, 16)
+    row = {"group": LONG, "train": 91982, "val": 12000, "test": 29879, "leaking": 29879}
+    long = full_audit(names, name=LONG, matrix=[row])
+    audits = [full_audit(names), clean_audit(), pretraining_audit(names), long]
+    return Results("Audits", audits=audits)
 
 
 OVERFLOW = """document.documentElement.scrollWidth > window.innerWidth
@@ -119,23 +140,30 @@ EAGER = """Promise.all([...document.images].map(image => {
     image.loading = 'eager';
     return image.decode();
 }))"""
+#: Text of claims and tables that is cut: wider than its box, where that does not scroll.
+CUT = """[...document.querySelectorAll('#claims, #study')]
+    .flatMap(s => [...s.querySelectorAll('th, td, p, li, summary, h3')])
+    .filter(e => e.checkVisibility() && !e.closest('.hidden')
+        && e.getBoundingClientRect().right > (e.closest('.wide') ? 1e9 : innerWidth))
+    .map(e => e.textContent.slice(0, 80))"""
+HEADS = "getComputedStyle(document.querySelector('.claims thead')).position"
+DECODED = "[...document.images].map(i => [i.complete, i.naturalWidth, i.alt.length])"
 UNFOLD = "document.querySelectorAll('details').forEach(d => { d.open = true })"
 
 
 @pytest.fixture(scope="module")
-def page_file(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("page")
-    return write_report(long_results(folder), folder / "page.html", max_bytes=10_000_000).page
-
-
-@pytest.fixture(scope="module")
-def audit_page(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("audits")
-    names = images(folder, 16)
-    row = {"group": LONG, "train": 91982, "val": 12000, "test": 29879, "leaking": 29879}
-    long = full_audit(names, name=LONG, matrix=[row])
-    audits = [full_audit(names), clean_audit(), pretraining_audit(names), long]
-    return write_report(Results("Audits", audits=audits), folder / "page.html").page
+def pages(tmp_path_factory):
+    """A page with every section, one of audits, and those of studies, with names of all lengths."""
+    folder = tmp_path_factory.mktemp("pages")
+    makers = {"page": long_results, "audits": all_audits, "long": long_study}
+    makers["study"] = lambda folder: study_results(folder, 40, 96)
+    files = {}
+    for name, make in makers.items():
+        (folder / name).mkdir()
+        limit = 10_000_000 if name == "page" else 1_500_000
+        file = folder / name / "page.html"
+        files[name] = write_report(make(folder / name), file, max_bytes=limit).page
+    return files
 
 
 @contextmanager
@@ -161,31 +189,29 @@ def screenshot(page, name):
     page.screenshot(path=folder / f"{name}.png", full_page=True)
 
 
-@pytest.mark.parametrize(("width", "scheme"), [(1280, "light"), (360, "dark")])
-def test_the_page_fits_and_decodes_every_image(chromium, page_file, width, scheme):
-    with opened(chromium, page_file, width, scheme) as page:
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+@pytest.mark.parametrize("wide", [True, False])
+@pytest.mark.parametrize("name", ["page", "audits", "study", "long"])
+def test_pages_fit_and_decode_every_image(chromium, pages, name, wide, scheme):
+    width = 1280 if wide else {"page": 360, "audits": 360}.get(name, 390)
+    with opened(chromium, pages[name], width, scheme) as page:
         for state in ("folded", "open"):
             if state == "open":
                 page.evaluate(UNFOLD)
-            screenshot(page, f"page-{width}-{scheme}-{state}")
+            screenshot(page, f"{name}-{width}-{scheme}-{state}")
             assert not page.evaluate(OVERFLOW), state
-        page.evaluate(EAGER)
-        ask = "[...document.images].map(i => [i.complete, i.naturalWidth, i.alt.length])"
-        decoded = page.evaluate(ask)
-    assert len(decoded) == 48 * 3 + 2 + 8 * 4
-    assert all(complete and natural > 0 and alt > 0 for complete, natural, alt in decoded)
-
-
-@pytest.mark.parametrize(("width", "scheme"), [(1280, "light"), (360, "dark")])
-def test_audits_fit_and_no_label_lies_on_another(chromium, audit_page, width, scheme):
-    with opened(chromium, audit_page, width, scheme) as page:
-        screenshot(page, f"audits-{width}-{scheme}")
-        page.evaluate(UNFOLD)
-        assert not page.evaluate(OVERFLOW)
-        assert page.evaluate(INSIDE) == page.evaluate(APART) == [True] * 6
-        if width == 360:  # nothing of the tables of signals, costs and groups is cut off
-            assert page.evaluate(UNCUT)
-        assert page.evaluate(ROLES)
+            assert page.evaluate(CUT) == []
+        if name == "audits":  # no label lies on another, and nothing is cut off on a phone
+            assert page.evaluate(INSIDE) == page.evaluate(APART) == [True] * 6
+            assert wide or page.evaluate(UNCUT)
+            assert page.evaluate(ROLES)
+        elif name == "page":
+            page.evaluate(EAGER)
+            decoded = page.evaluate(DECODED)
+            assert len(decoded) == 48 * 3 + 2 + 8 * 4
+            assert all(complete and natural and alt for complete, natural, alt in decoded)
+        elif not wide:  # claims become blocks, each value below its name
+            assert page.evaluate(HEADS) == "absolute"
 
 
 def luminance(color):
@@ -196,8 +222,8 @@ def luminance(color):
 
 
 @pytest.mark.parametrize("scheme", ["light", "dark"])
-def test_everything_has_the_contrast_of_wcag(chromium, page_file, audit_page, scheme):
-    for file, ask in ((audit_page, DRAWN), (page_file, WRITTEN)):
+def test_everything_has_the_contrast_of_wcag(chromium, pages, scheme):
+    for file, ask in ((pages["audits"], DRAWN), (pages["page"], WRITTEN)):
         with opened(chromium, file, scheme=scheme) as page:
             pairs = set(page.evaluate(ask))
         assert len(pairs) >= 5
@@ -206,9 +232,9 @@ def test_everything_has_the_contrast_of_wcag(chromium, page_file, audit_page, sc
             assert (a + 0.05) / (b + 0.05) >= 4.5, pair
 
 
-def test_the_keyboard_reaches_the_sections_and_the_wide_tables(chromium, page_file):
+def test_the_keyboard_reaches_the_sections_and_the_wide_tables(chromium, pages):
     reached = []
-    with opened(chromium, page_file, 360) as page:
+    with opened(chromium, pages["page"], 360) as page:
         for _ in range(40):
             page.keyboard.press("Tab")
             reached.append(page.evaluate(FOCUS))
@@ -219,12 +245,12 @@ def test_the_keyboard_reaches_the_sections_and_the_wide_tables(chromium, page_fi
     ask = """[...document.querySelectorAll('.wide')]
         .map(e => [e.tabIndex, e.scrollWidth > e.clientWidth])"""
     for width in (360, 1280):
-        with opened(chromium, page_file, width) as page:
+        with opened(chromium, pages["page"], width) as page:
             assert all((tab == 0) == scrolls for tab, scrolls in page.evaluate(ask))
 
 
-def test_a_printed_page_is_what_is_open_with_its_images(chromium, page_file):
-    with opened(chromium, page_file, 800) as page:
+def test_a_printed_page_is_what_is_open_with_its_images(chromium, pages):
+    with opened(chromium, pages["page"], 800) as page:
         page.emulate_media(media="print")
         folded = page.evaluate(FOLDED)
         assert len(folded) > 10
@@ -234,8 +260,8 @@ def test_a_printed_page_is_what_is_open_with_its_images(chromium, page_file):
         assert len(re.findall(rb"/Type\s*/Page\b", page.pdf())) > pages
 
 
-def test_a_sample_enlarges_by_click_and_by_key_and_commands_are_copied(chromium, page_file):
-    with opened(chromium, page_file) as page:
+def test_a_sample_enlarges_by_click_and_by_key_and_commands_are_copied(chromium, pages):
+    with opened(chromium, pages) as page:
         large = "document.querySelector('dialog[open] img')?.clientWidth ?? 0"
         page.click(".hero .row img >> nth=0")
         assert page.evaluate(large) > 200
@@ -250,7 +276,7 @@ def test_a_sample_enlarges_by_click_and_by_key_and_commands_are_copied(chromium,
         assert page.evaluate("getSelection().toString()").startswith(f"palpate audit {LONG}")
 
 
-def test_a_page_keeps_the_limits_of_its_benchmark(chromium, tmp_path):
+def test_pages_keep_the_limits_of_their_benchmark(chromium, pages, tmp_path):
     """Height, bytes, first screen, phone and print, as ``benchmarks/page.py`` measures them."""
     tool = runpy.run_path(str(Path(__file__).parents[1] / "benchmarks" / "page.py"))
     results = full_results(tmp_path, 48, 64)
@@ -258,9 +284,10 @@ def test_a_page_keeps_the_limits_of_its_benchmark(chromium, tmp_path):
     results = dataclasses.replace(results, scores=[*results.scores, accuracy])
     page, pictures = write_report(results, tmp_path / "page.html").page, tmp_path / "pictures"
     pictures.mkdir()
-    facts = tool["measure"](chromium, page, (1280, 800), pictures)
-    assert tool["problems"](facts, (1280, 800)) == []
-    assert facts["print pages"] <= 8
+    for file, folder in ((pages["study"], None), (page, pictures)):
+        facts = tool["measure"](chromium, file, (1280, 800), folder)
+        assert tool["problems"](facts, (1280, 800)) == []
+        assert facts["print pages"] <= 8
     assert {p.suffix for p in pictures.iterdir()} == {".png", ".pdf"}
     over = facts | {"bytes": 2_000_000, "light 390": facts["light 390"] | {"sideways": True}}
     assert len(tool["problems"](over, (1280, 500))) == 4

@@ -113,7 +113,9 @@ class FeatureSet:
             for name, column in columns.items()
             if column is not None
         }
-        encoder = {"encoder": np.array(self.encoder)} if self.encoder else {}
+        encoder: dict[str, np.ndarray] = {}
+        if self.encoder:
+            encoder["encoder"] = np.array(self.encoder)
         with atomic_path(Path(path)) as part, open(part, "wb") as file:
             np.savez(file, allow_pickle=False, ids=ids, features=self.features, **names | encoder)
 
