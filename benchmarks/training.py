@@ -41,7 +41,7 @@ import numpy as np
 import torch
 
 from palpate.core import quiet, rng_for
-from palpate.encoders.contrastive import TactileLoss, TactileModel, new_clip
+from palpate.encoders.contrastive import TactileLoss, TactileModel
 from palpate.encoders.embed import embed_images
 from palpate.encoders.encoder_set import EncoderSet, Preprocess, new_tactile
 from palpate.encoders.losses import in_chunks, three_way
@@ -236,10 +236,9 @@ def embedding(n=10_000):
     """``embed_images`` and the bare forward pass."""
     rng = rng_for(0, "embedding")
     images = rng.integers(0, 256, (n, MINI.image, MINI.image, 3), dtype=np.uint8)
-    clip = new_clip(MINI, WORDS, 0)
     preprocess = Preprocess(MINI.image, MINI.image)
     tactile = new_tactile(MINI.tactile_config(128), 0).eval().requires_grad_(False)
-    encoders = EncoderSet(clip, tactile, preprocess, {})
+    encoders = EncoderSet(tactile=tactile, preprocesses={"tactile": preprocess})
 
     @torch.inference_mode()
     def bare():

@@ -49,9 +49,9 @@ from palpate.diffusion.pipeline import TactilePipeline
 from palpate.diffusion.presets import MINI as DIFFUSION
 from palpate.diffusion.training import Parts, train_pipeline
 from palpate.encoders.contrastive import train_clip, train_tactile
-from palpate.encoders.encoder_set import ClipEncoders, EncoderSet, load_clip
+from palpate.encoders.encoder_set import EncoderSet, load_clip
 from palpate.encoders.models import SHIPPED, shipped_root
-from palpate.encoders.presets import EncoderPreset, preset
+from palpate.encoders.presets import EncoderPreset, preset, preset_of
 from palpate.sim import PRESETS, VERSION, WorldOptions, write_world
 from palpate.studies.files import fresh
 from palpate.studies.stages import Stage, run_stage, stored_stage
@@ -136,6 +136,12 @@ def train_round(
     return replace(made, training={**made.training, "ceiling": autoencoder.card.get("scores")})
 
 
+def _seeing(preset: EncoderPreset, epochs: float) -> EncoderPreset:
+    """A preset with so many epochs of vision and text."""
+    assert preset.clip_course is not None
+    return replace(preset, clip_course=replace(preset.clip_course, epochs=epochs))
+
+
 class Recipe:
     """The parts, each a stage of a run folder; a finished stage is read, not made again."""
 
@@ -180,37 +186,30 @@ class Recipe:
         train = self.world("gelsight")
 
         def build(folder: Path) -> Mapping[str, Any]:
-            clip = self._pair(train, ENCODER, folder, CLIP_EPOCHS)
+            preset = _seeing(ENCODER, CLIP_EPOCHS)
+            clip = train_clip(train, everything(train), preset, self._run(folder))
             clip.save(fresh(folder / "clip"))
             return {"vision": clip.digest("vision"), "text": clip.digest("text")}
 
         inputs = {"preset": ENCODER, "epochs": CLIP_EPOCHS, "seed": SEED, "train": train.digest}
         return self.stage("clip", inputs, build)
 
-    def _pair(
-        self, train: Manifest, preset: EncoderPreset, folder: Path, epochs: float, **how: Any
-    ) -> ClipEncoders:
-        how |= {"seed": SEED, "epochs": epochs, **self.common}
-        return train_clip(train, everything(train), preset, folder / "training", **how)
+    def _run(self, folder: Path) -> TrainingRun:
+        return TrainingRun(folder / "training", seed=SEED, cache=self.cache, progress=self.progress)
 
     def tactile(self) -> EncoderSet:
         """The pair and a tactile encoder that learns from it."""
         clip, train = self.clip(), self.world("gelsight")
-        how: dict[str, Any] = {"epochs": TACTILE_EPOCHS, "seed": SEED}
+        preset = preset_of(ENCODER, TACTILE_EPOCHS)
 
         def build(folder: Path) -> Mapping[str, Any]:
-            parts = (
-                train,
-                everything(train),
-                load_clip(clip.folder / "clip"),
-                ENCODER,
-                folder / "training",
-            )
-            encoders = train_tactile(*parts, **how, **self.common)
+            pair = load_clip(clip.folder / "clip")
+            run = self._run(folder)
+            encoders = train_tactile(train, everything(train), pair, preset, run)
             encoders.save(fresh(folder / "encoders"))
             return {"tactile": encoders.digest("tactile"), "text": encoders.digest("text")}
 
-        inputs = {"preset": ENCODER, **how, "clip": clip.digest}
+        inputs = {"preset": preset, "seed": SEED, "clip": clip.digest}
         return EncoderSet.load(self.stage("tactile", inputs, build).folder / "encoders")
 
     def encoders(self) -> EncoderSet:
@@ -220,9 +219,10 @@ class Recipe:
         train = Manifest.join(*parts)
 
         def build(folder: Path) -> Mapping[str, Any]:
-            how = {"start": encoders.clip, "compute": COMPUTE}
-            clip = self._pair(train, VISION, folder, VISION_EPOCHS, **how)
-            replace(encoders, clip=clip).save(fresh(folder / "encoders"))
+            run = replace(self._run(folder), compute=COMPUTE)
+            preset = _seeing(VISION, VISION_EPOCHS)
+            clip = train_clip(train, everything(train), preset, run, start=encoders)
+            clip.with_tactile(encoders).save(fresh(folder / "encoders"))
             return {"vision": clip.digest("vision")}
 
         inputs = {"preset": VISION, "epochs": VISION_EPOCHS, "seed": SEED, "train": train.digest}

@@ -100,7 +100,7 @@ def ship(
     pair = card("encoders")
     pair["title"], pair["summary"] = PAIR
     pair["scores"] = [row for row in pair["scores"] if "tactile" not in row["score"]]
-    encoders.clip.card = {**encoders.clip.card, **pair}
+    encoders.clip_card = {**encoders.clip_card, **pair}
     autoencoder.card = {**autoencoder.card, **card("autoencoder")}
     pipeline = replace(pipeline, training={**pipeline.training, **card("generator")})
     shutil.rmtree(target, ignore_errors=True)  # git has what was there

@@ -16,8 +16,9 @@ from palpate.diffusion.autoencoder import load_autoencoder
 from palpate.diffusion.autoencoder_training import train_autoencoder
 from palpate.diffusion.ceiling import judge_of, measure_ceiling
 from palpate.diffusion.training import train_generator
-from palpate.encoders.encoder_set import EncoderSet
-from palpate.encoders.preprocess import digest_images, load_frames
+from palpate.encoders.encoder_set import EncoderSet, load_clip
+from palpate.encoders.preprocess import load_frames
+from palpate.encoders.seen import digest_images
 from palpate.sim import WorldOptions, write_world
 
 SIZE = 64
@@ -130,7 +131,7 @@ def test_samples_are_scored_on_their_own_gels_if_any_has_one_else_on_the_stock_g
 
 
 def test_a_judge_without_touch_is_rejected_before_the_training(world, split):
-    clip = EncoderSet(EncoderSet.load("palpate/mini").clip)
+    clip = load_clip("palpate/mini")
     with pytest.raises(PalpateError, match="`judge` must have a tactile encoder"):
         train_autoencoder(world, split, judge=clip)
     with pytest.raises(PalpateError, match="no folder nowhere"):
@@ -140,7 +141,7 @@ def test_a_judge_without_touch_is_rejected_before_the_training(world, split):
 def test_a_judge_that_was_trained_on_the_images_does_not_judge_them(world, split):
     judge, test = EncoderSet.load("palpate/mini"), world.part(split, "test")
     preprocess = judge.preprocess("tactile")
-    judge.seen = digest_images(
+    judge.seen["tactile"] = digest_images(
         load_frames(preprocess.frames(test, "tactile").files[:3], preprocess)
     )
     found = measure_ceiling(Through(lambda x: x), world, split, SIZE, judge=judge)
@@ -150,7 +151,9 @@ def test_a_judge_that_was_trained_on_the_images_does_not_judge_them(world, split
     assert "not_judged" not in alone
     for name in ("tmmd", "accuracy_real", "accuracy"):
         assert found[name] == pytest.approx(alone[name], abs=1e-9)
-    judge.seen = digest_images(load_frames(preprocess.frames(test, "tactile").files, preprocess))
+    judge.seen["tactile"] = digest_images(
+        load_frames(preprocess.frames(test, "tactile").files, preprocess)
+    )
     found = measure_ceiling(Through(lambda x: x), world, split, SIZE, judge=judge)
     assert (found["not_judged"], found["judge"]) == (len(test), judge.digest("tactile"))
     assert found["psnr"] > 90

@@ -19,7 +19,6 @@ from palpate.core import PalpateError
 from palpate.diffusion.autoencoder import Autoencoder, load_autoencoder, to_bytes
 from palpate.diffusion.presets import PAPER, TINY
 from palpate.diffusion.training import Parts, train_pipeline
-from palpate.encoders import EncoderSet
 from palpate.encoders.preprocess import to_unit
 from palpate.training.run import TrainingRun
 
@@ -222,7 +221,7 @@ def test_an_autoencoder_that_does_not_fit_preset_or_start_is_rejected(small_mani
     path = write(tmp_path / "f64.ckpt", make_state((1,) * 7, 4, 16))
     with pytest.raises(PalpateError, match=r"`autoencoder` must reduce images of 32 .* Got 64"):
         pp.train_generator(*data, encoders, preset=TINY, autoencoder=path)
-    start = replace(make_pipeline(width=encoders.dim), encoders=EncoderSet(encoders.clip))
+    start = replace(make_pipeline(width=encoders.dim), encoders=encoders.without_tactile())
     wider = Autoencoder(small_vq(latent_channels=4))
     parts = Parts(TINY, wider, encoders, start=start)
     with pytest.raises(PalpateError, match=r"`start` must share autoenc.*another autoenc"):

@@ -15,7 +15,6 @@ from palpate.data.images import square
 from palpate.data.video import VideoReader
 from palpate.diffusion.gels import SMOOTH, gel_notes, unevenness
 from palpate.diffusion.generation import generate
-from palpate.encoders.encoder_set import EncoderSet
 from palpate.sim import World, WorldOptions
 
 DATA = Path(os.environ.get("PALPATE_SHARED_DATA", Path(__file__).parents[2] / "shared" / "data"))
@@ -72,7 +71,7 @@ def test_what_speaks_against_a_gel_is_noted(tmp_path):
 
 def test_a_text_that_the_tokenizer_cuts_is_said(tmp_path, monkeypatch, capsys):
     encoders = make_encoders()
-    model = replace(make_pipeline(width=encoders.dim), encoders=EncoderSet(encoders.clip))
+    model = replace(make_pipeline(width=encoders.dim), encoders=encoders.without_tactile())
     long = "rough " * 400
     (note,) = generate(text=long, model=model, steps=1).notes
     assert note.code == "text-cut"

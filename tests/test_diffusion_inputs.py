@@ -24,7 +24,6 @@ from palpate.diffusion.options import ConditionPolicy
 from palpate.diffusion.pipeline import TactilePipeline
 from palpate.diffusion.presets import TINY
 from palpate.diffusion.training import train_generator
-from palpate.encoders.encoder_set import EncoderSet
 from palpate.training.options import LoopOptions
 from palpate.training.run import TrainingRun
 from palpate.training.steps import Step
@@ -132,16 +131,16 @@ def patch_pipeline():
     encoders = make_encoders()
     policy = replace(PATCHES, width=encoders.dim)
     base = make_pipeline(policy=replace(policy, patches=0))
-    width = encoders.clip.model.config.vision_config.hidden_size
+    width = encoders.clip.config.vision_config.hidden_size
     denoiser = Denoiser(base.unet, policy, patch_width=width).eval()
-    return replace(base, denoiser=denoiser, encoders=EncoderSet(encoders.clip))
+    return replace(base, denoiser=denoiser, encoders=encoders.without_tactile())
 
 
 def test_patches_are_those_of_the_last_layer_of_transformers():
-    clip = make_encoders().clip
-    pixels = torch.randn(2, 3, *[clip.preprocess.size] * 2)
+    clip = make_encoders()
+    pixels = torch.randn(2, 3, *[clip.preprocess("vision").size] * 2)
     with torch.no_grad():
-        whole = clip.model.vision_model(pixels).last_hidden_state[:, 1:]
+        whole = clip.clip.vision_model(pixels).last_hidden_state[:, 1:]
         assert torch.allclose(clip.patches(pixels, whole.shape[1]), whole, atol=1e-6)
         mean = clip.patches(pixels, 1)
     assert torch.allclose(mean[:, 0], whole.mean(1), atol=1e-5)

@@ -14,7 +14,6 @@ from palpate.diffusion.denoiser_training import Rows, train_denoiser
 from palpate.diffusion.options import Schedule, UNetOptions
 from palpate.diffusion.presets import TINY
 from palpate.diffusion.training import Parts, train_pipeline
-from palpate.encoders.encoder_set import EncoderSet
 from palpate.training.options import LoopOptions
 from palpate.training.run import TrainingRun
 
@@ -54,7 +53,7 @@ def test_it_begins_with_the_given_weights_and_leaves_those_alone(tmp_path):
 
 def test_other_encoders_autoencoders_and_schedules_are_rejected(small_manifest, tmp_path):
     encoders = make_encoders()
-    start = replace(make_pipeline(width=encoders.dim), encoders=EncoderSet(encoders.clip))
+    start = replace(make_pipeline(width=encoders.dim), encoders=encoders.without_tactile())
     manifest = Manifest(small_manifest.table, small_manifest.root, {"synthetic": "yes"})
     split = Split.from_ids(
         train=manifest.ids[:8], test=manifest.ids[8:], rule={"name": "t"}, manifest=manifest.digest

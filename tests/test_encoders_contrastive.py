@@ -31,6 +31,7 @@ from palpate.encoders.presets import Augment, preset
 from palpate.encoders.rows import Rows
 from palpate.training.engine import Task, fit
 from palpate.training.options import Compute
+from palpate.training.run import TrainingRun
 
 TINY = preset("tiny")
 FEELS = {
@@ -76,6 +77,10 @@ def by_video(manifest, train=6):
 @pytest.fixture(scope="module")
 def world(tmp_path_factory):
     return make_world(tmp_path_factory.mktemp("world"))
+
+
+def run(folder, **change):
+    return TrainingRun(folder, device="cpu", **change)
 
 
 def unit(*shape, seed=0):
@@ -172,7 +177,7 @@ def test_photos_may_be_missing_and_videos_held_out(world, clip, tmp_path):
     for row in rows[:5]:
         row["vision"] = None
     manifest, split = Manifest.from_rows(rows, world.root), with_val(world, 6)
-    encoders = train_tactile(manifest, split, clip, quick(), tmp_path, device="cpu")
+    encoders = train_tactile(manifest, split, clip, quick(), run(tmp_path))
     assert encoders.card["without_photo"] == 5
     assert encoders.card["train_samples"] == 18
     lines = (tmp_path / "log.jsonl").read_text()
@@ -185,40 +190,59 @@ def with_val(manifest, rows):
     return Split.from_ids(train=split.ids("train"), val=split.ids("test")[:rows])
 
 
-def test_a_batch_of_one_and_one_sample_are_rejected(world, clip, tmp_path):
-    how = {"device": "cpu"}
-    with pytest.raises(PalpateError, match=r"held-out part must hold two samples.*Got one, v6/0"):
-        train_tactile(world, with_val(world, 1), clip, TINY, tmp_path, **how)
-    course = replace(TINY.tactile_course, evaluations=0)
-    encoders = train_tactile(
-        world, with_val(world, 1), clip, quick(tactile_course=course), tmp_path, **how
-    )
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"split": Split.from_ids(test=["v0/0"])}, "train part"),
+        ({"split": Split.from_ids(train=["nobody"])}, r"1 of 1 missing, first .nobody"),
+        ({"split": Split.from_ids(train=["v0/0"])}, "must hold two samples"),
+        ({"held_out": 1}, r"held-out part must hold two samples.*Got one, v6/0"),
+        ({"row": {"tactile": None}}, r"tactile image.*v0/2"),
+        ({"row": {"tactile": "gone.png"}}, "1 bad-image"),
+        ({"course": {"batch": 1}}, "`tactile_course.batch` must be at least 2"),
+        ({"course": {"batch": 0}}, "`batch` must be at least 1"),
+        ({"course": {"keep": "best"}}, "`tactile_course.keep` needs a part val"),
+        ({"course": {"patience": 1}}, "`tactile_course.patience` needs a part val"),
+        ({"device": "abacus"}, "`device` must be auto"),
+    ],
+)
+def test_a_training_of_the_tactile_encoder_that_cannot_be(world, clip, tmp_path, change, message):
+    rows = world.table.to_dicts()
+    rows[2].update(change.get("row", {}))
+    held = with_val(world, change["held_out"]) if "held_out" in change else by_video(world)
+    manifest, split = Manifest.from_rows(rows, world.root), change.get("split", held)
+    preset = quick(tactile_course=replace(TINY.tactile_course, **change.get("course", {})))
+    where = TrainingRun(tmp_path, device=change.get("device", "cpu"))
+    with pytest.raises(PalpateError, match=message):
+        train_tactile(manifest, split, clip, preset, where)
+
+
+def test_one_held_out_sample_is_enough_without_evaluations(world, clip, tmp_path):
+    preset = quick(tactile_course=replace(TINY.tactile_course, evaluations=0))
+    encoders = train_tactile(world, with_val(world, 1), clip, preset, run(tmp_path))
     assert not any("held_out" in line for line in encoders.card["loss"])
-    one = Split.from_ids(train=world.ids[:1])
-    with pytest.raises(PalpateError, match="must hold two samples"):
-        train_tactile(world, one, clip, TINY, tmp_path, device="cpu")
-    for batch, must in (
-        (1, "`tactile_course.batch` must be at least 2"),
-        (0, "`batch` must be at least 1"),
-    ):
-        preset = quick(tactile_course=replace(TINY.tactile_course, batch=batch))
-        with pytest.raises(PalpateError, match=must):
-            train_tactile(world, by_video(world), clip, preset, tmp_path, device="cpu")
 
 
-def test_vision_and_text_are_not_trained_on_one_row(world, tmp_path):
-    def train(folder, manifest=world, course=TINY.clip_course):
-        preset = replace(TINY, clip_course=course)
-        return train_clip(manifest, by_video(world), preset, tmp_path / folder, device="cpu")
-
-    one = [{**r, "vision": None} if k else r for k, r in enumerate(world.table.to_dicts())]
-    with pytest.raises(PalpateError, match=r"must hold two photos.*Got one, v0/0"):
-        train("one", Manifest.from_rows(one, world.root))
-    with pytest.raises(PalpateError, match=r"`clip_course\.batch` must be at least 2"):
-        train("batch", course=replace(TINY.clip_course, batch=1))
-    for change in ({"keep": "best"}, {"patience": 1}):
-        with pytest.raises(PalpateError, match="must keep its last weights and run to its end"):
-            train("best", course=replace(TINY.clip_course, **change))
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"photos": 1}, r"must hold two photos.*Got one, v0/0"),
+        ({"preset": preset("paper")}, "must describe a fresh CLIP"),
+        ({"course": {"batch": 1}}, "`clip_course.batch` must be at least 2"),
+        ({"course": {"keep": "best"}}, "must keep its last weights and run to its end"),
+        ({"course": {"patience": 1}}, "must keep its last weights and run to its end"),
+    ],
+)
+def test_a_training_of_vision_and_text_that_cannot_be(world, tmp_path, change, message):
+    photos = change.get("photos", len(world))
+    rows = [
+        {**r, "vision": r["vision"] if k < photos else None}
+        for k, r in enumerate(world.table.to_dicts())
+    ]
+    course = replace(TINY.clip_course, **change.get("course", {}))
+    chosen = change.get("preset", replace(TINY, clip_course=course))
+    with pytest.raises(PalpateError, match=message):
+        train_clip(Manifest.from_rows(rows, world.root), by_video(world), chosen, run(tmp_path))
 
 
 def test_a_test_part_without_materials_or_tactile_images_costs_no_training(world, tmp_path):
@@ -232,14 +256,6 @@ def test_a_test_part_without_materials_or_tactile_images_costs_no_training(world
             assert [row["n"] for row in encoders.card.get("scores", ())] == [count] * bool(count)
 
 
-def test_what_needs_a_held_out_part_is_rejected_without_one(world, clip, tmp_path):
-    for change in ({"keep": "best"}, {"patience": 1}):
-        preset = quick(tactile_course=replace(TINY.tactile_course, **change))
-        must = f"`tactile_course.{next(iter(change))}` needs a part val"
-        with pytest.raises(PalpateError, match=must):
-            train_tactile(world, by_video(world), clip, preset, tmp_path, device="cpu")
-
-
 @pytest.mark.parametrize("change", [{"crop": 5}, {"crop": -1}, {"gain": -0.1}])
 def test_views_out_of_range(change):
     with pytest.raises(PalpateError, match=f"`{next(iter(change))}` must lie in"):
@@ -249,10 +265,9 @@ def test_views_out_of_range(change):
 def test_gradient_goes_to_the_tactile_encoder_and_the_temperature_only(world):
     clip = new_clip(TINY, world.column("text"), seed=0)
     model = TactileModel(new_tactile(TINY.tactile_config(clip.dim), seed=1))
-    text = clip.encode_text(world.column("text")[:6])
-    vision = clip.encode_vision(
-        torch.randn(6, 3, 16, 16, generator=torch.Generator().manual_seed(0))
-    )
+    text = clip.encode("text", world.column("text")[:6])
+    noise = torch.randn(6, 3, 16, 16, generator=torch.Generator().manual_seed(0))
+    vision = clip.encode("vision", noise)
     assert not text.requires_grad
     assert not vision.requires_grad
     pixels = torch.randn(6, 3, 16, 16, generator=torch.Generator().manual_seed(1))
@@ -270,7 +285,7 @@ def test_gradient_goes_to_the_tactile_encoder_and_the_temperature_only(world):
     assert all(
         "post_layernorm" in name or "k_proj.bias" in name for name in silent
     )  # a key bias cancels in the softmax
-    assert all(p.grad is None for p in clip.model.parameters())
+    assert all(p.grad is None for p in clip.clip.parameters())
     assert float(scale.detach()) == pytest.approx(1 / 0.07, rel=1e-5)
 
 
@@ -291,13 +306,13 @@ def quick(**change):
 
 @pytest.fixture(scope="module")
 def clip(world, tmp_path_factory):
-    return train_clip(world, by_video(world), TINY, tmp_path_factory.mktemp("clip"), device="cpu")
+    return train_clip(world, by_video(world), TINY, run(tmp_path_factory.mktemp("clip")))
 
 
 def test_training_moves_the_tactile_encoder_alone_and_records_its_data(world, clip, tmp_path):
     split = by_video(world)
     before = clip.digest("vision"), clip.digest("text")
-    encoders = train_tactile(world, split, clip, quick(), tmp_path / "a", device="cpu")
+    encoders = train_tactile(world, split, clip, quick(), run(tmp_path / "a"))
     assert (
         (clip.digest("vision"), clip.digest("text"))
         == before
@@ -330,11 +345,9 @@ def test_training_moves_the_tactile_encoder_alone_and_records_its_data(world, cl
 def test_training_depends_on_the_seed_and_the_train_part_alone(world, clip, tmp_path):
     split = by_video(world)
 
-    def digest(name, manifest=world, **change):
-        options = {"device": "cpu", **change}
-        return train_tactile(manifest, split, clip, quick(), tmp_path / name, **options).digest(
-            "tactile"
-        )
+    def digest(name, manifest=world, preset=None, **change):
+        where = run(tmp_path / name, **change)
+        return train_tactile(manifest, split, clip, preset or quick(), where).digest("tactile")
 
     base = digest("a")
     torch.manual_seed(99)
@@ -346,36 +359,32 @@ def test_training_depends_on_the_seed_and_the_train_part_alone(world, clip, tmp_
     assert digest("b", Manifest.from_rows(rows, world.root), cache=tmp_path / "cache") == base
     assert torch.equal(torch.get_rng_state(), state)
     assert digest("b", seed=1) != base
-    assert digest("c", targets="diagonal") != base
+    assert digest("c", preset=quick(targets="diagonal")) != base
 
 
 def test_training_can_go_on_from_another_encoder(world, clip, tmp_path):
     split = by_video(world)
-    first = train_tactile(world, split, clip, quick(), tmp_path / "a", device="cpu", seed=3)
+    first = train_tactile(world, split, clip, quick(), run(tmp_path / "a", seed=3))
     digest = first.digest("tactile")
     frozen = quick(tactile_course=replace(TINY.tactile_course, lr=1e-30, weight_decay=0.0))
-    again = train_tactile(world, split, clip, frozen, tmp_path / "b", device="cpu", start=first)
-    fresh = train_tactile(world, split, clip, frozen, tmp_path / "c", device="cpu")
+    again = train_tactile(world, split, clip, frozen, run(tmp_path / "b"), start=first)
+    fresh = train_tactile(world, split, clip, frozen, run(tmp_path / "c"))
     assert again.digest("tactile") == first.digest("tactile") == digest != fresh.digest("tactile")
     assert again.tactile is not first.tactile
     assert again.card["start"] == digest
     assert again.card["start_card"]["seed"] == 3
     assert fresh.card["start"] is None
     with pytest.raises(PalpateError, match="size of the preset"):
-        train_tactile(
-            world, split, clip, replace(TINY, patch=4), tmp_path / "d", device="cpu", start=first
-        )
+        train_tactile(world, split, clip, replace(TINY, patch=4), run(tmp_path / "d"), start=first)
     with pytest.raises(PalpateError, match="tactile encoder"):
-        train_tactile(
-            world, split, clip, TINY, tmp_path / "e", device="cpu", start=EncoderSet(clip)
-        )
+        train_tactile(world, split, clip, TINY, run(tmp_path / "e"), start=clip)
 
 
 def test_data_without_photos_train_against_words_alone(world, tmp_path):
     bare = [{**row, "vision": None, "text": None} for row in world.table.iter_rows(named=True)]
     bare = Manifest.from_rows(bare, world.root)
     encoders = train_encoder(bare, by_video(world), preset=TINY, device="cpu")
-    assert encoders.clip.card["trained_on"] == "tactile images, not photos"
+    assert encoders.clip_card["trained_on"] == "tactile images, not photos"
     assert set(encoders.card["loss"][0]) >= {"tactile_text"}
     assert not {"vision_text", "tactile_vision"} & set(encoders.card["loss"][0])
     assert encoders.card["text_source"] == "caption"
@@ -383,63 +392,36 @@ def test_data_without_photos_train_against_words_alone(world, tmp_path):
 
 def test_fresh_clip_learns(world, tmp_path):
     course = replace(TINY.clip_course, epochs=40.0, batch=18, lr=1e-2)
-    clip = train_clip(
-        world, by_video(world), replace(TINY, clip_course=course), tmp_path, device="cpu"
-    )
-    curve = clip.card["loss"]
+    clip = train_clip(world, by_video(world), replace(TINY, clip_course=course), run(tmp_path))
+    curve = clip.clip_card["loss"]
     assert curve[-1]["loss"] < curve[0]["loss"] - 0.5
-    assert not any(p.requires_grad for p in clip.model.parameters())
+    assert not any(p.requires_grad for p in clip.clip.parameters())
 
 
 def test_vision_goes_on_against_the_text_encoder_as_it_is(world, clip, tmp_path):
     before = {m: clip.digest(m) for m in ("vision", "text")}
-    where, how = tmp_path / "on", {"device": "cpu", "start": clip}
-    on = train_clip(world, by_video(world), TINY, where, seed=1, **how)
+    on = train_clip(world, by_video(world), TINY, run(tmp_path / "on", seed=1), start=clip)
     assert {m: clip.digest(m) for m in before} == before  # the first one is not touched
     assert on.digest("text") == before["text"]
     assert on.digest("vision") != before["vision"]
-    assert on.preprocess == clip.preprocess
-    assert on.card["start_card"] == clip.card
-    assert {m: on.card[m] for m in before} == before
-    assert not any(p.requires_grad for p in on.model.parameters())
-    assert set(clip.seen) <= set(on.seen)
-    assert not on.card["seen_in_part"]
-    again = train_clip(world, by_video(world), TINY, tmp_path / "again", seed=1, **how)
+    assert on.preprocesses == clip.preprocesses
+    assert on.clip_card["start_card"] == clip.clip_card
+    assert {m: on.clip_card[m] for m in before} == before
+    assert not any(p.requires_grad for p in on.clip.parameters())
+    assert set(clip.seen["vision"]) <= set(on.seen["vision"])
+    assert not on.clip_card["seen_in_part"]
+    again = train_clip(world, by_video(world), TINY, run(tmp_path / "again", seed=1), start=clip)
     assert again.digest("vision") == on.digest("vision")
     # Nobody knows what a public one saw, whatever it goes on with.
-    public = replace(clip, seen=None, card={"license": "cc-by-nc-4.0"})
-    for place in ("once", "twice"):
-        how["start"] = public
-        public = train_clip(world, by_video(world), TINY, tmp_path / place, epochs=0.1, **how)
-        assert not EncoderSet(public).knows_seen("vision")
-        assert public.card["license"] == "cc-by-nc-4.0"
-    dino = replace(clip, model=SimpleNamespace(config=SimpleNamespace(model_type="dinov2")))
+    public = replace(clip, seen={}, clip_card={"license": "cc-by-nc-4.0"})
+    short = replace(TINY, clip_course=replace(TINY.clip_course, epochs=0.1))
+    for name in ("once", "twice"):
+        public = train_clip(world, by_video(world), short, run(tmp_path / name), start=public)
+        assert not public.knows_seen("vision")
+        assert public.clip_card["license"] == "cc-by-nc-4.0"
+    dino = replace(clip, clip=SimpleNamespace(config=SimpleNamespace(model_type="dinov2")))
     with pytest.raises(PalpateError, match="must be a CLIP"):
-        train_clip(world, by_video(world), TINY, tmp_path / "dino", **{**how, "start": dino})
-
-
-def test_mistakes_are_explained(world, clip, tmp_path):
-    def train(rows=None, split=None, **options):
-        manifest = world if rows is None else Manifest.from_rows(rows, world.root)
-        options = {"device": "cpu", **options}
-        train_tactile(manifest, split or by_video(world), clip, TINY, tmp_path, **options)
-
-    def changed(**change):
-        rows = world.table.to_dicts()
-        rows[2].update(change)
-        return rows
-
-    for options, message in (
-        ({"split": Split.from_ids(test=world.ids)}, "train part"),
-        ({"split": Split.from_ids(train=["nobody"])}, r"1 of 1 missing, first .nobody"),
-        ({"rows": changed(tactile=None)}, r"tactile image.*v0/2"),
-        ({"rows": changed(tactile="gone.png")}, "1 bad-image"),
-        ({"device": "abacus"}, "`device` must be auto"),
-    ):
-        with pytest.raises(PalpateError, match=message):
-            train(**options)
-    with pytest.raises(PalpateError, match="must describe a fresh CLIP"):
-        train_clip(world, by_video(world), preset("paper"), tmp_path, device="cpu")
+        train_clip(world, by_video(world), TINY, run(tmp_path / "dino"), start=dino)
 
 
 def test_paper_preset_is_the_paper():
@@ -548,13 +530,13 @@ def plain_loop(model, images, text, vision, words, preprocess, options):
 def test_losses_and_averaged_weights_are_those_of_the_loop_before_the_engine(world, clip, tmp_path):
     """The batch divides the rows, so that none crosses the border of two epochs: those changed."""
     train, course = world.part(by_video(world), "train"), replace(TINY.tactile_course, batch=6)
-    options = replace(course.options(len(train), seed=3, epochs=7), warmup=4, ema=0.9)
+    options = replace(replace(course, epochs=7).options(len(train), seed=3), warmup=4, ema=0.9)
     rows = Rows(train, clip, TINY.preprocess)
     loss = TactileLoss(rows, TINY.preprocess, "identical-text")
     task = Task("training", len(train), lambda step: rows.load(step, course.augment), loss)
     engine, plain = (TactileModel(new_tactile(TINY.tactile_config(8), seed=3)) for _ in range(2))
     log = fit(engine, task, options, tmp_path)
-    text = torch.from_numpy(embed(train, EncoderSet(clip), "text").features)
+    text = torch.from_numpy(embed(train, clip, "text").features)
     losses, average = plain_loop(
         plain, rows.images, text, rows.vision, rows.texts, TINY.preprocess, options
     )
@@ -570,8 +552,7 @@ def test_losses_and_averaged_weights_are_those_of_the_loop_before_the_engine(wor
 def test_gradient_checkpointing_changes_nothing_and_warns_of_nothing(world, clip, tmp_path):
     digests = set()
     for again in (False, True):
-        compute = Compute(gradient_checkpointing=again)
-        how = {"device": "cpu", "compute": compute}
-        encoders = train_tactile(world, by_video(world), clip, TINY, tmp_path / f"{again}", **how)
+        where = run(tmp_path / f"{again}", compute=Compute(gradient_checkpointing=again))
+        encoders = train_tactile(world, by_video(world), clip, TINY, where)
         digests.add(encoders.digest("tactile"))
     assert len(digests) == 1

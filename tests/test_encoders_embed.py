@@ -27,11 +27,9 @@ def world(tmp_path):
 
 @pytest.fixture
 def encoders(world):
-    return EncoderSet(
-        new_clip(TINY, world.column("text"), 0),
-        new_tactile(TINY.tactile_config(8), 1).eval(),
-        Preprocess(16, 16),
-    )
+    tactile = new_tactile(TINY.tactile_config(8), 1).eval()
+    alone = EncoderSet(tactile=tactile, preprocesses={"tactile": Preprocess(16, 16)})
+    return new_clip(TINY, world.column("text"), 0).with_tactile(alone)
 
 
 @pytest.fixture
@@ -58,7 +56,7 @@ def test_embedding_equals_the_encoder_image_by_image(world, encoders, encoder, c
     with torch.no_grad():
         for k in range(len(world)):
             if encoder == "text":
-                expect = encoders.clip.encode_text([world.column("text")[k]])[0]
+                expect = encoders.encode("text", [world.column("text")[k]])[0]
             else:
                 image = np.asarray(Image.open(world.paths(column)[k]))
                 pre = encoders.preprocess(encoder)
@@ -66,7 +64,7 @@ def test_embedding_equals_the_encoder_image_by_image(world, encoders, encoder, c
                     torch.tensor(image).permute(2, 0, 1)[None] / 255
                     - torch.tensor(pre.mean).view(3, 1, 1)
                 ) / torch.tensor(pre.std).view(3, 1, 1)
-                model = encoders.clip.model if encoder == "vision" else encoders.tactile
+                model = encoders.clip if encoder == "vision" else encoders.tactile
                 states = model.vision_model(pixel_values=pixels).pooler_output
                 expect = torch.nn.functional.normalize(model.visual_projection(states), dim=-1)[0]
             assert np.allclose(result.features[k], expect, atol=1e-5)
@@ -178,7 +176,7 @@ def test_mistakes_are_explained(world, encoders, tmp_path, cached):
     with pytest.raises(PalpateError, match="`batch` must be at least 1"):
         embed(world, encoders, "tactile", batch=0, cache=cache)
     with pytest.raises(PalpateError, match="tactile encoder"):
-        embed(world, EncoderSet(encoders.clip), "tactile", cache=cache)
+        embed(world, encoders.without_tactile(), "tactile", cache=cache)
     for k in (1, 8):  # in two batches: both are named
         world.paths("tactile")[k].write_bytes(b"no image")
     with pytest.raises(ProblemsError) as caught:

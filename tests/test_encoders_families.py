@@ -121,7 +121,7 @@ def test_a_folder_of_transformers_gives_its_own_features(tmp_path, name):
 def test_texts_of_siglip_are_lower_case_and_padded_without_a_mask(tmp_path, name):
     model, _ = write(name, tmp_path / "model")
     encoders = EncoderSet.load(tmp_path / "model")
-    ids = encoders.clip.tokenizer(
+    ids = encoders.tokenizer(
         ["rough wood"], padding="max_length", max_length=16, return_tensors="pt"
     )["input_ids"]
     with torch.no_grad():

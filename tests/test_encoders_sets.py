@@ -15,6 +15,7 @@ from transformers import AutoTokenizer, CLIPModel
 from forge.models import make_encoders
 from palpate.core import PalpateError
 from palpate.encoders import encoder_set as module
+from palpate.encoders.clip import tokens
 from palpate.encoders.contrastive import new_clip
 from palpate.encoders.embed import embed_images, embed_texts
 from palpate.encoders.encoder_set import EncoderSet, Preprocess, load_clip, new_tactile
@@ -42,12 +43,10 @@ def clip():
 
 @pytest.fixture
 def encoders(clip):
-    return EncoderSet(
-        clip,
-        new_tactile(TINY.tactile_config(8), 1).eval(),
-        Preprocess(16, 16, (0.5, 0.4, 0.3), (0.2, 0.3, 0.4)),
-        {"preset": "tiny"},
-    )
+    tactile = new_tactile(TINY.tactile_config(8), 1).eval()
+    shape = {"tactile": Preprocess(16, 16, (0.5, 0.4, 0.3), (0.2, 0.3, 0.4))}
+    alone = EncoderSet(tactile=tactile, preprocesses=shape, card={"preset": "tiny"})
+    return clip.with_tactile(alone)
 
 
 def make_images(n=5, side=16):
@@ -78,19 +77,19 @@ def test_tokenizer_ids_cut_and_determinism():
 
 
 def test_text_is_pooled_at_the_first_end_token(clip):
-    tokens = clip.tokens(TEXTS)
-    states = clip.model.text_model(**tokens).last_hidden_state
-    for k, row in enumerate(tokens["input_ids"].tolist()):
+    words = tokens(clip.clip, clip.tokenizer, TEXTS)
+    states = clip.clip.text_model(**words).last_hidden_state
+    for k, row in enumerate(words["input_ids"].tolist()):
         at = row.index(clip.tokenizer.eos_token_id)
-        expect = torch.nn.functional.normalize(clip.model.text_projection(states[k, at]), dim=-1)
-        assert torch.allclose(clip.encode_text(TEXTS)[k], expect, atol=1e-6)
+        expect = torch.nn.functional.normalize(clip.clip.text_projection(states[k, at]), dim=-1)
+        assert torch.allclose(clip.encode("text", TEXTS)[k], expect, atol=1e-6)
 
 
 def test_saved_clip_is_a_standard_folder_with_equal_embeddings(clip, tmp_path):
     clip.save(tmp_path / "clip")
     plain = CLIPModel.from_pretrained(tmp_path / "clip").eval()
     tokenizer = AutoTokenizer.from_pretrained(tmp_path / "clip")
-    pixels = clip.preprocess.normalize(to_unit(make_images()))
+    pixels = clip.preprocess("vision").normalize(to_unit(make_images()))
     tokens = tokenizer(TEXTS, padding=True, truncation=True, max_length=16, return_tensors="pt")
     with torch.no_grad():
         out = plain(
@@ -98,10 +97,14 @@ def test_saved_clip_is_a_standard_folder_with_equal_embeddings(clip, tmp_path):
             attention_mask=tokens["attention_mask"],
             pixel_values=pixels,
         )
-    assert torch.equal(out.image_embeds, clip.encode_vision(pixels))
-    assert torch.allclose(out.text_embeds, clip.encode_text(TEXTS), atol=1e-6)
+    assert torch.equal(out.image_embeds, clip.encode("vision", pixels))
+    assert torch.allclose(out.text_embeds, clip.encode("text", TEXTS), atol=1e-6)
     again = load_clip(tmp_path / "clip")
-    assert (again.preprocess, again.name, again.dim) == (clip.preprocess, "tiny", 8)
+    assert (again.preprocess("vision"), again.name, again.dim) == (
+        clip.preprocess("vision"),
+        "tiny",
+        8,
+    )
     assert [again.digest(t) for t in ("vision", "text")] == [
         clip.digest(t) for t in ("vision", "text")
     ]
@@ -113,18 +116,18 @@ def test_saved_clip_is_a_standard_folder_with_equal_embeddings(clip, tmp_path):
 
 def test_tensor_of_transformers_4_and_output_of_5_are_both_read(clip):
     pixels = torch.zeros(2, 3, 16, 16)
-    expect = clip.encode_vision(pixels)
-    raw = clip.model.visual_projection(clip.model.vision_model(pixel_values=pixels).pooler_output)
+    expect = clip.encode("vision", pixels)
+    raw = clip.clip.visual_projection(clip.clip.vision_model(pixel_values=pixels).pooler_output)
     for output in (raw, types.SimpleNamespace(pooler_output=raw)):
-        clip.model.get_image_features = lambda pixel_values, output=output: output
-        assert torch.allclose(clip.encode_vision(pixels), expect, atol=1e-6)
+        clip.clip.get_image_features = lambda pixel_values, output=output: output
+        assert torch.allclose(clip.encode("vision", pixels), expect, atol=1e-6)
 
 
 def test_encoders_survive_a_folder(encoders, tmp_path):
     encoders.save(tmp_path / "set")
     again = EncoderSet.load(tmp_path / "set")
     assert again.card == {"preset": "tiny"}
-    assert again.tactile_preprocess == encoders.tactile_preprocess
+    assert again.preprocesses == encoders.preprocesses
     for encoder in ("vision", "tactile"):
         assert np.array_equal(
             embed_images(make_images(), again, encoder),
@@ -134,7 +137,7 @@ def test_encoders_survive_a_folder(encoders, tmp_path):
     assert not [p for p in (tmp_path / "set").rglob("*") if p.suffix in (".bin", ".pt", ".pkl")]
     with pytest.raises(PalpateError, match="empty folder"):
         encoders.save(tmp_path / "set")
-    EncoderSet(encoders.clip).save(tmp_path / "two")
+    encoders.without_tactile().save(tmp_path / "two")
     assert EncoderSet.load(tmp_path / "two").tactile is None
 
 
@@ -149,11 +152,11 @@ def test_digest_changes_with_one_weight_and_with_preprocessing(encoders):
         before["text"],
     )
     with torch.no_grad():
-        encoders.clip.model.text_model.embeddings.token_embedding.weight[5, 0] += 1e-6
+        encoders.clip.text_model.embeddings.token_embedding.weight[5, 0] += 1e-6
     assert encoders.digest("text") != before["text"]
-    encoders.clip.preprocess = Preprocess(16, 16)
+    encoders.preprocesses["vision"] = Preprocess(16, 16)
     now = encoders.digest("vision")
-    encoders.clip.preprocess = Preprocess(16, 16, (0.0, 0.0, 0.0))
+    encoders.preprocesses["vision"] = Preprocess(16, 16, (0.0, 0.0, 0.0))
     assert encoders.digest("vision") != now
 
 
@@ -212,7 +215,7 @@ def test_unknown_and_missing_encoders(clip, encoders):
     with pytest.raises(PalpateError, match="must be vision or tactile for images"):
         embed_images(make_images(), encoders, "text")
     with pytest.raises(PalpateError, match="include a tactile encoder"):
-        embed_images(make_images(), EncoderSet(clip), "tactile")
+        embed_images(make_images(), clip, "tactile")
     with pytest.raises(PalpateError, match="uint8"):
         embed_images(make_images().astype(np.float32), encoders, "tactile")
     with pytest.raises(PalpateError, match="device"):

@@ -15,10 +15,13 @@ from palpate import audit, probe, score
 from palpate.core import PalpateError
 from palpate.data.manifest import Manifest
 from palpate.encoders import Encoder, EncoderSet, train_encoder
-from palpate.encoders.preprocess import digest_images, union
+from palpate.encoders.contrastive import train_tactile
+from palpate.encoders.presets import preset_of
+from palpate.encoders.seen import digest_images, union
 from palpate.evaluation.inputs import guard
 from palpate.report.notes import COMMAND_LINE, sentence
 from palpate.report.terminal import audit_text
+from palpate.training.run import TrainingRun
 
 
 @pytest.fixture(scope="module")
@@ -135,25 +138,20 @@ def test_an_encoder_of_another_split_is_doubted_only_where_its_images_are_unknow
         return [n.code for n in guard(replace(encoders, **changes), "tactile", test, split=other)]
 
     assert codes() == []
-    assert codes(seen=None) == ["encoder-of-other-split"]
+    assert codes(seen={}) == ["encoder-of-other-split"]
     assert codes(card={**encoders.card, "seen_in_part": True}) == ["encoder-of-other-split"]
-    assert codes(seen=None, card={}) == ["encoder-without-split"]
-    assert codes(seen=None, card={"split": other.digest}) == []
+    assert codes(seen={}, card={}) == ["encoder-without-split"]
+    assert codes(seen={}, card={"split": other.digest}) == []
 
 
 def test_going_on_from_an_encoder_keeps_what_it_saw(trained, small_manifest, tmp_path):
-    from palpate.encoders.contrastive import train_tactile
-    from palpate.encoders.presets import TINY
-
     start, _ = trained
     later = by_video(small_manifest, "v3")
-    options = {"epochs": 1, "device": "cpu"}
+    short = preset_of("tiny", 1)
     for known in (True, False):
-        begin = start if known else replace(start, seen=None)
-        folder = tmp_path / str(known)
-        result = train_tactile(
-            small_manifest, later, start.clip, TINY, folder, start=begin, **options
-        )
+        begin = start if known else replace(start, seen={})
+        run = TrainingRun(tmp_path / str(known), device="cpu")
+        result = train_tactile(small_manifest, later, start, short, run, start=begin)
         encoder = Encoder(result, "tactile")
         assert result.knows_seen("tactile") == known
         videos = {
@@ -176,7 +174,7 @@ def test_a_lost_record_of_seen_images_is_an_error(trained, tmp_path, damage):
         case "cut":
             file.write_bytes(file.read_bytes()[:-8])
         case "fewer":
-            save_file({"digests": trained[0].seen[1:]}, file)
+            save_file({"digests": trained[0].seen["tactile"][1:]}, file)
         case _:
             file.write_text("{}")
     with pytest.raises(PalpateError, match="must hold the digests of the 24 images"):

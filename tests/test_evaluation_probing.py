@@ -187,10 +187,8 @@ def test_samples_without_a_partner_are_left_out_and_counted(manifest, split, enc
 
 
 def test_a_vision_encoder_needs_no_tactile_encoder(manifest, split):
-    from palpate.encoders.encoder_set import EncoderSet
-
     results = probe(
-        manifest, split, encoder=EncoderSet(make_encoders().clip), modality="vision", top=(1,)
+        manifest, split, encoder=make_encoders().without_tactile(), modality="vision", top=(1,)
     )
     assert "probe-no-encoder" in {note.code for note in results.notes}
     assert results["top-1 of 24 (text by vision)", "real"].n == 24

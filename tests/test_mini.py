@@ -65,7 +65,7 @@ def test_every_loader_takes_the_shipped_name_without_a_network(mini, no_network)
         load_autoencoder("palpate/mini"),
     )
     pipeline = TactilePipeline.from_pretrained("palpate/mini")
-    assert clip.name == encoders.clip.name == "palpate/mini"
+    assert clip.name == encoders.name == "palpate/mini"
     assert (
         clip.digest("vision")
         == encoders.digest("vision")
@@ -165,9 +165,7 @@ def test_half_is_rounded_first_and_read_back_to_the_same_digest(tmp_path):
     assert {
         v.dtype for part in ("clip", "tactile") for v in weights(tmp_path / "t" / part).values()
     } == {torch.float16}
-    assert {p.dtype for m in (again.clip.model, again.tactile) for p in m.parameters()} == {
-        torch.float32
-    }
+    assert {p.dtype for m in (again.clip, again.tactile) for p in m.parameters()} == {torch.float32}
     for name in ("vision", "text", "tactile"):
         assert again.digest(name) == encoders.digest(name) != exact.digest(name)
     for mine, before in zip(encoders.tactile.parameters(), exact.tactile.parameters(), strict=True):
@@ -391,7 +389,7 @@ def test_equal_encoders_are_equal_files(half, tmp_path):
     made = make_encoders()
     made.save(tmp_path / "a", half=half)
     loaded = EncoderSet.load(tmp_path / "a")
-    loaded.clip.name = made.clip.name
+    loaded.name = made.name
     loaded.encode("text", ["a rough wall", "a soft cloth"])  # using it changes nothing
     loaded.save(tmp_path / "b", half=half)
     assert digest_folder(tmp_path / "a") == digest_folder(tmp_path / "b")
@@ -401,7 +399,7 @@ def test_equal_encoders_are_equal_files(half, tmp_path):
     other = EncoderSet.load(
         tmp_path / "b"
     )  # 16 bits on disk, saved in 32: nothing of where it came from is left
-    other.clip.name = made.clip.name
+    other.name = made.name
     other.save(tmp_path / "c")
     made.save(tmp_path / "d")
     assert digest_folder(tmp_path / "c") == digest_folder(tmp_path / "d")

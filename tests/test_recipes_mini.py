@@ -142,18 +142,18 @@ def test_every_part_is_made_shipped_and_verified(small, tmp_path, capsys):
 @pytest.mark.nightly
 @pytest.mark.slow
 def test_a_stop_between_saving_and_the_end_of_a_part_is_repaired(small, tmp_path, monkeypatch):
-    from palpate.encoders.encoder_set import ClipEncoders
+    from palpate.encoders.encoder_set import EncoderSet
 
-    save = ClipEncoders.save
+    save = EncoderSet.save
 
     def stopped(self, folder, **how):
         save(self, folder, **how)
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patch:
-        patch.setattr(ClipEncoders, "save", stopped)
+        patch.setattr(EncoderSet, "save", stopped)
         with pytest.raises(KeyboardInterrupt):
             small.Recipe(tmp_path / "work").make("clip")
     recipe = small.Recipe(tmp_path / "work")
     recipe.make("clip")
-    assert (tmp_path / "work" / "clip" / "clip" / "model.safetensors").is_file()
+    assert (tmp_path / "work" / "clip" / "clip" / "clip" / "model.safetensors").is_file()

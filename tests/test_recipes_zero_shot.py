@@ -30,9 +30,9 @@ def slow_accuracy(images, encoders):
     for row, label in zip(images.features, images.labels, strict=True):
         best, chosen = -2.0, None
         for name, texts in PROMPTS.items():
-            mean = sum(
-                encoders.clip.encode_text([text])[0].double().numpy() for text in texts
-            ) / len(texts)
+            mean = sum(encoders.encode("text", [text])[0].double().numpy() for text in texts) / len(
+                texts
+            )
             cosine = float(row @ mean / np.sqrt((mean**2).sum()))
             if cosine > best:
                 best, chosen = cosine, name
@@ -51,9 +51,7 @@ def test_it_equals_a_loop_over_images_classes_and_texts(encoders):
 
 
 def test_images_that_are_their_text_are_all_named(encoders):
-    rows = np.stack(
-        [encoders.clip.encode_text(PROMPTS[name])[0].numpy() for name in sorted(PROMPTS)]
-    )
+    rows = np.stack([encoders.encode("text", PROMPTS[name])[0].numpy() for name in sorted(PROMPTS)])
     images = FeatureSet(["a", "b", "c"], rows, sorted(PROMPTS), None, "encoder")
     prompts = {name: texts[:1] for name, texts in PROMPTS.items()}
     assert zero_shot_accuracy(images, prompts, encoders).value == 1.0

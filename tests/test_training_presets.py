@@ -17,12 +17,13 @@ from transformers import CLIPConfig, CLIPModel
 from forge.worlds import by_video
 from palpate.cli import main
 from palpate.encoders.contrastive import new_clip, plan_encoder, train_tactile
-from palpate.encoders.encoder_set import ClipEncoders, EncoderSet, new_tactile
+from palpate.encoders.encoder_set import EncoderSet, new_tactile
 from palpate.encoders.preprocess import Preprocess
 from palpate.encoders.presets import preset
 from palpate.encoders.tokenizer import train_tokenizer
 from palpate.training.estimate import estimate
 from palpate.training.options import Compute, LoopOptions
+from palpate.training.run import TrainingRun
 
 WORDS = ["rough, hard", "soft, warm", "smooth, cold"]
 MEMORY = 14e9  # of the largest: weights, gradient, moments, their copies for the checkpoint
@@ -53,10 +54,10 @@ def test_a_preset_takes_a_real_step_of_what_its_plan_says(name, small_manifest, 
     """With all its layers and pixels, on two samples, one at a time (cached gradients)."""
     chosen = preset(name)
     partners = new_clip(replace(preset("tiny"), dim=chosen.dim), WORDS, seed=0)
-    chosen = replace(chosen, tactile_course=replace(chosen.tactile_course, batch=2))
-    how = {"epochs": 1e-9, "device": "cpu", "compute": Compute(chunk=1)}
+    chosen = replace(chosen, tactile_course=replace(chosen.tactile_course, batch=2, epochs=1e-9))
+    run = TrainingRun(tmp_path / "run", device="cpu", compute=Compute(chunk=1))
     with memory(MEMORY) if name == "paper" else nullcontext():
-        encoders = train_tactile(small_manifest, split, partners, chosen, tmp_path / "run", **how)
+        encoders = train_tactile(small_manifest, split, partners, chosen, run)
     shutil.rmtree(tmp_path / "run")  # gigabytes
     plan = plan_encoder(small_manifest, split, preset="tiny")
     assert plan["train_samples"] == encoders.card["train_samples"]
@@ -79,7 +80,8 @@ def write_clip(folder):
     text = {**size, **ids, "vocab_size": len(tokenizer), "max_position_embeddings": 77}
     vision = {**size, "image_size": 224, "patch_size": 14}
     config = CLIPConfig(text_config=text, vision_config=vision, projection_dim=768)
-    ClipEncoders(CLIPModel(config), tokenizer, Preprocess(224, 224), "tiny L/14").save(folder)
+    shape = {"vision": Preprocess(224, 224)}
+    EncoderSet(CLIPModel(config), tokenizer, preprocesses=shape, name="tiny L/14").save(folder)
 
 
 @pytest.mark.slow

@@ -102,7 +102,9 @@ def make_encoders(seed: int = 0) -> EncoderSet:
     clip = new_clip(TINY_ENCODERS, ["a rough wall", "a soft cloth", "smooth cold metal"], seed=seed)
     tactile = new_tactile(TINY_ENCODERS.tactile_config(clip.dim), seed + 1).eval()
     preprocess = Preprocess(16, 16, (0.5, 0.4, 0.3), (0.2, 0.3, 0.4))
-    return EncoderSet(clip, tactile, preprocess, {"title": "Encoders", "data": WORLD})
+    card = {"title": "Encoders", "data": WORLD}
+    shape = {"tactile": preprocess}
+    return clip.with_tactile(EncoderSet(tactile=tactile, preprocesses=shape, card=card))
 
 
 def write_shipped(root: Path, monkeypatch) -> TactilePipeline:
@@ -130,7 +132,7 @@ def _build(root: Path, monkeypatch) -> TactilePipeline:
     made.autoencoder.card = {"data": WORLD, "scores": [{"score": "PSNR", "value": 12.5}]}
     made.autoencoder.save(root / "mini" / "autoencoder", half=True)
     training = {"synthetic": True, "materials": ["Wood", "Brick"], "data": WORLD, "split": None}
-    pipeline = replace(made, encoders=EncoderSet(encoders.clip), training=training)
+    pipeline = replace(made, encoders=encoders.without_tactile(), training=training)
     pipeline.save(root / "mini" / "generator", half=True, shared="palpate/mini")
     write_model_cards(root / "mini")
     return pipeline

@@ -45,7 +45,7 @@ def run(options: Options, terminal: Terminal) -> dict[str, Any]:
     facts: dict[str, Any] = {
         "folder": str(options.output),
         "tactile": encoders.digest("tactile"),
-        "clip": encoders.clip.name,
+        "clip": encoders.name,
         "split": encoders.card["split"],
         "text_source": encoders.card["text_source"],
         "processes": encoders.card["processes"],

@@ -45,9 +45,9 @@ from palpate.diffusion.ceiling import judge_of, measure_ceiling
 from palpate.diffusion.no_contact import gels_of, has_gels
 from palpate.diffusion.options import AutoencoderOptions, BackgroundOptions
 from palpate.diffusion.presets import DiffusionPreset, preset_of
-from palpate.encoders.contrastive import load_split, train_part
 from palpate.encoders.encoder_set import EncoderSet, seeded
 from palpate.encoders.models import pick_device
+from palpate.encoders.parts import load_split, train_part
 from palpate.training.engine import Batch, Losses, Task, fit
 from palpate.training.options import Compute, LoopOptions
 from palpate.training.processes import first_alone, gather_rows

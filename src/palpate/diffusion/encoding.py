@@ -154,7 +154,7 @@ def encode_latents(
 def encode_patches(
     part: Manifest, encoders: EncoderSet, count: int, *, folder: Path, progress: Progress = quiet
 ) -> NDArray[np.float16]:
-    """States of the photos' patches (see ``ClipEncoders.patches``), as a read-only memory map.
+    """States of the photos' patches (see ``EncoderSet.patches``), as a read-only memory map.
 
     Returns:
         float16 (n, count, width).
@@ -165,7 +165,7 @@ def encode_patches(
     def code(rows: slice) -> NDArray[np.float16]:
         with exact():
             pixels = preprocess(to_unit(images[rows], encoders.device))
-            return encoders.clip.patches(pixels, count).half().cpu().numpy()
+            return encoders.patches(pixels, count).half().cpu().numpy()
 
     key = [encoders.digest("vision"), image_stamp(part, "vision"), count]
     about = {"key": digest_json(key), "ids": part.ids}

@@ -166,7 +166,7 @@ def generate(  # noqa: PLR0913 - a public verb, step by step
     inputs = _inputs(model, manifest, table or {str(text): None}, gel)
     notes: list[Note] = []
     if text is not None and model.encoders is not None:
-        length, most = model.encoders.clip.length(text)
+        length, most = model.encoders.length(text)
         notes += [Note("text-cut", {"tokens": length, "most": most})] if length > most else []
     if gel is not None:
         from palpate.diffusion.gels import gel_notes

@@ -355,7 +355,7 @@ class TactilePipeline(DiffusionPipeline):
         embedding = encoders.encode("vision", pixels)
         if "patches" not in maps:
             return embedding
-        states = maps["patches"](encoders.clip.patches(pixels, count))
+        states = maps["patches"](encoders.patches(pixels, count))
         return torch.cat([embedding[:, None], states], dim=1)
 
     @torch.no_grad()
@@ -590,4 +590,4 @@ def _shared_parts(name: str) -> tuple[AnyAutoencoder, EncoderSet]:
     """Load autoencoder and encoders of a shipped model; a folder would differ elsewhere."""
     must, fix = f"must be one of {', '.join(SHIPPED)}", "Save the pipeline with its parts"
     require(name in SHIPPED, "shared", must, repr(name), fix=fix)
-    return load_autoencoder(name), EncoderSet(load_clip(name))
+    return load_autoencoder(name), load_clip(name)

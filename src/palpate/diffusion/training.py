@@ -37,10 +37,10 @@ from palpate.diffusion.options import AutoencoderOptions, ConditionPolicy, UNetO
 from palpate.diffusion.pipeline import TactilePipeline
 from palpate.diffusion.presets import DiffusionPreset, preset_of
 from palpate.diffusion.unet import find_unet
-from palpate.encoders.contrastive import load_split, train_part
 from palpate.encoders.embed import texts_of
 from palpate.encoders.encoder_set import EncoderSet, load_clip
 from palpate.encoders.models import is_hub_id, pick_device
+from palpate.encoders.parts import load_split, train_part
 from palpate.training.estimate import estimate
 from palpate.training.options import Compute
 from palpate.training.processes import connect, first_alone, place
@@ -132,7 +132,7 @@ def train_generator(  # noqa: PLR0913 - a public verb
     with run_for(output, seed, device, compute, progress) as run:
         judge = judge_of(judge, run.device)
         manifest, split = load(data), load_split(data, split)
-        encoders = EncoderSet(load_clip(clip)) if isinstance(clip, str | Path) else clip
+        encoders = load_clip(clip) if isinstance(clip, str | Path) else clip
         _require_encoders(_policy(chosen, encoders), encoders)
         if autoencoder is None:
             assert options is not None
@@ -200,7 +200,7 @@ def plan_generator(
     begin = None if start is None else TactilePipeline.from_pretrained(start)
     chosen = _preset(preset, begin)
     train = train_part(load(data), load_split(data, split))
-    policy = _policy(chosen, None if clip is None else EncoderSet(load_clip(clip)))
+    policy = _policy(chosen, None if clip is None else load_clip(clip))
     if autoencoder is not None:
         code = load_autoencoder(autoencoder)
     else:
@@ -305,7 +305,7 @@ def train_pipeline(
             preset.sampler,
             preset.size,
             # The tactile encoder scores, it does not generate.
-            None if encoders is None else EncoderSet(encoders.clip),
+            None if encoders is None else encoders.without_tactile(),
             preset.name,
             record or {},
             encoded.gels[0] if given_gel and encoded.gels is not None else None,

@@ -18,7 +18,6 @@ from numpy.typing import NDArray
 
 from palpate.core import (
     FeatureSet,
-    PalpateError,
     Problem,
     ProblemsError,
     Progress,
@@ -49,8 +48,8 @@ def texts_of(manifest: Manifest) -> tuple[list[str], str]:
         column = next(name for name in ("text", *NAMED) if row[name] or name == "id")
         text = str(row[column])
         texts.append(text if column == "text" else caption(text, str(row["id"])))
-        made = "caption" if column == "material" else f"caption of the {column}"
-        sources.add(default if column == "text" else made)
+        caption_source = "caption" if column == "material" else f"caption of the {column}"
+        sources.add(default if column == "text" else caption_source)
     return texts, " and ".join(sorted(sources, key=lambda s: (s != default, s)))
 
 
@@ -86,9 +85,8 @@ def embed(
         ProblemsError: naming every unreadable image.
     """
     _require(modality, batch)
-    if not len(manifest):
-        fix = "Check the split: is that part empty?"
-        raise PalpateError("There must be samples to embed", "none", fix)
+    fix = "Check the split: is that part empty?"
+    require(len(manifest) > 0, None, "There must be samples to embed", "none", fix=fix)
     digest, frames = encoders.digest(modality), None
     texts = texts_of(manifest)[0] if modality == "text" else []
     inputs: list[Any] = texts
@@ -158,16 +156,18 @@ def embed_texts(
 
 def require_rgb(images: NDArray[np.uint8]) -> None:
     """Raise unless ``images`` are uint8 (n, h, w, 3)."""
-    if images.dtype != np.uint8 or images.ndim != 4 or images.shape[3] != 3:
-        must, got = "must be uint8 of shape (n, h, w, 3)", f"{images.dtype} of shape {images.shape}"
-        raise PalpateError(must, got, "Scale to 0..255, round and clip", argument="images")
+    rgb = images.dtype == np.uint8 and images.ndim == 4 and images.shape[3] == 3
+    must, got = "must be uint8 of shape (n, h, w, 3)", f"{images.dtype} of shape {images.shape}"
+    require(rgb, "images", must, got, fix="Scale to 0..255, round and clip")
 
 
 @contextmanager
 def exact() -> Generator[None]:
     """Compute without gradients, and without TF32, by which results depend on the batch size."""
-    options: Any = {"enabled": True, "benchmark": False, "deterministic": True, "allow_tf32": False}
-    with torch.inference_mode(), torch.backends.cudnn.flags(**options):
+    exactly = torch.backends.cudnn.flags(
+        enabled=True, benchmark=False, deterministic=True, allow_tf32=False
+    )
+    with torch.inference_mode(), exactly:
         yield
 
 

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from palpate.core import PalpateError, Progress, quiet, require_choice
+from palpate.core import PalpateError, Progress, quiet, require, require_choice
 from palpate.data.images import SUFFIXES
 from palpate.data.manifest import Manifest
 from palpate.encoders.embed import embed, embed_frames, embed_texts
@@ -77,8 +77,8 @@ class Encoder:
     @property
     def license(self) -> str | None:
         """The license of its weights: ``unknown`` if others state none, None if you state none."""
-        origin, tactile = self.encoders.origin(self.modality), self.modality == "tactile"
-        card = self.encoders.card if tactile else self.encoders.clip.card
+        origin, encoders = self.encoders.origin(self.modality), self.encoders
+        card = encoders.card if self.modality == "tactile" else encoders.clip_card
         return origin.license if origin else card.get("license")
 
     @property
@@ -138,8 +138,7 @@ def list_images(inputs: Any) -> list[Path | Image.Image]:
         if not path.is_dir():
             return [path]
         files = (p for p in path.rglob("*") if p.suffix.lower() in SUFFIXES and p.is_file())
-        images: list[Path | Image.Image] = [*sorted(files)]
-        return images
+        return [*sorted(files)]
     if isinstance(inputs, Image.Image):
         return [inputs.convert("RGB")]
     if hasattr(inputs, "shape"):
@@ -164,8 +163,8 @@ def _bytes(images: Any) -> NDArray[np.uint8]:
         array = array.transpose(0, 2, 3, 1)
         if array.dtype.kind == "f" and array.size and array.min() >= 0 and array.max() <= 1:
             array = np.rint(array * 255).astype(np.uint8)
-    if array.ndim != 4 or array.shape[3] != 3 or array.dtype != np.uint8:
-        must = "must be uint8 (n, h, w, 3), or a tensor (n, 3, h, w) in [0, 1]"
-        got = f"{array.dtype} of shape {shape}"
-        raise PalpateError(must, got, "Scale to 0..255 and round", argument="images")
+    rgb = array.ndim == 4 and array.shape[3] == 3 and array.dtype == np.uint8
+    must = "must be uint8 (n, h, w, 3), or a tensor (n, 3, h, w) in [0, 1]"
+    got = f"{array.dtype} of shape {shape}"
+    require(rgb, "images", must, got, fix="Scale to 0..255 and round")
     return np.ascontiguousarray(array)

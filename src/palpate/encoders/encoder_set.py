@@ -1,12 +1,8 @@
-"""The three encoders: frozen CLIP vision and text, and a tactile encoder (paper section 3).
+"""The encoders of one space: frozen vision and text, and a tactile encoder (paper section 3).
 
-Every encoder maps into one space: features are *projected* (``visual_projection``,
-``text_projection``) and L2-normalized. States before the projection share no space, so nothing here
-returns them.
-
-Images are prepared by :class:`Preprocess`: center square, antialiased bicubic to ``resize``, center
-crop to ``size``, then ``(x / 255 - mean) / std`` per channel, as in CLIP's
-``preprocessor_config.json``.
+Images are prepared by :class:`~palpate.encoders.preprocess.Preprocess`: center square, antialiased
+bicubic to ``resize``, center crop to ``size``, then ``(x / 255 - mean) / std`` per channel, as in
+CLIP's ``preprocessor_config.json``.
 
 A saved set is a folder::
 
@@ -22,8 +18,6 @@ weights.
 
 from __future__ import annotations
 
-import json
-import math
 from collections.abc import Generator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field, replace
@@ -34,10 +28,8 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from PIL import Image
-from safetensors import SafetensorError
-from safetensors.numpy import load_file, save_file
 from torch import Tensor, nn
-from torch.nn.functional import adaptive_avg_pool2d, normalize
+from torch.nn.functional import normalize
 from transformers import (
     AutoModel,
     AutoTokenizer,
@@ -50,14 +42,23 @@ from palpate.core import (
     PalpateError,
     Progress,
     atomic_folder,
-    digest_json,
     quiet,
     read_record,
-    require_regular,
+    require,
     seed_for,
     write_json,
 )
 from palpate.data.manifest import Manifest
+from palpate.encoders.clip import (
+    FAMILIES,
+    context_of,
+    digest_text,
+    digest_vision,
+    encode_text,
+    encode_vision,
+    vision_patches,
+    width_of,
+)
 from palpate.encoders.models import (
     Origin,
     architecture,
@@ -74,14 +75,8 @@ from palpate.encoders.models import (
     silent,
     stated,
 )
-from palpate.encoders.preprocess import (
-    SAVE_AGAIN,
-    Digests,
-    Frame,
-    Preprocess,
-    digest_images,
-    load_frames,
-)
+from palpate.encoders.preprocess import SAVE_AGAIN, Frame, Preprocess, load_frames
+from palpate.encoders.seen import FETCH_AGAIN, Digests, digest_images, load_seen, save_seen
 from palpate.encoders.tactile import TactileModule, load_tactile
 from palpate.encoders.tokenizer import save_tokenizer
 from palpate.training.cards import write_model_cards
@@ -89,17 +84,6 @@ from palpate.training.cards import write_model_cards
 Modality = Literal["vision", "text", "tactile"]
 MODALITIES: tuple[Modality, ...] = get_args(Modality)
 FORMAT, CLIP_FORMAT = "palpate-encoders/1", "palpate-clip/1"
-#: Kinds of transformers' models that see, and whether they read, too.
-FAMILIES = {
-    "clip": True,
-    "siglip": True,
-    "siglip2": True,
-    "dinov2": False,
-    "dinov2_with_registers": False,
-    "dinov3_vit": False,
-}
-#: Digests of the images that an encoder was trained on, in its folder.
-SEEN = "seen.safetensors"
 CLIP_FIX = (
     "Pass a folder that holds config.json, model.safetensors, the tokenizer's files and "
     "preprocessor_config.json"
@@ -107,236 +91,59 @@ CLIP_FIX = (
 
 
 @dataclass
-class ClipEncoders:
-    """A CLIP, SigLIP or SigLIP 2 whose vision and text encoders are used as they are, or a DINO.
-
-    Attributes:
-        model: in evaluation mode; its parameters do not require gradients.
-        tokenizer: a transformers tokenizer that ends every text with the end token; None of a
-            vision encoder alone.
-        preprocess: for the vision encoder.
-        name: hub id or folder it came from, or the preset that made it.
-        card: how it was trained, if palpate trained it; else ``license`` and ``trained_on``.
-        seen: digests of the images that the vision encoder was trained on; None: unknown.
-    """
-
-    model: Any
-    tokenizer: Any
-    preprocess: Preprocess
-    name: str
-    card: dict[str, Any] = field(default_factory=dict)
-    seen: Digests | None = None
-
-    @property
-    def dim(self) -> int:
-        """Width of the shared space."""
-        config = _config(self.model)
-        if self.family == "clip":
-            return int(config.projection_dim)
-        return int(getattr(config, "vision_config", config).hidden_size)
-
-    @property
-    def family(self) -> str:
-        """The model's kind in transformers, a key of :data:`FAMILIES`."""
-        return str(_config(self.model).model_type)
-
-    def tokens(self, texts: Sequence[str]) -> dict[str, Tensor]:
-        """``input_ids`` and ``attention_mask`` (n, length), cut to the encoder's context."""
-        context = int(_config(self.model).text_config.max_position_embeddings)
-        names, how = ("input_ids", "attention_mask"), {"padding": True}
-        if self.family != "clip":  # SigLIP was trained on lower case, and on padding without a mask
-            names, how = ("input_ids",), {"padding": "max_length"}
-            texts = [text.lower() for text in texts]
-        options: dict[str, Any] = {"truncation": True, "max_length": context, **how}
-        encoded = self.tokenizer(list(texts), return_tensors="pt", **options)
-        return {k: encoded[k].to(self.model.device) for k in names}
-
-    def length(self, text: str) -> tuple[int, int]:
-        """Tokens of a text, marks of its ends included, and the most that the encoder takes."""
-        most = int(_config(self.model).text_config.max_position_embeddings)
-        with silent():  # the tokenizer warns of long texts, in its own words
-            return len(self.tokenizer(text)["input_ids"]), most
-
-    def encode_text(self, texts: Sequence[str]) -> Tensor:
-        """Texts to (n, dim), L2-normalized; differentiable."""
-        tokens: dict[str, Any] = {**self.tokens(texts)}
-        return normalize(_projected(self.model.get_text_features(**tokens)), dim=-1)
-
-    def encode_vision(self, pixels: Tensor) -> Tensor:
-        """Preprocessed pixels (n, 3, size, size) to (n, dim), L2-normalized; differentiable."""
-        if not hasattr(self.model, "get_image_features"):  # a DINO: its class token
-            model: Any = self.model
-            return normalize(model(pixel_values=pixels).pooler_output, dim=-1)
-        inputs = _patches(pixels, self.model) if self.family == "siglip2" else {}
-        inputs = {"pixel_values": pixels, **inputs}
-        return normalize(_projected(self.model.get_image_features(**inputs)), dim=-1)
-
-    def patches(self, pixels: Tensor, count: int) -> Tensor:
-        """States of a photo's patches in the last layer, before the projection.
-
-        Args:
-            pixels: preprocessed (n, 3, size, size).
-            count: a square number; the patches are averaged to so many.
-
-        Returns:
-            (n, count, width); what others put before the patches (CLS) is left out.
-        """
-        model: Any = getattr(self.model, "vision_model", self.model)
-        inputs = _patches(pixels, self.model) if self.family == "siglip2" else {}
-        output = model(**{"pixel_values": pixels, **inputs})
-        grid = pixels.shape[2] // int(model.config.patch_size)
-        states = output.last_hidden_state[:, -(grid**2) :].transpose(1, 2)
-        states = states.unflatten(2, (grid, grid))
-        return adaptive_avg_pool2d(states, math.isqrt(count)).flatten(2).transpose(1, 2)
-
-    def digest(self, modality: str) -> str:
-        """SHA-256 of the vision or the text encoder."""
-        config, model, facts = _config(self.model), self.model, {"family": self.family}
-        if modality == "vision":
-            facts |= {"preprocess": asdict(self.preprocess)}
-            facts |= architecture(getattr(config, "vision_config", config))
-            parts = {"encoder": getattr(model, "vision_model", model)}
-        else:
-            facts |= {"tokenizer": _tokenizer_digest(self.tokenizer)}
-            facts |= architecture(config.text_config)
-            parts = {"encoder": model.text_model}
-        if self.family == "clip":
-            vision = modality == "vision"
-            parts["projection"] = model.visual_projection if vision else model.text_projection
-        return digest_modules(parts, facts)
-
-    def save(self, folder: Path, *, half: bool = False) -> None:
-        """Write a folder for ``CLIPModel.from_pretrained``, whole or not at all.
-
-        Args:
-            folder: must be new or empty.
-            half: round the weights to 16 bits first (here too) and write 16-bit weights.
-
-        Raises:
-            PalpateError: if the folder is not empty, or a weight is too large for 16 bits.
-        """
-        with atomic_folder(Path(folder)) as part:
-            if half:
-                round_to_half({"clip": self.model})
-            self.write(part, half=half)
-            write_model_cards(part)
-
-    def write(self, folder: Path, *, half: bool) -> None:
-        """Write the files into ``folder``; see :meth:`save`, which does so atomically."""
-        save_model(self.model, folder, half=half)
-        modalities = ("vision", "text") if self.tokenizer is not None else ("vision",)
-        if self.tokenizer is not None:
-            with silent():
-                save_tokenizer(self.tokenizer, folder)
-        write_json(folder / "preprocessor_config.json", self.preprocess.to_config())
-        digests = {modality: self.digest(modality) for modality in modalities}
-        about = {"format": CLIP_FORMAT, "name": self.name, "digests": digests, "card": self.card}
-        write_json(folder / "palpate.json", about | _counts({"vision": self.seen}))
-        save_seen(self.seen, folder)
-
-
-def load_clip(source: str | Path, *, device: str = "cpu") -> ClipEncoders:
-    """Load a frozen CLIP, SigLIP or DINO; only one from the hub needs a network, once.
-
-    Args:
-        source: a shipped name (``palpate/mini``), a folder as :meth:`ClipEncoders.save` or
-            transformers writes it, a set of encoders, or a hub id
-            (``openai/clip-vit-large-patch14``). safetensors is preferred; a ``.bin`` is read as
-            weights only.
-        device: see :func:`palpate.encoders.models.pick_device`.
-
-    Raises:
-        PalpateError: if files are missing, unreadable, of another model or changed since, or the
-            hub is out of reach.
-    """
-    name, folder = find_single(source, "clip", "CLIP", CLIP_FIX)
-    local, must = name == str(folder), f"{source} must be a CLIP model"
-    note = folder / "palpate.json"
-    if note.is_file() and read_record(note, "card of the CLIP").get("format") == FORMAT:
-        return EncoderSet.load(source, device=device).clip
-    config = folder / "config.json"
-    family = read_record(config, "model").get("model_type") if config.is_file() else "clip"
-    if not isinstance(family, str) or family not in FAMILIES:
-        got = f"model_type {family!r} in {config}"
-        raise PalpateError(f"{source} must be one of {', '.join(FAMILIES)}", got, CLIP_FIX)
-    kind = CLIPModel if family == "clip" else AutoModel
-    model = load_model(kind, name, must, CLIP_FIX, local_files_only=local)
-    tokenizer = None
-    try:
-        with silent():
-            if FAMILIES[family]:
-                tokenizer = AutoTokenizer.from_pretrained(name, local_files_only=local)
-    except Exception as error:  # tokenizers raises bare ones
-        raise PalpateError(must, first_line(error), CLIP_FIX) from None
-    sized = family in ("clip", "siglip")  # the others take images of any size
-    size = int(model.config.vision_config.image_size) if sized else None
-    preprocess = Preprocess.from_config(folder / "preprocessor_config.json", size)
-    clip = ClipEncoders(model, tokenizer, preprocess, str(source))
-    if not note.is_file():
-        clip.card = stated(folder)
-    else:
-        about = _read_card(folder, CLIP_FORMAT)
-        clip.card = about["card"]
-        clip.name = clip.name if is_shipped(source) else str(about["name"])
-        clip.seen = load_seen(folder, about["seen"].get("vision"))
-        _require_digests(clip, about["digests"], folder)
-    model.to(pick_device(device))
-    return clip
-
-
-@dataclass
 class EncoderSet:
-    """Vision, text and, once trained, tactile encoder.
+    """Vision, text and tactile encoder, as many of them as there are.
+
+    Models are in evaluation mode, and their parameters do not require gradients.
 
     Attributes:
-        clip: the frozen vision and text encoders.
-        tactile: the tactile encoder, or None.
-        tactile_preprocess: for the tactile encoder, or None.
+        clip: transformers' CLIP, SigLIP or SigLIP 2 of vision and text, or a DINO, which sees
+            alone.
+        tokenizer: of transformers, ends every text with the end token; None without text.
+        tactile: palpate's tactile encoder, or a public one.
+        preprocesses: of the images of ``vision`` and ``tactile``.
+        name: of vision and text: hub id or folder, or the preset that made them.
+        clip_card: how vision and text were trained, if palpate trained them; else ``license`` and
+            ``trained_on``.
         card: how the tactile encoder was trained; ``{}`` if palpate did not train it.
-        seen: digests of the images that the tactile encoder was trained on; None: unknown.
+        seen: digests of the images that ``vision`` and ``tactile`` were trained on; without an
+            entry, or None: unknown.
         sensor: name of the sensor of all tactile images; None takes the manifest's.
     """
 
-    clip: ClipEncoders
+    clip: Any = None
+    tokenizer: Any = None
     tactile: CLIPVisionModelWithProjection | TactileModule | None = None
-    tactile_preprocess: Preprocess | None = None
+    preprocesses: dict[str, Preprocess] = field(default_factory=dict)
+    name: str = ""
+    clip_card: dict[str, Any] = field(default_factory=dict)
     card: dict[str, Any] = field(default_factory=dict)
-    seen: Digests | None = None
+    seen: dict[str, Digests | None] = field(default_factory=dict)
     sensor: str | None = None
+
+    @property
+    def modalities(self) -> list[Modality]:
+        """The modalities of this set."""
+        models = {"vision": self.clip, "text": self.tokenizer, "tactile": self.tactile}
+        return [m for m in MODALITIES if models[m] is not None]
 
     @property
     def dim(self) -> int:
         """Width of the shared space; of a set without one, that of its only encoder."""
-        return self.clip.dim if self._has_clip else self.width("tactile")
+        return self.width("tactile" if self.clip is None else "vision")
 
     def width(self, modality: str) -> int:
         """Width of one encoder's embeddings."""
+        self._require(modality)
         if modality != "tactile":
-            return self._clip(modality).dim
-        tactile = self._tactile(modality)[0]
-        foreign = isinstance(tactile, TactileModule)
-        return tactile.dim if foreign else int(_config(tactile).projection_dim)
+            return width_of(self.clip)
+        tactile: Any = self.tactile
+        return int(getattr(tactile, "dim", 0) or tactile.config.projection_dim)
 
     @property
     def device(self) -> torch.device:
         """Where the encoders are."""
         return next(p for module in self._modules().values() for p in module.parameters()).device
-
-    @property
-    def modalities(self) -> list[Modality]:
-        """The modalities of this set."""
-        text = self._has_clip and self.clip.tokenizer is not None
-        has = {"vision": self._has_clip, "text": text, "tactile": self.tactile is not None}
-        return [m for m in MODALITIES if has[m]]
-
-    @property
-    def _has_clip(self) -> bool:
-        return getattr(self, "clip", None) is not None
-
-    def _clip(self, modality: str) -> ClipEncoders:
-        if modality not in self.modalities:
-            raise _lacks(modality, self.modalities)
-        return self.clip
 
     def to(self, device: str | torch.device) -> EncoderSet:
         """Move all encoders; returns self."""
@@ -348,10 +155,12 @@ class EncoderSet:
         """The preprocessing of ``vision`` or ``tactile``.
 
         Raises:
-            PalpateError: for another modality, or if there is no tactile encoder.
+            PalpateError: for another modality, or if there is no such encoder.
         """
-        clip = modality == "vision"
-        return self._clip(modality).preprocess if clip else self._tactile(modality)[1]
+        must, fix = "must be vision or tactile for images", "Pass texts to the text encoder"
+        require(modality in ("vision", "tactile"), "modality", must, f"{modality!r}", fix=fix)
+        self._require(modality)
+        return self.preprocesses[modality]
 
     def encode(
         self, modality: str, batch: Tensor | Sequence[str], sensors: Sequence[str] | None = None
@@ -363,35 +172,46 @@ class EncoderSet:
             batch: preprocessed pixels (n, 3, size, size) on the encoders' device, or texts.
             sensors: names of the sensors (n), for tactile encoders that take them.
         """
+        self._require(modality)
         if modality == "text":
-            return self._clip(modality).encode_text([str(text) for text in batch])
+            return encode_text(self.clip, self.tokenizer, [str(text) for text in batch])
         pixels = torch.as_tensor(batch)
         if modality == "vision":
-            return self._clip(modality).encode_vision(pixels)
-        tactile = self._tactile(modality)[0]
-        if isinstance(tactile, TactileModule):
+            return encode_vision(self.clip, pixels)
+        if isinstance(self.tactile, TactileModule):
             names = [self.sensor] * len(pixels) if self.sensor else sensors
-            return tactile.encode(pixels, names)
-        return encode_tactile(tactile, pixels)
+            return self.tactile.encode(pixels, names)
+        assert self.tactile is not None
+        return encode_tactile(self.tactile, pixels)
+
+    def patches(self, pixels: Tensor, count: int) -> Tensor:
+        """See :func:`palpate.encoders.clip.vision_patches`."""
+        return vision_patches(self.clip, pixels, count)
+
+    def length(self, text: str) -> tuple[int, int]:
+        """Tokens of a text, marks of its ends included, and the most that the encoder takes."""
+        with silent():  # the tokenizer warns of long texts, in its own words
+            return len(self.tokenizer(text)["input_ids"]), context_of(self.clip)
 
     def digest(self, modality: str) -> str:
         """SHA-256 of one encoder: weights, architecture, preprocessing."""
-        if modality in ("vision", "text"):
-            return self._clip(modality).digest(modality)
-        tactile, preprocess = self._tactile(modality)
+        if modality == "text":
+            self._require(modality)
+            return digest_text(self.clip, self.tokenizer)
+        preprocess = self.preprocess(modality)
+        if modality == "vision":
+            return digest_vision(self.clip, preprocess)
+        assert self.tactile is not None
         facts = {"preprocess": asdict(preprocess), "sensor": self.sensor}
-        facts |= architecture(getattr(tactile, "config", {}))
-        return digest_modules({"encoder": tactile}, facts)
+        facts |= architecture(getattr(self.tactile, "config", {}))
+        return digest_modules({"encoder": self.tactile}, facts)
 
-    def seen_by(self, modality: str) -> Digests | None:
-        """Digests of the images that one encoder was trained on; None: unknown, or of texts."""
-        clip = self.clip.seen if self._has_clip else None
-        return {"vision": clip, "tactile": self.seen}.get(modality)
+    # --- what the encoders were trained on -------------------------------------------------------
 
     def knows_seen(self, modality: str) -> bool:
         """Whether all images are known that one encoder was trained on; else some, or none."""
-        card = self.clip.card if modality == "vision" else self.card
-        return self.seen_by(modality) is not None and not card.get("seen_in_part")
+        card = self.clip_card if modality == "vision" else self.card
+        return self.seen.get(modality) is not None and not card.get("seen_in_part")
 
     def saw(
         self,
@@ -406,30 +226,65 @@ class EncoderSet:
         Returns:
             (n,) booleans; all false where the encoder's images are not known (public ones).
         """
-        known = self.seen_by(modality)
-        if known is None:
-            return np.zeros(len(images), bool)
+        digests, seen = self.seen.get(modality), np.zeros(len(images), bool)
+        if digests is None:
+            return seen
         preprocess = replace(self.preprocess(modality), subtract=())
         files: Sequence[Frame] = (
             preprocess.frames(images, modality).files
             if isinstance(images, Manifest)
             else [(image, None, None) for image in images]
         )
-        seen = np.zeros(len(files), bool)
         for start in range(0, len(files), batch):
             pixels = load_frames(files[start : start + batch], preprocess)
-            seen[start : start + batch] = np.isin(digest_images(pixels), known)
+            seen[start : start + batch] = np.isin(digest_images(pixels), digests)
             progress("looking for known images", start + len(pixels), len(files))
         return seen
 
     def origin(self, modality: str) -> Origin | None:
         """What is known of an encoder that others trained; None of palpate's and one's own."""
+        self._require(modality)
         if modality == "tactile":
             return self.tactile.format if isinstance(self.tactile, TactileModule) else None
-        clip = self._clip(modality)
-        if "trained_on" not in clip.card:
+        if "trained_on" not in self.clip_card:
             return None
-        return Origin(clip.name, clip.card["license"], tuple(clip.card["trained_on"]))
+        return Origin(self.name, self.clip_card["license"], tuple(self.clip_card["trained_on"]))
+
+    # --- joining, saving, loading ----------------------------------------------------------------
+
+    def without_tactile(self) -> EncoderSet:
+        """The same vision and text encoders alone."""
+        return replace(
+            self,
+            tactile=None,
+            preprocesses={"vision": self.preprocess("vision")},
+            card={},
+            seen={"vision": self.seen.get("vision")},
+            sensor=None,
+        )
+
+    def with_tactile(self, other: EncoderSet) -> EncoderSet:
+        """These vision and text encoders with another set's tactile encoder, trained for them.
+
+        Raises:
+            PalpateError: if the widths of the spaces differ.
+        """
+        widths = other.width("tactile"), self.width("vision")
+        require(
+            widths[0] == widths[1],
+            None,
+            "Encoders of one space must have one width",
+            " and ".join(map(str, widths)),
+            fix="Join an encoder with the CLIP that it was trained with",
+        )
+        return replace(
+            self,
+            tactile=other.tactile,
+            preprocesses={**self.preprocesses, "tactile": other.preprocess("tactile")},
+            card=other.card,
+            seen={**self.seen, "tactile": other.seen.get("tactile")},
+            sensor=other.sensor,
+        ).to(self.device)
 
     def halve(self) -> None:
         """Round all weights to 16 bits in place; see ``models.round_to_half``."""
@@ -446,22 +301,24 @@ class EncoderSet:
             PalpateError: if the folder is not empty, a weight is too large for 16 bits, or the
                 tactile encoder is a public one, which is named by its file.
         """
-        if not self._has_clip or isinstance(self.tactile, TactileModule):
-            must, fix = "Encoders to be saved must be palpate's own", "Name the public one's file"
-            raise PalpateError(must, "a public tactile encoder", fix)
+        must, fix = "Encoders to be saved must be palpate's own", "Name the public one's file"
+        own = self.clip is not None and not isinstance(self.tactile, TactileModule)
+        require(own, None, must, "a public tactile encoder", fix=fix)
         with atomic_folder(Path(folder)) as part:
-            (part / "clip").mkdir()
             if half:
                 self.halve()
-            self.clip.write(part / "clip", half=half)
-            if self.tactile is not None and self.tactile_preprocess is not None:
-                save_model(self.tactile, part / "tactile", half=half)
-                config = self.tactile_preprocess.to_config()
-                write_json(part / "tactile" / "preprocessor_config.json", config)
-                save_seen(self.seen, part / "tactile")
-            digests = {m: self.digest(m) for m in self.modalities}
-            about = {"format": FORMAT, "digests": digests, "card": self.card}
-            write_json(part / "palpate.json", about | _counts({"tactile": self.seen}))
+            pair = [m for m in self.modalities if m != "tactile"]
+            self._write(part / "clip", self.clip, "vision", half)
+            if self.tokenizer is not None:
+                with silent():
+                    save_tokenizer(self.tokenizer, part / "clip")
+            about = {"format": CLIP_FORMAT, "name": self.name}
+            about |= self._about(pair, self.clip_card, "vision")
+            write_json(part / "clip" / "palpate.json", about)
+            if self.tactile is not None:
+                self._write(part / "tactile", self.tactile, "tactile", half)
+            about = {"format": FORMAT, **self._about(self.modalities, self.card, "tactile")}
+            write_json(part / "palpate.json", about)
             write_model_cards(part)
 
     @classmethod
@@ -483,57 +340,117 @@ class EncoderSet:
         """
         if len(parts := parts_of(source)) == 2:
             tactile, clip = (cls.load(part, device=device) for part in parts)
-            return tactile.with_clip(clip)
+            return clip.with_tactile(tactile)
         folder, sensor = find_encoder(source)
         if folder.is_file():
-            module = load_tactile(folder)
-            card = {"name": str(source), "license": module.format.license}
-            foreign = cls(None, module, module.preprocess, card, sensor=sensor)  # type: ignore[arg-type]
-            return foreign.to(device)
+            public = load_tactile(folder)
+            card = {"name": str(source), "license": public.format.license}
+            shape = {"tactile": public.preprocess}
+            return cls(tactile=public, preprocesses=shape, card=card, sensor=sensor).to(device)
         note = folder / "palpate.json"
         if not note.is_file() or read_record(note, "card").get("format") == CLIP_FORMAT:
-            return cls(load_clip(source, device=device))
+            return load_clip(source, device=device)
         about = _read_card(folder, FORMAT)
         # A shipped CLIP keeps its name, so that cards of what is trained with it say so.
-        clip = load_clip(source if is_shipped(source) else folder / "clip")
-        encoders = cls(clip, card=about["card"])
+        encoders = load_clip(source if is_shipped(source) else folder / "clip")
+        encoders.card = about["card"]
         if "tactile" in about["digests"]:
-            place = folder / "tactile"
-            must = f"The tactile encoder {place} must hold config.json and model.safetensors"
-            options = {"local_files_only": True, "use_safetensors": True}
-            kind = CLIPVisionModelWithProjection
-            encoders.tactile = tactile = load_model(kind, str(place), must, SAVE_AGAIN, **options)
-            path, size = place / "preprocessor_config.json", _config(tactile).image_size
-            encoders.tactile_preprocess = Preprocess.from_config(path, size)
-            encoders.seen = load_seen(place, about["seen"].get("tactile"))
+            part = folder / "tactile"
+            must = f"The tactile encoder {part} must hold config.json and model.safetensors"
+            model = load_model(
+                CLIPVisionModelWithProjection,
+                str(part),
+                must,
+                SAVE_AGAIN,
+                local_files_only=True,
+                use_safetensors=True,
+            )
+            encoders.tactile, size = model, int(model.config.image_size)
+            path = part / "preprocessor_config.json"
+            encoders.preprocesses["tactile"] = Preprocess.from_config(path, size)
+            encoders.seen["tactile"] = load_seen(part, about["seen"].get("tactile"))
         _require_digests(encoders, about["digests"], folder)
         return encoders.to(device)
 
-    def with_clip(self, other: EncoderSet) -> EncoderSet:
-        """This tactile encoder with another set's vision and text, whose space it was trained for.
-
-        Raises:
-            PalpateError: if the widths of the spaces differ.
-        """
-        widths = self.width("tactile"), other.width("vision")
-        if widths[0] != widths[1]:
-            must, got = "Encoders of one space must have one width", " and ".join(map(str, widths))
-            raise PalpateError(must, got, "Join an encoder with the CLIP that it was trained with")
-        return replace(self, clip=other.clip).to(other.device)
-
     def _modules(self) -> dict[str, nn.Module]:
-        modules = {"clip": self.clip.model if self._has_clip else None, "tactile": self.tactile}
+        modules = {"clip": self.clip, "tactile": self.tactile}
         return {name: module for name, module in modules.items() if module is not None}
 
-    def _tactile(
-        self, modality: str
-    ) -> tuple[CLIPVisionModelWithProjection | TactileModule, Preprocess]:
-        if modality != "tactile":
-            must, fix = "must be vision or tactile for images", "Pass texts to the text encoder"
-            raise PalpateError(must, repr(modality), fix, argument="modality")
-        if self.tactile is None or self.tactile_preprocess is None:
-            raise _lacks(modality, self.modalities)
-        return self.tactile, self.tactile_preprocess
+    def _require(self, modality: str) -> None:
+        require(
+            modality in self.modalities,
+            None,
+            f"These encoders must include a {modality} encoder",
+            f"{' and '.join(self.modalities)} only",
+            fix="Use others, or train one: palpate.train_encoder",
+        )
+
+    def _write(self, folder: Path, model: nn.Module, modality: str, half: bool) -> None:
+        """Write a model of images, how they are prepared, and which it was trained on."""
+        save_model(model, folder, half=half)
+        write_json(folder / "preprocessor_config.json", self.preprocesses[modality].to_config())
+        save_seen(self.seen.get(modality), folder)
+
+    def _about(
+        self, modalities: Sequence[str], card: Mapping[str, Any], seen: str
+    ) -> dict[str, Any]:
+        """What ``palpate.json`` says of encoders; ``seen``: whose images it counts."""
+        digests = self.seen.get(seen)
+        return {
+            "digests": {modality: self.digest(modality) for modality in modalities},
+            "card": card,
+            **({} if digests is None else {"seen": {seen: len(digests)}}),
+        }
+
+
+def load_clip(source: str | Path, *, device: str = "cpu") -> EncoderSet:
+    """Load a frozen CLIP, SigLIP or DINO; only one from the hub needs a network, once.
+
+    Args:
+        source: a shipped name (``palpate/mini``), a folder of transformers, a set of encoders,
+            whose tactile encoder is left out, or a hub id (``openai/clip-vit-large-patch14``).
+            safetensors is preferred; a ``.bin`` is read as weights only.
+        device: see :func:`palpate.encoders.models.pick_device`.
+
+    Raises:
+        PalpateError: if files are missing, unreadable, of another model or changed since, or the
+            hub is out of reach.
+    """
+    name, folder = find_single(source, "clip", "CLIP", CLIP_FIX)
+    local, must = name == str(folder), f"{source} must be a CLIP model"
+    note, config = folder / "palpate.json", folder / "config.json"
+    if note.is_file() and read_record(note, "card of the CLIP").get("format") == FORMAT:
+        return EncoderSet.load(source, device=device).without_tactile()
+    family = read_record(config, "model").get("model_type") if config.is_file() else "clip"
+    require(
+        isinstance(family, str) and family in FAMILIES,
+        None,
+        f"{source} must be one of {', '.join(FAMILIES)}",
+        f"model_type {family!r} in {config}",
+        fix=CLIP_FIX,
+    )
+    kind = CLIPModel if family == "clip" else AutoModel
+    model = load_model(kind, name, must, CLIP_FIX, local_files_only=local)
+    tokenizer = None
+    try:
+        with silent():
+            if FAMILIES[family]:
+                tokenizer = AutoTokenizer.from_pretrained(name, local_files_only=local)
+    except Exception as error:  # tokenizers raises bare ones
+        raise PalpateError(must, first_line(error), CLIP_FIX) from None
+    sized = family in ("clip", "siglip")  # the others take images of any size
+    size = int(model.config.vision_config.image_size) if sized else None
+    preprocess = Preprocess.from_config(folder / "preprocessor_config.json", size)
+    encoders = EncoderSet(model, tokenizer, preprocesses={"vision": preprocess}, name=str(source))
+    if not note.is_file():
+        encoders.clip_card = stated(folder)
+        return encoders.to(device)
+    about = _read_card(folder, CLIP_FORMAT)
+    encoders.clip_card = about["card"]
+    encoders.name = encoders.name if is_shipped(source) else str(about["name"])
+    encoders.seen["vision"] = load_seen(folder, about["seen"].get("vision"))
+    _require_digests(encoders, about["digests"], folder)
+    return encoders.to(device)
 
 
 def new_tactile(config: CLIPVisionConfig, seed: int) -> CLIPVisionModelWithProjection:
@@ -555,93 +472,23 @@ def seeded(seed: int, purpose: str) -> Generator[None]:
         yield
 
 
-def _config(model: nn.Module) -> Any:
-    """The model's configuration, whose fields transformers types too loosely."""
-    return model.config
-
-
-def _lacks(modality: str, modalities: Sequence[str]) -> PalpateError:
-    must, got = f"These encoders must include a {modality} encoder", f"{' and '.join(modalities)}"
-    return PalpateError(must, f"{got} only", "Use others, or train one: palpate.train_encoder")
-
-
-def save_seen(seen: Digests | None, folder: Path) -> None:
-    """Write the digests into the folder of an encoder; None writes nothing."""
-    if seen is not None:
-        save_file({"digests": seen}, folder / SEEN)
-
-
-def load_seen(folder: Path, count: int | None) -> Digests | None:
-    """Read what :func:`save_seen` wrote.
-
-    Args:
-        folder: of the encoder.
-        count: how many there must be, by the card; None for a card without a count.
-
-    Raises:
-        PalpateError: if the file is missing, damaged, or holds another number.
-    """
-    if count is None:
-        return None
-    require_regular(folder / SEEN)
-    must = f"{folder / SEEN} must hold the digests of the {count:,} images of the training"
-    try:
-        seen = load_file(folder / SEEN)["digests"]
-    except (OSError, KeyError, SafetensorError) as error:
-        raise PalpateError(must, str(error), "Fetch the encoder again") from None
-    if len(seen) != count or seen.dtype != np.uint64:
-        raise PalpateError(must, f"{len(seen):,}", "Fetch the encoder again")
-    return seen
-
-
-def _counts(seen: Mapping[str, Digests | None]) -> dict[str, Any]:
-    """The number of images that each encoder was trained on, for the card; {} if unknown."""
-    counts = {name: len(digests) for name, digests in seen.items() if digests is not None}
-    return {"seen": counts} if counts else {}
-
-
 def _read_card(folder: Path, form: str) -> dict[str, Any]:
-    about = read_record(
-        folder / "palpate.json", "card of the encoders", form=form, keys=("digests", "card")
+    path = folder / "palpate.json"
+    about = read_record(path, "card of the encoders", form=form, keys=("digests", "card"))
+    digests, card, seen = about["digests"], about["card"], about.setdefault("seen", {})
+    tables = all(isinstance(part, dict) for part in (digests, card, seen))
+    require(
+        tables and all(type(count) is int for count in seen.values()),
+        None,
+        f"digests, card and seen in {path} must be as palpate writes them",
+        "other values",
+        fix=FETCH_AGAIN,
     )
-    parts = [about["digests"], about["card"], about.setdefault("seen", {})]
-    kinds = [type(count) for count in parts[2].values()] if isinstance(parts[2], dict) else [str]
-    if not all(isinstance(part, dict) for part in parts) or {*kinds} - {int}:
-        must = f"digests, card and seen in {folder / 'palpate.json'} must be as palpate writes them"
-        raise PalpateError(must, "other values", "Fetch the encoder again")
     return about
 
 
-def _require_digests(
-    encoders: ClipEncoders | EncoderSet, digests: Mapping[str, str], folder: Path
-) -> None:
+def _require_digests(encoders: EncoderSet, digests: Mapping[str, str], folder: Path) -> None:
     for modality, digest in digests.items():
-        if encoders.digest(modality) != digest:
-            must = f"The {modality} encoder in {folder} must match its digest"
-            raise PalpateError(must, "weights or settings that were changed", SAVE_AGAIN)
-
-
-def _tokenizer_digest(tokenizer: Any) -> str:
-    """SHA-256 of all that a tokenizer does to a text."""
-    backend = getattr(tokenizer, "backend_tokenizer", None)
-    if backend is None:  # a slow tokenizer of transformers 4
-        return digest_json(tokenizer.get_vocab())
-    # Truncation and padding are state of the last call, not of the tokenizer.
-    table = json.loads(backend.to_str())
-    return digest_json({k: v for k, v in table.items() if k not in ("truncation", "padding")})
-
-
-def _patches(pixels: Tensor, model: Any) -> dict[str, Tensor]:
-    """Images (n, 3, side, side) as the rows of patches that SigLIP 2 of any aspect takes."""
-    patch = int(model.config.vision_config.patch_size)
-    n, side = len(pixels), pixels.shape[2] // patch
-    cells = pixels.unflatten(3, (side, patch)).unflatten(2, (side, patch))
-    rows = cells.permute(0, 2, 4, 3, 5, 1).reshape(n, side * side, -1)
-    shapes = torch.full((n, 2), side, device=pixels.device)
-    mask = torch.ones(rows.shape[:2], dtype=torch.int32, device=pixels.device)
-    return {"pixel_values": rows, "pixel_attention_mask": mask, "spatial_shapes": shapes}
-
-
-def _projected(output: Any) -> Tensor:
-    """The projected features: a tensor in transformers 4, the field ``pooler_output`` in 5."""
-    return output if isinstance(output, Tensor) else output.pooler_output
+        must = f"The {modality} encoder in {folder} must match its digest"
+        got = "weights or settings that were changed"
+        require(encoders.digest(modality) == digest, None, must, got, fix=SAVE_AGAIN)

@@ -20,7 +20,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from palpate.core import PalpateError, Progress, digest_file, digest_json, quiet
+from palpate.core import PalpateError, Progress, digest_file, digest_json, quiet, require
 from palpate.encoders.embed import exact, require_rgb
 from palpate.encoders.models import first_line
 
@@ -69,8 +69,8 @@ class Inception:
             got = (str(error).strip().splitlines() or ["an error of torch"])[-1][:200]
             raise PalpateError(must, got, FIX) from None
         shape = tuple(getattr(features, "shape", ()))
-        if len(shape) != 2 or shape[0] != n or not features.is_floating_point():
-            raise PalpateError(must, f"{type(features).__name__} of shape {shape}", FIX)
+        good = len(shape) == 2 and shape[0] == n and features.is_floating_point()
+        require(good, None, must, f"{type(features).__name__} of shape {shape}", fix=FIX)
         return features.float().numpy()
 
 
@@ -81,8 +81,8 @@ def load_inception(path: str | Path) -> Inception:
         PalpateError: if it is missing or another kind of file, with where to get it.
     """
     path = Path(path)
-    if not path.is_file():
-        raise PalpateError(f"The Inception weights {path} must be a file", "no such file", FIX)
+    must = f"The Inception weights {path} must be a file"
+    require(path.is_file(), None, must, "no such file", fix=FIX)
     try:
         with warnings.catch_warnings():  # torch deprecates TorchScript; published weights stay
             warnings.simplefilter("ignore", DeprecationWarning)

@@ -13,7 +13,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -124,5 +123,8 @@ def in_chunks(
     """
     if chunk is None or chunk >= len(inputs):
         return encode(inputs)
-    options: dict[str, Any] = {"use_reentrant": False, "preserve_rng_state": False}
-    return torch.cat([checkpoint(encode, part, **options) for part in inputs.split(chunk)])
+    parts = [
+        checkpoint(encode, part, use_reentrant=False, preserve_rng_state=False)
+        for part in inputs.split(chunk)
+    ]
+    return torch.cat(parts)

@@ -33,7 +33,7 @@ from zipfile import is_zipfile
 
 from safetensors import SafetensorError
 
-from palpate.core import PalpateError, require_regular
+from palpate.core import PalpateError, require, require_regular
 from palpate.core.digest import canonical_json
 
 if TYPE_CHECKING:  # names are checked before torch is imported, which takes seconds
@@ -119,14 +119,13 @@ def shipped_folder(name: str | Path, part: Part) -> Path | None:
     """
     if not is_shipped(name):
         return None
-    if name not in SHIPPED:
-        must = f"A name that begins with {PREFIX} must be one of {', '.join(SHIPPED)}"
-        fix = f"Choose one of these; a folder of that name is written ./{name}"
-        raise PalpateError(must, repr(name), fix)
+    must = f"A name that begins with {PREFIX} must be one of {', '.join(SHIPPED)}"
+    fix = f"Choose one of these; a folder of that name is written ./{name}"
+    require(name in SHIPPED, None, must, f"{name!r}", fix=fix)
     folder = shipped_root() / SHIPPED[str(name)] / PARTS[part]
-    if not (folder / "palpate.json").is_file():
-        must, got = f"{name} must lie in the installed package", f"no {part} in {shipped_root()}"
-        raise PalpateError(must, got, "Install palpate again, from its wheel")
+    must, got = f"{name} must lie in the installed package", f"no {part} in {shipped_root()}"
+    installed = (folder / "palpate.json").is_file()
+    require(installed, None, must, got, fix="Install palpate again, from its wheel")
     return folder
 
 
@@ -153,9 +152,9 @@ def find_model(source: str | Path, part: Part, what: str, fix: str) -> Path:
         return shipped
     if is_hub_id(source):
         return _fetch(str(source), PATTERNS, what, fix)
-    if not str(source) or not Path(source).is_dir():
-        must = f"The {what} must be a folder, one of {', '.join(SHIPPED)}, or a hub id (owner/name)"
-        raise PalpateError(must, f"no folder {source or repr('')}", fix)
+    must = f"The {what} must be a folder, one of {', '.join(SHIPPED)}, or a hub id (owner/name)"
+    found = str(source) != "" and Path(source).is_dir()
+    require(found, None, must, f"no folder {source or repr('')}", fix=fix)
     return Path(source)
 
 
@@ -191,10 +190,9 @@ def find_encoder(source: str | Path) -> tuple[Path, str | None]:
         )
     if path.is_dir() and not any((path / f).is_file() for f in ("palpate.json", "config.json")):
         files = sorted(path.glob("*.safetensors")) or sorted(path.glob("*.pth"))
-        if len(files) != 1:
-            must = f"The folder {path} must hold a set of encoders, a CLIP, or one file of weights"
-            got = ", ".join(p.name for p in files) or "none of these"
-            raise PalpateError(must, got, "Pass the file" if files else FIX_ENCODERS)
+        must = f"The folder {path} must hold a set of encoders, a CLIP, or one file of weights"
+        got, fix = ", ".join(p.name for p in files), "Pass the file" if files else FIX_ENCODERS
+        require(len(files) == 1, None, must, got or "none of these", fix=fix)
         path = files[0]
     return path, sensor.lower() or None
 
@@ -277,8 +275,7 @@ def read_weights(path: Path, fix: str) -> dict[str, Tensor]:
         raise PalpateError(must, first_line(error)[:160], fix) from None
     for key in ("model", "state_dict"):
         content = content.get(key, content) if isinstance(content, Mapping) else content
-    if not isinstance(content, Mapping):
-        raise PalpateError(must, type(content).__name__, fix)
+    require(isinstance(content, Mapping), None, must, type(content).__name__, fix=fix)
     return {str(name): value for name, value in content.items() if hasattr(value, "shape")}
 
 
@@ -306,11 +303,11 @@ def load_model(
         if any(map(is_pointer, Path(name, options.get("subfolder") or "").glob("*"))):
             raise PalpateError(must, *POINTER) from None
         raise PalpateError(must, first_line(error), fix) from None
-    if missing := sorted(report["missing_keys"]):
-        got = f"{len(missing)} weights are missing, first {missing[0]}"
-        raise PalpateError(must, got, fix)
-    if strict and (extra := sorted(report["unexpected_keys"])):
-        raise PalpateError(must, f"{len(extra)} unknown weights, first {extra[0]}", fix)
+    missing, extra = (sorted(report[f"{kind}_keys"]) for kind in ("missing", "unexpected"))
+    got = f"{len(missing)} weights are missing, first {''.join(missing[:1])}"
+    require(not missing, None, must, got, fix=fix)
+    got = f"{len(extra)} unknown weights, first {''.join(extra[:1])}"
+    require(not (strict and extra), None, must, got, fix=fix)
     return model.float().eval().requires_grad_(False)
 
 
@@ -372,11 +369,6 @@ def digest_modules(modules: Mapping[str, nn.Module], facts: Mapping[str, Any]) -
     """:func:`digest_tensors` of the weights of modules, as ``module.name``."""
     states = {part: module.state_dict() for part, module in modules.items()}
     return digest_tensors({f"{p}.{k}": v for p, s in states.items() for k, v in s.items()}, facts)
-
-
-def move(module: nn.Module, device: torch.device) -> None:
-    """Move a module in place; transformers types ``to`` of its models wrongly."""
-    module.to(device)
 
 
 def pick_device(device: str | torch.device) -> torch.device:

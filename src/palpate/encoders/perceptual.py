@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.nn.functional import max_pool2d, relu
 
-from palpate.core import PalpateError, Progress, quiet
+from palpate.core import PalpateError, Progress, quiet, require
 from palpate.encoders.embed import exact
 from palpate.encoders.models import digest_modules, read_weights
 from palpate.metrics.images import image_pairs
@@ -101,9 +101,9 @@ def load_lpips(backbone: Path, heads: Path) -> Lpips:
             and their origin are named.
     """
     files = [Path(backbone), Path(heads)]
-    if missing := [str(path) for path in files if not path.is_file()]:
-        must = "LPIPS must have the files of its backbone and of its heads"
-        raise PalpateError(must, f"no {', no '.join(missing)}", FIX)
+    missing = [str(path) for path in files if not path.is_file()]
+    must = "LPIPS must have the files of its backbone and of its heads"
+    require(not missing, None, must, f"no {', no '.join(missing)}", fix=FIX)
     states = [read_weights(path, FIX) for path in files]
     network = Lpips()
     try:
@@ -145,11 +145,9 @@ def lpips_per_image(
             than 32 x 32.
     """
     generated, reference = image_pairs(generated, reference)
-    shape = generated.shape
-    if min(shape[1:3]) < SMALLEST:
-        must = f"must be at least {SMALLEST} x {SMALLEST} for LPIPS"
-        got = f"{shape[1]} x {shape[2]}"
-        raise PalpateError(must, got, "Score larger images", argument="generated")
+    height, width = generated.shape[1:3]
+    must, got = f"must be at least {SMALLEST} x {SMALLEST} for LPIPS", f"{height} x {width}"
+    require(min(height, width) >= SMALLEST, "generated", must, got, fix="Score larger images")
     distances = np.empty(len(generated), np.float64)
     device = network.get_buffer("shift").device
     with exact():

@@ -4,16 +4,10 @@ An image is turned, fitted to the encoder's shape (the center of it, or the whol
 black borders, or the whole of it squashed), and resized; for some encoders the sensor's image
 without contact is subtracted first, and an earlier frame of the video follows in three further
 channels. What results is 8-bit and may be cached. Then ``(x / 255 - mean) / std`` per channel.
-
-The images that an encoder was trained on are known by these 8-bit pixels: by the first eight bytes
-of their SHA-256. Names play no part, as two data sets may both have a ``0001.jpg``. 100,000 digests
-take 800 kB; that any of 100,000 other images has one of them by chance has the probability
-100,000^2 / 2^64 = 5e-10.
 """
 
 from __future__ import annotations
 
-import hashlib
 import math
 import os
 from collections.abc import Mapping, Sequence
@@ -36,6 +30,7 @@ from palpate.core import (
     digest_json,
     quiet,
     read_record,
+    require,
     short,
 )
 from palpate.data.images import (
@@ -62,8 +57,6 @@ CLIP_STD = (0.26862954, 0.26130258, 0.27577711)
 MOST_TIMES = 16
 #: What an image is prepared from: itself, the sensor's no-contact image, an earlier frame.
 Frame = tuple[Path | Image.Image, Path | None, Path | None]
-#: Digests of images, (n,) uint64.
-Digests = NDArray[np.uint64]
 
 
 class Frames(NamedTuple):
@@ -129,30 +122,37 @@ class Preprocess:
                 resize = crop = round(int(patches) ** 0.5) * int(config["patch_size"])
             mean, std = config.get("image_mean") or CLIP_MEAN, config.get("image_std") or CLIP_STD
             (r, g, b), (sr, sg, sb) = map(float, mean), map(float, std)
-            whole = isinstance(config.get("size"), Mapping) and "height" in config["size"]
-            whole = whole or patches is not None
-            own: dict[str, Any] = {"fitting": "squash" if whole else "crop", "turn": "none"}
-            own |= {"resample": 3 if config.get("resample") is None else config["resample"]}
-            own |= config.get("palpate") or {}
-            bad = [f"{name} {own[name]!r}" for name, of in CHOICES.items() if own[name] not in of]
-            bad += own.keys() - CHOICES.keys()
+            squash = isinstance(config.get("size"), Mapping) and "height" in config["size"]
+            squash = squash or patches is not None
+            shape: dict[str, Any] = {"fitting": "squash" if squash else "crop", "turn": "none"}
+            shape |= {"resample": 3 if config.get("resample") is None else config["resample"]}
+            shape |= config.get("palpate") or {}
+            bad = [f"{k} {shape[k]!r}" for k, choices in CHOICES.items() if shape[k] not in choices]
+            bad += shape.keys() - CHOICES.keys()
             bad += [f"std {v}" for v in (sr, sg, sb) if not 1e-6 < v < math.inf]
             bad += [f"mean {v}" for v in (r, g, b) if not math.isfinite(v)]
             if bad:
                 raise ValueError(", ".join(bad))
-            made = cls(resize, resize, (r, g, b), (sr, sg, sb), **own)
         except (AttributeError, KeyError, TypeError, ValueError) as error:
             must = f"Size, crop and statistics in {path} must be those of an image processor"
             raise PalpateError(must, str(error), SAVE_AGAIN) from None
-        if not config.get("do_center_crop", "crop_size" in config or not whole):
+        if not config.get("do_center_crop", "crop_size" in config or not squash):
             crop = resize
         side = size or crop
-        if crop != side or not 0 < side <= resize <= MOST_TIMES * side:
-            must, got = f"{path} must give the encoder's {side} px", f"{crop} px from {resize} px"
-            raise PalpateError(must, got, "Set size and crop_size to the encoder's")
+        fits = crop == side and 0 < side <= resize <= MOST_TIMES * side
+        must, fix = f"{path} must give the encoder's {side} px", "Set size and crop_size to that"
+        require(fits, None, must, f"{crop} px from {resize} px", fix=fix)
         if not config.get("do_normalize", True):
-            made = replace(made, mean=(0.0,) * 3, std=(1.0,) * 3)
-        return replace(made, size=side)
+            (r, g, b), (sr, sg, sb) = (0.0,) * 3, (1.0,) * 3
+        return cls(
+            side,
+            resize,
+            (r, g, b),
+            (sr, sg, sb),
+            fitting=shape["fitting"],
+            turn=shape["turn"],
+            resample=shape["resample"],
+        )
 
     def to_config(self) -> dict[str, Any]:
         """The same as a ``preprocessor_config.json`` for transformers' ``CLIPImageProcessor``."""
@@ -231,19 +231,18 @@ class Preprocess:
             PalpateError: if a sample lacks its image, or the no-contact image of its sensor.
         """
         paths, names = manifest.paths(column), manifest.column("sensor")
-        places = list(zip(manifest.column("video"), manifest.column("frame"), strict=True))
-        at = dict(zip(places, paths, strict=True)) if self.lag and not still else {}
+        positions = list(zip(manifest.column("video"), manifest.column("frame"), strict=True))
+        at = dict(zip(positions, paths, strict=True)) if self.lag and not still else {}
         sensors = [(name or "").lower() for name in names]
+        fix = "Fill the column background: palpate background"
         files: list[Frame] = []
         for k, (path, gel) in enumerate(zip(paths, manifest.column("background"), strict=True)):
             need = column == "tactile" and any(word in sensors[k] for word in self.subtract)
-            if need and gel is None:
-                must = f"The encoder subtracts the no-contact image of {names[k] or 'every sensor'}"
-                got, fix = f"none for {path.name}", "Fill the column background: palpate background"
-                raise PalpateError(must, got, fix)
-            video, frame = places[k]
-            known = None not in (video, frame)
-            before = at.get((video, (frame or 0) - self.lag)) if known else None
+            must = f"The encoder subtracts the no-contact image of {names[k] or 'every sensor'}"
+            require(not need or gel is not None, None, must, f"none for {path.name}", fix=fix)
+            video, frame = positions[k]
+            numbered = video is not None and frame is not None
+            before = at.get((video, frame - self.lag)) if numbered else None
             files.append((path, manifest.path(gel) if need else None, before))
         return Frames(files, sensors)
 
@@ -319,17 +318,6 @@ def prepared_images(
     geometry = asdict(replace(preprocess, mean=CLIP_MEAN, std=CLIP_STD))
     key = digest_json([geometry, image_stamp(manifest, column), frames.stamps(manifest.root)])
     return mapped_images(Path(cache) / f"{column}-prepared-{short(key)}.npy", shape, fill)
-
-
-def digest_images(images: NDArray[np.uint8]) -> Digests:
-    """Digests (n,) of images (n, h, w, c) in memory or in a mapped file, in their order."""
-    names = (hashlib.sha256(image.tobytes()).digest()[:8] for image in images)
-    return np.frombuffer(b"".join(names), np.uint64)
-
-
-def union(*sets: Digests | None) -> Digests:
-    """The sorted distinct digests of several sets; None is an empty one."""
-    return np.unique(np.concatenate([np.empty(0, np.uint64), *(s for s in sets if s is not None)]))
 
 
 def to_unit(

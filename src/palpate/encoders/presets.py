@@ -9,9 +9,9 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Literal
 
-from palpate.core import PalpateError, require_choice
+from palpate.core import require, require_choice
 from palpate.training.options import LoopOptions
 
 if TYPE_CHECKING:
@@ -48,9 +48,8 @@ class Augment:
 
     def __post_init__(self) -> None:
         for name, top in {"crop": 0.99, "gain": 10, "offset": 1}.items():
-            if not 0 <= getattr(self, name) <= top:
-                must, got = f"must lie in [0, {top}]", str(getattr(self, name))
-                raise PalpateError(must, got, "Choose another value", argument=name)
+            value, must = getattr(self, name), f"must lie in [0, {top}]"
+            require(0 <= value <= top, name, must, value, fix="Choose another value")
 
 
 @dataclass(frozen=True)
@@ -68,10 +67,10 @@ class Size:
     heads: int
 
     def __post_init__(self) -> None:
-        if min(self.width, self.layers, self.heads) < 1 or self.width % self.heads:
-            got = f"width {self.width}, layers {self.layers}, heads {self.heads}"
-            must = "The width of a transformer must be a multiple of its heads, all at least 1"
-            raise PalpateError(must, got, "Choose other numbers")
+        possible = min(self.width, self.layers, self.heads) >= 1 and self.width % self.heads == 0
+        got = f"width {self.width}, layers {self.layers}, heads {self.heads}"
+        must = "The width of a transformer must be a multiple of its heads, all at least 1"
+        require(possible, None, must, got, fix="Choose other numbers")
 
 
 @dataclass(frozen=True)
@@ -105,15 +104,13 @@ class Course:
     keep: Literal["last", "best"] = "last"
 
     def __post_init__(self) -> None:
-        if not 0 <= self.warmup <= 1:
-            must, got = "must lie in [0, 1], as a share of the steps", str(self.warmup)
-            raise PalpateError(must, got, "Choose another value", argument="warmup")
+        must, fix = "must lie in [0, 1], as a share of the steps", "Choose another value"
+        require(0 <= self.warmup <= 1, "warmup", must, self.warmup, fix=fix)
 
-    def options(self, n: int, seed: int, epochs: float | None = None) -> LoopOptions:
+    def options(self, n: int, seed: int) -> LoopOptions:
         """Return the options for ``n`` rows; no batch is larger than the set."""
         batch = min(self.batch, n)
-        rows = (self.epochs if epochs is None else epochs) * n
-        steps = max(1, math.ceil(rows / max(1, batch)))
+        steps = max(1, math.ceil(self.epochs * n / max(1, batch)))
         return LoopOptions(
             steps,
             batch,
@@ -174,9 +171,9 @@ class EncoderPreset:
     data_statistics: bool = True
 
     def __post_init__(self) -> None:
-        if self.patch < 1 or self.image < 1 or self.image % self.patch:
-            must, got = f"must be a multiple of the patches, {self.patch}", f"{self.image}"
-            raise PalpateError(must, got, "Choose other sides", argument="image")
+        fits = self.patch >= 1 and self.image >= 1 and self.image % self.patch == 0
+        must, fix = f"must be a multiple of the patches, {self.patch}", "Choose other sides"
+        require(fits, "image", must, self.image, fix=fix)
 
     @property
     def preprocess(self) -> Preprocess:
@@ -285,9 +282,18 @@ def _tvl(name: str, size: Size, lr: float, cost: str) -> EncoderPreset:
     """
     view = Augment(0.0, 0.08, 0.02, flips=True, quarter_turns=True)
     course = replace(_TVL, lr=lr, augment=view)
-    more: dict[str, Any] = {"patch": 16, "targets": "soft-text"}
-    more |= {"fitting": "pad", "turn": "left", "data_statistics": True}
-    return replace(PAPER, name=name, tactile=size, tactile_course=course, cost=cost, **more)
+    return replace(
+        PAPER,
+        name=name,
+        tactile=size,
+        tactile_course=course,
+        cost=cost,
+        patch=16,
+        targets="soft-text",
+        fitting="pad",
+        turn="left",
+        data_statistics=True,
+    )
 
 
 _FLOP = "200 epochs of 13,900 pairs, arithmetic"
@@ -307,3 +313,17 @@ def preset(name: str) -> EncoderPreset:
     """
     require_choice("preset", name, PRESETS)
     return PRESETS[name]
+
+
+def preset_of(name: str | EncoderPreset, epochs: float | None = None) -> EncoderPreset:
+    """A preset as it is, or by name; with so many epochs of the tactile encoder.
+
+    Raises:
+        PalpateError: if there is none of that name, or the epochs are no positive number.
+    """
+    chosen = name if isinstance(name, EncoderPreset) else preset(name)
+    if epochs is None:
+        return chosen
+    must, fix = "must be a positive number", "Leave it out for the preset's length"
+    require(0 < epochs < math.inf, "epochs", must, epochs, fix=fix)
+    return replace(chosen, tactile_course=replace(chosen.tactile_course, epochs=epochs))

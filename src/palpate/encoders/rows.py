@@ -14,7 +14,7 @@ from torch.nn.functional import affine_grid, grid_sample
 from palpate.core import Progress, quiet
 from palpate.data.manifest import Manifest
 from palpate.encoders.embed import embed, texts_of
-from palpate.encoders.encoder_set import ClipEncoders, EncoderSet
+from palpate.encoders.encoder_set import EncoderSet
 from palpate.encoders.preprocess import Preprocess, prepared_images
 from palpate.encoders.presets import Augment
 from palpate.training.engine import Batch
@@ -36,9 +36,8 @@ class Rows:
     def __init__(
         self,
         part: Manifest,
-        clip: ClipEncoders,
+        clip: EncoderSet,
         preprocess: Preprocess,
-        *,
         cache: Path | None = None,
         progress: Progress = quiet,
     ) -> None:
@@ -52,12 +51,12 @@ class Rows:
         self.photo = with_photo.cumsum(0) - 1
         self.photo[~with_photo] = -1
         pictured = part.take([i for i, has in zip(part.ids, with_photo, strict=True) if has])
-        frozen, self.text, self.vision = EncoderSet(clip), None, None
+        self.text = self.vision = None
         if clip.tokenizer is not None:
-            rows = embed(part, frozen, "text", cache=cache, progress=progress)
+            rows = embed(part, clip, "text", cache=cache, progress=progress)
             self.text = torch.from_numpy(rows.features)
         if len(pictured):
-            rows = embed(pictured, frozen, "vision", cache=cache, progress=progress)
+            rows = embed(pictured, clip, "vision", cache=cache, progress=progress)
             self.vision = torch.from_numpy(rows.features)
 
     def load(self, step: Step, augment: Augment | None = None) -> Batch:

@@ -24,7 +24,7 @@ from tokenizers import (
 )
 from transformers import PreTrainedTokenizerFast
 
-from palpate.core import PalpateError, require
+from palpate.core import require
 
 PAD, START, UNKNOWN, END = SPECIAL = ("<pad>", "<|startoftext|>", "<unk>", "<|endoftext|>")
 
@@ -44,9 +44,8 @@ def train_tokenizer(
         PalpateError: without a text, or with a vocabulary too small for the bytes.
     """
     distinct = sorted({text.strip() for text in texts} - {""})
-    if not distinct:
-        fix = "Fill the manifest's column text or material"
-        raise PalpateError("A tokenizer needs at least one text", "none", fix)
+    fix = "Fill the manifest's column text or material"
+    require(len(distinct) > 0, None, "A tokenizer needs at least one text", "none", fix=fix)
     alphabet = pre_tokenizers.ByteLevel.alphabet()
     smallest = len(alphabet) + len(SPECIAL)
     must = f"must hold the bytes and special tokens, {smallest}"

@@ -602,9 +602,9 @@ class _Run:
             embed, digest = partial(inception.embed, progress=self.progress), inception.digest
         else:
             from palpate.encoders.embed import embed_images
-            from palpate.encoders.encoder_set import EncoderSet, load_clip
+            from palpate.encoders.encoder_set import load_clip
 
-            clip = EncoderSet(load_clip(str(source)))
+            clip = load_clip(str(source))
             options: dict[str, Any] = {"modality": "vision", "progress": self.progress}
             embed, digest = partial(embed_images, encoders=clip, **options), clip.digest("vision")
         embedded = {n: s.feature_set(embed(images[n]), digest) for n, s in subjects.items()}

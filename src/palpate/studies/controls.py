@@ -85,7 +85,7 @@ def mean_image(setting: Setting) -> Images:
 
 def nearest_photo(setting: Setting) -> Images:
     """The real tactile images of the train photos most similar to the test photos."""
-    encoders = EncoderSet(load_clip(setting.clip, device=setting.work.device))
+    encoders = load_clip(setting.clip, device=setting.work.device)
     rows = nearest_rows(setting.train, setting.test, encoders, setting.work)
     return setting.pixels(setting.train)[rows]
 

@@ -27,7 +27,7 @@ from palpate.diffusion.presets import MINI, DiffusionPreset
 from palpate.encoders.contrastive import train_tactile
 from palpate.encoders.encoder_set import EncoderSet, load_clip
 from palpate.encoders.presets import PRESETS as ENCODERS
-from palpate.encoders.presets import EncoderPreset
+from palpate.encoders.presets import EncoderPreset, preset_of
 from palpate.evaluation.controls import BACKGROUND
 from palpate.evaluation.scoring import score
 from palpate.leakage.auditing import audit
@@ -54,6 +54,7 @@ from palpate.studies.making import Training, make_generator, make_images, make_w
 from palpate.studies.names import NEAREST, SHIPPED
 from palpate.studies.stages import Facts, Stage, record_of
 from palpate.studies.study import TEN
+from palpate.training.run import TrainingRun
 
 #: Name of the split file, without its ending.
 SPLIT = "noleak"
@@ -230,17 +231,19 @@ def train_on(
     work: Work, *, seed: int, preset: EncoderPreset, epochs: float, clip: str, start: str
 ) -> Facts:
     """The frozen CLIP with a tactile encoder that goes on from the one of ``start``."""
-    encoders = train_tactile(
-        *data_of(work, SPLIT),
-        load_clip(clip, device=work.device),
-        preset,
+    run = TrainingRun(
         work.folder / "training",
-        start=EncoderSet.load(start),
-        epochs=epochs,
         seed=seed,
         cache=work.cache,
         device=work.device,
         progress=work.progress,
+    )
+    encoders = train_tactile(
+        *data_of(work, SPLIT),
+        load_clip(clip),
+        preset_of(preset, epochs),
+        run,
+        start=EncoderSet.load(start),
     )
     encoders.save(fresh(work.folder / "encoders"))
     source = encoders.card.get("text_source")

@@ -143,7 +143,7 @@ def judge_images(
     scores = [s for s in scores if _compares(s, methods)]
     if NEAREST in embedded and features.labels is not None:
         train = manifest.part(parts, "train")
-        vision = EncoderSet(load_clip(preset.clip, device=work.device))
+        vision = load_clip(preset.clip, device=work.device)
         rows = nearest_rows(train, test, vision, work)
         on_train = embed(train, judge, cache=work.cache)
         scores += _cross_fitted(on_train, embedded[NEAREST], features, rows, parts)

@@ -27,7 +27,7 @@ from palpate.diffusion.presets import DiffusionPreset
 from palpate.diffusion.training import Parts, train_pipeline
 from palpate.encoders import train_encoder
 from palpate.encoders.embed import texts_of
-from palpate.encoders.encoder_set import EncoderSet, load_clip
+from palpate.encoders.encoder_set import load_clip
 from palpate.encoders.models import pick_device
 from palpate.encoders.presets import EncoderPreset
 from palpate.evaluation.inputs import read as read_samples
@@ -166,9 +166,7 @@ def make_generator(
     parts = Parts(
         diffusion.with_steps(training.steps),
         load_autoencoder(autoencoder if trained is None else trained / "autoencoder"),
-        None
-        if diffusion.condition.source == "resnet"
-        else EncoderSet(load_clip(clip, device=work.device)),
+        None if diffusion.condition.source == "resnet" else load_clip(clip, device=work.device),
         background=training.background,
         start=None if start is None else TactilePipeline.from_pretrained(start),
     )

@@ -143,5 +143,4 @@ def train_on_split(
 def _digests(clip: str) -> dict[str, str]:
     """Digests of frozen encoders: another model of one name makes other stages."""
     encoders = load_clip(clip)
-    modalities = ("vision", "text") if encoders.tokenizer is not None else ("vision",)
-    return {f"{modality} encoder": encoders.digest(modality) for modality in modalities}
+    return {f"{modality} encoder": encoders.digest(modality) for modality in encoders.modalities}

@@ -125,6 +125,15 @@ def shared(error: PalpateError) -> PalpateError:
     return error
 
 
+@contextmanager
+def agreed() -> Generator[None]:
+    """Checks that all processes make alike: the first one alone prints what they raise."""
+    try:
+        yield
+    except PalpateError as error:
+        raise shared(error) from None
+
+
 def gather_rows(rows: Tensor, batch: int | None = None) -> Tensor:
     """The rows of all processes, (processes * n, ...), differentiable.
 
