@@ -129,13 +129,12 @@ def embed_images(
     """
     _require(modality, batch)
     require_rgb(images)
-    preprocess = encoders.preprocess(modality)
-    features = np.empty((len(images), encoders.width(modality)), np.float32)
-    for start in range(0, len(images), batch):
-        stop = min(start + batch, len(images))
-        squares = preprocess.fit(images[start:stop])
-        features[start:stop] = _forward(squares, encoders, modality)
-        progress(f"embedding {modality}", stop, len(images))
+    preprocess, n = encoders.preprocess(modality), len(images)
+    features = np.empty((n, encoders.width(modality)), np.float32)
+    for start in range(0, n, batch):
+        rows = slice(start, start + batch)
+        features[rows] = _forward(preprocess.fit(images[rows]), encoders, modality)
+        progress(f"embedding {modality}", min(start + batch, n), n)
     return features
 
 

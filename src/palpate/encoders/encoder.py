@@ -122,8 +122,7 @@ class Encoder:
         if self.modality == "text":
             texts = [inputs] if isinstance(inputs, str) else list(inputs)
             return embed_texts(texts, self.encoders, batch=batch, progress=progress)
-        files = [(image, None, None) for image in list_images(inputs)]
-        frames = Frames([*files], [""] * len(files))
+        frames = Frames.alone(list_images(inputs))
         return embed_frames(frames, self.encoders, self.modality, batch, progress)
 
 
@@ -151,7 +150,7 @@ def list_images(inputs: Any) -> list[Path | Image.Image]:
 
 def squares(images: Sequence[Path | Image.Image], size: int) -> NDArray[np.uint8]:
     """Decode images to center squares (n, size, size, 3)."""
-    return load_frames([(image, None, None) for image in images], Preprocess(size, size))
+    return load_frames(Frames.alone(images).files, Preprocess(size, size))
 
 
 def _bytes(images: Any) -> NDArray[np.uint8]:

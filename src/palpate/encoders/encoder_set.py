@@ -75,7 +75,7 @@ from palpate.encoders.models import (
     silent,
     stated,
 )
-from palpate.encoders.preprocess import SAVE_AGAIN, Frame, Preprocess, load_frames
+from palpate.encoders.preprocess import SAVE_AGAIN, Frames, Preprocess, load_frames
 from palpate.encoders.seen import FETCH_AGAIN, Digests, digest_images, load_seen, save_seen
 from palpate.encoders.tactile import TactileModule, load_tactile
 from palpate.encoders.tokenizer import save_tokenizer
@@ -230,15 +230,14 @@ class EncoderSet:
         if digests is None:
             return seen
         preprocess = replace(self.preprocess(modality), subtract=())
-        files: Sequence[Frame] = (
-            preprocess.frames(images, modality).files
-            if isinstance(images, Manifest)
-            else [(image, None, None) for image in images]
-        )
-        for start in range(0, len(files), batch):
-            pixels = load_frames(files[start : start + batch], preprocess)
-            seen[start : start + batch] = np.isin(digest_images(pixels), digests)
-            progress("looking for known images", start + len(pixels), len(files))
+        read = isinstance(images, Manifest)
+        frames = preprocess.frames(images, modality) if read else Frames.alone(images)
+        for start in range(0, len(seen), batch):
+            rows = slice(start, start + batch)
+            seen[rows] = np.isin(
+                digest_images(load_frames(frames.files[rows], preprocess)), digests
+            )
+            progress("looking for known images", min(start + batch, len(seen)), len(seen))
         return seen
 
     def origin(self, modality: str) -> Origin | None:

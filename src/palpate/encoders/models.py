@@ -136,14 +136,17 @@ def is_hub_id(name: str | Path) -> bool:
     return bool(HUB_ID.fullmatch(name)) and not Path(name).is_dir()
 
 
-def find_model(source: str | Path, part: Part, what: str, fix: str) -> Path:
+def find_model(
+    source: str | Path, part: Part, role: str, fix: str, files: Sequence[str] = PATTERNS
+) -> Path:
     """The local folder of a saved model, fetched from the hub where needed.
 
     Args:
         source: a shipped name, a folder, or a hub id; a :class:`~pathlib.Path` is always a folder.
         part: which part of a shipped model.
-        what: role of the model, for the error (``"pipeline"``).
+        role: of the model, for the error (``"pipeline"``).
         fix: how to get one, for the error.
+        files: patterns of what is fetched.
 
     Raises:
         PalpateError: for an unknown shipped name, a missing folder, or a hub out of reach.
@@ -151,8 +154,8 @@ def find_model(source: str | Path, part: Part, what: str, fix: str) -> Path:
     if (shipped := shipped_folder(source, part)) is not None:
         return shipped
     if is_hub_id(source):
-        return _fetch(str(source), PATTERNS, what, fix)
-    must = f"The {what} must be a folder, one of {', '.join(SHIPPED)}, or a hub id (owner/name)"
+        return _fetch(str(source), files, role, fix)
+    must = f"The {role} must be a folder, one of {', '.join(SHIPPED)}, or a hub id (owner/name)"
     found = str(source) != "" and Path(source).is_dir()
     require(found, None, must, f"no folder {source or repr('')}", fix=fix)
     return Path(source)
@@ -175,19 +178,17 @@ def find_encoder(source: str | Path) -> tuple[Path, str | None]:
         PalpateError: if there is none of that name, a folder holds none, or the hub is out of
             reach.
     """
-    what = "encoder"
     name, _, sensor = str(source).partition("#")
     owner, colon, file = name.partition(":")
     if str(source) and Path(source).exists() and not is_shipped(source):
         path, sensor = Path(source), ""
     elif colon and is_hub_id(owner):
-        path = _fetch(owner, [file], what, FIX_ENCODERS) / file
+        path = _fetch(owner, [file], "encoder", FIX_ENCODERS) / file
     elif Path(name).is_file():
         path = Path(name)
     else:
-        path = find_model(
-            name if isinstance(source, str) else source, "encoders", what, FIX_ENCODERS
-        )
+        path = Path(name) if isinstance(source, Path) else name
+        path = find_model(path, "encoders", "encoder", FIX_ENCODERS)
     if path.is_dir() and not any((path / f).is_file() for f in ("palpate.json", "config.json")):
         files = sorted(path.glob("*.safetensors")) or sorted(path.glob("*.pth"))
         must = f"The folder {path} must hold a set of encoders, a CLIP, or one file of weights"
@@ -198,17 +199,16 @@ def find_encoder(source: str | Path) -> tuple[Path, str | None]:
 
 
 def find_single(
-    source: str | Path, part: Part, what: str, fix: str, within: Sequence[str] = ()
+    source: str | Path, part: Part, role: str, fix: str, within: Sequence[str] = ()
 ) -> tuple[str, Path]:
     """Return what ``from_pretrained`` takes, and the local folder of the small files.
 
     Those of the subfolders ``within`` are fetched from the hub as well.
     """
-    if is_hub_id(source):  # small files first: a hub out of reach is queried once, not many times
-        files = (*SMALL_FILES, *(f"{folder}/*.json" for folder in within))
-        return str(source), _fetch(str(source), files, what, fix)
-    folder = find_model(source, part, what, fix)
-    return str(folder), folder
+    # Small files first: a hub out of reach is queried once, not many times.
+    files = (*SMALL_FILES, *(f"{folder}/*.json" for folder in within))
+    folder = find_model(source, part, role, fix, files)
+    return str(source if is_hub_id(source) else folder), folder
 
 
 def stated(folder: Path) -> dict[str, Any]:
@@ -224,7 +224,7 @@ def stated(folder: Path) -> dict[str, Any]:
     return {"license": ", ".join(map(str, terms)), "trained_on": [str(v) for v in sets if v]}
 
 
-def _fetch(name: str, patterns: Sequence[str], what: str, fix: str) -> Path:
+def _fetch(name: str, patterns: Sequence[str], role: str, fix: str) -> Path:
     from huggingface_hub import snapshot_download
     from huggingface_hub.utils import disable_progress_bars
 
@@ -232,7 +232,7 @@ def _fetch(name: str, patterns: Sequence[str], what: str, fix: str) -> Path:
     try:
         return Path(snapshot_download(name, allow_patterns=list(patterns)))
     except (OSError, ValueError) as error:
-        must = f"The {what} {name} must be a hub id within reach, a local folder or a shipped model"
+        must = f"The {role} {name} must be a hub id within reach, a local folder or a shipped model"
         raise PalpateError(must, first_line(error).removeprefix("Got: "), fix) from None
 
 

@@ -65,6 +65,11 @@ class Frames(NamedTuple):
     files: list[Frame]
     sensors: list[str]
 
+    @classmethod
+    def alone(cls, images: Sequence[Path | Image.Image]) -> Frames:
+        """Images without further ones, of unknown sensors."""
+        return cls([(image, None, None) for image in images], [""] * len(images))
+
     def stamps(self, root: Path) -> list[object]:
         """What changes with the no-contact images, the earlier frames and the sensors."""
         more = {path for _, *further in self.files for path in further if path is not None}
