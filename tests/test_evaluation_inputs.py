@@ -14,7 +14,8 @@ from forge.pictures import paint
 from palpate.core import FeatureSet, PalpateError, Split
 from palpate.data.manifest import Manifest
 from palpate.evaluation.embedding_files import read_embeddings
-from palpate.evaluation.inputs import read, read_inputs
+from palpate.evaluation.inputs import read_inputs
+from palpate.evaluation.sources import read
 
 N = 4
 ROWS = ["v0/1", "007", 'odd "name", [x]', "grün"]

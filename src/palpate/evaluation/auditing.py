@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from palpate.core import FeatureSet, Note, Progress, Split, quiet, require
 from palpate.data.manifest import MODALITIES, Manifest
-from palpate.evaluation.inputs import guard, load_encoders
+from palpate.evaluation.guard import guard, load_encoders
 from palpate.leakage.auditing import audit as audit_leakage
 from palpate.report.calls import Call
 from palpate.report.results import Audit, Impact

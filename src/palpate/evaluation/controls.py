@@ -17,7 +17,8 @@ from pathlib import Path
 
 from palpate.core import FeatureSet, Progress, Score, rng_for
 from palpate.evaluation.companions import Features
-from palpate.evaluation.inputs import Inputs, Samples
+from palpate.evaluation.inputs import Inputs
+from palpate.evaluation.samples import Samples
 from palpate.metrics.probe import fit_probe, material_accuracy
 
 #: Rows of the tables that are not generators.

@@ -30,7 +30,7 @@ from palpate.core import (
 )
 from palpate.core.digest import canonical_json
 from palpate.core.features import is_missing
-from palpate.evaluation.inputs import guard, load_encoders
+from palpate.evaluation.guard import guard, load_encoders
 from palpate.metrics.means import Mean, over_seeds
 from palpate.metrics.paired import differences_of_means
 from palpate.metrics.probe import class_accuracies

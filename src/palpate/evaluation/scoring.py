@@ -40,18 +40,11 @@ from palpate.evaluation.controls import (
     matched_features,
     material_accuracies,
 )
-from palpate.evaluation.inputs import (
-    REFERENCE,
-    Inputs,
-    Samples,
-    Source,
-    from_reference,
-    guard,
-    load_encoders,
-    read,
-    read_inputs,
-)
+from palpate.evaluation.guard import guard, load_encoders
+from palpate.evaluation.inputs import REFERENCE, Inputs, from_reference, read_inputs
 from palpate.evaluation.memorization import FEATURES, PIXELS, contact_rows, memorization
+from palpate.evaluation.samples import Samples
+from palpate.evaluation.sources import Source, read
 from palpate.metrics import compare, compare_tmmd, require_same_ids, tmmd
 from palpate.report.calls import OBJECT, PATH, Call
 from palpate.report.labels import measured

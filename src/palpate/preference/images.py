@@ -19,14 +19,9 @@ from PIL import Image, ImageFilter
 
 from palpate.core import Note, Progress, require, track
 from palpate.data.images import read_image, square
-from palpate.evaluation.inputs import (
-    Samples,
-    complete,
-    keywords_of,
-    named_sources,
-    read,
-    with_known_ids,
-)
+from palpate.evaluation.inputs import complete, keywords_of, named_sources, with_full_ids
+from palpate.evaluation.samples import Samples
+from palpate.evaluation.sources import read
 from palpate.preference.plan import COPY, EXAMPLE, GEL, REFERENCE, SAME, Item, Plan
 
 QUALITY = 92
@@ -58,7 +53,7 @@ def read_sources(
     real = complete(_files(read(reference, REFERENCE)), keywords)
     reserved = (REFERENCE, GEL, COPY, EXAMPLE, SAME)
     sources = named_sources(generated, names, reserved).items()
-    methods = {name: with_known_ids(_files(read(s, name)), real.ids) for name, s in sources}
+    methods = {name: with_full_ids(_files(read(s, name)), real.ids) for name, s in sources}
     ids = {name: {*samples.ids} for name, samples in methods.items()}
     every = {*real.ids}
     common = every.intersection(*ids.values())

@@ -30,7 +30,7 @@ from palpate.encoders.embed import texts_of
 from palpate.encoders.encoder_set import load_clip
 from palpate.encoders.models import pick_device
 from palpate.encoders.presets import EncoderPreset
-from palpate.evaluation.inputs import read as read_samples
+from palpate.evaluation.sources import read as read_samples
 from palpate.leakage.auditing import audit
 from palpate.leakage.splitting import split as leak_free_split
 from palpate.sim import WorldOptions, write_world

@@ -22,7 +22,7 @@ from typing import Any
 
 from palpate.core import Progress, digest_file, quiet, require, require_choice
 from palpate.evaluation.companions import Weights
-from palpate.evaluation.inputs import read as read_samples
+from palpate.evaluation.sources import read as read_samples
 from palpate.preference.scoring import PREFERENCE
 from palpate.report.results import Results
 from palpate.sim import WorldOptions

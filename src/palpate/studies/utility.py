@@ -35,7 +35,8 @@ from palpate.core import FeatureSet, PalpateError, Progress, Score, Split, quiet
 from palpate.data.manifest import Manifest
 from palpate.encoders.embed import embed
 from palpate.encoders.encoder_set import EncoderSet
-from palpate.evaluation.inputs import guard, read
+from palpate.evaluation.guard import guard
+from palpate.evaluation.sources import read
 from palpate.metrics.inputs import Array
 from palpate.metrics.means import Mean, mean_of
 from palpate.metrics.means import over_seeds as over_draws
