@@ -86,7 +86,7 @@ def test_text_is_pooled_at_the_first_end_token(clip):
 
 
 def test_saved_clip_is_a_standard_folder_with_equal_embeddings(clip, tmp_path):
-    clip.save(tmp_path / "clip")
+    clip.save(tmp_path)
     plain = CLIPModel.from_pretrained(tmp_path / "clip").eval()
     tokenizer = AutoTokenizer.from_pretrained(tmp_path / "clip")
     pixels = clip.preprocess("vision").normalize(to_unit(make_images()))
@@ -172,20 +172,22 @@ def test_changed_weights_on_disk_are_noticed(encoders, tmp_path):
 
 def test_folders_that_are_no_clip(clip, tmp_path, monkeypatch):
     clip.save(tmp_path / "clip")
-    (tmp_path / "clip" / "preprocessor_config.json").unlink()
+    folder = tmp_path / "clip" / "clip"
+    (folder / "preprocessor_config.json").unlink()
     with pytest.raises(
         PalpateError, match=r"image processor must exist.*no file .*preprocessor_config\.json"
     ):
-        load_clip(tmp_path / "clip")
+        load_clip(folder)
     clip.save(tmp_path / "cut")
-    weights = tmp_path / "cut" / "model.safetensors"
+    weights = tmp_path / "cut" / "clip" / "model.safetensors"
     weights.write_bytes(weights.read_bytes()[:100])
     with pytest.raises(PalpateError, match="must be a CLIP model"):
         load_clip(tmp_path / "cut")
     clip.save(tmp_path / "hole")
-    tensors = load_file(tmp_path / "hole" / "model.safetensors")
+    weights = tmp_path / "hole" / "clip" / "model.safetensors"
+    tensors = load_file(weights)
     del tensors["visual_projection.weight"]
-    save_file(tensors, tmp_path / "hole" / "model.safetensors", metadata={"format": "pt"})
+    save_file(tensors, weights, metadata={"format": "pt"})
     with pytest.raises(PalpateError, match="1 weights are missing, first visual_projection"):
         load_clip(tmp_path / "hole")
     (tmp_path / "cut" / "palpate.json").write_text("{}")
@@ -201,7 +203,6 @@ def test_folders_that_are_no_clip(clip, tmp_path, monkeypatch):
     monkeypatch.setattr(huggingface_hub, "snapshot_download", unreachable)  # called first
     with pytest.raises(PalpateError, match=rejection):
         load_clip("openai/clip-vit-base-patch32")
-    folder = tmp_path / "clip"
     monkeypatch.setattr(huggingface_hub, "snapshot_download", lambda *_, **__: folder)
     monkeypatch.setattr(module.CLIPModel, "from_pretrained", unreachable)
     with pytest.raises(PalpateError, match=rejection):

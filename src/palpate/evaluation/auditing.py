@@ -55,8 +55,9 @@ def audit(
         PalpateError: as :func:`palpate.leakage.audit`, and if the encoders cannot be loaded.
     """
     require(impact or encoder is None, "encoder", "must come with the impact", encoder)
-    given = {"train_or_data": train_or_data, "test": test, "encoder": encoder, "impact": impact}
-    call = Call.of("audit", audit, {**given, "allow_seen": allow_seen, **options})
+    arguments = {"train_or_data": train_or_data, "test": test, "encoder": encoder}
+    arguments |= {"impact": impact, "allow_seen": allow_seen, **options}
+    call = Call.of("audit", audit, arguments)
     folder = None if cache is None else Path(cache)
 
     @lru_cache
@@ -76,18 +77,25 @@ def audit(
         seen: list[str] = []
         if encoder is not None:  # every sample is in the test part of some leak-free split
             judged = samples.take([i for part in ("train", "test") for i in split.ids(part)])
-            there = [m for m in MODALITIES if judged.table[m].null_count() < len(judged)]
-            known: list[Any] = [m for m in there if m in encoders().modalities]
-            how: Any = {"allow_seen": allow_seen, "progress": progress}
             features = {}
-            for m in known:
-                notes += (new := guard(encoders(), m, judged, **how))
+            for m in encoders().modalities:
+                if m not in MODALITIES or judged.table[m].null_count() == len(judged):
+                    continue
+                new = guard(encoders(), m, judged, allow_seen=allow_seen, progress=progress)
+                notes += new
                 if any(note.code in ("seen-images", "seen-dataset") for note in new):
                     seen.append(f"{m} encoder")
                 features[f"{m} encoder"] = embed(samples, m)
-        how = {"features": features, "name": name, "cache": folder, "progress": progress}
-        how["seen"] = seen
-        result = measure_impact(samples, split, group=group, **how)
+        result = measure_impact(
+            samples,
+            split,
+            group=group,
+            features=features,
+            name=name,
+            seen=seen,
+            cache=folder,
+            progress=progress,
+        )
         return replace(result, notes=[*notes, *result.notes])
 
     result = audit_leakage(

@@ -53,8 +53,8 @@ class Weights:
     @property
     def companions(self) -> list[Name]:
         """What is computed as published with these weights, but for KID."""
-        given: dict[Name, object] = {"fid": self.inception, "cmmd": self.clip, "lpips": self.lpips}
-        return [name for name, weights in given.items() if weights is not None]
+        files: dict[Name, object] = {"fid": self.inception, "cmmd": self.clip, "lpips": self.lpips}
+        return [name for name, weights in files.items() if weights is not None]
 
     def for_features(self, name: str) -> tuple[Literal["inception", "clip"], Path | str | None]:
         """The standard encoder of a companion on features, and its weights."""
@@ -76,6 +76,32 @@ class Outcome:
         self.notes += other.notes
 
 
+@dataclass(frozen=True, kw_only=True)
+class Settings:
+    """What the metrics of one call have in common.
+
+    Attributes:
+        seed: of random halves, permutations and the choice of control images.
+        split: digest of the split, or None.
+        permutations, normalize: of the TMMD family and the companion ``cmmd``.
+    """
+
+    seed: int
+    split: str | None
+    permutations: int
+    normalize: Literal["check"] | bool
+
+    @property
+    def common(self) -> dict[str, Any]:
+        """What every metric of features takes."""
+        return {"seed": self.seed, "split": self.split}
+
+    @property
+    def family(self) -> dict[str, Any]:
+        """What the TMMD family takes."""
+        return {**self.common, "permutations": self.permutations, "normalize": self.normalize}
+
+
 @dataclass(frozen=True)
 class Features:
     """Features of generators and controls, and of the reference they are compared with.
@@ -86,8 +112,7 @@ class Features:
         reference: real features.
         paired: whether the generators' rows stand for the same samples.
         name: where the features come from: ``tactile``, ``embeddings``, ``Inception``, ``CLIP``.
-        common: seed and split digest.
-        family: options that ``cmmd`` shares with the TMMD family.
+        settings: what the metrics have in common.
     """
 
     generators: Mapping[str, FeatureSet]
@@ -95,8 +120,7 @@ class Features:
     reference: FeatureSet
     paired: bool
     name: str
-    common: Mapping[str, Any]
-    family: Mapping[str, Any]
+    settings: Settings
 
     def batches(self) -> Iterator[dict[str, FeatureSet]]:
         """Sets to compare in one call: paired generators together, every other set alone."""
@@ -121,7 +145,8 @@ class Pairs:
         generators: names of the subjects between which differences are made.
         reference: (n, h, w, 3).
         background: no-contact images of the reference, or None.
-        common: ids, groups and split digest.
+        ids, groups: of the reference's samples.
+        split: digest of the split, or None.
         weights: for LPIPS.
         progress: called with what is done.
     """
@@ -130,9 +155,16 @@ class Pairs:
     generators: Sequence[str]
     reference: Images
     background: Images | None
-    common: Mapping[str, Any]
+    ids: Sequence[str]
+    groups: Sequence[str] | None
+    split: str | None
     weights: Weights
     progress: Progress
+
+    @property
+    def common(self) -> dict[str, Any]:
+        """What every metric of pairs takes."""
+        return {"ids": self.ids, "groups": self.groups, "split": self.split}
 
 
 @dataclass(frozen=True)
@@ -177,17 +209,17 @@ def choose(
 
 def _lacking(name: str, weights: Weights, *, images: bool) -> PalpateError:
     """Why a companion cannot be computed."""
-    argument: dict[str, Any] = {"argument": "companions"}
+    refusal = partial(PalpateError, argument="companions")
     if name not in (*FEATURES, *PAIRS):
         must = f"must be among {', '.join((*FEATURES, *PAIRS))}"
-        return PalpateError(must, repr(name), "Check the spelling", **argument)
+        return refusal(must, repr(name), "Check the spelling")
     if name in PAIRS and not images:
         must = "must need no images for embeddings"
-        return PalpateError(must, name, "Score folders of images, or drop it", **argument)
+        return refusal(must, name, "Score folders of images, or drop it")
     if name == "contact":
         must = "must need no background images where the reference has none"
         fix = "Pass one no-contact image for all, a reference with a column background, or drop it"
-        return PalpateError(must, name, fix, example={"background": "gel.png"}, **argument)
+        return refusal(must, name, fix, example={"background": "gel.png"})
     if name == "lpips":
         from palpate.encoders.perceptual import FIX
 
@@ -200,7 +232,7 @@ def _lacking(name: str, weights: Weights, *, images: bool) -> PalpateError:
         where = {"inception": FIX, "clip": f"Fetch one with: hf download {CMMD_CLIP}"}
         fix = f"{fix}, or weights of {kind}. {where[kind]}"
     must = "must need no features of images without an encoder"
-    return PalpateError(must, name, fix, example={"encoder": "palpate/mini"}, **argument)
+    return refusal(must, name, fix, example={"encoder": "palpate/mini"})
 
 
 def score_features(names: Sequence[str], features: Features, default: bool) -> Outcome:
@@ -243,7 +275,7 @@ def _compared(
     """Scores and differences of ``compare``, which say what they are of."""
     outcome = Outcome()
     for sets in features.batches():
-        result = compare(sets, features.reference, **features.common, **options)
+        result = compare(sets, features.reference, **features.settings.common, **options)
         outcome.scores += _named(result.scores, metric, features)
         outcome.differences += _named(result.differences, metric, features)
     return outcome
@@ -254,13 +286,27 @@ def _fid(features: Features) -> Outcome:
 
 
 def _cmmd(features: Features) -> Outcome:
-    options: dict[str, Any] = {**features.family, "preset": "cmmd"}
-    return _compared(compare_tmmd, features, "CMMD", **options)
+    settings = features.settings
+    return _compared(
+        compare_tmmd,
+        features,
+        "CMMD",
+        preset="cmmd",
+        permutations=settings.permutations,
+        normalize=settings.normalize,
+    )
 
 
 def _kid(features: Features) -> Outcome:
-    options: dict[str, Any] = {"preset": "paper", "normalize": False, "permutations": 0}
-    outcome = _compared(compare_tmmd, features, "KID", kernel=Polynomial(), **options)
+    outcome = _compared(
+        compare_tmmd,
+        features,
+        "KID",
+        kernel=Polynomial(),
+        preset="paper",
+        normalize=False,
+        permutations=0,
+    )
     for scores in (outcome.scores, outcome.differences):
         noted = [Note("kid-interval")] if scores is outcome.scores else []
         for k, s in enumerate(scores):
@@ -273,7 +319,7 @@ def _prdc(features: Features) -> Outcome:
     outcome = Outcome()
     for sets in features.batches():
         first = next(iter(sets.values()))
-        split = features.common["split"]
+        split = features.settings.split
         results = {
             name: prdc_rows(s.take(list(first.ids)), features.reference, subject=name, split=split)
             for name, s in sets.items()
@@ -312,7 +358,7 @@ def _with_differences(
     if len(pairs.generators) > 1:
         compared = {name: scores[name] for name in pairs.generators}
         per_image = {name: values(name) for name in pairs.generators}
-        outcome.differences += mean_differences(compared, per_image, pairs.common["groups"])
+        outcome.differences += mean_differences(compared, per_image, pairs.groups)
     return outcome
 
 
@@ -332,17 +378,22 @@ def _lpips(pairs: Pairs) -> Outcome:
     assert pairs.weights.lpips is not None  # `choose` requires it
     network, real = load_lpips(*map(Path, pairs.weights.lpips)), pairs.reference
     size = [int(v) for v in real.shape[1:3]]
-    options: dict[str, Any] = {
-        "higher_is_better": False,
-        "encoder": network.digest,
-        "settings": {"network": "alex", "version": "0.1", "size": size},
-        **pairs.common,
-    }
     values = {
         name: lpips_per_image(x, real, network, progress=pairs.progress)
         for name, x in pairs.images.items()
     }
-    scores = {n: mean_score("LPIPS", v, subject=n, **options) for n, v in values.items()}
+    scores = {
+        name: mean_score(
+            "LPIPS",
+            value,
+            subject=name,
+            higher_is_better=False,
+            encoder=network.digest,
+            settings={"network": "alex", "version": "0.1", "size": size},
+            **pairs.common,
+        )
+        for name, value in values.items()
+    }
     return _with_differences(pairs, scores, lambda name: values[name])
 
 

@@ -44,15 +44,15 @@ def matched_rows(train: Columns, test: Columns, seed: int) -> list[int] | None:
     Returns:
         A row for each test row; None where train has no other video of a material.
     """
-    known, wanted = (_by_video(*part) for part in ((*train, "train"), (*test, "test")))
-    tested, rows = {video for of in wanted.values() for video in of}, [0] * len(test[0])
+    sources, wanted = (_by_video(*part) for part in ((*train, "train"), (*test, "test")))
+    tested, rows = {video for videos in wanted.values() for video in videos}, [0] * len(test[0])
     for material, videos in wanted.items():
         key = lambda video, m=material: float(rng_for(seed, "matched", m, video).random())
-        others = sorted({*known.get(material, {})} - tested, key=key)
-        if not others:
+        stand_ins = sorted({*sources.get(material, {})} - tested, key=key)
+        if not stand_ins:
             return None
-        for video, other in zip(sorted(videos), cycle(others), strict=False):
-            at, frames = videos[video], known[material][other]
+        for video, other in zip(sorted(videos), cycle(stand_ins), strict=False):
+            at, frames = videos[video], sources[material][other]
             for k, row in enumerate(at):
                 rows[row] = frames[k * len(frames) // len(at)]
     return rows
@@ -121,7 +121,7 @@ def material_accuracies(train: FeatureSet, features: Features) -> list[Score]:
     controls = {n: s for n, s in features.controls.items() if n != SAME_MATERIAL}
     subjects = {**features.generators, **controls, REAL: features.reference}
     return [
-        material_accuracy(train, s, probe=probe, subject=name, split=features.common["split"])
+        material_accuracy(train, s, probe=probe, subject=name, split=features.settings.split)
         for name, s in subjects.items()
         if s.labels is not None and any(s.labels)
     ]

@@ -26,7 +26,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from palpate.core import FeatureSet, PalpateError, Score
+from palpate.core import FeatureSet, Score, require
 from palpate.metrics.inputs import Array, require_one_encoder
 from palpate.metrics.intervals import Spread, jackknife_errors
 
@@ -102,61 +102,52 @@ def memorization(
         PalpateError: if one of the three is empty, or widths or encoders differ.
     """
     for name, features in (("generated", generated), ("real test", real), ("train", train)):
-        if not len(features.ids):
-            must, fix = f"There must be {name} images", "Check the folder or the split"
-            raise PalpateError(must, "none", fix)
-    for other, what in ((generated, "Generated and train"), (real, "Real and train")):
-        require_one_encoder(other, train, f"{what} images")
-        if other.features.shape[1] != train.features.shape[1]:
-            got = f"{other.features.shape[1]} and {train.features.shape[1]}"
-            must, fix = f"{what} images must have rows of one width", "Describe both alike"
-            raise PalpateError(must, got, fix)
-    made, at = nearest(generated.features, train.features)
+        must, fix = f"There must be {name} images", "Check the folder or the split"
+        require(len(features.ids) > 0, None, must, "none", fix=fix)
+    for other, pair in ((generated, "Generated and train"), (real, "Real and train")):
+        require_one_encoder(other, train, f"{pair} images")
+        widths = other.features.shape[1], train.features.shape[1]
+        must, got = f"{pair} images must have rows of one width", f"{widths[0]} and {widths[1]}"
+        require(widths[0] == widths[1], None, must, got, fix="Describe both alike")
+    drawn, at = nearest(generated.features, train.features)
     test, _ = nearest(real.features, train.features)
     groups = _units(generated), _units(real)
     threshold = float(np.quantile(test, QUANTILE))
-    first = [int(k) for k in np.argsort(made, kind="stable")[:10]]
+    first = [int(k) for k in np.argsort(drawn, kind="stable")[:10]]
     details: dict[str, Any] = {
         "quantile distance": threshold,
-        "median generated": float(np.median(made)),
+        "median generated": float(np.median(drawn)),
         "median real": float(np.median(test)),
         "nearest": [
-            {"id": generated.ids[k], "train": train.ids[at[k]], "distance": float(made[k])}
+            {"id": generated.ids[k], "train": train.ids[at[k]], "distance": float(drawn[k])}
             for k in first
         ],
     }
-    common: dict[str, Any] = {
-        "a": subject,
-        "features": space,
-        "n": len(made),
-        "m": len(test),
-        "split": split,
-        "encoder": train.encoder,
-        "higher_is_better": None,
-        "details": details,
-    }
     settings = {"space": space, "train": len(train.ids), **(settings or {})}
-    share = _spread(lambda d, r: (d < np.quantile(r, QUANTILE)).mean(), made, test, groups)
-    area = _spread(_nearness, made, test, groups)
+    share = _spread(lambda d, r: (d < np.quantile(r, QUANTILE)).mean(), drawn, test, groups)
+    area = _spread(_nearness, drawn, test, groups)
     return [
-        _score(SHARE, share, QUANTILE, common, settings | {"quantile": QUANTILE}),
-        _score(NEARNESS, area, 0.5, common, settings),
+        Score(
+            metric,
+            value=spread.value,
+            interval=(interval := spread.interval(0.0, 1.0)),
+            interval_method=spread.method if interval else "",
+            floor=floor,
+            settings=more,
+            a=subject,
+            features=space,
+            n=len(drawn),
+            m=len(test),
+            split=split,
+            encoder=train.encoder,
+            higher_is_better=None,
+            details=details,
+        )
+        for metric, spread, floor, more in (
+            (SHARE, share, QUANTILE, settings | {"quantile": QUANTILE}),
+            (NEARNESS, area, 0.5, settings),
+        )
     ]
-
-
-def _score(
-    metric: str, spread: Spread, floor: float, common: dict[str, Any], settings: dict[str, Any]
-) -> Score:
-    interval = spread.interval(0.0, 1.0)
-    return Score(
-        metric,
-        value=spread.value,
-        interval=interval,
-        interval_method=spread.method if interval else "",
-        floor=floor,
-        settings=settings,
-        **common,
-    )
 
 
 def _units(features: FeatureSet) -> NDArray[np.str_]:
@@ -167,22 +158,22 @@ def _units(features: FeatureSet) -> NDArray[np.str_]:
 
 def _spread(
     statistic: Callable[[Array, Array], float],
-    made: Array,
+    drawn: Array,
     test: Array,
     groups: tuple[NDArray[np.str_], NDArray[np.str_]],
 ) -> Spread:
     """A statistic of generated and real distances, left without one video after the other."""
     names = np.unique(np.concatenate(groups))
-    kept = [(made[groups[0] != g], test[groups[1] != g]) for g in names]
+    kept = [(drawn[groups[0] != g], test[groups[1] != g]) for g in names]
     replicates = np.array([statistic(*pair) for pair in kept if min(map(len, pair))])
     error, df = float(jackknife_errors(replicates[:, None])[0]), len(names) - 1
     method = f"leave-one-video-out jackknife, t, {df} df"
-    return Spread(statistic(made, test), error, df, method)
+    return Spread(statistic(drawn, test), error, df, method)
 
 
-def _nearness(made: Array, test: Array) -> float:
+def _nearness(drawn: Array, test: Array) -> float:
     """``P(d < r) + P(d = r) / 2``."""
     order = np.sort(test)
-    above = len(test) - np.searchsorted(order, made, "right")
-    equal = np.searchsorted(order, made, "right") - np.searchsorted(order, made, "left")
+    above = len(test) - np.searchsorted(order, drawn, "right")
+    equal = np.searchsorted(order, drawn, "right") - np.searchsorted(order, drawn, "left")
     return float((above + equal / 2).mean() / len(test))

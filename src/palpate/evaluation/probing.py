@@ -10,13 +10,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
 from palpate.core import (
-    FeatureSet,
     Measure,
     Note,
     PalpateError,
@@ -69,6 +69,11 @@ class Plan:
     axis: str = ""
     trained: bool = False
     pools: Mapping[str, int] = field(default_factory=dict[str, int])
+
+    @property
+    def settings(self) -> dict[str, Any]:
+        """What the scores keep of it."""
+        return {"axis": self.axis} if self.axis else {}
 
 
 @dataclass
@@ -129,18 +134,18 @@ def probe(  # noqa: PLR0913 - one argument a choice
         PalpateError: if nothing can be measured, images are missing or unreadable, or the encoder
             was trained on test images.
     """
-    given = locals()
+    arguments = locals()
     require_choice("modality", modality, ("tactile", "vision"))
     from palpate.data.reading import load
 
     manifest = load(data)
     splits, encoders = named(split, "split"), named(encoder, "encoder")
     several = {"split": splits, "encoder": encoders}  # names are those of today's files
-    given |= {name: of for name, of in several.items() if len(of) > 1}
-    call = Call.of("probe", probe, given)
-    if len(splits) > 1 and len(encoders) > 1:
-        must, fix = "must be one where several splits are compared", "Compare one at a time"
-        raise PalpateError(must, f"{len(encoders)}", fix, argument="encoder")
+    arguments |= {name: sets for name, sets in several.items() if len(sets) > 1}
+    call = Call.of("probe", probe, arguments)
+    must, fix = "must be one where several splits are compared", "Compare one at a time"
+    single = len(splits) == 1 or len(encoders) == 1
+    require(single, "encoder", must, len(encoders), fix=fix)
     loaded = {name: Split.load(s) for name, s in splits.items()}
     sets = {name: load_encoders(e, progress) for name, e in encoders.items()}
     axis = "split" if len(splits) > 1 else "encoder" if len(sets) > 1 else ""
@@ -181,7 +186,7 @@ def plan_of(manifest: Manifest, splits: Mapping[str, Split], plan: Plan) -> Plan
     tests = [manifest.part(split, "test") for split in splits.values()]
     tests = [test.take(_with(test, plan.modality)) for test in tests]
     counts = {other: [len(_with(test, other)) for test in tests] for other in _others(plan)}
-    pools = {other: min((n for n in of if n > 1), default=0) for other, of in counts.items()}
+    pools = {other: min((n for n in ns if n > 1), default=0) for other, ns in counts.items()}
     return replace(plan, label=labels, top=tuple(plan.top), group=group, pools=pools)
 
 
@@ -202,23 +207,36 @@ def measure(
     """
     from palpate.encoders.embed import embed
 
-    options: dict[str, Any] = {"groups": plan.group, "progress": progress}
-    options["cache"] = None if cache is None else Path(cache)
-    how: dict[str, Any] = {"split": split, "allow_seen": plan.allow_seen, "progress": progress}
+    folder = None if cache is None else Path(cache)
+    embedded = partial(embed, groups=plan.group, cache=folder, progress=progress)
+    seen = partial(guard, split=split, allow_seen=plan.allow_seen, progress=progress)
     parts = [manifest.part(split, part) for part in ("train", "test")]
     count = sum(map(len, parts))
     parts = [part.take(_with(part, plan.modality)) for part in parts]
-    notes = guard(encoders, plan.modality, parts[1], **how)
-    features = [embed(part, encoders, plan.modality, **options) for part in parts]
+    notes = seen(encoders, plan.modality, parts[1])
+    features = [embedded(part, encoders, plan.modality) for part in parts]
     if plan.trained:  # the encoder belongs to the split, which is the axis
         features = [replace(f, encoder=None) for f in features]
-    common: dict[str, Any] = {"subject": subject, "split": split.digest}
-    common["settings"] = {"axis": plan.axis} if plan.axis else {}
     result = Probed()
     if count := count - sum(map(len, parts)):
         result.notes.append(Note("probe-no-image", {"modality": plan.modality, "count": count}))
     for label in plan.label:
-        _classify(result, parts, features, label, plan=plan, common=common)
+        values = [["" if is_missing(v) else str(v) for v in p.column(label)] for p in parts]
+        if (note := _no_classes(label, *values)) is not None:
+            result.notes.append(note)
+            continue
+        if without := values[1].count(""):
+            result.notes.append(Note("probe-unlabeled", {"label": label, "count": without}))
+        train, test = (replace(f, labels=v) for f, v in zip(features, values, strict=True))
+        result.means += class_accuracies(
+            train,
+            test,
+            label=label,
+            seed=plan.seed,
+            subject=subject,
+            split=split.digest,
+            settings=plan.settings,
+        )
     for other in _others(plan) if plan.top else ():
         ids = _with(parts[1], other) if other in encoders.modalities else []
         if len(ids) < 2:
@@ -228,9 +246,32 @@ def measure(
         if missing := len(parts[1]) - len(ids):
             result.notes.append(Note("probe-some-partners", {"modality": other, "count": missing}))
         test = parts[1].take(ids)
-        notes += guard(encoders, other, test, **how)
-        pair = features[1].take(ids), embed(test, encoders, other, **options)
-        _retrieve(result, test, *pair, other, plan=plan, common=common)
+        notes += seen(encoders, other, test)
+        queries, keys = features[1].take(ids), embedded(test, encoders, other)
+        ranked = partial(
+            retrieval,
+            queries,
+            keys,
+            top=plan.top,
+            pool=min(plan.pool or len(test), plan.pools[other]),
+            seed=plan.seed,
+            subject=subject,
+            split=split.digest,
+            settings=plan.settings,
+        )
+        ways = list(ranked(names=(plan.modality, other)))
+        if other == "text":
+            names, threshold = (plan.modality, "similar text"), plan.text_threshold
+            ways += ranked(names=names, texts=keys.features, threshold=threshold)
+        result.means += [mean for way in ways for mean in way.top]
+        result.medians += [way.median for way in ways]
+        for x, y, names in (
+            (queries, keys, (plan.modality, other)),
+            (keys, queries, (other, plan.modality)),
+        ):
+            strips = _strips(test, unit_rows(x.features), unit_rows(y.features), names, plan.seed)
+            subject_shown = subject if plan.axis else ""
+            result.strips += [replace(strip, subject=subject_shown) for strip in strips]
     if not result.means:
         must = "There must be a label of two classes, or another modality to retrieve"
         fix = "Name a column with labels, or add texts or photos"
@@ -241,59 +282,14 @@ def measure(
     return result
 
 
-def _classify(
-    result: Probed,
-    parts: Sequence[Manifest],
-    features: Sequence[FeatureSet],
-    label: str,
-    *,
-    plan: Plan,
-    common: Mapping[str, Any],
-) -> None:
-    """Add the accuracies of one label, or why there are none."""
-    values = [["" if is_missing(v) else str(v) for v in part.column(label)] for part in parts]
-    names = ("train", "test")
-    if lacking := [name for name, column in zip(names, values, strict=True) if not any(column)]:
-        note = {"label": label, "part": " and ".join(lacking)}
-        result.notes.append(Note("probe-no-label", note))
-        return
-    if len(only := {*values[0]} - {""}) == 1:
-        result.notes.append(Note("probe-one-class", {"label": label, "only": only.pop()}))
-        return
-    if without := values[1].count(""):
-        result.notes.append(Note("probe-unlabeled", {"label": label, "count": without}))
-    train, test = (replace(f, labels=v) for f, v in zip(features, values, strict=True))
-    result.means += class_accuracies(train, test, label=label, seed=plan.seed, **common)
-
-
-def _retrieve(
-    result: Probed,
-    test: Manifest,
-    queries: FeatureSet,
-    keys: FeatureSet,
-    other: str,
-    *,
-    plan: Plan,
-    common: Mapping[str, Any],
-) -> None:
-    """Add both directions between the plan's modality and another one."""
-    pool = min(plan.pool or len(test), plan.pools[other])
-    options: dict[str, Any] = {"top": plan.top, "pool": pool, "seed": plan.seed, **common}
-    ways = list(retrieval(queries, keys, names=(plan.modality, other), **options))
-    if other == "text":
-        names = (plan.modality, "similar text")
-        options |= {"texts": keys.features, "threshold": plan.text_threshold}
-        ways += retrieval(queries, keys, names=names, **options)
-    for way in ways:
-        result.means += way.top
-        result.medians.append(way.median)
-    subject = str(common["subject"]) if plan.axis else ""
-    for x, y, names in (
-        (queries, keys, (plan.modality, other)),
-        (keys, queries, (other, plan.modality)),
-    ):
-        strips = _strips(test, unit_rows(x.features), unit_rows(y.features), names, plan.seed)
-        result.strips += [replace(strip, subject=subject) for strip in strips]
+def _no_classes(label: str, train: Sequence[str], test: Sequence[str]) -> Note | None:
+    """Why one label cannot be learned from train and scored on test; None where it can."""
+    parts = {"train": train, "test": test}
+    if lacking := [name for name, column in parts.items() if not any(column)]:
+        return Note("probe-no-label", {"label": label, "part": " and ".join(lacking)})
+    if len(only := {*train} - {""}) == 1:
+        return Note("probe-one-class", {"label": label, "only": only.pop()})
+    return None
 
 
 def _strips(test: Manifest, a: Floats, b: Floats, names: tuple[str, str], seed: int) -> list[Strip]:
@@ -335,17 +331,17 @@ def results_of(
     ``runs`` has for each subject what each of its trainings (one a seed) scores.
     """
     scores: list[Score] = []
-    single = all(len(of) == 1 for of in runs.values())
+    single = all(len(seeds) == 1 for seeds in runs.values())
     by_measure: dict[Measure, dict[str, list[Mean]]] = {}
-    for subject, of in runs.items():
-        for run in of:
+    for subject, seeds in runs.items():
+        for run in seeds:
             for mean in run.means:
                 by_measure.setdefault(mean.score.measure, {}).setdefault(subject, []).append(mean)
         for means in (sets.get(subject) for sets in by_measure.values()):
             scores += [means[0].score if single else over_seeds(means)] if means else []
-        scores += [median for run in of if single for median in run.medians]
+        scores += [median for run in seeds if single for median in run.medians]
     differences = [d for sets in by_measure.values() for d in differences_of_means(sets)]
-    all_runs = [run for of in runs.values() for run in of]
+    all_runs = [run for seeds in runs.values() for run in seeds]
     notes = list({canonical_json(note): note for run in all_runs for note in run.notes}.values())
     names = ("modality", "label", "group", "top", "pool", "text_threshold", "seed")
     digests = {"manifest": manifest.digest}
@@ -357,7 +353,7 @@ def results_of(
         title=title,
         facts=[_drop(d) for d in differences if plan.axis == "split"],
         scores=[*scores, *differences],
-        strips=[strip for of in runs.values() for strip in of[0].strips],
+        strips=[strip for seeds in runs.values() for strip in seeds[0].strips],
         notes=notes,
         settings={
             "digests": digests,
@@ -393,9 +389,9 @@ def named(value: Any, argument: str) -> dict[str, Any]:
         named = dict(zip(stems if len({*stems}) == len(stems) else paths, value, strict=True))
     else:
         named = {argument: value}
-    if not named or len(named) < (len(value) if isinstance(value, list | tuple) else 1):
-        must, fix = "must hold at least one, each once", "Name each of them once"
-        raise PalpateError(must, f"{value!r}", fix, argument=argument)
+    distinct = len(named) >= (len(value) if isinstance(value, list | tuple) else 1)
+    must, fix = "must hold at least one, each once", "Name each of them once"
+    require(distinct and len(named) > 0, argument, must, f"{value!r}", fix=fix)
     return named
 
 
