@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from palpate.core import PalpateError
+from palpate.core import PalpateError, require
 
 if TYPE_CHECKING:
     import polars as pl
@@ -72,17 +72,14 @@ def checked(embeddings: Embeddings, source: str) -> Embeddings:
         PalpateError: naming ``source``.
     """
     x = embeddings.features
-    if x.dtype.kind != "f" or x.ndim != 2 or 0 in x.shape:
-        raise PalpateError(
-            f"The features in {source} must be floats of shape (n, d), n and d at least 1",
-            f"{x.dtype} of shape {x.shape}",
-            "Save one row of the encoder's output per sample",
-        )
+    floats = x.dtype.kind == "f" and x.ndim == 2 and 0 not in x.shape
+    must = f"The features in {source} must be floats of shape (n, d), n and d at least 1"
+    fix = "Save one row of the encoder's output per sample"
+    require(floats, None, must, f"{x.dtype} of shape {x.shape}", fix=fix)
     for name in ("ids", "labels", "groups"):
-        column = getattr(embeddings, name)
-        if column is not None and len(column) != len(x):
+        if (column := getattr(embeddings, name)) is not None:
             must = f"{name} in {source} must have one entry per row ({len(x)})"
-            raise PalpateError(must, str(len(column)), "Write it again")
+            require(len(column) == len(x), None, must, len(column), fix="Write it again")
     require_ids(embeddings.ids or [], source)
     if x.dtype.itemsize < 4:
         return replace(embeddings, features=x.astype(np.float32))
@@ -91,12 +88,13 @@ def checked(embeddings: Embeddings, source: str) -> Embeddings:
 
 def require_ids(ids: Sequence[str], source: str) -> None:
     """Raise if an id is empty or occurs twice."""
-    if "" in ids:
-        got = f"none in row {list(ids).index('') + 1}"
-        raise PalpateError(f"Every row of {source} must have an id", got, "Fill the ids")
-    if repeated := [i for i, n in Counter(ids).items() if n > 1]:
-        got = f"{len(repeated)} that occur more than once, first {repeated[0]!r}"
-        raise PalpateError(f"Every id in {source} must occur once", got, "Keep one row per id")
+    row = next((k for k, name in enumerate(ids, 1) if not name), 0)
+    must = f"Every row of {source} must have an id"
+    require(row == 0, None, must, f"none in row {row}", fix="Fill the ids")
+    repeated = [i for i, n in Counter(ids).items() if n > 1]
+    got = f"{len(repeated)} that occur more than once, first {''.join(repeated[:1])!r}"
+    must = f"Every id in {source} must occur once"
+    require(not repeated, None, must, got, fix="Keep one row per id")
 
 
 def _read_npy(path: Path) -> Embeddings:
@@ -110,8 +108,8 @@ def _read_npz(path: Path) -> Embeddings:
     with zipfile.ZipFile(path) as archive:
         for entry in archive.infolist():
             if entry.file_size > UNPACKED + MOST_TIMES * entry.compress_size:
-                size, of = entry.file_size / 1e9, entry.compress_size / 1e6
-                raise ValueError(f"{entry.filename} unpacks to {size:.1f} GB from {of:.1f} MB")
+                size, packed = entry.file_size / 1e9, entry.compress_size / 1e6
+                raise ValueError(f"{entry.filename} unpacks to {size:.1f} GB from {packed:.1f} MB")
     with np.load(path, allow_pickle=False) as data:
         arrays = {name: data[name] for name in data if name in Embeddings.__annotations__}
     encoder = arrays["encoder"].reshape(-1) if "encoder" in arrays else np.zeros(0)

@@ -164,15 +164,14 @@ def _design(manifest: Manifest, split: Split, group: str, seeds: Sequence[int]) 
     """Choose the samples and materials that can be compared, and make leak-free splits."""
     manifest.take(split.ids("train", "test"))  # names ids that are missing
     for part in ("train", "test"):
-        if not split.ids(part):
-            raise PalpateError(f"The {part} part must hold samples", "none", "Check the split")
+        must = f"The {part} part must hold samples"
+        require(len(split.ids(part)) > 0, None, must, "none", fix="Check the split")
     ids, part_of = manifest.ids, [split.parts.get(i) for i in manifest.ids]
     labels = manifest.column("material")
     inside = [k for k, part in enumerate(part_of) if part in ("train", "test")]
     rows = sorted((k for k in inside if labels[k]), key=lambda k: ids[k])  # in any manifest's order
-    if not rows:
-        must, fix = "The impact of a leak needs materials", "Fill the manifest's column material"
-        raise PalpateError(must, "none in train and test", fix)
+    must, fix = "The impact of a leak needs materials", "Fill the manifest's column material"
+    require(len(rows) > 0, None, must, "none in train and test", fix=fix)
     pool = manifest.take([ids[k] for k in rows])
     notes: list[Note] = []
     if len(rows) < len(inside):
@@ -181,13 +180,13 @@ def _design(manifest: Manifest, split: Split, group: str, seeds: Sequence[int]) 
     if group == "contact" and videos not in (0, pool.table["contact"].n_unique()):
         notes.append(Note("shared-videos"))
     owners = _owners(pool, group)
-    here, given = [labels[k] for k in rows], [str(part_of[k]) for k in rows]
-    excluded = _incomparable(here, owners, [given], group)
-    rows, here, owners, given = _without(excluded, here, rows, here, owners, given)
-    share = given.count("train") / len(given)
+    here, leaking = [labels[k] for k in rows], [str(part_of[k]) for k in rows]
+    excluded = _incomparable(here, owners, [leaking], group)
+    rows, here, owners, leaking = _without(excluded, here, rows, here, owners, leaking)
+    share = leaking.count("train") / len(leaking)
     kept = manifest.take([ids[k] for k in rows])
     plans = [leak_free_split(kept, train=share, by=group, seed=s) for s in seeds]
-    parts = [given, *([p.parts[i] for i in kept.ids] for p in plans)]
+    parts = [leaking, *([p.parts[i] for i in kept.ids] for p in plans)]
     late = _incomparable(here, owners, parts, group)
     rows, here, owners, *parts = _without(late, here, rows, here, owners, *parts)
     excluded |= late
@@ -273,8 +272,8 @@ def _classify(source: Source, train: Rows, test: Rows, design: _Design) -> dict[
     owners, material = design.group[train], design.material[train]
     few = thin(np.arange(len(train)), owners, material, min(size, PROBE_ROWS), seed)
     ids, truth = [design.ids[k] for k in train[few]], design.material[test]
-    known = FeatureSet(ids, x[few], material[few].tolist(), owners[few].tolist())
-    right = np.array(fit_probe(known, seed=seed).predict(z)) == truth
+    fitted = FeatureSet(ids, x[few], material[few].tolist(), owners[few].tolist())
+    right = np.array(fit_probe(fitted, seed=seed).predict(z)) == truth
     hits = {"1-NN": nearest_hits(z, x, truth, material), "linear probe": right}
     groups = design.group[test].tolist()
     return {c: mean_of(c, hits[c], groups, subject=source.name) for c in CLASSIFIERS}
@@ -284,12 +283,12 @@ def _row(
     features: str, classifier: str, means: Sequence[Mean], chance: float, group: str
 ) -> ImpactRow:
     """One row from the accuracies under the given split and under the leak-free ones."""
-    given, *others = means
-    names = np.concatenate([m.groups for m in others]).tolist()
-    hits = np.concatenate([m.values for m in others])
+    leaking, *leak_free = means
+    names = np.concatenate([m.groups for m in leak_free]).tolist()
+    hits = np.concatenate([m.values for m in leak_free])
     clean = mean_of(classifier, hits, names, subject=features)
-    cost = spread_of([[given], [clean]], lambda m: m[..., 0] - m[..., 1])
-    a, b = given.score, clean.score
+    cost = spread_of([[leaking], [clean]], lambda m: m[..., 0] - m[..., 1])
+    a, b = leaking.score, clean.score
     intervals = a.interval, b.interval, cost.interval(-1, 1)
     return ImpactRow(
         features, classifier, float(a), float(b), cost.value, *intervals, chance, group

@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from palpate.core import FeatureSet, PalpateError, Progress, quiet, rng_for
+from palpate.core import FeatureSet, Progress, quiet, require, rng_for
 from palpate.data.images import cached_images
 from palpate.data.manifest import Manifest
 
@@ -87,10 +87,9 @@ def pixel_sources(
         name: manifest.table[name].null_count() for name in ("tactile", "vision", "background")
     }
     present = [name for name in ("tactile", "vision") if nulls[name] < len(manifest)]
-    if not present:
-        fix = "Import the data set with its images (palpate import), and take the import"
-        must = "Pixels as features need vision or tactile images"
-        raise PalpateError(must, "names alone", fix)
+    fix = "Import the data set with its images (palpate import), and take the import"
+    must = "Pixels as features need vision or tactile images"
+    require(len(present) > 0, None, must, "names alone", fix=fix)
     sources: list[Source] = []
     for name in present:
         images = cached_images(manifest, name, SIZE, cache, progress)
@@ -107,13 +106,13 @@ def given_sources(features: Mapping[str, FeatureSet], ids: Sequence[str]) -> lis
     Raises:
         PalpateError: if some have none.
     """
-    return [_given(name, known.take(ids)) for name, known in features.items()]
+    return [_given(name, rows.take(ids)) for name, rows in features.items()]
 
 
-def _given(name: str, known: FeatureSet) -> Source:
-    x = known.features.astype(np.float32, copy=False)
+def _given(name: str, rows: FeatureSet) -> Source:
+    x = rows.features.astype(np.float32, copy=False)
     unit = bool((np.abs(np.linalg.norm(x, axis=1) - 1) < UNIT).all())
-    return Source(name, x.shape[1], lambda at: x[at], not unit, known.encoder or _digest(x))
+    return Source(name, x.shape[1], lambda at: x[at], not unit, rows.encoder or _digest(x))
 
 
 def _pixels(name: str, images: NDArray[np.uint8], *less: NDArray[np.uint8]) -> Source:
