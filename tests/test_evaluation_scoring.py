@@ -15,7 +15,7 @@ from forge.scores import DIM, FRAMES, GROUPS, IDS, by_key, codes, feature_sets, 
 from palpate.core import FeatureSet, PalpateError, Score, Split
 from palpate.core.score import require_comparable
 from palpate.data.manifest import Manifest
-from palpate.evaluation import companions, inputs, score, scoring
+from palpate.evaluation import companions, family, samples, score, scoring_run
 from palpate.evaluation.controls import matched_features
 from palpate.metrics import Polynomial, compare, contact_scores, distance, i_tmmd, ssim
 from palpate.metrics.distributions import prdc_rows
@@ -204,7 +204,7 @@ def test_collapse_and_copies_are_noted():
 
 def test_of_many_rows_only_fid_is_computed_by_default(monkeypatch):
     monkeypatch.setattr(companions, "MANY", 10)
-    monkeypatch.setattr(scoring, "MANY", 10)
+    monkeypatch.setattr(family, "MANY", 10)
     results = score({"g": SETS["far"]}, SETS["real"], permutations=0)
     assert {m for m, _, _ in by_key(results) if "(embeddings)" in m} == {"FID (embeddings)"}
     assert [n.params.get("name") for n in results.notes] == [None, "kid", "prdc"]
@@ -575,12 +575,12 @@ def test_an_interrupted_run_goes_on_from_its_embeddings(
     cache = tmp_path / "cache"
     with monkeypatch.context() as stop:
         stop.setattr(
-            scoring, "score_family", lambda *_, **__: (_ for _ in ()).throw(KeyboardInterrupt)
+            scoring_run, "score_family", lambda *_, **__: (_ for _ in ()).throw(KeyboardInterrupt)
         )
         with pytest.raises(KeyboardInterrupt):
             score(made, small_manifest, cache=cache, **options)
     assert len([*cache.rglob("tactile-*.npz")]) == 3
-    monkeypatch.setattr(inputs, "IN_MEMORY", 0)  # every image in a file of the cache
+    monkeypatch.setattr(samples, "IN_MEMORY", 0)  # every image in a file of the cache
     monkeypatch.setattr(type(mini), "encode", lambda *_, **__: pytest.fail("embedded again"))
     again = by_key(score(made, small_manifest, cache=cache, **options))
     assert again.keys() == plain.keys()
@@ -594,7 +594,7 @@ def test_another_image_of_the_same_name_size_and_time_is_not_taken_from_the_cach
     tmp_path, monkeypatch, small_manifest, column
 ):
     """Decoded images in a cache are of the bytes of now."""
-    monkeypatch.setattr(inputs, "IN_MEMORY", 0)
+    monkeypatch.setattr(samples, "IN_MEMORY", 0)
     some = small_manifest.take(small_manifest.ids[:4])
     paths = [tmp_path / "root" / f"{column}{k}.bmp" for k in range(4)]
     for path, old in zip(paths, some.paths(column), strict=True):
