@@ -106,17 +106,12 @@ def slow_nce(a, b, scale, target):
 def test_loss_equals_the_slow_loop():
     a, b, c = unit(6, 4, seed=1), unit(6, 4, seed=2), unit(6, 4, seed=3)
     words = torch.tensor([0, 1, 0, 2, 1, 0])
-    soft = np.array(
-        [
-            [(words[i] == words[j]).item() / (words == words[i]).sum().item() for j in range(6)]
-            for i in range(6)
-        ]
-    )
+    same = [[float(words[i] == words[j]) for j in range(6)] for i in range(6)]
+    soft = np.array([[value / sum(row) for value in row] for row in same])
     assert torch.allclose(soft_targets(words).double(), torch.tensor(soft), atol=1e-7)
-    assert float(info_nce(a, b, 7.0)) == pytest.approx(slow_nce(a, b, 7.0, np.eye(6)), abs=1e-5)
-    assert float(info_nce(a, b, 7.0, soft_targets(words))) == pytest.approx(
-        slow_nce(a, b, 7.0, soft), abs=1e-5
-    )
+    plain, shared = info_nce(a, b, 7.0), info_nce(a, b, 7.0, soft_targets(words))
+    assert float(plain) == pytest.approx(slow_nce(a, b, 7.0, np.eye(6)), abs=1e-5)
+    assert float(shared) == pytest.approx(slow_nce(a, b, 7.0, soft), abs=1e-5)
     # arguments in the order tactile, text, vision
     parts = {
         "tactile_text": slow_nce(a, b, 7.0, soft),
@@ -274,17 +269,11 @@ def test_gradient_goes_to_the_tactile_encoder_and_the_temperature_only(world):
     scale = clamped_scale(model.log_scale)
     embedded = encode_tactile(model.tactile, pixels)
     three_way(embedded, text, vision, scale, torch.arange(6))[0].backward()
-    moved = {
-        name
-        for name, p in model.named_parameters()
-        if p.grad is not None and p.grad.abs().max() > 0
-    }
-    silent = {name for name, _ in model.named_parameters()} - moved
-    assert "log_scale" in moved
-    assert "tactile.visual_projection.weight" in moved
-    assert all(
-        "post_layernorm" in name or "k_proj.bias" in name for name in silent
-    )  # a key bias cancels in the softmax
+    weights = dict(model.named_parameters())
+    moved = {k for k, p in weights.items() if p.grad is not None and p.grad.abs().max() > 0}
+    assert {"log_scale", "tactile.visual_projection.weight"} <= moved
+    # A key bias cancels in the softmax.
+    assert all("post_layernorm" in k or "k_proj.bias" in k for k in weights.keys() - moved)
     assert all(p.grad is None for p in clip.clip.parameters())
     assert float(scale.detach()) == pytest.approx(1 / 0.07, rel=1e-5)
 
@@ -313,27 +302,16 @@ def test_training_moves_the_tactile_encoder_alone_and_records_its_data(world, cl
     split = by_video(world)
     before = clip.digest("vision"), clip.digest("text")
     encoders = train_tactile(world, split, clip, quick(), run(tmp_path / "a"))
-    assert (
-        (clip.digest("vision"), clip.digest("text"))
-        == before
-        == (encoders.digest("vision"), encoders.digest("text"))
-    )
-    start = new_tactile(TINY.tactile_config(clip.dim), seed=0)
-    assert not torch.equal(
-        start.visual_projection.weight, encoders.tactile.visual_projection.weight
-    )
+    for each in (clip, encoders):
+        assert (each.digest("vision"), each.digest("text")) == before
+    start = new_tactile(TINY.tactile_config(clip.dim), seed=0).visual_projection.weight
+    assert not torch.equal(start, encoders.tactile.visual_projection.weight)
     card = encoders.card
     assert card["split"] == split.digest
     assert card["train_manifest"] == world.part(split, "train").digest
     assert (card["train_samples"], card["steps"], card["text_source"]) == (18, 12, "manifest")
-    assert set(card["loss"][0]) == {
-        "step",
-        "loss",
-        "tactile_text",
-        "vision_text",
-        "tactile_vision",
-        "scale",
-    }
+    losses = {"loss", "tactile_text", "vision_text", "tactile_vision"}
+    assert set(card["loss"][0]) == {"step", "scale", *losses}
     assert card["targets"] == "identical-text"
     assert card["clip_card"]["split"] == split.digest
     encoders.save(tmp_path / "out")
@@ -426,23 +404,15 @@ def test_vision_goes_on_against_the_text_encoder_as_it_is(world, clip, tmp_path)
 
 def test_paper_preset_is_the_paper():
     paper = preset("paper")
-    assert (paper.tactile_course.epochs, paper.tactile_course.batch, paper.targets) == (
-        200,
-        256,
-        "diagonal",
-    )
-    options = paper.tactile_course.options(13_900, seed=0)
-    assert (options.steps, options.warmup, options.betas, options.lr) == (
-        10860,
-        543,
-        (0.9, 0.95),
-        1.5e-4,
-    )
+    course = paper.tactile_course
+    assert (course.epochs, course.batch, paper.targets) == (200, 256, "diagonal")
+    options = course.options(13_900, seed=0)
+    assert (options.steps, options.warmup, options.lr) == (10860, 543, 1.5e-4)
+    assert options.betas == (0.9, 0.95)
     with torch.device("meta"):
         tactile = contrastive.CLIPVisionModelWithProjection(paper.tactile_config(768))
-    assert (
-        sum(p.numel() for p in tactile.parameters()) == 303_966_208
-    )  # ViT-L/14 at 224 px with a 768-wide projection
+    # ViT-L/14 at 224 px with a 768-wide projection
+    assert sum(p.numel() for p in tactile.parameters()) == 303_966_208
     with pytest.raises(PalpateError, match="tiny, mini, tvl-tiny"):
         preset("huge")
 

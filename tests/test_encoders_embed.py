@@ -158,25 +158,21 @@ def test_arrays_and_files_agree_also_when_resized(world, encoders):
         rows.append({"id": str(k), "tactile": f"wide{k}.png"})
     result = embed(Manifest.from_rows(rows, world.root), encoders, "tactile")
     assert np.allclose(result.features, embed_images(images, encoders, "tactile"), atol=1e-6)
-    assert result.labels is None
-    assert result.groups is None
-
-
-def test_other_groups(world, encoders):
+    assert (result.labels, result.groups) == (None, None)
     assert list(embed(world, encoders, "tactile", groups="id").groups) == world.ids
 
 
 @pytest.mark.parametrize("cached", [True, False])
 def test_mistakes_are_explained(world, encoders, tmp_path, cached):
     cache = tmp_path / "cache" if cached else None
-    with pytest.raises(PalpateError, match="vision, text, tactile"):
-        embed(world, encoders, "smell", cache=cache)
-    with pytest.raises(PalpateError, match="must be samples"):
-        embed(world.take([]), encoders, "tactile", cache=cache)
-    with pytest.raises(PalpateError, match="`batch` must be at least 1"):
-        embed(world, encoders, "tactile", batch=0, cache=cache)
-    with pytest.raises(PalpateError, match="tactile encoder"):
-        embed(world, encoders.without_tactile(), "tactile", cache=cache)
+    for manifest, of, modality, batch, words in (
+        (world, encoders, "smell", 1, "vision, text, tactile"),
+        (world.take([]), encoders, "tactile", 1, "must be samples"),
+        (world, encoders, "tactile", 0, "`batch` must be at least 1"),
+        (world, encoders.without_tactile(), "tactile", 1, "tactile encoder"),
+    ):
+        with pytest.raises(PalpateError, match=words):
+            embed(manifest, of, modality, batch=batch, cache=cache)
     for k in (1, 8):  # in two batches: both are named
         world.paths("tactile")[k].write_bytes(b"no image")
     with pytest.raises(ProblemsError) as caught:

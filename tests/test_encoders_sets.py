@@ -56,21 +56,16 @@ def make_images(n=5, side=16):
 def test_tokenizer_ids_cut_and_determinism():
     tokenizer = train_tokenizer(TEXTS, vocabulary=300, context=16)
     assert (tokenizer.pad_token_id, tokenizer.bos_token_id, tokenizer.eos_token_id) == (0, 1, 3)
-    ids = tokenizer([*TEXTS, "", "ünïcödé 触覚"], padding=True, truncation=True, max_length=16)[
-        "input_ids"
-    ]
+    texts = [*TEXTS, "", "ünïcödé 触覚"]
+    ids = tokenizer(texts, padding=True, truncation=True, max_length=16)["input_ids"]
     assert all(row[0] == 1 and row.count(3) == 1 and 2 not in row and len(row) <= 16 for row in ids)
-    assert (
-        ids[1]
-        == tokenizer(["SMOOTH Cold METAL"], padding="max_length", max_length=len(ids[1]))[
-            "input_ids"
-        ][0]
+    upper = tokenizer(["SMOOTH Cold METAL"], padding="max_length", max_length=len(ids[1]))
+    assert upper["input_ids"] == [ids[1]]
+    fresh, again = (
+        train_tokenizer(texts, vocabulary=300, context=16).backend_tokenizer.to_str()
+        for texts in (TEXTS, [*reversed(TEXTS), TEXTS[0]])
     )
-    again = train_tokenizer([*reversed(TEXTS), TEXTS[0]], vocabulary=300, context=16)
-    assert (
-        again.backend_tokenizer.to_str()
-        == train_tokenizer(TEXTS, vocabulary=300, context=16).backend_tokenizer.to_str()
-    )
+    assert again == fresh
     for texts, size in (([" "], 300), (["a"], 100)):
         with pytest.raises(PalpateError):
             train_tokenizer(texts, vocabulary=size)
@@ -92,26 +87,15 @@ def test_saved_clip_is_a_standard_folder_with_equal_embeddings(clip, tmp_path):
     pixels = clip.preprocess("vision").normalize(to_unit(make_images()))
     tokens = tokenizer(TEXTS, padding=True, truncation=True, max_length=16, return_tensors="pt")
     with torch.no_grad():
-        out = plain(
-            input_ids=tokens["input_ids"],
-            attention_mask=tokens["attention_mask"],
-            pixel_values=pixels,
-        )
+        out = plain(**tokens, pixel_values=pixels)
     assert torch.equal(out.image_embeds, clip.encode("vision", pixels))
     assert torch.allclose(out.text_embeds, clip.encode("text", TEXTS), atol=1e-6)
     again = load_clip(tmp_path / "clip")
-    assert (again.preprocess("vision"), again.name, again.dim) == (
-        clip.preprocess("vision"),
-        "tiny",
-        8,
-    )
-    assert [again.digest(t) for t in ("vision", "text")] == [
-        clip.digest(t) for t in ("vision", "text")
-    ]
-    assert (
-        json.loads((tmp_path / "clip" / "tokenizer_config.json").read_text())["tokenizer_class"]
-        == "PreTrainedTokenizerFast"
-    )
+    assert (again.preprocesses, again.name, again.dim) == (clip.preprocesses, "tiny", 8)
+    for modality in ("vision", "text"):
+        assert again.digest(modality) == clip.digest(modality)
+    config = json.loads((tmp_path / "clip" / "tokenizer_config.json").read_text())
+    assert config["tokenizer_class"] == "PreTrainedTokenizerFast"
 
 
 def test_tensor_of_transformers_4_and_output_of_5_are_both_read(clip):
@@ -128,11 +112,9 @@ def test_encoders_survive_a_folder(encoders, tmp_path):
     again = EncoderSet.load(tmp_path / "set")
     assert again.card == {"preset": "tiny"}
     assert again.preprocesses == encoders.preprocesses
-    for encoder in ("vision", "tactile"):
-        assert np.array_equal(
-            embed_images(make_images(), again, encoder),
-            embed_images(make_images(), encoders, encoder),
-        )
+    for modality in ("vision", "tactile"):
+        first, second = (embed_images(make_images(), e, modality) for e in (again, encoders))
+        assert np.array_equal(first, second)
     assert np.array_equal(embed_texts(TEXTS, again), embed_texts(TEXTS, encoders))
     assert not [p for p in (tmp_path / "set").rglob("*") if p.suffix in (".bin", ".pt", ".pkl")]
     with pytest.raises(PalpateError, match="empty folder"):
@@ -146,11 +128,8 @@ def test_digest_changes_with_one_weight_and_with_preprocessing(encoders):
     assert len(set(before.values())) == 3
     with torch.no_grad():
         encoders.tactile.visual_projection.weight[0, 0] += 1e-6
-    assert encoders.digest("tactile") != before["tactile"]
-    assert (encoders.digest("vision"), encoders.digest("text")) == (
-        before["vision"],
-        before["text"],
-    )
+    changed = {m for m in before if encoders.digest(m) != before[m]}
+    assert changed == {"tactile"}
     with torch.no_grad():
         encoders.clip.text_model.embeddings.token_embedding.weight[5, 0] += 1e-6
     assert encoders.digest("text") != before["text"]
@@ -209,16 +188,22 @@ def test_folders_that_are_no_clip(clip, tmp_path, monkeypatch):
         load_clip("openai/clip-vit-base-patch32")
 
 
-def test_unknown_and_missing_encoders(clip, encoders):
-    for encoder in ("taste", "", "touch"):
-        with pytest.raises(PalpateError, match="vision, text, tactile"):
-            embed_images(make_images(), encoders, encoder)
-    with pytest.raises(PalpateError, match="must be vision or tactile for images"):
-        embed_images(make_images(), encoders, "text")
-    with pytest.raises(PalpateError, match="include a tactile encoder"):
-        embed_images(make_images(), clip, "tactile")
-    with pytest.raises(PalpateError, match="uint8"):
-        embed_images(make_images().astype(np.float32), encoders, "tactile")
+@pytest.mark.parametrize(
+    ("modality", "kind", "words"),
+    [
+        ("taste", np.uint8, "vision, text, tactile"),
+        ("", np.uint8, "vision, text, tactile"),
+        ("text", np.uint8, "must be vision or tactile for images"),
+        ("tactile", np.uint8, "include a tactile encoder"),
+        ("vision", np.float32, "uint8"),
+    ],
+)
+def test_unknown_and_missing_encoders(clip, modality, kind, words):
+    with pytest.raises(PalpateError, match=words):
+        embed_images(make_images().astype(kind), clip, modality)
+
+
+def test_devices():
     with pytest.raises(PalpateError, match="device"):
         pick_device("cuda:99")
     assert pick_device("cpu").type == "cpu"
@@ -228,10 +213,7 @@ def test_random_weights_belong_to_the_seed():
     torch.manual_seed(1)
     a = new_tactile(TINY.tactile_config(8), 5).state_dict()
     torch.manual_seed(2)
-    b, c = (
-        new_tactile(TINY.tactile_config(8), 5).state_dict(),
-        new_tactile(TINY.tactile_config(8), 6).state_dict(),
-    )
+    b, c = (new_tactile(TINY.tactile_config(8), seed).state_dict() for seed in (5, 6))
     assert all(torch.equal(a[k], b[k]) for k in a)
     assert not torch.equal(a["visual_projection.weight"], c["visual_projection.weight"])
 
@@ -241,11 +223,9 @@ def test_preprocess_equals_transformers_processor():
 
     ours = Preprocess(16, 20, (0.1, 0.2, 0.3), (0.4, 0.5, 0.6))
     config = {k: v for k, v in ours.to_config().items() if k != "image_processor_type"}
-    theirs = CLIPImageProcessorPil(**config)(
-        Image.fromarray(make_images(1, 40)[0]), return_tensors="pt"
-    )["pixel_values"]
-    mine = ours(to_unit(ours.fit(make_images(1, 40))))
-    assert torch.allclose(mine, theirs, atol=1e-5)
+    images = make_images(1, 40)
+    theirs = CLIPImageProcessorPil(**config)(Image.fromarray(images[0]), return_tensors="pt")
+    assert torch.allclose(ours(to_unit(ours.fit(images))), theirs["pixel_values"], atol=1e-5)
 
 
 def test_augmentation():
@@ -270,14 +250,12 @@ def test_augmentation():
         seen.update(match)
     assert len(seen) > 1
     lit = changed(Augment(crop=0, gain=0.3, offset=0.2), 4)
-    for image, result in zip(images, lit, strict=True):  # one straight line through all pixels
-        line = np.polyfit(image.flatten().numpy(), result.flatten().numpy(), 1)
-        assert np.allclose(
-            np.polyval(line, image.flatten().numpy()), result.flatten().numpy(), atol=1e-4
-        )
+    for image, result in zip(images.flatten(1).numpy(), lit.flatten(1).numpy(), strict=True):
+        line = np.polyfit(image, result, 1)  # one straight line through all pixels
+        assert np.allclose(np.polyval(line, image), result, atol=1e-4)
 
 
-def test_preprocess_reads_both_spellings_and_rejects_other_sizes(tmp_path):
+def test_preprocess_reads_both_spellings(tmp_path):
     def read(config, size):
         (tmp_path / "p.json").write_text(json.dumps(config))
         return Preprocess.from_config(tmp_path / "p.json", size)
@@ -291,11 +269,6 @@ def test_preprocess_reads_both_spellings_and_rejects_other_sizes(tmp_path):
     assert read({}, 64) == Preprocess(64, 64)
     made = Preprocess(24, 32, (0.1, 0.2, 0.3), (0.4, 0.5, 0.6))
     assert read(made.to_config(), 24) == made
-    with pytest.raises(PalpateError, match="224 px"):
-        read({"size": 336, "crop_size": 336}, 224)
-    for change in ({"size": "x"}, {"image_mean": [1]}, {"image_std": "abc"}):
-        with pytest.raises(PalpateError, match=r"p\.json must be those of an image processor"):
-            read(change, 224)
 
 
 def test_a_card_that_cannot_be_used_is_named(encoders, tmp_path):
@@ -327,6 +300,10 @@ def test_a_card_that_cannot_be_used_is_named(encoders, tmp_path):
         {"image_std": [0, 1, 1]},
         {"image_mean": [math.nan, 0, 0]},
         {"size": {"shortest_edge": 10**6}},
+        {"size": "x"},
+        {"image_mean": [1]},
+        {"image_std": "abc"},
+        {"size": 24, "crop_size": 24},
     ],
 )
 def test_an_image_processor_that_nobody_writes_is_refused(tmp_path, change):
