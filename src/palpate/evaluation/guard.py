@@ -67,14 +67,12 @@ def guard(
     dataset = str(getattr(images, "facts", {}).get("dataset") or "").lower()
     declared = [name for name in (origin.trained_on if origin else ()) if name.lower() in dataset]
     notes, got = list[Note](), ""
-    if seen.any():
-        params: dict[str, Any] = {"modality": modality, "seen": int(seen.sum()), "n": len(seen)}
-        notes = [Note("seen-images", params)]
-        got = f"{params['seen']:,} of {len(seen):,} that it was trained on"
-    elif declared:
-        params = {"modality": modality, "dataset": " and ".join(declared)}
-        notes = [Note("seen-dataset", params)]
-        got = f"images of {params['dataset']}, with which its authors trained it"
+    if count := int(seen.sum()):
+        notes.append(Note("seen-images", {"modality": modality, "seen": count, "n": len(seen)}))
+        got = f"{count:,} of {len(seen):,} that it was trained on"
+    elif dataset := " and ".join(declared):
+        notes.append(Note("seen-dataset", {"modality": modality, "dataset": dataset}))
+        got = f"images of {dataset}, with which its authors trained it"
     if notes and not allow_seen:
         must = f"The {modality} encoder must judge images that it has not seen"
         fix = "Judge other images or use another encoder, or allow it: every score then says so"

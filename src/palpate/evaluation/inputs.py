@@ -14,7 +14,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
-from palpate.core import Note, PalpateError, Split, require
+from palpate.core import Note, PalpateError, Split, require, require_rows
 from palpate.evaluation.embedding_files import GROUPS, LABELS, first_of, require_ids, text_column
 from palpate.evaluation.samples import Samples, picked
 from palpate.evaluation.sources import KINDS, Source, is_image_file, read, without_suffix
@@ -280,11 +280,9 @@ def _test_part(
     ids, wanted = {*samples.ids}, {*real.ids}
     if samples.numbered or ids.isdisjoint(everything.ids):
         return samples, []
-    missing = [i for i in real.ids if i not in ids]
     must = f"{name!r} must have every sample of the split's test part"
-    got = f"{len(missing)} of {len(wanted)} missing, first {next(iter(missing), '')!r}"
     fix = "Generate these too, or pass the split it was generated for"
-    require(not missing, None, must, got, fix=fix)
+    require_rows(samples.ids, real.ids, must, fix)
     part = samples.take([i for i in samples.ids if i in wanted])
     skipped = {"name": name, "skipped": len(samples) - len(part), "n": len(samples)}
     return part, [Note("outside-test-part", skipped)] if skipped["skipped"] else []
