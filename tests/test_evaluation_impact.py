@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 import subprocess
 import sys
@@ -27,19 +28,11 @@ from palpate.report.results import Impact
 
 def videos(materials: int = 4, each: int = 5, frames: int = 6, **columns: object) -> Manifest:
     """``each`` videos a material, ``frames`` frames a video, no pictures."""
-    rows = [
-        {
-            "id": f"v{m}.{v}/{k}",
-            "video": f"v{m}.{v}",
-            "frame": k,
-            "contact": f"v{m}.{v}#{k // 3}",
-            "material": f"M{m}",
-            **columns,
-        }
-        for m in range(materials)
-        for v in range(each)
-        for k in range(frames)
-    ]
+    rows = []
+    for m, v, k in itertools.product(range(materials), range(each), range(frames)):
+        video = f"v{m}.{v}"
+        contact = {"contact": f"{video}#{k // 3}", "material": f"M{m}"}
+        rows.append({"id": f"{video}/{k}", "video": video, "frame": k, **contact, **columns})
     return Manifest.from_rows(rows, Path())
 
 
@@ -88,10 +81,7 @@ def test_thinning_keeps_every_class_and_the_shares_of_groups() -> None:
 
 def test_nearest_hits_are_those_of_brute_force(monkeypatch: pytest.MonkeyPatch) -> None:
     rng = np.random.default_rng(0)
-    x, z = (
-        rng.standard_normal((37, 5)).astype(np.float32),
-        rng.standard_normal((83, 5)).astype(np.float32),
-    )
+    x, z = (rng.standard_normal((n, 5)).astype(np.float32) for n in (37, 83))
     y, w = rng.integers(0, 3, 37), rng.integers(0, 4, 83)
     expected = [
         float(w[((z.astype(float) - row) ** 2).sum(axis=1).argmin()] == label)
@@ -145,12 +135,8 @@ def test_directions_without_spread_in_train_are_left_out() -> None:
 def test_a_leak_of_known_worth() -> None:
     """Features that name the video alone: 1-NN is right when it saw the video, else it guesses."""
     manifest = videos()
-    found = impact(
-        manifest,
-        by_frame(manifest),
-        features={"video": one_hot(manifest.column("video"))},
-        seeds=(0, 1),
-    )
+    features = {"video": one_hot(manifest.column("video"))}
+    found = impact(manifest, by_frame(manifest), features, seeds=(0, 1))
     row = found.rows[0]
     # A new video is equally far from all train rows, a quarter of which have its material.
     assert (row.features, row.classifier, row.given, row.chance) == ("video", "1-NN", 1.0, 0.25)
@@ -164,15 +150,9 @@ def test_a_leak_of_known_worth() -> None:
 
 def test_no_leak_costs_nothing_where_the_material_is_known() -> None:
     manifest = videos()
-    found = impact(
-        manifest,
-        by_frame(manifest),
-        features={"material": one_hot(manifest.column("material"))},
-        seeds=(0,),
-    )
-    assert [(r.given, r.clean, r.cost, r.cost_interval) for r in found.rows] == [
-        (1.0, 1.0, 0.0, None)
-    ] * 2
+    features = {"material": one_hot(manifest.column("material"))}
+    rows = impact(manifest, by_frame(manifest), features, seeds=(0,)).rows
+    assert [(r.given, r.clean, r.cost, r.cost_interval) for r in rows] == [(1, 1, 0, None)] * 2
 
 
 def test_a_run_is_the_explicit_one() -> None:
@@ -230,18 +210,12 @@ def test_both_sides_get_the_same_materials_and_as_many_train_samples() -> None:
     manifest = Manifest.from_rows(
         [*base.table.iter_rows(named=True), *lone, *unknown, *onesided], Path()
     )
-    found = impact(
-        manifest,
-        by_frame(manifest),
-        features={"v": one_hot(manifest.column("video"))},
-        seeds=(0, 1),
-    )
+    features = {"v": one_hot(manifest.column("video"))}
+    found = impact(manifest, by_frame(manifest), features, seeds=(0, 1))
     assert found.settings["materials"] == ["M0", "M1", "M2"]
     assert found.rows[0].chance == pytest.approx(1 / 3)
-    assert found.settings["left_out"] == {
-        "Lone": "one video",
-        "Trained": "not in test of the given split",
-    }
+    left_out = {"Lone": "one video", "Trained": "not in test of the given split"}
+    assert found.settings["left_out"] == left_out
     assert (found.rows[0].given, found.settings["test_samples"][0]) == (1.0, 24)
     assert found.settings["train_samples"] <= 48
     notes = {note.code: note.params for note in found.notes}
@@ -256,12 +230,8 @@ def test_features_may_be_sets_by_id_and_keep_cosine_order() -> None:
     x /= np.linalg.norm(x, axis=1, keepdims=True)
     back = np.arange(len(manifest))[::-1]
     given = FeatureSet([manifest.ids[k] for k in back], x[back], encoder="encoder")
-    found = impact(
-        manifest,
-        by_frame(manifest),
-        features={"set": given, "array": x, "scaled": 3 * x},
-        seeds=(0,),
-    )
+    features = {"set": given, "array": x, "scaled": 3 * x}
+    found = impact(manifest, by_frame(manifest), features, seeds=(0,))
     assert [r.features for r in found.rows] == ["set", "set", "array", "array", "scaled", "scaled"]
     assert found.settings["features"]["set"] == "encoder"
     assert [r.given for r in found.rows[:2]] == [r.given for r in found.rows[2:4]]
@@ -270,20 +240,13 @@ def test_features_may_be_sets_by_id_and_keep_cosine_order() -> None:
 def test_each_kind_of_pixels_has_a_row(small_manifest: Manifest, tmp_path: Path) -> None:
     split = by_frame(small_manifest, every=4)
     found = impact(small_manifest, split, seeds=(0,), cache=tmp_path / "cache")
-    assert [r.features for r in found.rows[::2]] == [
-        "tactile pixels",
-        "tactile minus background",
-        "vision pixels",
-    ]
+    kinds = ["tactile pixels", "tactile minus background", "vision pixels"]
+    assert [r.features for r in found.rows[::2]] == kinds
     assert [found.rows[k].clean for k in (0, 4)] == [1.0, 1.0]  # brightness is the material there
     assert found.headline.startswith("1-NN on tactile pixels: ")
     assert len(list((tmp_path / "cache").iterdir())) == 3
-    bare = Manifest(
-        small_manifest.table.with_columns(background=None, vision=None).cast(
-            small_manifest.table.schema
-        ),
-        small_manifest.root,
-    )
+    table = small_manifest.table.with_columns(background=None, vision=None)
+    bare = Manifest(table.cast(small_manifest.table.schema), small_manifest.root)
     again = impact(bare, split, seeds=(0,))
     assert [r.features for r in again.rows] == ["tactile pixels"] * 2
     assert again.rows[0] == found.rows[0]
@@ -297,10 +260,8 @@ def test_tactile_minus_background_is_the_difference(small_manifest: Manifest) ->
         [np.asarray(Image.open(small_manifest.paths(c)[k]), float) for k in at]
         for c in ("tactile", "background")
     ]
-    np.testing.assert_array_equal(
-        by_name["tactile minus background"].reshape(2, 32, 32, 3),
-        np.array(raw[0]) - np.array(raw[1]),
-    )
+    difference = by_name["tactile minus background"].reshape(2, 32, 32, 3)
+    np.testing.assert_array_equal(difference, np.array(raw[0]) - np.array(raw[1]))
 
 
 def test_a_leak_free_split_is_not_charged() -> None:
@@ -311,31 +272,30 @@ def test_a_leak_free_split_is_not_charged() -> None:
     assert found.rows[0].cost == pytest.approx(0, abs=0.02)
 
 
-def refuse(match: str, manifest: Manifest, split: Split | None = None, **options: object) -> None:
-    with pytest.raises(PalpateError, match=match):
-        impact(
-            manifest,
-            split or by_frame(manifest),
-            **{"features": {"v": np.eye(len(manifest))}, **options},
-        )
+GOOD = videos(2, 3, 4)
+FEW = FeatureSet(GOOD.ids[:20], np.zeros((20, 2), np.float32))
 
 
-def test_bad_input_is_refused_in_words() -> None:
-    good = videos(2, 3, 4)
-    refuse("needs materials", videos(2, 3, 4, material=None))
-    refuse("two materials .* Got 1 material", videos(1, 3, 4))
-    refuse("Got 0 of 2 .2 one video.*group='contact'", videos(2, 1, 6))
-    refuse("needs a video. Got 24 without", videos(2, 3, 4, video=None))
-    refuse("train part must hold samples", good, Split(dict.fromkeys(good.ids, "test")))
-    refuse("must be in the manifest", good, Split({**by_frame(good).parts, "elsewhere": "train"}))
-    refuse("must be one of", good, group="color")
-    refuse("must hold features", good, features={})
-    refuse(
-        "missing, first",
-        good,
-        features={"x": FeatureSet(good.ids[:20], np.zeros((20, 2), np.float32))},
-    )
-    refuse("vision or tactile", good, features="pixels")
+@pytest.mark.parametrize(
+    ("manifest", "split", "options", "words"),
+    [
+        (videos(2, 3, 4, material=None), None, {}, "needs materials"),
+        (videos(1, 3, 4), None, {}, "two materials .* Got 1 material"),
+        (videos(2, 1, 6), None, {}, "Got 0 of 2 .2 one video.*group='contact'"),
+        (videos(2, 3, 4, video=None), None, {}, "needs a video. Got 24 without"),
+        (GOOD, dict.fromkeys(GOOD.ids, "test"), {}, "train part must hold samples"),
+        (GOOD, {**by_frame(GOOD).parts, "else": "train"}, {}, "must be in the manifest"),
+        (GOOD, None, {"group": "color"}, "must be one of"),
+        (GOOD, None, {"features": {}}, "must hold features"),
+        (GOOD, None, {"features": {"x": FEW}}, "missing, first"),
+        (GOOD, None, {"features": "pixels"}, "vision or tactile"),
+    ],
+)
+def test_bad_input_is_refused_in_words(manifest, split, options, words) -> None:
+    features = {"features": {"v": np.eye(len(manifest))}}
+    parts = by_frame(manifest) if split is None else Split(split)
+    with pytest.raises(PalpateError, match=words):
+        impact(manifest, parts, **(features | options))
 
 
 def test_missing_and_broken_pictures_are_named(small_manifest: Manifest) -> None:
@@ -344,27 +304,18 @@ def test_missing_and_broken_pictures_are_named(small_manifest: Manifest) -> None
     with pytest.raises(ProblemsError) as error:
         impact(small_manifest, split)
     assert [p.where for p in error.value.problems] == [str(small_manifest.paths("tactile")[5])]
-    some = small_manifest.column("vision")
-    some[2] = None
-    holes = Manifest.from_rows(
-        [
-            {**r, "vision": v}
-            for r, v in zip(small_manifest.table.iter_rows(named=True), some, strict=True)
-        ],
-        small_manifest.root,
-    )
     small_manifest.paths("tactile")[5].write_bytes(small_manifest.paths("tactile")[6].read_bytes())
-    with pytest.raises(
-        PalpateError, match=r"Every sample must have a vision image here\. Got 1 without"
-    ):
-        impact(holes, split)
+    rows = small_manifest.table.to_dicts()
+    rows[2]["vision"] = None
+    words = r"Every sample must have a vision image here\. Got 1 without"
+    with pytest.raises(PalpateError, match=words):
+        impact(Manifest.from_rows(rows, small_manifest.root), split)
 
 
 def test_features_without_any_spread_give_chance() -> None:
     manifest = videos(4, 4, 3)
-    found = impact(
-        manifest, by_frame(manifest), features={"flat": np.ones((len(manifest), 5))}, seeds=(0,)
-    )
+    features = {"flat": np.ones((len(manifest), 5))}
+    found = impact(manifest, by_frame(manifest), features, seeds=(0,))
     assert (found.rows[0].given, found.rows[0].clean) == pytest.approx((0.25, 0.25), abs=0.01)
 
 
@@ -391,9 +342,8 @@ sys.exit("torch" in sys.modules)
 def test_the_five_real_clips_can_be_compared_by_contact_only(
     real_data: Path, tmp_path: Path
 ) -> None:
-    manifest = import_dataset(
-        real_data / "touch_and_go" / "clips", tmp_path / "out", size=64, format="touch-and-go"
-    ).manifest
+    clips = real_data / "touch_and_go" / "clips"
+    manifest = import_dataset(clips, tmp_path / "out", size=64, format="touch-and-go").manifest
     split = by_frame(manifest, every=5)
     with pytest.raises(PalpateError, match=r"Got 0 of 5 .5 one video.*group='contact'"):
         impact(manifest, split)
