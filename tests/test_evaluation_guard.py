@@ -154,13 +154,8 @@ def test_going_on_from_an_encoder_keeps_what_it_saw(trained, small_manifest, tmp
         result = train_tactile(small_manifest, later, start, short, run, start=begin)
         encoder = Encoder(result, "tactile")
         assert result.knows_seen("tactile") == known
-        videos = {
-            v
-            for v, s in zip(
-                small_manifest.column("video"), encoder.saw(small_manifest), strict=True
-            )
-            if s
-        }
+        saw = zip(small_manifest.column("video"), encoder.saw(small_manifest), strict=True)
+        videos = {video for video, seen in saw if seen}
         assert videos == ({"v0", "v1", "v2", "v3"} if known else {"v3"})
 
 

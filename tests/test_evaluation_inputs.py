@@ -207,18 +207,16 @@ def test_what_is_known_of_some_samples_only_is_an_error(generated, keywords, wor
 
 
 def test_a_split_selects_the_test_part_of_every_set():
-    split = Split.from_ids(
-        train=ROWS[:2], test=ROWS[2:], rule={"group": "contact"}, manifest="m" * 64
-    )
+    parts, rule = {"train": ROWS[:2], "test": ROWS[2:]}, {"group": "contact"}
+    split = Split.from_ids(**parts, rule=rule, manifest="m" * 64)
     inputs = aligned({"all": sets(), "own": sets(list("abcd"))}, sets(ROWS, MATERIALS), split=split)
     assert inputs.reference.ids == inputs.generators["all"].ids == ROWS[2:]
     assert (inputs.train.ids, inputs.group) == (ROWS[:2], "contact")
     assert inputs.generators["own"].ids == list("abcd")  # ids of its own cannot be parted
     [note] = inputs.notes
     assert (note.code, note.params["skipped"]) == ("outside-test-part", 2)
-    with pytest.raises(
-        PalpateError, match=r"every sample of the split's test part\. Got 1 of 2 missing"
-    ):
+    words = r"every sample of the split's test part\. Got 1 of 2 missing"
+    with pytest.raises(PalpateError, match=words):
         aligned({"some": sets(ROWS[:3])}, sets(), split=split)
     with pytest.raises(PalpateError, match="must go with a reference that has ids"):
         aligned(X, X, split=split)
@@ -231,23 +229,20 @@ def test_images_pair_by_relative_name_whatever_the_suffix(tmp_path):
     paint(tmp_path / "made", [".hidden/1"], 1)
     inputs = aligned(tmp_path / "made", tmp_path / "real")
     assert sorted(inputs.generators["made"].ids) == sorted(inputs.reference.ids) == sorted(names)
-    listed = Manifest.from_rows(
-        [{"id": f"{n}.bmp", "tactile": f"{n}.bmp"} for n in names], tmp_path / "real"
-    )
+    files = [f"{name}.bmp" for name in names]
+    rows = [{"id": file, "tactile": file} for file in files]
+    listed = Manifest.from_rows(rows, tmp_path / "real")
     inputs = aligned(tmp_path / "made", listed)
     assert sorted(inputs.generators["made"].ids) == sorted(listed.ids)
     paint(tmp_path / "made", ["a/1"], 2, ".bmp")
-    with pytest.raises(
-        PalpateError, match=r"differ in name, suffixes aside\. Got 'a/1\.bmp' and 'a/1\.png'"
-    ):
+    words = r"differ in name, suffixes aside\. Got 'a/1\.bmp' and 'a/1\.png'"
+    with pytest.raises(PalpateError, match=words):
         aligned(tmp_path / "made", listed)
 
 
 def test_images_take_videos_and_materials_of_the_reference_by_id(tmp_path):
-    rows = [
-        {"id": i, "tactile": "x", "video": i[0], "material": i[0].upper()}
-        for i in ("c/1", "a/0", "b/1")
-    ]
+    cells = {i: {"video": i[0], "material": i[0].upper()} for i in ("c/1", "a/0", "b/1")}
+    rows = [{"id": i, "tactile": "x", **more} for i, more in cells.items()]
     real = Manifest.from_rows(rows, tmp_path)
     paint(tmp_path / "made", ["a/0", "b/1"], 0)
     samples = aligned(tmp_path / "made", real).generators["made"]
@@ -258,13 +253,8 @@ def test_images_take_videos_and_materials_of_the_reference_by_id(tmp_path):
 def test_a_folder_of_generate_may_not_name_files_outside_it(tmp_path, name):
     pytest.importorskip("torch")
     paint(tmp_path / "out" / "images", ["1"], 1)
-    index = {
-        "format": "palpate-generated/1",
-        "complete": True,
-        "settings": {"split": "s"},
-        "digest": "",
-    }
-    index |= {"notice": "", "skipped": [], "images": {"a": name}}
+    index = {"format": "palpate-generated/1", "complete": True, "settings": {"split": "s"}}
+    index |= {"digest": "", "notice": "", "skipped": [], "images": {"a": name}}
     (tmp_path / "out" / "index.json").write_text(json.dumps(index))
     if name == "1.png":
         samples = read(tmp_path / "out", "x")

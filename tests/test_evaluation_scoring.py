@@ -31,10 +31,9 @@ FAST = {"companions": [], "permutations": 0, "sigma": 10}
 def pairwise_mean(x, y, kernel, groups, same):
     """Mean of the kernel over pairs, by two loops; pairs of one group are excluded."""
     pairs = [(i, j) for i in range(len(x)) for j in range(len(y))]
-    kept = [
-        (i, j) for i, j in pairs if not (same and i == j) and (not groups or groups[i] != groups[j])
-    ]
-    return np.mean([kernel(x[i], y[j]) for i, j in kept])
+    pairs = [(i, j) for i, j in pairs if not (same and i == j)]
+    pairs = [(i, j) for i, j in pairs if not groups or groups[i] != groups[j]]
+    return np.mean([kernel(x[i], y[j]) for i, j in pairs])
 
 
 def mmd2(x, y, kernel, groups=None):
@@ -54,13 +53,12 @@ def test_embeddings_agree_with_loops_and_with_the_library():
     def cubic(a, b):
         return 1000 * (a @ b / DIM + 1) ** 3
 
-    assert scores["TMMD", "far", "paper"].value == pytest.approx(mmd2(x, y, gauss), abs=1e-6)
-    assert scores["TMMD", "far", "grouped"].value == pytest.approx(
-        mmd2(x, y, gauss, GROUPS), abs=1e-6
-    )
-    assert scores["KID (embeddings)", "far", None].value == pytest.approx(
-        mmd2(x, y, cubic), rel=1e-9
-    )
+    for key, want in {
+        ("TMMD", "far", "paper"): mmd2(x, y, gauss),
+        ("TMMD", "far", "grouped"): mmd2(x, y, gauss, GROUPS),
+        ("KID (embeddings)", "far", None): mmd2(x, y, cubic),
+    }.items():
+        assert scores[key].value == pytest.approx(want, rel=1e-9, abs=1e-6)
     library = compare(made, SETS["real"], floor=SETS["real"], preset="grouped")
     for s in [*library.scores, *library.differences]:
         got = scores[label_of(s), subject_of(s), "grouped"]
@@ -99,12 +97,9 @@ def test_differences_of_precision_take_the_groups_of_the_rows_they_average():
     real = FeatureSet(names, SETS["real"].features[:few], None, videos, "e" * 64)
     scores = by_key(score(made, real, companions=["prdc"], permutations=0))
     rows = [prdc_rows(SETS[name], real)[1] for name in ("near", "far")]
-    for metric, groups in (
-        ("Precision", GROUPS),
-        ("Density", GROUPS),
-        ("Recall", videos),
-        ("Coverage", videos),
-    ):
+    per_generated, per_real = ("Precision", "Density"), ("Recall", "Coverage")
+    for metric in (*per_generated, *per_real):
+        groups = GROUPS if metric in per_generated else videos
         delta = rows[0][metric] - rows[1][metric]
         got = scores[f"{metric} (embeddings) difference", "a - b", None]
         assert got.value == pytest.approx(delta.mean(), abs=1e-12)
@@ -131,10 +126,8 @@ def test_bare_arrays_have_no_groups_and_pair_by_row():
 def test_a_generator_in_another_order_takes_labels_and_groups_from_the_reference():
     order = np.random.default_rng(0).permutation(len(IDS))
     bare = FeatureSet([IDS[k] for k in order], SETS["far"].features[order])
-    want, got = (
-        by_key(score({"g": s}, SETS["real"], presets=["grouped"], **FAST))
-        for s in (SETS["far"], bare)
-    )
+    options = {"presets": ["grouped"], **FAST}
+    want, got = (by_key(score({"g": s}, SETS["real"], **options)) for s in (SETS["far"], bare))
     assert want.keys() == got.keys()
     for key, s in want.items():
         assert got[key].value == pytest.approx(s.value, abs=1e-6), key
@@ -142,9 +135,8 @@ def test_a_generator_in_another_order_takes_labels_and_groups_from_the_reference
 
 def test_several_bandwidths_have_names_of_their_own():
     made = {name: SETS[name] for name in ("near", "far")}
-    scores = by_key(
-        score(made, SETS["real"], sigma=[10, 1, "median", "multi"], companions=["cmmd"])
-    )
+    options = {"sigma": [10, 1, "median", "multi"], "companions": ["cmmd"]}
+    scores = by_key(score(made, SETS["real"], **options))
     x, y = SETS["far"].features, SETS["real"].features
     narrow = scores["TMMD (σ = 1)", "far", "paper"].value
     assert narrow == pytest.approx(distance(x, y, sigma=1).value, abs=1e-6)
@@ -173,17 +165,14 @@ def test_the_excess_has_a_floor_where_the_whole_score_has_none():
     real = SETS["real"]
     scores = by_key(score({"g": SETS["near"]}, real, presets=["grouped"], **FAST))
     whole, excess = scores["I-TMMD", "g", "grouped"], scores["I-TMMD E", "g", "grouped"]
-    assert (excess.value, excess.interval) == (
-        whole.details["E"],
-        tuple(whole.details["E_interval"]),
-    )
+    assert excess.value == whole.details["E"]
+    assert excess.interval == tuple(whole.details["E_interval"])
     assert whole.floor == pytest.approx(i_tmmd(real).value, abs=1e-9)
     few = real.take([i for i, g in zip(IDS, GROUPS, strict=True) if g in sorted({*GROUPS})[::2]])
     scores = by_key(score({"a": SETS["near"], "b": SETS["far"]}, few, presets=["grouped"], **FAST))
     assert scores["I-TMMD", "a", "grouped"].floor is None  # another number of videos
-    assert scores["I-TMMD E", "a", "grouped"].floor == pytest.approx(
-        i_tmmd(few).details["E"], abs=1e-9
-    )
+    floor = scores["I-TMMD E", "a", "grouped"].floor
+    assert floor == pytest.approx(i_tmmd(few).details["E"], abs=1e-9)
     assert scores["I-TMMD difference", "a - b", "grouped"].details["better"] is None
 
 
@@ -191,9 +180,8 @@ def test_collapse_and_copies_are_noted():
     real = SETS["real"]
     mean = real.features.mean(axis=0)
     still = dataclasses.replace(real, features=unit(mean + 0.05 * real.features))
-    copied = dataclasses.replace(
-        real, features=np.vstack([real.features[:5], SETS["far"].features[5:]])
-    )
+    half = np.vstack([real.features[:5], SETS["far"].features[5:]])
+    copied = dataclasses.replace(real, features=half)
     results = score({"still": still, "copied": copied}, real, **FAST)
     notes = by_key(results)["TMMD", "copied", "paper"].notes
     [copies] = [n.params for n in notes if n.code == "copied-rows"]
@@ -302,10 +290,8 @@ def test_paired_differences_of_pixels_are_those_of_the_images(tmp_path, small_ma
     a, b = (paint(tmp_path / name, ids, seed) for seed, name in enumerate("ab", 5))
     made = [tmp_path / "a", tmp_path / "b"]
     scores = by_key(score(made, small_manifest, companions=["psnr", "ms-ssim", "contact"]))
-    real = {
-        i: np.asarray(Image.open(p))
-        for i, p in zip(ids, small_manifest.paths("tactile"), strict=True)
-    }
+    files = zip(ids, small_manifest.paths("tactile"), strict=True)
+    real = {i: np.asarray(Image.open(path)) for i, path in files}
 
     def psnr(x, i):
         return -10 * np.log10(((x[i] / 255 - real[i] / 255) ** 2).mean())
@@ -315,12 +301,10 @@ def test_paired_differences_of_pixels_are_those_of_the_images(tmp_path, small_ma
     delta = {i: values[i] - psnr(b, i) for i in ids}
     difference = scores["PSNR difference", "a - b", None]
     assert difference.value == pytest.approx(np.mean([*delta.values()]), abs=1e-9)
-    means = [
-        np.mean([delta[i] for i, v in zip(ids, videos, strict=True) if v == w]) for w in {*videos}
-    ]
-    assert difference.details["p_value"] == pytest.approx(
-        stats.ttest_1samp(means, 0).pvalue, rel=1e-9
-    )
+    rows = [*zip(ids, videos, strict=True)]
+    means = [np.mean([delta[i] for i, v in rows if v == w]) for w in {*videos}]
+    p = stats.ttest_1samp(means, 0).pvalue
+    assert difference.details["p_value"] == pytest.approx(p, rel=1e-9)
     assert difference.details["better"] == ("a" if difference.value > 0 else "b")
     assert {"MS-SSIM", "contact residual", "contact IoU difference"} <= {m for m, _, _ in scores}
 
@@ -357,13 +341,11 @@ def test_unpaired_images_are_an_error_and_disjoint_ones_a_note(tmp_path):
     for seed, (name, ids) in enumerate({"real": "123", "some": "124", "other": "789"}.items()):
         paint(tmp_path / name, [*ids], seed)
     real = tmp_path / "real"
-    with pytest.raises(
-        PalpateError, match=r"some: .*1 not generated: '3'; 1 without reference: '4'"
-    ):
+    words = r"some: .*1 not generated: '3'; 1 without reference: '4'"
+    with pytest.raises(PalpateError, match=words):
         score(tmp_path / "some", real, companions=["ssim"])
-    results = score(
-        tmp_path / "other", real, encoder="palpate/mini", presets=["paper"], permutations=0
-    )
+    options = {"encoder": "palpate/mini", "presets": ["paper"], "permutations": 0}
+    results = score(tmp_path / "other", real, **options)
     assert "no-pairs" in codes(results)
     assert not {m for m, _, _ in by_key(results)} & {"SSIM", "PSNR"}
 
@@ -423,25 +405,15 @@ def test_images_are_embedded_and_scored_as_their_features(tmp_path, small_manife
         paint(tmp_path / name, small_manifest.ids, seed)
     results = score([tmp_path / "a", tmp_path / "b"], small_manifest, encoder=mini, permutations=19)
     scores, real = by_key(results), embedded(small_manifest, mini)
-    rows = [
-        {"id": i, "tactile": f"{i}.png", "material": m, "video": v}
-        for i, m, v in zip(
-            *(small_manifest.column(c) for c in ("id", "material", "video")), strict=True
-        )
-    ]
+    table = small_manifest.table.select("id", "material", "video")
+    rows = [{**row, "tactile": f"{row['id']}.png"} for row in table.to_dicts()]
     made = embedded(Manifest.from_rows(rows, tmp_path / "a"), mini)
     for s in compare({"a": made}, real, floor=real, preset="grouped", permutations=19).scores:
         got = scores[label_of(s), "a", "grouped"].value
         assert got == pytest.approx(s.value, rel=1e-6, abs=1e-6), label_of(s)
     metrics = {m for m, _, _ in scores}
-    for metric in (
-        "FID (tactile) difference",
-        "SSIM",
-        "MS-SSIM",
-        "contact residual",
-        "Precision (tactile)",
-    ):
-        assert metric in metrics
+    pixels = {"SSIM", "MS-SSIM", "contact residual"}
+    assert {"FID (tactile) difference", "Precision (tactile)", *pixels} <= metrics
     assert not [m for m in metrics if m.startswith(("CMMD", "LPIPS", "material"))]
     assert results.settings["digests"]["tactile encoder"] == mini.digest("tactile")
     assert len(results.gallery) == 40
@@ -460,12 +432,8 @@ def test_a_split_scores_controls_and_a_material_probe(tmp_path, small_manifest, 
     assert scores["TMMD", "g", "paper"].floor == pytest.approx(floor, abs=1e-6)
     controls = {"background only", "real, same material"}
     assert {subject for m, subject, _ in scores if m == "TMMD"} == {"g", *controls}
-    gel = embedded(
-        Manifest(
-            small_manifest.table.with_columns(tactile=pl.col("background")), small_manifest.root
-        ),
-        mini,
-    ).take(test.ids)
+    table = small_manifest.table.with_columns(tactile=pl.col("background"))
+    gel = embedded(Manifest(table, small_manifest.root), mini).take(test.ids)
     want = distance(gel.features, test.features).value
     assert scores["TMMD", "background only", "paper"].value == pytest.approx(want, abs=1e-4)
     probed = {subject for m, subject, _ in scores if m == "material accuracy"}
