@@ -14,12 +14,15 @@ from collections.abc import Collection
 from dataclasses import replace
 from itertools import cycle
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from palpate.core import FeatureSet, Progress, Score, rng_for
-from palpate.evaluation.companions import Features
-from palpate.evaluation.inputs import Inputs
-from palpate.evaluation.samples import Samples
 from palpate.metrics.probe import fit_probe, material_accuracy
+
+if TYPE_CHECKING:
+    from palpate.evaluation.companions import Features
+    from palpate.evaluation.inputs import Inputs
+    from palpate.evaluation.samples import Samples
 
 #: Rows of the tables that are not generators.
 BACKGROUND, SAME_MATERIAL, REAL = "background only", "real, same material", "real"
