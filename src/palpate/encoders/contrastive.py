@@ -60,16 +60,8 @@ from palpate.metrics.probe import material_accuracy
 from palpate.training.engine import Batch, Losses, Task, fit
 from palpate.training.estimate import estimate
 from palpate.training.options import Compute, LoopOptions
-from palpate.training.processes import (
-    agreed,
-    connect,
-    first_alone,
-    gather_rows,
-    keep_logs,
-    place,
-    work_folder,
-)
-from palpate.training.run import TrainingRun
+from palpate.training.processes import agreed, connect, first_alone, gather_rows, place
+from palpate.training.run import TrainingRun, run_for
 from palpate.training.steps import Step
 
 
@@ -116,22 +108,19 @@ def train_encoder(
     Raises:
         PalpateError: if the train part is empty, or a sample of it lacks an image.
     """
-    chosen, device = preset_of(preset, epochs), connect(device)
+    chosen = preset_of(preset, epochs)
     manifest, split = load(data), load_split(data, split)
-    output = None if output is None else Path(output)
-    with work_folder(output) as work:
-        cache = work / "cache"
-        run = TrainingRun(work / "tactile", cache, seed, device, compute or Compute(), progress)
+    with run_for(output, seed, device, compute, progress) as run:
         source = clip or chosen.pretrained
         if source is None:
-            source = train_clip(manifest, split, chosen, replace(run, folder=work / "clip"))
+            source = train_clip(manifest, split, chosen, run.stage("clip"))
         elif not isinstance(source, EncoderSet):
-            source = load_clip(source, device=device)
-        encoders = train_tactile(manifest, split, source, chosen, run)
+            source = load_clip(source)
+        encoders = train_tactile(manifest, split, source, chosen, run.stage("tactile"))
         parts = [_labeled(manifest.part(split, part)) for part in ("train", "test")]
         if len(parts[1]) and len(set(parts[0].column("material"))) > 1:
             with first_alone():
-                features = [embed(p, encoders, cache=cache, progress=progress) for p in parts]
+                features = [embed(p, encoders, cache=run.cache, progress=progress) for p in parts]
             score = material_accuracy(features[0], features[1], split=split.digest)
             row = {
                 "score": "linear probe of material, tactile",
@@ -141,9 +130,7 @@ def train_encoder(
                 "n": score.n,
             }
             encoders.card["scores"] = json.loads(json.dumps([row]))
-        if output is not None and place()[0] == 0:
-            encoders.save(output)
-            keep_logs(work, output)
+        run.keep(encoders, output)
     return encoders
 
 
@@ -248,7 +235,7 @@ def train_tactile(
     Raises:
         PalpateError: if the train part is empty, or a sample lacks a tactile image.
     """
-    where = pick_device(connect(run.device))
+    where = pick_device(connect(str(run.device)))
     train, held = train_part(manifest, split), manifest.part(split, "val")
     clip.to(where)
     with first_alone():
@@ -277,7 +264,7 @@ def train_tactile(
         "training the tactile encoder",
         len(train),
         lambda step: rows.load(step, course.augment),
-        TactileLoss(rows, preprocess, preset.targets, run.compute.chunk),
+        TactileLoss(rows, preprocess, preset.targets, _chunk(run)),
         digest_json([facts, _stamps(train)]),
         train.ids,
         None if held_rows is None else (len(held), held_rows.load),
@@ -294,6 +281,11 @@ def train_tactile(
         card=card,
         seen={**clip.seen, "tactile": seen},
     )
+
+
+def _chunk(run: TrainingRun) -> int | None:
+    """Rows that an encoder sees at a time."""
+    return run.compute.chunk if run.compute else None
 
 
 def _require_rows(
@@ -390,7 +382,7 @@ def train_clip(
         PalpateError: if the train part is empty or has one photo, ``start`` is no CLIP, or the
             preset takes a pretrained CLIP, or has this course keep the best weights or stop early.
     """
-    where = pick_device(connect(run.device))
+    where = pick_device(connect(str(run.device)))
     train = train_part(manifest, split)
     side = _sides(train)[0]
     pictured, course = _with_image(train, side), _clip_course(preset)
@@ -420,7 +412,7 @@ def train_clip(
 
     def loss(module: nn.Module, batch: Batch) -> Losses:
         pixels = preprocess(augmented(unit(batch["images"]), batch))
-        encoded = in_chunks(partial(encode_vision, module), pixels, run.compute.chunk)
+        encoded = in_chunks(partial(encode_vision, module), pixels, _chunk(run))
         some, inverse = torch.unique(batch["phrase"], return_inverse=True)  # each text once
         text = encode_text(module, clip.tokenizer, [distinct[int(k)] for k in some])[inverse]
         text, scale = gather_rows(text), clamped_scale(clip.clip.logit_scale)
