@@ -16,24 +16,15 @@ def one_class(s, name):
     return keep(s, np.array(s.labels) == name)
 
 
-@pytest.mark.parametrize(
-    "options",
-    [
-        {},
-        {"preset": "paper"},
-        {"preset": "cmmd"},
-        {"preset": "paper-tables"},
-        {"estimator": "biased"},
-    ],
-)
+PRESETS = [{"preset": name} for name in ("paper", "cmmd", "paper-tables")]
+
+
+@pytest.mark.parametrize("options", [{}, *PRESETS, {"estimator": "biased"}])
 def test_the_null_of_a_mean_over_classes_is_that_of_independent_classes(options):
     s = world(0, classes=4, videos=(3, 5, 4), frames=(3, 6, 4))
     nulls = [i_tmmd(one_class(s, f"m{c}"), **options).null for c in range(4)]
     sds = np.array([(high - low) / 2 / 1.96 for low, high in nulls])
-    center, reach = (
-        np.mean([(low + high) / 2 for low, high in nulls]),
-        1.96 * np.sqrt((sds**2).sum()) / 4,
-    )
+    center, reach = np.mean(nulls), 1.96 * np.sqrt((sds**2).sum()) / 4
     score = ci_tmmd(s, **options)
     assert score.null == pytest.approx((center - reach, center + reach), abs=1e-9)
     assert score.details["z"] == pytest.approx((score.value - center) / reach * 1.96)
@@ -44,9 +35,8 @@ def mixed(seed, apart, classes=3, videos=4, frames=3):
     s = world(seed, classes=1, videos=classes * videos, frames=frames)
     number = np.array([int(v.removeprefix("c0v")) for v in s.groups]) % classes
     x = s.features + apart * np.eye(6)[number]
-    return change(
-        s, features=x / np.linalg.norm(x, axis=1, keepdims=True), labels=[f"m{c}" for c in number]
-    )
+    x /= np.linalg.norm(x, axis=1, keepdims=True)
+    return change(s, features=x, labels=[f"m{c}" for c in number])
 
 
 def means_off_diagonal(score):
@@ -58,13 +48,11 @@ def in_errors(s):
     """D-TMMD, and divergences (C,) of a class from the others in recomputed jackknife errors."""
     score = d_tmmd(s, **OFF_DIAGONAL)
     assert "leave-one-group-out" in score.interval_method
-    out = [
-        means_off_diagonal(d_tmmd(keep(s, np.array(s.groups) != v), **OFF_DIAGONAL))
-        for v in sorted(set(s.groups))
-    ]
-    found = [means_off_diagonal(score), np.array(out)]
+    left = [keep(s, np.array(s.groups) != v) for v in sorted(set(s.groups))]
+    out = np.array([means_off_diagonal(d_tmmd(of, **OFF_DIAGONAL)) for of in left])
+    means = means_off_diagonal(score)
     error = lambda v: np.sqrt((len(v) - 1) / len(v) * ((v - v.mean(axis=0)) ** 2).sum(axis=0))
-    return score, found[0] / error(found[1]), found[0].mean() / error(found[1].mean(axis=1))
+    return score, means / error(out), means.mean() / error(out.mean(axis=1))
 
 
 @pytest.mark.parametrize(
@@ -108,18 +96,17 @@ def test_a_generator_of_some_classes_has_the_floor_of_these(preset):
     assert d.details["E_ratio_floor"] is None
     whole = four_scores(r, r, floor=r, preset=preset, permutations=0)
     assert whole[2].details["E_floor"] == pytest.approx(np.mean(list(excess.values())), abs=1e-9)
-    assert (
-        whole[3].details["E_ratio_floor"] == d_tmmd(r, preset=preset).details["E_ratio"] is not None
-    )
-    assert (whole[2].floor, whole[3].floor) == (
-        pytest.approx(ci_tmmd(r, preset=preset).value),
-        pytest.approx(d_tmmd(r, preset=preset).value),
-    )
-    unknown = four_scores(
-        r, g, floor=g, preset=preset, permutations=0
-    )  # and classes that no real touch shows have none
-    assert unknown[2].details["E_floor"] is None
-    assert unknown[2].floor is None
+    ci, d = ci_tmmd(r, preset=preset), d_tmmd(r, preset=preset)
+    assert whole[3].details["E_ratio_floor"] == d.details["E_ratio"] is not None
+    assert [s.floor for s in whole[2:]] == pytest.approx([ci.value, d.value])
+    # and classes that no real image shows have none
+    unknown = four_scores(r, g, floor=g, preset=preset, permutations=0)[2]
+    assert (unknown.details["E_floor"], unknown.floor) == (None, None)
+
+
+def floored(s, real, **options):
+    """I-, CI- and D-TMMD with the floor of real samples."""
+    return four_scores(s, real, floor=real, permutations=0, **options)[1:]
 
 
 @pytest.mark.parametrize("preset", ["cmmd", "paper-tables"])
@@ -128,24 +115,15 @@ def test_biased_halves_have_a_floor_of_as_many_samples_alone(preset):
 
     def drawn(n, prefix):
         x = rng.normal(size=(n, 6)) + 2
-        return FeatureSet(
-            [f"{prefix}{k}" for k in range(n)],
-            x / np.linalg.norm(x, axis=1, keepdims=True),
-            [f"m{k % 3}" for k in range(n)],
-        )
+        x /= np.linalg.norm(x, axis=1, keepdims=True)
+        return FeatureSet([f"{prefix}{k}" for k in range(n)], x, [f"m{k % 3}" for k in range(n)])
 
     few, many, equal = drawn(60, "a"), drawn(240, "b"), drawn(60, "c")
-    for score in four_scores(few, many, floor=many, preset=preset, permutations=0)[1:]:
+    for score in floored(few, many, preset=preset):
         assert score.floor is None
         assert "no-floor:sizes" in codes(score)
-    assert all(
-        s.floor is not None
-        for s in four_scores(few, equal, floor=equal, preset=preset, permutations=0)[1:]
-    )
-    assert all(
-        s.floor is not None
-        for s in four_scores(few, many, floor=many, preset="paper", permutations=0)[1:]
-    )
+    for real, name in ((equal, preset), (many, "paper")):
+        assert None not in [s.floor for s in floored(few, real, preset=name)]
 
 
 def videos_of(per_video, *, videos=12, spread=0.5, draw=0, prefix="", classes=2):
@@ -162,71 +140,46 @@ def videos_of(per_video, *, videos=12, spread=0.5, draw=0, prefix="", classes=2)
 def test_halves_of_whole_videos_have_a_floor_of_as_many_frames_alone(options):
     """Other numbers of frames have another share of pairs inside videos: another value, one E."""
     few, many, equal = (videos_of(n, draw=k, prefix=str(k)) for k, n in enumerate((2, 40, 2)))
-    for score in four_scores(few, many, floor=many, permutations=0, **options)[1:]:
+    for score in floored(few, many, **options):
         assert score.floor is None
         assert "no-floor:group-sizes" in codes(score)
         assert score.metric == "D-TMMD" or score.details["E_floor"] is not None
-    for score in four_scores(few, equal, floor=equal, permutations=0, **options)[1:]:
+    for score in floored(few, equal, **options):
         assert score.floor is not None
         assert not [c for c in codes(score) if c.startswith("no-floor")]
     whole = videos_of([200] * 12)
     one_less = whole.take([i for i in whole.ids if not i.endswith("/0")])
-    assert (
-        four_scores(
-            whole,
-            videos_of([190] * 12),
-            floor=videos_of([190] * 12),
-            permutations=0,
-            estimator="biased",
-        )[1].floor
-        is None
-    )  # 5 %
-    near, exact = (
-        four_scores(whole, s, floor=s, permutations=0, **options)[1] for s in (one_less, whole)
-    )
+    near, exact = (floored(whole, s, **options)[0] for s in (one_less, whole))
     assert near.floor == pytest.approx(exact.floor, rel=0.02)  # a frame in 2,400 is nothing
-    lost = four_scores(
-        whole, videos_of([150] * 12), floor=videos_of([150] * 12), permutations=0, **options
-    )[1]
-    assert (lost.floor is None) == (
-        "estimator" in options
-    )  # unbiased values of many frames hardly depend on how many
+    assert floored(whole, videos_of([190] * 12), estimator="biased")[0].floor is None  # 5 %
+    lost = floored(whole, videos_of([150] * 12), **options)[0]
+    # Unbiased values of many frames hardly depend on how many.
+    assert (lost.floor is None) == ("estimator" in options)
 
 
 def test_floors_over_classes_of_other_sizes_are_none():
-    few, other = (
-        videos_of(frames, draw=k, prefix=str(k))
-        for k, frames in enumerate(([4, 12] * 6, [12, 4] * 6))
-    )
-    assert len(few.ids) == len(other.ids)
+    few = videos_of([4, 12] * 6, draw=0, prefix="0")
+    other = videos_of([12, 4] * 6, draw=1, prefix="1")
     for preset in ("cmmd", "paper-tables"):
-        own, *of_classes = four_scores(few, other, floor=other, preset=preset, permutations=0)[1:]
+        own, *of_classes = floored(few, other, preset=preset)
         assert own.floor is not None
         assert [s.floor for s in of_classes] == [None, None]
 
 
 @pytest.mark.parametrize("options", [{"preset": "cmmd"}, {"preset": "paper-tables"}, {}])
 def test_no_generator_is_nearer_to_a_floor_that_is_none(options):
-    right, collapsed = (
-        videos_of(3, draw=1, prefix="a"),
-        videos_of(3, draw=2, prefix="a", spread=0.1),
-    )
+    right = videos_of(3, draw=1, prefix="a")
+    sets = {"right": right, "collapsed": videos_of(3, draw=2, prefix="a", spread=0.1)}
+    options = {**options, "permutations": 0}
     many, equal = videos_of(40, draw=3, prefix="b"), videos_of(3, draw=4, prefix="c")
     for real, known in ((many, False), (equal, True)):
-        found = compare(
-            {"right": right, "collapsed": collapsed}, real, floor=real, permutations=0, **options
-        )
-        for d in found.differences:
-            excess = d.kind == "excess"  # which does not depend on the number of frames
+        for d in compare(sets, real, floor=real, **options).differences:
+            decides = known or d.kind == "excess"  # which does not depend on the number of frames
             if d.metric in ("I-TMMD", "CI-TMMD"):
-                assert (
-                    (d.details["better"] is not None) == ("gap" in d.details) == (known or excess)
-                )
+                assert (d.details["better"] is not None) == ("gap" in d.details) == decides
                 assert d.details["p_value"] is not None
     some = videos_of(3, draw=4, prefix="c", classes=3)  # and other classes
-    found = compare(
-        {"right": right, "collapsed": collapsed}, some, floor=some, permutations=0, **options
-    )
+    found = compare(sets, some, floor=some, **options)
     gaps = {label_of(d): "gap" in d.details for d in found.differences if d.kind == "difference"}
     assert list(gaps.values()) == [False, True, False, False]
 

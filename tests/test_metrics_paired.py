@@ -130,6 +130,19 @@ def shifted(s, by):
     return change(s, features=x / np.linalg.norm(x, axis=1, keepdims=True))
 
 
+def collapsed(s):
+    """The set drawn together to a fifth of its spread."""
+    x = 0.2 * s.features + 0.8 * s.features.mean(axis=0)
+    return change(s, features=x / np.linalg.norm(x, axis=1, keepdims=True))
+
+
+def jackknife(value, out):
+    """A value, its error from the values without each group, and its 95 % interval."""
+    error = np.sqrt((len(out) - 1) / len(out) * ((out - out.mean()) ** 2).sum())
+    reach = stats.t.ppf(0.975, len(out) - 1) * error
+    return value, error, pytest.approx((value - reach, value + reach), abs=1e-9)
+
+
 @pytest.fixture(scope="module")
 def three():
     r = world(0, classes=3, videos=5, frames=4)
@@ -161,12 +174,10 @@ def test_differences_are_the_jackknife_of_the_difference(three):
         if d.metric == "TMMD":
             out = [[keep(s, np.array(s.groups) != g) for s in (a, b, r)] for g in groups]
             gaps = np.array([tmmd(x, z).value - tmmd(y, z).value for x, y, z in out])
-            error = np.sqrt((len(gaps) - 1) / len(gaps) * ((gaps - gaps.mean()) ** 2).sum())
-            reach = stats.t.ppf(0.975, len(gaps) - 1) * error
-            assert d.interval == pytest.approx((d.value - reach, d.value + reach), abs=1e-9)
-            assert d.details["p_better"] == pytest.approx(
-                stats.t.cdf(-d.value / error, len(gaps) - 1), abs=1e-9
-            )
+            _, error, interval = jackknife(d.value, gaps)
+            assert d.interval == interval
+            p_better = stats.t.cdf(-d.value / error, 14)
+            assert d.details["p_better"] == pytest.approx(p_better, abs=1e-9)
             assert d.interval_method == "paired leave-one-group-out jackknife, t, 14 df"
     first = found.differences[0]
     assert (subject_of(first), first.details["better"]) == ("near - far", "near")
@@ -201,11 +212,8 @@ def test_undefined_scores_have_no_difference(three):
 
 def test_without_a_reference_the_nearer_to_the_floor_is_better(three):
     r, generators = three
-    near = generators["near"]
-    center = near.features.mean(axis=0)
-    x = 0.2 * near.features + 0.8 * center
-    collapsed = change(near, features=x / np.linalg.norm(x, axis=1, keepdims=True))
-    sets = {"collapsed": collapsed, "near": near}
+    near, drawn = generators["near"], collapsed(generators["near"])
+    sets = {"collapsed": drawn, "near": near}
     for d in compare(sets, r).differences[1:]:
         assert d.value < 0
         assert (
@@ -221,10 +229,6 @@ def test_without_a_reference_the_nearer_to_the_floor_is_better(three):
     assert one.details["better"] == "near"
     assert one.details["decided"]
     assert one.details["p_better"] < 0.01
-    value = lambda s: i_tmmd(s).value
-    assert one.details["gap"] == pytest.approx(
-        abs(value(collapsed) - value(r)) - abs(value(near) - value(r)), abs=1e-9
-    )
     low, high = one.details["gap_interval"]
     assert 0 < low < one.details["gap"] < high
     assert "gap" not in found["TMMD difference"].details
@@ -273,125 +277,56 @@ def test_one_bandwidth_for_all_generators(three):
     assert len(several.settings["sigmas"]) == 5
 
 
-def test_the_excess_of_two_generators_is_compared_on_the_same_videos(three):
+@pytest.mark.parametrize("kind", ["difference", "excess"])
+@pytest.mark.parametrize("function", [i_tmmd, ci_tmmd])
+def test_differences_without_a_reference_lose_a_video_of_all_three_sets(three, function, kind):
+    """Of dist^2 between halves and of E; with videos of equal size the one is a multiple of the
+    other that the sizes of the set give.
+    """
     r, generators = three
-    near = generators["near"]
-    center = near.features.mean(axis=0)
-    x = 0.2 * near.features + 0.8 * center
-    sets = {
-        "collapsed": change(near, features=x / np.linalg.norm(x, axis=1, keepdims=True)),
-        "near": near,
-    }
-    found = compare(sets, r, floor=r, permutations=0)
-    metrics = ["TMMD", "I-TMMD", "I-TMMD E", "CI-TMMD", "CI-TMMD E", "D-TMMD"]
-    assert [(label_of(s), s.a) for s in found.scores] == [(m, s) for s in sets for m in metrics]
-    groups = sorted(set(r.groups))
-    for metric, function in (("I-TMMD E", i_tmmd), ("CI-TMMD E", ci_tmmd)):
-        value = lambda s: function(s).details["E"]  # noqa: B023
-        score = {s.a: s for s in found.scores if label_of(s) == metric}
-        for name, s in sets.items():
-            assert score[name].value == pytest.approx(value(s))
-            assert score[name].interval == pytest.approx(function(s).details["E_interval"])
-            assert score[name].floor == pytest.approx(value(r))
-        (d,) = (d for d in found.differences if label_of(d) == f"{metric} difference")
-        a, b, floor = (value(s) for s in (*sets.values(), r))
-        out = np.array(
-            [[value(keep(s, np.array(s.groups) != g)) for s in (*sets.values(), r)] for g in groups]
-        )
-        for got, interval, values in (
-            (d.value, d.interval, out[:, 0] - out[:, 1]),
-            (
-                d.details["gap"],
-                d.details["gap_interval"],
-                np.abs(out[:, 0] - out[:, 2]) - np.abs(out[:, 1] - out[:, 2]),
-            ),
-        ):
-            reach = stats.t.ppf(0.975, 14) * np.sqrt(
-                14 / 15 * ((values - values.mean()) ** 2).sum()
-            )
-            assert interval == pytest.approx((got - reach, got + reach), abs=1e-9)
-        assert d.value == pytest.approx(a - b)
-        assert d.details["gap"] == pytest.approx(abs(a - floor) - abs(b - floor))
-        assert d.details["better"] == "near"
-    bare = {name: change(s, groups=None) for name, s in sets.items()}
-    scores = compare(bare, change(r, groups=None), permutations=0).scores
-    assert not [s for s in scores if s.kind == "excess"]
-
-
-def test_the_p_value_of_a_metric_without_direction_is_that_of_the_gap_to_the_floor(three):
-    r, generators = three
-    sets = {"near": generators["near"], "far": generators["far"]}
-    d = {label_of(x): x for x in compare(sets, r, floor=r, permutations=0).differences}[
-        "I-TMMD difference"
-    ]
-    groups = sorted(set(r.groups))
-    value = lambda s: i_tmmd(s).value
-    design = (
-        i_tmmd(r).value / i_tmmd(r).details["E"]
-    )  # what E is multiplied by; leaving out a video keeps it
+    sets = {"collapsed": collapsed(generators["near"]), "near": generators["near"], "real": r}
+    metric, whole_set = function(r).metric, function is i_tmmd
+    factor = 1 if kind == "excess" else share(r, None if whole_set else "m0")
+    value = lambda s: factor * function(s).details["E"]
+    each = np.array([value(s) for s in sets.values()])
+    groups = np.array(r.groups)
     out = np.array(
-        [
-            [
-                design * i_tmmd(keep(s, np.array(s.groups) != g)).details["E"]
-                for s in (*sets.values(), r)
-            ]
-            for g in groups
-        ]
+        [[value(keep(s, groups != v)) for s in sets.values()] for v in sorted(set(groups))]
     )
-    for name, got, values in (
-        (
-            "p_value",
-            d.details["gap"],
-            np.abs(out[:, 0] - out[:, 2]) - np.abs(out[:, 1] - out[:, 2]),
-        ),
-        ("p_difference", value(sets["near"]) - value(sets["far"]), out[:, 0] - out[:, 1]),
-    ):
-        error = np.sqrt(14 / 15 * ((values - values.mean()) ** 2).sum())
-        assert d.details[name] == pytest.approx(2 * stats.t.sf(abs(got) / error, 14), rel=1e-6)
-    assert d.details["p_adjusted"] == d.details["p_value"]
-    assert d.details["p_value"] == pytest.approx(
-        2 * min(d.details["p_better"], 1 - d.details["p_better"])
-    )
-    bare = next(x for x in compare(sets, r, permutations=0).differences if x.metric == "I-TMMD")
-    assert bare.details["p_value"] == pytest.approx(d.details["p_difference"])
+    compared = compare({n: sets[n] for n in ("collapsed", "near")}, r, floor=r, permutations=0)
+    (d,) = (d for d in compared.differences if (d.metric, d.kind) == (metric, kind))
+    difference, error, interval = jackknife(each[0] - each[1], out[:, 0] - out[:, 1])
+    p_difference = 2 * stats.t.sf(abs(difference) / error, 14)
+    assert (d.value, d.interval) == (pytest.approx(difference, abs=1e-9), interval)
+    assert d.details["p_difference"] == pytest.approx(p_difference, rel=1e-6)
+    far = lambda v, floor: np.abs(v[..., 0] - floor) - np.abs(v[..., 1] - floor)
+    gap, error, interval = jackknife(far(each, each[2]), far(out, out[:, 2]))
+    assert (d.details["gap"], d.details["gap_interval"]) == (pytest.approx(gap, abs=1e-9), interval)
+    assert d.details["p_better"] == pytest.approx(stats.t.cdf(-gap / error, 14), abs=1e-9)
+    p_value = 2 * min(d.details["p_better"], 1 - d.details["p_better"])
+    assert d.details["p_value"] == d.details["p_adjusted"] == pytest.approx(p_value)
+    assert d.details["better"] == "near"
+    still = jackknife(gap, far(out, each[2]))[1]
+    assert abs(still / error - 1) > 0.1  # with a floor that stays as it is the error is another
+    bare = compare({n: sets[n] for n in ("collapsed", "near")}, r, permutations=0).differences
+    (d,) = (d for d in bare if (d.metric, d.kind) == (metric, kind))
+    assert d.details["p_value"] == pytest.approx(p_difference)
+    if kind == "excess":
+        for score in (s for s in compared.scores if (s.metric, s.kind) == (metric, kind)):
+            details = function(sets[score.a]).details
+            assert score.value == pytest.approx(details["E"])
+            assert score.interval == pytest.approx(details["E_interval"])
+            assert score.floor == pytest.approx(each[2])
 
 
-def error_of(values):
-    return np.sqrt((len(values) - 1) / len(values) * ((values - values.mean()) ** 2).sum())
-
-
-def test_the_gap_is_recomputed_without_each_video_in_all_three_sets():
-    """With videos of equal size the distance of two halves is E times a number of the set."""
-    r, near = (
-        world(0, classes=3, videos=5, frames=4),
-        world(0, classes=3, videos=5, frames=4, draw=1),
-    )
-    x = 0.5 * near.features + 0.5 * near.features.mean(axis=0)
-    sets = {
-        "collapsed": change(near, features=x / np.linalg.norm(x, axis=1, keepdims=True)),
-        "near": near,
-    }
-    found = {label_of(d): d for d in compare(sets, r, floor=r, permutations=0).differences}
-    groups, gaps = np.array(r.groups), {}
-    for metric, function, factor in (
-        ("I-TMMD", i_tmmd, share(r)),
-        ("CI-TMMD", ci_tmmd, share(r, "m0")),
-    ):
-        a, b, floor = (
-            factor
-            * np.array([function(keep(s, groups != v)).details["E"] for v in sorted(set(groups))])
-            for s in (*sets.values(), r)
-        )
-        whole = [function(s).value for s in (*sets.values(), r)]
-        value = abs(whole[0] - whole[2]) - abs(whole[1] - whole[2])
-        error, d = error_of(np.abs(a - floor) - np.abs(b - floor)), found[f"{metric} difference"]
-        reach = stats.t.ppf(0.975, 14) * error
-        assert d.details["gap"] == pytest.approx(value, abs=1e-9)
-        assert d.details["gap_interval"] == pytest.approx((value - reach, value + reach), abs=1e-9)
-        assert d.details["p_better"] == pytest.approx(stats.t.cdf(-value / error, 14), abs=1e-9)
-        still = error_of(np.abs(a - whole[2]) - np.abs(b - whole[2]))
-        gaps[metric] = abs(still / error - 1)
-    assert min(gaps.values()) > 0.1  # with a floor that stays as it is the error is another
+def test_scores_of_excess_follow_their_metric_where_there_are_groups(three):
+    r, generators = three
+    metrics = ["TMMD", "I-TMMD", "I-TMMD E", "CI-TMMD", "CI-TMMD E", "D-TMMD"]
+    scores = compare(generators, r, permutations=0).scores
+    assert [(label_of(s), s.a) for s in scores] == [(m, s) for s in generators for m in metrics]
+    bare = {name: change(s, groups=None) for name, s in generators.items()}
+    scores = compare(bare, change(r, groups=None), permutations=0).scores
+    assert {s.kind for s in scores} == {"value"}
 
 
 @pytest.mark.parametrize(("higher", "better", "sign"), [(True, "a", 1), (False, "b", -1)])
@@ -402,7 +337,7 @@ def test_the_better_of_two_follows_the_direction_of_the_metric(higher, better, s
         Scored(Score("SSIM", name, value, higher_is_better=higher, details=details), rows, units)
         for name, value, rows in (("a", 0.80, replicates[0]), ("b", 0.70, replicates[1]))
     )
-    error = error_of(replicates[0] - replicates[1])
+    _, error, interval = jackknife(0.1, replicates[0] - replicates[1])
     ahead = stats.t.cdf(sign * 0.1 / error, 3)
     found, turned = difference(one, two), difference(two, one)
     assert (found.details["better"], turned.details["better"]) == (better, better)
@@ -410,6 +345,5 @@ def test_the_better_of_two_follows_the_direction_of_the_metric(higher, better, s
     assert turned.details["p_better"] == pytest.approx(1 - ahead, abs=1e-12)
     assert found.details["p_value"] == pytest.approx(2 * stats.t.cdf(-0.1 / error, 3))
     assert (ahead > 0.5) == higher
-    reach = stats.t.ppf(0.975, 3) * error
-    assert found.interval == pytest.approx((0.1 - reach, 0.1 + reach))
-    assert found.details["decided"] == (reach < 0.1)
+    assert found.interval == interval
+    assert found.details["decided"] == (found.interval[0] > 0)

@@ -136,6 +136,14 @@ def audit(  # noqa: PLR0913
     """
     must = "An audit takes train and test samples, or samples with a split"
     require(test is None or split is None, None, must, "both", fix="Pass one of them")
+    require(by in (*GROUPS, "auto"), "by", f"must be auto or one of {', '.join(GROUPS)}", repr(by))
+    require(near_frames >= 0, "near_frames", "must be at least 0", near_frames, 30)
+    require(worst >= 0, "worst", "must be at least 0", worst, 12)
+    require_choice("identity", identity, ("auto", "names", "images"))
+    accepted, must = set(modalities) <= set(MODALITIES), "must be among vision, tactile"
+    require(accepted, "modalities", must, list(modalities), ["vision"])
+    accepted, must = 0 < false_positives <= 0.1, "must lie in (0, 0.1]"
+    require(accepted, "false_positives", must, false_positives, 0.001)
     options = _Options(
         by,
         near_frames,
@@ -148,7 +156,6 @@ def audit(  # noqa: PLR0913
         None if cache is None else Path(cache),
         progress,
     )
-    _check(options)
     must, fix = "needs all samples and a split", "Import them, and audit them with a split"
     require(impact is None or test is None, "impact", must, "train and test apart", fix=fix)
     sources = [x for x in (train_or_data, test, pretrain) if x is not None]
@@ -183,19 +190,6 @@ def audit(  # noqa: PLR0913
         result = replace(result, others=[against])
     notes = [note for k, note in enumerate(notes) if note not in notes[:k]]  # of train and test
     return replace(result, notes=[*result.notes, *notes])
-
-
-def _check(options: _Options) -> None:
-    by, rate = options.by, options.false_positives
-    require(by in (*GROUPS, "auto"), "by", f"must be auto or one of {', '.join(GROUPS)}", repr(by))
-    frames, worst = options.near_frames, options.worst
-    require(frames >= 0, "near_frames", "must be at least 0", frames, 30)
-    require(worst >= 0, "worst", "must be at least 0", worst, 12)
-    require_choice("identity", options.identity, ("auto", "names", "images"))
-    accepted = set(options.modalities) <= set(MODALITIES)
-    must = "must be among vision, tactile"
-    require(accepted, "modalities", must, list(options.modalities), ["vision"])
-    require(0 < rate <= 0.1, "false_positives", "must lie in (0, 0.1]", rate, 0.001)
 
 
 def _stated(splits: Mapping[str, Split]) -> Split:
@@ -294,6 +288,7 @@ def _compare(
     reason = _reason(train, test, group, flags, options, named=not equal)
     timed = gaps.frames[gaps.frames >= 0]
     last = int(timed.max()) if timed.size else 0
+    middle = float(np.median(timed)) if timed.size else None
     edges = [e for e in GAP_EDGES if e <= last] + [last + 1] if timed.size else []
     pairs = _worst_pairs(train, test, group, gaps, options.worst)
     signals = [f.summary(train, test, gaps, options.worst) for f in flags]
@@ -309,7 +304,7 @@ def _compare(
         leaked_fraction=0.0,  # the class computes it from the signals
         identical_samples=int(flags[0].flag.sum()),
         gap_min=int(timed.min()) if timed.size else None,
-        gap_median=_plain(float(np.median(timed))) if timed.size else None,
+        gap_median=int(middle) if middle is not None and middle.is_integer() else middle,
         gap_max=last if timed.size else None,
         gap_edges=edges,
         gap_counts=np.histogram(timed, edges)[0].tolist() if edges else [],
@@ -394,21 +389,15 @@ def _signals(
     flags.append(time_gap(gaps, options.near_frames))
     for modality in options.modalities if options.images else ():
         if _known(train, modality) and _known(test, modality):
-            flags.append(_near_duplicates(train, test, modality, options))
+            from palpate.leakage.near import near_duplicates
+
+            rate, cache, progress = options.false_positives, options.cache, options.progress
+            flags.append(
+                near_duplicates(
+                    train, test, modality, false_positives=rate, cache=cache, progress=progress
+                )
+            )
     return [f for f in flags if f is not None]
-
-
-def _near_duplicates(train: Manifest, test: Manifest, modality: str, options: _Options) -> Flags:
-    from palpate.leakage.near import near_duplicates
-
-    return near_duplicates(
-        train,
-        test,
-        modality,
-        false_positives=options.false_positives,
-        cache=options.cache,
-        progress=options.progress,
-    )
 
 
 def _matrix(
@@ -437,11 +426,6 @@ def _matrix(
         .head(MATRIX_ROWS)
     )
     return list(rows.select("group", *parts, "leaking").iter_rows(named=True))
-
-
-def _plain(value: float) -> float | int:
-    """A whole median as an int, so that 304.0 reads 304."""
-    return int(value) if value.is_integer() else value
 
 
 def _worst_pairs(

@@ -112,10 +112,8 @@ def components(manifest: Manifest, by: Sequence[str], links: Sequence[Ints] = ()
     for column in by:
         require(column in GROUPS, "by", f"must be among {', '.join(GROUPS)}", repr(column), "video")
         empty = table[column].null_count()
-        must, got = (
-            f"Every sample needs a {column} to be split by it",
-            f"{empty} of {n} samples without",
-        )
+        must = f"Every sample needs a {column} to be split by it"
+        got = f"{empty} of {n} samples without"
         require(not empty, None, must, got, fix="Fill the column, or choose another one")
     labels = [table[c].rank("dense").cast(pl.Int64).fill_null(0).to_numpy() - 1 for c in by]
     return _names(manifest, by, _joined([*labels, *links], n))

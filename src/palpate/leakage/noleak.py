@@ -18,7 +18,7 @@ from collections.abc import Mapping, Sequence
 from importlib import resources
 from typing import Any
 
-from palpate.core import Note, Split, digest_json, require
+from palpate.core import Note, Split, digest_json, few, require
 from palpate.data.manifest import Manifest
 
 FORMAT = "palpate-noleak/1"
@@ -83,9 +83,8 @@ def published(
         return videos
     column: list[str | None] = manifest.column("video")
     unknown = sorted({str(v) for v in column if v not in videos.parts})
-    names = ", ".join(map(repr, unknown[:8])) + " ..." * (len(unknown) > 8)
     must = "The video of every sample must be one that the record knows"
-    got = f"{len(unknown)} of {len(set(column))} that are not: {names}"
+    got = f"{len(unknown)} of {len(set(column))} that are not: {few(map(repr, unknown))}"
     fix = "Use the data set's video ids, or make a split by your groups"
     require(not unknown, None, must, got, fix=fix)
     parts = {i: videos.parts[str(v)] for i, v in zip(manifest.ids, column, strict=True)}

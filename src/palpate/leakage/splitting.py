@@ -108,7 +108,10 @@ def split(  # noqa: PLR0913  # pyright: ignore[reportInconsistentOverload]
         "shares": shares,
     }
     notes += reason
-    part_names = [list(shares)] if folds is None else _fold_parts(folds, val > 0)
+    part_names = [list(shares)]
+    if folds is not None:  # for each split the part of each fold
+        roles = ["test", "val" if val > 0 else "train", *["train"] * (folds - 2)]
+        part_names = [np.roll(roles, fold).tolist() for fold in range(folds)]
     splits: list[Split] = []
     assignment = draw(problem, optimum, seed)
     facts = rule | {"seed": seed}
@@ -188,8 +191,8 @@ def _problem(
     biggest = int(counts[:, -1].argmax())
     largest, wanted = float(counts[biggest, -1] / len(groups)), 1 - max(target)
     must = f"The smaller parts must get at least {LEAST_FILL:.0%} of their wanted {wanted:.1%}"
-    rest = f"which leaves them {1 - largest:.2%} at best"
-    got = f"{kind} {names[biggest]!r} with {largest:.1%} of all samples, {rest}"
+    got = f"{kind} {names[biggest]!r} with {largest:.1%} of all samples"
+    got += f", which leaves them {1 - largest:.2%} at best"
     fix = "Choose a finer group, thin that group out, or choose a larger train share"
     require(1 - largest >= LEAST_FILL * wanted, None, must, got, fix=fix)
     return names, materials, Problem(counts, np.array(target))
@@ -244,9 +247,3 @@ def _notes(manifest: Manifest, facts: dict[str, Any]) -> list[Note]:
     if facts["missing"]:
         notes.append(Note("missing-materials", {"materials": facts["missing"]}))
     return notes
-
-
-def _fold_parts(folds: int, val: bool) -> list[list[str]]:
-    """For each split the part of each fold."""
-    untested = ["val" if val else "train", *["train"] * (folds - 2)]
-    return [np.roll(["test", *untested], fold).tolist() for fold in range(folds)]

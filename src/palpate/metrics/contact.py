@@ -25,9 +25,9 @@ Compare each with ``details["empty"]``, the score of the no-contact image.
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple, Unpack
+from typing import Any, Unpack
 
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
@@ -239,55 +239,33 @@ def contacts_of_each(
 
     What the real images show is measured once. Arguments and errors as :func:`contact_scores`.
     """
-    y, gel = _checked(reference, background)
+    backgrounds = _for_all(background, reference)
+    y, gel = image_pairs(reference, backgrounds, arguments=("reference", "background"))
+    require_side(y.shape[1:3], "contact metrics")
     stacks = {name: image_pairs(x, y)[0] for name, x in generated.items()}
     n = len(y)
     nan = lambda: {metric: np.full(n, np.nan) for metric in METRICS}
     values, empty, area = {name: nan() for name in stacks}, nan(), np.zeros(n)
-    for i, (none, real, contact) in _in_contact(y, gel):
-        for metric, value in _compare(np.zeros_like(real), real, contact.kept).items():
+    for i, images in enumerate(zip(y, gel, strict=True)):
+        tactile, none = map(as_unit, images)
+        markers = marker_mask(none)
+        mask, near_marker = mask_of(tactile, none, markers)
+        kept, real = mask & ~near_marker, tactile - none
+        if not kept.any():
+            continue
+        for metric, value in _compare(np.zeros_like(real), real, kept).items():
             empty[metric][i] = value
         empty["contact IoU"][i] = 0.0
-        area[i] = contact.mask.mean()
+        area[i] = mask.mean()
         for name, x in stacks.items():
-            made = as_unit(x[i])
-            mask = mask_of(made, none, contact.markers)[0]
-            both, either = contact.mask & mask, contact.mask | mask
-            row = _compare(made - none, real, contact.kept)
-            for metric, value in (row | {"contact IoU": both.sum() / either.sum()}).items():
+            image = as_unit(x[i])
+            other = mask_of(image, none, markers)[0]
+            row = _compare(image - none, real, kept)
+            row["contact IoU"] = float((mask & other).sum() / (mask | other).sum())
+            for metric, value in row.items():
                 values[name][metric][i] = value
     size = {"size": list(y.shape[1:3]), "background": background_digest(background)}
-    return {name: Contacts(of, empty, area, SETTINGS | size) for name, of in values.items()}
-
-
-def _checked(reference: Any, background: Any) -> tuple[NDArray[Any], NDArray[Any]]:
-    """Real images and their backgrounds; errors as :func:`contact_scores`."""
-    background = _for_all(background, reference)
-    y, gel = image_pairs(reference, background, arguments=("reference", "background"))
-    require_side(y.shape[1:3], "contact metrics")
-    return y, gel
-
-
-class _Contact(NamedTuple):
-    """Of a real image: the pixels to compare, all of its mask, the markers of the background."""
-
-    kept: Mask
-    mask: Mask
-    markers: Mask
-
-
-def _in_contact(
-    y: NDArray[Any], gel: NDArray[Any]
-) -> Iterator[tuple[int, tuple[Array, Array, _Contact]]]:
-    """Of every real image that shows contact: its number, and (background, difference to it
-    (h, w, c), contact).
-    """
-    for i, images in enumerate(zip(y, gel, strict=True)):
-        real, none = map(as_unit, images)
-        markers = marker_mask(none)
-        mask, near_marker = mask_of(real, none, markers)
-        if (kept := mask & ~near_marker).any():
-            yield i, (none, real - none, _Contact(kept, mask, markers))
+    return {name: Contacts(v, empty, area, SETTINGS | size) for name, v in values.items()}
 
 
 def _compare(x: Array, y: Array, kept: Mask) -> dict[str, float]:

@@ -41,7 +41,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
-from itertools import combinations
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -59,8 +58,8 @@ from palpate.metrics.inputs import (
     feature_sets,
     require_one_encoder,
 )
-from palpate.metrics.intervals import Scored, Spread, jackknife_errors, spread_of_values
-from palpate.metrics.paired import Comparison, difference, holm, same_samples
+from palpate.metrics.intervals import Scored, Spread, score_of, spread_of_values
+from palpate.metrics.paired import Comparison, compared, same_samples
 
 #: A set as a normal distribution: mean (d,), and factor F (r, d) of its covariance F' F.
 Normal = tuple[Array, Array]
@@ -138,11 +137,10 @@ def compare_fid(
         PalpateError: if generators differ in ids, labels, groups or encoder, or as :func:`fid`.
     """
     sets = same_samples(generators)
-    scored = [_fid(s, reference, subject=name, **options) for name, s in sets.items()]
+    result = compared({n: [_fid(s, reference, subject=n, **options)] for n, s in sets.items()})
     note = Note("fid-difference-biased")
-    differences = [difference(a, b) for a, b in combinations(scored, 2)]
-    differences = [replace(d, notes=(note,)) if d.interval else d for d in differences]
-    return Comparison([s.score for s in scored], holm(differences))
+    differences = [replace(d, notes=(note,)) if d.interval else d for d in result.differences]
+    return replace(result, differences=differences)
 
 
 def _fid(
@@ -166,17 +164,15 @@ def _fid(
         units = list(blocks.names)
         without = (_without_each(v, at, len(units), center) for v, at in sets)
         replicates = np.array([_distance(*pair) for pair in zip(*without, strict=True)])
-    error = float(jackknife_errors(replicates[:, None])[0])
-    limits = Spread(value, error, len(units) - 1, "").interval(0.0)
+    spread = Spread.of(value, replicates, blocks.method)
     n, d = min(len(x), len(y)), x.shape[1]
     notes.append(Note("fid-biased") if n > d else Note("fid-mostly-bias", {"n": n, "d": d}))
-    notes += [Note("no-interval-few-units")] if limits is None else []
-    score = Score(
+    notes += [Note("no-interval-few-units")] if not spread.known else []
+    score = score_of(
         "FID",
         subject,
-        value,
-        limits,
-        interval_method=blocks.method if limits else "",
+        spread,
+        (0.0, np.inf),
         estimator="plug-in",
         n=len(x),
         m=len(y),
@@ -375,19 +371,17 @@ def prdc_rows(
     for metric, values in rows.items():
         over_real, balls = metric in ("Recall", "Coverage"), int(metric != "Recall")
         spread = spread_of_values(values, groups[over_real])
-        interval = spread.interval(0.0, np.inf if metric == "Density" else 1.0)
         empty, side = int((radii[balls] == 0).sum()), ("generated", "real")[balls]
         details = {"radius_generated": median[0], "radius_real": median[1], "empty_balls": empty}
         balls = Note("empty-balls", {"count": empty, "n": len(radii[balls]), "of": side})
         notes = [*copied, *[balls] * (empty > 0)]
-        notes += [Note("no-interval-over-groups")] * (interval is None)
+        notes += [Note("no-interval-over-groups")] * (not spread.known)
         scores.append(
-            Score(
+            score_of(
                 metric,
                 subject,
-                float(values.mean()),
-                interval,
-                interval_method=spread.method if interval else "",
+                spread,
+                (0.0, np.inf if metric == "Density" else 1.0),
                 estimator="per-row mean",
                 n=len(x),
                 m=len(y),
@@ -412,7 +406,7 @@ def _squared_radii(name: str, x: Array, groups: Sequence[str] | None, k: int) ->
     must = f"Every group must have at least k = {k} {name} rows outside it"
     got = f"{outside.min()} outside group {names[int(outside.argmin())]!r}"
     fix = "Choose a smaller k, more groups, or leave the groups out"
-    require(groups is None or outside.min() >= k, None, must, got, fix=fix)
+    require(groups is None or int(outside.min()) >= k, None, must, got, fix=fix)
     radii = np.empty(n)
     for rows, squares in _blocks(x, x):
         squares[unit[rows, None] == unit] = np.inf

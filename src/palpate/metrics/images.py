@@ -27,9 +27,9 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from palpate._version import __version__
-from palpate.core import Note, PalpateError, Score, few
+from palpate.core import Note, Score, few, require
 from palpate.metrics.inputs import Array, as_array, checked_names, to_host
-from palpate.metrics.intervals import LEVEL, spread_of_values
+from palpate.metrics.intervals import score_of, spread_of_values
 
 Border = Literal["valid", "mirror"]
 
@@ -108,9 +108,9 @@ class PerImage:
 
     def score(self, **fields: Any) -> Score:
         """Their mean; ``fields`` as :func:`mean_score`."""
-        fields = {"bounds": self.bounds, **fields}
+        common = (self.metric, self.values)
         return mean_score(
-            self.metric, self.values, settings=self.settings, notes=self.notes, **fields
+            *common, bounds=self.bounds, settings=self.settings, notes=self.notes, **fields
         )
 
 
@@ -174,7 +174,6 @@ def mean_score(
     kept, identical = values[finite], int(np.isinf(values).sum())
     kept_groups = None if groups is None else list(np.array(groups)[finite])
     spread = spread_of_values(kept, kept_groups)
-    interval = spread.interval(*bounds)
     badness = np.where(finite, -values if higher_is_better else values, -np.inf)
     worst = [i for i in np.argsort(-badness, kind="stable")[:5] if finite[i]]
     details = {
@@ -187,28 +186,24 @@ def mean_score(
         "groups": len(set(groups)) if groups else None,
         "version": __version__,
     }
-    return Score(
+    if len(kept):
+        own = [Note("identical-pairs", {"count": identical, "n": n})] * (identical > 0)
+        own += [Note("no-interval-over-images")] * (not spread.known)
+    else:
+        own = [Note("all-identical", {"n": n}) if identical else Note("no-pair-has-a-value")]
+    return score_of(
         metric,
         subject,
-        float(kept.mean()) if len(kept) else None,
-        interval,
-        level=LEVEL,
-        interval_method=spread.method if interval else "",
+        spread,
+        bounds,
         estimator="per-image mean",
         n=n,
         m=n,
         higher_is_better=higher_is_better,
         details=details | fields.pop("details", {}),
-        notes=(*_mean_notes(n, len(kept), identical, interval is None), *notes),
+        notes=(*own, *notes),
         **fields,
     )
-
-
-def _mean_notes(n: int, kept: int, identical: int, no_interval: bool) -> list[Note]:
-    if not kept:
-        return [Note("all-identical", {"n": n}) if identical else Note("no-pair-has-a-value")]
-    notes = [Note("identical-pairs", {"count": identical, "n": n})] if identical else []
-    return notes + ([Note("no-interval-over-images")] if no_interval else [])
 
 
 def require_same_ids(generated_ids: Sequence[str], reference_ids: Sequence[str]) -> None:
@@ -219,18 +214,18 @@ def require_same_ids(generated_ids: Sequence[str], reference_ids: Sequence[str])
     """
     generated, reference = ([str(v) for v in ids] for ids in (generated_ids, reference_ids))
     for name, ids in (("generated", generated), ("reference", reference)):
-        if repeated := [i for i, count in Counter(ids).items() if count > 1]:
-            got = f"{len(repeated)} repeated: {few(map(repr, repeated))}"
-            raise PalpateError(f"Every {name} id must be unique", got, "Keep one image an id")
+        repeated = [i for i, count in Counter(ids).items() if count > 1]
+        must, got = f"Every {name} id must be unique", few(map(repr, repeated))
+        got = f"{len(repeated)} repeated: {got}"
+        require(not repeated, None, must, got, fix="Keep one image an id")
     missing, surplus = set(reference) - set(generated), set(generated) - set(reference)
-    if missing or surplus or not reference:
-        lists = (("not generated", missing), ("without reference", surplus))
-        got = "; ".join(
-            f"{len(ids)} {what}: {few(map(repr, sorted(ids)))}" for what, ids in lists if ids
-        )
-        fix = "Score the same samples in both: take() the common ids if that is what you mean"
-        must = "Generated and reference ids must be the same set"
-        raise PalpateError(must, got or "none", fix)
+    lists = (("not generated", missing), ("without reference", surplus))
+    got = "; ".join(
+        f"{len(ids)} {title}: {few(map(repr, sorted(ids)))}" for title, ids in lists if ids
+    )
+    fix = "Score the same samples in both: take() the common ids if that is what you mean"
+    must, same = "Generated and reference ids must be the same set", not (missing or surplus)
+    require(same and len(reference) > 0, None, must, got or "none", fix=fix)
 
 
 def image_pairs(
@@ -242,29 +237,27 @@ def image_pairs(
         PalpateError: on other shapes, dtypes or ranges (image numbers are named).
     """
     x, y = image_stack(arguments[0], generated), image_stack(arguments[1], reference)
-    if x.shape != y.shape:
-        must = f"`{arguments[0]}` and `{arguments[1]}` must pair one to one in one size"
-        got = f"shapes {x.shape} and {y.shape}"
-        raise PalpateError(must, got, "Pass the same samples in the same order and size")
+    must = f"`{arguments[0]}` and `{arguments[1]}` must pair one to one in one size"
+    got, fix = f"shapes {x.shape} and {y.shape}", "Pass the same samples in the same order and size"
+    require(x.shape == y.shape, None, must, got, fix=fix)
     return x, y
 
 
 def image_stack(argument: str, images: Any) -> NDArray[Any]:
     """A stack of images, checked; errors as :func:`image_pairs`."""
     pixels = np.asarray(as_array(argument, to_host(images)))
-    if pixels.ndim != 4 or pixels.shape[3] not in (1, 3) or 0 in pixels.shape:
-        must, got = "must have shape (n, h, w, 3 or 1), n >= 1", f"shape {pixels.shape}"
-        raise PalpateError(must, got, "Stack images with channels last", argument=argument)
+    stacked = pixels.ndim == 4 and pixels.shape[3] in (1, 3) and 0 not in pixels.shape
+    must, fix = "must have shape (n, h, w, 3 or 1), n >= 1", "Stack images with channels last"
+    require(stacked, argument, must, f"shape {pixels.shape}", fix=fix)
     if pixels.dtype == np.uint8:
         return pixels
     must, fix = "must be uint8, or floats in [0, 1]", "Convert them to this range"
-    if pixels.dtype.kind != "f":
-        raise PalpateError(must, f"dtype {pixels.dtype}", fix, argument=argument)
+    require(pixels.dtype.kind == "f", argument, must, f"dtype {pixels.dtype}", fix=fix)
     least, most = pixels.min(axis=(1, 2, 3)), pixels.max(axis=(1, 2, 3))
-    if (bad := ~((least >= -1e-6) & (most <= 1 + 1e-6))).any():  # also for NaN
-        k = int(bad.argmax())
-        got = f"[{least[k]:.4g}, {most[k]:.4g}] in image {k}"
-        raise PalpateError(must, got, fix, argument=argument)
+    inside = (least >= -1e-6) & (most <= 1 + 1e-6)  # not for NaN
+    k = int(inside.argmin())
+    got = f"[{least[k]:.4g}, {most[k]:.4g}] in image {k}"
+    require(bool(inside.all()), argument, must, got, fix=fix)
     return pixels
 
 
@@ -342,9 +335,8 @@ def scale_weights(scales: int) -> Array:
     return weights if scales == len(WEIGHTS) else weights / weights.sum()
 
 
-def require_side(size: Sequence[int], what: str) -> None:
+def require_side(size: Sequence[int], metric: str) -> None:
     """Reject images (height, width) that are smaller than a window."""
-    if min(size) < WINDOW:
-        must = f"Images must be at least {WINDOW} x {WINDOW} for {what}"
-        got = f"{size[0]} x {size[1]}"
-        raise PalpateError(must, got, "Score larger images")
+    must = f"Images must be at least {WINDOW} x {WINDOW} for {metric}"
+    big = min(size) >= WINDOW
+    require(big, None, must, f"{size[0]} x {size[1]}", fix="Score larger images")

@@ -24,7 +24,7 @@ import numpy as np
 from array_api_compat import array_namespace, device
 from numpy.typing import NDArray
 
-from palpate.core import FeatureSet, PalpateWarning, require
+from palpate.core import FeatureSet, PalpateError, PalpateWarning, require
 from palpate.core.features import is_missing
 
 Array = NDArray[np.float64]
@@ -38,11 +38,15 @@ NORM_TOLERANCE = 1e-3
 SLAB = 8192
 
 
-def check(holds: bool, name: str, must: str, got: Any, fix: str) -> None:
-    """Check an input, whose ``name`` is an argument ("x") or a clause ("The features of 'a'")."""
-    if name.isidentifier():
-        require(holds, name, must, got, fix=fix)
-    require(holds, None, f"{name} {must}", got, fix=fix)
+def check(holds: bool, name: str, must: str, got: Any, fix: str, **example: Any) -> None:
+    """Check an input, whose ``name`` is an argument ("x") or a clause ("The features of 'a'").
+
+    As :func:`palpate.core.require`; ``example`` are arguments that would work.
+    """
+    if not holds:
+        argument = name if name.isidentifier() else None
+        must = must if argument else f"{name} {must}"
+        raise PalpateError(must, str(got), fix, argument=argument, example=example)
 
 
 def feature_set(
@@ -198,8 +202,8 @@ def checked_features(name: str, x: Any, *, normalize: Normalize = "check", least
         return (x / scale).astype(x.dtype) if isinstance(x, np.ndarray) else x / scale
     bad = np.abs(norms - 1) > NORM_TOLERANCE
     got = f"norm {', '.join(f'{v:.4g}' for v in norms[bad][:1])} in {rows_text(bad)}"
-    fix = "Divide by the norms with normalize=True, or keep them with False"
-    check(not bad.any(), name, "must be L2-normalized", got, fix)
+    fix = "Divide by the norm, or choose to keep the norms"
+    check(not bad.any(), name, "must be L2-normalized", got, fix, normalize=True)
     return x
 
 
@@ -310,14 +314,14 @@ def checked_whole(least: int, **values: Any) -> None:
     must = f"must be a whole number of at least {least}"
     for name, value in values.items():
         whole_number = isinstance(value, int | np.integer) and not isinstance(value, bool)
-        holds = whole_number and least <= value < 2**63
+        holds = whole_number and bool(least <= value < 2**63)
         require(holds, name, must, repr(value), fix="Drop it for the default")
 
 
 def checked_scale(scale: Any) -> None:
     """Reject a factor on the result that is not a finite number above 0."""
     number = isinstance(scale, int | float | np.number) and not isinstance(scale, bool)
-    positive = number and 0 < scale < np.inf
+    positive = number and bool(0 < scale < np.inf)
     require(positive, "scale", "must be positive", repr(scale), fix="Drop it for the default")
 
 

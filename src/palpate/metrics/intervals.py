@@ -105,7 +105,7 @@ class PairSums:
     ) -> PairSums:
         """From sums of items with items; ``cells`` (2, P) are the segment and unit of each item."""
         m, same = one_hot(cells[0], segments), np.where(cells[1][:, None] == cells[1], block, 0.0)
-        return cls(n, n, block @ m, same @ m, diagonal, *cells, block)
+        return cls(n, n, block @ m, same @ m, diagonal, cells[0], cells[1], block)
 
     @property
     def segments(self) -> int:
@@ -240,6 +240,12 @@ class Spread:
     df: float
     method: str
 
+    @classmethod
+    def of(cls, value: float, replicates: Array, method: str = "") -> Spread:
+        """A value with its jackknife, from the values (G,) without each group."""
+        error = float(jackknife_errors(replicates[:, None])[0])
+        return cls(value, error, len(replicates) - 1, method)
+
     @property
     def known(self) -> bool:
         """Whether there is an error: no change without any group is no evidence of certainty."""
@@ -271,9 +277,17 @@ def spread_of_values(values: Array, groups: Sequence[str] | None) -> Spread:
     if len(size) < 2:
         return Spread(value, np.nan, 0, "")
     without = (total.sum() - total) / (n - size)
-    df = len(size) - 1
-    method = f"leave-one-{each}-out jackknife, t, {df} df{tail}"
-    return Spread(value, float(jackknife_errors(without[:, None])[0]), df, method)
+    method = f"leave-one-{each}-out jackknife, t, {len(size) - 1} df{tail}"
+    return Spread.of(value, without, method)
+
+
+def score_of(
+    metric: str, subject: str, spread: Spread, bounds: Interval = (-np.inf, np.inf), **fields: Any
+) -> Score:
+    """The score of a value with its interval within bounds; ``fields`` are further ones."""
+    interval = spread.interval(*bounds)
+    method = spread.method if interval else ""
+    return Score(metric, subject, spread.value, interval, interval_method=method, **fields)
 
 
 @dataclass(frozen=True)

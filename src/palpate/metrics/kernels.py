@@ -35,7 +35,17 @@ import numpy as np
 from array_api_compat import array_namespace
 
 from palpate.core import PalpateWarning, require, rng_for
-from palpate.metrics.inputs import Array, Index, host, in_threads, like, release, row_norms, rows_at
+from palpate.metrics.inputs import (
+    Array,
+    Index,
+    check,
+    host,
+    in_threads,
+    like,
+    release,
+    row_norms,
+    rows_at,
+)
 from palpate.metrics.intervals import PairSums, one_hot, split_by
 from palpate.metrics.moments import moments_of
 
@@ -189,14 +199,14 @@ def median_distance(x: Any, groups: Sequence[str] | Index | None = None) -> floa
     at = np.sort(rng_for(0, "median distance").permutation(n)[:MEDIAN_ROWS])
     some = host(rows_at(x, at))
     release(x)
-    squares = (some**2).sum(axis=1)
-    distance = np.sqrt(np.maximum(squares[:, None] + squares - 2 * some @ some.T, 0))
-    wanted = np.triu(np.ones(distance.shape, dtype=bool), 1)
+    squares, (first, second) = (some**2).sum(axis=1), np.triu_indices(len(at), 1)
+    products = squares[:, None] + squares - 2 * some @ some.T
+    distances = np.sqrt(np.maximum(products[first, second], 0))
     if groups is not None:
-        names = np.unique(np.asarray(groups)[at], return_inverse=True)[1]
-        apart = wanted & (names[:, None] != names)
-        wanted = apart if apart.any() else wanted
-    middle = float(np.median(distance[wanted])) if wanted.any() else 0.0
+        names = np.asarray(groups)[at]
+        apart = names[first] != names[second]
+        distances = distances[apart] if apart.any() else distances
+    middle = float(np.median(distances)) if distances.size else 0.0
     got = f"{n} row{'s' * (n != 1)}, {'all equal' if n > 1 else 'no pair'}"
     must = "must be a number where the median distance has no rows that differ"
     require(middle > 1e-12, "sigma", must, got, 10, fix="Choose a bandwidth")
@@ -212,8 +222,6 @@ ROWS_A_WIDTH, LEAST_ROWS = 8, 4096
 #: Bytes of the moments of all items: at most, and four times that where pairs would take hours; up
 #: to the second number in any case, beyond it no more than the features.
 MOMENT_BYTES, STATE_BYTES = 512 << 20, 64 << 20
-#: What to do where moments cannot be taken.
-BLOCKED = "Choose the blocked back end, which forms all pairs"
 #: From so many rows on a fall back to blocks warns: it takes hours.
 LONG = 300_000
 #: Largest ``||z||^2`` in float32: an exponent is then rounded by less than 1e-7, so that MMD^2 at
@@ -269,8 +277,8 @@ def kernel_sums(
         count = f"{items.shape[1]} (unit, segment) cells of width {width}"
         reason = f"second moments of {count} take more than {room >> 20} MiB"
     requested = backend == "moments"
-    must = "The moments back end needs one Gaussian bandwidth and few groups"
-    require(not (requested and reason), None, must, reason, fix=BLOCKED)
+    must, holds = "needs one Gaussian bandwidth and few groups", not (requested and reason)
+    check(holds, "The moments back end", must, reason, "Sum blocks", backend="blocked")
     cheap = size <= max(STATE_BYTES, rows * width * 4)
     many = rows >= max(LEAST_ROWS, ROWS_A_WIDTH * width)
     if requested or (backend == "auto" and not reason and cheap and many):
@@ -281,7 +289,7 @@ def kernel_sums(
         reason = f"their bound is {remainder:.2g}"
         must = "must be wide against the features for the moments back end"
         fits = not requested or remainder <= 2000
-        require(fits, "sigma", must, reason, fix=BLOCKED)
+        check(fits, "sigma", must, reason, "Sum blocks", backend="blocked")
         if requested or remainder <= TOLERANCE:
             return sums
     if rows > LONG:
@@ -289,7 +297,7 @@ def kernel_sums(
         text = f"All {rows**2 / 2:.2g} pairs are formed, which takes long.{why}"
         warnings.warn(text, PalpateWarning, stacklevel=4)
     x = parts[0] if len(parts) == 1 else array_namespace(parts[0]).concat(list(parts), axis=0)
-    return blocked_sums(x, *cells, segments, kernel, block=block, weights=weights)
+    return blocked_sums(x, cells[0], cells[1], segments, kernel, block=block, weights=weights)
 
 
 def blocked_sums(
@@ -328,7 +336,8 @@ def blocked_sums(
     for (i, j), sums in zip(todo, in_threads(sums_of, todo, x), strict=True):
         for values, a, b in zip(sums, (i, j), (j, i), strict=False):
             total[np.ix_(rows[a][0], columns[b][0])] += values
-    size, diagonal = (np.bincount(item, v, count) for v in (np.ones(n), pairs.diagonal()))
+    each = (np.ones(n), pairs.diagonal())
+    size, diagonal = (np.bincount(item, v, count).astype(np.float64) for v in each)
     if joined:
         sums, weighed = PairSums.from_block(total, size, diagonal, items, segments), repeat(None)
     else:

@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 
 from palpate.core import Score
 from palpate.metrics.inputs import Array
-from palpate.metrics.intervals import Spread, jackknife_errors
+from palpate.metrics.intervals import Spread, jackknife_errors, score_of
 
 #: (..., K) means -> (...) their statistic.
 Statistic = Callable[[Array], Array]
@@ -71,14 +71,16 @@ def mean_of(
     """
     values = np.asarray(values, dtype=np.float64)
     weights = np.ones(len(values)) if weights is None else weights
-    value = float(weights @ values / weights.sum())
-    fields = {"higher_is_better": True, "n": len(values)} | fields
-    score = Score(metric, subject, value, **fields)
+    score = Score(metric, subject, float(weights @ values / weights.sum()))
     mean = Mean(score, values, weights, np.array(groups, dtype=str))
-    spread = spread_of([[mean]])
-    interval = spread.interval(0.0, 1.0)
-    method = spread.method if interval else ""
-    return replace(mean, score=replace(score, interval=interval, interval_method=method))
+    score = score_of(
+        metric,
+        subject,
+        spread_of([[mean]]),
+        (0.0, 1.0),
+        **{"higher_is_better": True, "n": len(values)} | fields,
+    )
+    return replace(mean, score=score)
 
 
 def over_seeds(runs: Sequence[Mean]) -> Score:

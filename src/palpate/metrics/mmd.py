@@ -49,6 +49,7 @@ grouped       grouped    group    sum                ratio_of_means  the default
 
 from __future__ import annotations
 
+import math
 import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
@@ -61,6 +62,7 @@ from palpate.metrics.inputs import (
     Array,
     Index,
     Normalize,
+    check,
     checked_names,
     checked_pair,
     checked_scale,
@@ -242,14 +244,12 @@ def distance(  # noqa: PLR0913
     )
     value = float(mmd_matrix(sums.totals, estimator, scale)[0, 1])
     bound = largest_bound(sums, estimator, scale)
-    finite, fix = (
-        bool(np.isfinite(sums.totals.sums).all()),
-        "Normalize the rows, or scale them down",
-    )
-    require(finite, None, "Kernel values must be finite", "infinity or NaN", fix=fix)
+    finite = bool(np.isfinite(sums.totals.sums).all())
+    fix = "Normalize the rows, or scale them down"
+    check(finite, "Kernel values", "must be finite", "infinity or NaN", fix)
     got = f"{len(set(gx or ()))} and {len(set(gy or ()))} groups"
-    must = "must not be grouped unless each set has at least two groups, not all shared"
-    require(np.isfinite(value), "estimator", must, got, "unbiased", fix="Pass more groups")
+    must, fix = "must have at least two groups, not all shared", "Pass more groups"
+    check(math.isfinite(value), "Each set", must, got, fix, estimator="unbiased")
     settings = (sums.backend, estimator, kernel.settings(), kernel.bandwidth, scale)
     return Distance(value, bound, *settings, m=len(x), n=len(y))
 
@@ -324,7 +324,7 @@ def plan_for(options: Mapping[str, Any], *, grouped: bool) -> Options:
     for name, value in (("estimator", "grouped"), ("halves", "group")):
         must = f"must know the group of every sample for {name}={value!r}"
         fits = grouped or getattr(plan, name) != value
-        require(fits, "groups", must, "none", fix="Pass groups, or another preset, e.g. paper")
+        check(fits, "groups", must, "none", "Pass groups, or another preset", preset="paper")
     return plan
 
 

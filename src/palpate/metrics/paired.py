@@ -27,9 +27,9 @@ from typing import Any
 
 import numpy as np
 
-from palpate.core import FeatureSet, Note, PalpateError, Score, require_comparable
+from palpate.core import FeatureSet, Note, Score, require, require_comparable
 from palpate.metrics.inputs import Array, feature_set, require_one_encoder
-from palpate.metrics.intervals import Interval, Scored, Spread, jackknife_errors, spread_of_values
+from palpate.metrics.intervals import Interval, Scored, Spread, spread_of_values
 from palpate.metrics.means import Mean, spread_of
 from palpate.metrics.table import build_table
 from palpate.metrics.tactile import floors_of, four_of, not_comparable, tmmd_of, with_floor
@@ -70,7 +70,8 @@ def compare(
     reference = feature_set(reference, argument="reference")
     sets = same_samples(generators)
     scores = {
-        name: four_of(of, reference, {**options, "subject": name}) for name, of in sets.items()
+        name: four_of(features, reference, {**options, "subject": name})
+        for name, features in sets.items()
     }
     floors: list[Scored | None] = [None] * 4
     if floor is not None:
@@ -78,7 +79,7 @@ def compare(
         real = floors_of(feature_set(floor, argument="floor"), reference, first, options)
         floors = [None, *real]
         scores = {n: [s[0], *map(with_floor, s[1:], real)] for n, s in scores.items()}
-    return _compared({n: _with_excess(s) for n, s in scores.items()}, _with_excess(floors))
+    return compared({n: _with_excess(s) for n, s in scores.items()}, _with_excess(floors))
 
 
 def _with_excess(four: Sequence[Scored | None]) -> list[Scored | None]:
@@ -86,8 +87,8 @@ def _with_excess(four: Sequence[Scored | None]) -> list[Scored | None]:
     return [x for s in four for x in (s, s and excess_of(s))]
 
 
-def _compared(
-    sets: Mapping[str, Sequence[Scored | None]], floors: Sequence[Scored | None]
+def compared(
+    sets: Mapping[str, Sequence[Scored | None]], floors: Sequence[Scored | None] = (None,)
 ) -> Comparison:
     """Scores of each generator, and differences of those that both of a pair have."""
     differences: list[Score] = []
@@ -107,11 +108,13 @@ def compare_tmmd(generators: Mapping[str, Any], reference: Any, **options: Any) 
         PalpateError: as :func:`compare`.
     """
     reference = feature_set(reference, argument="reference")
-    sets = {
-        name: [tmmd_of(build_table(of, reference, {**options, "subject": name}))]
-        for name, of in same_samples(generators).items()
-    }
-    return _compared(sets, [None])
+    sets = same_samples(generators)
+    return compared(
+        {
+            name: [tmmd_of(build_table(features, reference, {**options, "subject": name}))]
+            for name, features in sets.items()
+        }
+    )
 
 
 def same_samples(generators: Mapping[str, Any]) -> dict[str, FeatureSet]:
@@ -120,9 +123,8 @@ def same_samples(generators: Mapping[str, Any]) -> dict[str, FeatureSet]:
     Raises:
         PalpateError: if there is none, or if they differ in ids, labels, groups or encoder.
     """
-    if not generators:
-        must = "must hold a generator"
-        raise PalpateError(must, "none", "Pass its features by name", argument="generators")
+    must, fix = "must hold a generator", "Pass its features by name"
+    require(len(generators) > 0, "generators", must, "none", fix=fix)
     sets = {name: feature_set(x) for name, x in generators.items()}
     first = next(iter(sets))
     return {name: _ordered(sets[first], first, x, name) for name, x in sets.items()}
@@ -132,20 +134,18 @@ def _ordered(first: FeatureSet, first_name: str, other: FeatureSet, name: str) -
     """``other`` in the order of ``first``."""
     a, b = set(first.ids), set(other.ids)
     both = f"{name!r} and {first_name!r}"
-    if a != b or not len(a) == len(first.ids) == len(other.ids):
-        odd = sorted(a - b) + sorted(b - a)
-        named = f", first {odd[0]!r}" if odd else ", repeated ids"
-        got = f"{len(a - b)} missing and {len(b - a)} surplus ids{named}"
-        fix = "Generate for the same manifest and split"
-        raise PalpateError(f"{both} must have the same samples, each once", got, fix)
+    odd = [f"first {i!r}" for i in (*sorted(a - b), *sorted(b - a))] or ["repeated ids"]
+    got = f"{len(a - b)} missing and {len(b - a)} surplus ids, {odd[0]}"
+    must, fix = f"{both} must have the same samples, each once", "Generate for the same manifest"
+    same = a == b and len(a) == len(first.ids) == len(other.ids)
+    require(same, None, must, got, fix=f"{fix} and split")
     require_one_encoder(first, other, both)
     other = other if list(other.ids) == list(first.ids) else other.take(list(first.ids))
     for column in ("labels", "groups"):
         values = [getattr(s, column) for s in (first, other)]
-        known = [None if v is None else list(map(str, v)) for v in values]
-        if known[0] != known[1]:
-            fix = "Take both from one manifest"
-            raise PalpateError(f"{both} must have the same {column}", "different ones", fix)
+        texts = [None if v is None else list(map(str, v)) for v in values]
+        must, same = f"{both} must have the same {column}", texts[0] == texts[1]
+        require(same, None, must, "different ones", fix="Take both from one manifest")
     return other
 
 
@@ -165,34 +165,28 @@ def difference(a: Scored, b: Scored, floor: Scored | None = None) -> Score:
     Raises:
         PalpateError: if the two scores are of different settings.
     """
-    require_comparable([a.score, b.score])
-    use_floor = floor is not None and not not_comparable(a, floor)
-    others = [floor] if floor and use_floor else []
     x, y = a.score, b.score
+    require_comparable([x, y])
     if x.value is None or y.value is None:
-        return _as_difference(x, y, None, {}, note=Note("undefined", {"reason": "score"}))
-    value, df = x.value - y.value, len(a.units) - 1
+        return _paired(x, y, None, {}, "score")
     if not a.units or list(a.units) != list(b.units):
         reason = "different-units" if a.units else "no-units"
-        return _as_difference(x, y, value, {}, note=Note("no-interval", {"reason": reason}))
-    spread = _spread(value, a.replicates - b.replicates, df)
-    interval = spread.interval()
-    note = Note("no-interval", {"reason": "no-change"}) if interval is None else None
+        return _paired(x, y, Spread(x.value - y.value, np.nan, 0, ""), {}, reason)
     unit = x.details.get("left_out", x.details["unit"])
-    method = f"paired leave-one-{unit}-out jackknife, t, {df} df" if interval else ""
-    p = 2 * min(spread.shares()) if interval else None
+    method = f"paired leave-one-{unit}-out jackknife, t, {len(a.units) - 1} df"
+    spread = Spread.of(x.value - y.value, a.replicates - b.replicates, method)
+    p = 2 * min(spread.shares()) if spread.known else None
     details: dict[str, Any] = {"p_value": p}
     if x.higher_is_better is not None:
-        details = _verdict(x, y, spread, interval)
-    elif others and others[0].score.value is not None and list(others[0].units) == list(a.units):
-        real, center = others[0].replicates, others[0].score.value
-        gap = abs(x.value - center) - abs(y.value - center)
-        moved = np.abs(a.replicates - real) - np.abs(b.replicates - real)
-        of_gap = _spread(gap, moved, df)
-        gap_interval = of_gap.interval()
-        details = {"gap": gap, "gap_interval": gap_interval, "p_difference": p}
-        details |= _verdict(x, y, of_gap, gap_interval)
-    return _as_difference(x, y, value, details, note=note, interval=interval, method=method)
+        details = _verdict(x, y, spread)
+    elif floor and floor.score.value is not None and not not_comparable(a, floor):
+        center, real = floor.score.value, floor.replicates
+        if list(floor.units) == list(a.units):
+            moved = np.abs(a.replicates - real) - np.abs(b.replicates - real)
+            gap = Spread.of(abs(x.value - center) - abs(y.value - center), moved)
+            details = {"gap": gap.value, "gap_interval": gap.interval(), "p_difference": p}
+            details |= _verdict(x, y, gap)
+    return _paired(x, y, spread, details, "no-change")
 
 
 def excess_of(result: Scored) -> Scored | None:
@@ -222,15 +216,11 @@ def excess_of(result: Scored) -> Scored | None:
     return Scored(of_excess, result.excess, units, groups=result.groups)
 
 
-def _spread(value: float, replicates: Array, df: int) -> Spread:
-    return Spread(value, float(jackknife_errors(replicates[:, None])[0]), df, "")
-
-
-def _verdict(x: Score, y: Score, spread: Spread, interval: Interval | None) -> dict[str, Any]:
+def _verdict(x: Score, y: Score, spread: Spread) -> dict[str, Any]:
     """Which of two is ahead, by a difference of which 0 is a tie."""
     ahead = spread.value if x.higher_is_better else -spread.value
     better = x.a if ahead > 0 else y.a if ahead < 0 else None
-    if interval is None:
+    if (interval := spread.interval()) is None:
         return {"better": better, "p_value": None}
     return {
         "better": better,
@@ -240,28 +230,32 @@ def _verdict(x: Score, y: Score, spread: Spread, interval: Interval | None) -> d
     }
 
 
-def _as_difference(
+def _paired(
     x: Score,
     y: Score,
-    value: float | None,
+    spread: Spread | None,
     details: Mapping[str, Any],
+    reason: str,
     *,
-    note: Note | None = None,
-    interval: Interval | None = None,
-    method: str = "",
+    bounds: Interval = (-np.inf, np.inf),
 ) -> Score:
+    """The difference of two scores; ``reason`` why it has no interval, or, without a spread, no
+    value.
+    """
     empty = {"better": None, "p_better": None, "p_value": None, "decided": False}
+    interval = spread.interval(*bounds) if spread else None
+    note = Note("no-interval" if spread else "undefined", {"reason": reason})
     return replace(
         x,
         kind="excess" if x.kind == "excess" else "difference",
         b=y.a,
-        value=value,
+        value=spread.value if spread else None,
         interval=interval,
-        interval_method=method,
+        interval_method=spread.method if spread and interval else "",
         null=None,
         floor=None,
         details={**empty, **details},
-        notes=(note,) if note else (),
+        notes=() if interval else (note,),
     )
 
 
@@ -286,29 +280,13 @@ def _difference_of_means(a: Sequence[Mean], b: Sequence[Mean]) -> Score:
     x, y = a[0].score, b[0].score
     require_comparable([x, y])
     spread = spread_of([a, b], lambda m: m[..., 0] - m[..., 1])
-    more: dict[str, Any] = {}
+    details = _verdict(x, y, spread)
     if min(run.score.value or 0 for run in a) > 0:
         with np.errstate(divide="ignore", invalid="ignore"):  # a mean may be 0 without one group
             relative = spread_of([a, b], lambda m: 1 - m[..., 1] / m[..., 0])
-        bounds = relative.interval(high=1.0)
-        more = {"relative": relative.value, "relative_interval": bounds}
-    return _by_spread(x, y, spread, (-1.0, 1.0), reason="no-change", **more)
-
-
-def _by_spread(
-    x: Score, y: Score, spread: Spread, bounds: Interval, *, reason: str, **more: Any
-) -> Score:
-    """The difference with the interval of a spread; ``reason`` where there is none."""
-    interval = spread.interval(*bounds)
-    return _as_difference(
-        x,
-        y,
-        spread.value,
-        {**_verdict(x, y, spread, interval), **more},
-        note=None if interval else Note("no-interval", {"reason": reason}),
-        interval=interval,
-        method=f"paired, {spread.method}" if interval else "",
-    )
+        details |= {"relative": relative.value, "relative_interval": relative.interval(high=1.0)}
+    spread = replace(spread, method=f"paired, {spread.method}")
+    return _paired(x, y, spread, details, "no-change", bounds=(-1.0, 1.0))
 
 
 def mean_differences(
@@ -330,18 +308,19 @@ def _mean_difference(x: Score, y: Score, delta: Array, groups: Sequence[str] | N
     require_comparable([x, y])
     finite = np.isfinite(delta)
     if not finite.any():
-        return _as_difference(x, y, None, {}, note=Note("undefined", {"reason": "no-images"}))
+        return _paired(x, y, None, {}, "no-images")
     names = None if groups is None else list(np.asarray(groups)[finite])
     spread = spread_of_values(delta[finite], names)
-    return _by_spread(x, y, spread, (-np.inf, np.inf), reason="few-images")
+    spread = replace(spread, method=f"paired, {spread.method}")
+    return _paired(x, y, spread, _verdict(x, y, spread), "few-images")
 
 
 def holm(differences: Sequence[Score]) -> list[Score]:
     """The differences of one metric with ``p_adjusted``, by Holm's step-down method."""
     p = {k: d.details["p_value"] for k, d in enumerate(differences)}
-    known = sorted((k for k in p if p[k] is not None), key=lambda k: p[k])
-    each = [min(1.0, (len(known) - rank) * p[k]) for rank, k in enumerate(known)]
-    adjusted = dict(zip(known, accumulate(each, max), strict=True))
+    tested = sorted((k for k in p if p[k] is not None), key=lambda k: p[k])
+    each = [min(1.0, (len(tested) - rank) * p[k]) for rank, k in enumerate(tested)]
+    adjusted = dict(zip(tested, accumulate(each, max), strict=True))
     return [
         replace(d, details={**d.details, "p_adjusted": adjusted.get(k)})
         for k, d in enumerate(differences)

@@ -23,7 +23,7 @@ from scipy.optimize import minimize
 from scipy.special import log_softmax
 
 from palpate.core import FeatureSet, Score, require, rng_for
-from palpate.metrics.inputs import Array, require_one_encoder
+from palpate.metrics.inputs import Array, check, require_one_encoder
 from palpate.metrics.means import Mean, mean_of
 from palpate.metrics.retrieval import TIE, blocks, unit_rows
 
@@ -237,11 +237,8 @@ def _labeled(features: FeatureSet, part: str) -> tuple[Array, list[str], list[st
     """Rows with a label: features as float64, labels, groups (the id where there is none)."""
     labels = features.labels or []
     keep = [k for k, label in enumerate(labels) if label]
-    must, fix = (
-        f"The {part} features must have rows with a label",
-        "Check the split, and the labels",
-    )
-    require(bool(keep), None, must, "none", fix=fix)
+    must, fix = "must have rows with a label", "Check the split, and the column of the labels"
+    check(bool(keep), f"The {part} features", must, "none", fix)
     groups = features.ids if features.groups is None else features.groups
     names = [groups[k] or features.ids[k] for k in keep]
     return features.features[keep].astype(np.float64), [labels[k] for k in keep], names

@@ -26,8 +26,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import gammaln
 
-from palpate.core import FeatureSet, PalpateError, Score, rng_for
-from palpate.metrics.inputs import rows_text
+from palpate.core import FeatureSet, Score, require, rng_for
+from palpate.metrics.inputs import check, rows_text
 from palpate.metrics.means import Array, Mean, mean_of
 
 #: Cosines that differ by less are ties: products of equal vectors differ in the last bits.
@@ -83,7 +83,7 @@ class Retrieved(NamedTuple):
     median: Score
 
 
-def retrieval(  # noqa: PLR0913 - one argument a choice
+def retrieval(
     a: FeatureSet,
     b: FeatureSet,
     *,
@@ -93,9 +93,7 @@ def retrieval(  # noqa: PLR0913 - one argument a choice
     texts: NDArray[Any] | None = None,
     threshold: float = 0.999,
     seed: int = 0,
-    subject: str = "real",
-    split: str | None = None,
-    settings: dict[str, Any] | None = None,
+    **fields: Any,
 ) -> tuple[Retrieved, Retrieved]:
     """How often the right key is among the k most similar ones, and the median of its rank.
 
@@ -110,9 +108,8 @@ def retrieval(  # noqa: PLR0913 - one argument a choice
             has a cosine above ``threshold`` to the query's. None counts the sample's own key only.
         threshold: see ``texts``; 0.999 takes equal texts.
         seed: of the pools.
-        subject: what is scored, kept in the scores.
-        split: digest of the split, kept in the scores.
-        settings: more to keep in the scores.
+        **fields: further fields of the scores: ``subject``, by default ``"real"``, ``split``, and
+            more ``settings``.
 
     Returns:
         b found by a (``"top-1"`` with ``features`` of ``"text by tactile"``), and a found by b;
@@ -123,31 +120,35 @@ def retrieval(  # noqa: PLR0913 - one argument a choice
         PalpateError: if ids differ, the pool is larger than the set, n < 2, or on texts that are
             not finite.
     """
-    n = len(a.ids)
-    _check(a, b, pool)
+    n, widths = len(a.ids), (a.features.shape[1], b.features.shape[1])
+    must = "Queries and keys must have the same ids in the same order"
+    require(list(a.ids) == list(b.ids), None, must, "different ids", fix="Take the same from both")
+    must = "Retrieval needs at least two samples in one common space"
+    got = f"{n} samples, widths {widths[0]} and {widths[1]}"
+    fix = "Embed both with one set of encoders"
+    require(n > 1 and widths[0] == widths[1], None, must, got, fix=fix)
+    must, fix = f"must lie in 2 to {n}, the number of samples", "Choose a smaller pool"
+    require(pool is None or 2 <= pool <= n, "pool", must, pool, fix=fix)
     draws = [np.arange(n)]
     if pool is not None and pool < n:
         count = int(np.clip(POOLED // pool**2, 1, 20))
         draws = [rng_for(seed, "pool", r).choice(n, pool, replace=False) for r in range(count)]
-    size, left, right = len(draws[0]), unit_rows(a.features), unit_rows(b.features)
+    size, queries, keys = len(draws[0]), unit_rows(a.features), unit_rows(b.features)
     words = None if texts is None else unit_rows(texts, "The embeddings of texts")
     some = [slice(None)] if size == n else draws  # without a copy
     by_draw = [
-        both_ranks(left[rows], right[rows], None if words is None else words[rows], threshold)
+        both_ranks(queries[rows], keys[rows], None if words is None else words[rows], threshold)
         for rows in some
     ]
     groups = np.array(a.ids if a.groups is None else a.groups, dtype=str)
-    fields = {
-        "subject": subject,
-        "split": split,
+    right = "the sample's own" if texts is None else f"text cosine > {threshold:g}"
+    common = {
+        "subject": "real",
         "encoder": a.encoder,
         "estimator": "mean",
         "seed": seed if len(draws) > 1 else None,
-        "settings": {
-            "pool": size,
-            "right": "the sample's own" if texts is None else f"text cosine > {threshold:g}",
-            **(settings or {}),
-        },
+        **fields,
+        "settings": {"pool": size, "right": right, **(fields.get("settings") or {})},
     }
     forth, back = (
         _retrieved(
@@ -155,7 +156,7 @@ def retrieval(  # noqa: PLR0913 - one argument a choice
             draws,
             groups,
             top=top,
-            fields={**fields, "features": name},
+            fields={**common, "features": name},
         )
         for way, name in enumerate((f"{names[1]} by {names[0]}", f"{names[0]} by {names[1]}"))
     )
@@ -208,9 +209,8 @@ def unit_rows(x: NDArray[Any], name: str = "The features") -> Floats:
     """
     x = np.asarray(x, dtype=np.float32)
     length = np.linalg.norm(x, axis=1, keepdims=True)
-    if (bad := ~np.isfinite(length[:, 0])).any():
-        got, fix = f"NaN or infinity in {rows_text(bad)}", "Check what those rows were made from"
-        raise PalpateError(f"{name} must be finite", got, fix)
+    bad, fix = ~np.isfinite(length[:, 0]), "Check what those rows were made from"
+    check(not bad.any(), name, "must be finite", f"NaN or infinity in {rows_text(bad)}", fix)
     return x / np.maximum(length, 1e-12)
 
 
@@ -298,17 +298,3 @@ def _median(
     fields |= {"estimator": "median", "interval": interval, "interval_method": method}
     fields |= {"a": fields.pop("subject"), "n": len(ranks), "higher_is_better": False}
     return Score("median rank", value=value, details=details, **fields)
-
-
-def _check(a: FeatureSet, b: FeatureSet, pool: int | None) -> None:
-    n, widths = len(a.ids), (a.features.shape[1], b.features.shape[1])
-    if list(a.ids) != list(b.ids):
-        must = "Queries and keys must have the same ids in the same order"
-        raise PalpateError(must, "different ids", "Take the same ids from both")
-    if n < 2 or widths[0] != widths[1]:
-        must = "Retrieval needs at least two samples in one common space"
-        got = f"{n} samples, widths {widths[0]} and {widths[1]}"
-        raise PalpateError(must, got, "Embed both with one set of encoders")
-    if pool is not None and not 2 <= pool <= n:
-        must, fix = f"must lie in 2 to {n}, the number of samples", "Choose a smaller pool"
-        raise PalpateError(must, f"{pool}", fix, argument="pool")

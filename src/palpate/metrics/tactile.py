@@ -246,7 +246,7 @@ def kid(generated: Any, reference: Any, **options: Any) -> Score:
     Raises:
         PalpateError: as :func:`palpate.metrics.tmmd`.
     """
-    defaults = {"kernel": Polynomial(), "preset": "paper", "normalize": False}
+    defaults = {"kernel": Polynomial(), "preset": "paper", "normalize": False, "permutations": 0}
     return _named("KID", generated, reference, defaults | options)
 
 
@@ -261,11 +261,11 @@ def cmmd(generated: Any, reference: Any, **options: Any) -> Score:
     Raises:
         PalpateError: as :func:`palpate.metrics.tmmd`.
     """
-    return _named("CMMD", generated, reference, {"preset": "cmmd"} | options)
+    return _named("CMMD", generated, reference, {"preset": "cmmd", "permutations": 0} | options)
 
 
 def _named(name: str, generated: Any, reference: Any, options: Mapping[str, Any]) -> Score:
-    score = tmmd(generated, reference, **{"permutations": 0, **options})
+    score = tmmd(generated, reference, **options)
     settings = {k: v for k, v in score.settings.items() if k != "preset"}
     return replace(score, metric=name, settings=settings)
 
