@@ -144,10 +144,13 @@ def _check(options: Options) -> None:
         require_extra("palpate audit --encoder")
     inputs = [*options.paths, *(p for p in (options.split, options.pretrain) if p)]
     Files(output=outputs.output, page=outputs.page).guard(inputs)
+    if outputs.output and outputs.page:
+        must, fix = "must not be a file that the page writes", "Choose another file"
+        pages = map(outputs.page.with_suffix, (".html", ".json", ".md"))
+        require(outputs.output not in pages, "output", must, str(outputs.output), fix=fix)
     if table is not None:
-        suffixes = (".parquet", ".csv")
-        must = f"must end in {' or '.join(suffixes)}"
-        require(table.suffix.lower() in suffixes, "table", must, table.name)
+        is_table = table.suffix.lower() in (".parquet", ".csv")
+        require(is_table, "table", "must end in .parquet or .csv", table.name)
         guard_output(table, inputs, (TABLE_FORMAT.encode(), b"id,video,frame,material,leaking"))
 
 

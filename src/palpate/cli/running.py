@@ -108,10 +108,9 @@ def _parse_error(
             must = f"{_written(argument)} must be {argument.lowered.metavar}"
             return PalpateError(must, " ".join(values) or message.partition("\n")[0], fix)
         case _:
-            pass
-    argument = getattr(event, "argument", None)
-    must = f"{_written(argument)} must have its values" if argument else "The options must fit"
-    return PalpateError(must, "too few" if argument else type(event).__name__, fix)
+            argument = getattr(event, "argument", None)
+            must = f"{_written(argument) if argument else 'Each option'} must have its values"
+            return PalpateError(must, "too few", fix)
 
 
 def _written(argument: Any) -> str:

@@ -12,7 +12,7 @@ import tyro
 
 from palpate.cli.importing import Reading
 from palpate.cli.terminal import Common, OutPath, Switch, Terminal, guard_output
-from palpate.core import Split, atomic_folder, require, require_new_folder
+from palpate.core import atomic_folder, require, require_new_folder
 
 Column = Literal["auto", "video", "object", "session", "contact", "domain", "sensor"]
 #: Facts of the rule that are printed.
@@ -90,7 +90,11 @@ def run(options: Options, terminal: Terminal) -> dict[str, Any]:
             splits = make(seed=options.seed, folds=options.folds, progress=progress)
     for note in splits[0].notes:
         terminal.note(note)
-    rows = [_facts(s) for s in splits]
+    rows = [
+        {"digest": each.digest, "counts": each.counts()}
+        | {name: each.rule[name] for name in PRINTED if name in each.rule}
+        for each in splits
+    ]
     if not several:
         splits[0].save(options.output)
         terminal.facts(f"Split {options.output}", rows[0])
@@ -138,8 +142,3 @@ def _check(options: Options, several: bool) -> None:
     for folder in (options.output if several else None, options.lists):
         if folder is not None:
             require_new_folder(folder)
-
-
-def _facts(split: Split) -> dict[str, Any]:
-    facts = {name: split.rule[name] for name in PRINTED if name in split.rule}
-    return {"digest": split.digest, "counts": split.counts(), **facts}

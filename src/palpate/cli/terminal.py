@@ -109,14 +109,12 @@ class Files:
         """Check what :meth:`Terminal.deliver` is to write, as :func:`guard_output`.
 
         Raises:
-            PalpateError: if two of these are one file, or the page is no .html.
+            PalpateError: if the tables are to replace the results, or the page is no .html.
         """
         output, page, latex = self.output, self.page, self.latex
         is_page = page is None or page.suffix.lower() == ".html"
         require(is_page, "page", "must end in .html", page and page.name)
         pages = [page.with_suffix(suffix) for suffix in (".html", ".json", ".md")] if page else []
-        must = "must not be a file that the page writes"
-        require(output not in pages, "output", must, str(output), fix="Choose another file")
         same = output and latex and latex.resolve() == output.resolve()
         must, fix = "must not be the file of the results", "Choose another file for one of them"
         require(not same, "latex", must, str(latex), fix=fix)
