@@ -11,7 +11,7 @@ from forge.errors import fails
 from forge.formats import TREES, Tree
 from forge.pictures import tree
 from palpate.core import Split
-from palpate.data.formats import FORMATS
+from palpate.data.formats import FORMATS, tarf, touch_and_go
 from palpate.data.importing import import_dataset, validate, write_lists
 from palpate.data.manifest import IMAGE_COLUMNS, Manifest
 from palpate.data.scanning import finished
@@ -55,6 +55,11 @@ def copied(made: Tree, folder: Path, copy: Path) -> Tree:
 
 def facts_of(problems) -> set[tuple[str, str, str]]:
     return {(p.where, p.kind, p.text) for p in problems}
+
+
+@pytest.mark.parametrize("module", [tarf, touch_and_go])
+def test_the_size_of_an_image_is_that_of_the_published_layout(module):
+    assert "{}x{}".format(*module.FACTS.image_size) in module.__doc__
 
 
 def test_every_format_has_a_tree():

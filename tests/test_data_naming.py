@@ -98,6 +98,15 @@ def test_rows_of_one_file_have_the_same_columns(tmp_path, keyed):
     assert (manifest.table["path"].null_count(), len(manifest), problems) == (0, 4, [])
 
 
+def test_rows_that_begin_with_an_image_are_no_videos_and_frames(tmp_path):
+    path = tmp_path / "a.json"
+    path.write_text(json.dumps([["cup/1.jpg", "7"], ["pan/2.jpg", "8"]]))
+    assert read_names(path) is None
+    path.write_text(json.dumps([["cup", "7"], ["pan", "8"]]))
+    manifest, _, _ = read_names(path)
+    assert manifest.table["video"].to_list() == ["cup", "pan"]
+
+
 def test_ids_alone_cannot_show_a_leak(tmp_path, capsys):
     for part, numbers in (("train", range(8)), ("test", range(8, 10))):
         (tmp_path / f"{part}.csv").write_text(rows_of("ssvtp", numbers))

@@ -79,6 +79,12 @@ def test_bad_lines(tmp_path):
         "Orig-vision2touch": {"train": 3, "test": 2},
         "Orig-touch2vision": {"train": 6, "test": 3},
     }
+    files = {
+        way: result.splits[f"Orig-{way}"].rule["files"] for way in ("vision2touch", "touch2vision")
+    }
+    assert all(
+        len(names) == 2 and all(way in name for name in names) for way, names in files.items()
+    )
 
 
 def test_lists_in_another_folder(tmp_path):
