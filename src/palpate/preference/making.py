@@ -269,7 +269,9 @@ def trials_of(plan: Plan, *, first: bool) -> list[Trial]:
     extra = min(len(base), max(FEWEST, round(EXTRA * len(base))))
     again = enumerate(base[k] for k in rng.permutation(len(base))[:extra])
     repeats = [
-        Trial(f"r{k:04d}", "repeat", trial.item, *trial.sides(plan.task == "pair"), trial.id)
+        Trial(
+            f"r{k:04d}", "repeat", trial.item, *trial.sides(plan.task == "pair"), repeats=trial.id
+        )
         for k, trial in again
     ]
     some = rng.permutation(max(extra, len(answered)))[:extra] % len(answered)

@@ -196,7 +196,8 @@ def preference_scores(arrays: VoteArrays) -> list[Score]:
         net = 2 * replicates[:, c] - 1
         difference = share
         if share.value is not None:
-            interval = share.interval and tuple(2 * end - 1 for end in share.interval)
+            low, high = share.interval or (np.nan, np.nan)
+            interval = (2 * low - 1, 2 * high - 1)  # NaN is none
             difference = replace(share, value=2 * share.value - 1, interval=interval)
         verdict = _verdict(difference, (a, b), net, items)
         differences.append(replace(difference, kind="difference", b=b, details=verdict))

@@ -51,6 +51,7 @@ def make_contacts(options: WorldOptions, plan: VideoPlan) -> list[State]:
     normal = lambda spread: (spread * rng.normal(), spread * rng.normal())
     anywhere = lambda: (draw(0.0, TILE_MM), draw(0.0, TILE_MM))
     home, turn, last = (0.0, 0.0), 0.0, -1
+    lightest, heaviest = map(math.log, LOAD_MM)
     for contact, number in enumerate(plan.object_index):
         first = number != last  # on this object
         if first:
@@ -63,7 +64,7 @@ def make_contacts(options: WorldOptions, plan: VideoPlan) -> list[State]:
             position=away if far else (home[0] + near[0], home[1] + near[1]),
             slide=normal(SLIDE_MM[int(rng.integers(len(SLIDE_MM)))]),
             rotation=turn + rng.normal(0.0, 0.5 if far else 0.1),
-            load=math.exp(draw(*map(math.log, LOAD_MM))),
+            load=math.exp(draw(lightest, heaviest)),
             tilt=normal(TILT),
             shear=normal(SHEAR),
         )

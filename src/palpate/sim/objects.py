@@ -27,5 +27,6 @@ def _make(seed: int, ref: ObjectRef, material: Material, tile: int) -> Surface:
     surface = draw_surface(ref.material, material, tile, rng)
     curved = rng.random() < CURVED
     bulge = 1.0 if rng.random() < 0.5 else -0.3
-    radius = math.exp(rng.uniform(*map(math.log, RADIUS_MM)))
+    smallest, largest = map(math.log, RADIUS_MM)
+    radius = math.exp(rng.uniform(smallest, largest))
     return replace(surface, curvature=bulge / radius if curved else 0.0)

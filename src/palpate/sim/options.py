@@ -124,10 +124,11 @@ def _names(materials: Any) -> tuple[str, ...]:
     names = tuple(MATERIALS)
     if type(materials) is int and 1 <= materials <= len(names):
         return tuple(names[k * len(names) // materials] for k in range(materials))
-    differ = isinstance(materials, tuple) and len({*materials}) == len(materials) > 0
+    chosen: tuple[str, ...] = materials if isinstance(materials, tuple) else ()
     must = f"must be different names, or a count from 1 to {len(names)}"
     fix = f"Names: {', '.join(names)}"
+    differ = len({*chosen}) == len(chosen) > 0
     require(differ, "materials", must, repr(materials), fix=fix)
-    unknown = [name for name in materials if name not in MATERIALS]
+    unknown = [name for name in chosen if name not in MATERIALS]
     require(not unknown, "materials", "must be names of materials", few(unknown), fix=fix)
-    return materials
+    return chosen
