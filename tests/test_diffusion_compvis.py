@@ -13,6 +13,7 @@ from safetensors.torch import save_file
 
 import palpate as pp
 from forge.models import VQ_F4, decode, encode, make_encoders, make_pipeline, make_state
+from forge.pictures import photos
 from forge.worlds import by_video
 from palpate.cli import main
 from palpate.core import PalpateError
@@ -21,10 +22,6 @@ from palpate.diffusion.presets import PAPER, TINY
 from palpate.diffusion.training import Parts, train_pipeline
 from palpate.encoders.preprocess import to_unit
 from palpate.training.run import TrainingRun
-
-
-def images(n=2, size=32):
-    return np.random.default_rng(0).integers(0, 256, (n, size, size, 3), dtype=np.uint8)
 
 
 def small_vq(**options):
@@ -57,7 +54,7 @@ def test_a_file_computes_what_the_published_architecture_computes(tmp_path, shap
     model = load_autoencoder(write(tmp_path / "model.ckpt", state | loss))
     assert (model.factor, model.channels) == (2 ** (len(shape["mult"]) - 1), shape["z"])
     # In double precision: float32 adds rounding of 1e-5 where values are large.
-    model, x = model.double(), to_unit(images(), signed=True).double()
+    model, x = model.double(), to_unit(photos(2, 32), signed=True).double()
     state = {name: value.double() for name, value in state.items()}
     with torch.no_grad():
         z = model.latents(x)
@@ -101,7 +98,7 @@ def test_what_is_saved_is_a_diffusers_model_that_names_its_file(tmp_path):
     model.save(tmp_path / "saved")
     again = load_autoencoder(tmp_path / "saved")
     assert again.digest == model.digest
-    assert np.array_equal(again.encode(images()), model.encode(images()))
+    assert np.array_equal(again.encode(photos(2, 32)), model.encode(photos(2, 32)))
     digest = hashlib.sha256(path.read_bytes()).hexdigest()
     assert again.card["source"] == {"file": "vq-f4.ckpt", "sha256": digest}
     page = (tmp_path / "saved" / "README.md").read_text()
@@ -109,7 +106,7 @@ def test_what_is_saved_is_a_diffusers_model_that_names_its_file(tmp_path):
     assert "license: unknown" in page
     theirs = VQModel.from_pretrained(tmp_path / "saved").eval()
     with torch.no_grad():
-        x = to_unit(images(), signed=True)
+        x = to_unit(photos(2, 32), signed=True)
         assert torch.equal(theirs.encode(x).latents, model.latents(x))
 
 

@@ -13,6 +13,7 @@ from safetensors.torch import load_file, save_file
 from transformers import AutoTokenizer, CLIPModel
 
 from forge.models import make_encoders
+from forge.pictures import photos
 from palpate.core import PalpateError
 from palpate.encoders import encoder_set as module
 from palpate.encoders.clip import tokens
@@ -49,10 +50,6 @@ def encoders(clip):
     return clip.with_tactile(alone)
 
 
-def make_images(n=5, side=16):
-    return np.random.default_rng(0).integers(0, 256, (n, side, side, 3), dtype=np.uint8)
-
-
 def test_tokenizer_ids_cut_and_determinism():
     tokenizer = train_tokenizer(TEXTS, vocabulary=300, context=16)
     assert (tokenizer.pad_token_id, tokenizer.bos_token_id, tokenizer.eos_token_id) == (0, 1, 3)
@@ -84,7 +81,7 @@ def test_saved_clip_is_a_standard_folder_with_equal_embeddings(clip, tmp_path):
     clip.save(tmp_path)
     plain = CLIPModel.from_pretrained(tmp_path / "clip").eval()
     tokenizer = AutoTokenizer.from_pretrained(tmp_path / "clip")
-    pixels = clip.preprocess("vision").normalize(to_unit(make_images()))
+    pixels = clip.preprocess("vision").normalize(to_unit(photos(5)))
     tokens = tokenizer(TEXTS, padding=True, truncation=True, max_length=16, return_tensors="pt")
     with torch.no_grad():
         out = plain(**tokens, pixel_values=pixels)
@@ -113,7 +110,7 @@ def test_encoders_survive_a_folder(encoders, tmp_path):
     assert again.card == {"preset": "tiny"}
     assert again.preprocesses == encoders.preprocesses
     for modality in ("vision", "tactile"):
-        first, second = (embed_images(make_images(), e, modality) for e in (again, encoders))
+        first, second = (embed_images(photos(5), e, modality) for e in (again, encoders))
         assert np.array_equal(first, second)
     assert np.array_equal(embed_texts(TEXTS, again), embed_texts(TEXTS, encoders))
     assert not [p for p in (tmp_path / "set").rglob("*") if p.suffix in (".bin", ".pt", ".pkl")]
@@ -200,7 +197,7 @@ def test_folders_that_are_no_clip(clip, tmp_path, monkeypatch):
 )
 def test_unknown_and_missing_encoders(clip, modality, kind, words):
     with pytest.raises(PalpateError, match=words):
-        embed_images(make_images().astype(kind), clip, modality)
+        embed_images(photos(5).astype(kind), clip, modality)
 
 
 def test_devices():
@@ -223,7 +220,7 @@ def test_preprocess_equals_transformers_processor():
 
     ours = Preprocess(16, 20, (0.1, 0.2, 0.3), (0.4, 0.5, 0.6))
     config = {k: v for k, v in ours.to_config().items() if k != "image_processor_type"}
-    images = make_images(1, 40)
+    images = photos(1, 40)
     theirs = CLIPImageProcessorPil(**config)(Image.fromarray(images[0]), return_tensors="pt")
     assert torch.allclose(ours(to_unit(ours.fit(images))), theirs["pixel_values"], atol=1e-5)
 

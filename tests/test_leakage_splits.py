@@ -13,6 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from forge.commands import call, mistake
+from forge.scores import codes
 from palpate.core import PalpateError, Split
 from palpate.data.listing import read_lists
 from palpate.data.manifest import Manifest
@@ -44,10 +45,6 @@ def filled(counts):
             for j in range(n)
         ]
     )
-
-
-def codes(split):
-    return [note.code for note in split.notes]
 
 
 @pytest.fixture(scope="module")

@@ -8,17 +8,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import linalg, stats
 
+from forge.scores import codes
+from forge.scores import numbered as features
 from palpate.core import FeatureSet, Note, Score
 from palpate.metrics import distributions
 from palpate.metrics.distributions import compare_fid, fid
-
-
-def features(x, groups=None, encoder=None):
-    return FeatureSet([str(i) for i in range(len(x))], x, None, groups, encoder)
-
-
-def codes(score):
-    return [note.code for note in score.notes]
 
 
 def definition(x, y):

@@ -8,6 +8,7 @@ import pytest
 from scipy import stats
 from skimage.metrics import structural_similarity
 
+from forge.scores import codes
 from palpate.core import Note, PalpateError, require_comparable
 from palpate.metrics.images import (
     WEIGHTS,
@@ -40,10 +41,6 @@ def coarse_images(seed, n=2, h=45, w=50, c=3, noise=60):
 
 def ssim_per_image(a, b):
     return per_image("SSIM", a, b).values
-
-
-def codes(score):
-    return [note.code for note in score.notes]
 
 
 # ---- SSIM and PSNR

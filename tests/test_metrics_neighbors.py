@@ -5,15 +5,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from palpate.core import FeatureSet, Note, Score
+from forge.scores import numbered as features
+from palpate.core import Note, Score
 from palpate.metrics import distributions, prdc
 from palpate.metrics.intervals import spread_of_values
 
 NAMES = ["Precision", "Recall", "Density", "Coverage"]
-
-
-def features(x, groups=None, encoder=None):
-    return FeatureSet([str(i) for i in range(len(x))], x, None, groups, encoder)
 
 
 def by_matrices(generated, real, k, unit_g=None, unit_r=None):

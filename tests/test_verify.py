@@ -11,6 +11,7 @@ from PIL import Image
 
 import palpate as pp
 from forge.pictures import paint
+from forge.results import edit
 from forge.scores import GROUPS, IDS, LABELS, feature_sets
 from palpate.core import FeatureSet, PalpateError, Score, Split, plain
 from palpate.data.manifest import Manifest
@@ -38,13 +39,6 @@ def images(tmp_path, monkeypatch):
         paint(Path(folder), names, seed)
     pp.score("made", "real", companions=["ssim", "psnr"]).save("scores.json")
     return Path("scores.json")
-
-
-def edit(file, change):
-    """Change the JSON of a results file by hand."""
-    data = json.loads(file.read_text())
-    change(data)
-    file.write_text(json.dumps(data))
 
 
 def differing(file, **options):

@@ -1,6 +1,5 @@
 """Run folders verified: changed files, records and numbers are named; moved folders verify."""
 
-import json
 import shutil
 from dataclasses import replace
 from pathlib import Path
@@ -10,6 +9,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from forge.results import edit
 from palpate.cli import main
 from palpate.core import Score
 from palpate.report.results import Results
@@ -59,12 +59,6 @@ def same_again(file, monkeypatch):
 
 def differing(file):
     return {c.name: c.why for c in verify(file).checks if c.status == "differs"}
-
-
-def edit(file, change):
-    data = json.loads(file.read_text())
-    change(data)
-    file.write_text(json.dumps(data))
 
 
 def test_an_unknown_study_is_checked_by_its_records_alone(forged):

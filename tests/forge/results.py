@@ -1,6 +1,7 @@
 """Results and audits with everything that they can hold, for tests of the report."""
 
 import dataclasses
+import json
 from functools import partial
 from html.parser import HTMLParser
 
@@ -322,3 +323,10 @@ def study_results(folder, n=12, side=64):
     audits = [full_audit(images(folder, 16)), clean_audit()]
     results = dataclasses.replace(full_results(folder, n, side), audits=audits)
     return dataclasses.replace(results, tables=tables, claims=claims)
+
+
+def edit(file, change):
+    """Change the JSON of a results file by hand."""
+    data = json.loads(file.read_text())
+    change(data)
+    file.write_text(json.dumps(data))

@@ -31,6 +31,11 @@ def feature_sets() -> dict[str, FeatureSet]:
     return {n: FeatureSet(IDS, features(*s), LABELS, GROUPS, "e" * 64) for n, s in settings.items()}
 
 
+def numbered(x, groups=None, encoder=None) -> FeatureSet:
+    """Features of samples that are named by their numbers."""
+    return FeatureSet([str(i) for i in range(len(x))], x, None, groups, encoder)
+
+
 def by_key(results) -> dict:
     """Scores by (metric, subject, preset)."""
     return {(label_of(s), subject_of(s), s.settings.get("preset")): s for s in results}

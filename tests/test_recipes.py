@@ -1,4 +1,4 @@
-"""The recipe of the shipped models, in small: its parts, resuming, shipping, verifying."""
+"""The recipe of the shipped models, in small; zero-shot classification against a loop."""
 
 import importlib
 import shutil
@@ -6,9 +6,12 @@ import sys
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
+from mini_scores import zero_shot_accuracy
 
-from palpate.core import digest_folder, read_json
+from forge.models import make_encoders
+from palpate.core import FeatureSet, digest_folder, read_json
 from palpate.encoders import models as shipped_module
 from palpate.sim.presets import MINI_SEEDS
 
@@ -157,3 +160,57 @@ def test_a_stop_between_saving_and_the_end_of_a_part_is_repaired(small, tmp_path
     recipe = small.Recipe(tmp_path / "work")
     recipe.make("clip")
     assert (tmp_path / "work" / "clip" / "clip" / "clip" / "model.safetensors").is_file()
+
+
+# --- zero-shot classification
+
+PROMPTS = {
+    "Cloth": ["a soft cloth"],
+    "Metal": ["smooth cold metal", "cold"],
+    "Wall": ["a rough wall", "rough", "wall"],
+}
+
+
+@pytest.fixture(scope="module")
+def encoders():
+    return make_encoders()
+
+
+def features(labels, seed=0, groups=None):
+    rows = np.random.default_rng(seed).standard_normal((len(labels), 8)).astype(np.float32)
+    rows /= np.linalg.norm(rows, axis=1, keepdims=True)
+    return FeatureSet([f"s{k}" for k in range(len(labels))], rows, labels, groups, "encoder")
+
+
+def slow_accuracy(images, encoders):
+    right = 0
+    for row, label in zip(images.features, images.labels, strict=True):
+        best, chosen = -2.0, None
+        for name, texts in PROMPTS.items():
+            mean = sum(encoders.encode("text", [text])[0].double().numpy() for text in texts) / len(
+                texts
+            )
+            cosine = float(row @ mean / np.sqrt((mean**2).sum()))
+            if cosine > best:
+                best, chosen = cosine, name
+        right += chosen == label
+    return right / len(images.labels)
+
+
+def test_it_equals_a_loop_over_images_classes_and_texts(encoders):
+    labels = [sorted(PROMPTS)[k % 3] for k in range(60)]
+    images = features(labels, groups=[f"v{k // 6}" for k in range(60)])
+    score = zero_shot_accuracy(images, PROMPTS, encoders)
+    assert score.value == pytest.approx(slow_accuracy(images, encoders))
+    assert 0.1 < score.value < 0.9
+    assert score.details["chance"] == pytest.approx(1 / 3)
+    assert score.interval[0] < score.value < score.interval[1]
+
+
+def test_images_that_are_their_text_are_all_named(encoders):
+    rows = np.stack([encoders.encode("text", PROMPTS[name])[0].numpy() for name in sorted(PROMPTS)])
+    images = FeatureSet(["a", "b", "c"], rows, sorted(PROMPTS), None, "encoder")
+    prompts = {name: texts[:1] for name, texts in PROMPTS.items()}
+    assert zero_shot_accuracy(images, prompts, encoders).value == 1.0
+    moved = FeatureSet(["a", "b", "c"], rows[[1, 2, 0]], sorted(PROMPTS), None, "encoder")
+    assert zero_shot_accuracy(moved, prompts, encoders).value == 0.0
