@@ -19,7 +19,6 @@ from palpate.core import (
     Split,
     atomic_folder,
     atomic_path,
-    columns,
     digest_json,
     inside,
     plain,
@@ -28,8 +27,9 @@ from palpate.core import (
     require_comparable,
     rng_for,
     seed_for,
-    to_numpy,
 )
+from palpate.core.digest import to_numpy
+from palpate.report.families import columns
 from palpate.studies.stages import run_stage
 
 PROBLEMS = [Problem("a:1", "bad-line", "x"), Problem("a:2", "bad-line", "y")]

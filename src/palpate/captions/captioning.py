@@ -82,7 +82,7 @@ class Captions:
             **self.record,
             "path": str(self.path),
             "problems": plain(self.problems),
-            "notes": [note.to_json() for note in self.notes],
+            "notes": plain(self.notes),
         }
 
     def __str__(self) -> str:

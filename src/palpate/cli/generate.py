@@ -9,7 +9,7 @@ from typing import Annotated, Any, Literal
 import tyro
 
 from palpate.cli.terminal import Common, OutPath, Switch, Terminal, require_extra
-from palpate.core import problem_lines
+from palpate.core import plain, problem_lines
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -80,5 +80,5 @@ def run(options: Options, terminal: Terminal) -> dict[str, Any]:
         terminal.print_line(f"Skipped {len(images.skipped)}:")
         for line in problem_lines(images.skipped):
             terminal.print_line(line)
-    notes = [note.to_json() for note in images.notes]
+    notes = plain(images.notes)
     return facts | {"skipped": [asdict(p) for p in images.skipped], "notes": notes}

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from palpate.cli.terminal import Common, OptionalOutPath, Switch, Terminal
-from palpate.core import require
+from palpate.core import plain, require
 
 #: Seconds that a trial takes, for the time a study will take.
 SECONDS = 5
@@ -88,4 +88,4 @@ def run(options: Options, terminal: Terminal) -> dict[str, Any]:
     if plan.expected:
         reach = f"about {plan.expected['half_width']:.2f} to each side, by simulation"
         terminal.print_line(f"The interval of a comparison will reach {reach}")
-    return facts | {"notes": [note.to_json() for note in plan.notes]}
+    return facts | {"notes": plain(plan.notes)}

@@ -32,12 +32,11 @@ from palpate.core import (
     PalpateError,
     Progress,
     fact_lines,
-    is_stream,
     quiet,
     require,
     write_text,
 )
-from palpate.core.files import NO_ROOM
+from palpate.core.files import NO_ROOM, is_stream
 
 if TYPE_CHECKING:
     from palpate.report.results import Audit, Results

@@ -10,7 +10,6 @@ from palpate.core.digest import (
     rng_for,
     seed_for,
     short,
-    to_numpy,
 )
 from palpate.core.errors import (
     MissingExtraError,
@@ -22,14 +21,12 @@ from palpate.core.errors import (
     problem_lines,
     require,
     require_choice,
-    require_rows,
 )
 from palpate.core.features import FeatureSet
 from palpate.core.files import (
     atomic_folder,
     atomic_path,
     inside,
-    is_stream,
     locked,
     read_json,
     read_record,
@@ -42,7 +39,7 @@ from palpate.core.files import (
 from palpate.core.notes import Note
 from palpate.core.progress import Progress, quiet, track
 from palpate.core.samples import SampleRef
-from palpate.core.score import Measure, Score, columns, require_comparable
+from palpate.core.score import Measure, Score, require_comparable
 from palpate.core.split import PARTS, Split
 
 __all__ = [
@@ -61,7 +58,6 @@ __all__ = [
     "Split",
     "atomic_folder",
     "atomic_path",
-    "columns",
     "digest_file",
     "digest_folder",
     "digest_json",
@@ -69,7 +65,6 @@ __all__ = [
     "fact_lines",
     "few",
     "inside",
-    "is_stream",
     "locked",
     "plain",
     "problem_lines",
@@ -82,11 +77,9 @@ __all__ = [
     "require_comparable",
     "require_new_folder",
     "require_regular",
-    "require_rows",
     "rng_for",
     "seed_for",
     "short",
-    "to_numpy",
     "track",
     "write_json",
     "write_text",

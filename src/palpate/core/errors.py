@@ -78,14 +78,14 @@ class PalpateError(Exception):
 
     def to_json(self) -> dict[str, Any]:
         """Return the error as a JSON object: ``error, must, got, fix, argument``."""
-        names = ("must", "got", "fix", "argument", *(["choices"] if self.choices else []))
+        names = ("must", "got", "fix", "argument", *["choices"] * bool(self.choices))
         return {"error": type(self).__name__} | {name: getattr(self, name) for name in names}
 
 
 def few(names: Iterable[object]) -> str:
     """Return ``"a, b, c, d, e and 3 more"``, or ``"none"``."""
     words = [str(name) for name in names]
-    more = f" and {len(words) - FEW:,} more" if len(words) > FEW else ""
+    more = f" and {len(words) - FEW:,} more" * (len(words) > FEW)
     return ", ".join(words[:FEW]) + more if words else "none"
 
 
@@ -117,7 +117,7 @@ def require(
         PalpateError: unless it ``holds``.
     """
     if not holds:
-        examples = {} if argument is None or example is None else {argument: example}
+        examples = {argument: example} if argument and example is not None else {}
         text = got if isinstance(got, str) else repr(got)
         raise PalpateError(must, text, fix, argument=argument, example=examples)
 

@@ -54,7 +54,11 @@ class FeatureSet:
 
     def __post_init__(self) -> None:
         if not isinstance(self.features, np.ndarray):  # a tensor, or a list of rows
-            object.__setattr__(self, "features", _array(self.features))
+            try:
+                object.__setattr__(self, "features", to_numpy(self.features))
+            except (TypeError, ValueError, RuntimeError) as error:
+                must, got = "Features must turn into an array (n, d)", str(error).splitlines()[0]
+                raise PalpateError(must, got, "Pass rows of one width") from None
         if self.features.dtype.kind not in "fiub":
             got = f"dtype {self.features.dtype}"
             raise PalpateError("Features must be numbers", got, "Pass one row of numbers per id")
@@ -107,32 +111,22 @@ class FeatureSet:
 
     def save(self, path: Path) -> None:
         """Write an ``.npz`` of plain arrays (no pickles), atomically."""
-        columns, ids = {"labels": self.labels, "groups": self.groups}, np.array([*self.ids], str)
-        names = {
-            name: np.array(["" if is_missing(c) else c for c in column], dtype=str)
-            for name, column in columns.items()
-            if column is not None
-        }
-        encoder: dict[str, np.ndarray] = {}
-        if self.encoder:
-            encoder["encoder"] = np.array(self.encoder)
+        text = lambda column: np.array(["" if is_missing(c) else c for c in column], dtype=str)
+        names = [name for name in ("labels", "groups") if getattr(self, name) is not None]
         with atomic_path(Path(path)) as part, open(part, "wb") as file:
-            np.savez(file, allow_pickle=False, ids=ids, features=self.features, **names | encoder)
+            np.savez(
+                file,
+                allow_pickle=False,
+                ids=np.array(list(self.ids), dtype=str),
+                features=self.features,
+                **{name: text(getattr(self, name)) for name in names},
+                **({"encoder": np.array(self.encoder)} if self.encoder else {}),
+            )
 
     @classmethod
     def load(cls, path: Path) -> FeatureSet:
         """Read what :meth:`save` wrote; never a pickle."""
         with np.load(path, allow_pickle=False) as data:
-            names = ("ids", "labels", "groups")
-            ids, labels, groups = (data[k].tolist() if k in data else [] for k in names)
+            labels, groups = (data[k].tolist() if k in data else None for k in ("labels", "groups"))
             encoder = str(data["encoder"]) if "encoder" in data else None
-            return cls(ids, data["features"], labels or None, groups or None, encoder)
-
-
-def _array(features: Any) -> np.ndarray:
-    try:
-        return to_numpy(features)
-    except (TypeError, ValueError, RuntimeError) as error:
-        got = str(error).splitlines()[0]
-        fix = "Pass rows of one width"
-        raise PalpateError("Features must turn into an array (n, d)", got, fix) from None
+            return cls(data["ids"].tolist(), data["features"], labels, groups, encoder)

@@ -228,7 +228,7 @@ def require_regular(path: Path) -> None:
     Raises:
         PalpateError: if it is one.
     """
-    if not path.is_file() and not path.is_dir() and path.exists():
+    if is_stream(path):
         got, fix = f"{path}, a pipe or a device", "Write it to a file first"
         raise PalpateError("An input must be a file or a folder", got, fix)
 

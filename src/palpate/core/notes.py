@@ -22,7 +22,3 @@ class Note:
 
     code: str
     params: Mapping[str, Any] = field(default_factory=dict)
-
-    def to_json(self) -> dict[str, Any]:
-        """Return the note as a JSON object."""
-        return {"code": self.code, "params": dict(self.params)}

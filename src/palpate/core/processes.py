@@ -28,8 +28,7 @@ def worker_pool(
         PalpateError: if a worker dies, mostly because the calling script has no ``__main__`` guard.
     """
     context = multiprocessing.get_context("spawn")
-    start = (initializer, arguments)
-    with ProcessPoolExecutor(workers, context, _start_worker, start) as pool:
+    with ProcessPoolExecutor(workers, context, _start_worker, (initializer, arguments)) as pool:
         try:
             yield pool
         except BrokenProcessPool:

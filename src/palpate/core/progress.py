@@ -17,7 +17,6 @@ class Progress(Protocol):
 
     def __call__(self, task: str, done: int, total: int, remark: str = "", /) -> None:
         """Report once."""
-        ...
 
 
 def quiet(task: str, done: int, total: int, remark: str = "") -> None:

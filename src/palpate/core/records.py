@@ -44,7 +44,13 @@ def _value(hint: Any, value: Any, name: str) -> Any:
     if hint is Any:
         return value
     if origin in (Union, UnionType):
-        return _value_of_any(inner, value, name)
+        if value is None and type(None) in inner:
+            return None
+        *first, last = (kind for kind in inner if kind is not type(None))
+        for kind in first:  # the first that fits, such as a text or a record
+            with suppress(ValueError):
+                return _value(kind, value, name)
+        return _value(last, value, name)
     if dataclasses.is_dataclass(hint):
         try:
             kind: Any = hint
@@ -60,17 +66,6 @@ def _value(hint: Any, value: Any, name: str) -> Any:
     if _is(hint, value):
         return value
     raise ValueError(f"{name} of type {type(value).__name__}")
-
-
-def _value_of_any(kinds: Sequence[Any], value: Any, name: str) -> Any:
-    """``value`` as the first of some types that fits, such as a text or a record."""
-    if value is None and type(None) in kinds:
-        return None
-    *first, last = (kind for kind in kinds if kind is not type(None))
-    for kind in first:
-        with suppress(ValueError):
-            return _value(kind, value, name)
-    return _value(last, value, name)
 
 
 def _is(hint: Any, value: Any) -> bool:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import html
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, Literal, NamedTuple
 
@@ -15,9 +15,7 @@ from palpate.core.records import from_plain
 
 #: Settings that must agree before two scores may share a column.
 COMPARABLE = (
-    "metric",
-    "features",
-    "kernel",
+    "measure",
     "kind",
     "estimator",
     "bandwidth",
@@ -27,8 +25,7 @@ COMPARABLE = (
     "reference",
     "split",
 )
-#: Arrow and words for ``Score.higher_is_better``.
-ARROWS: Mapping[bool | None, str] = {True: "↑", False: "↓", None: "→"}
+#: Words for ``Score.higher_is_better``.
 BETTER: Mapping[bool | None, str] = {
     True: "higher is better",
     False: "lower is better",
@@ -152,14 +149,14 @@ class Score:
     def __str__(self) -> str:
         """Return three lines: the number with its interval; how it was made; on what."""
         value = "undefined" if self.value is None else f"{self.value:.4g}"
-        if self.interval is not None:
+        if self.interval:
             method = ", ".join(filter(None, [f"{self.level:.0%}", self.interval_method]))
             value += " [{:.4g}, {:.4g}] ({})".format(*self.interval, method)
         setting = [
             self.estimator,
             f"sigma {self.bandwidth:g}" if self.bandwidth is not None else "",
             f"scale {self.scale:g}" if self.scale != 1 else "",
-            "null {:.4g} to {:.4g}".format(*self.null) if self.null is not None else "",
+            "null {:.4g} to {:.4g}".format(*self.null) if self.null else "",
             f"floor {self.floor:.4g}" if self.floor is not None else "",
             BETTER[self.higher_is_better],
         ]
@@ -169,8 +166,8 @@ class Score:
             f"seed {self.seed}" if self.seed is not None else "",
             *(f"{name} {short(d)}" for name in names if (d := getattr(self, name))),
         ]
-        fields = (self.features, self.kernel, "" if self.kind == "value" else self.kind)
-        name = ", ".join(filter(None, (self.metric, *fields)))
+        kind = self.kind * (self.kind != "value")
+        name = ", ".join(filter(None, (self.metric, self.features, self.kernel, kind)))
         head = f"{name} of {self.a}{f' against {self.b}' if self.b else ''}: {value}"
         return "\n  ".join([head, *(", ".join(filter(None, line)) for line in (setting, data))])
 
@@ -209,17 +206,3 @@ def require_comparable(scores: Sequence[Score]) -> None:
                     f"{a!r} for {compared[0].a!r} and {b!r} for {score.a!r}",
                     "Score both again with the same settings, or put them into two tables",
                 )
-
-
-def columns(scores: Iterable[Score]) -> list[list[Score]]:
-    """Return the scores of each measure and kind, in order of first appearance.
-
-    Raises:
-        PalpateError: if two scores of one column were not made with the same settings.
-    """
-    table: dict[tuple[Measure, Kind, bool], list[Score]] = {}
-    for score in scores:
-        table.setdefault((score.measure, score.kind, score.b is None), []).append(score)
-    for column in table.values():
-        require_comparable(column)
-    return [*table.values()]

@@ -48,8 +48,8 @@ from palpate.core import (
     fact_lines,
     inside,
     require,
-    require_rows,
 )
+from palpate.core.errors import require_rows
 
 IMAGE_COLUMNS = ("vision", "tactile", "background")
 _WORDS = ("video", "frame", "contact", "object", "session", "material", "text")

@@ -1,22 +1,23 @@
 """Scores by family: which metrics answer one question, and how they were made.
 
-A column is what :func:`palpate.core.columns` makes, so scores of different settings raise instead
-of sharing one. Scores of another family, preset, split or reference, or on other features, are in
-tables of their own.
+Scores of different settings raise instead of sharing a column. Scores of another family, preset,
+split or reference, or on other features, are in tables of their own.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
-from palpate.core import Measure, Note, Score, columns, plain, short
-from palpate.core.score import ARROWS, BETTER
+from palpate.core import Measure, Note, Score, plain, require_comparable, short
+from palpate.core.score import BETTER, Kind
 from palpate.report.labels import measured
 from palpate.report.numbers import digits_of
 
+#: Arrow for ``Score.higher_is_better``.
+ARROWS: Mapping[bool | None, str] = {True: "↑", False: "↓", None: "→"}
 #: Title, question, and words that are part of the names of metrics (lower case): the first family
 #: whose words match takes a metric.
 FAMILIES: tuple[tuple[str, str, tuple[str, ...]], ...] = (
@@ -279,6 +280,20 @@ def _references(scores: Sequence[Score]) -> list[int]:
             last[subject] = k
         result.append(last.get(subject, 0))
     return result
+
+
+def columns(scores: Iterable[Score]) -> list[list[Score]]:
+    """Return the scores of each measure and kind, in order of first appearance.
+
+    Raises:
+        PalpateError: if two scores of one column were not made with the same settings.
+    """
+    table: dict[tuple[Measure, Kind, bool], list[Score]] = {}
+    for score in scores:
+        table.setdefault((score.measure, score.kind, score.b is None), []).append(score)
+    for column in table.values():
+        require_comparable(column)
+    return [*table.values()]
 
 
 def _family(title: str, question: str, scores: Sequence[Score]) -> Family:

@@ -16,8 +16,9 @@ from itertools import count, pairwise, zip_longest
 from typing import Any
 
 from palpate.core import Measure, Note, Score, plain, short
-from palpate.core.score import ARROWS, BETTER
+from palpate.core.score import BETTER
 from palpate.report.families import (
+    ARROWS,
     BASELINES,
     REAL,
     Column,
