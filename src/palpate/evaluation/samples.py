@@ -12,15 +12,8 @@ from typing import TYPE_CHECKING, Any, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from palpate.core import (
-    FeatureSet,
-    PalpateError,
-    Progress,
-    digest_file,
-    digest_json,
-    require_rows,
-    short,
-)
+from palpate.core import FeatureSet, PalpateError, Progress, digest_file, digest_json, short
+from palpate.core.errors import require_rows
 
 if TYPE_CHECKING:
     from palpate.data.manifest import Manifest
