@@ -11,9 +11,8 @@ import pytest
 import tyro
 
 from forge.commands import call, mistake
-from palpate.cli import VERBS, main, running
-from palpate.cli.running import error_line, polish_help
-from palpate.cli.terminal import CONFIG
+from palpate.cli import VERBS, main, terminal
+from palpate.cli.terminal import CONFIG, error_line, polish_help
 from palpate.core import PalpateError, Split
 
 
@@ -120,7 +119,7 @@ def test_words_become_arguments(argv, arguments):
     words = shlex.split(argv)
     name = next(n for n in (" ".join(words[:2]), words[0]) if n in VERBS)
     options = import_module(f"palpate.cli.{VERBS[name].module}").Options
-    parsed = running.parse(name, options, words[len(name.split()) :]).keywords()
+    parsed = terminal.parse(name, options, words[len(name.split()) :]).keywords()
     plain = lambda v: str(v) if isinstance(v, Path) else v
     flat = {
         k: tuple(map(plain, v)) if isinstance(v, tuple) else plain(v) for k, v in parsed.items()
@@ -221,11 +220,11 @@ def test_an_error_of_all_processes_is_printed_by_the_first(monkeypatch, capsys):
     def fails(name, args):
         raise error
 
-    monkeypatch.setattr(running, "_call", fails)
+    monkeypatch.setattr(terminal, "_call", fails)
     error = PalpateError("It must hold", "not", "")
     printed = []
     for first, error.shared in ((False, False), (True, True), (False, True)):
-        monkeypatch.setattr(running, "FIRST", first)
+        monkeypatch.setattr(terminal, "FIRST", first)
         assert main(["split", "x"]) == 2
         printed.append(capsys.readouterr().err != "")
     assert printed == [True, True, False]

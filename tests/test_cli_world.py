@@ -5,7 +5,7 @@ import dataclasses
 import pytest
 
 from forge.commands import mistake
-from palpate.cli.running import parse
+from palpate.cli.terminal import parse
 from palpate.cli.world import FIELDS, Options, world_options
 from palpate.sim import PRESETS, WorldOptions
 

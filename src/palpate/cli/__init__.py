@@ -75,6 +75,6 @@ def _run(args: list[str]) -> int:
     if grouped and args[1:] in ([], ["-h"], ["--help"]):
         sys.stdout.write(usage(group))
         return OK if args[1:] else USER_ERROR
-    from palpate.cli.running import run_verb
+    from palpate.cli.terminal import run_verb
 
     return run_verb(args[0], args[1:])

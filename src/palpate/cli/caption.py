@@ -10,8 +10,7 @@ from typing import Annotated, Any, Literal
 
 import tyro
 
-from palpate.cli.running import error_line
-from palpate.cli.terminal import Common, OutPath, Switch, Terminal
+from palpate.cli.terminal import Common, OutPath, Switch, Terminal, error_line
 from palpate.cli.verbs import FAILED_CHECK
 from palpate.core import require
 

@@ -6,9 +6,8 @@ import dataclasses
 from dataclasses import dataclass
 from typing import Any, Literal
 
-from palpate.cli.running import option_name
 from palpate.cli.settings import PresetTable, Settings
-from palpate.cli.terminal import Common, OutPath, Terminal
+from palpate.cli.terminal import Common, OutPath, Terminal, option_name
 from palpate.sim import DEFAULT, PRESETS, SEEN_WARNING, WorldOptions, seen_by_mini, write_world
 
 #: Fields of a preset that are options of their own.
