@@ -28,11 +28,12 @@ from typing import Any
 import numpy as np
 
 from palpate.core import FeatureSet, Note, Score, require, require_comparable
+from palpate.metrics.floors import not_comparable, with_floor
 from palpate.metrics.inputs import Array, feature_set, require_one_encoder
 from palpate.metrics.intervals import Interval, Scored, Spread, spread_of_values
 from palpate.metrics.means import Mean, spread_of
 from palpate.metrics.table import build_table
-from palpate.metrics.tactile import floors_of, four_of, not_comparable, tmmd_of, with_floor
+from palpate.metrics.tactile import floors_of, four_of, tmmd_of
 
 
 @dataclass(frozen=True)
