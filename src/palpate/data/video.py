@@ -45,8 +45,8 @@ class VideoReader:
             raise MissingExtraError("av", "video", "Reading video files") from None
         self.path = Path(path)
         self._errors: tuple[type[Exception], ...] = (FFmpegError, OSError)
-        fix = "Check the path"
-        require(self.path.is_file(), None, "The video must exist", f"no file {self.path}", fix=fix)
+        got = f"no file {self.path}"
+        require(self.path.is_file(), None, "The video must exist", got, fix="Check the path")
         try:
             self._container: Any = av.open(str(self.path), metadata_errors="replace")
         except self._errors as error:

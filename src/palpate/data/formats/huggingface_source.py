@@ -41,8 +41,7 @@ def open_source(source: Path, config: str | None = None, revision: str | None = 
     name = source.name if local else source.as_posix()
     loaded = _loaded(source, name, config, revision)
     splits: dict[str, Any] = dict(loaded) if isinstance(loaded, dict) else {"": loaded}
-    fix = "Check what wrote it"
-    require(bool(splits), None, f"The data set {name} must hold rows", "none", fix=fix)
+    require(bool(splits), None, f"{name} must hold rows", "none", fix="Check what wrote it")
     features = dict(next(iter(splits.values())).features or {})
     images = [n for n, f in features.items() if isinstance(f, datasets.Image)]
     for split, data in splits.items():

@@ -208,9 +208,8 @@ def _require_amounts(
     videos: Mapping[str, _Video], every: int | None, max_per_contact: int | None
 ) -> None:
     require(every is None or every >= 1, "every", "must be at least 1", every)
-    must, got = "must come without every", str(max_per_contact)
-    fix = "Choose one"
-    require(every is None or max_per_contact is None, "max_per_contact", must, got, fix=fix)
+    must, alone = "must come without every", every is None or max_per_contact is None
+    require(alone, "max_per_contact", must, str(max_per_contact), fix="Choose one")
     if every is None and videos and not any("tactile" in v.moving for v in videos.values()):
         must, got = "must be given", "videos without touch, in which no contact is found"
         raise PalpateError(must, got, "", argument="every", example={"every": 10})
