@@ -267,7 +267,7 @@ def test_a_card_says_what_it_must(mini):
     for line in lines:
         assert f"\n{line}\n" in body, line
     assert len(text) < 2500
-    with pytest.raises(PalpateError, match="made of one of palpate-clip/1"):
+    with pytest.raises(PalpateError, match="`format` must be one of palpate-clip/1"):
         model_card({"format": "other"})
 
 

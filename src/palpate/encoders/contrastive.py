@@ -493,7 +493,7 @@ def _facts(
     return {
         "preset": preset.name,
         "settings": {k: v for k, v in asdict(preset).items() if k not in ("cost", "score")},
-        "options": options.facts,
+        "options": asdict(options),
         "seed": options.seed,
         "train_manifest": train.digest,
         "train_samples": len(train),

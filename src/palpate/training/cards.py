@@ -25,7 +25,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from palpate.core import read_json, require, write_text
+from palpate.core import read_json, require_choice, write_text
 
 PLACED = (
     *("title", "summary", "license", "tags", "data", "ceiling", "recipe", "scores", "limits"),
@@ -91,13 +91,8 @@ def model_card(about: Mapping[str, Any]) -> str:
     """
     from huggingface_hub import ModelCardData
 
-    form = _FORMATS.get(str(about.get("format")))
-    must, fix = (
-        f"A model card is made of one of {', '.join(_FORMATS)}",
-        "Pass the JSON of palpate.json",
-    )
-    require(form is not None, None, must, repr(about.get("format")), fix=fix)
-    assert form is not None
+    require_choice("format", about.get("format"), _FORMATS)
+    form = _FORMATS[about["format"]]
     card, pipeline = _card(about), "training" in about
     head = ModelCardData(
         license=card.get("license", "unknown" if pipeline else "apache-2.0"),

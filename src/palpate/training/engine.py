@@ -18,7 +18,7 @@ import warnings
 from collections.abc import Callable, Generator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -36,6 +36,7 @@ from palpate.core import (
     Progress,
     atomic_path,
     digest_json,
+    few,
     quiet,
     require,
     rng_for,
@@ -189,7 +190,7 @@ class _Run:
         averaged = self.parameters if options.ema is not None else {}
         self.average = {name: p.detach().clone() for name, p in averaged.items()}
         shapes = {name: list(p.shape) for name, p in self.parameters.items()}
-        self.key = digest_json(["palpate-checkpoint/1", task.key, task.n, shapes, options.facts])
+        self.key = digest_json(["palpate-checkpoint/1", task.key, task.n, shapes, asdict(options)])
         self.best_file = folder / f"best-{short(self.key)}.safetensors"  # not of another run
         self.order = RowOrder(task.n, batch, options.seed)
         self.loss = torch.compile(task.loss) if compute.compile else task.loss
@@ -266,7 +267,8 @@ class _Run:
         self.optimizer.zero_grad(set_to_none=True)
         losses = self.forward(batch)
         self.scaler.scale(losses.total).backward()
-        values = _stacked(losses)
+        scalars = (losses.total, *losses.logs.values())
+        values = torch.stack([scalar.detach().float() for scalar in scalars])
         gradients = [p.grad for p in self.parameters.values() if p.grad is not None]
         average([*gradients, values])
         self.scaler.unscale_(self.optimizer)
@@ -311,12 +313,10 @@ class _Run:
             finite = torch.isfinite(rows.flatten()).cpu().numpy()
         parts = merged({str(self.part[0]): batch.rows[~finite]})
         bad = np.concatenate([parts[str(rank)] for rank in range(self.part[1])])
-        bad = bad if len(bad) else batch.all_rows
-        names = self.task.names
-        listed = [str(names[r]) if names is not None else f"row {r}" for r in bad[:5]]
-        more = f" and {len(bad) - 5} more" if len(bad) > 5 else ""
+        bad, names = bad if len(bad) else batch.all_rows, self.task.names
+        listed = few(f"row {row}" if names is None else names[row] for row in bad)
         must = f"The {name} of {self.task.name} must be finite"
-        got = f"{value} at step {step}, with {', '.join(listed)}{more}"
+        got = f"{value} at step {step}, with {listed}"
         kept = "; the last checkpoint is kept" if self.resumed or self.written else ""
         fix = f"Look at these samples, or lower the learning rate{kept}"
         return shared(PalpateError(must, got, fix))
@@ -425,7 +425,7 @@ class _Run:
         self.trackers = [_tracker(each, self.folder) for each in self.compute.trackers]
         for tracker in self.trackers:
             if tracker.name == "wandb":  # TensorBoard's takes numbers and words alone
-                tracker.store_init_configuration(dict(self.options.facts))
+                tracker.store_init_configuration(asdict(self.options))
 
     def write_log(self, line: dict[str, float]) -> None:
         """Add a line to the log, its file and the trackers."""
@@ -525,11 +525,6 @@ def _require(task: Task, options: LoopOptions, processes: int) -> int:
         fix = "Choose another, or another number of processes"
         raise shared(PalpateError(must, got, fix, argument="batch"))
     return batch
-
-
-def _stacked(losses: Losses) -> Tensor:
-    """The loss and the logged numbers, (1 + logs,)."""
-    return torch.stack([v.detach().float() for v in (losses.total, *losses.logs.values())])
 
 
 def _copies(tensors: dict[str, Tensor]) -> dict[str, Tensor]:

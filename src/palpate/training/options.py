@@ -6,7 +6,7 @@ This file needs no torch: presets and the command line are made of it.
 from __future__ import annotations
 
 import math
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
@@ -78,11 +78,6 @@ class LoopOptions:
         }
         for name, (holds, must) in valid.items():
             require(holds, name, must, repr(getattr(self, name)), fix="Choose another value")
-
-    @property
-    def facts(self) -> dict[str, object]:
-        """All options, for the key of a checkpoint and for cards."""
-        return asdict(self)
 
 
 @dataclass(frozen=True)
