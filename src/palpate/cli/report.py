@@ -13,7 +13,7 @@ from typing import Annotated, Any
 import tyro
 
 from palpate.cli.terminal import Common, OutPath, Terminal, guard_output
-from palpate.core import Note, PalpateError, inside, read_record, short
+from palpate.core import Note, PalpateError, few, inside, read_record, require, short
 from palpate.report.results import AUDIT_FORMAT, RESULTS_FORMAT, Audit, Results
 
 TITLE = "palpate report"
@@ -77,13 +77,11 @@ def _guard_folder(folder: Path | None) -> None:
     """
     if folder is None or not folder.exists():
         return
-    if not folder.is_dir():
-        raise PalpateError("must be a folder", str(folder), "Name another", argument="figures")
+    require(folder.is_dir(), "figures", "must be a folder", str(folder), fix="Name another")
     foreign = sorted(path.name for path in folder.iterdir() if not WRITTEN.fullmatch(path.name))
-    if foreign:
-        must = "must be a new folder, or hold nothing but files of this command"
-        got = f"{folder} with {foreign[0]}"
-        raise PalpateError(must, got, "Choose another folder", argument="figures")
+    must = "must be a new folder, or hold nothing but files of this command"
+    got = f"{folder} with {few(foreign)}"
+    require(not foreign, "figures", must, got, fix="Choose another folder")
 
 
 def read(path: Path, folders: Sequence[Path] = ()) -> Results:
@@ -123,10 +121,13 @@ def read(path: Path, folders: Sequence[Path] = ()) -> Results:
 
 def join(first: Results, second: Results) -> Results:
     """Return both, one after the other; the first title of its own stays."""
-    names = [f.name for f in fields(Results) if f.name not in ("title", "settings")]
-    lists: dict[str, Any] = {n: [*getattr(first, n), *getattr(second, n)] for n in names}
+    names = (f.name for f in fields(Results) if f.name not in ("title", "settings"))
     title = second.title if first.title == TITLE and second.title else first.title
-    return Results(title=title, settings={**first.settings, **second.settings}, **lists)
+    return Results(
+        title=title,
+        settings={**first.settings, **second.settings},
+        **{name: [*getattr(first, name), *getattr(second, name)] for name in names},
+    )
 
 
 def _mismatch(results: Results) -> list[Note]:

@@ -13,7 +13,7 @@ error is 1, and a mean of effects of correlated metrics has an error of at most 
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import groupby
 from statistics import fmean
 
@@ -25,6 +25,7 @@ from palpate.report.labels import measured
 from palpate.report.numbers import number
 from palpate.report.study import Claim, StudyTable, Verdict
 from palpate.studies.evidence import ahead, in_words, over_seeds, side_of
+from palpate.studies.names import BACKGROUND, GVST, NOLEAK, ORIG, OURS
 
 #: Metrics that compare pixels, or features of networks trained on photos (paper, table 3).
 TRADITIONAL = ("SSIM", "PSNR", "LPIPS", "FID", "CMMD")
@@ -39,25 +40,10 @@ BEHIND = "below 0: behind"
 Z = float(special.ndtri(0.975))
 
 
-@dataclass(frozen=True)
-class Names:
-    """What the methods of the paper's claims are called in the scores.
-
-    Attributes:
-        ours: trained on text.
-        images: trained on images.
-        background, plain: with the no-contact image as a condition, and the same without.
-    """
-
-    ours: str = "Ours"
-    images: Sequence[str] = ("GVST",)
-    background: str = "Ours w/ BG"
-    plain: str = "Ours"
-
-    @property
-    def pairs(self) -> list[tuple[str, str]]:
-        """The paper's comparisons, its method first."""
-        return [*((self.ours, other) for other in self.images), (self.plain, self.background)]
+#: The paper's comparisons, its method first: with trainings on images, then with the no-contact
+#: image as a further condition.
+Pairs = Sequence[tuple[str, str]]
+PAIRS: Pairs = ((OURS, GVST), (OURS, BACKGROUND))
 
 
 def differences_over_seeds(runs: Sequence[Iterable[Score]]) -> list[Score]:
@@ -87,15 +73,14 @@ def _chosen(scores: Iterable[Score]) -> dict[tuple[Measure, str, str | None], Sc
 
 def _combined(scores: Sequence[Score]) -> Score:
     """A difference over seeds, and the difference of its distances to the floor."""
-    made = over_seeds(scores)
-    if any("gap" not in s.details for s in scores):
-        return made
-    gaps = [
-        replace(s, value=s.details["gap"], interval=s.details.get("gap_interval")) for s in scores
-    ]
-    gap = over_seeds(gaps)
+    mean, details = over_seeds(scores), [score.details for score in scores]
+    if any("gap" not in d for d in details):
+        return mean
+    pairs = zip(scores, details, strict=True)
+    gaps = (replace(s, value=d["gap"], interval=d.get("gap_interval")) for s, d in pairs)
+    gap = over_seeds([*gaps])
     more = {"gap": gap.value, "gap_interval": gap.interval}
-    return replace(made, details={**made.details, **more})
+    return replace(mean, details={**mean.details, **more})
 
 
 def decide(sides: Sequence[int], *, every: bool = False) -> Verdict:
@@ -111,34 +96,29 @@ def decide(sides: Sequence[int], *, every: bool = False) -> Verdict:
     return "undecided"
 
 
-def leak_claims(
-    tasks: Mapping[str, Score], names: tuple[str, str] = ("Orig", "NoLeak")
-) -> list[Claim]:
+def leak_claims(tasks: Mapping[str, Score]) -> list[Claim]:
     """Leakage inflates every task: one row for all with a better direction, and one a task.
 
     I-, CI- and D-TMMD have none: leaks inflate them if they bring images closer to their floor.
 
     Args:
-        tasks: task -> paired difference of its score between the splits ``names``, of
-            :func:`palpate.studies.evidence.difference_between` or of
+        tasks: task -> paired difference of its score between the data set's own split and the
+            leak-free one, of :func:`palpate.studies.evidence.difference_between` or of
             :func:`palpate.studies.split_study.compare_splits`.
-        names: of the leaking split and the leak-free one, as in the differences.
     """
-    gains = {task: ahead(difference, names[0]) for task, difference in tasks.items()}
+    gains = {task: ahead(difference, ORIG) for task, difference in tasks.items()}
     source, rows = "paper, tables 1 and 2", list[Claim]()
     for task, gain in gains.items():
-        lead = f"Lead of {names[0]} over {names[1]} in {measured(tasks[task])}"
-        why = f"{lead} ({BEHIND}): {in_words(gain)}{_runs(gain)}"
-        verdict = decide([side_of(gain)])
-        claim, known = f"Leakage inflates {task}", gain.interval is not None
-        rows.append(Claim(claim, source, verdict, f"{why}.", [gain], known))
+        lead = f"Lead of {ORIG} over {NOLEAK} in {measured(gain)}"
+        why = f"{lead} ({BEHIND}): {in_words(gain)}{_runs(gain)}."
+        verdict, numbers = decide([side_of(gain)]), gain.interval is not None
+        rows.append(Claim(f"Leakage inflates {task}", source, verdict, why, [gain], numbers))
     directed = [g for task, g in gains.items() if tasks[task].higher_is_better is not None]
     sides = [side_of(gain) for gain in directed]
     counts = f"{sides.count(1)} of {len(sides)} tasks inflated, {sides.count(-1)} deflated"
     why = f"{counts}, {sides.count(0)} with an interval that holds 0 or is missing."
-    verdict, known = decide(sides, every=True), any(gain.interval for gain in directed)
-    overall = Claim("Leakage inflates every task", source, verdict, why, directed, known)
-    return [overall, *rows]
+    verdict, numbers = decide(sides, every=True), any(gain.interval for gain in directed)
+    return [Claim("Leakage inflates every task", source, verdict, why, directed, numbers), *rows]
 
 
 def _runs(score: Score) -> str:
@@ -154,13 +134,14 @@ def _of_metric(metric: str, difference: Score) -> bool:
     return measure.metric == metric and usual
 
 
-def _between(differences: Iterable[Score], metric: str, a: str, b: str) -> list[Score]:
-    """Differences of a metric between two methods."""
-    return [d for d in differences if {d.a, d.b} == {a, b} and _of_metric(metric, d)]
+def _leads_of(scores: Iterable[Score], metric: str, front: str, other: str) -> list[Score]:
+    """Differences of a metric between two methods, as leads of the first."""
+    between = (d for d in scores if {d.a, d.b} == {front, other} and _of_metric(metric, d))
+    return [ahead(d, front) for d in between]
 
 
 def preference_claims(
-    differences: Sequence[Score], people: Sequence[Score], names: Names | None = None
+    differences: Sequence[Score], people: Sequence[Score], pairs: Pairs = PAIRS
 ) -> list[Claim]:
     """Which metrics prefer what people prefer: one row a metric, over the paper's two comparisons.
 
@@ -168,33 +149,32 @@ def preference_claims(
         differences: of :func:`differences_over_seeds`.
         people: scores of ``palpate preference score`` (``Results.load(path).scores``); empty
             without a human study, and then every row is undecided.
-        names: of the methods.
+        pairs: of methods.
     """
-    names, votes = names or Names(), [s for s in people if s.b is not None]
-    return [
-        _preference_claim(metric, differences, votes, names) for metric in (*TRADITIONAL, *FAMILY)
-    ]
-
-
-def _preference_claim(
-    metric: str, differences: Sequence[Score], votes: Sequence[Score], names: Names
-) -> Claim:
-    against = metric in TRADITIONAL
-    does = "prefers what people do not" if against else "prefers what people prefer"
-    of_metric, of_people, signs = list[Score](), list[Score](), list[int]()
-    for pair in names.pairs:
-        scores = [ahead(d, pair[0]) for d in _between(differences, metric, *pair)]
-        people = [ahead(v, pair[0]) for v in _between(votes, PEOPLE, *pair)]
-        signs += [side_of(score) * side_of(vote) for score in scores for vote in people]
-        of_metric, of_people = of_metric + scores, of_people + people
-    parts = [_leads(of_metric), _leads(of_people)]
-    if not of_metric:
-        parts[0] = f"{metric} was not computed (its weights may be missing)"
-    if not of_people:
-        parts[1] = "the human study compared other methods" if votes else "no human study was given"
-    verdict = decide([-sign if against else sign for sign in signs])
-    why, evidence = f"{_capital('; '.join(parts))}.", [*of_metric, *of_people]
-    return Claim(f"{metric} {does}", "paper, table 3", verdict, why, evidence, bool(signs))
+    claims = list[Claim]()
+    for metric in (*TRADITIONAL, *FAMILY):
+        against = metric in TRADITIONAL
+        does = "prefers what people do not" if against else "prefers what people prefer"
+        leads, votes, signs = list[Score](), list[Score](), list[int]()
+        for pair in pairs:
+            scores = _leads_of(differences, metric, *pair)
+            of_people = _leads_of(people, PEOPLE, *pair)
+            signs += [side_of(score) * side_of(vote) for score in scores for vote in of_people]
+            leads, votes = leads + scores, votes + of_people
+        parts = [_leads(leads), _leads(votes)]
+        if not leads:
+            parts[0] = f"{metric} was not computed (its weights may be missing)"
+        if not votes:
+            compared = any(score.b is not None for score in people)
+            parts[1] = "no human study was given"
+            if compared:
+                parts[1] = "the human study compared other methods"
+        verdict = decide([-sign if against else sign for sign in signs])
+        why = "; ".join(parts)
+        why, evidence = f"{why[0].upper()}{why[1:]}.", [*leads, *votes]
+        source = "paper, table 3"
+        claims.append(Claim(f"{metric} {does}", source, verdict, why, evidence, bool(signs)))
+    return claims
 
 
 def _leads(scores: Sequence[Score]) -> str:
@@ -208,68 +188,52 @@ def _leads(scores: Sequence[Score]) -> str:
     return f"lead by {measured(scores[0])} ({BEHIND}): {'; '.join(parts)}"
 
 
-def _capital(sentence: str) -> str:
-    return sentence[:1].upper() + sentence[1:]
-
-
 def ranking_claims(
-    differences: Sequence[Score], people: Sequence[Score] = (), names: Names | None = None
+    differences: Sequence[Score], people: Sequence[Score] = (), pairs: Pairs = PAIRS
 ) -> list[Claim]:
     """Text as a bridge beats images; conditioning on the background hurts.
 
     TMMD and, if given, people decide; I-, CI- and D-TMMD, which say how images vary and not how
     close they are, are listed as evidence alone.
     """
-    names = names or Names()
-    wanted = [f"Text as a bridge beats images ({other})" for other in names.images]
-    wanted.append("Conditioning on the background hurts")
-    return [
-        _ranking_claim(claim, *pair, differences, people)
-        for claim, pair in zip(wanted, names.pairs, strict=True)
-    ]
-
-
-def _ranking_claim(
-    claim: str, front: str, other: str, differences: Sequence[Score], people: Sequence[Score]
-) -> Claim:
-    pair = front, other
-    votes = [s for s in people if s.b is not None]
-    compared = _between(differences, "TMMD", *pair) + _between(votes, PEOPLE, *pair)
-    deciding = [ahead(d, front) for d in compared]
-    others = [
-        ahead(d, front) for metric in FAMILY[1:] for d in _between(differences, metric, *pair)
-    ]
-    why = f"{other} was not compared with {front}"
-    if scores := [*deciding, *others]:
-        each = ", ".join(f"{measured(s)} {in_words(s)}" for s in scores)
-        why = f"Lead of {front} over {other} ({BEHIND}): {each}{_runs(scores[0])}"
-        if deciding and others:
-            people_too = any(d.metric == PEOPLE for d in compared)
-            why += f". {'TMMD and people decide' if people_too else 'TMMD decides'}"
-    sides = [side_of(s) for s in deciding]
-    source = "paper, tables 3 and 4" if "images" in claim else "paper, table 3"
-    known = any(score.interval for score in deciding)
-    return Claim(claim, source, decide(sides), f"{why}.", [*deciding, *others], known)
+    claims = list[Claim]()
+    for pair in pairs:
+        front, other = pair
+        claim, source = f"Text as a bridge beats images ({other})", "paper, tables 3 and 4"
+        if pair == pairs[-1]:
+            claim, source = "Conditioning on the background hurts", "paper, table 3"
+        votes = _leads_of(people, PEOPLE, *pair)
+        deciding = [*_leads_of(differences, "TMMD", *pair), *votes]
+        spread = [s for metric in FAMILY[1:] for s in _leads_of(differences, metric, *pair)]
+        why = f"{other} was not compared with {front}"
+        if scores := [*deciding, *spread]:
+            each = ", ".join(f"{measured(s)} {in_words(s)}" for s in scores)
+            why = f"Lead of {front} over {other} ({BEHIND}): {each}{_runs(scores[0])}"
+            if deciding and spread:
+                why += f". {'TMMD and people decide' if votes else 'TMMD decides'}"
+        verdict = decide([side_of(score) for score in deciding])
+        numbers = any(score.interval for score in deciding)
+        claims.append(Claim(claim, source, verdict, f"{why}.", scores, numbers))
+    return claims
 
 
 def effect_size(difference: Score) -> Score | None:
     """``|difference| / standard error`` of a metric for two methods; None without an interval."""
     if difference.value is None or difference.interval is None:
         return None
-    low, high = difference.interval
-    if not high > low:
+    error = (difference.interval[1] - difference.interval[0]) / (2 * Z)
+    if not error > 0:
         return None
-    value = abs(difference.value) / ((high - low) / (2 * Z))
     return replace(
         difference,
         kind="effect size",
-        value=value,
+        value=abs(difference.value) / error,
         interval=None,
         interval_method="",
         estimator="difference over its standard error",
         scale=1.0,
         higher_is_better=True,
-        details={"difference": difference.value, "error": (high - low) / (2 * Z)},
+        details={"difference": difference.value, "error": error},
     )
 
 
@@ -278,9 +242,9 @@ def effect_table(differences: Sequence[Score]) -> StudyTable:
     pairs = list(dict.fromkeys((d.a, d.b) for d in differences))
     rank = {Measure(name): k for k, name in enumerate((*TRADITIONAL, *FAMILY))}
     bare = lambda d: d.measure._replace(features="", kernel="")
-    place = lambda d: (rank.get(bare(d), len(rank)), measured(d))
+    order = lambda d: (rank.get(bare(d), len(rank)), measured(d))
     rows: list[list[Score | str | None]] = []
-    for (_, name), same in groupby(sorted(differences, key=place), key=place):
+    for (_, name), same in groupby(sorted(differences, key=order), key=order):
         of_pair = {(d.a, d.b): effect_size(d) for d in same}
         rows.append([name, *(of_pair.get(pair) for pair in pairs)])
     return StudyTable(
@@ -292,36 +256,33 @@ def effect_table(differences: Sequence[Score]) -> StudyTable:
     )
 
 
-def discrimination_claim(differences: Sequence[Score], names: Names | None = None) -> Claim:
+def discrimination_claim(differences: Sequence[Score], pairs: Pairs = PAIRS) -> Claim:
     """Traditional metrics hardly discriminate: their mean effect size against the TMMD family's.
 
     Over the pairs of the paper's methods that both kinds have; each mean has an error of at most 1,
     so means that differ by less than ``1.96 sqrt(2)`` are undecided.
     """
-    names = names or Names()
-    known = [{*pair} for pair in names.pairs]
-    differences = [d for d in differences if {d.a, d.b} in known]
     claim, source = "Traditional metrics hardly discriminate between methods", "paper, section 1"
-    sizes: dict[str, dict[tuple[str, str | None], list[float]]] = {"traditional": {}, "family": {}}
-    evidence: list[Score] = []
-    for kind, metrics in (("traditional", TRADITIONAL), ("family", FAMILY)):
-        for d in differences:
-            effect = effect_size(d) if any(_of_metric(m, d) for m in metrics) else None
-            if effect is not None and effect.value is not None:
-                pair = d.a, d.b
-                sizes[kind].setdefault(pair, []).append(effect.value)
-                evidence.append(effect)
-    shared = [pair for pair in sizes["traditional"] if pair in sizes["family"]]
-    if not shared:
+    compared = [d for d in differences if {d.a, d.b} in [{*pair} for pair in pairs]]
+    sizes = [
+        [e for d in compared if any(_of_metric(m, d) for m in metrics) and (e := effect_size(d))]
+        for metrics in (TRADITIONAL, FAMILY)
+    ]
+    traditional, family = ({(e.a, e.b) for e in effects} for effects in sizes)
+    evidence = [effect for effects in sizes for effect in effects]
+    if not (shared := traditional & family):
         why = "No two methods were compared by both kinds of metrics with intervals."
         return Claim(claim, source, "undecided", why, evidence, measured=False)
-    means = {kind: fmean(fmean(of[pair]) for pair in shared) for kind, of in sizes.items()}
-    gap, reach = means["family"] - means["traditional"], Z * np.sqrt(2)
-    pairs = f"{len(shared)} pair{'s' * (len(shared) != 1)}"
+    low, high = (
+        fmean(fmean(float(e) for e in effects if (e.a, e.b) == pair) for pair in shared)
+        for effects in sizes
+    )
+    gap, reach = high - low, Z * np.sqrt(2)
+    count = f"{len(shared)} pair{'s' * (len(shared) != 1)}"
     why = (
-        f"The mean effect size of the TMMD family is {means['family']:.2g}, of traditional metrics "
-        f"{means['traditional']:.2g}, over {pairs} of methods; the difference is {number(gap, 1)} "
-        f"[{number(gap - reach, 1)}, {number(gap + reach, 1)}]."
+        f"The mean effect size of the TMMD family is {high:.2g}, of traditional metrics {low:.2g}, "
+        f"over {count} of methods; the difference is {number(gap, 1)} [{number(gap - reach, 1)}, "
+        f"{number(gap + reach, 1)}]."
     )
     return Claim(claim, source, decide([int(gap > reach) - int(gap < -reach)]), why, evidence)
 
@@ -331,8 +292,7 @@ def paper_claims(
     *,
     tasks: Mapping[str, Score],
     people: Sequence[Score] = (),
-    names: Names | None = None,
-    splits: tuple[str, str] = ("Orig", "NoLeak"),
+    pairs: Pairs = PAIRS,
 ) -> list[Claim]:
     """All claims of the paper.
 
@@ -340,13 +300,12 @@ def paper_claims(
         noleak: scores and differences of the methods under the leak-free split, a list a seed.
         tasks: see :func:`leak_claims`.
         people: see :func:`preference_claims`.
-        names: of the methods.
-        splits: see :func:`leak_claims`.
+        pairs: of methods.
     """
     differences = differences_over_seeds(noleak)
     return [
-        *leak_claims(tasks, splits),
-        *ranking_claims(differences, people, names),
-        *preference_claims(differences, people, names),
-        discrimination_claim(differences, names),
+        *leak_claims(tasks),
+        *ranking_claims(differences, people, pairs),
+        *preference_claims(differences, people, pairs),
+        discrimination_claim(differences, pairs),
     ]

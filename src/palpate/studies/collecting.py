@@ -15,14 +15,22 @@ from palpate.evaluation.probing import results_of
 from palpate.report.labels import measured
 from palpate.report.numbers import percent
 from palpate.report.results import Audit, Results
-from palpate.studies.claims import Names, differences_over_seeds, effect_table, paper_claims
+from palpate.studies.claims import differences_over_seeds, effect_table, paper_claims
 from palpate.studies.evidence import difference_between, in_words
-from palpate.studies.files import data_of, gallery, read_audits, read_scores
+from palpate.studies.files import (
+    gallery,
+    probing_plan,
+    read_audits,
+    read_probed,
+    read_scores,
+    splits_of,
+    stamped,
+)
 from palpate.studies.graph import Work
-from palpate.studies.judging import probing_plan, read_probed, stamped
 from palpate.studies.names import (
     BACKGROUND,
     FLOOR,
+    GVST,
     NEAREST,
     NOLEAK,
     ORIG,
@@ -46,9 +54,8 @@ def collect(
 
     ``people``: results of a human study, columns of table 3 and evidence of claims.
     """
-    after, stage, manifest = work.after, work.stage, data_of(work)[0]
-    splits = {name: data_of(work, name)[1] for name in SPLITS}
-    audits = read_audits(work)
+    after, stage, audits = work.after, work.stage, read_audits(work)
+    manifest, splits = splits_of(work)
     runs_of = {
         pair: [read_scores(after[scores_node(*pair, seed)]) for seed in seeds]
         for pair in product(SPLITS, SPLITS)
@@ -74,10 +81,9 @@ def collect(
     ]
     answers = [Results.load(after[n] / "results.json") for n in ("utility",) if n in after]
     tables += [table for answer in answers for table in answer.tables]
-    of_images = [m for m in methods if m.startswith("GVST")]
     tasks = {**_tasks_of_encoders(probed.scores), **_tasks_of_generators(runs_of)}
-    named = Names(OURS, of_images, BACKGROUND, VQ)
-    claims = paper_claims(noleak, tasks=tasks, people=votes, names=named)
+    pairs = [*((OURS, m) for m in methods if m.startswith(GVST)), (VQ, BACKGROUND)]
+    claims = paper_claims(noleak, tasks=tasks, people=votes, pairs=pairs)
     claims += [claim for answer in answers for claim in answer.claims]
     images = after[images_node(study.on_both[0], NOLEAK, seeds[0])] / "images"
     notes = [*probed.notes, *([Note("synthetic-data")] if manifest.facts.get("synthetic") else [])]

@@ -51,9 +51,8 @@ from palpate.studies.files import (
 )
 from palpate.studies.graph import Named, Node, Nodes, Work
 from palpate.studies.making import Training, make_generator, make_images, make_world, read_data
-from palpate.studies.names import NEAREST, SHIPPED
+from palpate.studies.names import NEAREST, SHIPPED, TEN
 from palpate.studies.stages import Facts, Stage, record_of
-from palpate.studies.study import TEN
 from palpate.training.run import TrainingRun
 
 #: Name of the split file, without its ending.

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from scipy import special
 
-from palpate.core import Note, PalpateError, Score, plain
+from palpate.core import Note, Score, plain, require
 from palpate.report.labels import label_of, measured, subject_of
 from palpate.report.numbers import digits_of, number, with_interval
 
@@ -32,10 +32,9 @@ def over_seeds(scores: Sequence[Score]) -> Score:
     Raises:
         PalpateError: without scores, or if metrics or subjects differ.
     """
-    if len(kinds := {f"{label_of(s)} of {subject_of(s)}" for s in scores}) != 1:
-        got = ", ".join(sorted(kinds)) or "none"
-        fix = "Pass one score a seed"
-        raise PalpateError("Scores over seeds must be of one metric and subject", got, fix)
+    kinds, fix = {f"{label_of(s)} of {subject_of(s)}" for s in scores}, "Pass one score a seed"
+    must, got = "Scores over seeds must be of one metric and subject", ", ".join(sorted(kinds))
+    require(len(kinds) == 1, None, must, got or "none", fix=fix)
     first, values = scores[0], [s.value for s in scores]
     if len(values) == 1:
         return replace(first, details={**first.details, "by_seed": values})
@@ -45,15 +44,13 @@ def over_seeds(scores: Sequence[Score]) -> Score:
         notes += [note for note in score.notes if note not in notes]
     encoder = first.encoder if len({s.encoder for s in scores}) == 1 else None
     first = replace(first, null=None, seed=None, notes=notes, encoder=encoder)
-    known = [v for v in values if v is not None]
-    if len(known) < len(values):
-        return replace(first, value=None, interval=None, interval_method="", details=details)
-    mean, count = float(np.mean(known)), len(known)
-    between = float(special.stdtrit(count - 1, 0.5 + first.level / 2))
-    between *= float(np.std(known, ddof=1)) / np.sqrt(count)
+    means = [value for value in values if value is not None]
+    mean, count = float(np.mean(means)) if len(means) == len(values) else None, len(values)
     reaches = [reach for s in scores if (reach := _reach(s))]
-    if len(reaches) < count:
+    if mean is None or len(reaches) < count:
         return replace(first, value=mean, interval=None, interval_method="", details=details)
+    between = float(special.stdtrit(count - 1, 0.5 + first.level / 2))
+    between *= float(np.std(means, ddof=1)) / np.sqrt(count)
     low, high = np.sqrt(np.mean(np.square(reaches), axis=0) + between**2)
     return replace(
         first,
@@ -100,9 +97,8 @@ def difference_between(a: Sequence[Score], b: Sequence[Score], names: tuple[str,
         PalpateError: as :func:`over_seeds`, or if the two differ in metric.
     """
     x, y = over_seeds(a), over_seeds(b)
-    if x.measure != y.measure:
-        must, fix = "A difference must be of one metric", "Pair scores by their metric"
-        raise PalpateError(must, f"{measured(x)} and {measured(y)}", fix)
+    must, got = "A difference must be of one metric", f"{measured(x)} and {measured(y)}"
+    require(x.measure == y.measure, None, must, got, fix="Pair scores by their metric")
     value = None if x.value is None or y.value is None else x.value - y.value
     interval = _limits_of_difference(x, y)
     gap: dict[str, Any] = {}
@@ -164,10 +160,9 @@ def ahead(difference: Score, name: str) -> Score:
     Raises:
         PalpateError: if the difference is not between ``name`` and another one.
     """
-    pair = difference.a, difference.b
-    if name not in pair:
-        must, fix = f"A difference must be between {name!r} and another", "Check the names"
-        raise PalpateError(must, subject_of(difference), fix)
+    pair, fix = (difference.a, difference.b), "Check the names"
+    must = f"A difference must be between {name!r} and another"
+    require(name in pair, None, must, subject_of(difference), fix=fix)
     value, interval = difference.value, difference.interval
     if difference.higher_is_better is None and "gap" in difference.details:
         value = difference.details["gap"]

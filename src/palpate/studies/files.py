@@ -6,6 +6,7 @@ import hashlib
 import inspect
 import shutil
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -29,10 +30,12 @@ from palpate.core import (
 from palpate.data.manifest import Manifest
 from palpate.diffusion.generated import Generated
 from palpate.encoders.models import Part, shipped_folder
+from palpate.evaluation.probing import Plan, Probed, plan_of
+from palpate.metrics.means import Mean
 from palpate.report.results import Audit, GalleryItem
 from palpate.sim.presets import MINI_SEEDS
 from palpate.studies.graph import Work
-from palpate.studies.names import NOLEAK, slug
+from palpate.studies.names import NOLEAK, ORIG, slug
 
 
 def fresh(folder: Path) -> Path:
@@ -44,6 +47,12 @@ def fresh(folder: Path) -> Path:
 def data_of(work: Work, split: str = NOLEAK) -> tuple[Manifest, Split]:
     """The data and one of its splits."""
     return Manifest.load(work.after["data"]), Split.load(work.after["split"] / f"{split}.json")
+
+
+def splits_of(work: Work) -> tuple[Manifest, dict[str, Split]]:
+    """The data and both splits."""
+    manifest, split = data_of(work)
+    return manifest, {ORIG: data_of(work, ORIG)[1], NOLEAK: split}
 
 
 def write_images(folder: Path, ids: Sequence[str], images: NDArray[np.uint8]) -> None:
@@ -69,6 +78,39 @@ def write_scores(folder: Path, scores: Sequence[Score]) -> None:
 def read_scores(folder: Path) -> list[Score]:
     """What :func:`write_scores` wrote."""
     return [Score.from_json(s) for s in read_json(folder / "scores.json", "scores")]
+
+
+def stamped(score: Score, stage: str) -> Score:
+    """The score with the name of the stage that it was made in."""
+    return replace(score, details={**score.details, "stage": stage})
+
+
+_MEAN = ("values", "weights", "groups")
+
+
+def write_probed(work: Work, probed: Probed) -> None:
+    """What encoders score in probing, with the values of every sample."""
+    write_scores(work.folder, [stamped(mean.score, work.stage) for mean in probed.means])
+    means = enumerate(probed.means)
+    arrays = ((f"{name}{k}", getattr(mean, name)) for k, mean in means for name in _MEAN)
+    np.savez(work.folder / "means.npz", **dict(arrays))
+
+
+def read_probed(folder: Path) -> Probed:
+    """What :func:`write_probed` wrote."""
+    scores = read_scores(folder)
+    with np.load(folder / "means.npz") as arrays:
+        parts = [[arrays[f"{name}{k}"] for name in _MEAN] for k in range(len(scores))]
+    return Probed([Mean(s, *part) for s, part in zip(scores, parts, strict=True)])
+
+
+def probing_plan(manifest: Manifest, splits: Mapping[str, Split]) -> Plan:
+    """What encoders are probed for: the paper's material accuracy and retrieval.
+
+    A leaking split may hold a test image in train as well: that is what is measured.
+    """
+    plan = Plan(top=(1, 5), allow_seen=True, axis="split", trained=True)
+    return plan_of(manifest, splits, plan)
 
 
 def read_audits(work: Work) -> list[Audit]:

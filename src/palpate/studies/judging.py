@@ -8,24 +8,35 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from palpate.core import FeatureSet, Note, Score, Split
 from palpate.data.images import load_images
 from palpate.data.manifest import Manifest
+from palpate.diffusion.generated import Generated
 from palpate.encoders.embed import embed, embed_images
 from palpate.encoders.encoder_set import EncoderSet, load_clip
 from palpate.evaluation.companions import Weights
-from palpate.evaluation.probing import Plan, Probed, measure, plan_of
+from palpate.evaluation.probing import measure
 from palpate.evaluation.scoring import score
 from palpate.metrics import tmmd
-from palpate.metrics.means import Mean, mean_of
+from palpate.metrics.means import mean_of
 from palpate.metrics.probe import fit_probe
 from palpate.studies.controls import nearest_rows
-from palpate.studies.files import control_folders, data_of, read_scores, write_scores
+from palpate.studies.files import (
+    control_folders,
+    data_of,
+    probing_plan,
+    splits_of,
+    stamped,
+    write_probed,
+    write_scores,
+)
 from palpate.studies.graph import Work
 from palpate.studies.methods import Judged
 from palpate.studies.names import (
@@ -37,7 +48,6 @@ from palpate.studies.names import (
     NEAREST,
     ONE,
     OURS,
-    SPLITS,
     WRONG,
 )
 from palpate.studies.stages import Facts
@@ -52,41 +62,16 @@ READINGS = ("grouped", "paper")
 SIGMA = 10.0
 
 
-def probing_plan(manifest: Manifest, splits: Mapping[str, Split]) -> Plan:
-    """What encoders are probed for: the paper's material accuracy and retrieval.
-
-    A leaking split may hold a test image in train as well: that is what is measured.
-    """
-    plan = Plan(top=(1, 5), allow_seen=True, axis="split", trained=True)
-    return plan_of(manifest, splits, plan)
-
-
 def probe_encoders(work: Work, *, split: str, encoders: str) -> Facts:
     """What the encoder of a split knows of its test part (tables 1 and 2, left)."""
-    manifest = data_of(work)[0]
-    splits = {name: data_of(work, name)[1] for name in SPLITS}
+    manifest, splits = splits_of(work)
     plan = probing_plan(manifest, splits)
     loaded = EncoderSet.load(work.after[encoders] / "encoders", device=work.device)
     probed = measure(
         manifest, splits[split], loaded, split, plan, cache=work.cache, progress=work.progress
     )
-    write_scores(work.folder, [stamped(mean.score, work.stage) for mean in probed.means])
-    np.savez(
-        work.folder / "means.npz",
-        **{f"{n}{k}": getattr(mean, n) for k, mean in enumerate(probed.means) for n in _MEAN},
-    )
+    write_probed(work, probed)
     return {"scores": len(probed.means)}
-
-
-def read_probed(folder: Path) -> Probed:
-    """The means that :func:`probe_encoders` wrote."""
-    scores = read_scores(folder)
-    with np.load(folder / "means.npz") as arrays:
-        parts = [[arrays[f"{name}{k}"] for name in _MEAN] for k in range(len(scores))]
-    return Probed([Mean(s, *part) for s, part in zip(scores, parts, strict=True)])
-
-
-_MEAN = ("values", "weights", "groups")
 
 
 def judge_images(
@@ -158,11 +143,6 @@ def judge_images(
     return {"scores": len(scores), "judge": judge.digest("tactile")}
 
 
-def stamped(score: Score, stage: str) -> Score:
-    """The score with the name of the stage that it was made in."""
-    return replace(score, details={**score.details, "stage": stage})
-
-
 def _compares(score: Score, methods: Mapping[str, str]) -> bool:
     """Whether a score is of one subject, or the difference of a method from another subject.
 
@@ -176,8 +156,6 @@ def _compares(score: Score, methods: Mapping[str, str]) -> bool:
 def image_files(folder: Path, ids: Sequence[str]) -> list[Path]:
     """The files of images of either kind of folder, in the order of ``ids``."""
     if (folder / "index.json").is_file():
-        from palpate.diffusion.generated import Generated
-
         generated = Generated.load(folder)
         return [generated.path(i) for i in ids]
     return Manifest.load(folder).take(ids).paths("tactile")
@@ -193,42 +171,47 @@ def _cross_fitted(
     images of the same samples as well. Samples without material do not count; no score where a half
     holds fewer than two materials.
     """
-    videos = np.array(train.groups or train.ids, dtype=str)
-    names = np.unique(videos)
-    half = np.isin(videos, names[::2])
+    half = _half(train)
     labels, truth = np.array(train.labels), np.array(images.labels)
-    hits, known = np.zeros((2, len(rows))), truth != ""
+    hits, labeled = np.zeros((2, len(rows))), truth != ""
     if min(len({*labels[side]} - {"", None}) for side in (half, ~half)) < 2:
         return []
     for side in (half, ~half):
-        ids = [i for i, inside in zip(train.ids, side, strict=True) if inside]
-        probe = fit_probe(train.take(ids))
+        probe = fit_probe(_rows(train, side))
         other = ~side[rows]
-        for k, of in enumerate((images, real)):
-            hits[k, other] = np.array(probe.predict(of.features[other])) == truth[other]
-    chance = 1 / len({*(train.labels or ())} - {""})
+        for k, features in enumerate((images.features, real.features)):
+            hits[k, other] = np.array(probe.predict(features[other])) == truth[other]
     text = f"By probes of half the train videos: compare with {HALF_PROBES!r}"
-    fields: dict[str, Any] = {
-        "split": split.digest,
-        "encoder": images.encoder,
-        "details": {"chance": chance},
-        "notes": [Note("text", {"text": text})],
-        "estimator": "mean",
-    }
-    groups = [*np.array(images.groups or images.ids)[known]]
+    groups = [*np.array(images.groups or images.ids)[labeled]]
     return [
-        mean_of(MATERIAL, of[known], groups, subject=name, **fields).score
-        for name, of in zip((NEAREST, HALF_PROBES), hits, strict=True)
+        mean_of(
+            MATERIAL,
+            hit[labeled],
+            groups,
+            subject=name,
+            split=split.digest,
+            encoder=images.encoder,
+            details={"chance": 1 / len({*(train.labels or ())} - {""})},
+            notes=[Note("text", {"text": text})],
+            estimator="mean",
+        ).score
+        for name, hit in zip((NEAREST, HALF_PROBES), hits, strict=True)
     ]
 
 
 def _halves(features: FeatureSet, permutations: int, split: Split) -> list[Score]:
     """TMMD between the images of two halves of the test videos, of one generator."""
-    groups = np.array(features.groups or features.ids, dtype=str)
-    first = np.isin(groups, np.unique(groups)[::2])
-    halves = [
-        features.take([i for i, inside in zip(features.ids, side, strict=True) if inside])
-        for side in (first, ~first)
-    ]
-    how: dict[str, Any] = {"subject": HALVES, "split": split.digest, "permutations": permutations}
-    return [tmmd(*halves, preset=preset, sigma=SIGMA, **how) for preset in READINGS]
+    half = _half(features)
+    measure = partial(tmmd, _rows(features, half), _rows(features, ~half), sigma=SIGMA)
+    measure = partial(measure, subject=HALVES, split=split.digest, permutations=permutations)
+    return [measure(preset=preset) for preset in READINGS]
+
+
+def _half(features: FeatureSet) -> NDArray[np.bool_]:
+    """Which rows are of every other video."""
+    videos = np.array(features.groups or features.ids, dtype=str)
+    return np.isin(videos, np.unique(videos)[::2])
+
+
+def _rows(features: FeatureSet, inside: NDArray[np.bool_]) -> FeatureSet:
+    return features.take([features.ids[k] for k in np.flatnonzero(inside)])

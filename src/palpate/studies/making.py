@@ -29,7 +29,6 @@ from palpate.encoders import train_encoder
 from palpate.encoders.embed import texts_of
 from palpate.encoders.encoder_set import load_clip
 from palpate.encoders.models import pick_device
-from palpate.encoders.presets import EncoderPreset
 from palpate.evaluation.sources import read as read_samples
 from palpate.leakage.auditing import audit
 from palpate.leakage.splitting import split as leak_free_split
@@ -95,15 +94,30 @@ def make_splits(work: Work, *, noleak: str | None) -> Facts:
     return {name: {"digest": s.digest, **s.counts()} for name, s in splits.items()}
 
 
-def make_encoders(work: Work, *, split: str, seed: int, preset: EncoderPreset, clip: str) -> Facts:
-    """A tactile encoder trained on the train part, with the frozen ones; in ``encoders``."""
+def make_encoders(
+    work: Work,
+    *,
+    split: str,
+    seed: int,
+    preset: Any,
+    clip: str | None,
+    data: tuple[Manifest, Split] | None = None,
+    epochs: float | None = None,
+    compute: Compute | None = None,
+) -> Facts:
+    """A tactile encoder trained on the train part, with the frozen ones; in ``encoders``.
+
+    ``data``: in the place of the stages before.
+    """
     encoders = train_encoder(
-        *data_of(work, split),
+        *(data or data_of(work, split)),
         preset=preset,
         clip=clip,
         output=fresh(work.folder / "encoders"),
+        epochs=epochs,
         seed=seed,
         device=work.device,
+        compute=compute,
         progress=work.progress,
     )
     return {"digest": encoders.digest("tactile"), "scores": encoders.card.get("scores")}

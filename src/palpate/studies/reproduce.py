@@ -18,7 +18,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import product
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from palpate.core import Progress, digest_file, quiet, require, require_choice
 from palpate.evaluation.companions import Weights
@@ -29,7 +29,6 @@ from palpate.sim import WorldOptions
 from palpate.sim.presets import MINI_SEEDS
 from palpate.studies import making
 from palpate.studies.collecting import collect
-from palpate.studies.demo import Demo
 from palpate.studies.files import data_stamp, function_stamp, model_stamp, require_unseen
 from palpate.studies.graph import Named, Node, Nodes, run_graph
 from palpate.studies.judging import judge_images, probe_encoders
@@ -39,6 +38,9 @@ from palpate.studies.names import NOLEAK, SHIPPED, SPLITS, images_node, scores_n
 from palpate.studies.stages import PrintLine, Stage, record_of
 from palpate.studies.study import STUDIES, Preset, Study
 from palpate.studies.utility import USEFUL, Draws, measure_utility
+
+if TYPE_CHECKING:
+    from palpate.studies.demo import Demo
 
 
 @dataclass(frozen=True)
@@ -428,14 +430,12 @@ def run_study(
     return results
 
 
-def plan_again(settings: Mapping[str, Any], folder: Path) -> Plan | Demo:
+def plan_again(settings: Mapping[str, Any], folder: Path) -> Plan:
     """The plan of a run by its record; what was given to it lies in the run folder.
 
     Raises:
         PalpateError: for a study that is not of palpate, or as :class:`Plan`.
     """
-    if settings["study"] == Demo.name:
-        return Demo.again(settings)
     fix = "Verify it where it is defined"
     must = f"The study must be one of {', '.join(STUDIES)}, to be made again"
     require(settings["study"] in STUDIES, None, must, repr(settings["study"]), fix=fix)

@@ -9,19 +9,19 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from itertools import product
 from pathlib import Path
 from typing import Any
 
 from palpate.core import Progress, Split, quiet, require
-from palpate.data.manifest import Manifest
 from palpate.data.reading import load
-from palpate.encoders import EncoderSet, train_encoder
-from palpate.encoders.encoder_set import load_clip
+from palpate.encoders import EncoderSet
 from palpate.evaluation.probing import Plan, Probed, measure, named, plan_of, results_of
 from palpate.report.results import Results
-from palpate.studies.files import fresh
-from palpate.studies.graph import Named, Node, Work, run_graph
-from palpate.studies.stages import Facts, PrintLine
+from palpate.studies.files import model_stamp
+from palpate.studies.graph import Named, Nodes, run_graph
+from palpate.studies.making import make_encoders
+from palpate.studies.stages import PrintLine
 from palpate.training.options import Compute
 
 
@@ -70,30 +70,27 @@ def compare_splits(  # noqa: PLR0913 - those of training
     axis = "split" if len(loaded) > 1 else ""
     # A leaking split may hold a test image in train as well: that is what is measured.
     plan = plan_of(manifest, loaded, Plan(**options, allow_seen=True, axis=axis, trained=True))
-    frozen = {} if clip is None else _digests(clip)
-    pairs = {f"{name}-{seed}": (name, seed) for name in loaded for seed in seeds}
-    nodes = [
-        Node(
-            stage,
-            train_on_split,
-            {
-                "manifest": Named(manifest, manifest.digest),
-                "split": Named(loaded[name], loaded[name].digest),
-                "seed": seed,
-                "preset": preset,
-                "clip": Named(clip, frozen),
-                "epochs": epochs,
-                "compute": Named(compute, ""),
-            },
+    weights, pairs = model_stamp("clip", clip), list(product(loaded.items(), seeds))
+    nodes = Nodes()
+    for (name, split), seed in pairs:
+        nodes.add(
+            f"{name}-{seed}",
+            make_encoders,
+            split=name,
+            seed=seed,
+            preset=preset,
+            clip=Named(clip, weights),
+            data=Named((manifest, split), [manifest.digest, split.digest]),
+            epochs=epochs,
+            compute=Named(compute, ""),
         )
-        for stage, (name, seed) in pairs.items()
-    ]
     stages = run_graph(nodes, folder, device=device, print_line=print_line, progress=progress)
     runs: dict[str, list[Probed]] = {}
-    for stage, (name, _) in pairs.items():
-        encoders = EncoderSet.load(stages[stage].folder / "encoders", device=device)
+    for (name, split), seed in pairs:
+        stage = stages[f"{name}-{seed}"].folder
+        encoders = EncoderSet.load(stage / "encoders", device=device)
         probed = measure(
-            manifest, loaded[name], encoders, name, plan, cache=folder / "cache", progress=progress
+            manifest, split, encoders, name, plan, cache=folder / "cache", progress=progress
         )
         runs.setdefault(name, []).append(probed)
     results = results_of("Encoders trained on each split", runs, plan, manifest, loaded)
@@ -103,44 +100,11 @@ def compare_splits(  # noqa: PLR0913 - those of training
         "epochs": epochs,
         "device": device,
         "seeds": list(seeds),
-        **frozen,
+        "clip weights": weights,
     }
     trainings = {
-        name: {"encoder": stage.facts["tactile"], "seconds": stage.seconds}
+        name: {"encoder": stage.facts["digest"], "seconds": stage.seconds}
         for name, stage in stages.items()
     }
     settings = {**results.settings, "training": training, "trainings": trainings}
     return replace(results, settings=settings)
-
-
-def train_on_split(
-    work: Work,
-    *,
-    manifest: Manifest,
-    split: Split,
-    seed: int,
-    preset: Any,
-    clip: str | None,
-    epochs: float | None,
-    compute: Compute | None,
-) -> Facts:
-    """A tactile encoder of one split and seed, in ``encoders``."""
-    encoders = train_encoder(
-        manifest,
-        split,
-        preset=preset,
-        clip=clip,
-        output=fresh(work.folder / "encoders"),
-        epochs=epochs,
-        seed=seed,
-        device=work.device,
-        compute=compute,
-        progress=work.progress,
-    )
-    return {"tactile": encoders.digest("tactile")}
-
-
-def _digests(clip: str) -> dict[str, str]:
-    """Digests of frozen encoders: another model of one name makes other stages."""
-    encoders = load_clip(clip)
-    return {f"{modality} encoder": encoders.digest(modality) for modality in encoders.modalities}

@@ -22,7 +22,7 @@ from palpate.sim import PRESETS as WORLDS
 from palpate.sim import WorldOptions
 from palpate.studies.controls import CONTROLS
 from palpate.studies.methods import METHODS, Make, Method, Metric
-from palpate.studies.names import BEST, GVST, NOLEAK, OURS, SHIPPED
+from palpate.studies.names import BEST, GVST, NOLEAK, OURS, SHIPPED, TEN
 from palpate.training.options import Precision
 
 
@@ -101,11 +101,6 @@ class Study:
         return [m for m in self.methods if split == NOLEAK or m.name in self.on_both]
 
 
-#: Materials that feel different: with all twenty, minutes of training stay close to chance.
-TEN = (
-    *("Wood", "Brick", "Tile", "Leather", "Synthetic Fabric"),
-    *("Rubber", "Tree", "Grass", "Gravel", "Sand"),
-)
 _WORLD = replace(
     WORLDS["small"],
     two_videos=0.0,

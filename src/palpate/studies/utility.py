@@ -25,13 +25,13 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, TypeGuard
+from typing import Any
 
 import numpy as np
 import polars as pl
 from numpy.typing import NDArray
 
-from palpate.core import FeatureSet, PalpateError, Progress, Score, Split, quiet, rng_for
+from palpate.core import FeatureSet, Progress, Score, Split, quiet, require, rng_for
 from palpate.data.manifest import Manifest
 from palpate.encoders.embed import embed
 from palpate.encoders.encoder_set import EncoderSet
@@ -48,7 +48,7 @@ from palpate.studies.claims import decide
 from palpate.studies.evidence import in_words, over_seeds, side_of
 from palpate.studies.files import control_folders, data_of
 from palpate.studies.graph import Work
-from palpate.studies.names import CEILING, EMPTY, NEAREST, NOLEAK
+from palpate.studies.names import CEILING, EMPTY, MATERIAL, NEAREST, NOLEAK
 from palpate.studies.stages import Facts
 
 #: Controls whose images train a classifier: a perfect generator, retrieval, and no touch at all.
@@ -243,18 +243,25 @@ def material_utility(
     """
     draws = draws or Draws()
     for part, features in {"train": train, "test": test, **generated}.items():
-        if not any(features.labels or ()):
-            must, fix = f"The features of {part!r} must have materials", "Pass a labeled manifest"
-            raise PalpateError(must, "none", fix)
+        must, fix = f"The features of {part!r} must have materials", "Pass a labeled manifest"
+        require(any(features.labels or ()), None, must, "none", fix=fix)
     truth, groups = ([pair[c] for pair in _pairs(test)] for c in (0, 1))
-    common: dict[str, Any] = {"split": split, "encoder": test.encoder, "estimator": "mean"}
-    details = {"chance": 1 / len(set(truth)), "draws": draws.draws}
 
     def measured(training: Training, label: str, shots: int) -> list[Mean]:
-        settings = {"k": shots, "l2": draws.l2}
-        fields: dict[str, Any] = {"subject": label, "settings": settings, **common}
-        hits = (_hits(draws, draw, test, training) for draw in range(draws.draws))
-        return [mean_of("material accuracy", h, groups, details=details, **fields) for h in hits]
+        return [
+            mean_of(
+                MATERIAL,
+                _hits(draws, draw, test, training),
+                groups,
+                subject=label,
+                split=split,
+                encoder=test.encoder,
+                estimator="mean",
+                settings={"k": shots, "l2": draws.l2},
+                details={"chance": 1 / len({*truth}), "draws": draws.draws},
+            )
+            for draw in range(draws.draws)
+        ]
 
     means: dict[tuple[str, int], list[Mean]] = {}
     for done, shots in enumerate(draws.shots):
@@ -268,7 +275,8 @@ def material_utility(
     for name in generated:
         pairs = ((means.get((f"{REAL} + {name}", k)), means.get((REAL, k))) for k in draws.shots)
         rows.append([f"{GAIN}{name}", *(_gain(a, b) if a and b else None for a, b in pairs)])
-    control_rows = {label for name in controls for label in _rows_of(name)}
+    label_of = (f"{REAL} + {{}}", "{} alone", f"{GAIN}{{}}")
+    control_rows = {label.format(name) for name in controls for label in label_of}
     return StudyTable(
         "Material accuracy by training data",
         "Accuracy on real images of new videos, of a linear probe trained on k real videos a "
@@ -280,11 +288,6 @@ def material_utility(
         rows,
         controls=[str(row[0]) for row in rows if row[0] in control_rows],
     )
-
-
-def _rows_of(name: str) -> list[str]:
-    """Labels of the rows that images of one name have part in."""
-    return [f"{REAL} + {name}", f"{name} alone", f"{GAIN}{name}"]
 
 
 def _gain(more: Sequence[Mean], less: Sequence[Mean]) -> Score:
@@ -300,13 +303,14 @@ def utility_claims(table: StudyTable, generators: Iterable[str]) -> list[Claim]:
     claims, first = list[Claim](), table.columns[1]
     for name in generators:
         cells = zip(table.columns[1:], _gains(table, name), strict=True)
-        gains = [(k, cell) for k, cell in cells if _is_score(cell)]
+        gains = [(k, cell) for k, cell in cells if isinstance(cell, Score)]
         if not gains or f"{GAIN}{name}" in table.controls:
             continue
         scores = [score for _, score in gains]
         each = ", ".join(f"{in_words(score)} at {k}" for k, score in gains)
         why = f"Accuracy on real images of new videos changes by {each} real videos a class."
-        if _is_score(perfect := _gains(table, CEILING)[0]):
+        perfect = _gains(table, CEILING)[0]
+        if isinstance(perfect, Score):
             why += (
                 f" Images of a perfect generator would change it by {in_words(perfect)} at {first}."
             )
@@ -319,10 +323,6 @@ def _gains(table: StudyTable, name: str) -> Sequence[Score | str | None]:
     """The gains by images of one name, from the fewest videos on; None where there are none."""
     cells = (row[1:] for row in table.rows if row[0] == f"{GAIN}{name}")
     return next(cells, [None] * (len(table.columns) - 1))
-
-
-def _is_score(cell: Any) -> TypeGuard[Score]:
-    return isinstance(cell, Score)
 
 
 def utility(

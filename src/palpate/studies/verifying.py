@@ -225,6 +225,7 @@ def _run_again(
     results: Results, file: Path, progress: Progress
 ) -> tuple[dict[str, Any], list[str]]:
     """What the stages next to a file hold and make now, and why some cannot be made."""
+    from palpate.studies.demo import Demo
     from palpate.studies.reproduce import plan_again
 
     folder, settings = file.absolute().parent, results.settings
@@ -235,7 +236,8 @@ def _run_again(
     with tempfile.TemporaryDirectory() as target:
         try:
             with reading_entry(file, "The settings"):
-                plan = plan_again(settings, folder)
+                demo = settings["study"] == Demo.name
+                plan = Demo.again(settings) if demo else plan_again(settings, folder)
                 stages = measured_again(plan.nodes(), folder, Path(target), progress)
                 return _items(plan.results(stages)) | items, reasons
         except (PalpateError, OSError) as error:
