@@ -53,14 +53,6 @@ def test_each_node_reads_what_the_nodes_before_it_wrote(tmp_path, jobs):
     assert {n: s.outputs for n, s in again.items()} == {n: s.outputs for n, s in stages.items()}
 
 
-def test_one_process_and_two_write_the_same_stages(tmp_path):
-    one = run_graph(DIAMOND, tmp_path / "one")
-    two = run_graph(DIAMOND, tmp_path / "two", jobs=2)
-    assert {n: (s.digest, s.outputs) for n, s in one.items()} == {
-        n: (s.digest, s.outputs) for n, s in two.items()
-    }
-
-
 @pytest.mark.parametrize(
     ("changed", "names"),
     [

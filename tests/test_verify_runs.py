@@ -9,15 +9,16 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from forge import studies as small_study
 from forge.results import edit
 from palpate.cli import main
 from palpate.core import Score
+from palpate.preference.scoring import PREFERENCE
 from palpate.report.results import Results
 from palpate.report.study import Claim, StudyTable
 from palpate.studies import reproduce
-from palpate.studies.methods import METHODS
-from palpate.studies.names import NOLEAK, OURS
-from palpate.studies.reproduce import Plan, run_study
+from palpate.studies.names import NOLEAK
+from palpate.studies.reproduce import run_study
 from palpate.studies.stages import record_of, run_stage
 from palpate.studies.study import STUDIES
 from palpate.studies.verifying import verify
@@ -139,32 +140,30 @@ def test_edited_settings_give_a_reason(forged, settings):
     assert main(["verify", str(forged), "-q"]) in (0, 1)
 
 
+def nightly(test):
+    return pytest.mark.nightly(pytest.mark.slow(pytest.mark.timeout(900)(test)))
+
+
 @pytest.fixture(scope="module")
-def toy(tmp_path_factory):
-    """A study of one method, run at ``smoke``, and its folder."""
-    known = STUDIES["world-gelsight"]
-    small = replace(known.presets["smoke"], steps=4, permutations=9)
-    one = replace(known, name="toy", methods=[METHODS[OURS]], presets={"smoke": small})
-    folder = tmp_path_factory.mktemp("toy") / "run"
+def small(tmp_path_factory):
+    """The folder of a small study."""
+    folder = tmp_path_factory.mktemp("small") / "run"
     people = folder.parent / "people.json"
-    Results("People", scores=[SCORE]).save(people)
+    Results("People", scores=[Score(PREFERENCE, "Ours", 0.6)]).save(people)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setitem(STUDIES, "toy", one)
-        run_study(Plan(one, preset="smoke", people=people), folder)
+        patch.setitem(STUDIES, small_study.STUDY.name, small_study.STUDY)
+        run_study(replace(small_study.plan(), people=people), folder)
         people.unlink()
         yield folder
 
 
 @pytest.fixture
-def copied(toy, tmp_path):
+def copied(small, tmp_path):
     """A copy of the run folder elsewhere."""
-    shutil.copytree(toy, tmp_path / "moved")
-    return tmp_path / "moved"
+    return shutil.copytree(small, tmp_path / "moved")
 
 
-@pytest.mark.nightly
-@pytest.mark.slow
-@pytest.mark.timeout(900)
+@nightly
 def test_a_run_that_was_moved_is_made_again_number_by_number(copied):
     checked = verify(copied / "results.json")
     names = {c.name for c in checked.checks}
@@ -172,9 +171,7 @@ def test_a_run_that_was_moved_is_made_again_number_by_number(copied):
     assert {"stage scores-NoLeak-by-NoLeak-0", "stage ours-NoLeak-0", "digests"} <= names
 
 
-@pytest.mark.nightly
-@pytest.mark.slow
-@pytest.mark.timeout(900)
+@nightly
 def test_a_pixel_and_a_number_are_found_in_a_run(copied):
     file = next((copied / f"images-ours-{NOLEAK}-0").rglob("*.png"))
     with Image.open(file) as image:
@@ -189,9 +186,7 @@ def test_a_pixel_and_a_number_are_found_in_a_run(copied):
     assert not any(name.startswith("SSIM of mean image") for name in changed)
 
 
-@pytest.mark.nightly
-@pytest.mark.slow
-@pytest.mark.timeout(900)
+@nightly
 def test_a_swapped_encoder_and_an_edited_split_are_found_in_a_run(copied):
     place, other = (copied / f"encoder-{split}-0" / "encoders" for split in (NOLEAK, "Orig"))
     shutil.rmtree(place)

@@ -68,7 +68,7 @@ class Options(Common):
 def run(options: Options, terminal: Terminal) -> dict[str, Any]:
     """Run the stages and write what shows them."""
     require_extra("palpate reproduce")
-    others = _folders(options.method)
+    systems = _folders(options.method)
     from palpate.core import write_text
     from palpate.evaluation.companions import Weights
     from palpate.studies.graph import plan_graph
@@ -81,7 +81,7 @@ def run(options: Options, terminal: Terminal) -> dict[str, Any]:
         preset=options.preset,
         seeds=options.seeds,
         root=options.root,
-        others=others,
+        systems=systems,
         device=options.device,
         people=options.people,
         steps=options.steps,

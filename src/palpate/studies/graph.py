@@ -292,8 +292,8 @@ def _build_node(
     """Build a node of the stages that it reads, in this process."""
     node, before = task
 
-    def report(what: str, done: int, total: int, remark: str = "") -> None:
-        progress(f"{node.name}: {what}", done, total, remark)
+    def report(step: str, done: int, total: int, remark: str = "") -> None:
+        progress(f"{node.name}: {step}", done, total, remark)
 
     def build(partial_folder: Path) -> Mapping[str, Any] | None:
         after = {name: stage.folder for name, stage in before.items()}
@@ -314,9 +314,9 @@ def _build_node(
 
 
 def _run_here(run: _Run) -> None:
-    def report(what: str, done: int, total: int, remark: str = "") -> None:
+    def report(step: str, done: int, total: int, remark: str = "") -> None:
         run.show()
-        run.progress(what, done, total, remark)
+        run.progress(step, done, total, remark)
 
     while (task := run.ready()) is not None:
         run.begin(task[0])
@@ -400,8 +400,8 @@ def _work(channel: Channel, environment: Mapping[str, str], folder: Path, device
     def send(kind: str, value: Any) -> None:
         channel.send((kind, value))
 
-    def report(what: str, done: int, total: int, remark: str = "") -> None:
-        send("progress", (what, done, total, remark))
+    def report(step: str, done: int, total: int, remark: str = "") -> None:
+        send("progress", (step, done, total, remark))
 
     while True:
         try:

@@ -52,7 +52,7 @@ class Plan:
         preset: name of its size.
         seeds: one training of every encoder and method each; splits and autoencoders are made once.
         root: the data set on disk, for a study that is not of the world.
-        others: name -> folder of images of the test part (of the split without leaks) that another
+        systems: name -> folder of images of the test part (of the split without leaks) that another
             system made.
         device: ``auto``, ``cpu``, ``cuda`` or ``mps``.
         people: results of ``palpate preference score`` on images of the methods, or None.
@@ -70,7 +70,7 @@ class Plan:
     preset: str = "mini"
     seeds: Sequence[int] = (0,)
     root: Path | str | None = None
-    others: Mapping[str, Path | str] = field(default_factory=dict[str, Path | str])
+    systems: Mapping[str, Path | str] = field(default_factory=dict[str, Path | str])
     device: str = "auto"
     people: Path | str | None = None
     steps: int | None = None
@@ -99,7 +99,7 @@ class Plan:
         fix = "Pass the folder, hub id or .ckpt of latent diffusion's vq-f4"
         require(coded, "vq", f"must be given for preset {self.preset}", "none", fix=fix)
         taken = {slug(name) for name in (*(m.name for m in study.methods), *study.controls)}
-        for name, folder in self.others.items():
+        for name, folder in self.systems.items():
             must, fix = "must have a name of its own", "Choose another name"
             require(slug(name) not in taken, "method", must, name, fix=fix)
             must, got = f"{name} must be a folder of images", f"nothing at {folder}"
@@ -143,7 +143,7 @@ class Plan:
             graph.add_encoders(split, seed)
             for method in self.study.trained_on(split):
                 graph.add_method(method, split, seed)
-        for name, folder in self.others.items():
+        for name, folder in self.systems.items():
             graph.nodes.add(
                 images_node(name, NOLEAK),
                 making.take_images,
@@ -177,7 +177,7 @@ class Plan:
             "seeds": list(seeds),
             "options": {
                 "root": self.root and str(self.root),
-                "methods of others": {name: str(folder) for name, folder in self.others.items()},
+                "methods of others": {name: str(folder) for name, folder in self.systems.items()},
                 "people": self.people and str(self.people),
                 "steps of a method": self.size.steps,
                 "vq": self.size.vq if isinstance(self.size.vq, str) else None,
@@ -324,7 +324,7 @@ class _Graph:
         chosen = [m.name for m in study.trained_on(split)] if judge == split else study.on_both
         methods = {name: images_node(name, split, seed) for name in chosen}
         if split == judge == NOLEAK:
-            methods |= {name: images_node(name, NOLEAK) for name in self.plan.others}
+            methods |= {name: images_node(name, NOLEAK) for name in self.plan.systems}
         metrics = [function_stamp(metric) for metric in study.metrics]
         sizes = [size.diffusion.size, size.permutations, self.clip.name]
         self.nodes.add(
@@ -381,7 +381,7 @@ class _Graph:
             study=Named(
                 study, [study.name, study.title, study.tables, study.paper, *study.controls]
             ),
-            methods=[*(m.name for m in study.methods), *plan.others],
+            methods=[*(m.name for m in study.methods), *plan.systems],
             seeds=plan.seeds,
             people=plan.people and Named(Path(plan.people), digest_file(Path(plan.people))),
             measures=True,
@@ -440,13 +440,13 @@ def plan_again(settings: Mapping[str, Any], folder: Path) -> Plan:
     must = f"The study must be one of {', '.join(STUDIES)}, to be made again"
     require(settings["study"] in STUDIES, None, must, repr(settings["study"]), fix=fix)
     options = settings["options"]
-    others = {n: folder / images_node(n, NOLEAK) / "images" for n in options["methods of others"]}
+    systems = {n: folder / images_node(n, NOLEAK) / "images" for n in options["methods of others"]}
     return Plan(
         STUDIES[settings["study"]],
         preset=settings["preset"],
         seeds=settings["seeds"],
         root=options["root"] and folder / "data",
-        others=others,
+        systems=systems,
         people=options["people"] and folder / "results" / "people.json",
         steps=options["steps of a method"],
         vq=options["vq"],

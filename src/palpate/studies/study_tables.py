@@ -17,7 +17,17 @@ from palpate.preference.scoring import PREFERENCE, STRENGTH
 from palpate.report.labels import measured
 from palpate.report.study import StudyTable
 from palpate.studies.evidence import over_seeds
-from palpate.studies.names import FLOOR, HALF_PROBES, HALVES, MATERIAL, NOLEAK, ORIG, OURS, SPLITS
+from palpate.studies.names import (
+    FLOOR,
+    GVST,
+    HALF_PROBES,
+    HALVES,
+    MATERIAL,
+    NOLEAK,
+    ORIG,
+    OURS,
+    SPLITS,
+)
 
 if TYPE_CHECKING:
     from palpate.studies.study import Study
@@ -74,11 +84,9 @@ class Scores:
             each = [table[key] for table in tables]
             floors = [s.floor for s in each if s.floor is not None]
             floor = sum(floors) / len(floors) if len(floors) == len(each) else None
-            mean = over_seeds(each)
-            of = [s.details["stage"] for s in each]
-            merged[key] = replace(
-                mean, floor=floor, details={**mean.details, "stage": stage, "of": of}
-            )
+            mean, stages = over_seeds(each), [s.details["stage"] for s in each]
+            details = {**mean.details, "stage": stage, "of": stages}
+            merged[key] = replace(mean, floor=floor, details=details)
         return cls(merged)
 
     def get(self, measure: Measure, subject: str) -> Score | None:
@@ -140,8 +148,8 @@ class _Context:
 
     def present(self, split: str, names: Iterable[str]) -> list[str]:
         """Those that are scored on a split."""
-        known = {score.a for score in self.judged[split, split].of_one}
-        return [name for name in names if name in known]
+        scored = {score.a for score in self.judged[split, split].of_one}
+        return [name for name in names if name in scored]
 
 
 def _of_splits(context: _Context, number: int) -> StudyTable:
@@ -188,34 +196,33 @@ def _probed(context: _Context, task: Measure, split: str) -> Score | None:
 
 def _of_methods(context: _Context, number: int) -> StudyTable:
     """Tables 3 and 4: methods and controls on the split without leaks, by metric."""
-    scores = context.judged[NOLEAK, NOLEAK]
-    prior = [m for m in context.methods if m == OURS or m.startswith("GVST")]
-    known = {m.name for m in context.study.methods}
-    prior += [m for m in context.methods if m not in known]  # other people's
-    methods = context.methods if number == 3 else prior
+    scores, methods = context.judged[NOLEAK, NOLEAK], context.methods
+    make = {method.name: method.make for method in context.study.methods}
     metrics = [*FAMILY]
     if number == 3:
         photos = {measure.metric for measure in _PHOTOS}
         of_photos = dict.fromkeys(s.measure for s in scores.of_one if s.metric in photos)
         metrics = [*_PIXELS, *of_photos, *FAMILY, NAMED, *context.extra]
+    else:  # prior art, and other people's
+        methods = [m for m in methods if m == OURS or m.startswith(GVST) or m not in make]
     subjects = context.present(NOLEAK, [*methods, *context.controls])
     metrics = [m for m in metrics if any(scores.get(m, s) for s in subjects)]
     subjects = [s for s in subjects if any(scores.get(m, s) for m in metrics)]
-    of = {(m, s): scores.get(m, s) for m in metrics for s in subjects}
+    cells = {(m, s): scores.get(m, s) for m in metrics for s in subjects}
     if number == 3:
-        of |= context.people
+        cells |= context.people
         metrics += dict.fromkeys(m for m, s in context.people if s in subjects)
-    rows: list[list[Cell]] = [[s, *(of.get((m, s)) for m in metrics)] for s in subjects]
+    rows: list[list[Cell]] = [[s, *(cells.get((m, s)) for m in metrics)] for s in subjects]
     controls = [s for s in subjects if s in context.controls]
     if context.study.paper:
         for name in ("GVST", OURS, *(("Ours w/ BG",) if number == 3 else ())):
             printed = PAPER["HCT" if 2 in context.study.tables else 3, name]
             rows.append([f"paper, {name}", *map(printed.get, metrics)])
             controls.append(f"paper, {name}")
-    alike = {m.name for m in context.study.methods if m.make is None}
-    others = [s for s in subjects if s not in {*alike, *controls}]
+    # Which are not trained as ours are.
+    apart = [s for s in subjects if s not in controls and make.get(s, s) is not None]
     text = (
-        f"All methods{' but ' * bool(others)}{' and '.join(others)} are trained from random "
+        f"All methods{' but ' * bool(apart)}{' and '.join(apart)} are trained from random "
         "weights for the same number of steps. Controls are no generators: a metric that ranks "
         "one of them first rewards something else than touch. "
     )

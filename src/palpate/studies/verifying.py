@@ -255,8 +255,8 @@ def _differences(a: Any, b: Any, tolerance: float, name: str) -> Iterator[str]:
             tolerance = max(tolerance, LEAST["effect size"])
         for key in dict.fromkeys([*a, *b]):
             x, y = a.get(key), b.get(key)
-            place = key in PLACES and all(isinstance(value, str | None) for value in (x, y))
-            if key not in PASSING and not place:
+            file = key in PLACES and all(isinstance(value, str | None) for value in (x, y))
+            if key not in PASSING and not file:
                 least = max(tolerance, LEAST.get(key, 0.0))
                 yield from _differences(x, y, least, f"{name} {key.replace('_', ' ')}".strip())
     elif isinstance(a, list) and isinstance(b, list) and len(a) == len(b):
