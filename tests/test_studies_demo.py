@@ -166,30 +166,6 @@ def test_an_encoder_and_a_generator_of_another_split_are_noted(whole, tmp_path, 
     assert not [n for s in own for n in s.notes if n.code.endswith("-of-other-split")]
 
 
-def test_every_verb_by_itself(tmp_path, monkeypatch, capsys):
-    monkeypatch.chdir(tmp_path)
-    for line in (
-        "world -o world --preset tiny --workers 1 --layout videos",
-        "import world -o tag",
-        "split tag -o s.json --train 0.5",
-        "audit tag --split s.json -o audit.json --fail-over 0",
-        "train encoder tag --split s.json -o encoders --preset tiny",
-        "train generator tag --split s.json --clip encoders -o model --preset tiny --background",
-        "generate tag --split s.json --model model -o made",
-        "probe tag --split s.json --encoder encoders -o probe.json",
-        "score --generated made --reference tag --split s.json --encoder encoders -o scores.json",
-        "report audit.json scores.json -o page.html",
-    ):
-        assert main([*line.split(), "-q"]) == 0, (line, capsys.readouterr())
-    assert not list(tmp_path.glob(".*.work"))
-    results = Results.load(tmp_path / "page.json")
-    assert results.audits[0].leaked_fraction == 0
-    assert results.scores
-    assert results.gallery
-    assert results.settings["digests"]["split"] == results.audits[0].split
-    assert any(command.startswith("palpate score") for command in results.commands)
-
-
 @pytest.mark.nightly
 def test_real_clips_become_a_page(real_data, tmp_path):
     demo(tmp_path / "run", "--data", str(real_data / "touch_and_go" / "clips"))

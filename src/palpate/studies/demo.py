@@ -35,8 +35,8 @@ from palpate.leakage.splitting import split as leak_free_split
 from palpate.report.families import families
 from palpate.report.numbers import percent, with_interval
 from palpate.report.results import Results
-from palpate.sim import PRESETS as WORLDS
-from palpate.sim import WorldOptions
+from palpate.sim.options import WorldOptions
+from palpate.sim.presets import PRESETS as WORLDS
 from palpate.studies.controls import nearest_rows
 from palpate.studies.files import (
     data_of,

@@ -32,7 +32,8 @@ from palpate.encoders.models import pick_device
 from palpate.evaluation.sources import read as read_samples
 from palpate.leakage.auditing import audit
 from palpate.leakage.splitting import split as leak_free_split
-from palpate.sim import WorldOptions, write_world
+from palpate.sim.options import WorldOptions
+from palpate.sim.writer import write_world
 from palpate.studies.files import data_of, fresh, require_unseen, write_images
 from palpate.studies.graph import Work
 from palpate.studies.methods import Images, Make, Setting
@@ -152,11 +153,10 @@ def _parts(manifest: Manifest, split: Split) -> tuple[Manifest, Manifest]:
 
 @dataclass(frozen=True)
 class Training:
-    """How a generator is trained; ``steps`` None: as many as its preset says."""
+    """How a generator is trained."""
 
     diffusion: DiffusionPreset
     background: bool = False
-    steps: int | None = None
     precision: Precision = "float32"
 
 
@@ -178,7 +178,7 @@ def make_generator(
     folder, diffusion = work.folder / "training", training.diffusion
     trained = work.after.get(autoencoder)
     parts = Parts(
-        diffusion.with_steps(training.steps),
+        diffusion,
         load_autoencoder(autoencoder if trained is None else trained / "autoencoder"),
         None if diffusion.condition.source == "resnet" else load_clip(clip, device=work.device),
         background=training.background,

@@ -25,7 +25,7 @@ from palpate.evaluation.companions import Weights
 from palpate.evaluation.sources import read as read_samples
 from palpate.preference.scoring import PREFERENCE
 from palpate.report.results import Results
-from palpate.sim import WorldOptions
+from palpate.sim.options import WorldOptions
 from palpate.sim.presets import MINI_SEEDS
 from palpate.studies import making
 from palpate.studies.collecting import collect
@@ -295,7 +295,7 @@ class _Graph:
             return
         generator, by_text = f"{slug(method.text_of or method.name)}-{split}-{seed}", method.text_of
         if not by_text:
-            diffusion = method.preset(size.diffusion)
+            diffusion = method.preset(size.diffusion).with_steps(size.steps)
             self.nodes.add(
                 generator,
                 making.make_generator,
@@ -303,7 +303,7 @@ class _Graph:
                 autoencoder,
                 split=split,
                 seed=seed,
-                training=Training(diffusion, method.background, size.steps, size.precision),
+                training=Training(diffusion, method.background, size.precision),
                 clip=self.clip,
                 autoencoder=autoencoder,
             )

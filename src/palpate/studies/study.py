@@ -18,8 +18,8 @@ from palpate.diffusion.options import AutoencoderOptions, BackgroundOptions, UNe
 from palpate.diffusion.presets import MINI, PAPER, DiffusionPreset
 from palpate.encoders.presets import PRESETS as ENCODERS
 from palpate.encoders.presets import EncoderPreset
-from palpate.sim import PRESETS as WORLDS
-from palpate.sim import WorldOptions
+from palpate.sim.options import WorldOptions
+from palpate.sim.presets import PRESETS as WORLDS
 from palpate.studies.controls import CONTROLS
 from palpate.studies.methods import METHODS, Make, Method, Metric
 from palpate.studies.names import BEST, GVST, NOLEAK, OURS, SHIPPED, TEN
