@@ -213,9 +213,9 @@ def _predicted(
         features = np.zeros((len(texts), len(words) + 1))
         for row, bag in enumerate(bags):
             features[row, [column[word] for word in bag if word in column]] = 1
-        columns = ([str(items[row]) for row in train] for items in (labels, groups))
+        label, group = ([str(items[row]) for row in train.tolist()] for items in (labels, groups))
         names = [str(row) for row in train]
-        probe = fit_probe(FeatureSet(names, features[train], *columns), l2=PENALTY)
+        probe = fit_probe(FeatureSet(names, features[train], label, group), l2=PENALTY)
         predicted[test] = probe.predict(features[test])
     return predicted
 

@@ -12,7 +12,7 @@ import tyro
 
 from palpate.cli.terminal import Common, OutPath, Switch, Terminal, error_line
 from palpate.cli.verbs import FAILED_CHECK
-from palpate.core import require
+from palpate.core import PalpateError
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -110,5 +110,6 @@ def _object(text: str | None) -> dict[str, Any] | None:
     except ValueError:
         value = text
     must, example = "must be a JSON object", '{"temperature": null}'
-    require(isinstance(value, dict | None), "body", must, str(text), example)
+    if not isinstance(value, dict | None):
+        raise PalpateError(must, str(text), "", argument="body", example={"body": example})
     return value

@@ -6,7 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, cast
 
 import tyro
 
@@ -79,7 +79,7 @@ def run(options: Options, terminal: Terminal) -> dict[str, Any]:
     _check(options, several)
     data = list(options.paths) or None
     names = ("paths", "output", "seed", "seeds", "folds", "lists")
-    make: Callable[..., Any] = partial(split, data, **options.keywords(*names))
+    make = cast("Callable[..., Any]", partial(split, data, **options.keywords(*names)))
     with terminal.progress() as progress:
         if options.folds is None:
             seeds = range(options.seed, options.seed + (options.seeds or 1))

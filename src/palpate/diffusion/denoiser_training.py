@@ -92,8 +92,8 @@ def train_denoiser(
     """
     policy, conditions = preset.condition, rows.conditions
     _require_conditions(policy, conditions)
-    tables = {s: _floats(conditions[s]) for s in SOURCES if s in conditions}
-    means = {s: table.double().mean(0).float() for s, table in tables.items()}
+    tables: dict[Source, Tensor] = {s: _floats(conditions[s]) for s in SOURCES if s in conditions}
+    means: dict[Source, Tensor] = {s: table.double().mean(0).float() for s, table in tables.items()}
     with seeded(preset.loop.seed, "denoiser"):
         gel = 0 if rows.background is None else rows.background(np.arange(1)).shape[1]
         channels, side = rows.latents.shape[1:3]
@@ -107,7 +107,7 @@ def train_denoiser(
 
     def loss_of(part: Rows) -> DiffusionLoss:
         with torch.no_grad():
-            tokens = {
+            tokens: dict[Source, Tensor] = {
                 s: model.tokens(_floats(part.conditions[s]), s).to("cpu") for s in policy.sources
             }
         return DiffusionLoss(

@@ -303,6 +303,7 @@ class EncoderSet:
         must, fix = "Encoders to be saved must be palpate's own", "Name the public one's file"
         own = self.clip is not None and not isinstance(self.tactile, TactileModule)
         require(own, None, must, "a public tactile encoder", fix=fix)
+        assert self.clip is not None
         with atomic_folder(Path(folder)) as part:
             if half:
                 self.halve()
@@ -433,7 +434,7 @@ def load_clip(source: str | Path, *, device: str = "cpu") -> EncoderSet:
     tokenizer = None
     try:
         with silent():
-            if FAMILIES[family]:
+            if FAMILIES[str(family)]:
                 tokenizer = AutoTokenizer.from_pretrained(name, local_files_only=local)
     except Exception as error:  # tokenizers raises bare ones
         raise PalpateError(must, first_line(error), CLIP_FIX) from None

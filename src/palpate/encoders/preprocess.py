@@ -246,9 +246,10 @@ class Preprocess:
             must = f"The encoder subtracts the no-contact image of {names[k] or 'every sensor'}"
             require(not need or gel is not None, None, must, f"none for {path.name}", fix=fix)
             video, frame = positions[k]
-            numbered = video is not None and frame is not None
-            before = at.get((video, frame - self.lag)) if numbered else None
-            files.append((path, manifest.path(gel) if need else None, before))
+            before = None
+            if video is not None and frame is not None:
+                before = at.get((video, frame - self.lag))
+            files.append((path, manifest.path(gel) if need and gel is not None else None, before))
         return Frames(files, sensors)
 
     def normalize(self, unit: Tensor) -> Tensor:

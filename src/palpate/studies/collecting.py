@@ -56,7 +56,7 @@ def collect(
     """
     after, stage, audits = work.after, work.stage, read_audits(work)
     manifest, splits = splits_of(work)
-    runs_of = {
+    runs_of: dict[tuple[str, str], list[list[Score]]] = {
         pair: [read_scores(after[scores_node(*pair, seed)]) for seed in seeds]
         for pair in product(SPLITS, SPLITS)
     }

@@ -20,7 +20,7 @@ from functools import partial
 from multiprocessing.connection import wait
 from multiprocessing.process import BaseProcess
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any, NoReturn, cast
 
 from palpate.core import PalpateError, Progress, few, locked, quiet, require
 from palpate.core.processes import exit_with_parent
@@ -337,7 +337,7 @@ def _run_in_workers(run: _Run) -> None:
                 run.begin(task[0])
             for worker in wait([w for w in workers if w not in idle], timeout=1.0):
                 try:
-                    kind, value = worker.recv()
+                    kind, value = cast("Channel", worker).recv()
                 except (EOFError, OSError):
                     _raise_dead(workers[worker])
                 if kind == "stage":

@@ -214,4 +214,4 @@ def _half(features: FeatureSet) -> NDArray[np.bool_]:
 
 
 def _rows(features: FeatureSet, inside: NDArray[np.bool_]) -> FeatureSet:
-    return features.take([features.ids[k] for k in np.flatnonzero(inside)])
+    return features.take([features.ids[k] for k in np.flatnonzero(inside).tolist()])

@@ -276,6 +276,7 @@ def take_images(work: Work, *, split: str, folder: Path, size: int) -> Facts:
     manifest, parts = data_of(work, split)
     ids = manifest.part(parts, "test").ids
     samples = read_samples(folder, str(folder)).take(ids)
+    assert work.cache is not None  # every run of a study has one
     pixels = samples.pixels(size, work.cache, work.progress)
     write_images(work.folder / "images", ids, pixels)
     return {"images": len(ids), "digest": samples.image_digest()}
