@@ -36,7 +36,7 @@ SIGNATURES = {
     ),
     "split": ("data * by train val seed folds near noleak cache reading skip_bad progress"),
     "train_encoder": (
-        "data split * preset clip output epochs targets seed device compute progress"
+        "data split * preset clip output epochs seed device compute progress"
     ),
     "train_autoencoder": "data split * preset start judge output seed device compute progress",
     "train_generator": (
