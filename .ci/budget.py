@@ -7,7 +7,7 @@ Tokens are those of Python's ``tokenize`` without comments, docstrings and line 
 style sheets, scripts and JSON in the package, words and signs (shipped models and split lists are
 not counted). Words of docs are those of docs/, README.md and CONTRIBUTING.md as committed. Options
 are the leaves of a verb's parser but for --help, --json and --quiet. Modules are those of palpate
-that a run of the verb loads. A bag is a name bound in a function and splatted into a call there
+that a run of the verb loads. A bag is a dict that a function binds to a name and splats into a call
 (.ci/bags.py). A parameter of a public name counts as documented if its docstring names it.
 """
 

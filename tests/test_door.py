@@ -35,9 +35,7 @@ SIGNATURES = {
         "permutations seed allow_seen cache progress"
     ),
     "split": ("data * by train val seed folds near noleak cache reading skip_bad progress"),
-    "train_encoder": (
-        "data split * preset clip output epochs seed device compute progress"
-    ),
+    "train_encoder": ("data split * preset clip output epochs seed device compute progress"),
     "train_autoencoder": "data split * preset start judge output seed device compute progress",
     "train_generator": (
         "data split clip * preset autoencoder start output background"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -51,15 +52,16 @@ def run(options: Options, terminal: Terminal) -> tuple[dict[str, Any], int]:
     inputs = [p for p in (options.captions, options.data, options.split) if p is not None]
     files = Files(output=options.output, page=options.page)
     files.guard(inputs)
-    extra = {"columns": columns} if (columns := columns_of(options.columns)) else {}
+    check = check_captions
+    if columns := columns_of(options.columns):
+        check = partial(check, columns=columns)
     with terminal.progress() as progress:
-        results = check_captions(
+        results = check(
             options.captions,
             options.data,
             split=options.split,
             seed=options.seed,
             progress=progress,
-            **extra,
         )
     shown = terminal.deliver(results, files)
     flagged = float(results[SHARE, FLAGGED])

@@ -51,8 +51,9 @@ def load(
     imported = isinstance(source, str | Path) and is_manifest(Path(source))
     if imported:
         _require_left_out(options, {"root"}, "a manifest")
-    options |= {"format": format, "skip_bad": skip_bad, "progress": progress}
-    manifest, _ = read_samples(source, **options)
+    manifest, _ = read_samples(
+        source, format=format, skip_bad=skip_bad, progress=progress, **options
+    )
     without = not manifest.table["vision"].count() and not manifest.table["tactile"].count()
     if images and without and "format" in manifest.facts:  # lists and tables have no format
         got = f"{source}, whose images are inside videos or tables"

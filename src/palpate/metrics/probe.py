@@ -215,12 +215,13 @@ def _accuracies(
         "unseen_classes": sorted(set(truth) - set(trained)),
         **details,
     }
-    fields |= {"encoder": test.encoder}
     weights = np.array([1 / counts[label] for label in truth])
     plain = {**details, "majority": counts[majority] / len(truth)}
     equal = {**details, "majority": (majority in counts) / len(counts)}
     return [
-        mean_of(name, hits, groups, estimator="mean", details=plain, **fields),
+        mean_of(
+            name, hits, groups, estimator="mean", details=plain, encoder=test.encoder, **fields
+        ),
         mean_of(
             f"{name}, balanced",
             hits,
@@ -228,6 +229,7 @@ def _accuracies(
             weights=weights,
             estimator="mean of class recalls",
             details=equal,
+            encoder=test.encoder,
             **fields,
         ),
     ]

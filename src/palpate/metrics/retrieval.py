@@ -284,6 +284,10 @@ def _retrieved(
     return Retrieved(means, median)
 
 
+#: Fields of a share that the median rank has of its own.
+LEFT = ("subject", "estimator")
+
+
 def _median(
     ranks: Array, groups: Sequence[str], details: dict[str, Any], fields: dict[str, Any]
 ) -> Score:
@@ -295,6 +299,15 @@ def _median(
         bounds = np.clip([0.5 - half, 0.5 + half], 0, 1)
         low, high = np.quantile(ranks, bounds, method="inverted_cdf").tolist()
         interval, method = (low, high), f"Woodruff, from the {share.interval_method}"
-    fields |= {"estimator": "median", "interval": interval, "interval_method": method}
-    fields |= {"a": fields.pop("subject"), "n": len(ranks), "higher_is_better": False}
-    return Score("median rank", value=value, details=details, **fields)
+    return Score(
+        "median rank",
+        fields["subject"],
+        value,
+        estimator="median",
+        interval=interval,
+        interval_method=method,
+        n=len(ranks),
+        higher_is_better=False,
+        details=details,
+        **{name: field for name, field in fields.items() if name not in LEFT},
+    )

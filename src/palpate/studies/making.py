@@ -83,8 +83,8 @@ def make_splits(work: Work, *, noleak: str | None) -> Facts:
     share = counts["train"] / (counts["train"] + counts["test"])
     if noleak == "touch-and-go":
         share = 0.8  # of the record
-    rule: Any = {"by": "video"} if noleak is None else {"noleak": noleak}
-    splits, audits = {ORIG: original, NOLEAK: split_by(**rule, train=share)}, list[Any]()
+    keep = partial(split_by, noleak=noleak) if noleak else partial(split_by, by="video")
+    splits, audits = {ORIG: original, NOLEAK: keep(train=share)}, list[Any]()
     for name, split in splits.items():
         split.save(work.folder / f"{name}.json")
         audited = audit(

@@ -19,6 +19,7 @@ from collections.abc import Callable, Generator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -395,8 +396,10 @@ class _Run:
         with atomic_path(self.folder / SAMPLES / f"{self.step:07}.png") as part:
             Image.fromarray(image).save(part)
         for tracker in self.trackers:
-            layout = {"dataformats": "NHWC"} if tracker.name == "tensorboard" else {}
-            tracker.log_images({"samples": image[None]}, step=self.step, **layout)
+            log = tracker.log_images
+            if tracker.name == "tensorboard":
+                log = partial(log, dataformats="NHWC")
+            log({"samples": image[None]}, step=self.step)
 
     def copy(self, weights: dict[str, Tensor]) -> None:
         """Copy these weights into the module."""

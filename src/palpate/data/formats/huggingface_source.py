@@ -8,6 +8,7 @@ import os
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -124,10 +125,10 @@ def _streamed(name: str, config: str | None, revision: str | None, local: bool) 
     """Parquet shards or an image folder."""
     import datasets
 
-    options: dict[str, Any] = {} if local else {"revision": revision}
-    if "trust_remote_code" in inspect.signature(datasets.load_dataset_builder).parameters:
-        options["trust_remote_code"] = False  # versions that have the option differ in its default
-    builder = datasets.load_dataset_builder(name, config, **options)
+    load: Any = datasets.load_dataset_builder
+    if "trust_remote_code" in inspect.signature(load).parameters:
+        load = partial(load, trust_remote_code=False)  # versions that have it differ in its default
+    builder = load(name, config, revision=None if local else revision)
     kinds = LOCAL if local else REMOTE
     if builder.name not in kinds:
         must = f"{name} must be made of {' or '.join(kinds)} files"
