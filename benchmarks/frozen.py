@@ -34,6 +34,9 @@ import numpy as np
 from PIL import Image
 from scipy import stats
 
+from palpate.core import Score
+from palpate.report.labels import label_of, subject_of
+
 TOP = Path(__file__).resolve().parents[1]
 FROZEN = Path(__file__).with_suffix(".json")
 LISTS = Path(os.environ.get("PALPATE_SHARED_DATA", TOP.parent / "shared" / "data"))
@@ -378,10 +381,10 @@ def demo(work):
     )
     results = json.loads((work / "demo" / "page.json").read_text())
     rows, count = {}, Counter()
-    for s in results["scores"]:
-        name = f"{s['subject']}: {s['metric']}"
+    for s in map(Score.from_json, results["scores"]):
+        name = f"{subject_of(s)}: {label_of(s)}"
         count[name] += 1
-        rows[f"{name} ({count[name]})"] = [s["value"], *(s["interval"] or ()), s["floor"]]
+        rows[f"{name} ({count[name]})"] = [s.value, *(s.interval or ()), s.floor]
     return rows
 
 

@@ -191,8 +191,8 @@ def test_trainings_print_the_ceiling_of_the_data_that_they_are_given(
     world, split, tmp_path, capsys
 ):
     split.save(tmp_path / "split.json")
-    common = ["--split", str(tmp_path / "split.json"), "--steps", "2", "--json"]
-    start = ["--start", "palpate/mini"]
+    common = ["--split", str(tmp_path / "split.json"), "--json"]
+    start = ["--start", "palpate/mini", "--set", "autoencoder.steps=2"]
     folder = str(world.root)
     assert main(["train", "autoencoder", folder, *common, *start, "-o", str(tmp_path / "a")]) == 0
     found = json.loads(capsys.readouterr().out)
@@ -200,7 +200,7 @@ def test_trainings_print_the_ceiling_of_the_data_that_they_are_given(
     assert 0 < found["ceiling_accuracy"] <= 1
     assert load_autoencoder(tmp_path / "a").card["ceiling"]["tmmd"] == found["ceiling_tmmd"]
     assert "| psnr |" in (tmp_path / "a" / "README.md").read_text()
-    given = ["--autoencoder", str(tmp_path / "a"), "--clip", "palpate/mini"]
+    given = ["--autoencoder", str(tmp_path / "a"), "--clip", "palpate/mini", "--steps", "2"]
     assert main(["train", "generator", folder, *common, *given, "-o", str(tmp_path / "g")]) == 0
     again = json.loads(capsys.readouterr().out)
     assert again["ceiling_psnr"] == pytest.approx(found["ceiling_psnr"], abs=0.01)

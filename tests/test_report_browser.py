@@ -261,7 +261,7 @@ def test_a_printed_page_is_what_is_open_with_its_images(chromium, pages):
 
 
 def test_a_sample_enlarges_by_click_and_by_key_and_commands_are_copied(chromium, pages):
-    with opened(chromium, pages) as page:
+    with opened(chromium, pages["page"]) as page:
         large = "document.querySelector('dialog[open] img')?.clientWidth ?? 0"
         page.click(".hero .row img >> nth=0")
         assert page.evaluate(large) > 200
