@@ -108,6 +108,7 @@ TACTILE = [
         for m in (tmmd, kid, cmmd, fid, prdc)
     ),
     (lambda: tmmd(X, Y, labels="a"), ["`labels`", "8", "1"]),
+    (lambda: tmmd(X, Y, labels=np.array(8)), ["`labels`", "8"]),
     (lambda: tmmd(X, Y, seed=2**70), ["`seed`", "whole number", str(2**70)]),
     (lambda: i_tmmd(X, sigmaa=3), ["sigmaa", "spelling"]),
     (lambda: i_tmmd(X, permutations=1.5), ["`permutations`"]),

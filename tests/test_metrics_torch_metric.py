@@ -38,6 +38,7 @@ def test_a_true_metric_with_the_same_score():
     assert same(value, want)
     assert close(metric.score().to_json(), want.to_json())
     before = metric.update_count
+    assert hash(metric) == hash(metric)  # so that a module that holds it finds it again
     metric.update(np.zeros((0, 6)))
     assert metric.update_count == before + 1
     assert same(metric.compute(), want)

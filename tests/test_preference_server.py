@@ -176,7 +176,7 @@ def test_a_full_file_system_rolls_back_the_whole_batch(tmp_path):
     ]
     with pytest.raises(sqlite3.OperationalError, match="full"):
         store.store(votes)
-    with pytest.raises(PalpateError, match=r"can be written\. Got database or disk is full"):
+    with pytest.raises(PalpateError, match=r"read and write\. Got database or disk is full"):
         store.invite([f"r{k:03}" for k in range(1, 900)], 899)
     assert (store.votes("r01"), store.raters()) == ([], {})
     assert store.store(votes[:3]) == [True] * 3

@@ -6,7 +6,7 @@ import pytest
 
 from forge.results import difference, score, text_note
 from palpate.core import Note, PalpateError
-from palpate.report.families import families, family_of
+from palpate.report.families import columns, families, family_of
 from palpate.report.labels import label_of, subject_of
 from palpate.report.numbers import decimals, number, percent, plural, score_text
 from palpate.report.results import Results
@@ -149,6 +149,11 @@ def test_more_than_two_generators_are_ranked():
     decided = [pairs[0], pair("a", "c", 0.01, 0.001), pairs[2]]
     (other,) = families([*results.scores[:3], *decided])
     assert rankings(other).plain()[1] == [["TMMD ↓", "b ~ c > a"]]
+
+
+def test_pools_of_different_sizes_have_a_column_each():
+    scores = [score("top-1", settings={"pool": pool}) for pool in (24, 100)]
+    assert [[s.settings["pool"] for s in column] for column in columns(scores)] == [[24], [100]]
 
 
 def test_a_table_is_headed_by_the_features_and_a_column_by_the_kernel():

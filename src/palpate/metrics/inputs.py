@@ -110,7 +110,8 @@ def column(name: str, values: Any, n: int) -> list[Any] | None:
         return None
     items: Any = values.tolist() if hasattr(values, "tolist") else list(values)
     count = len(items) if isinstance(items, list) else items
-    check(count == n, name, f"must have one entry a row ({n})", count, "Pass the order of the rows")
+    listed = isinstance(items, list) and count == n
+    check(listed, name, f"must have one entry a row ({n})", count, "Pass the order of the rows")
     return items
 
 

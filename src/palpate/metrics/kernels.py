@@ -271,7 +271,7 @@ def kernel_sums(
     size = items.shape[1] * width**2 * 4
     room = MOMENT_BYTES if rows <= LONG else 4 * MOMENT_BYTES
     reason = ""
-    if kernel.bandwidth is None:
+    if not isinstance(kernel, Gaussian) or kernel.bandwidth is None:
         reason = f"the kernel is {kernel.settings()}, not one Gaussian"
     elif size > room:
         count = f"{items.shape[1]} (unit, segment) cells of width {width}"

@@ -59,7 +59,11 @@ class VoteStore:
                 self._disk.execute("PRAGMA synchronous=FULL")
                 self._disk.execute("INSERT OR IGNORE INTO study VALUES (?)", (study,))
             names = [name for (name,) in self._disk.execute("SELECT name FROM study")]
-        require_study(path, study, *names)
+        try:
+            require_study(path, study, *names)
+        except PalpateError:
+            self.close()
+            raise
 
     def close(self) -> None:
         """Close the file."""
@@ -132,8 +136,8 @@ def _usable(path: Path) -> Generator[None]:
     try:
         yield
     except sqlite3.Error as error:
-        must = f"{path} must be a file of votes that can be written"
-        fix = "Choose another, and keep the files next to it"
+        must = f"{path} must be a file of votes that the server can read and write"
+        fix = "Name the one that it wrote, with the files next to it"
         raise PalpateError(must, str(error), fix) from None
 
 

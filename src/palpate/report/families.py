@@ -10,9 +10,10 @@ import math
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Any
 
 from palpate.core import Measure, Note, Score, plain, require_comparable, short
-from palpate.core.score import BETTER, Kind
+from palpate.core.score import BETTER
 from palpate.report.labels import measured
 from palpate.report.numbers import digits_of
 
@@ -288,9 +289,10 @@ def columns(scores: Iterable[Score]) -> list[list[Score]]:
     Raises:
         PalpateError: if two scores of one column were not made with the same settings.
     """
-    table: dict[tuple[Measure, Kind, bool], list[Score]] = {}
+    table: dict[tuple[Any, ...], list[Score]] = {}
     for score in scores:
-        table.setdefault((score.measure, score.kind, score.b is None), []).append(score)
+        key = (score.measure, score.settings.get("pool"), score.kind, score.b is None)
+        table.setdefault(key, []).append(score)
     for column in table.values():
         require_comparable(column)
     return [*table.values()]
