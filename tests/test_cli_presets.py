@@ -10,6 +10,7 @@ from palpate.cli.presets import PRESETS
 from palpate.core import PalpateError
 from palpate.diffusion.presets import MINI, PAPER, TINY
 from palpate.encoders.presets import PRESETS as ENCODERS
+from palpate.leakage import split
 from palpate.sim import PRESETS as WORLDS
 from palpate.training.options import LoopOptions
 
@@ -101,3 +102,23 @@ def test_mistakes_say_what_must_be(setting, message, tmp_path, monkeypatch, caps
 def test_a_part_and_its_fields_are_not_set_together():
     with pytest.raises(PalpateError, match=r"unet.layers must be left out beside unet"):
         GENERATOR.preset("mini", [["unet=folder", "unet.layers=1"]])
+
+
+@pytest.mark.parametrize(
+    ("command", "message"),
+    [
+        ("encoder DATA --clip palpate/mini --set tactile_course.lr=-1", "--set tactile_course.lr"),
+        ("autoencoder DATA --preset tiny --set autoencoder.lr=-1", "--set autoencoder.lr"),
+        ("generator nothing/", "PATH must exist. Got nothing at nothing"),
+        ("generator DATA --set condition.dropout=2", "E.g. --set condition.dropout=0.1."),
+    ],
+)
+def test_what_a_training_refuses_is_named_as_it_is_given(
+    command, message, small_manifest, tmp_path, monkeypatch, capsys
+):
+    monkeypatch.chdir(tmp_path)
+    small_manifest.save(tmp_path / "manifest.parquet")
+    split(small_manifest, by="video").save(tmp_path / "s.json")
+    words = ["manifest.parquet" if word == "DATA" else word for word in command.split()]
+    assert main(["train", *words, "--split", "s.json", "-o", "out"]) == 2
+    assert message in capsys.readouterr().err

@@ -74,7 +74,9 @@ OPTION_NAMES: dict[tuple[str, str], str] = {
     ("", "columns"): "--map",
     ("train encoder", "batch"): "--set tactile_course.batch",
     ("train generator", "batch"): "--set loop.batch",
-    ("train generator", "source"): "--set condition.source",
+    ("train encoder", "vocabulary"): "--set vocabulary",
+    ("train generator", "unet"): "--set unet",
+    ("train generator", "method"): "--set sampler.method",
     ("presets", "name"): "NAME",
     ("", "side"): "--as",
     ("", "data"): "PATH",
@@ -291,7 +293,7 @@ def guard_output(
         output: the file to write.
         inputs: what the command reads.
         signatures: an existing file must hold one of these in its first 4 KB to be replaced, a
-            Parquet file in its last 16, where its metadata are.
+            Parquet file a whole name of a format in its last 16 KB, where its metadata are.
 
     Raises:
         PalpateError: saying which.
@@ -319,7 +321,7 @@ def guard_output(
             head = file.read(4096)
             if head.startswith(b"PAR1"):
                 file.seek(max(0, output.stat().st_size - 16_384))
-                head = file.read()
+                head, signatures = file.read(), [name for name in signatures if b"/" in name]
         must = f"{output} must be new, or a file of the kind that this command writes"
         ours = not head or any(each in head for each in signatures)
         require(ours, None, must, "another file", fix="Choose another file, or remove it")
@@ -451,6 +453,8 @@ def _option(verb: str, argument: str, value: Any) -> str:
         value = [f"{key}={cell}" for key, cell in value.items()]
     values = value if isinstance(value, list | tuple) else [value]
     words = shlex.join(map(str, values))
+    if name.startswith("--set "):
+        return f"{name}={words}"
     return f"{name} {words}" if name.startswith("-") else words
 
 

@@ -8,7 +8,8 @@ from __future__ import annotations
 
 import re
 from collections import Counter
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Generator, Iterable, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from typing import Any
 
@@ -80,6 +81,18 @@ class PalpateError(Exception):
         """Return the error as a JSON object: ``error, must, got, fix, argument``."""
         names = ("must", "got", "fix", "argument", *["choices"] * bool(self.choices))
         return {"error": type(self).__name__} | {name: getattr(self, name) for name in names}
+
+
+@contextmanager
+def fields_of(name: str) -> Generator[None]:
+    """Name arguments of errors that are raised inside as fields: ``lr`` as ``"loop.lr"``."""
+    try:
+        yield
+    except PalpateError as error:
+        if error.argument:
+            error.example = {f"{name}.{k}": v for k, v in error.example.items()}
+            error.argument = f"{name}.{error.argument}"
+        raise
 
 
 def few(names: Iterable[object]) -> str:

@@ -31,7 +31,7 @@ from scipy.spatial import KDTree
 from torch import Tensor, nn
 from torch.nn.functional import avg_pool2d, interpolate
 
-from palpate.core import Progress, Split, digest_json, quiet, require, rng_for
+from palpate.core import Progress, Split, digest_json, fields_of, quiet, require, rng_for
 from palpate.data.images import cached_images, image_stamp
 from palpate.data.manifest import Manifest
 from palpate.data.reading import load
@@ -218,21 +218,23 @@ def fit_autoencoder(
 
     if isinstance(options, BackgroundOptions):
         assert gels is not None
-        loop = LoopOptions(
-            options.steps,
-            options.batch,
-            options.lr,
-            warmup=min(100, options.steps),
-            weight_decay=1e-4,
-            betas=(0.9, 0.98),
-            ema=0.995,
-            seed=run.seed,
-        )
+        with fields_of("autoencoder"):
+            loop = LoopOptions(
+                options.steps,
+                options.batch,
+                options.lr,
+                warmup=min(100, options.steps),
+                weight_decay=1e-4,
+                betas=(0.9, 0.98),
+                ema=0.995,
+                seed=run.seed,
+            )
         stage("autoencoder", GelLoss(images, gels, options), loop, run.folder)
     else:
         assert isinstance(model, Autoencoder)
         steps, batch, lr = options.steps_free, options.batch, options.lr
-        loop = LoopOptions(steps, batch, lr, weight_decay=1e-4, seed=run.seed)
+        with fields_of("autoencoder"):
+            loop = LoopOptions(steps, batch, lr, weight_decay=1e-4, seed=run.seed)
         if start is None:
             loss = VQLoss(images, options, quantize=False)
             stage("autoencoder", loss, loop, run.folder / "free")

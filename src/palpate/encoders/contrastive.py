@@ -27,7 +27,7 @@ from torch import Tensor, nn
 from transformers import CLIPModel, CLIPVisionModelWithProjection
 
 from palpate._version import __version__
-from palpate.core import Progress, Split, digest_json, digest_lines, quiet, require
+from palpate.core import Progress, Split, digest_json, digest_lines, fields_of, quiet, require
 from palpate.data.images import image_stamp
 from palpate.data.manifest import Manifest
 from palpate.data.reading import load
@@ -246,7 +246,8 @@ def train_tactile(
     assert rows is not None
     tactile, preprocess = _first_weights(preset, clip.dim, rows.images, run.seed, start)
     course = preset.tactile_course
-    options = course.options(len(train), run.seed)
+    with fields_of("tactile_course"):
+        options = course.options(len(train), run.seed)
     with agreed():
         _require_rows(train, options.batch)
         must = "A vision encoder without text must have two photos to teach"
@@ -277,6 +278,7 @@ def train_tactile(
     return replace(
         clip,
         tactile=model.tactile,
+        sensor=None,
         preprocesses={**clip.preprocesses, "tactile": preprocess},
         card=card,
         seen={**clip.seen, "tactile": seen},
@@ -386,7 +388,8 @@ def train_clip(
     train = train_part(manifest, split)
     side = _sides(train)[0]
     pictured, course = _with_image(train, side), _clip_course(preset)
-    options = course.options(len(pictured), run.seed)
+    with fields_of("clip_course"):
+        options = course.options(len(pictured), run.seed)
     with agreed():
         noun = "photos" if side == "vision" else "samples"
         _require_rows(pictured, options.batch, noun, "clip_course")

@@ -119,8 +119,9 @@ def make(  # noqa: PLR0913
     require(32 <= size <= 1024, "size", "must lie in 32 .. 1024", size, 256)
     require(abs(seed) < LARGEST, "seed", "must lie between -2^63 and 2^63", seed, 0)
     until = last_day(until)
-    must, fix = "A study needs a folder", "Name a new folder"
-    require(output is not None or dry_run, None, must, "none", {"output": "study/"}, fix=fix)
+    if output is None and not dry_run:
+        must, fix = "A study needs a folder", "Name a new folder"
+        raise PalpateError(must, "none", fix, example={"output": "study/"})
     sources = read_sources(reference, generated, names, labels)
     methods = [name for name in sources.paths if name not in (REFERENCE, GEL)]
     if task == "pair" and len(methods) < 2:
