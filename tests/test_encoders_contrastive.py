@@ -195,7 +195,7 @@ def with_val(manifest, rows):
         ({"row": {"tactile": None}}, r"tactile image.*v0/2"),
         ({"row": {"tactile": "gone.png"}}, "1 bad-image"),
         ({"course": {"batch": 1}}, "`tactile_course.batch` must be at least 2"),
-        ({"course": {"batch": 0}}, "`batch` must be at least 1"),
+        ({"course": {"batch": 0}}, "`tactile_course.batch` must be at least 1"),
         ({"course": {"keep": "best"}}, "`tactile_course.keep` needs a part val"),
         ({"course": {"patience": 1}}, "`tactile_course.patience` needs a part val"),
         ({"device": "abacus"}, "`device` must be auto"),
