@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 from palpate.cli.terminal import Switch, Terminal, require_extra
-from palpate.cli.training import PRESETS, Training, print_plan
+from palpate.cli.training import PRESETS, EncoderMachine, Training, print_plan
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -18,6 +18,8 @@ class Options(Training):
     that is trained first on the same train part."""
     epochs: float | None = None
     """Passes over the train part. Default: the preset's."""
+    machine: EncoderMachine = field(default_factory=EncoderMachine)
+    """How to run it on the machine at hand."""
     dry_run: Switch = False
     """Print parameters, steps and time, and stop."""
 

@@ -9,7 +9,7 @@ from typing import Annotated, Any, Literal
 import tyro
 
 from palpate.cli.terminal import Common, Files, OptionalOutPath, Switch, Terminal, require_extra
-from palpate.cli.training import Machine
+from palpate.cli.training import EncoderMachine
 from palpate.core import require
 
 
@@ -78,7 +78,7 @@ class Options(Common):
     """Folder for embeddings, which an interrupted run finds again."""
     probing: Probing = field(default_factory=Probing)
     training: Training = field(default_factory=Training)
-    machine: Machine = field(default_factory=Machine)
+    machine: EncoderMachine = field(default_factory=EncoderMachine)
     """How to train on the machine at hand."""
 
 

@@ -54,8 +54,6 @@ class Machine:
     """Memory layout of convolutions."""
     gradient_checkpointing: Switch = False
     """Compute activations twice instead of keeping them."""
-    chunk: int | None = None
-    """Rows that a contrastive encoder sees at a time; the loss is that of the whole batch."""
     checkpoint_minutes: float = 5.0
     """Time between checkpoints."""
     trackers: tuple[Literal["tensorboard", "wandb"], ...] = ()
@@ -69,6 +67,14 @@ class Machine:
     def keywords(self) -> dict[str, Any]:
         """What the functions that train take of it."""
         return {"device": self.device, "compute": self.compute}
+
+
+@dataclass(frozen=True, kw_only=True)
+class EncoderMachine(Machine):
+    """The same for the training of encoders."""
+
+    chunk: int | None = None
+    """Rows that the encoder sees at a time; the loss is that of the whole batch."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -39,7 +39,7 @@ Kind = Literal["value", "difference", "excess", "lead", "effect size"]
 class Measure(NamedTuple):
     """What a number measures, whatever it was measured on: see the same fields of :class:`Score`.
 
-    ``excess`` tells the between-group excess E from the metric itself.
+    ``excess`` distinguishes the between-group excess E from the metric itself.
     """
 
     metric: str

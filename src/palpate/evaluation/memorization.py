@@ -108,7 +108,7 @@ def memorization(
         require_one_encoder(other, train, f"{pair} images")
         widths = other.features.shape[1], train.features.shape[1]
         must, got = f"{pair} images must have rows of one width", f"{widths[0]} and {widths[1]}"
-        require(widths[0] == widths[1], None, must, got, fix="Describe both alike")
+        require(widths[0] == widths[1], None, must, got, fix="Describe both in one way")
     drawn, at = nearest(generated.features, train.features)
     test, _ = nearest(real.features, train.features)
     groups = _units(generated), _units(real)

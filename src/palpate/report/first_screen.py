@@ -18,7 +18,7 @@ from palpate.report.sentences import share_of
 #: Columns of the verdict table, the most telling first; others follow as they come.
 TELLING = tuple(map(Measure, ("TMMD", "material accuracy", "D-TMMD", "CI-TMMD", "SSIM")))
 COLUMNS, CARDS, CARD_ROWS = 5, 3, 4
-#: Metrics whose null is that generated and real images are alike.
+#: Metrics whose null is that generated and real images do not differ.
 DISTANCES = ("TMMD", "FID", "CMMD", "KID")
 #: Width of the strip in a card, and of the one that explains strips, in pixels.
 STRIP, READING = 296.0, 330.0

@@ -1,4 +1,4 @@
-"""Numbers as text: with the decimals that their intervals warrant, in every front end alike."""
+"""Numbers as text: with the decimals that their intervals warrant, the same in every front end."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def decimals(values: Iterable[float]) -> int:
 
 
 def digits_of(scores: Iterable[Score], *, finest: bool = False) -> int:
-    """Return the decimals of scores that are written alike, those of a column or one alone.
+    """Return the decimals of scores that are written in one way, those of a column or one alone.
 
     The median interval gets two digits for its half, so that one that is narrow does not lengthen
     all others, and no limit is written as the 0 that it excludes; with ``finest`` the narrowest

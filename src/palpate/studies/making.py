@@ -142,7 +142,7 @@ def make_autoencoder(
         gels = setting.pixels(setting.test, "background")
     ceiling = measure_reconstruction(model, real, gels)
     shutil.rmtree(training, ignore_errors=True)
-    # Nothing is said of a codebook where there is none.
+    # A codebook is reported only where there is one.
     scores = {k: float(v) for k, v in vars(ceiling).items() if v is not None}
     return {"digest": model.digest, "ceiling": scores}
 

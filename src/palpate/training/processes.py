@@ -127,7 +127,7 @@ def shared(error: PalpateError) -> PalpateError:
 
 @contextmanager
 def agreed() -> Generator[None]:
-    """Checks that all processes make alike: the first one alone prints what they raise."""
+    """Checks that every process makes: the first one alone prints what they raise."""
     try:
         yield
     except PalpateError as error:
