@@ -28,7 +28,7 @@ from palpate.core import (
     rng_for,
     seed_for,
 )
-from palpate.core.digest import to_numpy
+from palpate.core.features import to_numpy
 from palpate.report.families import columns
 from palpate.studies.stages import run_stage
 

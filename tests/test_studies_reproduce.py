@@ -14,7 +14,7 @@ from forge.commands import call, mistake
 from forge.studies import TINY
 from palpate.cli import main
 from palpate.core import FeatureSet, Measure, PalpateError, Score, Split, digest_file
-from palpate.core.digest import canonical_json
+from palpate.core.files import canonical_json
 from palpate.encoders.models import shipped_folder
 from palpate.preference.scoring import PREFERENCE, STRENGTH
 from palpate.report.results import Results

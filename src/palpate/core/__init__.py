@@ -1,16 +1,5 @@
 """The vocabulary that every room shares; needs NumPy alone."""
 
-from palpate.core.digest import (
-    digest_file,
-    digest_folder,
-    digest_json,
-    digest_lines,
-    fact_lines,
-    plain,
-    rng_for,
-    seed_for,
-    short,
-)
 from palpate.core.errors import (
     MissingExtraError,
     PalpateError,
@@ -27,19 +16,27 @@ from palpate.core.features import FeatureSet
 from palpate.core.files import (
     atomic_folder,
     atomic_path,
+    digest_file,
+    digest_folder,
+    digest_json,
+    digest_lines,
+    fact_lines,
     inside,
     locked,
+    plain,
     read_json,
     read_record,
     reading_entry,
     require_new_folder,
     require_regular,
+    rng_for,
+    seed_for,
+    short,
     write_json,
     write_text,
 )
-from palpate.core.notes import Note
+from palpate.core.notes import Note, SampleRef
 from palpate.core.progress import Progress, quiet, track
-from palpate.core.samples import SampleRef
 from palpate.core.score import Measure, Score, require_comparable
 from palpate.core.split import PARTS, Split
 

@@ -53,8 +53,8 @@ class PalpateError(Exception):
         super().__init__(must, got, fix)
 
     def __reduce__(self) -> tuple[Any, ...]:
-        # By default an exception is rebuilt from its positional arguments alone.
-        return type(self), self.args, self.__dict__
+        # By default an exception is rebuilt by a call with its positional arguments alone.
+        return type(self).__new__, (type(self), *self.args), self.__dict__
 
     def __str__(self) -> str:
         return self.message()
@@ -217,9 +217,6 @@ class ProblemsError(PalpateError):
         must = must or "Every row and file of the input must be readable and consistent"
         super().__init__(must, got, fix, example=example)
 
-    def __reduce__(self) -> tuple[Any, ...]:
-        return type(self), (self.problems, self.fix, self.must), self.__dict__
-
     def __str__(self) -> str:
         return "\n".join([self.message(), *problem_lines(self.problems)])
 
@@ -232,9 +229,5 @@ class MissingExtraError(PalpateError):
     """An optional dependency is not installed; names the ``pip install`` that adds it."""
 
     def __init__(self, package: str, extra: str, purpose: str) -> None:
-        self._given = (package, extra, purpose)
         must, got = f"{purpose} needs the package {package}", "no such package in this environment"
         super().__init__(must, got, f"In palpate's checkout run: pip install -e '.[{extra}]'")
-
-    def __reduce__(self) -> tuple[Any, ...]:
-        return type(self), self._given, self.__dict__

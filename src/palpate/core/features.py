@@ -12,12 +12,24 @@ from typing import Any
 
 import numpy as np
 
-from palpate.core.digest import to_numpy
-from palpate.core.errors import PalpateError, require_rows
+from palpate.core.errors import PalpateError, few, require_rows
 from palpate.core.files import atomic_path
 
 #: Rows that are checked and hashed at a time: a memory-mapped array is never copied whole.
 BLOCK = 8192
+
+
+def to_numpy(values: Any) -> np.ndarray:
+    """Return an array, or a tensor on any device, as a NumPy array; bfloat16 becomes float32.
+
+    Raises:
+        TypeError, ValueError: if the values are no array.
+    """
+    if hasattr(values, "detach"):
+        values = values.detach().cpu()
+        if str(values.dtype).endswith("bfloat16"):
+            values = values.float()
+    return np.asarray(values)
 
 
 def is_missing(name: Any) -> bool:
@@ -75,7 +87,7 @@ class FeatureSet:
         bad = np.flatnonzero(~np.concatenate(finite)) if finite else ()
         if len(bad):
             names = list(self.ids)  # a pandas column may have another index
-            rows = ", ".join(f"{k}: {names[k]!r}" for k in bad[:5]) + ", ..." * (len(bad) > 5)
+            rows = few(f"{k}: {names[k]!r}" for k in bad)
             got = f"NaN or infinity in {len(bad)} row{'s' * (len(bad) != 1)} ({rows})"
             fix = "Check what those rows were made from"
             raise PalpateError("Features must be finite", got, fix)

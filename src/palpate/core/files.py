@@ -1,16 +1,25 @@
-"""Files that are either whole or absent: written to a temporary sibling, then renamed."""
+"""Files that are either whole or absent, values as JSON, digests and seeds.
+
+Files are written to a temporary sibling, then renamed. Digests are SHA-256 over canonical forms:
+equal content has one name, and a random draw depends on (seed, purpose, sample), never on order.
+"""
 
 from __future__ import annotations
 
+import dataclasses
 import errno
+import hashlib
 import json
+import math
 import os
 import shutil
 import tempfile
-from collections.abc import Generator, Sequence
+from collections.abc import Generator, Iterable, Mapping, Sequence
 from contextlib import contextmanager, suppress
-from pathlib import Path
+from pathlib import Path, PurePath
 from typing import Any
+
+import numpy as np
 
 from palpate.core.errors import PalpateError
 
@@ -18,9 +27,124 @@ from palpate.core.errors import PalpateError
 NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 
 
+def plain(value: Any) -> Any:
+    """Return ``value`` with only the types of JSON: dataclasses, paths and arrays are converted.
+
+    NaN and infinity, which JSON has not, become null. Fields of dataclasses that are not compared
+    are skipped.
+
+    Raises:
+        TypeError: for any other type.
+    """
+    if value is None or isinstance(value, str | bool | int):
+        return value
+    if isinstance(value, float):
+        return float(value) if math.isfinite(value) else None
+    if isinstance(value, Mapping):
+        return {str(key): plain(item) for key, item in value.items()}
+    if isinstance(value, list | tuple | set | frozenset):
+        return [plain(item) for item in value]
+    if isinstance(value, np.ndarray | np.generic):
+        return plain(value.tolist())
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        fields = (field.name for field in dataclasses.fields(value) if field.compare)
+        return {name: plain(getattr(value, name)) for name in fields}
+    if isinstance(value, PurePath):
+        return value.as_posix()
+    raise TypeError(f"cannot put a {type(value).__name__} into JSON")
+
+
+def fact_lines(rows: Mapping[str, Any]) -> list[str]:
+    """Return one line per name, the values below each other; ``-`` for none."""
+    width = max(map(len, rows), default=0)
+    return [f"{name:<{width}}  {_as_text(value) or '-'}" for name, value in rows.items()]
+
+
+def _as_text(value: Any) -> str:
+    """Return a value as a person writes it: ``train 16, test 4`` for a mapping."""
+    if isinstance(value, Mapping):
+        return ", ".join(f"{name} {_as_text(cell)}" for name, cell in value.items())
+    if isinstance(value, list | tuple):
+        return ", ".join(map(_as_text, value))
+    return "" if value is None else str(value)
+
+
+def canonical_json(value: Any) -> str:
+    """Return ``value`` as JSON with sorted keys and no spaces; dataclasses and paths are accepted.
+
+    Raises:
+        ValueError: for NaN or infinity, which JSON cannot hold.
+    """
+    return json.dumps(
+        value,
+        sort_keys=True,
+        separators=(",", ":"),
+        default=plain,
+        allow_nan=False,
+        ensure_ascii=False,
+    )
+
+
+def digest_json(value: Any) -> str:
+    """Return the SHA-256 (64 hex digits) of the canonical JSON of ``value``."""
+    return hashlib.sha256(canonical_json(value).encode()).hexdigest()
+
+
+def digest_lines(lines: Iterable[str]) -> str:
+    """Return the SHA-256 of the lines, each ended by a newline, in the order given."""
+    state = hashlib.sha256()
+    for line in lines:
+        state.update(f"{line}\n".encode())
+    return state.hexdigest()
+
+
+def digest_file(path: Path) -> str:
+    """Return the SHA-256 of a file's bytes."""
+    with open(path, "rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def digest_folder(folder: Path, pattern: str = "**/*", *, without: str = "") -> str:
+    """Return the SHA-256 over names and bytes of the files in ``folder`` that match ``pattern``.
+
+    ``without``: name of a file of the folder that is left out.
+    """
+    files = sorted(p for p in folder.glob(pattern) if p.is_file() and p != folder / without)
+    return digest_lines(f"{p.relative_to(folder).as_posix()} {digest_file(p)}" for p in files)
+
+
+def short(digest: str) -> str:
+    """Return the first 12 digits: enough for people and folder names."""
+    return digest[:12]
+
+
+def seed_for(seed: int, *names: str | int) -> int:
+    """Return a 63-bit seed that depends on ``seed`` and ``names`` alone, on every machine."""
+    text = "\x1f".join([str(int(seed)), *map(str, names)])
+    return int.from_bytes(hashlib.sha256(text.encode()).digest()[:8], "little") >> 1
+
+
+def rng_for(seed: int, *names: str | int) -> np.random.Generator:
+    """Return a NumPy generator for (seed, names), e.g. ``rng_for(0, "noise", sample_id)``."""
+    return np.random.default_rng(seed_for(seed, *names))
+
+
 def is_stream(path: Path) -> bool:
     """Whether there is something at ``path`` but neither a file nor a folder: a device, a pipe."""
     return path.exists() and not path.is_file() and not path.is_dir()
+
+
+@contextmanager
+def _starting(path: Path) -> Generator[None]:
+    """Raise what stops something from being written with the path that the user named."""
+    try:
+        yield
+    except OSError as error:
+        reason = error.strerror or str(error)
+        if error.errno in NO_ROOM:
+            raise OSError(error.errno, reason, str(path)) from None
+        fix = "Choose another path, or check its rights"
+        raise PalpateError(f"{path} must be writable", reason, fix) from None
 
 
 @contextmanager
@@ -34,7 +158,7 @@ def atomic_path(path: Path) -> Generator[Path]:
         PalpateError: if nothing can be written there.
     """
     path = Path(path)
-    try:
+    with _starting(path):
         stream = is_stream(path)  # the real path of a pipe names nothing
         final = path if stream else Path(os.path.realpath(path))
         if final.is_dir():
@@ -42,12 +166,6 @@ def atomic_path(path: Path) -> Generator[Path]:
         parent = Path(tempfile.gettempdir()) if stream else final.parent
         parent.mkdir(parents=True, exist_ok=True)
         handle, name = tempfile.mkstemp(dir=parent, prefix=f".{final.name}.", suffix=final.suffix)
-    except OSError as error:  # name the user's path, not the temporary one
-        reason = error.strerror or str(error)
-        if error.errno in NO_ROOM:
-            raise OSError(error.errno, reason, str(path)) from None
-        fix = "Choose another path, or check its rights"
-        raise PalpateError(f"{path} must be writable", reason, fix) from None
     os.close(handle)
     part = Path(name)
     part.chmod(0o644)
@@ -115,13 +233,8 @@ def locked(folder: Path, output: Path | None = None) -> Generator[None]:
         PalpateError: if another process holds it, or it cannot be made.
     """
     new = not folder.exists()
-    try:
+    with _starting(output or folder):
         folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        if error.errno in NO_ROOM:
-            raise
-        must, got = f"{output or folder} must be writable", error.strerror or str(error)
-        raise PalpateError(must, got, "Choose another path, or check its rights") from None
     handle = -1
     try:
         import fcntl  # not on Windows, where a folder cannot be opened either
@@ -196,14 +309,14 @@ def read_record(
         PalpateError: if the file is missing, is not JSON, or is no object of that format with
             those keys.
     """
-    record, fix = read_json(path, role), "Name another folder, or copy the whole folder again"
+    record, fix = read_json(path, role), "Name another one, or copy its whole folder again"
     if not isinstance(record, dict):
         got = f"a {type(record).__name__}"
         raise PalpateError(f"The {role} {path} must be a JSON object", got, fix)
     forms = [form] if isinstance(form, str) else form
     if forms is not None and record.get("format") not in forms:
         got = repr(record.get("format"))
-        fix = "Name another folder, or install the release of palpate that wrote it"
+        fix = "Name another one, or install the release of palpate that wrote it"
         raise PalpateError(f"The {role} {path} must have the format {forms[0]}", got, fix)
     if missing := [name for name in keys if name not in record]:
         must = f"The {role} {path} must have the keys {', '.join(keys)}"

@@ -1,7 +1,7 @@
-"""Notes: what a reader must know about a number, as a code with parameters.
+"""What results hold besides numbers: notes, and references to samples.
 
-Rooms make notes; :mod:`palpate.report.notes` has the sentence of each code. No program parses a
-sentence.
+A note is what a reader must know about a number, as a code with parameters. Rooms make notes;
+:mod:`palpate.report.notes` has the sentence of each code. No program parses a sentence.
 """
 
 from __future__ import annotations
@@ -22,3 +22,16 @@ class Note:
 
     code: str
     params: Mapping[str, Any] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class SampleRef:
+    """A sample. Image paths are absolute or relative to the results file; None = no image."""
+
+    id: str
+    video: str | None = None
+    frame: int | None = None
+    material: str | None = None
+    vision: str | None = None
+    tactile: str | None = None
+    background: str | None = None

@@ -19,9 +19,8 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-from palpate.core.digest import digest_lines, plain, short
 from palpate.core.errors import PalpateError
-from palpate.core.files import read_json, write_json
+from palpate.core.files import digest_lines, plain, read_record, short, write_json
 from palpate.core.notes import Note
 from palpate.core.records import from_plain
 
@@ -141,13 +140,9 @@ class Split:
         if not isinstance(path, str | Path):
             must, got = "must be a split or its file", type(path).__name__
             raise PalpateError(must, got, "E.g. palpate.split(...)", argument="split")
-        data = read_json(Path(path), "split file")
-        if not isinstance(data, dict) or data.get("format") != FORMAT:
-            must, fix = f"{path} must be a split file ({FORMAT})", "Write one with: palpate split"
-            raise PalpateError(must, "another kind of file", fix)
         fix = "Write it again with: palpate split"
         try:
-            file = from_plain(_File, data)
+            file = from_plain(_File, read_record(Path(path), "split file", form=FORMAT))
             split = cls.from_ids(rule=file.rule, manifest=file.manifest, **file.parts)
         except (TypeError, ValueError):
             must = f"{path} must hold a rule and lists of ids by part"

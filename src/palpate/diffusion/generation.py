@@ -37,7 +37,7 @@ from palpate.core import (
     require,
     write_json,
 )
-from palpate.core.digest import canonical_json
+from palpate.core.files import canonical_json
 from palpate.data.images import BROKEN, SUFFIXES, check_image, read_image, square
 from palpate.diffusion.generated import FORMAT, Generated, file_name, old_index
 from palpate.encoders.models import FIX_MODEL, find_model

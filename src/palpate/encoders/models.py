@@ -34,7 +34,7 @@ from zipfile import is_zipfile
 from safetensors import SafetensorError
 
 from palpate.core import PalpateError, require, require_regular
-from palpate.core.digest import canonical_json
+from palpate.core.files import canonical_json
 
 if TYPE_CHECKING:  # names are checked before torch is imported, which takes seconds
     import torch

@@ -28,8 +28,8 @@ from palpate.core import (
     require_choice,
     rng_for,
 )
-from palpate.core.digest import canonical_json
 from palpate.core.features import is_missing
+from palpate.core.files import canonical_json
 from palpate.evaluation.guard import guard, load_encoders
 from palpate.metrics.means import Mean, over_seeds
 from palpate.metrics.paired import differences_of_means

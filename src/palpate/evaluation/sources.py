@@ -25,8 +25,7 @@ from palpate.core import (
     require,
     require_regular,
 )
-from palpate.core.digest import to_numpy
-from palpate.core.features import is_missing
+from palpate.core.features import is_missing, to_numpy
 from palpate.evaluation.embedding_files import SUFFIXES, Embeddings, checked, read_embeddings
 from palpate.evaluation.samples import Samples
 

@@ -33,7 +33,7 @@ import numpy as np
 
 from palpate._version import __version__
 from palpate.core import FeatureSet, Note, Score, require
-from palpate.core.digest import plain
+from palpate.core.files import plain
 from palpate.metrics.floors import with_floor
 from palpate.metrics.inputs import Array, Index, feature_set, feature_sets, require_one_encoder
 from palpate.metrics.intervals import (

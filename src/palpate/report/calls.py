@@ -15,7 +15,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path, PurePath
 from typing import Any
 
-from palpate.core.digest import digest_file, digest_folder
+from palpate.core.files import digest_file, digest_folder
 
 PATH, DIGEST, ROWS, OBJECT = "$path", "$digest", "$rows", "$object"
 #: Arguments that are names of files and folders, if there is something of that name.

@@ -15,12 +15,10 @@ from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Self, overload
 
-from palpate.core.digest import plain
 from palpate.core.errors import PalpateError
-from palpate.core.files import read_record, reading_entry, write_json
-from palpate.core.notes import Note
+from palpate.core.files import plain, read_record, reading_entry, write_json
+from palpate.core.notes import Note, SampleRef
 from palpate.core.records import from_plain
-from palpate.core.samples import SampleRef
 from palpate.core.score import Score
 from palpate.report.calls import Call
 from palpate.report.labels import label_of, subject_of
