@@ -175,9 +175,8 @@ def measure_disk(x_path, y_path):
         start = time.perf_counter(), time.process_time()
         result = distance(x, y)
         wall, cpu = time.perf_counter() - start[0], time.process_time() - start[1]
-    keys = ("value", "bound", "backend")
     times = {"rows": len(x), "wall": wall, "cpu": cpu, "mib": peak.most}
-    return times | {key: getattr(result, key) for key in keys}
+    return times | {"value": result.value} | result.details
 
 
 def in_a_process(threads, *arguments):

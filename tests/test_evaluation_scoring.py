@@ -216,7 +216,7 @@ def test_two_plain_folders_show_sigma_10_and_multi_without_pairs_of_one_scene():
     wide, multi = results["TMMD", "g"], results["TMMD (σ multi)", "g"]
     assert (wide.bandwidth, wide.settings["preset"]) == (10, "grouped")
     assert (multi.settings["kernel"], multi.settings["preset"]) == ("gaussian, multi", "grouped")
-    scenes = {"estimator": "grouped", "groups_x": IDS, "groups_y": IDS}
+    scenes = {"estimator": "grouped", "groups": IDS, "reference_groups": IDS}
     assert wide.value == pytest.approx(distance(made.features, real.features, **scenes).value)
     assert results["I-TMMD", "g"].settings["preset"] == "paper"
     [paper] = score({"g": made}, real, presets=["paper"], **FAST)["TMMD"]

@@ -12,43 +12,35 @@ from palpate.core import FeatureSet
 from palpate.metrics import cmmd, fid, kid, prdc, tmmd
 from palpate.report.notes import SENTENCES
 
-ROWS = "ids=None, groups=None, reference_ids=None, reference_groups=None, encoder=None"
-ONE_SET = "generated, *, ids=None, labels=None, groups=None, encoder=None, **options"
+TWO_SETS, ONE_SET = "generated, reference, **options", "generated, **options"
 IMAGES = "generated, reference"
-CONTACT = "generated, reference, background"
 
 FUNCTIONS = {
     "background_digest": "images",
     "ci_tmmd": ONE_SET,
-    "cmmd": "generated, reference, **options",
+    "cmmd": TWO_SETS,
     "compare": "generators, reference, *, floor=None, **options",
     "compare_fid": "generators, reference, **options",
     "compare_tmmd": "generators, reference, **options",
     "contact_mask": "tactile, background",
-    "contact_scores": f"{CONTACT}, **options",
+    "contact_scores": f"{IMAGES}, background, *, ids=None, **options",
     "d_tmmd": ONE_SET,
     "distance": (
-        "x, y, *, sigma=10.0, kernel=None, scale=1000.0, estimator='unbiased', groups_x=None, "
-        "groups_y=None, normalize='check', backend='auto', block=1024"
+        "generated, reference, *, groups=None, reference_groups=None, block=1024, **options"
     ),
-    "fid": f"generated, reference, *, {ROWS}, **options",
+    "fid": TWO_SETS,
     "four_scores": "generated, reference, *, floor=None, **options",
     "i_tmmd": ONE_SET,
-    "kid": "generated, reference, **options",
-    "mean_score": (
-        "metric, values, *, subject='generated', ids=None, groups=None, bounds=(-inf, inf), "
-        "higher_is_better=True, notes=(), **fields"
-    ),
-    "ms_ssim": f"{IMAGES}, **options",
+    "kid": TWO_SETS,
+    "ms_ssim": TWO_SETS,
     "per_image": f"metric, {IMAGES}",
-    "prdc": f"generated, reference, k=5, *, {ROWS}, **options",
-    "psnr": f"{IMAGES}, **options",
+    "prdc": "generated, reference, k=5, **options",
+    "psnr": TWO_SETS,
     "require_same_ids": "generated_ids, reference_ids",
-    "ssim": f"{IMAGES}, **options",
-    "tmmd": f"generated, reference, *, {ROWS.replace('ids=None,', 'ids=None, labels=None,', 1)}, "
-    "**options",
+    "ssim": TWO_SETS,
+    "tmmd": TWO_SETS,
 }
-CLASSES = {"TMMD", "Comparison", "Distance", "Options"}
+CLASSES = {"TMMD", "Comparison", "Options", "PerImage"}
 KERNELS = {"Gaussian", "Polynomial"}
 
 

@@ -10,7 +10,7 @@ from world_statistics import change, contact_area
 
 from palpate.core import Note, PalpateError, require_comparable
 from palpate.metrics import background_digest, contact, contact_mask, contact_scores
-from palpate.metrics.contact import contacts_of_each
+from palpate.metrics.contact import contact_per_image
 from palpate.sim import Video, World, WorldOptions
 from palpate.sim.plan import first_contact, plan_world
 
@@ -18,7 +18,9 @@ RESIDUAL, SSIM, IOU = (f"contact {name}" for name in ("residual", "SSIM", "IoU")
 
 
 def measured(generated, reference, background):
-    return contacts_of_each({"": generated}, reference, background)[""]
+    """Metric -> values by pair."""
+    each = contact_per_image({"": generated}, reference, background)[""]
+    return {metric.metric: metric.values for metric in each}
 
 
 def contact_residual(*images, **options):
@@ -88,7 +90,7 @@ def test_moved_markers_are_no_contact():
     assert mask.mean() < 0.4
     # the same print with its markers elsewhere: identical away from the markers
     moved = np.where(background == 0.1, background, 0.6) + np.where(dent - image > 0.05, 0.1, 0)
-    residual = measured(moved, dent, background).values[RESIDUAL][0]
+    residual = measured(moved, dent, background)[RESIDUAL][0]
     assert residual == pytest.approx(0, abs=1e-12)
 
 
@@ -171,12 +173,13 @@ def test_values_by_hand():
     real[:, 12:36, 12:36] += 0.2
     made[:, 12:36, 12:36] += 0.1
     mask, made_mask = contact_mask(real, background)[0], contact_mask(made, background)[0]
-    contacts = measured(made, real, background)
-    assert contacts.area[0] == pytest.approx(mask.mean())
-    assert contacts.values[RESIDUAL][0] == pytest.approx(0.01 / (0.01 + 0.04))
-    assert contacts.values[IOU][0] == (mask & made_mask).sum() / (mask | made_mask).sum()
+    values = measured(made, real, background)
+    area = contact_scores(made, real, background)[0].details["area"]
+    assert area == pytest.approx(mask.mean())
+    assert values[RESIDUAL][0] == pytest.approx(0.01 / (0.01 + 0.04))
+    assert values[IOU][0] == (mask & made_mask).sum() / (mask | made_mask).sum()
     negative = measured(2 * background - real, real, background)
-    assert negative.values[RESIDUAL][0] == pytest.approx(2)
+    assert negative[RESIDUAL][0] == pytest.approx(2)
 
 
 def test_stacks_measured_together_score_as_each_alone():
@@ -184,12 +187,12 @@ def test_stacks_measured_together_score_as_each_alone():
     background, real = gel(3), gel(3)
     real[:2, 12:36, 12:36] += 0.2  # the third shows no contact
     stacks = {name: np.clip(real + rng.normal(0, 0.05, real.shape), 0, 1) for name in "ab"}
-    for name, both in contacts_of_each(stacks, real, background).items():
-        alone = measured(stacks[name], real, background)
-        for metric, values in alone.values.items():
-            assert np.array_equal(both.values[metric], values, equal_nan=True)
-            assert np.array_equal(both.empty[metric], alone.empty[metric], equal_nan=True)
-        assert list(both.area > 0) == [True, True, False]
+    for name, together in contact_per_image(stacks, real, background).items():
+        alone = contact_per_image({"": stacks[name]}, real, background)[""]
+        for a, b in zip(together, alone, strict=True):
+            assert np.array_equal(a.values, b.values, equal_nan=True)
+            assert (a.details, a.notes) == (b.details, b.notes)
+            assert np.isnan(a.values).tolist() == [False, False, True]
 
 
 @pytest.mark.parametrize("sigma", [4, 8, 16])
@@ -197,8 +200,8 @@ def test_the_negative_of_a_contact_is_not_similar(sigma):
     background, real = gel(1, 64), gel(1, 64)
     at = np.arange(64) - 32
     real += 0.3 * np.exp(-(at[:, None] ** 2 + at**2) / (2 * sigma**2))[..., None]
-    contacts = measured(1 - real, real, background)
-    assert contacts.values[SSIM][0] < 0 < contacts.empty[SSIM][0]
+    _, similarity, _ = contact_scores(1 - real, real, background)
+    assert similarity.value < 0 < similarity.details["empty"]
 
 
 def slow_maps(x, y):
@@ -228,7 +231,7 @@ def slow_ssim(made, real, mask):
 def test_values_equal_loops_over_the_mask():
     background, real = pressed(2, 2)
     made = pressed(3, 2)[1]
-    contacts = measured(made, real, background)
+    values, empty = (measured(x, real, background) for x in (made, background))
     real_masks, made_masks = contact_mask(real, background), contact_mask(made, background)
     for n in range(2):
         mask, union = real_masks[n], real_masks[n] | made_masks[n]
@@ -241,9 +244,9 @@ def test_values_equal_loops_over_the_mask():
             IOU: (mask & made_masks[n]).sum() / union.sum(),
         }
         for metric, value in expected.items():
-            assert contacts.values[metric][n] == pytest.approx(value, abs=1e-12), metric
-        empty = slow_ssim(np.zeros_like(d), d, mask)
-        assert contacts.empty[SSIM][n] == pytest.approx(empty, abs=1e-12)
+            assert values[metric][n] == pytest.approx(value, abs=1e-12), metric
+        expected = slow_ssim(np.zeros_like(d), d, mask)
+        assert empty[SSIM][n] == pytest.approx(expected, abs=1e-12)
 
 
 def test_what_lies_outside_the_contact_earns_and_costs_nothing():
@@ -253,7 +256,7 @@ def test_what_lies_outside_the_contact_earns_and_costs_nothing():
     far[44:] = True  # further from the mask than half a window
     junk = made.copy()
     junk[:, far] = np.random.default_rng(6).random((3, int(far.sum()), 3))
-    plain, with_junk = (measured(v, real, background).values for v in (made, junk))
+    plain, with_junk = (measured(v, real, background) for v in (made, junk))
     for metric in (SSIM, RESIDUAL):
         np.testing.assert_allclose(plain[metric], with_junk[metric], rtol=1e-12)
     assert (with_junk[IOU] < plain[IOU]).all()  # a contact that is not there shows in the mask
@@ -336,7 +339,7 @@ def test_directions_and_intervals():
     scores = contact_scores(made, real, background)
     assert [s.metric for s in scores] == [RESIDUAL, SSIM, IOU]
     assert [s.higher_is_better for s in scores] == [False, True, True]
-    values = measured(made, real, background).values[RESIDUAL]
+    values = measured(made, real, background)[RESIDUAL]
     reach = stats.t.ppf(0.975, 5) * values.std(ddof=1) / math.sqrt(6)
     assert scores[0].interval == pytest.approx((values.mean() - reach, values.mean() + reach))
     assert scores[0].details["highest"][0]["value"] == values.max()

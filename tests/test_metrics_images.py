@@ -12,9 +12,9 @@ from forge.scores import codes
 from palpate.core import Note, PalpateError, require_comparable
 from palpate.metrics.images import (
     WEIGHTS,
+    PerImage,
     fitting_scales,
     least_side,
-    mean_score,
     ms_ssim,
     multiscale_similarity,
     per_image,
@@ -128,13 +128,13 @@ def test_scores_name_their_settings_and_the_lowest_images():
 
 def test_means_exclude_what_has_no_value_and_stay_in_their_bounds():
     values, note = np.array([0.9, np.nan, 1.0, 0.2]), Note("no-contact", {"count": 1, "n": 4})
-    score = mean_score("x", values, ids=list("abcd"), bounds=(0.0, 1.0), subject="s", notes=[note])
+    score = PerImage("x", values, (0.0, 1.0), notes=[note]).score(ids=list("abcd"))
     assert (score.value, score.interval) == (pytest.approx(0.7), (0, 1))
     assert (score.details["identical"], score.notes) == (0, (note,))
     assert [row["id"] for row in score.details["lowest"]] == ["d", "a", "c"]
-    down = mean_score("x", values, ids=list("abcd"), higher_is_better=False, subject="s")
+    down = PerImage("x", values, higher_is_better=False).score(ids=list("abcd"))
     assert [row["id"] for row in down.details["highest"]] == ["c", "a", "d"]
-    none = mean_score("x", np.full(3, np.nan), subject="s")
+    none = PerImage("x", np.full(3, np.nan)).score()
     assert (none.value, codes(none)) == (None, ["no-pair-has-a-value"])
     assert sentence(none.notes[0]).startswith("Undefined")
 

@@ -268,8 +268,8 @@ def test_one_bandwidth_for_all_generators(three):
             r.features,
             sigma="median",
             estimator="grouped",
-            groups_x=near.groups,
-            groups_y=r.groups,
+            groups=near.groups,
+            reference_groups=r.groups,
         )
     )
     several = compare(generators, r, sigma="multi", permutations=0).scores[0]

@@ -35,7 +35,7 @@ from test_metrics_mmd import unit_rows as drawn
 from test_metrics_tactile import change, without_groups, world
 
 X, Y = drawn(0, 8, 3), drawn(1, 8, 3)
-GROUPS = {"estimator": "grouped", "groups_x": ["a"] * 8, "groups_y": ["b"] * 8}
+GROUPS = {"estimator": "grouped", "groups": ["a"] * 8, "reference_groups": ["b"] * 8}
 G = world(19)
 ROWS = np.random.default_rng(7).normal(size=(9, 4))
 LETTERS = list("abcdefghi")
@@ -64,8 +64,8 @@ def labeled(n, classes=3, **columns):
 
 
 DISTANCE = [
-    (lambda: mmd2(changed(X, np.nan, 3), X), ["`x` must be finite", "1 row (3)"]),
-    (lambda: mmd2(X, changed(X, np.inf, 1, 6)), ["`y`", "finite", "2 rows (1, 6)"]),
+    (lambda: mmd2(changed(X, np.nan, 3), X), ["`generated` must be finite", "1 row (3)"]),
+    (lambda: mmd2(X, changed(X, np.inf, 1, 6)), ["`reference`", "finite", "2 rows (1, 6)"]),
     (lambda: mmd2(X[:1], X), ["at least 2 rows", "1"]),
     (lambda: mmd2(X[:0], X, estimator="biased"), ["at least 1 rows"]),
     (lambda: mmd2(X, X[:, :2]), ["same width", "3 and 2"]),
@@ -75,12 +75,12 @@ DISTANCE = [
     (lambda: mmd2(changed(X, 0.0, 2), X, normalize=True), ["zero vector"]),
     (lambda: mmd2(2 * X, X), ["L2-normalized", "norm 2", "8 rows", "normalize=True"]),
     (lambda: mmd2(0.998 * X, X), ["L2-normalized", "norm 0.998"]),
-    (lambda: mmd2([[1.0, 0.0], [1.0]], X), ["`x` must turn into an array"]),
+    (lambda: mmd2([[1.0, 0.0], [1.0]], X), ["`generated` must turn into an array"]),
     (lambda: mmd2(X, X, normalize="yes"), ["`normalize`", "'yes'"]),
-    (lambda: mmd2(X, X, **{**GROUPS, "groups_x": None}), ["`estimator`", "groups_x"]),
+    (lambda: mmd2(X, X, **{**GROUPS, "groups": None}), ["`groups`", "estimator='grouped'"]),
     (lambda: mmd2(X, Y, **GROUPS), ["two groups", "1 and 1"]),
-    (lambda: mmd2(X, Y, **{**GROUPS, "groups_x": ["a"] * 7}), ["`groups_x`", "8", "7"]),
-    (lambda: mmd2(X, Y, **{**GROUPS, "groups_x": ["a"] * 7 + [None]}), ["1 row (7)"]),
+    (lambda: mmd2(X, Y, **{**GROUPS, "groups": ["a"] * 7}), ["`groups`", "8", "7"]),
+    (lambda: mmd2(X, Y, **{**GROUPS, "groups": ["a"] * 7 + [None]}), ["1 row (7)"]),
     (lambda: mmd2(X, X, estimator="best"), ["`estimator`", "best"]),
     (lambda: mmd2(X, X, backend="best"), ["`backend`", "best"]),
     (lambda: mmd2(X, X, scale=math.nan), ["`scale`", "positive"]),
@@ -273,7 +273,7 @@ EMBEDDINGS = [
 @pytest.mark.parametrize(
     ("call", "words"), DISTANCE + TACTILE + COMPARED + DISTRIBUTIONS + IMAGES + EMBEDDINGS
 )
-@pytest.mark.filterwarnings("ignore:.*bit for bit", "ignore::RuntimeWarning")
+@pytest.mark.filterwarnings("ignore::RuntimeWarning")
 def test_bad_input_is_rejected_and_named(call, words):
     with pytest.raises(PalpateError) as caught:
         call()

@@ -13,8 +13,7 @@ from scipy import stats
 
 from palpate.core import FeatureSet, PalpateError, Score, require_comparable
 from palpate.metrics import PRESETS, ci_tmmd, d_tmmd, four_scores, i_tmmd, tmmd
-from palpate.metrics.mmd import half_of, sample_units
-from palpate.metrics.table import build_table
+from palpate.metrics.mmd import build_table, half_of, sample_units
 from palpate.metrics.tactile import i_tmmd_of
 from palpate.report.notes import sentence
 from test_metrics_mmd import loop_mmd, mmd2, unit_rows

@@ -11,10 +11,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from palpate.core.errors import PalpateError, few, require_rows
 from palpate.core.files import atomic_path
 
+Array = NDArray[np.float64]
+Index = NDArray[np.intp]
 #: Rows that are checked and hashed at a time: a memory-mapped array is never copied whole.
 BLOCK = 8192
 

@@ -29,8 +29,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from palpate.core import FeatureSet, Note, PalpateError, Progress, Score
-from palpate.metrics import Polynomial, compare_fid, compare_tmmd, mean_score, per_image
-from palpate.metrics.contact import contacts_of_each
+from palpate.metrics import PerImage, Polynomial, compare_fid, compare_tmmd, per_image
+from palpate.metrics.contact import contact_per_image
 from palpate.metrics.distributions import prdc_rows
 from palpate.metrics.paired import mean_differences
 
@@ -345,30 +345,26 @@ def _named(scores: Sequence[Score], metric: str, features: Features) -> list[Sco
 
 
 def _mean_of_pairs(pairs: Pairs, metric: Literal["SSIM", "PSNR", "MS-SSIM"]) -> Outcome:
-    each = {n: per_image(metric, images, pairs.reference) for n, images in pairs.images.items()}
+    images = pairs.images.items()
+    return _scored(pairs, {name: per_image(metric, x, pairs.reference) for name, x in images})
+
+
+def _scored(pairs: Pairs, each: Mapping[str, PerImage]) -> Outcome:
+    """Scores of one metric, with differences between the generators."""
     scores = {name: e.score(subject=name, **pairs.common) for name, e in each.items()}
-    return _with_differences(pairs, scores, lambda name: each[name].values)
-
-
-def _with_differences(
-    pairs: Pairs, scores: Mapping[str, Score], values: Callable[[str], NDArray[np.float64]]
-) -> Outcome:
-    """Scores of one metric, with differences from the generators' values per image."""
     outcome = Outcome([*scores.values()])
     if len(pairs.generators) > 1:
         compared = {name: scores[name] for name in pairs.generators}
-        per_image = {name: values(name) for name in pairs.generators}
-        outcome.differences += mean_differences(compared, per_image, pairs.groups)
+        values = {name: each[name].values for name in pairs.generators}
+        outcome.differences += mean_differences(compared, values, pairs.groups)
     return outcome
 
 
 def _contact(pairs: Pairs) -> Outcome:
-    contacts = contacts_of_each(pairs.images, pairs.reference, pairs.background)
-    scores = {name: c.scores(subject=name, **pairs.common) for name, c in contacts.items()}
+    each = contact_per_image(pairs.images, pairs.reference, pairs.background, pairs.ids)
     outcome = Outcome()
-    for of_metric in zip(*scores.values(), strict=True):
-        metric, by_name = of_metric[0].metric, dict(zip(scores, of_metric, strict=True))
-        outcome.add(_with_differences(pairs, by_name, lambda n, m=metric: contacts[n].values[m]))
+    for of_metric in zip(*each.values(), strict=True):
+        outcome.add(_scored(pairs, dict(zip(each, of_metric, strict=True))))
     return outcome
 
 
@@ -378,23 +374,19 @@ def _lpips(pairs: Pairs) -> Outcome:
     assert pairs.weights.lpips is not None  # `choose` requires it
     network, real = load_lpips(*map(Path, pairs.weights.lpips)), pairs.reference
     size = [int(v) for v in real.shape[1:3]]
-    values = {
-        name: lpips_per_image(x, real, network, progress=pairs.progress)
-        for name, x in pairs.images.items()
-    }
-    scores = {
-        name: mean_score(
-            "LPIPS",
-            value,
-            subject=name,
-            higher_is_better=False,
-            encoder=network.digest,
-            settings={"network": "alex", "version": "0.1", "size": size},
-            **pairs.common,
-        )
-        for name, value in values.items()
-    }
-    return _with_differences(pairs, scores, lambda name: values[name])
+    return _scored(
+        pairs,
+        {
+            name: PerImage(
+                "LPIPS",
+                lpips_per_image(x, real, network, progress=pairs.progress),
+                settings={"network": "alex", "version": "0.1", "size": size},
+                higher_is_better=False,
+                encoder=network.digest,
+            )
+            for name, x in pairs.images.items()
+        },
+    )
 
 
 FEATURES: Mapping[str, Callable[[Features], Outcome]] = {

@@ -6,20 +6,20 @@ On pairs of images: SSIM, PSNR and MS-SSIM; residual, SSIM and IoU of the contac
 
 from palpate.metrics.contact import background_digest, contact_mask, contact_scores
 from palpate.metrics.distributions import compare_fid, fid, prdc
-from palpate.metrics.images import mean_score, ms_ssim, per_image, psnr, require_same_ids, ssim
+from palpate.metrics.images import PerImage, ms_ssim, per_image, psnr, require_same_ids, ssim
 from palpate.metrics.kernels import Gaussian, Polynomial
-from palpate.metrics.mmd import PRESETS, Distance, Options, distance
-from palpate.metrics.paired import Comparison, compare, compare_tmmd
-from palpate.metrics.streaming import TMMD
-from palpate.metrics.tactile import ci_tmmd, cmmd, d_tmmd, four_scores, i_tmmd, kid, tmmd
+from palpate.metrics.mmd import PRESETS, Options
+from palpate.metrics.paired import Comparison, compare, compare_tmmd, four_scores
+from palpate.metrics.streaming import TMMD, distance
+from palpate.metrics.tactile import ci_tmmd, cmmd, d_tmmd, i_tmmd, kid, tmmd
 
 __all__ = [
     "PRESETS",
     "TMMD",
     "Comparison",
-    "Distance",
     "Gaussian",
     "Options",
+    "PerImage",
     "Polynomial",
     "background_digest",
     "ci_tmmd",
@@ -35,7 +35,6 @@ __all__ = [
     "four_scores",
     "i_tmmd",
     "kid",
-    "mean_score",
     "ms_ssim",
     "per_image",
     "prdc",

@@ -26,8 +26,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from typing import Any, Unpack
+from typing import Any
 
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
@@ -38,12 +37,11 @@ from palpate.core import Note, Score
 from palpate.metrics.images import (
     WINDOW_SETTINGS,
     Array,
-    ScoreOptions,
+    PerImage,
     as_unit,
     image_pairs,
     image_stack,
     local_maps,
-    mean_score,
     require_side,
 )
 from palpate.metrics.inputs import checked_names, to_host
@@ -173,7 +171,12 @@ def _noise(background: Array, keep: Mask) -> float:
 
 
 def contact_scores(
-    generated: Any, reference: Any, background: Any, **options: Unpack[ScoreOptions]
+    generated: Any,
+    reference: Any,
+    background: Any,
+    *,
+    ids: Sequence[str] | None = None,
+    **options: Any,
 ) -> list[Score]:
     """Mean contact residual, SSIM and IoU, over the images that show contact.
 
@@ -181,7 +184,8 @@ def contact_scores(
         generated: (n, h, w, 3 or 1) array or tensor, uint8 or float in [0, 1]; h, w >= 11.
         reference: the same shape: the real tactile image of each generated one.
         background: the same shape, or one image (h, w, c) for all: the real gel without contact.
-        **options: :class:`palpate.metrics.images.ScoreOptions`.
+        ids: n names.
+        **options: of :meth:`palpate.metrics.PerImage.score`.
 
     Returns:
         Three scores: residual (0: identical, 1: no contact), SSIM, IoU of the masks. Images without
@@ -190,62 +194,26 @@ def contact_scores(
     Raises:
         PalpateError: on other shapes, dtypes or ranges, or images smaller than the window.
     """
-    return contacts_of_each({"": generated}, reference, background)[""].scores(**options)
+    each = contact_per_image({"": generated}, reference, background, ids)[""]
+    return [metric.score(ids=ids, **options) for metric in each]
 
 
-@dataclass(frozen=True)
-class Contacts:
-    """What each pair scores on the contact; NaN where the real image shows none.
+def contact_per_image(
+    generated: Mapping[str, Any], reference: Any, background: Any, ids: Sequence[str] | None = None
+) -> dict[str, list[PerImage]]:
+    """Contact residual, SSIM and IoU of each pair of several stacks, by name; NaN without contact.
 
-    Attributes:
-        values: metric -> (n,), those of :data:`METRICS`.
-        empty: metric -> (n,) score of the no-contact image.
-        area: (n,) share of the pixels in the real mask, 0 where it is empty.
-        settings: of the comparison.
-    """
-
-    values: dict[str, Array]
-    empty: dict[str, Array]
-    area: Array
-    settings: dict[str, Any]
-
-    def scores(self, *, ids: Sequence[str] | None = None, **fields: Any) -> list[Score]:
-        """One score a metric; ``fields`` as :func:`palpate.metrics.mean_score`."""
-        n, none = len(self.area), self.area == 0
-        names = checked_names("ids", ids, n) or [str(i) for i in range(n)]
-        count, first = int(none.sum()), [names[i] for i in np.flatnonzero(none)[:10]]
-        notes = [Note("no-contact", {"count": count, "n": n})] if count else []
-        common = {"no_contact": {"count": count, "ids": first}, "area": _mean(self.area[~none])}
-        return [
-            mean_score(
-                metric,
-                self.values[metric],
-                ids=names,
-                bounds=bounds,
-                higher_is_better=up,
-                settings=self.settings | settings,
-                notes=notes,
-                details={"empty": _mean(self.empty[metric]), **common},
-                **fields,
-            )
-            for metric, (bounds, up, settings) in METRICS.items()
-        ]
-
-
-def contacts_of_each(
-    generated: Mapping[str, Any], reference: Any, background: Any
-) -> dict[str, Contacts]:
-    """Every contact metric of each pair of several stacks, by name.
-
-    What the real images show is measured once. Arguments and errors as :func:`contact_scores`.
+    What the real images show is measured once. ``details["empty"]`` is the score of the no-contact
+    image, ``details["area"]`` the mean share of the pixels in the real mask. Arguments and errors
+    as :func:`contact_scores`.
     """
     backgrounds = _for_all(background, reference)
     y, gel = image_pairs(reference, backgrounds, arguments=("reference", "background"))
     require_side(y.shape[1:3], "contact metrics")
     stacks = {name: image_pairs(x, y)[0] for name, x in generated.items()}
-    n = len(y)
-    nan = lambda: {metric: np.full(n, np.nan) for metric in METRICS}
-    values, empty, area = {name: nan() for name in stacks}, nan(), np.zeros(n)
+    n, area = len(y), np.zeros(len(y))
+    names = checked_names("ids", ids, n) or [str(i) for i in range(n)]
+    empty, *each = np.full((1 + len(stacks), len(METRICS), n), np.nan)
     for i, images in enumerate(zip(y, gel, strict=True)):
         tactile, none = map(as_unit, images)
         markers = marker_mask(none)
@@ -253,28 +221,39 @@ def contacts_of_each(
         kept, real = mask & ~near_marker, tactile - none
         if not kept.any():
             continue
-        for metric, value in _compare(np.zeros_like(real), real, kept).items():
-            empty[metric][i] = value
-        empty["contact IoU"][i] = 0.0
-        area[i] = mask.mean()
-        for name, x in stacks.items():
+        area[i], empty[:, i] = mask.mean(), (*_compare(np.zeros_like(real), real, kept), 0.0)
+        for x, values in zip(stacks.values(), each, strict=True):
             image = as_unit(x[i])
             other = mask_of(image, none, markers)[0]
-            row = _compare(image - none, real, kept)
-            row["contact IoU"] = float((mask & other).sum() / (mask | other).sum())
-            for metric, value in row.items():
-                values[name][metric][i] = value
-    size = {"size": list(y.shape[1:3]), "background": background_digest(background)}
-    return {name: Contacts(v, empty, area, SETTINGS | size) for name, v in values.items()}
-
-
-def _compare(x: Array, y: Array, kept: Mask) -> dict[str, float]:
-    """Every metric of two differences (h, w, c) on the pixels ``kept``."""
-    error, energy, generated = (float((v[kept] ** 2).mean()) for v in (x - y, y, x))
+            iou = (mask & other).sum() / (mask | other).sum()
+            values[:, i] = (*_compare(image - none, real, kept), iou)
+    lacks = np.flatnonzero(area == 0)
+    notes = [Note("no-contact", {"count": len(lacks), "n": n})] * (len(lacks) > 0)
+    common = {"no_contact": {"count": len(lacks), "ids": [names[i] for i in lacks[:10]]}}
+    common |= {"area": _mean(area[area > 0])}
+    settings = SETTINGS | {"size": list(y.shape[1:3]), "background": background_digest(background)}
     return {
-        "contact residual": error / (energy + generated) if energy + generated else np.nan,
-        "contact SSIM": float(local_maps(x, y, "mirror", SSIM_RANGE)[0][kept].mean()),
+        name: [
+            PerImage(
+                metric,
+                values[k],
+                bounds,
+                settings | further,
+                notes,
+                {"empty": _mean(empty[k]), **common},
+                up,
+            )
+            for k, (metric, (bounds, up, further)) in enumerate(METRICS.items())
+        ]
+        for name, values in zip(stacks, each, strict=True)
     }
+
+
+def _compare(x: Array, y: Array, kept: Mask) -> tuple[float, float]:
+    """Residual and SSIM of two differences (h, w, c) on the pixels ``kept``."""
+    error, energy, generated = (float((v[kept] ** 2).mean()) for v in (x - y, y, x))
+    residual = error / (energy + generated) if energy + generated else np.nan
+    return residual, float(local_maps(x, y, "mirror", SSIM_RANGE)[0][kept].mean())
 
 
 def _mean(values: Array) -> float | None:

@@ -74,32 +74,16 @@ BLOCK = 1 << 23
 TIE = 1e-12
 
 
-def fid(
-    generated: Any,
-    reference: Any,
-    *,
-    ids: Any = None,
-    groups: Any = None,
-    reference_ids: Any = None,
-    reference_groups: Any = None,
-    encoder: str | None = None,
-    **options: Any,
-) -> Score:
+def fid(generated: Any, reference: Any, **options: Any) -> Score:
     """FID between generated and real samples; lower is better.
 
     Args:
         generated: (n, d) features, n >= 2: an array, a tensor, a list of rows, or a FeatureSet; FID
             as published takes the 2048 pool features of Inception.
         reference: (m, d) features, m >= 2.
-        ids: n sample ids.
-        groups: n groups (videos) of ``generated``; they count only if both sets have them, and the
-            same name is the same group.
-        reference_ids: m sample ids.
-        reference_groups: m groups of ``reference``.
-        encoder: digest of the encoder of both.
-        **options: ``subject`` and ``split`` are kept in the score; ``seed`` draws more than 20
-            groups, or rows where there are none, into 20 blocks of about equal size, which are then
-            left out.
+        **options: columns as of :func:`palpate.metrics.tmmd`; ``subject`` and ``split`` are kept in
+            the score; ``seed`` draws more than 20 groups, or rows where there are none, into 20
+            blocks of about equal size, which are then left out.
 
     Returns:
         Value and interval; ``details["mean_term"]``: the part |mu1 - mu2|^2.
@@ -108,15 +92,7 @@ def fid(
         PalpateError: on features that cannot be used, unequal widths, fewer than two rows, or
             encoders of different digests.
     """
-    x, y = feature_sets(
-        generated,
-        reference,
-        ids,
-        groups=groups,
-        reference_ids=reference_ids,
-        reference_groups=reference_groups,
-        encoder=encoder,
-    )
+    x, y = feature_sets(options, generated=generated, reference=reference)
     return _fid(x, y, **options).score
 
 
@@ -261,8 +237,8 @@ def _rows(
 ) -> tuple[Array, Array, list[list[str] | None], list[Note]]:
     """Both sets of rows and of groups, checked, and a note of copies."""
     require_one_encoder(generated, reference, "Generated and reference")
-    sets, names = (generated.features, reference.features), ("generated", "reference")
-    x, y = checked_pair(*sets, normalize=False, least=least, names=names)
+    sets = generated.features, reference.features
+    x, y = checked_pair(*sets, normalize=False, least=least)
     groups = [checked_names("groups", s.groups, len(s.ids)) for s in (generated, reference)]
     copies = copies_across(x, y)
     return x, y, groups, [Note("copied-rows", {"count": copies, "n": len(x)})] * bool(copies)
@@ -294,32 +270,17 @@ def _draw_blocks(n: int, m: int, groups: Sequence[list[str] | None], seed: int) 
     return _Blocks(x, y, [f"block {b}" for b in range(count)], details, method)
 
 
-def prdc(
-    generated: Any,
-    reference: Any,
-    k: int = 5,
-    *,
-    ids: Any = None,
-    groups: Any = None,
-    reference_ids: Any = None,
-    reference_groups: Any = None,
-    encoder: str | None = None,
-    **options: Any,
-) -> list[Score]:
+def prdc(generated: Any, reference: Any, k: int = 5, **options: Any) -> list[Score]:
     """Precision, recall, density and coverage, in that order; higher is better for all four.
 
     Args:
         generated: (n, d) features, n > k: an array, a tensor, a list of rows, or a FeatureSet.
         reference: (m, d) features of real images, m > k.
         k: which neighbor gives the radius; 5 as Naeem et al. (Kynkäänniemi et al. use 3).
-        ids: n sample ids.
-        groups: n groups (videos) of ``generated``.
-        reference_ids: m sample ids.
-        reference_groups: m groups of ``reference``.
-        encoder: digest of the encoder of both.
-        **options: ``grouped``: look for neighbors in other groups only (see the top of this file),
-            default where both sets have groups, False gives the values of the package ``prdc``;
-            ``subject`` and ``split`` are kept in the scores.
+        **options: columns as of :func:`palpate.metrics.tmmd`; ``grouped``: look for neighbors in
+            other groups only (see the top of this file), default where both sets have groups, False
+            gives the values of the package ``prdc``; ``subject`` and ``split`` are kept in the
+            scores.
 
     Returns:
         Four scores. Intervals are of the mean over rows (see :func:`prdc_rows`), robust to whole
@@ -329,15 +290,7 @@ def prdc(
         PalpateError: on features that cannot be used, unequal widths, encoders of different
             digests, or (grouped) a group outside which there are fewer than k rows.
     """
-    x, y = feature_sets(
-        generated,
-        reference,
-        ids,
-        groups=groups,
-        reference_ids=reference_ids,
-        reference_groups=reference_groups,
-        encoder=encoder,
-    )
+    x, y = feature_sets(options, generated=generated, reference=reference)
     return prdc_rows(x, y, k, **options)[0]
 
 

@@ -18,9 +18,9 @@ sensor itself; :mod:`palpate.metrics.contact` compares the contact alone.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Any, Literal, TypedDict, Unpack
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -40,29 +40,13 @@ WINDOW_SETTINGS = {"window": WINDOW, "sigma": SIGMA, "k1": K1, "k2": K2}
 WEIGHTS = (0.0448, 0.2856, 0.3001, 0.2363, 0.1333)
 
 
-class ScoreOptions(TypedDict, total=False):
-    """Options of every score of pairs of images.
-
-    Keys:
-        ids: n names, for ``details["lowest"]``.
-        groups: n groups (videos); the interval is then robust to whole groups deviating together.
-        subject: what is scored, default ``"generated"``.
-        split: digest of the split, kept in the score.
-    """
-
-    ids: Sequence[str] | None
-    groups: Sequence[str] | None
-    subject: str
-    split: str | None
-
-
-def ssim(generated: Any, reference: Any, **options: Unpack[ScoreOptions]) -> Score:
+def ssim(generated: Any, reference: Any, **options: Any) -> Score:
     """Mean SSIM over pairs of images; 1 is identical.
 
     Args:
         generated: (n, h, w, 3 or 1) array or tensor, uint8 or float in [0, 1]; h, w >= 11.
         reference: the same shape; image i is the partner of generated image i.
-        **options: see :class:`ScoreOptions`.
+        **options: of :meth:`PerImage.score`.
 
     Raises:
         PalpateError: on other shapes, dtypes or ranges, or images smaller than the window.
@@ -70,7 +54,7 @@ def ssim(generated: Any, reference: Any, **options: Unpack[ScoreOptions]) -> Sco
     return per_image("SSIM", generated, reference).score(**options)
 
 
-def psnr(generated: Any, reference: Any, **options: Unpack[ScoreOptions]) -> Score:
+def psnr(generated: Any, reference: Any, **options: Any) -> Score:
     """Mean PSNR in dB over the pairs of images that are not identical.
 
     Arguments and errors as :func:`ssim`; images may be smaller than its window.
@@ -78,7 +62,7 @@ def psnr(generated: Any, reference: Any, **options: Unpack[ScoreOptions]) -> Sco
     return per_image("PSNR", generated, reference).score(**options)
 
 
-def ms_ssim(generated: Any, reference: Any, **options: Unpack[ScoreOptions]) -> Score:
+def ms_ssim(generated: Any, reference: Any, **options: Any) -> Score:
     """Mean MS-SSIM over pairs of images, of as many scales as these hold; 1 is identical.
 
     Arguments and errors as :func:`ssim`. Weights of fewer than five scales are divided by their
@@ -94,23 +78,78 @@ class PerImage:
 
     Attributes:
         metric: its name.
-        values: (n,); a PSNR is infinite where the two are identical.
-        bounds: of the metric.
+        values: (n,); infinite where the two are identical, NaN where a pair has no value (``notes``
+            say why): a mean excludes both.
+        bounds: of the metric; a t interval may leave them.
         settings: what a score keeps.
         notes: of the score.
+        details: of the score.
+        higher_is_better: its direction.
+        encoder: digest of a network that it needs, or None.
     """
 
     metric: str
     values: Array
-    bounds: tuple[float, float]
-    settings: dict[str, Any]
+    bounds: tuple[float, float] = (-np.inf, np.inf)
+    settings: Mapping[str, Any] = field(default_factory=dict)
     notes: Sequence[Note] = ()
+    details: Mapping[str, Any] = field(default_factory=dict)
+    higher_is_better: bool = True
+    encoder: str | None = None
 
-    def score(self, **fields: Any) -> Score:
-        """Their mean; ``fields`` as :func:`mean_score`."""
-        common = (self.metric, self.values)
-        return mean_score(
-            *common, bounds=self.bounds, settings=self.settings, notes=self.notes, **fields
+    def score(
+        self,
+        *,
+        ids: Sequence[str] | None = None,
+        groups: Sequence[str] | None = None,
+        subject: str = "generated",
+        split: str | None = None,
+    ) -> Score:
+        """The mean over pairs of images.
+
+        Args:
+            ids: n names, for ``details["lowest"]``.
+            groups: n groups (videos); the interval is then robust to whole groups deviating
+                together.
+            subject: what is scored.
+            split: digest of the split, kept in the score.
+        """
+        values, up = self.values, self.higher_is_better
+        n, finite = len(values), np.isfinite(values)
+        names = checked_names("ids", ids, n) or [str(k) for k in range(n)]
+        groups = checked_names("groups", groups, n)
+        kept, identical = values[finite], int(np.isinf(values).sum())
+        spread = spread_of_values(kept, groups and list(np.array(groups)[finite]))
+        worst = [i for i in np.argsort(values if up else -values, kind="stable") if finite[i]][:5]
+        details = {
+            "sd": float(kept.std(ddof=1)) if len(kept) > 1 else None,
+            "median": float(np.median(kept)) if len(kept) else None,
+            "identical": identical,
+            "lowest" if up else "highest": [
+                {"id": names[i], "value": float(values[i])} for i in worst
+            ],
+            "groups": len(set(groups)) if groups else None,
+            "version": __version__,
+        }
+        if len(kept):
+            own = [Note("identical-pairs", {"count": identical, "n": n})] * (identical > 0)
+            own += [Note("no-interval-over-images")] * (not spread.known)
+        else:
+            own = [Note("all-identical", {"n": n}) if identical else Note("no-pair-has-a-value")]
+        return score_of(
+            self.metric,
+            subject,
+            spread,
+            self.bounds,
+            estimator="per-image mean",
+            n=n,
+            m=n,
+            encoder=self.encoder,
+            split=split,
+            higher_is_better=up,
+            settings=self.settings,
+            details=details | dict(self.details),
+            notes=(*own, *self.notes),
         )
 
 
@@ -128,7 +167,7 @@ def per_image(
     if metric == "PSNR":
         with np.errstate(divide="ignore"):
             values = -10 * np.log10([((a - b) ** 2).mean() for a, b in pairs])
-        return PerImage(metric, values, (-np.inf, np.inf), settings)
+        return PerImage(metric, values, settings=settings)
     require_side(size, metric)
     settings |= WINDOW_SETTINGS | {"border": "valid"}
     if metric == "SSIM":
@@ -138,72 +177,8 @@ def per_image(
     values = np.array([multiscale_similarity(a, b, scales) for a, b in pairs])
     weights = [round(float(v), 6) for v in scale_weights(scales)]
     settings |= {"scales": scales, "downsampling": "2 x 2 mean", "weights": weights}
-    few = Note("fewer-scales", {"scales": scales, "least": least_side(len(WEIGHTS))})
-    return PerImage(metric, values, (0.0, 1.0), settings, [few] if scales < len(WEIGHTS) else [])
-
-
-def mean_score(
-    metric: str,
-    values: Array,
-    *,
-    subject: str = "generated",
-    ids: Sequence[str] | None = None,
-    groups: Sequence[str] | None = None,
-    bounds: tuple[float, float] = (-np.inf, np.inf),
-    higher_is_better: bool = True,
-    notes: Sequence[Note] = (),
-    **fields: Any,
-) -> Score:
-    """The score of a mean over pairs of images.
-
-    Args:
-        metric: its name.
-        values: (n,) one a pair; infinite where a pair is identical, NaN where it has no value
-            (``notes`` say why): both are excluded.
-        subject: what is scored.
-        ids: n names.
-        groups: n groups.
-        bounds: of the metric; a t interval may leave them.
-        higher_is_better: its direction.
-        notes: further notes.
-        **fields: further fields of the score; ``details`` are merged with those made here.
-    """
-    n, finite = len(values), np.isfinite(values)
-    names = checked_names("ids", ids, n) or [str(k) for k in range(n)]
-    groups = checked_names("groups", groups, n)
-    kept, identical = values[finite], int(np.isinf(values).sum())
-    kept_groups = None if groups is None else list(np.array(groups)[finite])
-    spread = spread_of_values(kept, kept_groups)
-    badness = np.where(finite, -values if higher_is_better else values, -np.inf)
-    worst = [i for i in np.argsort(-badness, kind="stable")[:5] if finite[i]]
-    details = {
-        "sd": float(kept.std(ddof=1)) if len(kept) > 1 else None,
-        "median": float(np.median(kept)) if len(kept) else None,
-        "identical": identical,
-        "lowest" if higher_is_better else "highest": [
-            {"id": names[i], "value": float(values[i])} for i in worst
-        ],
-        "groups": len(set(groups)) if groups else None,
-        "version": __version__,
-    }
-    if len(kept):
-        own = [Note("identical-pairs", {"count": identical, "n": n})] * (identical > 0)
-        own += [Note("no-interval-over-images")] * (not spread.known)
-    else:
-        own = [Note("all-identical", {"n": n}) if identical else Note("no-pair-has-a-value")]
-    return score_of(
-        metric,
-        subject,
-        spread,
-        bounds,
-        estimator="per-image mean",
-        n=n,
-        m=n,
-        higher_is_better=higher_is_better,
-        details=details | fields.pop("details", {}),
-        notes=(*own, *notes),
-        **fields,
-    )
+    fewer = Note("fewer-scales", {"scales": scales, "least": least_side(len(WEIGHTS))})
+    return PerImage(metric, values, (0.0, 1.0), settings, [fewer] * (scales < len(WEIGHTS)))
 
 
 def require_same_ids(generated_ids: Sequence[str], reference_ids: Sequence[str]) -> None:

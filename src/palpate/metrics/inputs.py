@@ -25,11 +25,8 @@ from array_api_compat import array_namespace, device
 from numpy.typing import NDArray
 
 from palpate.core import FeatureSet, PalpateError, PalpateWarning, require
-from palpate.core.features import is_missing
+from palpate.core.features import Array, Index, is_missing
 
-Array = NDArray[np.float64]
-Index = NDArray[np.intp]
-Floats = NDArray[np.floating[Any]]
 Normalize = Literal["check"] | bool
 
 #: Rows may differ from unit length by this much before ``normalize="check"`` rejects them.
@@ -49,55 +46,37 @@ def check(holds: bool, name: str, must: str, got: Any, fix: str, **example: Any)
         raise PalpateError(must, str(got), fix, argument=argument, example=example)
 
 
-def feature_set(
-    features: Any,
-    *,
-    argument: str = "generated",
-    ids: Any = None,
-    labels: Any = None,
-    groups: Any = None,
-    encoder: str | None = None,
-) -> FeatureSet:
-    """Features as a :class:`FeatureSet`, whose columns the other arguments replace.
+def feature_sets(options: dict[str, Any], **features: Any) -> list[FeatureSet]:
+    """Features by role (``generated``, ``reference``) as :class:`FeatureSet`.
 
-    Without ids, rows get the name of the argument and their number: rows of two arrays without ids
-    are different samples.
+    Their columns ``ids``, ``labels`` and ``groups``, of another role than ``generated`` after its
+    name and ``_``, and ``encoder`` are taken out of ``options``. Without ids, rows get the name of
+    the role and their number: rows of two arrays without ids are different samples.
 
     Raises:
         PalpateError: on what does not turn into rows, or columns of another length.
     """
+    encoder = options.pop("encoder", None)
+    return [_feature_set(role, x, options, encoder) for role, x in features.items()]
+
+
+def _feature_set(
+    role: str, features: Any, options: dict[str, Any], encoder: str | None
+) -> FeatureSet:
     base = features if isinstance(features, FeatureSet) else None
-    columns = (ids, labels, groups)
+    names, prefix = ("ids", "labels", "groups"), "" if role == "generated" else f"{role}_"
+    columns = [options.pop(prefix + name, None) for name in names]
     if base is not None and all(v is None for v in (*columns, encoder)):
         return base
-    x = as_array(argument, to_host(features if base is None else base.features))
-    _check_rows(argument, x, x.ndim == 2)
-    n, names = len(x), ("ids", "labels", "groups")
+    x = as_array(role, to_host(features if base is None else base.features))
+    _check_rows(role, x, x.ndim == 2)
+    n = len(x)
     ids, labels, groups = (
-        getattr(base, name, None) if v is None else column(name, v, n)
+        getattr(base, name, None) if v is None else column(prefix + name, v, n)
         for name, v in zip(names, columns, strict=True)
     )
-    ids = ids or [f"{argument} {k:0{len(str(n))}d}" for k in range(n)]
+    ids = ids or [f"{role} {k:0{len(str(n))}d}" for k in range(n)]
     return FeatureSet(ids, x, labels, groups, encoder or getattr(base, "encoder", None))
-
-
-def feature_sets(
-    generated: Any,
-    reference: Any,
-    ids: Any = None,
-    labels: Any = None,
-    groups: Any = None,
-    *,
-    reference_ids: Any = None,
-    reference_groups: Any = None,
-    encoder: str | None = None,
-) -> tuple[FeatureSet, FeatureSet]:
-    """Both sets of a metric; arguments and errors as of :func:`feature_set`."""
-    x = feature_set(generated, ids=ids, labels=labels, groups=groups, encoder=encoder)
-    names = (reference_ids, reference_groups)
-    return x, feature_set(
-        reference, argument="reference", ids=names[0], groups=names[1], encoder=encoder
-    )
 
 
 def column(name: str, values: Any, n: int) -> list[Any] | None:
@@ -209,32 +188,31 @@ def checked_features(name: str, x: Any, *, normalize: Normalize = "check", least
 
 
 def checked_pair(
-    x: Any, y: Any, *, normalize: Normalize, least: int, names: tuple[str, str] = ("x", "y")
-) -> tuple[Any, Any]:
+    generated: Any, reference: Any, *, normalize: Normalize, least: int, name: str = "generated"
+) -> list[Any]:
     """Both feature arrays, checked, of one width, one library and one dtype.
 
     Raises:
         PalpateError: as :func:`checked_features`, and if widths or libraries differ.
     """
-    x, y = as_array(names[0], x), as_array(names[1], y)
-    first, second = (f"`{name}`" if name.isidentifier() else name for name in names)
-    both = f"{first} and {second.replace('The ', 'the ', 1)}"
-    got = " and ".join(str(v.shape[-1]) for v in (x, y) if v.ndim)
-    same = not x.ndim == y.ndim == 2 or x.shape[1] == y.shape[1]
+    pair = [as_array(name, generated), as_array("reference", reference)]
+    both = f"{f'`{name}`' if name.isidentifier() else name} and `reference`"
+    got = " and ".join(str(v.shape[-1]) for v in pair if v.ndim)
+    same = any(v.ndim != 2 for v in pair) or pair[0].shape[1] == pair[1].shape[1]
     must, fix = f"{both} must have the same width", "Embed both with the same encoder"
     require(same, None, must, got, fix=fix)
     library = lambda v: f"{type(v).__module__.split('.')[0]} {getattr(v, 'device', '')}"
-    homes = [library(v) if is_foreign(v) else "numpy" for v in (x, y)]
+    homes = [library(v) if is_foreign(v) else "numpy" for v in pair]
     must = f"{both} must be arrays of one library on one device"
     require(homes[0] == homes[1], None, must, " and ".join(homes), fix="Move one of them")
     a, b = (
-        checked_features(name, v, normalize=normalize, least=least)
-        for name, v in zip(names, (x, y), strict=True)
+        checked_features(role, v, normalize=normalize, least=least)
+        for role, v in zip((name, "reference"), pair, strict=True)
     )
     if isinstance(a, np.ndarray):
         dtype = np.result_type(a.dtype, b.dtype)
-        return a.astype(dtype, copy=False), b.astype(dtype, copy=False)
-    return (like(a, b), b) if "64" in str(b.dtype) else (a, like(b, a))
+        return [v.astype(dtype, copy=False) for v in (a, b)]
+    return [like(a, b), b] if "64" in str(b.dtype) else [a, like(b, a)]
 
 
 def _at_least_float32(x: Any) -> Any:
@@ -317,13 +295,6 @@ def checked_whole(least: int, **values: Any) -> None:
         whole_number = isinstance(value, int | np.integer) and not isinstance(value, bool)
         holds = whole_number and bool(least <= value < 2**63)
         require(holds, name, must, repr(value), fix="Drop it for the default")
-
-
-def checked_scale(scale: Any) -> None:
-    """Reject a factor on the result that is not a finite number above 0."""
-    number = isinstance(scale, int | float | np.number) and not isinstance(scale, bool)
-    positive = number and bool(0 < scale < np.inf)
-    require(positive, "scale", "must be positive", repr(scale), fix="Drop it for the default")
 
 
 def require_one_encoder(a: FeatureSet, b: FeatureSet, both: str) -> None:

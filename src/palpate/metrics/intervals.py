@@ -32,7 +32,7 @@ import numpy as np
 from scipy import special
 
 from palpate.core import Score, rng_for
-from palpate.metrics.inputs import Array, Index
+from palpate.core.features import Array, Index
 
 
 @dataclass(frozen=True)
@@ -249,7 +249,7 @@ class Spread:
     @property
     def known(self) -> bool:
         """Whether there is an error: no change without any group is no evidence of certainty."""
-        return bool(1e-12 < self.error < np.inf)  # not for NaN
+        return bool(1e-12 < self.error < np.inf and np.isfinite(self.value))  # not for NaN
 
     def interval(self, low: float = -np.inf, high: float = np.inf) -> Interval | None:
         """The 95 % t interval within [low, high], or None."""
@@ -292,41 +292,28 @@ def score_of(
 
 @dataclass(frozen=True)
 class Estimate:
-    """A statistic with its jackknife.
+    """Statistics with their jackknife.
 
     Attributes:
-        values: (K,).
-        errors: (K,) standard errors.
-        df: their degrees of freedom.
-        method: in words.
+        spreads: K values with their errors.
         replicates: (G, K) values without each unit, or (C, 4) without each class.
         units: (G,) units.
         of_classes: whether classes are left out.
     """
 
-    values: Array
-    errors: Array
-    df: int
-    method: str
+    spreads: Sequence[Spread]
     replicates: Array = field(repr=False)
     units: Index = field(repr=False)
     of_classes: bool = False
 
-    def interval(self, k: int) -> Interval | None:
-        """Interval of value k, or None where it has none."""
-        value = float(self.values[k])
-        spread = Spread(value, float(self.errors[k]), self.df, self.method)
-        return spread.interval() if np.isfinite(value) else None
-
 
 def estimate(sums: PairSums, statistic: Callable[[Totals], Array], unit: str) -> Estimate:
-    """The statistic on all samples, with its leave-one-unit-out jackknife."""
+    """The statistics on all samples, with their leave-one-unit-out jackknife."""
     replicates = np.array([statistic(t) for t in sums.leave_one_out()], dtype=np.float64)
-    df = len(sums.units) - 1
     tail = "" if unit == "group" else ", samples taken as independent"
-    method = f"leave-one-{unit}-out jackknife, t, {df} df{tail}"
-    errors = jackknife_errors(replicates)
-    return Estimate(statistic(sums.totals), errors, df, method, replicates, sums.units)
+    method = f"leave-one-{unit}-out jackknife, t, {len(replicates) - 1} df{tail}"
+    pairs = zip(statistic(sums.totals), replicates.T, strict=True)
+    return Estimate([Spread.of(*pair, method) for pair in pairs], replicates, sums.units)
 
 
 def class_estimate(sums: PairSums, statistic: Callable[[Totals], Array], unit: str) -> Estimate:
@@ -338,15 +325,15 @@ def class_estimate(sums: PairSums, statistic: Callable[[Totals], Array], unit: s
     errors then.
     """
     over_units, classes = estimate(sums, statistic, unit), sums.segments // 2
-    if classes < 3 or np.isfinite(over_units.errors[0]):
+    if classes < 3 or np.isfinite(over_units.spreads[0].error):
         return over_units
     without = np.array([statistic(without_set(sums.totals, c))[:4] for c in range(classes)])
-    errors = np.full(len(over_units.values), np.nan)
-    errors[: without.shape[1]] = jackknife_errors(without)
     reason = f"(a class has too few {unit}s to leave one out)"
     method = f"leave-one-class-out jackknife, t, {classes - 1} df {reason}"
-    values, units = over_units.values, over_units.units
-    return Estimate(values, errors, classes - 1, method, without, units, of_classes=True)
+    first, others = over_units.spreads[: without.shape[1]], over_units.spreads[without.shape[1] :]
+    spreads = [Spread.of(s.value, v, method) for s, v in zip(first, without.T, strict=True)]
+    spreads += [Spread(s.value, np.nan, classes - 1, method) for s in others]
+    return Estimate(spreads, without, over_units.units, of_classes=True)
 
 
 def without_set(t: Totals, c: int) -> Totals:

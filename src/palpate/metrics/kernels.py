@@ -157,13 +157,6 @@ class Polynomial(Kernel):
         return super().settings() | {"degree": self.degree, "gamma": gamma, "coef0": self.coef0}
 
 
-def checked_kernel(kernel: Any) -> None:
-    """Reject what is no kernel; None is the Gaussian of ``sigma``."""
-    must = "must be a kernel: Gaussian(), Polynomial() or another Kernel"
-    holds = kernel is None or isinstance(kernel, Kernel)
-    require(holds, "kernel", must, repr(kernel), fix="Import one from palpate.metrics")
-
-
 def gaussian(sigma: Sigma, x: Any, groups: Sequence[str] | Index | None = None) -> Gaussian:
     """The Gaussian kernel that ``sigma`` names.
 
@@ -214,7 +207,6 @@ def median_distance(x: Any, groups: Sequence[str] | Index | None = None) -> floa
 
 
 Backend = Literal["auto", "blocked", "moments"]
-BACKENDS = ("auto", "blocked", "moments")
 #: Largest bound that ``auto`` accepts, at scale 1000.
 TOLERANCE = 1e-4
 #: ``auto`` tries moments from so many rows on, in units of the width and in all.

@@ -49,51 +49,38 @@ grouped       grouped    group    sum                ratio_of_means  the default
 
 from __future__ import annotations
 
-import math
-import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 import numpy as np
 
-from palpate.core import PalpateWarning, require, require_choice, seed_for
+from palpate.core import FeatureSet, require, require_choice, seed_for
+from palpate.core.features import Array, Index, is_missing
 from palpate.metrics.inputs import (
-    Array,
-    Index,
     Normalize,
     check,
+    checked_features,
     checked_names,
     checked_pair,
-    checked_scale,
     checked_whole,
     copies_across,
+    require_one_encoder,
 )
 from palpate.metrics.intervals import PairSums, Totals, mean_of_pairs
-from palpate.metrics.kernels import (
-    BACKENDS,
-    Backend,
-    Kernel,
-    Sigma,
-    checked_kernel,
-    gaussian,
-    kernel_sums,
-)
+from palpate.metrics.kernels import Backend, Kernel, Sigma, centered_squares, gaussian, kernel_sums
 
 Estimator = Literal["unbiased", "biased", "grouped"]
 Halves = Literal["group", "random", "ordered"]
 Denominator = Literal["sum", "mean", "mean_off_diagonal"]
 Aggregate = Literal["mean_of_ratios", "ratio_of_means"]
-HALVES = ("group", "random", "ordered")
-DENOMINATORS = ("sum", "mean", "mean_off_diagonal")
-AGGREGATES = ("mean_of_ratios", "ratio_of_means")
-ESTIMATORS = ("unbiased", "biased", "grouped")
+#: Options that are words.
 CHOICES = {
-    "estimator": ESTIMATORS,
-    "halves": HALVES,
-    "denominator": DENOMINATORS,
-    "aggregate": AGGREGATES,
-    "backend": BACKENDS,
+    "estimator": Estimator,
+    "halves": Halves,
+    "denominator": Denominator,
+    "aggregate": Aggregate,
+    "backend": Backend,
 }
 
 
@@ -140,118 +127,6 @@ def unit_index(*columns: Sequence[str]) -> Index:
     """Integers for the names of all columns, one column after the other."""
     names = np.concatenate([np.asarray(c, dtype=object).astype(str) for c in columns])
     return np.unique(names, return_inverse=True)[1].astype(np.intp)
-
-
-@dataclass(frozen=True)
-class Distance:
-    """A squared MMD and how it was computed.
-
-    Attributes:
-        value: times ``scale``; may be negative for ``unbiased`` and ``grouped``.
-        bound: the value is within this of the exact one (rounding aside); 0 for ``blocked``.
-        backend: ``"blocked"`` or ``"moments"``.
-        estimator: which pairs were averaged.
-        kernel: settings of the kernel.
-        bandwidth: sigma, or None where there are several or none.
-        scale: factor on the raw value.
-        m: rows of x.
-        n: rows of y.
-    """
-
-    value: float
-    bound: float
-    backend: str
-    estimator: Estimator
-    kernel: dict[str, Any]
-    bandwidth: float | None
-    scale: float
-    m: int
-    n: int
-
-    def __float__(self) -> float:
-        """The value."""
-        return self.value
-
-
-def distance(  # noqa: PLR0913
-    x: Any,
-    y: Any,
-    *,
-    sigma: Sigma = 10.0,
-    kernel: Kernel | None = None,
-    scale: float = 1000.0,
-    estimator: Estimator = "unbiased",
-    groups_x: Any = None,
-    groups_y: Any = None,
-    normalize: Normalize = "check",
-    backend: Backend = "auto",
-    block: int = 1024,
-) -> Distance:
-    """Squared MMD between two sets of features (paper, Eq. 2), times ``scale``.
-
-    Args:
-        x: (m, d) features, see :mod:`palpate.metrics.inputs`; an array on disk is streamed.
-        y: (n, d) features of the same library; m and n may differ.
-        sigma: bandwidth of the Gaussian kernel; several are averaged; ``"median"`` and ``"multi"``
-            take the median distance of ``y``.
-        kernel: instead of the Gaussian, e.g. :class:`palpate.metrics.Polynomial`.
-        scale: factor on the result; 1000 as in CMMD.
-        estimator: ``"unbiased"``, ``"biased"`` or ``"grouped"``, see the module.
-        groups_x: m group names, for ``"grouped"``; the same name in both sets is the same group.
-        groups_y: n group names.
-        normalize: ``"check"`` rejects rows not of unit length (1e-3), ``True`` normalizes,
-            ``False`` takes them as they are.
-        backend: ``"auto"``, ``"blocked"`` or ``"moments"``, see :mod:`palpate.metrics.kernels`.
-        block: rows of a kernel block; memory is about ``block^2`` numbers a thread.
-
-    Returns:
-        The value. Blocked: float32 unit-norm features with an error below 1e-4 at scale 1000,
-        float64 below 1e-9.
-
-    Raises:
-        PalpateError: on features that :func:`palpate.metrics.inputs.checked_features` rejects,
-            fewer than two rows for ``"unbiased"``, or groups that are missing or too few for
-            ``"grouped"``.
-    """
-    require_choice("estimator", estimator, ESTIMATORS)
-    require_choice("backend", backend, BACKENDS)
-    checked_scale(scale)
-    checked_whole(1, block=block)
-    checked_kernel(kernel)
-    least = 1 if estimator == "biased" else 2
-    x, y = checked_pair(x, y, normalize=normalize, least=least)
-    if copies := copies_across(x, y):
-        text = f"{copies} rows of x are bit for bit rows of y: a copy is not a generator"
-        warnings.warn(text, PalpateWarning, stacklevel=2)
-    segment = np.repeat(np.arange(2), [len(x), len(y)])
-    unit = segment  # no pair is excluded: a set is one item
-    gx = checked_names("groups_x", groups_x, len(x))
-    gy = checked_names("groups_y", groups_y, len(y))
-    if estimator == "grouped":
-        must = "must be unbiased or biased where the groups of a set are unknown"
-        both = gx is not None and gy is not None
-        require(both, "estimator", must, repr(estimator), fix="Pass groups_x and groups_y")
-        unit = unit_index(gx or (), gy or ())
-    kernel = gaussian(sigma, y, gy) if kernel is None else kernel
-    sums = kernel_sums(
-        [x, y],
-        np.stack([segment, unit]),
-        2,
-        kernel,
-        lambda sums: largest_bound(sums, estimator, 1000.0),
-        backend=backend,
-        block=block,
-    )
-    value = float(mmd_matrix(sums.totals, estimator, scale)[0, 1])
-    bound = largest_bound(sums, estimator, scale)
-    finite = bool(np.isfinite(sums.totals.sums).all())
-    fix = "Normalize the rows, or scale them down"
-    check(finite, "Kernel values", "must be finite", "infinity or NaN", fix)
-    got = f"{len(set(gx or ()))} and {len(set(gy or ()))} groups"
-    must, fix = "must have at least two groups, not all shared", "Pass more groups"
-    check(math.isfinite(value), "Each set", must, got, fix, estimator="unbiased")
-    settings = (sums.backend, estimator, kernel.settings(), kernel.bandwidth, scale)
-    return Distance(value, bound, *settings, m=len(x), n=len(y))
 
 
 @dataclass(frozen=True)
@@ -317,10 +192,15 @@ def plan_for(options: Mapping[str, Any], *, grouped: bool) -> Options:
     require(not unknown, "".join(unknown[:1]), must, ", ".join(unknown), fix="Check the spelling")
     plan = replace(PRESETS[preset], **{**options, "preset": preset})
     for name, choices in CHOICES.items():
-        require_choice(name, getattr(plan, name), choices)
-    checked_scale(plan.scale)
+        require_choice(name, getattr(plan, name), get_args(choices))
+    scale: Any = plan.scale
+    number = isinstance(scale, int | float | np.number) and not isinstance(scale, bool)
+    positive = number and bool(0 < scale < np.inf)
+    require(positive, "scale", "must be positive", repr(scale), fix="Drop it for the default")
     checked_whole(0, permutations=plan.permutations, seed=plan.seed)
-    checked_kernel(plan.kernel)
+    kernel: Any = plan.kernel
+    must, fix = "must be a kernel: Gaussian(), Polynomial()", "Import one from palpate.metrics"
+    require(kernel is None or isinstance(kernel, Kernel), "kernel", must, repr(kernel), fix=fix)
     for name, value in (("estimator", "grouped"), ("halves", "group")):
         must = f"must know the group of every sample for {name}={value!r}"
         fits = grouped or getattr(plan, name) != value
@@ -476,3 +356,167 @@ def random_halves_sd(spread: Array, n: Array, estimator: str, scale: float) -> A
         variance = 2 * off + 4 * p2 * (squares - off) + p4 * four - (p2 * trace) ** 2
         c = 1 / m**2 if estimator == "biased" else (1 / (m * (m - 1)) + 1 / m**2) / 2
         return np.where(n < 4, np.nan, scale * c * np.sqrt(np.maximum(variance, 0)))
+
+
+@dataclass(frozen=True)
+class Table:
+    """Kernel sums of one generated set (and its reference).
+
+    Attributes:
+        plan: the options completed.
+        generated: the set that is halved and divided into classes.
+        reference: real samples, or None where no metric needs them.
+        sums: segment ``4 c + 2 (half of the class) + (half of the set)`` for class number c; the
+            last segment is the reference.
+        classes: label of each class number; ``""`` holds samples without a label.
+        unit: what the jackknife leaves out: ``"group"``, ``"sample"`` or ``"random-block"``.
+        names: the name of each unit number.
+        kernel: what was summed.
+        x: (n, d) generated features.
+        label: (n,) class number of each.
+        copies: generated rows that are bit for bit rows of the reference.
+    """
+
+    plan: Options
+    generated: FeatureSet
+    reference: FeatureSet | None
+    sums: PairSums
+    classes: Sequence[str]
+    unit: str
+    names: Sequence[str]
+    kernel: Kernel
+    x: Any
+    label: Index
+    copies: int | None
+
+    @property
+    def grouped(self) -> bool:
+        """Whether units are groups."""
+        return self.unit == "group"
+
+    def tmmd(self) -> PairSums:
+        """Segments 0: generated, 1: reference."""
+        return self.sums.merge(np.repeat([0, 1], [self.sums.segments - 1, 1]), 2)
+
+    def halves(self, kept: Index | None = None) -> PairSums:
+        """Segments 2k, 2k + 1: the halves of class number ``kept[k]``, or of the whole set."""
+        if kept is None:
+            return self.sums.merge(np.append(np.arange(self.sums.segments - 1) % 2, -1), 2, 0)
+        to = np.full(self.sums.segments, -1, dtype=np.intp)
+        for k, c in enumerate(kept):
+            to[4 * c : 4 * c + 4] = [2 * k, 2 * k, 2 * k + 1, 2 * k + 1]
+        return self.sums.merge(to, 2 * len(kept), 1)
+
+    def spread(self, kept: Index | None = None) -> Array:
+        """(K, 3) centered squares of these classes, or (1, 3) of the whole generated set."""
+        every = [np.arange(len(self.label))]
+        rows = every if kept is None else [np.flatnonzero(self.label == c) for c in kept]
+        return np.array([centered_squares(self.x, at, self.kernel) for at in rows])
+
+    def whole_classes(self) -> PairSums:
+        """Segment c: class number c, whole."""
+        classes = len(self.classes)
+        return self.sums.merge(np.append(np.repeat(np.arange(classes), 4), -1), classes)
+
+    def bound(self) -> float:
+        """What moments may change, at scale 1000: TMMD, or a distance between classes; of one set
+        alone any distance.
+        """
+        of_classes = largest_bound(self.whole_classes(), self.plan.estimator, 1000.0)
+        tmmd = self.tmmd()
+        if self.reference is not None:
+            return max(of_classes, largest_bound(tmmd, self.plan.estimator, 1000.0))
+        assert tmmd.bound is not None  # moments have one
+        return max(of_classes, float(mmd_bound(tmmd.bound.totals, "biased", 1000.0)[0, 0]))
+
+
+def build_table(
+    generated: FeatureSet,
+    reference: FeatureSet | None,
+    options: Mapping[str, Any],
+    median_of: FeatureSet | None = None,
+) -> Table:
+    """Check the sets and the options, and pass once over all pairs.
+
+    Units are groups where all sets have them, else samples; the preset is ``"grouped"`` also where
+    the sets share ids.
+
+    Args:
+        generated: the set that is halved and divided into classes.
+        reference: real samples, or None where no metric needs them.
+        options: those of :class:`palpate.metrics.Options` that are not the preset's.
+        median_of: whose median distance ``sigma="median"`` takes; else the last set's.
+
+    Raises:
+        PalpateError: on features, groups or options that are rejected.
+    """
+    sets = [generated] if reference is None else [generated, reference]
+    grouped, shared = all(s.groups is not None for s in sets), 0
+    if reference is not None:
+        require_one_encoder(generated, reference, "Generated and reference")
+        shared = shared_ids(generated, reference)
+    plan = plan_for(options, grouped=grouped or shared > 0)
+    name = "generated" if plan.subject == "generated" else f"The features of {plan.subject!r}"
+    x, normalize = generated.features, plan.normalize
+    if reference is None:
+        parts = [checked_features(name, x, normalize=normalize)]
+    else:
+        parts = checked_pair(x, reference.features, normalize=normalize, least=1, name=name)
+    if grouped:
+        groups = [checked_names("groups", s.groups, len(s.ids)) or [] for s in sets]
+        units, unit = unit_index(*groups), "group"
+        unit_names = sorted({name for group in groups for name in group})
+    else:
+        ids = [str(i) for s in sets for i in s.ids]
+        units, unit, unit_names = sample_units(ids, plan.seed)
+    classes, label, cell = _segments(generated, plan)
+    last = 4 * len(classes)
+    segment = np.append(cell, np.full(len(units) - len(cell), last))
+    kernel = plan.kernel
+    if kernel is None and isinstance(plan.sigma, str) and median_of is not None:
+        name = "The features that the median distance is taken over"
+        rows = checked_features(name, median_of.features, normalize=plan.normalize)
+        kernel = gaussian(plan.sigma, rows, median_of.groups)
+    kernel = kernel or gaussian(plan.sigma, parts[-1], sets[-1].groups)
+    copies = 0 if reference is None else copies_across(*parts)
+
+    def table_of(sums: PairSums) -> Table:
+        sides = (plan, generated, reference)
+        return Table(*sides, sums, classes, unit, unit_names, kernel, parts[0], label, copies)
+
+    sums = kernel_sums(
+        parts,
+        np.stack([segment, units]),
+        last + 1,
+        kernel,
+        lambda sums: table_of(sums).bound(),
+        backend=plan.backend,
+        weights=_even_weights(units, segment, len(label)) if grouped else (),
+    )
+    return table_of(sums)
+
+
+def shared_ids(generated: FeatureSet, reference: FeatureSet) -> int:
+    """How many ids both sets have: a generated and a real image of one scene are dependent."""
+    return len({str(i) for i in generated.ids} & {str(i) for i in reference.ids})
+
+
+def _even_weights(unit: Index, segment: Index, generated: int) -> list[Array]:
+    """(N,) weights with which units weigh the same in the generated set, and in each class."""
+    weights: list[Array] = []
+    for of_class in (np.zeros_like(segment), segment // 4):
+        key = np.stack([unit, of_class])[:, :generated]
+        _, at, size = np.unique(key, axis=1, return_inverse=True, return_counts=True)
+        real = np.zeros(len(unit) - generated)
+        weights.append(np.append(1 / size[at.reshape(-1)], real))
+    return weights
+
+
+def _segments(generated: FeatureSet, plan: Options) -> tuple[list[str], Index, Index]:
+    """The classes, and (n,) the class number and the segment of each sample."""
+    ids = [str(i) for i in generated.ids]
+    labels = ["" if is_missing(v) else str(v) for v in generated.labels or [""] * len(ids)]
+    classes = sorted(set(labels))
+    label = np.searchsorted(classes, labels)
+    halves = 2 * half_of(ids, label, plan) + half_of(ids, np.zeros_like(label), plan)
+    return classes, label, 4 * label + halves

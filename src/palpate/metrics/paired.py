@@ -28,12 +28,119 @@ from typing import Any
 import numpy as np
 
 from palpate.core import FeatureSet, Note, Score, require, require_comparable
-from palpate.metrics.floors import not_comparable, with_floor
-from palpate.metrics.inputs import Array, feature_set, require_one_encoder
+from palpate.core.features import Array
+from palpate.metrics.inputs import feature_sets, require_one_encoder
 from palpate.metrics.intervals import Interval, Scored, Spread, spread_of_values
 from palpate.metrics.means import Mean, spread_of
-from palpate.metrics.table import build_table
-from palpate.metrics.tactile import floors_of, four_of, tmmd_of
+from palpate.metrics.mmd import build_table, shared_ids
+from palpate.metrics.tactile import ci_tmmd_of, d_tmmd_of, i_tmmd_of, tmmd_of
+
+#: Designs that differ by less have one floor: the change is far below the noise of any floor.
+SAME_DESIGN = 0.01
+
+
+def not_comparable(result: Scored, floor: Scored) -> str:
+    """Why real samples like these give another value of this metric; '' if they do not.
+
+    Values of halves of whole groups depend on the sizes of the groups, biased values on n, a mean
+    over classes on the classes.
+
+    Returns:
+        ``"classes"``, ``"groups"``, ``"group-sizes"``, ``"sizes"`` or ``""``.
+    """
+    if result.score.details.get("classes") != floor.score.details.get("classes"):
+        return "classes"
+    by_group = result.score.settings.get("halves") == "group"
+    if by_group and list(result.groups) != list(floor.groups):
+        return "groups"
+    same = result.design.shape == floor.design.shape
+    if not same or not np.allclose(result.design, floor.design, rtol=SAME_DESIGN, atol=0):
+        return "group-sizes" if by_group else "sizes"
+    return ""
+
+
+def with_floor(result: Scored, floor: Scored) -> Scored:
+    """The score with that of real samples as its floor, where the two are comparable.
+
+    E of CI-TMMD has as its floor that of the real samples of the generator's classes, E_ratio of
+    D-TMMD none where the classes differ.
+    """
+    details, real = result.score.details, floor.score.details
+    reason = not_comparable(result, floor)
+    classes = details.get("classes")
+    more: dict[str, Any] = {}
+    if "E" in details:
+        same = classes == real.get("classes")
+        more["E_floor"] = real.get("E") if same else _mean_excess(floor.score, classes or [])
+    if "E_ratio" in details:
+        more["E_ratio_floor"] = real.get("E_ratio") if classes == real.get("classes") else None
+    notes = list(result.score.notes)
+    if reason and result.score.value is not None:
+        notes.append(Note("no-floor", {"reason": reason}))
+    value = None if reason else floor.score.value
+    score = replace(result.score, floor=value, details={**details, **more}, notes=tuple(notes))
+    return replace(result, score=score)
+
+
+def _mean_excess(score: Score, classes: Sequence[str]) -> float | None:
+    """The mean E of some classes, None unless all are known."""
+    per_class = score.details.get("per_class", {})
+    each = [per_class.get(name, {}).get("E") for name in classes]
+    return sum(each) / len(each) if each and None not in each else None
+
+
+def four_scores(
+    generated: Any, reference: Any, *, floor: Any = None, **options: Any
+) -> list[Score]:
+    """TMMD, I-TMMD, CI-TMMD and D-TMMD from one sweep over the pairs.
+
+    Args:
+        generated: features of generated samples, with labels (for CI and D) and groups.
+        reference: features of the real test samples.
+        floor: real samples for ``Score.floor`` of the other three; usually ``reference``. Values
+            of halves of whole groups depend on the sizes of the groups, biased ones on n:
+            ``Score.floor`` is given where these are the same (within 1 %, else a note gives the
+            reason), ``details["E_floor"]`` for any groups of the same classes.
+        **options: see :class:`palpate.metrics.Options`; the same for all four.
+
+    Raises:
+        PalpateError: as the single metrics do.
+    """
+    x, y = feature_sets({}, generated=generated, reference=reference)
+    subject = options.pop("subject", "generated")
+    scores, _ = _four_of_each({subject: x}, y, floor, options)
+    return [result.score for result in scores[subject]]
+
+
+#: The metrics of one set alone, from a table.
+FREE = (i_tmmd_of, ci_tmmd_of, d_tmmd_of)
+
+
+def _four_of_each(
+    sets: Mapping[str, FeatureSet], reference: FeatureSet, floor: Any, options: Mapping[str, Any]
+) -> tuple[dict[str, list[Scored]], list[Scored | None]]:
+    """The four metrics of each set in the order of the paper, and those of the floor."""
+    scores = {name: _four(s, reference, {**options, "subject": name}) for name, s in sets.items()}
+    if floor is None:
+        return scores, [None] * 4
+    (floor,), first = feature_sets({}, floor=floor), next(iter(sets.values()))
+    require_one_encoder(first, floor, "Generated and floor")
+    must, got = "The floor must be scored like the generated samples", "groups in one of the two"
+    same = (floor.groups is None) == (first.groups is None)
+    require(same, None, must, got, fix="Give groups to both, or to none")
+    table = build_table(floor, None, options, median_of=reference)
+    real = [metric(table) for metric in FREE]
+    floored = {n: [tmmd, *map(with_floor, free, real)] for n, (tmmd, *free) in scores.items()}
+    return floored, [None, *real]
+
+
+def _four(generated: FeatureSet, reference: FeatureSet, options: Mapping[str, Any]) -> list[Scored]:
+    table = build_table(generated, reference, options)
+    first = tmmd_of(table)
+    alone = generated.groups is None and not shared_ids(generated, reference)
+    if not (table.grouped or alone):  # else the other three have the same units and options
+        table = build_table(generated, None, options, median_of=reference)
+    return [first, *(metric(table) for metric in FREE)]
 
 
 @dataclass(frozen=True)
@@ -68,18 +175,8 @@ def compare(
     Raises:
         PalpateError: if generators differ in ids, labels, groups or encoder, or as the metrics do.
     """
-    reference = feature_set(reference, argument="reference")
-    sets = same_samples(generators)
-    scores = {
-        name: four_of(features, reference, {**options, "subject": name})
-        for name, features in sets.items()
-    }
-    floors: list[Scored | None] = [None] * 4
-    if floor is not None:
-        first = next(iter(sets.values()))
-        real = floors_of(feature_set(floor, argument="floor"), reference, first, options)
-        floors = [None, *real]
-        scores = {n: [s[0], *map(with_floor, s[1:], real)] for n, s in scores.items()}
+    (reference,) = feature_sets({}, reference=reference)
+    scores, floors = _four_of_each(same_samples(generators), reference, floor, options)
     return compared({n: _with_excess(s) for n, s in scores.items()}, _with_excess(floors))
 
 
@@ -108,7 +205,7 @@ def compare_tmmd(generators: Mapping[str, Any], reference: Any, **options: Any) 
     Raises:
         PalpateError: as :func:`compare`.
     """
-    reference = feature_set(reference, argument="reference")
+    (reference,) = feature_sets({}, reference=reference)
     sets = same_samples(generators)
     return compared(
         {
@@ -126,7 +223,7 @@ def same_samples(generators: Mapping[str, Any]) -> dict[str, FeatureSet]:
     """
     must, fix = "must hold a generator", "Pass its features by name"
     require(len(generators) > 0, "generators", must, "none", fix=fix)
-    sets = {name: feature_set(x) for name, x in generators.items()}
+    sets = {name: feature_sets({}, generated=x)[0] for name, x in generators.items()}
     first = next(iter(sets))
     return {name: _ordered(sets[first], first, x, name) for name, x in sets.items()}
 
@@ -174,7 +271,7 @@ def difference(a: Scored, b: Scored, floor: Scored | None = None) -> Score:
         reason = "different-units" if a.units else "no-units"
         return _paired(x, y, Spread(x.value - y.value, np.nan, 0, ""), {}, reason)
     unit = x.details.get("left_out", x.details["unit"])
-    method = f"paired leave-one-{unit}-out jackknife, t, {len(a.units) - 1} df"
+    method = f"leave-one-{unit}-out jackknife, t, {len(a.units) - 1} df"
     spread = Spread.of(x.value - y.value, a.replicates - b.replicates, method)
     p = 2 * min(spread.shares()) if spread.known else None
     details: dict[str, Any] = {"p_value": p}
@@ -252,7 +349,7 @@ def _paired(
         b=y.a,
         value=spread.value if spread else None,
         interval=interval,
-        interval_method=spread.method if spread and interval else "",
+        interval_method=f"paired {spread.method}" if spread and interval else "",
         null=None,
         floor=None,
         details={**empty, **details},
@@ -286,7 +383,6 @@ def _difference_of_means(a: Sequence[Mean], b: Sequence[Mean]) -> Score:
         with np.errstate(divide="ignore", invalid="ignore"):  # a mean may be 0 without one group
             relative = spread_of([a, b], lambda m: 1 - m[..., 1] / m[..., 0])
         details |= {"relative": relative.value, "relative_interval": relative.interval(high=1.0)}
-    spread = replace(spread, method=f"paired, {spread.method}")
     return _paired(x, y, spread, details, "no-change", bounds=(-1.0, 1.0))
 
 
@@ -312,7 +408,6 @@ def _mean_difference(x: Score, y: Score, delta: Array, groups: Sequence[str] | N
         return _paired(x, y, None, {}, "no-images")
     names = None if groups is None else list(np.asarray(groups)[finite])
     spread = spread_of_values(delta[finite], names)
-    spread = replace(spread, method=f"paired, {spread.method}")
     return _paired(x, y, spread, _verdict(x, y, spread), "few-images")
 
 

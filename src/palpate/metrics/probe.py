@@ -171,12 +171,6 @@ def neighbor_hits(
     return hits
 
 
-def recall_by_class(hits: NDArray[Any], labels: Sequence[str]) -> dict[str, float]:
-    """Share of hits (n,) of every class."""
-    names = np.array(labels)
-    return {str(name): float(hits[names == name].mean()) for name in np.unique(names)}
-
-
 def _linear(
     probe: Probe, train: FeatureSet, test: FeatureSet, label: str, **fields: Any
 ) -> list[Mean]:
@@ -209,29 +203,34 @@ def _accuracies(
     _, trained, _ = _labeled(train, "train")
     _, truth, groups = _labeled(test, "test")
     counts, majority = Counter(truth), Counter(trained).most_common(1)[0][0]
+    names = np.array(truth)
     details = {
         "chance": 1 / len(set(trained)),
-        "recall": recall_by_class(hits, truth),
+        "recall": {label: float(hits[names == label].mean()) for label in sorted(counts)},
         "unseen_classes": sorted(set(truth) - set(trained)),
         **details,
     }
     weights = np.array([1 / counts[label] for label in truth])
-    plain = {**details, "majority": counts[majority] / len(truth)}
-    equal = {**details, "majority": (majority in counts) / len(counts)}
     return [
         mean_of(
-            name, hits, groups, estimator="mean", details=plain, encoder=test.encoder, **fields
-        ),
-        mean_of(
-            f"{name}, balanced",
+            metric,
             hits,
             groups,
-            weights=weights,
-            estimator="mean of class recalls",
-            details=equal,
+            weights=weighted,
+            estimator=estimator,
+            details={**details, "majority": share},
             encoder=test.encoder,
             **fields,
-        ),
+        )
+        for metric, weighted, estimator, share in (
+            (name, None, "mean", counts[majority] / len(truth)),
+            (
+                f"{name}, balanced",
+                weights,
+                "mean of class recalls",
+                (majority in counts) / len(counts),
+            ),
+        )
     ]
 
 

@@ -19,7 +19,7 @@ by jackknife over groups, turned back into ranks.
 from __future__ import annotations
 
 from collections.abc import Generator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -284,30 +284,24 @@ def _retrieved(
     return Retrieved(means, median)
 
 
-#: Fields of a share that the median rank has of its own.
-LEFT = ("subject", "estimator")
-
-
 def _median(
     ranks: Array, groups: Sequence[str], details: dict[str, Any], fields: dict[str, Any]
 ) -> Score:
     value = float(np.median(ranks))
-    share = mean_of("share", ranks <= value, groups, subject="").score
+    share = mean_of("share", ranks <= value, groups, **fields).score
     interval, method = None, ""
     if share.interval is not None:
         half = (share.interval[1] - share.interval[0]) / 2
         bounds = np.clip([0.5 - half, 0.5 + half], 0, 1)
         low, high = np.quantile(ranks, bounds, method="inverted_cdf").tolist()
         interval, method = (low, high), f"Woodruff, from the {share.interval_method}"
-    return Score(
-        "median rank",
-        fields["subject"],
-        value,
+    return replace(
+        share,
+        metric="median rank",
+        value=value,
         estimator="median",
         interval=interval,
         interval_method=method,
-        n=len(ranks),
         higher_is_better=False,
         details=details,
-        **{name: field for name, field in fields.items() if name not in LEFT},
     )

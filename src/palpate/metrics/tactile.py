@@ -27,15 +27,15 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
 
 from palpate._version import __version__
-from palpate.core import FeatureSet, Note, Score, require
+from palpate.core import Note, Score
+from palpate.core.features import Array, Index
 from palpate.core.files import plain
-from palpate.metrics.floors import with_floor
-from palpate.metrics.inputs import Array, Index, feature_set, feature_sets, require_one_encoder
+from palpate.metrics.inputs import feature_sets
 from palpate.metrics.intervals import (
     Estimate,
     PairSums,
@@ -47,10 +47,12 @@ from palpate.metrics.intervals import (
 )
 from palpate.metrics.kernels import TOLERANCE, Polynomial
 from palpate.metrics.mmd import (
-    AGGREGATES,
-    DENOMINATORS,
     LEAST,
+    Aggregate,
+    Denominator,
     Options,
+    Table,
+    build_table,
     design_of,
     dispersion_of,
     halves_of,
@@ -58,9 +60,9 @@ from palpate.metrics.mmd import (
     mmd_matrix,
     random_halves_sd,
     self_distances,
+    shared_ids,
     whole_sets,
 )
-from palpate.metrics.table import Table, build_table, shared_ids
 
 INDEPENDENT = Note("independent-samples")
 #: Options that bear on a metric and are recorded, besides preset and normalize.
@@ -72,33 +74,23 @@ SETTINGS = {
 }
 
 
-def tmmd(
-    generated: Any,
-    reference: Any,
-    *,
-    ids: Any = None,
-    labels: Any = None,
-    groups: Any = None,
-    reference_ids: Any = None,
-    reference_groups: Any = None,
-    encoder: str | None = None,
-    **options: Any,
-) -> Score:
+def tmmd(generated: Any, reference: Any, **options: Any) -> Score:
     """TMMD: dist^2 between generated and real samples (paper, Eq. 2).
 
     Args:
         generated: (n, d) features of generated tactile images: an array, a tensor, a list of rows,
             or a FeatureSet.
         reference: (m, d) features of real tactile images; n and m may differ.
-        ids: n ids of ``generated``; without, all rows are different samples.
-        labels: n classes, for CI- and D-TMMD.
-        groups: n groups (videos), which are left out as a whole.
-        reference_ids: m ids; an id in both sets is the same scene. Without groups of both sets,
-            shared ids act as groups: the default preset excludes the pairs of one scene.
-        reference_groups: m groups; groups count only if both sets have them, and a group in both
-            sets is the same group.
-        encoder: digest of the encoder of both.
-        **options: see :class:`palpate.metrics.Options`.
+        **options: columns of both, and those of :class:`palpate.metrics.Options`:
+
+            * ``ids``: n ids of ``generated``; without, all rows are different samples.
+            * ``groups``: n groups (videos), which are left out as a whole.
+            * ``labels``: n classes, for CI- and D-TMMD.
+            * ``reference_ids``: m ids; an id in both sets is the same scene. Without groups of both
+              sets, shared ids act as groups: the default preset excludes the pairs of one scene.
+            * ``reference_groups``: m groups; groups count only if both sets have them, and a group
+              in both sets is the same group.
+            * ``encoder``: digest of the encoder of both.
 
     Returns:
         Value with a leave-one-group-out interval; ``details``: the p-value of a permutation of
@@ -114,28 +106,11 @@ def tmmd(
         >>> tmmd(x, y, normalize=True).n
         50
     """
-    x, y = feature_sets(
-        generated,
-        reference,
-        ids,
-        labels,
-        groups,
-        reference_ids=reference_ids,
-        reference_groups=reference_groups,
-        encoder=encoder,
-    )
+    x, y = feature_sets(options, generated=generated, reference=reference)
     return tmmd_of(build_table(x, y, options)).score
 
 
-def i_tmmd(
-    generated: Any,
-    *,
-    ids: Any = None,
-    labels: Any = None,
-    groups: Any = None,
-    encoder: str | None = None,
-    **options: Any,
-) -> Score:
+def i_tmmd(generated: Any, **options: Any) -> Score:
     """I-TMMD: dist^2 between two halves of the generated samples (paper, Eq. 3).
 
     With ``halves="group"`` the value is the average over halvings by whole groups, in closed form
@@ -143,11 +118,8 @@ def i_tmmd(
 
     Args:
         generated: (n, d) features: an array, a tensor, a list of rows, or a FeatureSet.
-        ids: n ids, on which random and ordered halves depend; without, the row numbers.
-        labels: n classes, for CI- and D-TMMD.
-        groups: n groups (videos).
-        encoder: digest of the encoder.
-        **options: see :class:`palpate.metrics.Options`.
+        **options: as of :func:`tmmd`. Random and ordered halves depend on ``ids``; without, on the
+            row numbers.
 
     Returns:
         Value, interval, ``null`` (95 % of random halves by a normal approximation with the exact
@@ -157,41 +129,23 @@ def i_tmmd(
     Raises:
         PalpateError: on features that are rejected, or ``halves="group"`` without groups.
     """
-    x = feature_set(generated, ids=ids, labels=labels, groups=groups, encoder=encoder)
-    return i_tmmd_of(build_table(x, None, options)).score
+    return i_tmmd_of(_table(generated, options)).score
 
 
-def ci_tmmd(
-    generated: Any,
-    *,
-    ids: Any = None,
-    labels: Any = None,
-    groups: Any = None,
-    encoder: str | None = None,
-    **options: Any,
-) -> Score:
+def ci_tmmd(generated: Any, **options: Any) -> Score:
     """CI-TMMD: the mean over classes of dist^2 between two halves of a class (paper, Eq. 4).
 
-    A class counts with at least four samples and, for halves by group, two groups of
+    A class (``labels``) counts with at least four samples and, for halves by group, two groups of
     which one has two samples. Arguments and errors as :func:`i_tmmd`.
 
     Returns:
         Value, interval (over groups; over classes where a class has only two groups), ``null``;
         ``details``: ``E``, ``per_class``, ``excluded``.
     """
-    x = feature_set(generated, ids=ids, labels=labels, groups=groups, encoder=encoder)
-    return ci_tmmd_of(build_table(x, None, options)).score
+    return ci_tmmd_of(_table(generated, options)).score
 
 
-def d_tmmd(
-    generated: Any,
-    *,
-    ids: Any = None,
-    labels: Any = None,
-    groups: Any = None,
-    encoder: str | None = None,
-    **options: Any,
-) -> Score:
+def d_tmmd(generated: Any, **options: Any) -> Score:
     """D-TMMD: how much a class differs from itself, against how much from the others (Eq. 5-7).
 
     ``denominator``: ``"sum"`` over c' including c (Eq. 7), ``"mean"`` of the same, or
@@ -206,33 +160,13 @@ def d_tmmd(
         where ``inter`` is not two standard errors above 0), ``unstable`` (classes whose denominator
         is not two standard errors above 0), ``excluded``.
     """
-    x = feature_set(generated, ids=ids, labels=labels, groups=groups, encoder=encoder)
-    return d_tmmd_of(build_table(x, None, options)).score
+    return d_tmmd_of(_table(generated, options)).score
 
 
-def four_scores(
-    generated: FeatureSet, reference: FeatureSet, *, floor: FeatureSet | None = None, **options: Any
-) -> list[Score]:
-    """TMMD, I-TMMD, CI-TMMD and D-TMMD from one sweep over the pairs.
-
-    Args:
-        generated: features of generated samples, with labels (for CI and D) and groups.
-        reference: features of the real test samples.
-        floor: real samples for ``Score.floor`` of the other three; usually ``reference``. Values
-            of halves of whole groups depend on the sizes of the groups, biased ones on n:
-            ``Score.floor`` is given where these are the same (within 1 %, else a note gives the
-            reason), ``details["E_floor"]`` for any groups of the same classes.
-        **options: see :class:`palpate.metrics.Options`; the same for all four.
-
-    Raises:
-        PalpateError: as the single metrics do.
-    """
-    generated, reference = feature_set(generated), feature_set(reference, argument="reference")
-    first, *free = four_of(generated, reference, options)
-    if floor is not None:
-        real = floors_of(feature_set(floor, argument="floor"), reference, generated, options)
-        free = map(with_floor, free, real)
-    return [result.score for result in (first, *free)]
+def _table(generated: Any, options: dict[str, Any]) -> Table:
+    """The table of one set."""
+    (x,) = feature_sets(options, generated=generated)
+    return build_table(x, None, options)
 
 
 def kid(generated: Any, reference: Any, **options: Any) -> Score:
@@ -271,45 +205,16 @@ def _named(name: str, generated: Any, reference: Any, options: Mapping[str, Any]
     return replace(score, metric=name, settings=settings)
 
 
-def four_of(
-    generated: FeatureSet, reference: FeatureSet, options: Mapping[str, Any]
-) -> list[Scored]:
-    """The four metrics as :class:`Scored`, in the order of the paper."""
-    table = build_table(generated, reference, options)
-    first = tmmd_of(table)
-    alone = generated.groups is None and not shared_ids(generated, reference)
-    if not (table.grouped or alone):  # else the other three have the same units and options
-        table = build_table(generated, None, options, median_of=reference)
-    return [first, i_tmmd_of(table), ci_tmmd_of(table), d_tmmd_of(table)]
-
-
-def floors_of(
-    floor: FeatureSet, reference: FeatureSet, like: FeatureSet, options: Mapping[str, Any]
-) -> list[Scored]:
-    """I-, CI- and D-TMMD of real samples, computed as those of ``like``.
-
-    Raises:
-        PalpateError: if one of the two has groups and the other none, or encoders differ.
-    """
-    require_one_encoder(like, floor, "Generated and floor")
-    must, got = "The floor must be scored like the generated samples", "groups in one of the two"
-    same = (floor.groups is None) == (like.groups is None)
-    require(same, None, must, got, fix="Give groups to both, or to none")
-    table = build_table(floor, None, options, median_of=reference)
-    return [i_tmmd_of(table), ci_tmmd_of(table), d_tmmd_of(table)]
-
-
 def tmmd_of(table: Table) -> Scored:
     """TMMD from a table."""
     plan, sums, reference = table.plan, table.tmmd(), table.reference
     assert reference is not None  # TMMD is of two sets
     notes: list[Note] = []
     est = estimate(sums, lambda t: mmd_matrix(t, plan.estimator, plan.scale)[:1, 1], table.unit)
-    if not np.isfinite(est.values[0]):
+    if not np.isfinite(est.spreads[0].value):
         reason = "few-groups" if plan.estimator == "grouped" else "one-sample"
         notes.append(Note("undefined", {"reason": reason}))
-    if table.copies:
-        notes.append(Note("copied-rows", {"count": table.copies, "n": len(table.label)}))
+    notes += copied_rows(table.copies, len(table.label))
     if not table.grouped:
         notes.append(INDEPENDENT)
         count = shared_ids(table.generated, reference) * (plan.estimator != "grouped")
@@ -327,6 +232,11 @@ def tmmd_of(table: Table) -> Scored:
         details["p_value"], values, details["permutations"] = test
         null = (float(np.quantile(values, 0.025)), float(np.quantile(values, 0.975)))
     return _scored(table, "TMMD", est, details, notes, null=null)
+
+
+def copied_rows(count: int | None, n: int) -> list[Note]:
+    """A note of generated rows that are bit for bit rows of the reference."""
+    return [Note("copied-rows", {"count": count, "n": n})] if count else []
 
 
 def i_tmmd_of(table: Table) -> Scored:
@@ -375,11 +285,11 @@ def _mean_of_halves(
     dispersion = float(dispersion_of(joined, plan).mean())
     center = dispersion if plan.estimator == "biased" else 0.0
     details |= {
-        "z": (est.values[0] - center) / sd if sd > 0 else None,
+        "z": (est.spreads[0].value - center) / sd if sd > 0 else None,
         "dispersion": dispersion,
         "units": len(sums.units),
-        "E": est.values[1] if table.grouped else None,
-        "E_interval": est.interval(1) if table.grouped else None,
+        "E": est.spreads[1].value if table.grouped else None,
+        "E_interval": est.spreads[1].interval() if table.grouped else None,
     }
     collapsed = not sums.rows.any() and not sums.diagonal.any()
     random = plan.halves == "random" and plan.estimator != "biased"
@@ -457,27 +367,31 @@ def d_tmmd_of(table: Table) -> Scored:
         return np.array([ratio, excess, pooled, inter, *denominators(matrix, plan.denominator)])
 
     est, matrix = class_estimate(sums, statistic, table.unit), matrix_of(sums.totals)
-    below, errors = est.values[4:], est.errors[4:]
+    _, excess, pooled, inter, *below = est.spreads
     # A ratio over a mean that may well be 0 is noise.
-    apart = est.values[3] > (2 * est.errors[3] if np.isfinite(est.errors[3]) else 0.0)
-    stable = below > np.where(np.isfinite(errors), 2 * errors, np.inf)
-    unstable = [name for name, ok in zip(details["classes"], stable, strict=True) if not ok]
+    apart = inter.value > (2 * inter.error if np.isfinite(inter.error) else 0.0)
+    names = details["classes"]
+    unstable = [n for n, s in zip(names, below, strict=True) if not s.value > 2 * s.error]
     use_excess = table.grouped and apart
     details |= {
         "matrix": matrix,
-        "variants": {f"{d}/{a}": d_ratio(matrix, d, a) for d in DENOMINATORS for a in AGGREGATES},
-        "ratio_of_means": {"value": est.values[2], "interval": est.interval(2)},
+        "variants": {
+            f"{d}/{a}": d_ratio(matrix, d, a)
+            for d in get_args(Denominator)
+            for a in get_args(Aggregate)
+        },
+        "ratio_of_means": {"value": pooled.value, "interval": pooled.interval()},
         "unstable": unstable,
-        "inter": {"value": est.values[3], "interval": est.interval(3)},
-        "E_ratio": est.values[1] if use_excess else None,
-        "E_ratio_interval": est.interval(1) if use_excess else None,
+        "inter": {"value": inter.value, "interval": inter.interval()},
+        "E_ratio": excess.value if use_excess else None,
+        "E_ratio_interval": excess.interval() if use_excess else None,
         "units": len(sums.units),
     }
     notes: list[Note] = []
-    if not np.isfinite(est.values[0]):
+    if not np.isfinite(est.spreads[0].value):
         notes = [Note("undefined", {"reason": "not-separate"})]
     elif unstable:
-        params = {"classes": unstable, "known_errors": bool(np.isfinite(errors).all())}
+        params = {"classes": unstable, "known_errors": all(np.isfinite(s.error) for s in below)}
         notes = [Note("unstable-denominators", params)]
     design = _design(design, whole_sets(sums.totals).n, plan)
     return _scored(table, "D-TMMD", est, details, notes, design=design)
@@ -515,8 +429,8 @@ def _scored(
 
     NaN becomes None, and an undefined value loses its interval and has a note ``undefined``.
     """
-    plan, value = table.plan, plain(estimate.values[0]) if estimate else None
-    interval = estimate.interval(0) if estimate and value is not None else None
+    plan, spread = table.plan, estimate and estimate.spreads[0]
+    value, interval = (plain(spread.value), spread.interval()) if spread else (None, None)
     if value is None:
         null, notes = None, notes or [Note("undefined", {"reason": "no-pairs"})]
     elif interval is None:
@@ -532,7 +446,7 @@ def _scored(
         plan.subject,
         value,
         interval,
-        interval_method=estimate.method if estimate and interval else "",
+        interval_method=spread.method if spread and interval else "",
         null=null,
         estimator=estimator,
         bandwidth=table.kernel.bandwidth,
