@@ -9,7 +9,7 @@ better for all four.
 * **D-TMMD** ``= 1/C sum_c D_cc / sum_c' D_cc'`` (Eq. 7) with ``D_cc = dist^2(G^c_1, G^c_2)`` (Eq.
   5), ``D_cc' = dist^2(G^c, G^c')`` (Eq. 6).
 
-One pass over the pairs fills a table of kernel sums (:mod:`palpate.metrics.table`); a metric merges
+One pass over the pairs fills a table of kernel sums (:class:`palpate.metrics.mmd.Table`); a metric merges
 its segments and computes a statistic of the totals, and the jackknife the same statistic without
 each unit.
 
