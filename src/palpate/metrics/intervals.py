@@ -216,6 +216,7 @@ def mean_of_pairs(sums: Array, pairs: Array) -> Array:
 
 
 Interval = tuple[float, float]
+NONE: Array = np.zeros(0)
 #: Coverage of every interval.
 LEVEL = 0.95
 #: Relabelings that are computed together.
@@ -287,7 +288,7 @@ def score_of(
     """The score of a value with its interval within bounds; ``fields`` are further ones."""
     interval = spread.interval(*bounds)
     method = spread.method if interval else ""
-    return Score(metric, subject, spread.value, interval, interval_method=method, **fields)
+    return Score(metric, subject, float(spread.value), interval, interval_method=method, **fields)
 
 
 @dataclass(frozen=True)
@@ -330,9 +331,9 @@ def class_estimate(sums: PairSums, statistic: Callable[[Totals], Array], unit: s
     without = np.array([statistic(without_set(sums.totals, c))[:4] for c in range(classes)])
     reason = f"(a class has too few {unit}s to leave one out)"
     method = f"leave-one-class-out jackknife, t, {classes - 1} df {reason}"
-    first, others = over_units.spreads[: without.shape[1]], over_units.spreads[without.shape[1] :]
+    first, further = over_units.spreads[: without.shape[1]], over_units.spreads[without.shape[1] :]
     spreads = [Spread.of(s.value, v, method) for s, v in zip(first, without.T, strict=True)]
-    spreads += [Spread(s.value, np.nan, classes - 1, method) for s in others]
+    spreads += [Spread(s.value, np.nan, classes - 1, method) for s in further]
     return Estimate(spreads, without, over_units.units, of_classes=True)
 
 
@@ -360,10 +361,10 @@ class Scored:
     """
 
     score: Score
-    replicates: Array = field(default_factory=lambda: np.zeros(0), repr=False)
+    replicates: Array = field(default_factory=lambda: NONE, repr=False)
     units: Sequence[str] = ()
-    excess: Array = field(default_factory=lambda: np.zeros(0), repr=False)
-    design: Array = field(default_factory=lambda: np.zeros(0), repr=False)
+    excess: Array = field(default_factory=lambda: NONE, repr=False)
+    design: Array = field(default_factory=lambda: NONE, repr=False)
     groups: Sequence[str] = ()
 
 

@@ -290,7 +290,7 @@ def self_distances(t: Totals, plan: Options, design: Array | None = None) -> tup
         if design is None or design.shape[1] != len(joined.n):
             design = design_of(t, plan)
         return design[0] * excess + design[1] * spread, excess
-    return _between_halves(mmd_matrix(t, _estimator(plan), plan.scale)), excess
+    return _between_halves(mmd_matrix(t, estimator_of_halves(plan), plan.scale)), excess
 
 
 def _even_means(t: Totals) -> tuple[Array, Array, Array]:
@@ -301,7 +301,8 @@ def _even_means(t: Totals) -> tuple[Array, Array, Array]:
         return inside / (pairs - t.squares), between, t.diagonal / t.n
 
 
-def _estimator(plan: Options) -> str:
+def estimator_of_halves(plan: Options) -> str:
+    """``"grouped"`` acts as ``"unbiased"`` between halves, see :func:`self_distances`."""
     return "biased" if plan.estimator == "biased" else "unbiased"
 
 

@@ -9,9 +9,9 @@ better for all four.
 * **D-TMMD** ``= 1/C sum_c D_cc / sum_c' D_cc'`` (Eq. 7) with ``D_cc = dist^2(G^c_1, G^c_2)`` (Eq.
   5), ``D_cc' = dist^2(G^c, G^c')`` (Eq. 6).
 
-One pass over the pairs fills a table of kernel sums (:class:`palpate.metrics.mmd.Table`); a metric merges
-its segments and computes a statistic of the totals, and the jackknife the same statistic without
-each unit.
+One pass over the pairs fills a table of kernel sums (:class:`palpate.metrics.mmd.Table`); a metric
+merges its segments and computes a statistic of the totals, and the jackknife the same statistic
+without each unit.
 
 Read the last three next to the same metric on real samples (``Score.floor``) and next to TMMD: a
 generator that collapses to one image has a perfect I- and CI-TMMD. A score that is not defined has
@@ -37,13 +37,17 @@ from palpate.core.features import Array, Index
 from palpate.core.files import plain
 from palpate.metrics.inputs import feature_sets
 from palpate.metrics.intervals import (
+    NONE,
     Estimate,
+    Interval,
     PairSums,
     Scored,
+    Spread,
     Totals,
     class_estimate,
     estimate,
     permutation_test,
+    score_of,
 )
 from palpate.metrics.kernels import TOLERANCE, Polynomial
 from palpate.metrics.mmd import (
@@ -55,6 +59,7 @@ from palpate.metrics.mmd import (
     build_table,
     design_of,
     dispersion_of,
+    estimator_of_halves,
     halves_of,
     largest_bound,
     mmd_matrix,
@@ -64,7 +69,7 @@ from palpate.metrics.mmd import (
     whole_sets,
 )
 
-INDEPENDENT = Note("independent-samples")
+INDEPENDENT, UNDEFINED = Note("independent-samples"), Spread(np.nan, np.nan, 0, "")
 #: Options that bear on a metric and are recorded, besides preset and normalize.
 SETTINGS = {
     "TMMD": (),
@@ -312,7 +317,7 @@ def _design(design: Array, n: Array, plan: Options) -> Array:
     if plan.halves == "group":
         return design.ravel()
     with np.errstate(divide="ignore"):
-        return (1 / halves_of(n)).sum(axis=1) if plan.estimator == "biased" else np.zeros(0)
+        return (1 / halves_of(n)).sum(axis=1) if plan.estimator == "biased" else NONE
 
 
 def unfit(sums: PairSums, segments: list[int], plan: Options) -> str:
@@ -422,33 +427,25 @@ def _scored(
     details: dict[str, Any],
     notes: Sequence[Note],
     *,
-    design: Array | None = None,
-    null: tuple[float, float] | None = None,
+    design: Array = NONE,
+    null: Interval | None = None,
 ) -> Scored:
-    """A score with everything that the plan and the sets fix.
-
-    NaN becomes None, and an undefined value loses its interval and has a note ``undefined``.
-    """
-    plan, spread = table.plan, estimate and estimate.spreads[0]
-    value, interval = (plain(spread.value), spread.interval()) if spread else (None, None)
-    if value is None:
+    """A score with everything that the plan and the sets fix; an undefined one says why."""
+    plan, spread = table.plan, estimate.spreads[0] if estimate else UNDEFINED
+    if not np.isfinite(spread.value):
         null, notes = None, notes or [Note("undefined", {"reason": "no-pairs"})]
-    elif interval is None:
+    elif not spread.known:
         notes = [*notes, Note("no-interval", {"reason": "too-few"})]
     common = {"unit": table.unit, "backend": table.sums.backend, "version": __version__}
     recorded = ("preset", "normalize", *SETTINGS[metric])
     real, of_halves = table.reference if metric == "TMMD" else None, metric != "TMMD"
-    estimator = plan.estimator
-    if metric in ("I-TMMD", "CI-TMMD") and estimator == "grouped":
-        estimator = "unbiased"  # see self_distances
-    score = Score(
+    in_halves = metric in ("I-TMMD", "CI-TMMD")  # see self_distances
+    score = score_of(
         metric,
         plan.subject,
-        value,
-        interval,
-        interval_method=spread.method if spread and interval else "",
+        spread,
         null=null,
-        estimator=estimator,
+        estimator=estimator_of_halves(plan) if in_halves else plan.estimator,
         bandwidth=table.kernel.bandwidth,
         scale=plan.scale,
         n=len(table.label),
@@ -463,12 +460,11 @@ def _scored(
         notes=tuple(notes),
         settings=table.kernel.settings() | {name: getattr(plan, name) for name in recorded},
     )
-    design = np.zeros(0) if design is None else design
     if estimate is None or not len(estimate.units):
         return Scored(score, design=design)
     names = units = [table.names[int(u)] for u in estimate.units]
     if estimate.of_classes:
         units = score.details["classes"]
         score = replace(score, details={**score.details, "left_out": "class"})
-    excess = estimate.replicates[:, 1] if "E" in details else np.zeros(0)
+    excess = estimate.replicates[:, 1] if "E" in details else NONE
     return Scored(score, estimate.replicates[:, 0], units, excess, design, names)
