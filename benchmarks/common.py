@@ -13,15 +13,16 @@ from torch import nn
 from palpate.core import FeatureSet, rng_for
 from palpate.data.images import cached_images
 from palpate.data.manifest import Manifest
-from palpate.diffusion.no_contact import gels_of
+from palpate.diffusion.gels import gels_of
 from palpate.diffusion.presets import MINI
 from palpate.encoders.embed import embed, embed_images
-from palpate.encoders.encoder_set import EncoderSet, seeded
+from palpate.encoders.encoder_set import EncoderSet
 from palpate.metrics import tmmd
 from palpate.metrics.probe import fit_probe, material_accuracy
 from palpate.sim import PRESETS, write_world
 from palpate.training.engine import Losses, Task, fit
 from palpate.training.options import Compute, LoopOptions
+from palpate.training.steps import seeded
 
 #: Samples that are judged, one image of as many videos.
 JUDGED = 1600

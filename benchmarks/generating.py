@@ -54,12 +54,13 @@ from palpate.diffusion.pipeline import TactilePipeline
 from palpate.diffusion.presets import MINI
 from palpate.diffusion.unet import build_unet
 from palpate.encoders.embed import embed, embed_images, embed_texts, texts_of
-from palpate.encoders.encoder_set import EncoderSet, seeded
+from palpate.encoders.encoder_set import EncoderSet
 from palpate.metrics import tmmd
 from palpate.metrics.probe import fit_probe, material_accuracy
 from palpate.sim import PRESETS, write_world
 from palpate.training.engine import Task, fit, has_bf16
 from palpate.training.options import Compute, LoopOptions
+from palpate.training.steps import seeded
 
 SHAPE = {"contacts_per_video": 3, "frames_per_contact": 1, "sensors": 3, "materials": 10}
 #: New objects, videos and gels each: judges learn on the first, few and many steps are judged on

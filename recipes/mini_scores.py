@@ -22,8 +22,8 @@ from palpate.data.images import cached_images
 from palpate.data.manifest import Manifest
 from palpate.diffusion.autoencoder import AnyAutoencoder, BackgroundAutoencoder
 from palpate.diffusion.ceiling import measure_reconstruction
+from palpate.diffusion.gels import gels_of
 from palpate.diffusion.generation import generate
-from palpate.diffusion.no_contact import gels_of
 from palpate.diffusion.pipeline import TactilePipeline
 from palpate.encoders.embed import embed, embed_images, embed_texts, texts_of
 from palpate.encoders.encoder_set import EncoderSet

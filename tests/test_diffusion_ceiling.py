@@ -17,8 +17,7 @@ from palpate.diffusion.autoencoder_training import train_autoencoder
 from palpate.diffusion.ceiling import judge_of, measure_ceiling
 from palpate.diffusion.training import train_generator
 from palpate.encoders.encoder_set import EncoderSet, load_clip
-from palpate.encoders.preprocess import load_frames
-from palpate.encoders.seen import digest_images
+from palpate.encoders.preprocess import digest_images, load_frames
 from palpate.sim import WorldOptions, write_world
 
 SIZE = 64

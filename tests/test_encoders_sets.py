@@ -16,10 +16,9 @@ from forge.models import make_encoders
 from forge.pictures import photos
 from palpate.core import PalpateError
 from palpate.encoders import encoder_set as module
-from palpate.encoders.clip import tokens
 from palpate.encoders.contrastive import new_clip
 from palpate.encoders.embed import embed_images, embed_texts
-from palpate.encoders.encoder_set import EncoderSet, Preprocess, load_clip, new_tactile
+from palpate.encoders.encoder_set import EncoderSet, Preprocess, load_clip, new_tactile, tokens
 from palpate.encoders.models import pick_device
 from palpate.encoders.preprocess import CLIP_MEAN, CLIP_STD, to_unit
 from palpate.encoders.presets import Augment, preset

@@ -42,17 +42,17 @@ from palpate.diffusion.autoencoder import (
     load_autoencoder,
 )
 from palpate.diffusion.ceiling import judge_of, measure_ceiling
-from palpate.diffusion.no_contact import gels_of, has_gels
+from palpate.diffusion.gels import gels_of, has_gels
 from palpate.diffusion.options import AutoencoderOptions, BackgroundOptions
 from palpate.diffusion.presets import DiffusionPreset, preset_of
-from palpate.encoders.encoder_set import EncoderSet, seeded
+from palpate.encoders.encoder_set import EncoderSet
 from palpate.encoders.models import pick_device
-from palpate.encoders.parts import load_split, train_part
+from palpate.encoders.rows import load_split, train_part
 from palpate.training.engine import Batch, Losses, Task, fit
 from palpate.training.options import Compute, LoopOptions
 from palpate.training.processes import first_alone, gather_rows
 from palpate.training.run import TrainingRun, run_for
-from palpate.training.steps import Step
+from palpate.training.steps import Step, seeded
 
 Images = NDArray[np.uint8]
 Options = AutoencoderOptions | BackgroundOptions

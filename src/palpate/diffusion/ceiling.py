@@ -21,7 +21,7 @@ from palpate.core import FeatureSet, PalpateError, Progress, Split, quiet, requi
 from palpate.data.images import cached_images
 from palpate.data.manifest import Manifest
 from palpate.diffusion.autoencoder import AnyAutoencoder, BackgroundAutoencoder
-from palpate.diffusion.no_contact import gels_of, has_gels
+from palpate.diffusion.gels import gels_of, has_gels
 from palpate.encoders.embed import embed_images
 from palpate.encoders.encoder_set import EncoderSet
 from palpate.encoders.models import pick_device

@@ -444,14 +444,19 @@ def sample(
         scheduler.set_timesteps(options.steps, device=tokens.device)
         z = noise[rows].to(tokens.device) * getattr(scheduler, "init_noise_sigma", 1.0)
         for k, t in enumerate(scheduler.timesteps):
-            inside = float(t) / scheduler.config.num_train_timesteps <= options.high
-            now = options if inside else replace(options, guidance=1.0)
+            now = replace(options, guidance=scale_at(t, scheduler, options))
             scaled = scheduler.scale_model_input(z, t) if scales else z
             prediction = guided(predict, scaled, t.expand(len(z)), conditions, ground, now)
             z = step(prediction, t, z, return_dict=False)[0]
             z = z if on_step is None else on_step(k, t, z)
         parts.append(z[:count].cpu())
     return torch.cat(parts)
+
+
+def scale_at(t: Any, scheduler: Any, options: SamplerOptions) -> float:
+    """The scale of guidance at a time step: 1, none, above the share ``high`` of them."""
+    inside = float(t) / scheduler.config.num_train_timesteps <= options.high
+    return options.guidance if inside else 1.0
 
 
 def guided(  # noqa: PLR0917 - in the order of the network's arguments

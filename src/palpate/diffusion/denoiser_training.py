@@ -28,18 +28,17 @@ from palpate.diffusion.denoiser import Denoiser, inputs_of, lengths_of, slots_of
 from palpate.diffusion.options import SOURCES, ConditionPolicy, Schedule, Source, UNetOptions
 from palpate.diffusion.presets import DiffusionPreset
 from palpate.diffusion.unet import build_unet, load_unet
-from palpate.encoders.encoder_set import seeded
 from palpate.encoders.models import digest_tensors, pick_device
 from palpate.training.engine import Batch, Losses, Task, fit
 from palpate.training.run import TrainingRun
-from palpate.training.steps import Step
+from palpate.training.steps import Step, seeded
 
 #: Share of the rows that are trained without the patches of their photo, so that the embedding
 #: alone is known, too.
 DROP_PATCHES = 0.5
 #: Mean of the logit of the time of flow matching.
 TIME_MEAN = 0.5
-Backgrounds = Callable[[NDArray[np.int64]], Tensor]
+Backgrounds = Callable[[NDArray[np.int64], LatentStats], Tensor]
 
 
 @dataclass(frozen=True)
@@ -49,10 +48,13 @@ class Rows:
     Attributes:
         latents: (n, c, h, w) of the autoencoder, not normalized; a memory map will do.
         conditions: embeddings (n, d) by source; those of ``policy.sources`` are needed, others only
-            give their mean. By name ``inputs_of(policy)``, arrays or memory maps.
-        background: rows -> (n, g, h, w), what the variant w/ BG sees of the gel.
+            give their mean. By name ``inputs_of(policy)``, arrays or memory maps: ``patches``,
+            states (n, k, w), or ``photos`` of GVST (n, s, s, 3).
+        background: rows -> (n, g, h, w), what the variant w/ BG sees of the gel, by the statistics
+            of the latents.
         ids: of the rows, for errors.
         key: digest of all of this, which is not read for it.
+        gels: the no-contact images (n, s, s, 3), where they are needed.
     """
 
     latents: Tensor | NDArray[Any]
@@ -60,6 +62,7 @@ class Rows:
     background: Backgrounds | None = None
     ids: Sequence[str] | None = None
     key: str = ""
+    gels: NDArray[np.uint8] | None = None
 
 
 def train_denoiser(
@@ -95,7 +98,7 @@ def train_denoiser(
     tables: dict[Source, Tensor] = {s: _floats(conditions[s]) for s in SOURCES if s in conditions}
     means: dict[Source, Tensor] = {s: table.double().mean(0).float() for s, table in tables.items()}
     with seeded(preset.loop.seed, "denoiser"):
-        gel = 0 if rows.background is None else rows.background(np.arange(1)).shape[1]
+        gel = 0 if rows.background is None else rows.background(np.arange(1), stats).shape[1]
         channels, side = rows.latents.shape[1:3]
         net = new_unet(start, preset.unet, policy, side, channels=channels, background=gel)
         memory = _memory(tables) if policy.gap == "pairs" else None
@@ -236,7 +239,7 @@ class DiffusionLoss:
             "dropped": self._dropped(step).repeat_interleave(self.lengths, dim=1),
         }
         if self.background is not None:
-            batch["background"] = self.background(step.rows)
+            batch["background"] = self.background(step.rows, self.stats)
         return batch
 
     def __call__(self, module: nn.Module, batch: Batch) -> Losses:

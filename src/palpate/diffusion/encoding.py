@@ -5,7 +5,6 @@ images, and what conditions on its photos and texts.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -16,10 +15,10 @@ from numpy.typing import NDArray
 from palpate.core import Progress, atomic_path, digest_json, quiet, read_json, short, write_json
 from palpate.data.images import cached_images, image_stamp
 from palpate.data.manifest import Manifest
-from palpate.diffusion.autoencoder import AnyAutoencoder, BackgroundAutoencoder, LatentStats
+from palpate.diffusion.autoencoder import AnyAutoencoder, BackgroundAutoencoder
 from palpate.diffusion.denoiser import inputs_of
-from palpate.diffusion.denoiser_training import Backgrounds
-from palpate.diffusion.no_contact import gels_of
+from palpate.diffusion.denoiser_training import Rows
+from palpate.diffusion.gels import gels_of
 from palpate.diffusion.options import ConditionPolicy
 from palpate.encoders.embed import embed, exact
 from palpate.encoders.encoder_set import EncoderSet
@@ -28,32 +27,6 @@ from palpate.encoders.preprocess import prepared_images, to_unit
 from palpate.training.run import TrainingRun
 
 CACHE_FORMAT = "palpate-latents/1"
-
-
-@dataclass(frozen=True)
-class Encoded:
-    """A part of the data as the frozen models see it.
-
-    Attributes:
-        conditions: embeddings (n, d) by source; ``patches``, states (n, k, w); ``photos`` of GVST
-            (n, s, s, 3).
-        latents: (n, c, h, w), not normalized, in memory or mapped.
-        gels: the no-contact images (n, s, s, 3), where they are needed.
-        gel_latents: of an autoencoder that codes the gel with the image.
-    """
-
-    conditions: Mapping[str, NDArray[Any]]
-    latents: NDArray[np.float32]
-    gels: NDArray[np.uint8] | None = None
-    gel_latents: NDArray[np.float32] | None = None
-
-    def backgrounds(self, autoencoder: AnyAutoencoder, stats: LatentStats) -> Backgrounds:
-        """What the denoiser of the variant w/ BG sees."""
-        gels: Any = self.gels
-        latents: Any = self.gel_latents
-        if isinstance(autoencoder, BackgroundAutoencoder):
-            return lambda rows: autoencoder.gel(gels[rows])
-        return lambda rows: stats.normalize(torch.as_tensor(latents[rows]))
 
 
 def encode_part(
@@ -65,8 +38,9 @@ def encode_part(
     encoders: EncoderSet | None,
     autoencoder: AnyAutoencoder,
     columns: Sequence[str],
+    background: bool,
     like: NDArray[np.uint8] | None = None,
-) -> Encoded:
+) -> Rows:
     """Encode a part, or find it in the cache.
 
     Args:
@@ -77,11 +51,12 @@ def encode_part(
         encoders: of photos and texts, where the policy needs them.
         autoencoder: of the tactile images.
         columns: of the images: ``tactile``, and ``background`` where the gels are used.
+        background: whether the denoiser sees the gels, the variant w/ BG.
         like: gels of the train part, of which the first is the stock gel.
     """
     cache, progress = run.cache, run.progress
     folder, own = cache or run.folder, isinstance(autoencoder, BackgroundAutoencoder)
-    gels = None
+    gels: Any = None
     if own:
         gels = gels_of(part, size, cache, progress, like)
     elif "background" in columns:
@@ -109,10 +84,13 @@ def encode_part(
             autoencoder, pixels, ground, ids=part.ids, folder=target, key=key, progress=progress
         )
 
-    latents = code(images, gels if own else None, "")
-    return Encoded(
-        conditions, latents, gels, None if gels is None or own else code(gels, None, "background")
-    )
+    latents, seen = code(images, gels if own else None, ""), None
+    if isinstance(autoencoder, BackgroundAutoencoder) and background:
+        seen = lambda rows, _: autoencoder.gel(gels[rows])
+    elif background:
+        coded = code(gels, None, "background")
+        seen = lambda rows, stats: stats.normalize(torch.as_tensor(coded[rows]))
+    return Rows(latents, conditions, seen, part.ids, gels=gels)
 
 
 def encode_latents(

@@ -1,4 +1,6 @@
-"""What speaks against a no-contact image of a gel, seen by itself.
+"""No-contact images of gels: which each sample is given, and what speaks against one by itself.
+
+A sample has the manifest's, or all have one stock gel. Against an image speaks:
 
 - *It shows contact.* Light falls on a gel smoothly, and markers are gray: of the opponent colors
   (channel minus mean of the channels), markers left out, a polynomial of degree 4 leaves hardly
@@ -20,15 +22,47 @@ from numpy.typing import NDArray
 from PIL import Image
 from scipy import ndimage
 
-from palpate.core import Note
-from palpate.data.images import read_image, square
+from palpate.core import Note, Progress, quiet
+from palpate.data.images import cached_images, read_image, square
+from palpate.data.manifest import Manifest
+from palpate.encoders.rows import evenly
 from palpate.metrics.contact import marker_mask
 
+MEDIAN = 500  # images that a stock gel is the median of, at most
 #: Gray levels that a smooth fit may leave of a gel without contact.
 SMOOTH = 4.0
 #: Difference of the light, on the scale of 0 to 128, from which it is another sensor.
 OTHER_LIGHT = 10.0
 _SIZE, _CELLS, _DEGREE = 64, 4, 4
+
+
+def has_gels(part: Manifest) -> bool:
+    """Whether the samples name no-contact images."""
+    return any(part.column("background"))
+
+
+def gels_of(
+    part: Manifest,
+    size: int,
+    cache: Path | None = None,
+    progress: Progress = quiet,
+    like: NDArray[np.uint8] | None = None,
+) -> NDArray[np.uint8]:
+    """The no-contact image of each sample, bytes (n, size, size, 3).
+
+    Where no sample has one, all get one stock gel: the first of ``like``, or the median of up to
+    500 of the tactile images.
+
+    Raises:
+        PalpateError: if some samples have one and others have not.
+    """
+    if has_gels(part):
+        return cached_images(part, "background", size, cache, progress)
+    if like is not None:
+        return np.broadcast_to(like[0], (len(part), size, size, 3))
+    images = cached_images(part, "tactile", size, cache, progress)
+    stock = np.median(images[evenly(len(images), MEDIAN)], axis=0).astype(np.uint8)
+    return np.broadcast_to(stock, images.shape)
 
 
 def gel_notes(file: Path, stock: NDArray[np.uint8] | None) -> list[Note]:

@@ -16,7 +16,7 @@ from dataclasses import asdict, dataclass, replace
 from functools import lru_cache
 from itertools import chain, islice
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar, cast
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -62,26 +62,20 @@ GELS = 64
 
 
 @dataclass(frozen=True)
-class _Input:
-    """One image to make."""
+class _Item:
+    """One image to make; once its files have been read, their digest and pixels."""
 
     id: str
     vision: Path | None
     background: Path | None = None
+    stamp: str = ""
+    photo: NDArray[np.uint8] | None = None
+    ground: NDArray[np.uint8] | None = None
+    condition: Tensor | None = None
 
     def digest(self) -> str:
+        """Of the bytes of both files."""
         return digest_json([digest_file(p) if p else None for p in (self.vision, self.background)])
-
-
-@dataclass(frozen=True)
-class _Ready:
-    """An input whose files have been read: its pixels, and later its condition."""
-
-    item: _Input
-    stamp: str
-    photo: NDArray[np.uint8] | None
-    ground: NDArray[np.uint8] | None
-    condition: Tensor | None = None
 
 
 def generate(  # noqa: PLR0913 - a public verb, step by step
@@ -140,50 +134,49 @@ def generate(  # noqa: PLR0913 - a public verb, step by step
     require(photos is not None or text is not None, None, must, "none", fix=fix)
     require(0 <= weight <= 1, "weight", "must lie in [0, 1]", f"{weight:g}", fix="1 is the photo")
     output = None if output is None else Path(output)
+    place, gathered = (0, 1), dict
     if int(os.environ.get("WORLD_SIZE", "1")) > 1:
-        from palpate.training.processes import connect
+        from palpate.training import processes
 
-        device = connect(device)
-    manifest, table = None if photos is None else _manifest(photos), dict[str, Path]()
-    if manifest is not None:
-        manifest = manifest if split is None else manifest.part(Split.load(split), part)
-    elif photos is not None:
-        table = photo_ids(cast("Photos", photos))
-    paths = [*table.values()] if manifest is None else manifest.paths("vision")
-    must, fix = "There must be at least one photo", "Check the folder, the split or the names"
-    require(bool(paths) or photos is None, None, must, "none", fix=fix)
-    single = _is_single(output, paths or [Path(str(text))])
+        device = processes.connect(device)
+        place, gathered = processes.place(), processes.merged
+    items = [_Item(str(text), None)] if photos is None else _items(photos, split, part)
+    paths = [item.vision or Path(item.id) for item in items]
+    single = _is_single(output, paths)
     if photos is not None and not skip_bad:
         _require_readable(paths)
-    model = loaded(model, device, progress)
+    if isinstance(model, str | Path):
+        progress(f"loading {model}", 0, 0)
+        model = find_model(model, "generator", "pipeline", FIX_MODEL)  # before torch is imported
+    from palpate.diffusion.pipeline import TactilePipeline
+
+    if not isinstance(model, TactilePipeline):
+        model = TactilePipeline.from_pretrained(model, device=device)
     sampler = model.sampler_with(guidance=guidance, steps=steps, batch=batch)
     if single:  # not among the copies that fill a batch: a fraction of the time
         sampler = replace(sampler, batch=1)
     words = None if text is None else model.embed_text(text)
     settings = _settings(model, sampler, seed)
     settings |= {"text": text, "weight": None if photos is None else weight} if text else {}
-    target = _Target(output, single, settings, model.notice)
-    inputs = _inputs(model, manifest, table or {str(text): None}, gel)
-    notes: list[Note] = []
-    if text is not None and model.encoders is not None:
-        length, most = model.encoders.length(text)
-        notes += [Note("text-cut", {"tokens": length, "most": most})] if length > most else []
-    if gel is not None:
-        from palpate.diffusion.gels import gel_notes
-
-        notes += gel_notes(Path(gel), model.gel)
+    target = _Target(output, single, settings, model.notice, place[0] == 0)
+    items = _on_gels(items, model, gel)
+    notes = _notes(model, text, gel)
     if dry_run:
-        missing, evaluations = _planned(model, inputs, target, sampler)
-        planned = Generated(target.folder, {}, settings, missing=missing, evaluations=evaluations)
-        return replace(planned, notes=notes)
+        files = ((item, target.path(item.id)) for item in items)
+        there = [item for item, path in files if path and path.is_file()]
+        missing = len(items) - sum(target.has(item, item.digest()) for item in there)
+        each = model.evaluations(sampler)
+        return Generated(
+            target.folder, {}, settings, notes=notes, missing=missing, evaluations=missing * each
+        )
 
-    def draw(ready: Iterator[_Ready]) -> Generator[tuple[_Ready, NDArray[np.uint8]]]:
-        while chunk := [*islice(ready, sampler.batch)]:
-            rows: list[Any] = [one.condition for one in chunk if one.condition is not None]
-            grounds = [one.ground for one in chunk if one.ground is not None]
+    def drawn(items: Iterator[_Item]) -> Generator[tuple[_Item, NDArray[np.uint8]]]:
+        while chunk := [*islice(items, sampler.batch)]:
+            rows: list[Any] = [item.condition for item in chunk if item.condition is not None]
+            grounds = [item.ground for item in chunk if item.ground is not None]
             images = model.sample(
-                None if not rows else cast("Tensor", rows[0].new_tensor(np.stack(rows))),
-                [one.item.id for one in chunk],
+                np.stack(rows) if rows else None,
+                [item.id for item in chunk],
                 seed=seed,
                 texts=words,
                 weight=weight,
@@ -192,47 +185,20 @@ def generate(  # noqa: PLR0913 - a public verb, step by step
             )
             yield from zip(chunk, images, strict=True)
 
-    rank, size = target.place
-    reader = _Reader(model, inputs[rank::size], target, skip_bad=skip_bad)
-    return replace(_generated(inputs, reader, draw, sampler.batch, progress), notes=notes)
-
-
-def _generated(
-    inputs: Sequence[_Input],
-    reader: _Reader,
-    draw: Callable[[Iterator[_Ready]], Iterator[tuple[_Ready, NDArray[np.uint8]]]],
-    batch: int,
-    progress: Progress,
-) -> Generated:
-    """Draw the images that are not there, and keep them."""
-    target, ready = reader.target, iter(reader)
-    first = next(ready, None)  # few photos are all read before anything is written
-    bad = target.gathered(reader.bad)
-    reader.require_none(bad)
+    reader = _Reader(model, items[place[0] :: place[1]], target, skip_bad)
+    ready = iter(reader)
+    first = [*islice(ready, 1)]  # few photos are all read before anything is written
+    bad = reader.checked(gathered(reader.bad))
     new: dict[str, bool] = {}
     with target.writing():
-        rows = draw(ready if first is None else chain([first], ready))
-        for one in _ahead(lambda row: target.keep(*row), rows, batch, 1):
-            new[one.item.id] = True
-            done = len(new) + reader.found + len(reader.bad)
-            progress("generating", done, len(reader.inputs))
-        bad, new = target.gathered(bad | reader.bad), target.gathered(new)
-        reader.require_none(bad)
-        ids = [i.id for i in inputs if i.id not in bad]
-        return target.finish(ids, [*bad.values()], len(new))
-
-
-def _planned(
-    model: TactilePipeline, inputs: Sequence[_Input], target: _Target, sampler: SamplerOptions
-) -> tuple[int, int]:
-    """Images to make and network evaluations; guidance takes two of these a step."""
-    paths = [target.path(i.id) for i in inputs]
-    there = [i for i, path in zip(inputs, paths, strict=True) if path and path.is_file()]
-    missing = len(inputs) - sum(target.has(i.id, i.digest()) for i in there)
-    model.scheduler.set_timesteps(sampler.steps)
-    times = [float(t) / model.schedule.steps for t in model.scheduler.timesteps]
-    guided = sampler.guidance not in (0.0, 1.0)
-    return missing, missing * (len(times) + sum(t <= sampler.high for t in times if guided))
+        rows = drawn(chain(first, ready))
+        for item in _ahead(lambda row: target.keep(*row), rows, sampler.batch, 1):
+            new[item.id] = True
+            done = len(new) + reader.there + len(reader.bad)
+            progress("generating", done, len(reader.items))
+        bad, new = reader.checked(gathered(bad | reader.bad)), gathered(new)
+        ids = [item.id for item in items if item.id not in bad]
+        return target.finish(ids, [*bad.values()], len(new), notes)
 
 
 def _ahead(
@@ -252,33 +218,17 @@ def _ahead(
             pool.shutdown(wait=True, cancel_futures=True)
 
 
-def loaded(model: TactilePipeline | str | Path, device: str, progress: Progress) -> TactilePipeline:
-    """The pipeline, loaded where it is a name or a folder."""
-    if isinstance(model, str | Path):
-        progress(f"loading {model}", 0, 0)
-        model = find_model(model, "generator", "pipeline", FIX_MODEL)
-    from palpate.diffusion.pipeline import TactilePipeline
-
-    if isinstance(model, TactilePipeline):
-        return model
-    return TactilePipeline.from_pretrained(model, device=device)
-
-
 class _Target:
     """Where images go: memory, one PNG, or a folder with an index."""
 
     def __init__(
-        self, output: Path | None, single: bool, settings: dict[str, Any], notice: str
+        self, output: Path | None, single: bool, settings: dict[str, Any], notice: str, first: bool
     ) -> None:
         self.settings, self.digest, self.notice = settings, digest_json(settings), notice
         self.file = output if single else None
         self.folder = None if single else output
         self.memory: dict[str, Image.Image] = {}
-        self.place = (0, 1)
-        if int(os.environ.get("WORLD_SIZE", "1")) > 1:
-            from palpate.training.processes import place
-
-            self.place = place()
+        self.first = first  # of several processes
         self.index: dict[str, Any] = {}
         if self.folder is not None:
             index = old_index(self.folder, settings, self.digest)
@@ -290,64 +240,56 @@ class _Target:
         """The file of an image; None in memory."""
         return self.folder / "images" / file_name(sample_id) if self.folder else self.file
 
-    def has(self, sample_id: str, stamp: str) -> bool:
+    def has(self, item: _Item, stamp: str) -> bool:
         """Whether the image of this id, photo and settings is there."""
-        if (path := self.path(sample_id)) is None:
+        if (path := self.path(item.id)) is None:
             return False
         try:
             with Image.open(path) as image:
                 text = [image.info.get(f"palpate.{k}") for k in ("id", "settings", "input")]
         except BROKEN:
             return False
-        return text == [sample_id, self.digest, stamp]
+        return text == [item.id, self.digest, stamp]
 
     @contextmanager
     def writing(self) -> Generator[None]:
         """Hold the folder, and mark it as unfinished; of several processes the first one."""
         self.index["complete"] = False
-        if self.place[0]:
-            yield
-            return
-        with nullcontext() if self.folder is None else locked(self.folder):
-            if self.folder is not None:
-                write_json(self.folder / "index.json", self.index)
+        folder = self.folder if self.first else None
+        with nullcontext() if folder is None else locked(folder):
+            if folder is not None:
+                write_json(folder / "index.json", self.index)
             yield
 
-    def gathered(self, table: dict[str, T]) -> dict[str, T]:
-        """The entries of all processes; each of them has come this far."""
-        if self.place[1] == 1:
-            return table
-        from palpate.training.processes import merged
-
-        return merged(table)
-
-    def keep(self, one: _Ready, array: NDArray[np.uint8]) -> _Ready:
+    def keep(self, item: _Item, array: NDArray[np.uint8]) -> _Item:
         """Keep one image, as a PNG that says what it is."""
         image = Image.fromarray(array)
-        if (path := self.path(one.item.id)) is None:
-            self.memory[one.item.id] = image
-            return one
+        if (path := self.path(item.id)) is None:
+            self.memory[item.id] = image
+            return item
         text = PngImagePlugin.PngInfo()
-        values = {"id": one.item.id, "settings": self.digest, "input": one.stamp}
+        values = {"id": item.id, "settings": self.digest, "input": item.stamp}
         values |= {"made-with": canonical_json(self.settings), "notice": self.notice}
         for name, value in values.items():  # their order decides the bytes
             if value:
                 text.add_itxt(f"palpate.{name}", value)
         with atomic_path(path) as part:
             image.save(part, format="PNG", pnginfo=text)
-        return one
+        return item
 
-    def finish(self, ids: Sequence[str], skipped: Sequence[Problem], new: int) -> Generated:
+    def finish(
+        self, ids: Sequence[str], skipped: Sequence[Problem], new: int, notes: Sequence[Note]
+    ) -> Generated:
         """Complete the index; all images of the target, earlier ones included."""
         files = {} if self.file is None else {i: str(self.file) for i in ids}
         if self.folder is not None:
             files = self.index["images"] | {i: file_name(i) for i in ids}
             skips = [asdict(problem) for problem in skipped]
             self.index |= {"complete": True, "images": files, "skipped": skips}
-            if not self.place[0]:
+            if self.first:
                 write_json(self.folder / "index.json", self.index)
-        common = (self.settings, skipped, new, self.notice)
-        return Generated(self.folder, files, *common, memory=self.memory)
+        common = (self.settings, skipped, new, self.notice, notes, self.memory)
+        return Generated(self.folder, files, *common)
 
 
 def photo_ids(photos: Photos) -> dict[str, Path]:
@@ -376,20 +318,62 @@ def photo_ids(photos: Photos) -> dict[str, Path]:
     return table
 
 
-def _manifest(photos: Any) -> Manifest | None:
-    """The manifest that ``photos`` is or names, or None for photos."""
-    if hasattr(photos, "columns"):
-        from palpate.data.reading import load
-
-        return load(photos)
+def _items(photos: Any, split: Split | str | Path | None, part: str) -> list[_Item]:
+    """One image per photo, or per sample of a manifest, with its own no-contact image."""
+    manifest: Manifest | None = None
     if isinstance(photos, str | Path):
         path = Path(photos)
-        if path.suffix != ".parquet" and not (path / "manifest.parquet").is_file():
-            return None
-        from palpate.data.manifest import Manifest
+        if path.suffix == ".parquet" or (path / "manifest.parquet").is_file():
+            from palpate.data.manifest import Manifest
 
-        return Manifest.load(path)
-    return None if isinstance(photos, Sequence | Mapping) else photos
+            manifest = Manifest.load(path)
+    elif hasattr(photos, "columns"):
+        from palpate.data.reading import load
+
+        manifest = load(photos)
+    elif not isinstance(photos, Sequence | Mapping):
+        manifest = photos
+    if manifest is None:
+        items = [_Item(i, path) for i, path in photo_ids(photos).items()]
+    else:
+        manifest = manifest if split is None else manifest.part(Split.load(split), part)
+        gels = (gel and manifest.path(gel) for gel in manifest.column("background"))
+        rows = zip(manifest.ids, manifest.paths("vision"), gels, strict=True)
+        items = [_Item(*row) for row in rows]
+    must, fix = "There must be at least one photo", "Check the folder, the split or the names"
+    require(bool(items), None, must, "none", fix=fix)
+    return items
+
+
+def _on_gels(
+    items: Sequence[_Item], pipeline: TactilePipeline, gel: str | Path | None
+) -> list[_Item]:
+    """The items with the gel that each is made on, where that is another than the stock gel."""
+    if gel is not None:
+        gel, must = Path(gel), "must be left out for a generator that codes the gel with the image"
+        require(pipeline.background, "gel", must, str(gel), fix="Train one with the preset mini")
+        _require_readable([gel], "gel")
+    lacking = [item.id for item in items if item.background is None]
+    stock = pipeline.gel is not None and len(lacking) == len(items)
+    if gel is not None or stock or not pipeline.background:
+        return [replace(item, background=gel) for item in items]
+    must, fix = "must be given for a generator w/ BG", "Or pass a manifest with backgrounds"
+    got = "photos alone" if len(lacking) == len(items) else f"no background of {lacking[:1]}"
+    require(not lacking, "gel", must, got, fix=fix)
+    return list(items)
+
+
+def _notes(pipeline: TactilePipeline, text: str | None, gel: str | Path | None) -> list[Note]:
+    """What the caller must know of the text and the gel."""
+    notes: list[Note] = []
+    if text is not None and pipeline.encoders is not None:
+        length, most = pipeline.encoders.length(text)
+        notes += [Note("text-cut", {"tokens": length, "most": most})] if length > most else []
+    if gel is not None:
+        from palpate.diffusion.gels import gel_notes
+
+        notes += gel_notes(Path(gel), pipeline.gel)
+    return notes
 
 
 def _is_single(output: Path | None, paths: Sequence[Path]) -> bool:
@@ -441,67 +425,39 @@ def _settings(pipeline: TactilePipeline, sampler: SamplerOptions, seed: int) -> 
     }
 
 
-def _inputs(
-    pipeline: TactilePipeline,
-    manifest: Manifest | None,
-    photos: Mapping[str, Path | None],
-    gel: str | Path | None,
-) -> list[_Input]:
-    """One input per image; its gel where the pipeline uses one other than its stock gel."""
-    if gel is not None:
-        gel, must = Path(gel), "must be left out for a generator that codes the gel with the image"
-        require(pipeline.background, "gel", must, str(gel), fix="Train one with the preset mini")
-        _require_readable([gel], "gel")
-    if manifest is None:
-        enough = not pipeline.background or gel is not None or pipeline.gel is not None
-        must, fix = "must be given for a generator w/ BG", "Or pass a manifest with backgrounds"
-        require(enough, "gel", must, "photos alone", fix=fix)
-        return [_Input(i, path, gel) for i, path in photos.items()]
-    grounds: Sequence[Path | None] = [gel] * len(manifest)
-    if pipeline.background and gel is None:
-        own = pipeline.gel is None or any(manifest.column("background"))
-        grounds = manifest.paths("background") if own else grounds
-    rows = zip(manifest.ids, manifest.paths("vision"), grounds, strict=True)
-    return [_Input(*row) for row in rows]
-
-
 class _Reader:
-    """Reads inputs in threads, ahead of the sampling; yields those that are still to be made.
+    """Reads items in threads, ahead of the sampling; yields those that are still to be made.
 
     After an unreadable photo that may not be skipped it yields no more, and only looks for others.
 
     Attributes:
         bad: by id, what could not be read.
-        found: how many images are there already.
+        there: how many images are there already.
     """
 
     def __init__(
-        self,
-        pipeline: TactilePipeline,
-        inputs: Sequence[_Input],
-        target: _Target,
-        *,
-        skip_bad: bool,
+        self, pipeline: TactilePipeline, items: Sequence[_Item], target: _Target, skip_bad: bool
     ) -> None:
-        self.pipeline, self.inputs, self.target, self.skip_bad = pipeline, inputs, target, skip_bad
+        self.pipeline, self.items, self.target, self.skip_bad = pipeline, items, target, skip_bad
         self.bad: dict[str, Problem] = {}
-        self.found = 0
+        self.there = 0
         self._gel = lru_cache(GELS)(self._square)  # many samples share one
 
-    def require_none(self, bad: Mapping[str, Problem]) -> None:
+    def checked(self, bad: dict[str, Problem]) -> dict[str, Problem]:
         """Raise ``ProblemsError`` for what could not be read and may not be skipped."""
         if bad and not self.skip_bad:
             raise ProblemsError([*bad.values()], FIX_PHOTOS, example={"skip_bad": True})
+        return bad
 
-    def __iter__(self) -> Generator[_Ready]:
+    def __iter__(self) -> Generator[_Item]:
         from palpate.diffusion.pipeline import EMBED
 
-        ready: list[_Ready] = []
-        for item, one in _ahead(self._read, self.inputs, EMBED, THREADS):
+        ready: list[_Item] = []
+        for item, one in _ahead(self._read, self.items, EMBED, THREADS):
             if isinstance(one, Problem):
                 self.bad[item.id] = one
             elif one is None:
-                self.found += 1
+                self.there += 1
             else:
                 ready.append(one)
             if self.bad and not self.skip_bad:
@@ -511,16 +467,16 @@ class _Reader:
                 ready = []
         yield from self._embedded(ready)
 
-    def _read(self, item: _Input) -> tuple[_Input, _Ready | Problem | None]:
+    def _read(self, item: _Item) -> tuple[_Item, _Item | Problem | None]:
         file = item.vision
         try:
             stamp = item.digest()
-            if self.target.has(item.id, stamp):
+            if self.target.has(item, stamp):
                 return item, None
             photo = None if file is None else self._square(file, self.pipeline.vision_size)
             file = item.background
             ground = None if file is None else self._gel(file, self.pipeline.size)
-            return item, _Ready(item, stamp, photo, ground)
+            return item, replace(item, stamp=stamp, photo=photo, ground=ground)
         except PalpateError as error:
             return item, Problem(str(file), "bad-image", error.got)
         except OSError as error:
@@ -531,8 +487,8 @@ class _Reader:
     def _square(file: Path, size: int) -> NDArray[np.uint8]:
         return square(read_image(file), size)
 
-    def _embedded(self, ready: list[_Ready]) -> Generator[_Ready]:
-        photos = [one.photo for one in ready if one.photo is not None]
+    def _embedded(self, ready: list[_Item]) -> Generator[_Item]:
+        photos = [item.photo for item in ready if item.photo is not None]
         rows: Any = self.pipeline.embed(np.stack(photos)) if photos else [None] * len(ready)
-        for one, row in zip(ready, rows, strict=True):
-            yield replace(one, condition=row, photo=None)
+        for item, row in zip(ready, rows, strict=True):
+            yield replace(item, condition=row, photo=None)

@@ -37,12 +37,12 @@ from palpate.diffusion.denoiser import (
     batches,
     build_scheduler,
     sample,
+    scale_at,
     starting_noise,
 )
 from palpate.diffusion.options import ConditionPolicy, SamplerOptions, Schedule
 from palpate.diffusion.saving import FORMAT, KEYS, write_pipeline
 from palpate.encoders.embed import embed_texts
-from palpate.encoders.encoder import list_images, squares
 from palpate.encoders.encoder_set import EncoderSet, load_clip
 from palpate.encoders.models import (
     FIX_MODEL,
@@ -52,7 +52,7 @@ from palpate.encoders.models import (
     find_model,
     pick_device,
 )
-from palpate.encoders.preprocess import Preprocess, to_unit
+from palpate.encoders.preprocess import Preprocess, list_images, squares, to_unit
 from palpate.training.cards import write_model_cards
 
 COPY_AGAIN = "Copy the whole folder again"
@@ -331,6 +331,12 @@ class TactilePipeline(DiffusionPipeline):
         fits = scale == 1 or self.denoiser.policy.dropout > 0
         require(fits, "guidance", must, f"{scale:g}", fix="Choose 1")
         return sampler
+
+    def evaluations(self, sampler: SamplerOptions) -> int:
+        """Rows that the network sees for one image; guidance takes two a step."""
+        self.scheduler.set_timesteps(sampler.steps)
+        scales = [scale_at(t, self.scheduler, sampler) for t in self.scheduler.timesteps]
+        return sum(1 + (scale not in (0.0, 1.0)) for scale in scales)
 
     def embed(self, photos: NDArray[np.uint8]) -> Tensor:
         """Photos, bytes (n, h, w, 3), -> what conditions on them, on the CPU.

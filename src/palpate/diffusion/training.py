@@ -31,8 +31,8 @@ from palpate.diffusion.autoencoder_training import autoencoder_of, build_autoenc
 from palpate.diffusion.ceiling import judge_of, measure_ceiling, some_whole
 from palpate.diffusion.denoiser import Denoiser, lengths_of
 from palpate.diffusion.denoiser_training import Rows, new_unet, train_denoiser
-from palpate.diffusion.encoding import Encoded, encode_part
-from palpate.diffusion.no_contact import gels_of, has_gels
+from palpate.diffusion.encoding import encode_part
+from palpate.diffusion.gels import gels_of, has_gels
 from palpate.diffusion.options import AutoencoderOptions, ConditionPolicy, UNetOptions
 from palpate.diffusion.pipeline import TactilePipeline
 from palpate.diffusion.presets import DiffusionPreset, preset_of
@@ -40,7 +40,7 @@ from palpate.diffusion.unet import find_unet
 from palpate.encoders.embed import texts_of
 from palpate.encoders.encoder_set import EncoderSet, load_clip
 from palpate.encoders.models import is_hub_id, pick_device
-from palpate.encoders.parts import load_split, train_part
+from palpate.encoders.rows import load_split, train_part
 from palpate.training.estimate import estimate
 from palpate.training.options import Compute
 from palpate.training.processes import connect, first_alone, place
@@ -259,7 +259,7 @@ def train_pipeline(
     gels = parts.background or (given_gel and has_gels(train))
     columns = ["tactile", "background"] if gels else ["tactile"]
 
-    def encode(part: Manifest, like: NDArray[np.uint8] | None = None) -> Encoded:
+    def encode(part: Manifest, like: NDArray[np.uint8] | None = None) -> Rows:
         return encode_part(
             part,
             policy,
@@ -268,25 +268,22 @@ def train_pipeline(
             encoders=encoders,
             autoencoder=autoencoder,
             columns=columns,
+            background=parts.background,
             like=like,
         )
 
     with first_alone():
-        encoded = encode(train)
-        encoded_held = encode(held, encoded.gels) if len(held) else None
-        drawn = _drawn(manifest, split, preset.size, encoded.gels)
+        rows = encode(train)
+        held_rows = encode(held, rows.gels) if len(held) else None
+        drawn = _drawn(manifest, split, preset.size, rows.gels)
     key = [
         digest_lines(texts),
         *(image_stamp(train, column) for column in ("vision", *columns)),
         *(train.digest, held.digest if len(held) else "", autoencoder.digest),
         *(encoders.digest(modality) for modality in policy.modalities if encoders is not None),
     ]
-    stats = LatentStats.of(encoded.latents, preset.latent_scale) if start is None else start.stats
+    stats = LatentStats.of(rows.latents, preset.latent_scale) if start is None else start.stats
     loop = preset.loop_for(len(train), seed=run.seed)
-
-    def rows(part: Manifest, code: Encoded) -> Rows:
-        background = code.backgrounds(autoencoder, stats) if parts.background else None
-        return Rows(code.latents, code.conditions, background, part.ids, digest_json(key))
 
     def samples(module: nn.Module) -> NDArray[np.uint8]:
         assert isinstance(module, Denoiser)
@@ -308,15 +305,15 @@ def train_pipeline(
             None if encoders is None else encoders.without_tactile(),
             preset.name,
             record or {},
-            encoded.gels[0] if given_gel and encoded.gels is not None else None,
+            rows.gels[0] if given_gel and rows.gels is not None else None,
         )
 
     denoiser = train_denoiser(
-        rows(train, encoded),
+        replace(rows, key=digest_json(key)),
         replace(preset, condition=policy, loop=loop),
         stats,
         run.stage("denoiser"),
-        held_out=None if encoded_held is None else rows(held, encoded_held),
+        held_out=held_rows,
         start=start.denoiser if start else None,
         samples=samples if drawn else None,
     )

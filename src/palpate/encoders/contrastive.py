@@ -31,15 +31,16 @@ from palpate.core import Progress, Split, digest_json, digest_lines, fields_of, 
 from palpate.data.images import image_stamp
 from palpate.data.manifest import Manifest
 from palpate.data.reading import load
-from palpate.encoders.clip import encode_text, encode_vision, family_of
 from palpate.encoders.embed import embed, texts_of
 from palpate.encoders.encoder_set import (
     EncoderSet,
     Preprocess,
     encode_tactile,
+    encode_text,
+    encode_vision,
+    family_of,
     load_clip,
     new_tactile,
-    seeded,
 )
 from palpate.encoders.losses import (
     LOG_SCALE_START,
@@ -50,11 +51,9 @@ from palpate.encoders.losses import (
     three_way,
 )
 from palpate.encoders.models import digest_tensors, pick_device
-from palpate.encoders.parts import load_split, train_part
-from palpate.encoders.preprocess import CLIP_MEAN, CLIP_STD, prepared_images
+from palpate.encoders.preprocess import CLIP_MEAN, CLIP_STD, digest_images, prepared_images, union
 from palpate.encoders.presets import Course, EncoderPreset, Targets, preset_of
-from palpate.encoders.rows import Rows, augmented, draw, numbers, unit
-from palpate.encoders.seen import digest_images, union
+from palpate.encoders.rows import Rows, augmented, draw, load_split, numbers, train_part, unit
 from palpate.encoders.tokenizer import train_tokenizer
 from palpate.metrics.probe import material_accuracy
 from palpate.training.engine import Batch, Losses, Task, fit
@@ -62,7 +61,7 @@ from palpate.training.estimate import estimate
 from palpate.training.options import Compute, LoopOptions
 from palpate.training.processes import agreed, connect, first_alone, gather_rows, place
 from palpate.training.run import TrainingRun, run_for
-from palpate.training.steps import Step
+from palpate.training.steps import Step, seeded
 
 
 def train_encoder(

@@ -7,10 +7,10 @@ row is therefore another key; the root and the batch size are not part of it.
 
 from __future__ import annotations
 
-from collections.abc import Generator, Sequence
+from collections.abc import Callable, Generator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
@@ -29,9 +29,11 @@ from palpate.core import (
 )
 from palpate.data.captions import NAMED, caption
 from palpate.data.images import REFETCH, image_stamp
-from palpate.data.manifest import Manifest
 from palpate.encoders.encoder_set import MODALITIES, EncoderSet, Modality
 from palpate.encoders.preprocess import Frames, load_frames, to_unit
+
+if TYPE_CHECKING:
+    from palpate.data.manifest import Manifest
 
 
 def texts_of(manifest: Manifest) -> tuple[list[str], str]:
@@ -129,13 +131,10 @@ def embed_images(
     """
     _require(modality, batch)
     require_rgb(images)
-    preprocess, n = encoders.preprocess(modality), len(images)
-    features = np.empty((n, encoders.width(modality)), np.float32)
-    for start in range(0, n, batch):
-        rows = slice(start, start + batch)
-        features[rows] = _forward(preprocess.fit(images[rows]), encoders, modality)
-        progress(f"embedding {modality}", min(start + batch, n), n)
-    return features
+    fit, n = encoders.preprocess(modality).fit, len(images)
+    return _embedded(
+        n, lambda rows: fit(images[rows]), encoders, modality, batch=batch, progress=progress
+    )
 
 
 def embed_texts(
@@ -173,34 +172,47 @@ def exact() -> Generator[None]:
 def embed_frames(
     frames: Frames, encoders: EncoderSet, modality: Modality, batch: int, progress: Progress
 ) -> NDArray[np.float32]:
-    """Embed files, a batch in memory at a time; report all unreadable files together."""
+    """Embed files; report all unreadable ones together."""
     preprocess, n = encoders.preprocess(modality), len(frames.files)
+
+    def load(rows: slice) -> NDArray[np.uint8]:
+        return load_frames(frames.files[rows], preprocess)
+
+    return _embedded(
+        n, load, encoders, modality, batch=batch, progress=progress, sensors=frames.sensors
+    )
+
+
+def _embedded(
+    n: int,
+    load: Callable[[slice], NDArray[np.uint8]],
+    encoders: EncoderSet,
+    modality: Modality,
+    *,
+    batch: int,
+    progress: Progress,
+    sensors: Sequence[str] | None = None,
+) -> NDArray[np.float32]:
+    """Embed n prepared images, a batch in memory at a time."""
+    preprocess = encoders.preprocess(modality)
     features = np.empty((n, encoders.width(modality)), np.float32)
     problems: list[Problem] = []
     for start in range(0, n, batch):
         rows = slice(start, start + batch)
         try:
-            images = load_frames(frames.files[rows], preprocess)
+            images = load(rows)
         except ProblemsError as error:
             problems += error.problems
             continue
         if not problems:
-            features[rows] = _forward(images, encoders, modality, frames.sensors[rows])
+            with exact():
+                pixels = preprocess(to_unit(images, encoders.device))
+                part = encoders.encode(modality, pixels, sensors and sensors[rows])
+            features[rows] = part.float().cpu().numpy()
         progress(f"embedding {modality}", min(start + batch, n), n)
     if problems:
         raise ProblemsError(problems, REFETCH)
     return features
-
-
-def _forward(
-    images: NDArray[np.uint8],
-    encoders: EncoderSet,
-    modality: Modality,
-    sensors: Sequence[str] | None = None,
-) -> NDArray[np.float32]:
-    with exact():
-        pixels = encoders.preprocess(modality)(to_unit(images, encoders.device))
-        return encoders.encode(modality, pixels, sensors).float().cpu().numpy()
 
 
 def _require(modality: str, batch: int) -> None:

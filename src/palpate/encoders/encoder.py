@@ -2,22 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from PIL import Image
 
-from palpate.core import PalpateError, Progress, quiet, require, require_choice
-from palpate.data.images import SUFFIXES
+from palpate.core import Progress, quiet, require_choice
 from palpate.data.manifest import Manifest
 from palpate.encoders.embed import embed, embed_frames, embed_texts
 from palpate.encoders.encoder_set import EncoderSet, Modality
 from palpate.encoders.models import pick_device
-from palpate.encoders.preprocess import Frames, Preprocess, load_frames
+from palpate.encoders.preprocess import Frames, Preprocess, list_images
 
 
 @dataclass(frozen=True)
@@ -124,46 +121,3 @@ class Encoder:
             return embed_texts(texts, self.encoders, batch=batch, progress=progress)
         frames = Frames.alone(list_images(inputs))
         return embed_frames(frames, self.encoders, self.modality, batch, progress)
-
-
-def list_images(inputs: Any) -> list[Path | Image.Image]:
-    """Images in any form that :meth:`Encoder.encode` takes, as a list of files and PIL images.
-
-    Raises:
-        PalpateError: for arrays of another type or shape, a missing path, or other objects.
-    """
-    if isinstance(inputs, str | Path):
-        path = Path(inputs)
-        if not path.is_dir():
-            return [path]
-        files = (p for p in path.rglob("*") if p.suffix.lower() in SUFFIXES and p.is_file())
-        return [*sorted(files)]
-    if isinstance(inputs, Image.Image):
-        return [inputs.convert("RGB")]
-    if hasattr(inputs, "shape"):
-        return [Image.fromarray(image) for image in _bytes(inputs)]
-    if isinstance(inputs, Sequence):
-        return [image for entry in inputs for image in list_images(entry)]
-    must, fix = "must be files, PIL images, arrays or tensors", "Pass e.g. a list of files"
-    raise PalpateError(must, type(inputs).__name__, fix, argument="images")
-
-
-def squares(images: Sequence[Path | Image.Image], size: int) -> NDArray[np.uint8]:
-    """Decode images to center squares (n, size, size, 3)."""
-    return load_frames(Frames.alone(images).files, Preprocess(size, size))
-
-
-def _bytes(images: Any) -> NDArray[np.uint8]:
-    """An array or tensor as uint8 (n, h, w, 3)."""
-    array = np.asarray(images.detach().cpu() if hasattr(images, "detach") else images)
-    shape = array.shape
-    array = array[None] if array.ndim == 3 else array
-    if hasattr(images, "detach") and array.ndim == 4 and array.shape[1] == 3:
-        array = array.transpose(0, 2, 3, 1)
-        if array.dtype.kind == "f" and array.size and array.min() >= 0 and array.max() <= 1:
-            array = np.rint(array * 255).astype(np.uint8)
-    rgb = array.ndim == 4 and array.shape[3] == 3 and array.dtype == np.uint8
-    must = "must be uint8 (n, h, w, 3), or a tensor (n, 3, h, w) in [0, 1]"
-    got = f"{array.dtype} of shape {shape}"
-    require(rgb, "images", must, got, fix="Scale to 0..255 and round")
-    return np.ascontiguousarray(array)

@@ -14,22 +14,27 @@ A saved set is a folder::
 
 The digest of an encoder is SHA-256 over its architecture, preprocessing (text: tokenizer) and
 weights.
+
+Vision and text are one model of transformers: CLIP, SigLIP or SigLIP 2; a DINO sees alone. Features
+of CLIP are *projected* (``visual_projection``, ``text_projection``), and all features are
+L2-normalized. States before the projection share no space; :meth:`EncoderSet.patches` returns them.
 """
 
 from __future__ import annotations
 
-from collections.abc import Generator, Mapping, Sequence
-from contextlib import contextmanager
+import json
+import math
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import TYPE_CHECKING, Any, Literal, get_args
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from PIL import Image
 from torch import Tensor, nn
-from torch.nn.functional import normalize
+from torch.nn.functional import adaptive_avg_pool2d, normalize
 from transformers import (
     AutoModel,
     AutoTokenizer,
@@ -42,22 +47,11 @@ from palpate.core import (
     PalpateError,
     Progress,
     atomic_folder,
+    digest_json,
     quiet,
     read_record,
     require,
-    seed_for,
     write_json,
-)
-from palpate.data.manifest import Manifest
-from palpate.encoders.clip import (
-    FAMILIES,
-    context_of,
-    digest_text,
-    digest_vision,
-    encode_text,
-    encode_vision,
-    vision_patches,
-    width_of,
 )
 from palpate.encoders.models import (
     Origin,
@@ -75,11 +69,24 @@ from palpate.encoders.models import (
     silent,
     stated,
 )
-from palpate.encoders.preprocess import SAVE_AGAIN, Frames, Preprocess, load_frames
-from palpate.encoders.seen import FETCH_AGAIN, Digests, digest_images, load_seen, save_seen
+from palpate.encoders.preprocess import (
+    FETCH_AGAIN,
+    SAVE_AGAIN,
+    Digests,
+    Frames,
+    Preprocess,
+    digest_images,
+    load_frames,
+    load_seen,
+    save_seen,
+)
 from palpate.encoders.tactile import TactileModule, load_tactile
 from palpate.encoders.tokenizer import save_tokenizer
 from palpate.training.cards import write_model_cards
+from palpate.training.steps import seeded
+
+if TYPE_CHECKING:
+    from palpate.data.manifest import Manifest
 
 Modality = Literal["vision", "text", "tactile"]
 MODALITIES: tuple[Modality, ...] = get_args(Modality)
@@ -88,6 +95,15 @@ CLIP_FIX = (
     "Pass a folder that holds config.json, model.safetensors, the tokenizer's files and "
     "preprocessor_config.json"
 )
+#: Kinds of transformers' models that see, and whether they read, too.
+FAMILIES = {
+    "clip": True,
+    "siglip": True,
+    "siglip2": True,
+    "dinov2": False,
+    "dinov2_with_registers": False,
+    "dinov3_vit": False,
+}
 
 
 @dataclass
@@ -135,10 +151,13 @@ class EncoderSet:
     def width(self, modality: str) -> int:
         """Width of one encoder's embeddings."""
         self._require(modality)
-        if modality != "tactile":
-            return width_of(self.clip)
-        tactile: Any = self.tactile
-        return int(getattr(tactile, "dim", 0) or tactile.config.projection_dim)
+        model: Any = self.tactile if modality == "tactile" else self.clip
+        if isinstance(model, TactileModule):
+            return model.dim
+        config = model.config
+        if modality == "tactile" or family_of(model) == "clip":
+            return int(config.projection_dim)
+        return int(getattr(config, "vision_config", config).hidden_size)
 
     @property
     def device(self) -> torch.device:
@@ -185,26 +204,47 @@ class EncoderSet:
         return encode_tactile(self.tactile, pixels)
 
     def patches(self, pixels: Tensor, count: int) -> Tensor:
-        """See :func:`palpate.encoders.clip.vision_patches`."""
-        return vision_patches(self.clip, pixels, count)
+        """States of photos' patches in the last layer, before the projection.
+
+        Args:
+            pixels: preprocessed (n, 3, size, size).
+            count: a square number; the patches are averaged to so many.
+
+        Returns:
+            (n, count, width); what others put before the patches (CLS) is left out.
+        """
+        vision: Any = getattr(self.clip, "vision_model", self.clip)
+        output = vision(**_inputs(self.clip, pixels))
+        grid = pixels.shape[2] // int(vision.config.patch_size)
+        states = output.last_hidden_state[:, -(grid**2) :].transpose(1, 2)
+        states = states.unflatten(2, (grid, grid))
+        return adaptive_avg_pool2d(states, math.isqrt(count)).flatten(2).transpose(1, 2)
 
     def length(self, text: str) -> tuple[int, int]:
         """Tokens of a text, marks of its ends included, and the most that the encoder takes."""
         with silent():  # the tokenizer warns of long texts, in its own words
-            return len(self.tokenizer(text)["input_ids"]), context_of(self.clip)
+            return len(self.tokenizer(text)["input_ids"]), _context(self.clip)
 
     def digest(self, modality: str) -> str:
-        """SHA-256 of one encoder: weights, architecture, preprocessing."""
+        """SHA-256 of one encoder: weights, architecture, preprocessing (of text: the tokenizer)."""
+        self._require(modality)
+        facts: dict[str, Any]
+        if modality == "tactile":
+            assert self.tactile is not None
+            config, parts = getattr(self.tactile, "config", {}), {"encoder": self.tactile}
+            facts = {"sensor": self.sensor}
+        else:
+            config = getattr(self.clip.config, f"{modality}_config", self.clip.config)
+            parts = {"encoder": getattr(self.clip, f"{modality}_model", self.clip)}
+            facts = {"family": family_of(self.clip)}
+            if facts["family"] == "clip":
+                name = {"vision": "visual", "text": "text"}[modality]
+                parts["projection"] = getattr(self.clip, f"{name}_projection")
         if modality == "text":
-            self._require(modality)
-            return digest_text(self.clip, self.tokenizer)
-        preprocess = self.preprocess(modality)
-        if modality == "vision":
-            return digest_vision(self.clip, preprocess)
-        assert self.tactile is not None
-        facts = {"preprocess": asdict(preprocess), "sensor": self.sensor}
-        facts |= architecture(getattr(self.tactile, "config", {}))
-        return digest_modules({"encoder": self.tactile}, facts)
+            facts["tokenizer"] = _tokenizer_digest(self.tokenizer)
+        else:
+            facts["preprocess"] = asdict(self.preprocesses[modality])
+        return digest_modules(parts, facts | architecture(config))
 
     # --- what the encoders were trained on -------------------------------------------------------
 
@@ -230,8 +270,8 @@ class EncoderSet:
         if digests is None:
             return seen
         preprocess = replace(self.preprocess(modality), subtract=())
-        read = isinstance(images, Manifest)
-        frames = preprocess.frames(images, modality) if read else Frames.alone(images)
+        alone = isinstance(images, Sequence)
+        frames = Frames.alone(images) if alone else preprocess.frames(images, modality)
         for start in range(0, len(seen), batch):
             rows = slice(start, start + batch)
             seen[rows] = np.isin(
@@ -464,12 +504,75 @@ def encode_tactile(tactile: nn.Module, pixels: Tensor) -> Tensor:
     return normalize(tactile(pixel_values=pixels).image_embeds, dim=-1)
 
 
-@contextmanager
-def seeded(seed: int, purpose: str) -> Generator[None]:
-    """Seed torch's CPU generator by (seed, purpose) inside and restore it afterwards."""
-    with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(seed_for(seed, purpose))
-        yield
+def family_of(model: Any) -> str:
+    """The kind of a model of vision in transformers, a key of :data:`FAMILIES`."""
+    return str(model.config.model_type)
+
+
+def _context(model: Any) -> int:
+    """The most tokens of a text that a model takes, marks of its ends included."""
+    return int(model.config.text_config.max_position_embeddings)
+
+
+def tokens(model: Any, tokenizer: Any, texts: Sequence[str]) -> dict[str, Tensor]:
+    """``input_ids`` and ``attention_mask`` (n, length), cut to the model's context.
+
+    SigLIP was trained on lower case, and on padding without a mask.
+    """
+    masked = family_of(model) == "clip"
+    encoded = tokenizer(
+        [text if masked else text.lower() for text in texts],
+        return_tensors="pt",
+        truncation=True,
+        max_length=_context(model),
+        padding=True if masked else "max_length",
+    )
+    names = ("input_ids", "attention_mask") if masked else ("input_ids",)
+    return {name: encoded[name].to(model.device) for name in names}
+
+
+def encode_text(model: Any, tokenizer: Any, texts: Sequence[str]) -> Tensor:
+    """Texts to (n, dim), L2-normalized; differentiable."""
+    return _projected(model.get_text_features(**tokens(model, tokenizer, texts)))
+
+
+def encode_vision(model: Any, pixels: Tensor) -> Tensor:
+    """Preprocessed pixels (n, 3, size, size) to (n, dim), L2-normalized; differentiable.
+
+    Of a DINO, which has no projection, its class token.
+    """
+    encode = getattr(model, "get_image_features", model)
+    return _projected(encode(**_inputs(model, pixels)))
+
+
+def _inputs(model: Any, pixels: Tensor) -> dict[str, Tensor]:
+    """Pixels (n, 3, side, side) as the model takes them; SigLIP 2 takes rows of patches."""
+    if family_of(model) != "siglip2":
+        return {"pixel_values": pixels}
+    patch = int(model.config.vision_config.patch_size)
+    n, side = len(pixels), pixels.shape[2] // patch
+    cells = pixels.unflatten(3, (side, patch)).unflatten(2, (side, patch))
+    rows = cells.permute(0, 2, 4, 3, 5, 1).reshape(n, side * side, -1)
+    return {
+        "pixel_values": rows,
+        "pixel_attention_mask": torch.ones(rows.shape[:2], dtype=torch.int32, device=pixels.device),
+        "spatial_shapes": torch.full((n, 2), side, device=pixels.device),
+    }
+
+
+def _projected(output: Any) -> Tensor:
+    """The projected features: a tensor in transformers 4, the field ``pooler_output`` in 5."""
+    return normalize(output if isinstance(output, Tensor) else output.pooler_output, dim=-1)
+
+
+def _tokenizer_digest(tokenizer: Any) -> str:
+    """SHA-256 of all that a tokenizer does to a text."""
+    backend = getattr(tokenizer, "backend_tokenizer", None)
+    if backend is None:  # a slow tokenizer of transformers 4
+        return digest_json(tokenizer.get_vocab())
+    # Truncation and padding are state of the last call, not of the tokenizer.
+    table = json.loads(backend.to_str())
+    return digest_json({k: v for k, v in table.items() if k not in ("truncation", "padding")})
 
 
 def _read_card(folder: Path, form: str) -> dict[str, Any]:

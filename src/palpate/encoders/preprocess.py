@@ -4,22 +4,30 @@ An image is turned, fitted to the encoder's shape (the center of it, or the whol
 black borders, or the whole of it squashed), and resized; for some encoders the sensor's image
 without contact is subtracted first, and an earlier frame of the video follows in three further
 channels. What results is 8-bit and may be cached. Then ``(x / 255 - mean) / std`` per channel.
+
+The images that an encoder was trained on are known by these pixels: a digest is the first eight
+bytes of their SHA-256. Names play no part, as two data sets may both have a ``0001.jpg``. 100,000
+digests take 800 kB; that any of 100,000 other images has one of them by chance has the probability
+100,000^2 / 2^64 = 5e-10.
 """
 
 from __future__ import annotations
 
+import hashlib
 import math
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import KW_ONLY, asdict, dataclass, replace
 from functools import lru_cache
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from PIL import Image
+from safetensors import SafetensorError
+from safetensors.numpy import load_file, save_file
 from torch import Tensor
 
 from palpate.core import (
@@ -31,10 +39,12 @@ from palpate.core import (
     quiet,
     read_record,
     require,
+    require_regular,
     short,
 )
 from palpate.data.images import (
     REFETCH,
+    SUFFIXES,
     cached_images,
     file_stamp,
     image_stamp,
@@ -42,9 +52,11 @@ from palpate.data.images import (
     mapped_images,
     read_image,
 )
-from palpate.data.manifest import Manifest
 
-SAVE_AGAIN = "Save the encoders again"
+if TYPE_CHECKING:
+    from palpate.data.manifest import Manifest
+
+SAVE_AGAIN, FETCH_AGAIN = "Save the encoders again", "Fetch the encoder again"
 #: What an image processor may have of these.
 CHOICES = {
     "fitting": ("crop", "pad", "squash"),
@@ -55,6 +67,10 @@ CLIP_MEAN = (0.48145466, 0.4578275, 0.40821073)
 CLIP_STD = (0.26862954, 0.26130258, 0.27577711)
 #: A square before the crop is at most so many times what the encoder sees.
 MOST_TIMES = 16
+#: Digests of images, (n,) uint64.
+Digests = NDArray[np.uint64]
+#: Their file in the folder of an encoder.
+SEEN = "seen.safetensors"
 #: What an image is prepared from: itself, the sensor's no-contact image, an earlier frame.
 Frame = tuple[Path | Image.Image, Path | None, Path | None]
 
@@ -350,3 +366,86 @@ def _side(value: Any, default: int) -> int:
     if isinstance(value, Mapping):
         value = value.get("shortest_edge", value.get("height"))
     return default if value is None else int(value)
+
+
+def list_images(inputs: Any) -> list[Path | Image.Image]:
+    """Images in any form that :meth:`Encoder.encode` takes, as a list of files and PIL images.
+
+    Raises:
+        PalpateError: for arrays of another type or shape, a missing path, or other objects.
+    """
+    if isinstance(inputs, str | Path):
+        path = Path(inputs)
+        if not path.is_dir():
+            return [path]
+        files = (p for p in path.rglob("*") if p.suffix.lower() in SUFFIXES and p.is_file())
+        return [*sorted(files)]
+    if isinstance(inputs, Image.Image):
+        return [inputs.convert("RGB")]
+    if hasattr(inputs, "shape"):
+        return [Image.fromarray(image) for image in _bytes(inputs)]
+    if isinstance(inputs, Sequence):
+        return [image for entry in inputs for image in list_images(entry)]
+    must, fix = "must be files, PIL images, arrays or tensors", "Pass e.g. a list of files"
+    raise PalpateError(must, type(inputs).__name__, fix, argument="images")
+
+
+def squares(images: Sequence[Path | Image.Image], size: int) -> NDArray[np.uint8]:
+    """Decode images to center squares (n, size, size, 3)."""
+    return load_frames(Frames.alone(images).files, Preprocess(size, size))
+
+
+def _bytes(images: Any) -> NDArray[np.uint8]:
+    """An array or tensor as uint8 (n, h, w, 3)."""
+    array = np.asarray(images.detach().cpu() if hasattr(images, "detach") else images)
+    shape = array.shape
+    array = array[None] if array.ndim == 3 else array
+    if hasattr(images, "detach") and array.ndim == 4 and array.shape[1] == 3:
+        array = array.transpose(0, 2, 3, 1)
+        if array.dtype.kind == "f" and array.size and array.min() >= 0 and array.max() <= 1:
+            array = np.rint(array * 255).astype(np.uint8)
+    rgb = array.ndim == 4 and array.shape[3] == 3 and array.dtype == np.uint8
+    must = "must be uint8 (n, h, w, 3), or a tensor (n, 3, h, w) in [0, 1]"
+    got = f"{array.dtype} of shape {shape}"
+    require(rgb, "images", must, got, fix="Scale to 0..255 and round")
+    return np.ascontiguousarray(array)
+
+
+def digest_images(images: NDArray[np.uint8]) -> Digests:
+    """Digests (n,) of images (n, h, w, c) in memory or in a mapped file, in their order."""
+    names = (hashlib.sha256(image.tobytes()).digest()[:8] for image in images)
+    return np.frombuffer(b"".join(names), np.uint64)
+
+
+def union(*sets: Digests | None) -> Digests:
+    """The sorted distinct digests of several sets; None is an empty one."""
+    return np.unique(np.concatenate([np.empty(0, np.uint64), *(s for s in sets if s is not None)]))
+
+
+def save_seen(seen: Digests | None, folder: Path) -> None:
+    """Write the digests into the folder of an encoder; None writes nothing."""
+    if seen is not None:
+        save_file({"digests": seen}, folder / SEEN)
+
+
+def load_seen(folder: Path, count: int | None) -> Digests | None:
+    """Read what :func:`save_seen` wrote.
+
+    Args:
+        folder: of the encoder.
+        count: how many there must be, by the card; None for a card without a count.
+
+    Raises:
+        PalpateError: if the file is missing, damaged, or holds another number.
+    """
+    if count is None:
+        return None
+    require_regular(folder / SEEN)
+    must = f"{folder / SEEN} must hold the digests of the {count:,} images of the training"
+    try:
+        seen = load_file(folder / SEEN)["digests"]
+    except (OSError, KeyError, SafetensorError) as error:
+        raise PalpateError(must, str(error), FETCH_AGAIN) from None
+    complete = len(seen) == count and seen.dtype == np.uint64
+    require(complete, None, must, f"{len(seen):,}", fix=FETCH_AGAIN)
+    return seen

@@ -1,4 +1,4 @@
-"""What the steps of a contrastive training read: decoded once, embedded once where frozen."""
+"""What trainings read: a part of a split; its rows, decoded once and embedded where frozen."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn.functional import affine_grid, grid_sample
 
-from palpate.core import Progress, quiet
+from palpate.core import Progress, Split, quiet, require
 from palpate.data.manifest import Manifest
 from palpate.encoders.embed import embed, texts_of
 from palpate.encoders.encoder_set import EncoderSet
@@ -19,6 +19,33 @@ from palpate.encoders.preprocess import Preprocess, prepared_images
 from palpate.encoders.presets import Augment
 from palpate.training.engine import Batch
 from palpate.training.steps import Step
+
+
+def load_split(data: Manifest | str | Path, split: Split | str | Path | None = None) -> Split:
+    """A split as it is, or from its file, or the only one that lies with the data.
+
+    Raises:
+        PalpateError: if there is none with the data, or several.
+    """
+    if split is not None:
+        return Split.load(split)
+    files = sorted(Path(data).glob("splits/*.json")) if isinstance(data, str | Path) else []
+    must, fix = "must be given unless one lies with the data", "Make one with: palpate split"
+    got = ", ".join(path.name for path in files) or "none there"
+    require(len(files) == 1, "split", must, got, fix=fix)
+    return Split.load(files[0])
+
+
+def train_part(manifest: Manifest, split: Split) -> Manifest:
+    """The train part of a split.
+
+    Raises:
+        PalpateError: if it is empty.
+    """
+    train = manifest.part(split, "train")
+    must = "The train part of the split must hold samples of this manifest"
+    require(len(train) > 0, None, must, "none", fix="Make a split with: palpate split")
+    return train
 
 
 class Rows:

@@ -19,8 +19,8 @@ from PIL import Image
 from palpate.core import FeatureSet, Score
 from palpate.data.images import cached_images
 from palpate.data.manifest import Manifest
+from palpate.diffusion.gels import gels_of
 from palpate.diffusion.generation import generate
-from palpate.diffusion.no_contact import gels_of
 from palpate.diffusion.presets import DiffusionPreset
 from palpate.studies.graph import Work
 from palpate.studies.names import BACKGROUND, BEST, GVST, OURS, SHIPPED, VQ

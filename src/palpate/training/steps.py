@@ -7,6 +7,9 @@ of one.
 
 from __future__ import annotations
 
+from collections.abc import Generator
+from contextlib import contextmanager
+
 import numpy as np
 import torch
 from numpy.typing import NDArray
@@ -46,3 +49,11 @@ class Step:
         """Integers from 0 to ``high - 1``, (rows, *shape)."""
         size = (len(self.all_rows), *shape)
         return torch.randint(0, high, size, generator=self.generator)[self.mine]
+
+
+@contextmanager
+def seeded(seed: int, purpose: str) -> Generator[None]:
+    """Seed torch's CPU generator by (seed, purpose) inside and restore it afterwards."""
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(seed_for(seed, purpose))
+        yield
