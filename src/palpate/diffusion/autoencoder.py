@@ -68,13 +68,84 @@ FIX = (
 diffusers_logging.set_verbosity(logging.ERROR)
 
 
-class Autoencoder(nn.Module):
+class _Coder(nn.Module):
+    """What both autoencoders share: bytes to latents and back in batches, and their files.
+
+    Both have ``net``, the diffusers model; ``factor``, pixels of the image that a latent position
+    covers along one side; ``channels`` of the latents; ``digest``; and ``card``, JSON facts about
+    how it was trained and how well it reconstructs.
+    """
+
+    @torch.no_grad()
+    def encode(
+        self: Any,
+        images: NDArray[np.uint8],
+        background: NDArray[np.uint8] | None = None,
+        batch: int = 32,
+    ) -> Tensor:
+        """Bytes (n, h, w, 3) -> float32 latents (n, c, h / f, w / f) on the CPU.
+
+        Args:
+            images: in memory or mapped.
+            background: their gels, of one that is given them.
+            batch: at once; changes the result by rounding only.
+
+        Raises:
+            PalpateError: if height or width is no multiple of the factor.
+        """
+        sides, factor = images.shape[1:3], self.factor
+        must, got = f"must have sides that are multiples of {factor}", f"{sides[0]} x {sides[1]}"
+        fits = not any(side % factor for side in sides)
+        require(fits, "images", must, got, fix="Resize or crop them first")
+        parts = [torch.empty(0, self.channels, *(side // factor for side in sides))]
+        for start in range(0, len(images), batch):
+            rows = slice(start, start + batch)
+            ground = None if background is None else background[rows]
+            parts.append(self.code(images[rows], ground).float().cpu())
+        return torch.cat(parts)
+
+    @torch.no_grad()
+    def decode(
+        self: Any, latents: Tensor, background: NDArray[np.uint8] | None = None, batch: int = 32
+    ) -> NDArray[np.uint8]:
+        """Latents (n, c, h, w) -> bytes (n, f h, f w, 3); see :meth:`encode`."""
+        height, width = (self.factor * side for side in latents.shape[2:])
+        parts = [np.empty((0, height, width, 3), np.uint8)]
+        for start in range(0, len(latents), batch):
+            rows = slice(start, start + batch)
+            ground = None if background is None else background[rows]
+            z = latents[rows].to(next(self.parameters()))
+            parts.append(to_bytes(self.picture(z, ground)))
+        return np.concatenate(parts)
+
+    def halve(self: Any) -> None:
+        """Round all weights to 16 bits in place; see ``models.round_to_half``."""
+        round_to_half({"autoencoder": self.net})
+
+    def save(self: Any, folder: Path, *, half: bool = False) -> None:
+        """Write the diffusers model, ``palpate.json`` and ``README.md``.
+
+        Args:
+            folder: is created.
+            half: :meth:`halve` first (this object too), and write 16-bit weights.
+
+        Raises:
+            PalpateError: if a weight is too large for 16 bits.
+        """
+        if half:
+            self.halve()
+        save_model(self.net, folder, half=half)
+        about = {"patch": self.patch} if isinstance(self, Autoencoder) else {}
+        about |= {"digest": self.digest, "card": self.card}
+        write_json(Path(folder) / "palpate.json", {"format": FORMAT, **about})
+        write_model_cards(Path(folder))
+
+
+class Autoencoder(_Coder):
     """A VQModel with an optional patch stem.
 
     Attributes:
-        net: the diffusers model.
         patch: side of the pixel patches that become channels (1: none).
-        card: JSON facts about how it was trained and how well it reconstructs.
     """
 
     def __init__(self, net: VQModel, patch: int = 1, card: dict[str, Any] | None = None) -> None:
@@ -88,7 +159,7 @@ class Autoencoder(nn.Module):
 
     @property
     def factor(self) -> int:
-        """Pixels of the image that a latent position covers, along one side."""
+        """That of the stem times that of the network's levels."""
         return self.patch * 2 ** (len(self.net.config["block_out_channels"]) - 1)
 
     @property
@@ -119,63 +190,13 @@ class Autoencoder(nn.Module):
         patches, loss = decode(latents, force_not_quantize=not quantize, return_dict=False)
         return pixel_shuffle(patches, self.patch), loss
 
-    @torch.no_grad()
-    def encode(
-        self,
-        images: NDArray[np.uint8],
-        background: NDArray[np.uint8] | None = None,
-        batch: int = 32,
-    ) -> Tensor:
-        """Encode bytes (n, h, w, 3) to float32 unquantized latents on the CPU.
+    def code(self, images: NDArray[np.uint8], background: NDArray[np.uint8] | None) -> Tensor:
+        """Unquantized latents; the gels are not read."""
+        return self.latents(to_unit(images, next(self.parameters()).device, signed=True))
 
-        ``background``, the gels, is not read.
-
-        Raises:
-            PalpateError: if height or width is no multiple of the factor.
-        """
-        height, width = images.shape[1:3]
-        fits = height % self.factor == width % self.factor == 0
-        must, got = f"must have sides that are multiples of {self.factor}", f"{height} x {width}"
-        require(fits, "images", must, got, fix="Resize or crop them first")
-        device = next(self.parameters()).device
-        parts = [torch.empty(0, self.channels, height // self.factor, width // self.factor)]
-        for start in range(0, len(images), batch):
-            unit = to_unit(images[start : start + batch], signed=True).to(device)
-            parts.append(self.latents(unit).float().cpu())
-        return torch.cat(parts)
-
-    @torch.no_grad()
-    def decode(
-        self, latents: Tensor, background: NDArray[np.uint8] | None = None, batch: int = 32
-    ) -> NDArray[np.uint8]:
-        """Latents (n, c, h, w), quantized first -> bytes (n, f h, f w, 3); see :meth:`encode`."""
-        device = next(self.parameters()).device
-        height, width = (self.factor * side for side in latents.shape[2:])
-        parts = [np.empty((0, height, width, 3), np.uint8)]
-        for start in range(0, len(latents), batch):
-            parts.append(to_bytes(self.image(latents[start : start + batch].to(device))[0]))
-        return np.concatenate(parts)
-
-    def halve(self) -> None:
-        """Round all weights to 16 bits in place; see ``models.round_to_half``."""
-        round_to_half({"net": self.net})
-
-    def save(self, folder: Path, *, half: bool = False) -> None:
-        """Write the diffusers model, ``palpate.json`` and ``README.md``.
-
-        Args:
-            folder: is created.
-            half: :meth:`halve` first (this object too), and write 16-bit weights.
-
-        Raises:
-            PalpateError: if a weight is too large for 16 bits.
-        """
-        if half:
-            self.halve()
-        save_model(self.net, folder, half=half)
-        about = {"format": FORMAT, "patch": self.patch, "digest": self.digest, "card": self.card}
-        write_json(Path(folder) / "palpate.json", about)
-        write_model_cards(Path(folder))
+    def picture(self, latents: Tensor, background: NDArray[np.uint8] | None) -> Tensor:
+        """The image of latents, quantized first."""
+        return self.image(latents)[0]
 
 
 def _foreign(name: str, source: Any, terms: str) -> dict[str, Any]:
@@ -202,7 +223,7 @@ class _Residual(nn.Module):
         return x + self.last(silu(self.first(silu(x))))
 
 
-class BackgroundAutoencoder(ModelMixin, ConfigMixin):
+class BackgroundAutoencoder(_Coder, ModelMixin, ConfigMixin):
     """Codes the difference between a tactile image x and its gel without contact, b.
 
         z = E(x - b, b);   x_hat = b + D(z, b)
@@ -216,8 +237,6 @@ class BackgroundAutoencoder(ModelMixin, ConfigMixin):
     term, no normalization layer and no attention; sides may be any multiple of 4.
 
     Attributes:
-        factor: pixels of the image that a latent position covers, along one side.
-        card: JSON facts about how it was trained and how well it reconstructs.
         spread: standard deviation of each color of x - b over the training part (3, 1, 1).
         mean, std: of each color of b over the gels (3, 1, 1).
     """
@@ -263,6 +282,11 @@ class BackgroundAutoencoder(ModelMixin, ConfigMixin):
             self.register_buffer(name, torch.full((3, 1, 1), fill))
 
     @property
+    def net(self) -> BackgroundAutoencoder:
+        """Itself: it is a diffusers model."""
+        return self
+
+    @property
     def channels(self) -> int:
         """Channels of the latents."""
         return int(self.config["channels"])
@@ -292,36 +316,18 @@ class BackgroundAutoencoder(ModelMixin, ConfigMixin):
         coarse = self.decode_coarse(self.decode_in(latents) + self.background_coarse(fine))
         return self.decode_fine(self.mix(torch.cat([coarse, fine], 1)))
 
-    @torch.no_grad()
-    def encode(
-        self, images: NDArray[np.uint8], background: NDArray[np.uint8] | None, batch: int = 32
-    ) -> Tensor:
-        """Encode bytes (n, h, w, 3) and their gels, needed, to float32 latents on the CPU."""
+    def code(self, images: NDArray[np.uint8], background: NDArray[np.uint8] | None) -> Tensor:
+        """Latents of images and their gels, which are needed."""
         assert background is not None
-        parts = [
-            torch.empty(0, self.channels, *(side // self.factor for side in images.shape[1:3]))
-        ]
-        for start in range(0, len(images), batch):
-            rows = slice(start, start + batch)
-            pairs = self.inputs(*(_gray(a[rows], self.device) for a in (images, background)))
-            parts.append(self.latents(*pairs).float().cpu())
-        return torch.cat(parts)
+        return self.latents(*self.inputs(*(_gray(a, self.device) for a in (images, background))))
 
-    @torch.no_grad()
-    def decode(
-        self, latents: Tensor, background: NDArray[np.uint8] | None, batch: int = 32
-    ) -> NDArray[np.uint8]:
-        """Latents (n, c, h, w) on gels (n, f h, f w, 3), needed -> bytes (n, f h, f w, 3)."""
+    def picture(self, latents: Tensor, background: NDArray[np.uint8] | None) -> Tensor:
+        """The image of latents on gels, which are needed."""
         assert background is not None
-        parts = [np.empty((0, *background.shape[1:]), np.uint8)]
-        for start in range(0, len(latents), batch):
-            gray = _gray(background[start : start + batch], self.device)
-            residual = self.residual(
-                latents[start : start + batch].to(gray), self.inputs(gray, gray)[1]
-            )
-            back = torch.einsum("ij,nihw->njhw", self.colors, residual.float() * self.spread)
-            parts.append(to_bytes((gray + back) / 127.5 - 1))
-        return np.concatenate(parts)
+        gray = _gray(background, self.device)
+        residual = self.residual(latents, self.inputs(gray, gray)[1])
+        back = torch.einsum("ij,nihw->njhw", self.colors, residual.float() * self.spread)
+        return (gray + back) / 127.5 - 1
 
     @torch.no_grad()
     def gel(self, background: NDArray[np.uint8]) -> Tensor:
@@ -332,19 +338,6 @@ class BackgroundAutoencoder(ModelMixin, ConfigMixin):
         """
         gray = _gray(background, self.device)
         return pixel_unshuffle(self.inputs(gray, gray)[1], self.factor).cpu()
-
-    def halve(self) -> None:
-        """Round all weights to 16 bits in place; see ``models.round_to_half``."""
-        round_to_half({"autoencoder": self})
-
-    def save(self, folder: Path, *, half: bool = False) -> None:
-        """Write the model in diffusers' format, ``palpate.json`` and ``README.md``."""
-        if half:
-            self.halve()
-        save_model(self, folder, half=half)
-        about = {"format": FORMAT, "digest": self.digest, "card": self.card}
-        write_json(Path(folder) / "palpate.json", about)
-        write_model_cards(Path(folder))
 
     @torch.no_grad()
     def measure(self, images: NDArray[np.uint8], background: NDArray[np.uint8]) -> None:

@@ -161,14 +161,11 @@ class _Run:
         self, module: nn.Module, task: Task, options: LoopOptions, folder: Path, compute: Compute
     ) -> None:
         self.part = place()
-        batch = _require(task, options, self.part[1])
+        batch = _require_batch(task, options, self.part[1])
         self.module, self.task, self.options = module, task, options
         self.folder, self.compute = folder, compute
         self.parameters = {k: p for k, p in module.named_parameters() if p.requires_grad}
-        must, fix = (
-            f"{task.name} needs parameters that require gradients",
-            "Do not freeze all of it",
-        )
+        must, fix = f"{task.name} needs parameters that require gradients", "Freeze less of it"
         require(bool(self.parameters), None, must, "none", fix=fix)
         self.device = next(iter(self.parameters.values())).device
         self.dtype = DTYPES.get(compute.precision)
@@ -204,7 +201,8 @@ class _Run:
         self.reader, self.writer = ThreadPoolExecutor(1), ThreadPoolExecutor(1)
         self.written: Future[None] | None = None
         self.trackers: list[Any] = []
-        self.unchecked: list[_Values] = []
+        #: Step, names, values, gradient's norm and rows of steps, still on the device.
+        self.unchecked: list[tuple[int, tuple[str, ...], Tensor, Tensor, Tensor | None]] = []
 
     # --- the steps -----------------------------------------------------------------------------
 
@@ -285,7 +283,7 @@ class _Run:
                     list(self.average.values()), list(self.parameters.values()), 1 - d
                 )
         rows = None if losses.rows is None else losses.rows.detach()
-        self.unchecked.append(_Values(self.step, tuple(losses.logs), values, norm.detach(), rows))
+        self.unchecked.append((self.step, tuple(losses.logs), values, norm.detach(), rows))
         self.step += 1
 
     def check(self) -> dict[str, float]:
@@ -476,10 +474,7 @@ class _Run:
             steps = torch.tensor([float(self.step)] * 2, device=self.device)
             average([steps[:1]])
             must = f"All processes must read the same checkpoint {path}"
-            got, fix = (
-                f"step {self.step} in one of them",
-                "Put it on a disk that all machines share",
-            )
+            got, fix = f"step {self.step} in one of them", "Put it on a disk that all share"
             require(bool(steps[0] == steps[1]), None, must, got, fix=fix)
         return self.step
 
@@ -507,17 +502,7 @@ class _Run:
                 self.optimizer.state[p] = state | {"step": state["step"].to(counter)}
 
 
-class _Values(NamedTuple):
-    """What a step gave, still on the device."""
-
-    step: int
-    names: tuple[str, ...]
-    values: Tensor
-    norm: Tensor
-    rows: Tensor | None
-
-
-def _require(task: Task, options: LoopOptions, processes: int) -> int:
+def _require_batch(task: Task, options: LoopOptions, processes: int) -> int:
     """Check that there are rows, and that processes share a batch equally; return its size."""
     fix = "Check the split: is its train part empty?"
     require(task.n >= 1, None, f"{task.name} needs at least one sample", "none", fix=fix)
