@@ -329,17 +329,10 @@ def test_scores_of_methods_are_compared_too(study, downloads, results, tmp_path)
 
 
 def test_votes_of_the_server_count_as_downloads_do(plan, study, downloads, results):
-    database = study / "study.db"
-    with sqlite3.connect(database) as disk:
-        disk.execute("CREATE TABLE study (name)")
-        disk.execute("CREATE TABLE votes (rater, trial, choice, ms, at, undone, received)")
-        disk.execute("INSERT INTO study VALUES (?)", (plan.study,))
-        for path in downloads.iterdir():
-            file = json.loads(path.read_text())
-            names = ("trial", "choice", "ms", "at", "undone")
-            rows = [[file["rater"], *(v[n] for n in names), ""] for v in file["votes"]]
-            disk.executemany("INSERT INTO votes VALUES (?, ?, ?, ?, ?, ?, ?)", rows)
-    disk.close()
+    database, files = study / "study.db", [json.loads(p.read_text()) for p in downloads.iterdir()]
+    names = ("trial", "choice", "ms", "at", "undone")
+    rows = [[f["rater"], *(v[n] for n in names), ""] for f in files for v in f["votes"]]
+    write_database(database, plan, rows)
     try:
         served = preference.score(study)
         both = preference.score(study, downloads)

@@ -10,6 +10,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
+import torch
 from PIL import Image
 
 from palpate.cli import main
@@ -23,6 +24,7 @@ from palpate.report.results import Results
 from palpate.sim import MINI_SEEDS, write_world
 from palpate.studies.demo import PRESETS, Demo
 from palpate.studies.files import require_unseen
+from palpate.studies.graph import digests_of, plan_graph
 from palpate.studies.reproduce import run_study
 from palpate.studies.verifying import verify
 
@@ -60,7 +62,8 @@ def outcome(run: Path) -> tuple[object, dict[str, bytes]]:
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory) -> Path:
     run = tmp_path_factory.mktemp("whole") / "run"
-    demo(run)
+    torch.set_num_threads(1)  # as in the processes of their own
+    assert main(["demo", "--preset", "tiny", "-o", str(run), "-q"]) == 0
     return run
 
 
@@ -112,39 +115,20 @@ def test_a_killed_demo_resumes_from_its_last_finished_stage(whole, tmp_path, sta
     assert outcome(run) == outcome(whole)
 
 
-@pytest.mark.nightly
-def test_a_demo_killed_between_the_last_file_of_a_stage_and_its_mark_resumes(whole, tmp_path):
-    run = shutil.copytree(whole, tmp_path / "run")
-    for name in STAGES:  # as each stage was just before it was marked as finished
-        record = json.loads((run / name / "stage.json").read_text())
-        inputs = {key: record[key] for key in ("digest", "inputs", "read")}
-        (run / f"{name}.partial.json").write_text(json.dumps(inputs))
-        (run / name / "stage.json").unlink()
-        (run / name).rename(run / f"{name}.partial")
-    demo(run)
-    assert not list(run.glob("*.partial"))
-    assert outcome(run) == outcome(whole)
+def finished(run: Path, **changes: object) -> set[str]:
+    """The stages of a run that are done for a demo of other options."""
+    return {
+        name for name, done in plan_graph(replace(DEMO, **changes).nodes(), run).items() if done
+    }
 
 
-@pytest.mark.nightly
-def test_a_finished_demo_runs_nothing_again_and_another_seed_does(whole, tmp_path):
-    run = shutil.copytree(whole, tmp_path / "run")
-    assert reused(demo(run)) == {*STAGES}
-    lines = demo(run, "--seed", "1", kill_at="encoders")
-    assert "split: ..." in lines
-    assert "world" in reused(lines)
-
-
-@pytest.mark.nightly
-def test_images_that_change_in_place_rebuild_everything_that_read_them(tmp_path):
-    data, run = tmp_path / "data", tmp_path / "run"
-    assert main(["world", "-o", str(data), "--preset", "tiny", "--seed", "5", "-q"]) == 0
-    demo(run, "--data", str(data))
-    for path in data.rglob("*.jpg"):
-        with Image.open(path) as image:
-            turned = image.rotate(180)
-        turned.save(path)
-    assert reused(demo(run, "--data", str(data))) <= {"split"}
+def test_another_seed_keeps_the_data_and_images_that_change_in_place_nothing(whole, tmp_path):
+    assert finished(whole, seed=1) == {"world", "data"}
+    write_world(tmp_path / "data", PRESETS["tiny"].world)
+    nodes = replace(DEMO, data=tmp_path / "data").nodes
+    before, path = digests_of(nodes()), next((tmp_path / "data").rglob("*.jpg"))
+    path.write_bytes(path.read_bytes())
+    assert not {*before.items()} & {*digests_of(nodes()).items()}
 
 
 def test_an_encoder_and_a_generator_of_another_split_are_noted(whole, tmp_path, monkeypatch):
@@ -204,35 +188,28 @@ def test_no_preset_uses_a_world_that_the_shipped_models_saw():
     assert not {p.world.seed for p in PRESETS.values()} & {*MINI_SEEDS}
 
 
-def test_training_goes_on_from_the_shipped_models(tmp_path, monkeypatch):
-    shutil.copytree(models.shipped_root(), tmp_path / "models")
-    monkeypatch.setattr(models, "shipped_root", lambda: tmp_path / "models")
-    demo = run_study(DEMO, tmp_path / "run")
+def test_training_goes_on_from_the_shipped_models(whole, tmp_path, monkeypatch):
+    demo = Results.load(whole / "results.json")
     assert [*demo.settings["stages"]] == STAGES
-    encoders = EncoderSet.load(tmp_path / "run" / "encoders" / "encoders")
-    model = TactilePipeline.from_pretrained(tmp_path / "run" / "generator" / "model")
-    ready, shipped = (
-        EncoderSet.load("palpate/mini"),
-        TactilePipeline.from_pretrained("palpate/mini"),
-    )
+    encoders = EncoderSet.load(whole / "encoders" / "encoders")
+    model = TactilePipeline.from_pretrained(whole / "generator" / "model")
+    ready = EncoderSet.load("palpate/mini")
+    shipped = TactilePipeline.from_pretrained("palpate/mini")
     assert encoders.digest("vision") == ready.digest("vision")
     assert encoders.digest("tactile") != ready.digest("tactile")
     assert (model.training["start"], model.stats) == (shipped.digest, shipped.stats)
     assert {s.encoder for s in demo.scores if s.metric == "TMMD"} == {encoders.digest("tactile")}
     notes = {note.code: note.params for note in demo.notes}
     assert notes["models-shipped"]["name"] == "palpate/mini"
-    lines: list[str] = []
-    run_study(DEMO, tmp_path / "run", print_line=lines.append)
-    assert all("already done" in line for line in lines)
     # Other words change nothing; another license changes everything that carries the card.
+    shutil.copytree(models.shipped_root(), tmp_path / "models")
+    monkeypatch.setattr(models, "shipped_root", lambda: tmp_path / "models")
     file = shipped_folder("palpate/mini", "clip") / "palpate.json"
     record = json.loads(file.read_text())
     for key, stages in {"summary": {*STAGES}, "license": {"world", "data", "split"}}.items():
         record["card"][key] = "other"
         file.write_text(json.dumps(record))
-        lines.clear()
-        run_study(DEMO, tmp_path / "run", print_line=lines.append)
-        assert {line.split(":")[0] for line in lines if "already done" in line} == stages
+        assert finished(whole) == stages
 
 
 def test_a_world_that_the_shipped_models_saw_is_an_error(tmp_path):

@@ -36,13 +36,11 @@ from palpate.studies.names import (
     slug,
 )
 from palpate.studies.reproduce import Plan
-from palpate.studies.study import STUDIES, Study
+from palpate.studies.study import STUDIES
 from palpate.studies.study_tables import Scores, study_tables
 from palpate.studies.verifying import verify
 
 WORLD = STUDIES["world-gelsight"]
-
-
 TRAINED = [m for m in METHODS.values() if m.make is None]
 
 
@@ -89,7 +87,7 @@ def test_nodes_train_once_for_each_split_and_seed():
     assert judged.options["study"].name["controls"] == [*CONTROLS]
 
 
-def test_another_seed_leaves_the_nodes_of_the_first(tmp_path):
+def test_another_seed_leaves_the_nodes_of_the_first():
     one, two = (
         {n.name: (n.options, n.after, n.version) for n in Plan(WORLD, seeds=seeds).nodes()}
         for seeds in ((0,), (0, 1))
@@ -166,31 +164,28 @@ def test_the_size_of_the_paper_takes_its_autoencoder(tmp_path):
         assert made[preset]["autoencoder-vq-NoLeak"].options["options"].name == digest_file(file)
         assert made[preset]["ours-vq-NoLeak-0"].options["training"].diffusion.loop.steps == 400
     assert made["paper"].keys() == made["mini"].keys()
+    assert "world" not in made["mini"]
 
 
 def closed(by):
     return lambda setting: by
 
 
-def made_by(make):
+def nodes_of(make):
+    """The nodes of a study with a method of one's own."""
     study = replace(WORLD, name="mine", methods=[METHODS[OURS], Method("mine", "", make=make)])
-    return digests(study)["images-mine-NoLeak-0"]
+    return {n.name: n for n in Plan(study, preset="smoke").nodes()}
 
 
 @pytest.mark.parametrize("make", [closed(1), len, partial(controls.mean_image, by=1)])
-def test_a_function_without_source_or_with_values_of_another_is_refused(make):
-    assert made_by(controls.mean_image) != made_by(controls.one_image)
+def test_a_method_of_your_own_is_a_function_of_a_file_and_trains_nothing(make):
+    one, two = nodes_of(controls.mean_image), nodes_of(controls.one_image)
+    each = [digests_of([*nodes.values()])["images-mine-NoLeak-0"] for nodes in (one, two)]
+    assert each[0] != each[1]
+    assert "mine-NoLeak-0" not in one
+    assert "mine" in one["scores-NoLeak-by-NoLeak-0"].options["methods"]
     with pytest.raises(PalpateError, match="must be a function of a file"):
-        made_by(make)
-
-
-def test_a_method_of_your_own_trains_nothing():
-    mine = Method("mine", "", make=controls.mean_image)
-    study = replace(WORLD, name="mine", methods=[METHODS[OURS], mine])
-    nodes = {n.name: n for n in Plan(study, preset="smoke").nodes()}
-    assert "images-mine-NoLeak-0" in nodes
-    assert "mine-NoLeak-0" not in nodes
-    assert "mine" in nodes["scores-NoLeak-by-NoLeak-0"].options["methods"]
+        nodes_of(make)
 
 
 def test_a_dry_run_writes_nothing(tmp_path, capsys):
@@ -228,12 +223,6 @@ def test_mistakes_are_reported_in_one_line(args, words, capsys, tmp_path, monkey
     Results("t", scores=[Score("TMMD", "Ours", 0.1)]).save(tmp_path / "s.json")
     mistake(capsys, words, "reproduce", *args, "-o", "r")
     assert not (tmp_path / "r").exists()
-
-
-def test_a_study_on_disk_makes_no_world(small_manifest, tmp_path):
-    small_manifest.save(tmp_path / "data" / "manifest.parquet")
-    nodes = Plan(Study("mine", "Mine", (1, 3, 4)), root=tmp_path / "data").nodes()
-    assert (nodes[0].name, "world" in {n.name for n in nodes}) == ("data", False)
 
 
 @pytest.fixture

@@ -2,6 +2,7 @@
 
 import json
 import os
+import shlex
 import signal
 import subprocess
 import sys
@@ -45,18 +46,7 @@ def data(tmp_path):
     return manifest
 
 
-ARGS = [
-    "tag",
-    "--splits",
-    "orig.json",
-    "noleak.json",
-    "--train",
-    "--preset",
-    "tiny",
-    "--seeds",
-    "0",
-    "1",
-]
+ARGS = shlex.split("tag --splits orig.json noleak.json --train --preset tiny --seeds 0 1")
 
 
 @pytest.mark.slow

@@ -199,7 +199,7 @@ def test_k_is_what_every_tested_class_has_without_its_fold():
 
 def test_mistakes_are_named():
     with pytest.raises(PalpateError, match="'test' must have materials"):
-        material_utility(TRAIN, replace(TEST, labels=None), {})
+        material_utility(TRAIN, replace(TEST, labels=None), {}, FEW)
 
 
 def test_an_encoder_that_saw_test_videos_is_rejected(tmp_path):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import threading
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -9,12 +10,13 @@ from pathlib import Path
 from queue import Empty, SimpleQueue
 from typing import TYPE_CHECKING, TypeVar
 
-from palpate.captions.photos import prepared
+from PIL import Image
+
 from palpate.captions.prompts import Description, Prompt
-from palpate.captions.replies import Question, RejectedError, Reply, ReplyLog
+from palpate.captions.replies import QUALITY, SIDE, Question, RejectedError, Reply, ReplyLog
 from palpate.captions.units import Units
 from palpate.core import PalpateError, Problem, Progress, require
-from palpate.data.images import file_digest, in_threads
+from palpate.data.images import file_digest, in_threads, read_image
 from palpate.data.manifest import Manifest
 
 if TYPE_CHECKING:
@@ -27,6 +29,9 @@ AGAIN_TEMPERATURE = 0.5
 PROBES = 16
 #: Seconds after which Ctrl-C is noticed: once polars has run, it interrupts no waiting.
 CTRL_C = 0.2
+# One photo at a time: a photo is read in many small steps, and threads that take turns after each
+# of them need half as much time again.
+_READING = threading.Lock()
 T = TypeVar("T")
 R = TypeVar("R")
 
@@ -60,6 +65,20 @@ def photos_of(
         sample = "" if row is None else ids[row]
         photos.append(Photo(sample, path, None if digest is None else question.key(digest)))
     return photos
+
+
+def prepared(path: Path) -> bytes:
+    """The file that is sent for a photo: a JPEG without metadata.
+
+    Raises:
+        PalpateError: if the photo is missing, truncated or none.
+    """
+    data = io.BytesIO()
+    with _READING:
+        photo = read_image(path)
+        photo.thumbnail((SIDE, SIDE), Image.Resampling.LANCZOS)
+        photo.save(data, "JPEG", quality=QUALITY, exif=b"", icc_profile=None)
+    return data.getvalue()
 
 
 def pending(photos: Sequence[Photo], log: ReplyLog) -> list[Photo]:

@@ -23,9 +23,11 @@ from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import Any, BinaryIO
 
-from palpate.captions.photos import QUALITY, SIDE
 from palpate.captions.prompts import Description, Prompt
 from palpate.core import PalpateError, digest_json
+
+#: Photos are sent at most so many pixels a side, as JPEG of this quality.
+SIDE, QUALITY = 768, 90
 
 
 @dataclass(frozen=True)

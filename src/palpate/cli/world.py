@@ -8,7 +8,7 @@ from typing import Any, Literal
 
 from palpate.cli.settings import PresetTable, Settings
 from palpate.cli.terminal import Common, OutPath, Terminal, option_name
-from palpate.sim import DEFAULT, PRESETS, SEEN_WARNING, WorldOptions, seen_by_mini, write_world
+from palpate.sim import DEFAULT, MINI_SEEDS, PRESETS, SEEN_WARNING, WorldOptions, write_world
 
 #: Fields of a preset that are options of their own.
 FIELDS = (
@@ -54,7 +54,7 @@ class Options(Common):
 def run(options: Options, terminal: Terminal) -> dict[str, Any]:
     """Write the world and print what it holds."""
     world = world_options(options)
-    seen = {"seen_by_shipped_models": SEEN_WARNING} if seen_by_mini(world) else {}
+    seen = {"seen_by_shipped_models": SEEN_WARNING} if world.seed in MINI_SEEDS else {}
     if seen:
         terminal.print_line(f"Seed {world.seed}: {SEEN_WARNING}")
     with terminal.progress() as progress:

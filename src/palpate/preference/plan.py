@@ -23,7 +23,6 @@ from palpate.core import (
     plain,
     read_record,
     reading_entry,
-    require,
     short,
 )
 from palpate.core.records import from_plain
@@ -252,14 +251,3 @@ def last_day(until: str | None) -> str | None:
     except ValueError:
         must, example = "must be a date", {"until": "2030-12-31"}
         raise PalpateError(must, repr(until), "", argument="until", example=example) from None
-
-
-def require_rater(plan: Plan, code: str) -> None:
-    """Check that a study has a rater.
-
-    Raises:
-        PalpateError: if it has not.
-    """
-    codes = [rater.code for rater in plan.raters]
-    must = f"A rater of study {plan.study} must be one of {codes[0]} to {codes[-1]}"
-    require(code in codes, None, must, repr(code), fix="Check the code")

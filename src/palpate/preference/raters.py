@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -68,24 +68,21 @@ def _facts(plan: Plan, code: str, votes: Mapping[str, Vote]) -> RaterFacts:
     ]
     sides = [v.choice for v in votes.values() if v.trial.right and v.trial.kind != "catch"]
     left, right = sides.count("left"), sides.count("right")
-    finished = len(votes) / len(plan.trials)
-    catches = float(np.mean(caught)) if caught else None
-    one_side = max(left, right) / max(1, left + right)
-    broken = {
-        "finished": finished < plan.rule.finished,
-        "catches": catches is not None and catches < plan.rule.catches,
-        "side": left + right >= FEWEST_SIDES and one_side > plan.rule.side,
-    }
-    return RaterFacts(
+    facts = RaterFacts(
         code=code,
         votes=len(votes),
-        finished=finished,
-        catches=catches,
+        finished=len(votes) / len(plan.trials),
+        catches=float(np.mean(caught)) if caught else None,
         repeats=len(again),
         consistent=sum(again),
         left=left,
         right=right,
         seconds=float(np.median([vote.ms for vote in votes.values()])) / 1000,
         undone=sum(vote.undone for vote in votes.values()),
-        excluded=next((name for name, fails in broken.items() if fails), ""),
     )
+    broken = {
+        "finished": facts.finished < plan.rule.finished,
+        "catches": facts.catches is not None and facts.catches < plan.rule.catches,
+        "side": left + right >= FEWEST_SIDES and facts.side > plan.rule.side,
+    }
+    return replace(facts, excluded=next((name for name, fails in broken.items() if fails), ""))

@@ -100,9 +100,10 @@ def score(
         require(not metrics, "metrics", "must be left out where people sort", metrics)
         scores = accuracy_scores(arrays)
     else:
-        settings["comparisons"] = comparisons(arrays)
+        shares = shares_of(arrays)
+        settings["comparisons"] = comparisons(arrays, shares)
         compared = [*shown_metrics(plan, progress), *metrics_of_files(plan, metrics)]
-        scores = [*preference_scores(arrays), *strength_scores(arrays)]
+        scores = [*preference_scores(arrays, shares), *strength_scores(arrays)]
         scores += agreement_scores(compared, arrays, progress)
     return Results(
         title="Human preference" if plan.task == "pair" else "Materials sorted by people",
@@ -166,23 +167,31 @@ def agreement_of(arrays: VoteArrays, raters: Sequence[RaterFacts]) -> dict[str, 
     )
 
 
-def comparisons(arrays: VoteArrays) -> list[dict[str, Any]]:
-    """Every comparison: votes, and the share of the first method with its interval."""
+def shares_of(arrays: VoteArrays) -> list[Score]:
+    """The share of the first method in every comparison."""
     shares, replicates = preferences(arrays.counts), preferences(arrays.replicated)
+    votes = arrays.counts.sum(axis=1)
+    return [
+        arrays.score(PREFERENCE, a, shares[c], replicates[:, c], votes[c], items=arrays.answered(c))
+        for c, (a, _) in enumerate(arrays.columns)
+    ]
+
+
+def comparisons(arrays: VoteArrays, shares: Sequence[Score]) -> list[dict[str, Any]]:
+    """Every comparison: votes, and the share of the first method with its interval."""
     rows: list[dict[str, Any]] = []
-    for c, (a, b) in enumerate(arrays.columns):
-        wins, ties, losses = (int(n) for n in arrays.counts[c])
+    for share, (a, b), votes in zip(shares, arrays.columns, arrays.counts, strict=True):
+        wins, ties, losses = map(int, votes)
         row = {"a": a, "b": b, "votes_a": wins, "ties": ties, "votes_b": losses}
-        interval, _, _ = arrays.interval(shares[c], replicates[:, c], arrays.answered(c))
-        rows.append(row | {"share": shares[c], "interval": interval})
+        rows.append(row | {"share": share.value, "interval": share.interval})
     return rows
 
 
-def preference_scores(arrays: VoteArrays) -> list[Score]:
+def preference_scores(arrays: VoteArrays, shares: Sequence[Score]) -> list[Score]:
     """The preference of each method, and the differences of all comparisons."""
     methods, votes = arrays.plan.methods, arrays.counts.sum(axis=1)
-    shares, replicates = preferences(arrays.counts), preferences(arrays.replicated)
-    means = method_preferences(shares, arrays.pairs, len(methods))
+    replicates = preferences(arrays.replicated)
+    means = method_preferences(preferences(arrays.counts), arrays.pairs, len(methods))
     spread = method_preferences(replicates, arrays.pairs, len(methods))
     scores: list[Score] = []
     for k, name in enumerate(methods):
@@ -190,17 +199,14 @@ def preference_scores(arrays: VoteArrays) -> list[Score]:
         items, n = arrays.answered(*own), sum(votes[own])
         scores.append(arrays.score(PREFERENCE, name, means[k], spread[:, k], n, items=items))
     differences: list[Score] = []
-    for c, (a, b) in enumerate(arrays.columns):
-        items = arrays.answered(c)
-        share = arrays.score(PREFERENCE, a, shares[c], replicates[:, c], votes[c], items=items)
-        net = 2 * replicates[:, c] - 1
+    for c, (share, pair) in enumerate(zip(shares, arrays.columns, strict=True)):
         difference = share
         if share.value is not None:
             low, high = share.interval or (np.nan, np.nan)
             interval = (2 * low - 1, 2 * high - 1)  # NaN is none
             difference = replace(share, value=2 * share.value - 1, interval=interval)
-        verdict = _verdict(difference, (a, b), net, items)
-        differences.append(replace(difference, kind="difference", b=b, details=verdict))
+        verdict = _verdict(difference, pair, 2 * replicates[:, c] - 1, arrays.answered(c))
+        differences.append(replace(difference, kind="difference", b=pair[1], details=verdict))
     return [*scores, *holm(differences)]
 
 

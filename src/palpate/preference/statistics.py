@@ -48,7 +48,7 @@ REPLICATES = 1000
 #: Standard deviation of the prior of strengths, in logits.
 PRIOR = 3.0
 #: What the expected width assumes, in logits; gives the first method a preference of about 0.7.
-ASSUMED = {"mean": 1.2, "item_sd": 1.5, "rater_sd": 0.7, "tie_band": 0.5}
+SIMULATED, ASSUMED = 100, {"mean": 1.2, "item_sd": 1.5, "rater_sd": 0.7, "tie_band": 0.5}
 
 
 @dataclass(frozen=True)
@@ -75,12 +75,12 @@ def _resampled(n: int, rng: np.random.Generator, count: int) -> Array:
     return rng.multinomial(n, np.full(n, 1 / n), size=count).astype(np.float64)
 
 
-def percentiles(replicates: Array, level: float = 0.95) -> Interval | None:
-    """The central interval of replicates; None if they do not vary or fewer than half are known."""
+def percentiles(replicates: Array) -> Interval | None:
+    """The central 95 % of replicates; None if they do not vary or fewer than half are known."""
     finite = replicates[np.isfinite(replicates)]
     if 2 * len(finite) < len(replicates) or np.ptp(finite) < 1e-12:
         return None
-    low, high = np.quantile(finite, [(1 - level) / 2, (1 + level) / 2])
+    low, high = np.quantile(finite, [0.025, 0.975])
     return float(low), float(high)
 
 
@@ -247,34 +247,20 @@ def tau_b(x: Array, y: Array, weights: Array, *, mirrored: bool = False) -> floa
     return both / np.sqrt(of_x * of_y) if of_x * of_y > 0 else float("nan")
 
 
-def simulated_votes(
-    items: int,
-    raters: int,
-    rng: np.random.Generator,
-    *,
-    mean: float,
-    item_sd: float,
-    rater_sd: float,
-    tie_band: float,
-) -> Array:
-    """Votes (R, 1, N) of logits that vary between items and raters; small differences are ties."""
-    logit = (
-        mean + item_sd * rng.standard_normal(items) + rater_sd * rng.standard_normal((raters, 1))
-    )
-    felt = logit + rng.logistic(size=(raters, items))
-    return np.where(np.abs(felt) < tie_band, 0.0, np.sign(felt))[:, None]
+def expected_half_width(items: int, raters: int) -> float:
+    """Mean half-width of the interval of a preference in ``SIMULATED`` studies as ``ASSUMED``.
 
-
-def expected_half_width(items: int, raters: int, seed: int = 0, studies: int = 100) -> float:
-    """Mean half-width of the interval of a preference in studies simulated as ``ASSUMED``.
-
-    Studies without an interval are left out; NaN if they are more than half.
+    Logits vary between items and raters; small differences are ties. Studies without an interval
+    are left out; NaN if they are more than half.
     """
-    rng = np.random.default_rng(seed)
+    rng, a = np.random.default_rng(0), ASSUMED
     widths: list[float] = []
-    for _ in range(studies):
-        votes = simulated_votes(items, raters, rng, **ASSUMED)
+    for _ in range(SIMULATED):
+        logit = a["mean"] + a["item_sd"] * rng.standard_normal(items)
+        logit = logit + a["rater_sd"] * rng.standard_normal((raters, 1))
+        felt = logit + rng.logistic(size=(raters, items))
+        votes = np.where(np.abs(felt) < a["tie_band"], 0.0, np.sign(felt))[:, None]
         weights = Weights.draw(raters, items, rng, 300)
         interval = percentiles(preferences(outcome_counts(votes, weights))[:, 0])
         widths += [(interval[1] - interval[0]) / 2] if interval else []
-    return float(np.mean(widths)) if 2 * len(widths) >= studies else float("nan")
+    return float(np.mean(widths)) if 2 * len(widths) >= SIMULATED else float("nan")

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from palpate.core import Note, PalpateError, digest_json, read_record, require
-from palpate.preference.plan import PLAN, SAME, Plan, Trial, require_rater
+from palpate.preference.plan import PLAN, SAME, Plan, Trial
 from palpate.preference.store import VoteStore, require_study
 
 FORMAT = "palpate/preference-votes@1"
@@ -114,7 +114,6 @@ def _of_download(plan: Plan, path: Path) -> list[Vote]:
     require_study(path, plan.study, record["study"])
     must, got = f"The digest in {path} must match its votes", "edited votes, or a part of them"
     require(record.get("digest") == digest_json(rest), None, must, got, fix=AGAIN)
-    require_rater(plan, record["rater"])
     rows = record["votes"] if isinstance(record["votes"], list) else [None]
     return _checked(plan, record["rater"], rows, path)
 
@@ -122,8 +121,6 @@ def _of_download(plan: Plan, path: Path) -> list[Vote]:
 def _of_server(plan: Plan, path: Path) -> list[Vote]:
     with closing(VoteStore(path, plan.study, "ro")) as store:
         rows = {rater: store.votes(rater) for rater in store.voters()}
-    for rater in rows:
-        require_rater(plan, rater)
     return [vote for rater, votes in rows.items() for vote in _checked(plan, rater, votes, path)]
 
 
@@ -131,8 +128,11 @@ def _checked(plan: Plan, rater: str, rows: Sequence[Any], path: Path) -> list[Vo
     """Rows as votes of trials of the plan.
 
     Raises:
-        PalpateError: naming the first that is none.
+        PalpateError: for another rater, or naming the first that is none.
     """
+    codes = [rater.code for rater in plan.raters]
+    must = f"A rater of study {plan.study} must be one of {codes[0]} to {codes[-1]}"
+    require(rater in codes, None, must, repr(rater), fix="Check the code")
     trials, votes = plan.shown(rater), list[Vote]()
     for row in rows:
         try:

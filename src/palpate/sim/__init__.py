@@ -10,7 +10,7 @@ compared with real data.
 from palpate.sim.materials import MATERIALS, Material, Surface
 from palpate.sim.options import VERSION, WorldOptions
 from palpate.sim.plan import VideoPlan, plan_world
-from palpate.sim.presets import DEFAULT, MINI_SEEDS, PRESETS, SEEN_WARNING, seen_by_mini
+from palpate.sim.presets import DEFAULT, MINI_SEEDS, PRESETS, SEEN_WARNING
 from palpate.sim.tile import Tile
 from palpate.sim.video import Video
 from palpate.sim.world import World
@@ -32,6 +32,5 @@ __all__ = [
     "WorldOptions",
     "WorldRecord",
     "plan_world",
-    "seen_by_mini",
     "write_world",
 ]

@@ -45,8 +45,3 @@ COSTS = {
 }
 #: The preset of ``palpate world`` without options.
 DEFAULT = "small"
-
-
-def seen_by_mini(options: WorldOptions) -> bool:
-    """Return whether the shipped mini models may have been trained on this world."""
-    return options.seed in MINI_SEEDS

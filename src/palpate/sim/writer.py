@@ -44,7 +44,7 @@ from palpate.sim.leak import LEAK_COLUMNS, leak_counts, leak_table
 from palpate.sim.materials import MATERIALS, Material
 from palpate.sim.options import VERSION, WorldOptions
 from palpate.sim.plan import VideoPlan, written_frames
-from palpate.sim.presets import SEEN_WARNING, seen_by_mini
+from palpate.sim.presets import MINI_SEEDS, SEEN_WARNING
 from palpate.sim.video import Video
 from palpate.sim.world import World
 
@@ -183,7 +183,7 @@ def _finish(unfinished: Path, world: World) -> None:
         "format": WORLD_FORMAT,
         "version": VERSION,
         "note": NOTE,
-        **({"seen_by_shipped_models": SEEN_WARNING} if seen_by_mini(options) else {}),
+        **({"seen_by_shipped_models": SEEN_WARNING} if options.seed in MINI_SEEDS else {}),
         "digest": digest_json({"options": options.digest, "lists": lists}),
         "options_digest": options.digest,
         "manifest_digest": manifest.digest,

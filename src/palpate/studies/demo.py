@@ -51,8 +51,9 @@ from palpate.studies.files import (
 )
 from palpate.studies.graph import Named, Node, Nodes, Work
 from palpate.studies.making import Training, make_generator, make_images, make_world, read_data
-from palpate.studies.names import NEAREST, SHIPPED, TEN
+from palpate.studies.names import NEAREST, SHIPPED
 from palpate.studies.stages import Facts, Stage, record_of
+from palpate.studies.study import WORLD
 from palpate.training.run import TrainingRun
 
 #: Name of the split file, without its ending.
@@ -79,21 +80,12 @@ class DemoPreset:
     tactile_epochs: float
 
 
-_TINY = replace(WORLDS["tiny"], objects_per_material=4, contacts_per_video=2, frames_per_contact=2)
-_MINI = replace(
-    WORLDS["demo"],
-    materials=TEN,
-    objects_per_material=24,
-    contacts_per_video=3,
-    frames_per_contact=2,
-    free_written="background",
-)
 PRESETS = {
     preset.name: preset
     for preset in (
         DemoPreset(
             "tiny",  # for tests
-            _TINY,
+            replace(WORLDS["tiny"], objects_per_material=4),
             ENCODERS["mini"],
             replace(
                 MINI,
@@ -103,7 +95,14 @@ PRESETS = {
             train=0.75,
             tactile_epochs=0.5,
         ),
-        DemoPreset("mini", _MINI, ENCODERS["mini"], MINI, train=0.85, tactile_epochs=6),
+        DemoPreset(
+            "mini",
+            replace(WORLD, frames_per_contact=2),
+            ENCODERS["mini"],
+            MINI,
+            train=0.85,
+            tactile_epochs=6,
+        ),
     )
 }
 

@@ -13,8 +13,7 @@ import multiprocessing
 import os
 import signal
 import traceback
-from collections.abc import Callable, Generator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from multiprocessing.connection import wait
@@ -248,23 +247,21 @@ class _Run:
     stages: dict[str, Stage] = field(default_factory=dict[str, Stage])
     begun: set[str] = field(default_factory=set[str])
 
+    def ready(self) -> Iterator[tuple[Node, dict[str, Stage]]]:
+        """The nodes that may begin, in order, with the stages that they read."""
+        for node in self.ordered:
+            if node.name not in {*self.stages, *self.begun} and self.stages.keys() >= {*node.after}:
+                yield node, {name: self.stages[name] for name in node.after}
+
     def take_finished(self) -> None:
         """Take what needs no work, from now on or once what it reads has been made again."""
         digests = digests_of(self.ordered)
-        for node in self.ordered:
-            if node.name in {*self.stages, *self.begun} or not self.stages.keys() >= {*node.after}:
-                continue
-            outputs = {name: self.stages[name].outputs for name in node.after}
+        for node, before in self.ready():
+            outputs = {name: stage.outputs for name, stage in before.items()}
             stage = finished_stage(self.folder / node.name, digests[node.name], outputs)
             if stage is not None:
                 self.stages[node.name] = stage
                 self.print_line(f"{node.name}: already done ({stage.seconds:.0f} s then)")
-
-    def ready(self) -> tuple[Node, dict[str, Stage]] | None:
-        """The first node that may begin, with the stages that it reads."""
-        waiting = (n for n in self.ordered if n.name not in {*self.stages, *self.begun})
-        node = next((n for n in waiting if self.stages.keys() >= {*n.after}), None)
-        return node and (node, {name: self.stages[name] for name in node.after})
 
     def begin(self, node: Node) -> None:
         self.begun.add(node.name)
@@ -318,7 +315,7 @@ def _run_here(run: _Run) -> None:
         run.show()
         run.progress(step, done, total, remark)
 
-    while (task := run.ready()) is not None:
+    while task := next(run.ready(), None):
         run.begin(task[0])
         run.end(_build_node(run.folder, run.device, task, run.print_line, report))
 
@@ -326,9 +323,9 @@ def _run_here(run: _Run) -> None:
 def _run_in_workers(run: _Run) -> None:
     workers: dict[Channel, BaseProcess] = {}
     idle: list[Channel] = []
-    with _ended_with(workers):
+    try:
         while len(run.stages) < len(run.ordered):
-            while (idle or len(workers) < run.jobs) and (task := run.ready()) is not None:
+            while (idle or len(workers) < run.jobs) and (task := next(run.ready(), None)):
                 worker = idle.pop() if idle else _start_worker(workers, run)
                 try:
                     worker.send(task)
@@ -350,14 +347,7 @@ def _run_in_workers(run: _Run) -> None:
                 else:
                     run.progress(*value)
             run.show()
-
-
-@contextmanager
-def _ended_with(workers: Mapping[Channel, BaseProcess]) -> Generator[None]:
-    """Kill the workers at the end: what they were building stays, to go on from."""
-    try:
-        yield
-    finally:
+    finally:  # what they were building stays, to go on from
         for process in workers.values():
             process.kill()
         for process in workers.values():

@@ -51,6 +51,7 @@ from palpate.studies.names import (
     WRONG,
 )
 from palpate.studies.stages import Facts
+from palpate.studies.utility import picked
 
 if TYPE_CHECKING:
     from palpate.studies.study import Preset, Study
@@ -177,7 +178,7 @@ def _cross_fitted(
     if min(len({*labels[side]} - {"", None}) for side in (half, ~half)) < 2:
         return []
     for side in (half, ~half):
-        probe = fit_probe(_rows(train, side))
+        probe = fit_probe(picked(train, np.flatnonzero(side)))
         other = ~side[rows]
         for k, features in enumerate((images.features, real.features)):
             hits[k, other] = np.array(probe.predict(features[other])) == truth[other]
@@ -202,7 +203,8 @@ def _cross_fitted(
 def _halves(features: FeatureSet, permutations: int, split: Split) -> list[Score]:
     """TMMD between the images of two halves of the test videos, of one generator."""
     half = _half(features)
-    measure = partial(tmmd, _rows(features, half), _rows(features, ~half), sigma=SIGMA)
+    sides = (picked(features, np.flatnonzero(side)) for side in (half, ~half))
+    measure = partial(tmmd, *sides, sigma=SIGMA)
     measure = partial(measure, subject=HALVES, split=split.digest, permutations=permutations)
     return [measure(preset=preset) for preset in READINGS]
 
@@ -211,7 +213,3 @@ def _half(features: FeatureSet) -> NDArray[np.bool_]:
     """Which rows are of every other video."""
     videos = np.array(features.groups or features.ids, dtype=str)
     return np.isin(videos, np.unique(videos)[::2])
-
-
-def _rows(features: FeatureSet, inside: NDArray[np.bool_]) -> FeatureSet:
-    return features.take([features.ids[k] for k in np.flatnonzero(inside).tolist()])

@@ -144,7 +144,7 @@ class Plan:
             for method in self.study.trained_on(split):
                 graph.add_method(method, split, seed)
         for name, folder in self.systems.items():
-            graph.nodes.add(
+            graph.add(
                 images_node(name, NOLEAK),
                 making.take_images,
                 *DATA,
@@ -156,7 +156,7 @@ class Plan:
             graph.add_scores(split, judge, seed)
         graph.add_utility()
         graph.add_results()
-        return graph.nodes
+        return graph
 
     def results(self, stages: Mapping[str, Stage], jobs: int = 1) -> Results:
         """The results of finished stages, with what was chosen, digests, versions and times."""
@@ -212,30 +212,30 @@ def _stamps(weights: Weights) -> dict[str, Any]:
 DATA = ("data", "split")
 
 
-class _Graph:
+class _Graph(Nodes):
     """The nodes of a plan."""
 
     def __init__(self, plan: Plan) -> None:
+        super().__init__()
         self.plan, self.study, self.size = plan, plan.study, plan.size
-        self.nodes = Nodes()
         # Other weights under the same name make other stages.
         self.clip = Named(self.size.clip, model_stamp("clip", self.size.clip))
 
     def add_data(self) -> None:
         """World, data and splits."""
-        study, root, nodes = self.study, self.plan.root, self.nodes
+        study, root = self.study, self.plan.root
         if (world := self.plan.world) is not None:
-            nodes.add("world", making.make_world, options=Named(world, [world, world.digest]))
-        nodes.add(
+            self.add("world", making.make_world, options=Named(world, [world, world.digest]))
+        self.add(
             "data",
             making.read_data,
-            *(node.name for node in nodes),
+            *(node.name for node in self),
             read=Named(study.read, function_stamp(study.read)),
             root=root and Named(Path(root), [_absolute(root), data_stamp(Path(root))]),
             name=study.name,
             unseen=self.size.clip == SHIPPED,
         )
-        nodes.add("split", making.make_splits, "data", noleak=study.noleak, measures=True)
+        self.add("split", making.make_splits, "data", noleak=study.noleak, measures=True)
 
     def add_split(self, split: str) -> None:
         """Autoencoders and controls of a split."""
@@ -246,10 +246,8 @@ class _Graph:
         for name, options in kinds.items():
             if isinstance(options, str):
                 options = Named(options, model_stamp("autoencoder", options))
-            self.nodes.add(
-                name, making.make_autoencoder, *DATA, split=split, options=options, size=size
-            )
-        self.nodes.add(
+            self.add(name, making.make_autoencoder, *DATA, split=split, options=options, size=size)
+        self.add(
             f"controls-{split}",
             making.make_controls,
             *DATA,
@@ -263,13 +261,11 @@ class _Graph:
     def add_encoders(self, split: str, seed: int) -> None:
         """Encoders of a split, and what they know of it."""
         name, preset = f"encoder-{split}-{seed}", self.size.encoder
-        self.nodes.add(
+        self.add(
             name, making.make_encoders, *DATA, split=split, seed=seed, preset=preset, clip=self.clip
         )
         probe = f"probe-{split}-{seed}"
-        self.nodes.add(
-            probe, probe_encoders, *DATA, name, split=split, encoders=name, measures=True
-        )
+        self.add(probe, probe_encoders, *DATA, name, split=split, encoders=name, measures=True)
 
     def add_method(self, method: Method, split: str, seed: int) -> None:
         """Training, unless it shares that of another or makes its images itself, and images."""
@@ -279,7 +275,7 @@ class _Graph:
             stamp: Any = function_stamp(make)
             if make is shipped:
                 stamp = [stamp, model_stamp("generator", SHIPPED)]
-            self.nodes.add(
+            self.add(
                 images,
                 making.make_own_images,
                 *DATA,
@@ -296,7 +292,7 @@ class _Graph:
         generator, by_text = f"{slug(method.text_of or method.name)}-{split}-{seed}", method.text_of
         if not by_text:
             diffusion = method.preset(size.diffusion).with_steps(size.steps)
-            self.nodes.add(
+            self.add(
                 generator,
                 making.make_generator,
                 *DATA,
@@ -307,7 +303,7 @@ class _Graph:
                 clip=self.clip,
                 autoencoder=autoencoder,
             )
-        self.nodes.add(
+        self.add(
             images,
             making.make_images,
             *DATA,
@@ -327,7 +323,7 @@ class _Graph:
             methods |= {name: images_node(name, NOLEAK) for name in self.plan.systems}
         metrics = [function_stamp(metric) for metric in study.metrics]
         sizes = [size.diffusion.size, size.permutations, self.clip.name]
-        self.nodes.add(
+        self.add(
             scores_node(split, judge, seed),
             judge_images,
             *DATA,
@@ -355,7 +351,7 @@ class _Graph:
             for seed in self.plan.seeds
         }
         images = [node for nodes in runs.values() for node in nodes.values()]
-        self.nodes.add(
+        self.add(
             "utility",
             measure_utility,
             *DATA,
@@ -372,12 +368,12 @@ class _Graph:
         """Tables, claims and pictures."""
         plan, study = self.plan, self.study
         read = ("scores-", "probe-", "utility")
-        self.nodes.add(
+        self.add(
             "results",
             collect,
             *DATA,
             images_node(study.on_both[0], NOLEAK, plan.seeds[0]),
-            *(node.name for node in self.nodes if node.name.startswith(read)),
+            *(node.name for node in self if node.name.startswith(read)),
             study=Named(
                 study, [study.name, study.title, study.tables, study.paper, *study.controls]
             ),

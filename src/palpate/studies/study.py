@@ -101,21 +101,12 @@ class Study:
         return [m for m in self.methods if split == NOLEAK or m.name in self.on_both]
 
 
-_WORLD = replace(
-    WORLDS["small"],
-    two_videos=0.0,
-    materials=TEN,
-    objects_per_material=24,
-    contacts_per_video=3,
-    frames_per_contact=3,
+#: The embedded world of studies, and of the demo with fewer frames.
+WORLD = WorldOptions(
+    materials=TEN, objects_per_material=24, contacts_per_video=3, free_written="background"
 )
 _SMOKE_WORLD = replace(
-    _WORLD,
-    materials=("Wood", "Brick", "Leather", "Grass"),
-    objects_per_material=8,
-    contacts_per_video=2,
-    frames_per_contact=2,
-    test=0.375,
+    WORLDS["tiny"], objects_per_material=8, test=0.375, free_written="background"
 )
 _VQ = AutoencoderOptions(
     patch=2, widths=(32, 64), channels=4, codes=8192, steps_free=1000, steps_quantized=200
@@ -146,7 +137,7 @@ PRESETS: Mapping[str, Preset] = {
         ),
         Preset(
             "mini",
-            _WORLD,
+            WORLD,
             ENCODERS["mini"],
             MINI,
             steps=1500,
@@ -163,7 +154,7 @@ ON_DISK: Mapping[str, Preset] = {
     **PRESETS,
     "paper": Preset(
         "paper",
-        _WORLD,
+        WORLD,
         ENCODERS["paper"],
         PAPER,
         steps=10_500,  # 30 epochs of Touch and Go's train part in batches of 32

@@ -148,7 +148,8 @@ def fewest_videos(draws: Draws, features: FeatureSet, test: FeatureSet) -> int:
     return min(left, default=0)
 
 
-def _picked(features: FeatureSet, rows: Iterable[int]) -> FeatureSet:
+def picked(features: FeatureSet, rows: Iterable[int]) -> FeatureSet:
+    """The samples in these rows."""
     return features.take([features.ids[k] for k in rows])
 
 
@@ -162,7 +163,7 @@ def _hits(draws: Draws, draw: int, test: FeatureSet, training: Training) -> Arra
     for rows, names in zip(parts, tested, strict=True):
         sets: list[FeatureSet] = []
         if real is not None:
-            sets.append(_picked(real, draws.rows(real, training.of_real, draw)))
+            sets.append(picked(real, draws.rows(real, training.of_real, draw)))
         if generated is not None:
             videos = _videos(generated).items()
             # As many of a class as are left by the fold that tests most.
@@ -170,9 +171,9 @@ def _hits(draws: Draws, draw: int, test: FeatureSet, training: Training) -> Arra
                 c: len(of_class) - max(len(of_class & t) for t in tested) for c, of_class in videos
             }
             free = [k for k, (_, video) in enumerate(_pairs(generated)) if video not in names]
-            free = _picked(generated, free)
+            free = picked(generated, free)
             shots = training.of_generated or left
-            sets.append(_picked(free, draws.rows(free, shots, draw)))
+            sets.append(picked(free, draws.rows(free, shots, draw)))
         named = _named(_joined(sets), test.features[rows], draws.l2)
         hits[rows] = [name == pairs[k][0] for name, k in zip(named, rows, strict=True)]
     return hits
@@ -217,7 +218,7 @@ def material_utility(
     train: FeatureSet,
     test: FeatureSet,
     generated: Mapping[str, FeatureSet],
-    draws: Draws | None = None,
+    draws: Draws,
     *,
     controls: Sequence[str] = (),
     split: str | None = None,
@@ -241,7 +242,6 @@ def material_utility(
     Raises:
         PalpateError: without labels, or with fewer than two materials.
     """
-    draws = draws or Draws()
     for part, features in {"train": train, "test": test, **generated}.items():
         must, fix = f"The features of {part!r} must have materials", "Pass a labeled manifest"
         require(any(features.labels or ()), None, must, "none", fix=fix)
@@ -330,7 +330,7 @@ def utility(
     split: Split,
     encoders: EncoderSet,
     generated: Mapping[str, Path],
-    draws: Draws | None = None,
+    draws: Draws,
     *,
     controls: Sequence[str] = (),
     progress: Progress = quiet,
@@ -363,7 +363,7 @@ def utility(
 
 
 def embed_generated(
-    images: Path, manifest: Manifest, encoders: EncoderSet, progress: Progress = quiet
+    images: Path, manifest: Manifest, encoders: EncoderSet, progress: Progress
 ) -> FeatureSet:
     """Tactile features (n, d) of generated images.
 
