@@ -1,7 +1,9 @@
 """The page about captions: its commands run against a local server, its flags exist."""
 
+import json
 import re
 import shlex
+import shutil
 from pathlib import Path
 
 import pytest
@@ -21,7 +23,7 @@ def test_the_blocks_of_the_page_run(tmp_path, monkeypatch, capsys):
     )
     write_world(tmp_path / "data", options)
     monkeypatch.chdir(tmp_path)
-    (tmp_path / "data" / "splits" / "Orig.json").rename(tmp_path / "noleak.json")
+    shutil.copy("data/splits/Orig.json", "noleak.json")
     assert Split.load("noleak.json").counts()["test"]
     text = PAGE.read_text(encoding="utf-8")
     with FakeServer(model="allenai/Molmo-7B-D-0924") as server:
@@ -31,6 +33,16 @@ def test_the_blocks_of_the_page_run(tmp_path, monkeypatch, capsys):
     for block in re.findall(r"^```python\n(.*?)^```", text, re.DOTALL | re.MULTILINE):
         exec(compile(block, str(PAGE), "exec"), {})
     assert "material accuracy from the text" in capsys.readouterr().out
+    # What is trained on the captions names them.
+    digest = json.loads(Path("captions/record.json").read_text())["digest"][:12]
+    for words, part in (
+        ("encoder captioned -o encoders", "card"),
+        ("generator captioned --clip encoders --steps 2 -o model", "training"),
+    ):
+        line = f"train {words} --split captioned/splits/Orig.json --preset tiny -q"
+        assert main(shlex.split(line)) == 0, capsys.readouterr().err
+        facts = json.loads(Path(words.split()[-1], "palpate.json").read_text())[part]
+        assert digest in facts["text_source"]
 
 
 @pytest.mark.parametrize("verb", ["caption", "caption check"])

@@ -12,7 +12,6 @@ from palpate.report.labels import label_of
 from palpate.studies.claims import (
     FAMILY,
     TRADITIONAL,
-    differences_over_seeds,
     discrimination_claim,
     effect_size,
     effect_table,
@@ -22,6 +21,7 @@ from palpate.studies.claims import (
     ranking_claims,
 )
 from palpate.studies.evidence import ahead, difference_between, over_seeds
+from palpate.studies.study_tables import Scores
 
 HIGHER = {"SSIM": True, "PSNR": True, "human preference": True}
 
@@ -232,22 +232,23 @@ def test_effect_sizes_are_differences_over_errors_and_decide_who_discriminates()
 
 
 def test_differences_of_seeds_are_joined_by_metric_pair_and_preset():
-    paper = replace(difference("TMMD", 9.0), settings={"preset": "paper"})
+    paper = replace(difference("TMMD", 9.0, stage="s"), settings={"preset": "paper"})
     runs = [
         [
             paper,
-            replace(difference("TMMD", v), settings={"preset": "grouped"}),
-            Score("TMMD", "x", 1),
+            replace(difference("TMMD", v, stage="s"), settings={"preset": "grouped"}),
+            Score("TMMD", "x", 1, details={"stage": "s"}),
         ]
         for v in (-1.0, -2.0)
     ]
     runs[0].append(difference("SSIM", 1.0))  # one seed alone
-    made = differences_over_seeds(runs)
+    made = Scores.over_seeds(runs, "results").differences
     assert [(label_of(d), d.value) for d in made] == [("TMMD difference", -1.5)]
     gap = difference("I-TMMD", -0.5, gap=0.4, gap_interval=[0.3, 0.5])
-    joined = differences_over_seeds([[gap], [gap]])[0]
-    assert joined.details["gap"] == pytest.approx(0.4)
-    assert joined.details["gap_interval"] == pytest.approx((0.3, 0.5))
-    claims = paper_claims([study(1, 0.005)], tasks={}, people=PEOPLE)
+    joined = over_seeds([gap, replace(gap, details={"gap": 0.6, "gap_interval": [0.5, 0.7]})])
+    assert joined.details["gap"] == pytest.approx(0.5)
+    reach = np.hypot(0.1, stats.t.ppf(0.975, 1) * 0.1)
+    assert joined.details["gap_interval"] == pytest.approx((0.5 - reach, 0.5 + reach))
+    claims = paper_claims(study(1, 0.005), tasks={}, people=PEOPLE)
     assert len({c.claim for c in claims}) == len(claims) == 1 + 2 + 9 + 1
     assert claims[0].verdict == "undecided"  # no task was measured

@@ -148,9 +148,7 @@ class _Handler(BaseHTTPRequestHandler):
             "fenced": f"Here you are:\n```json\n{json.dumps(answer)}\n```",
             "truncated": json.dumps(answer)[:25],
             "refusal": "I'm sorry, but I can't help with that.",
-            "duplicate": '{"adjectives": ["hard", "flat", "cold"], "surface_visible": true}',
             "hidden": json.dumps(answer | {"surface_visible": False}),
-            "echo": json.dumps(answer) + (self.server.key or ""),
         }
         message = {"role": "assistant", "content": texts.get(fault, json.dumps(answer))}
         if fault == "flagged":

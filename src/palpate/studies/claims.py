@@ -24,7 +24,7 @@ from palpate.core import Measure, Score
 from palpate.report.labels import measured
 from palpate.report.numbers import number
 from palpate.report.study import Claim, StudyTable, Verdict
-from palpate.studies.evidence import ahead, in_words, over_seeds, side_of
+from palpate.studies.evidence import ahead, in_words, side_of
 from palpate.studies.names import BACKGROUND, GVST, NOLEAK, ORIG, OURS
 
 #: Metrics that compare pixels, or features of networks trained on photos (paper, table 3).
@@ -44,43 +44,6 @@ Z = float(special.ndtri(0.975))
 #: image as a further condition.
 Pairs = Sequence[tuple[str, str]]
 PAIRS: Pairs = ((OURS, GVST), (OURS, BACKGROUND))
-
-
-def differences_over_seeds(runs: Sequence[Iterable[Score]]) -> list[Score]:
-    """The paired differences of a study, each over its seeds.
-
-    Args:
-        runs: all scores of each seed, as ``Results.scores`` has them. Of several presets of a
-            metric ``grouped`` counts.
-
-    Returns:
-        One score for each metric and pair of methods that every seed has.
-    """
-    listed = [_chosen(s for s in run if s.b is not None) for run in runs]
-    shared = [key for key in listed[0] if all(key in run for run in listed)] if listed else []
-    return [_combined([run[key] for run in listed]) for key in shared]
-
-
-def _chosen(scores: Iterable[Score]) -> dict[tuple[Measure, str, str | None], Score]:
-    """By measure and pair; of several presets ``grouped``, else the first."""
-    chosen: dict[tuple[Measure, str, str | None], Score] = {}
-    for score in scores:
-        key = score.measure, score.a, score.b
-        if key not in chosen or score.settings.get("preset") == "grouped":
-            chosen[key] = score
-    return chosen
-
-
-def _combined(scores: Sequence[Score]) -> Score:
-    """A difference over seeds, and the difference of its distances to the floor."""
-    mean, details = over_seeds(scores), [score.details for score in scores]
-    if any("gap" not in d for d in details):
-        return mean
-    pairs = zip(scores, details, strict=True)
-    gaps = (replace(s, value=d["gap"], interval=d.get("gap_interval")) for s, d in pairs)
-    gap = over_seeds([*gaps])
-    more = {"gap": gap.value, "gap_interval": gap.interval}
-    return replace(mean, details={**mean.details, **more})
 
 
 def decide(sides: Sequence[int], *, every: bool = False) -> Verdict:
@@ -146,7 +109,7 @@ def preference_claims(
     """Which metrics prefer what people prefer: one row a metric, over the paper's two comparisons.
 
     Args:
-        differences: of :func:`differences_over_seeds`.
+        differences: of methods, each over its seeds.
         people: scores of ``palpate preference score`` (``Results.load(path).scores``); empty
             without a human study, and then every row is undecided.
         pairs: of methods.
@@ -288,7 +251,7 @@ def discrimination_claim(differences: Sequence[Score], pairs: Pairs = PAIRS) -> 
 
 
 def paper_claims(
-    noleak: Sequence[Iterable[Score]],
+    differences: Sequence[Score],
     *,
     tasks: Mapping[str, Score],
     people: Sequence[Score] = (),
@@ -297,12 +260,11 @@ def paper_claims(
     """All claims of the paper.
 
     Args:
-        noleak: scores and differences of the methods under the leak-free split, a list a seed.
+        differences: of the methods under the leak-free split, each over its seeds.
         tasks: see :func:`leak_claims`.
         people: see :func:`preference_claims`.
         pairs: of methods.
     """
-    differences = differences_over_seeds(noleak)
     return [
         *leak_claims(tasks),
         *ranking_claims(differences, people, pairs),

@@ -9,13 +9,13 @@ from itertools import product
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from palpate.core import Measure, Note, Score
+from palpate.core import Note, Score
 from palpate.diffusion.generated import Generated
 from palpate.evaluation.probing import results_of
 from palpate.report.labels import measured
 from palpate.report.numbers import percent
 from palpate.report.results import Audit, Results
-from palpate.studies.claims import differences_over_seeds, effect_table, paper_claims
+from palpate.studies.claims import effect_table, paper_claims
 from palpate.studies.evidence import difference_between, in_words
 from palpate.studies.files import (
     gallery,
@@ -41,7 +41,7 @@ from palpate.studies.names import (
     scores_node,
 )
 from palpate.studies.stages import Facts
-from palpate.studies.study_tables import FAMILY, NAMED, READING, RETRIEVAL, Scores, study_tables
+from palpate.studies.study_tables import FAMILY, NAMED, RETRIEVAL, Scores, study_tables
 
 if TYPE_CHECKING:
     from palpate.studies.study import Study
@@ -64,7 +64,7 @@ def collect(
     runs = {s: [read_probed(after[f"probe-{s}-{seed}"]) for seed in seeds] for s in SPLITS}
     plan = probing_plan(manifest, splits)
     probed = results_of(study.title, runs, plan, manifest, splits)
-    own, noleak = judged[NOLEAK, NOLEAK], runs_of[NOLEAK, NOLEAK]
+    own = judged[NOLEAK, NOLEAK]
     extra = list(dict.fromkeys(s.measure for s in own.of_one if s.details.get("extra")))
     votes = [] if people is None else [*Results.load(people).scores]
     tables = [
@@ -77,13 +77,13 @@ def collect(
             extra=extra,
             people=votes,
         ),
-        effect_table([d for d in differences_over_seeds(noleak) if _compares(d, methods)]),
+        effect_table([d for d in own.differences if _compares(d, methods)]),
     ]
     answers = [Results.load(after[n] / "results.json") for n in ("utility",) if n in after]
     tables += [table for answer in answers for table in answer.tables]
     tasks = {**_tasks_of_encoders(probed.scores), **_tasks_of_generators(runs_of)}
     pairs = [*((OURS, m) for m in methods if m.startswith(GVST)), (VQ, BACKGROUND)]
-    claims = paper_claims(noleak, tasks=tasks, people=votes, pairs=pairs)
+    claims = paper_claims(own.differences, tasks=tasks, people=votes, pairs=pairs)
     claims += [claim for answer in answers for claim in answer.claims]
     images = after[images_node(study.on_both[0], NOLEAK, seeds[0])] / "images"
     notes = [*probed.notes, *([Note("synthetic-data")] if manifest.facts.get("synthetic") else [])]
@@ -130,16 +130,12 @@ def _tasks_of_generators(
     tasks: dict[str, Score] = {}
     for measure in FAMILY:
         each = [
-            [s for run in seeds[split, split] for s in run if _is(s, measure)] for split in SPLITS
+            [s for run in seeds[split, split] if (s := Scores.of(run).get(measure, OURS))]
+            for split in SPLITS
         ]
         if all(each):
             tasks[f"generation, {measured(measure)}"] = difference_between(*each, names=SPLITS)
     return tasks
-
-
-def _is(score: Score, measure: Measure) -> bool:
-    fields = score.measure, score.a, score.b, score.settings.get("preset")
-    return fields == (measure, OURS, None, READING)
 
 
 def _staged_rows(rows: Sequence[Sequence[Any]], stage: str) -> list[list[Any]]:

@@ -18,7 +18,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any, ClassVar
 
-from palpate.core import Measure, Note, Progress, Score, Split, require, require_choice, write_json
+from palpate.core import Note, Progress, Score, Split, require, require_choice, write_json
 from palpate.data.images import cached_images
 from palpate.data.importing import import_dataset
 from palpate.data.manifest import Manifest
@@ -54,6 +54,7 @@ from palpate.studies.making import Training, make_generator, make_images, make_w
 from palpate.studies.names import NEAREST, SHIPPED
 from palpate.studies.stages import Facts, Stage, record_of
 from palpate.studies.study import WORLD
+from palpate.studies.study_tables import FAMILY, NAMED, Scores
 from palpate.training.run import TrainingRun
 
 #: Name of the split file, without its ending.
@@ -282,6 +283,7 @@ class Page:
         self.manifest, self.split = data_of(self.work, SPLIT)
         self.generated = Generated.load(self.work.after["generated"] / "images")
         self.scores = read_scores(self.work.after["scores"])
+        self.named = Scores.of(self.scores)
         self.audits = read_audits(self.work)
 
     def results(self, jobs: int) -> Results:
@@ -329,13 +331,6 @@ class Page:
             return f"Leak: {fact} by {noleak.group}, but {share} train: there are too few videos."
         return f"Leak: {fact}."
 
-    def _score(self, metric: str, subject: str, preset: str | None = None) -> Score | None:
-        for s in self.scores:
-            same = (s.measure, s.a, s.b) == (Measure(metric), subject, None)
-            if same and s.settings.get("preset") == preset:
-                return s
-        return None
-
     def _with_interval(self, score: Score | None) -> str:
         """The score and its interval, rounded as in the tables."""
         if score is None or score.value is None:
@@ -347,16 +342,15 @@ class Page:
     def _distance(self) -> str:
         given_gels = self.stages["generator"].facts["background"]
         source = "photos and no-contact images" if given_gels else "photos alone"
-        background = self._score("TMMD", BACKGROUND, "grouped")
+        background, made = (self.named.get(FAMILY[0], n) for n in (BACKGROUND, "generated"))
         versus = f", the no-contact image {self._with_interval(background)}" if background else ""
-        value = self._with_interval(self._score("TMMD", "generated", "grouped"))
         start = f"Distance: {len(self.generated.ids)} tactile images generated from {source}"
+        value = self._with_interval(made)
         return f"{start} have TMMD (grouped) {value} to the real ones{versus} (lower is better)."
 
     def _material(self) -> str:
         generated, real, nearest, background = (
-            self._score("material accuracy", name)
-            for name in ("generated", "real", NEAREST, BACKGROUND)
+            self.named.get(NAMED, name) for name in ("generated", "real", NEAREST, BACKGROUND)
         )
         if generated is None or real is None:
             materials = self.manifest.table["material"].drop_nulls().n_unique()
@@ -375,7 +369,7 @@ class Page:
         notes += self.split.notes
         if self.manifest.table["text"].null_count():
             notes.append(Note("template-texts"))
-        background = self._score("material accuracy", BACKGROUND)
+        background = self.named.get(NAMED, BACKGROUND)
         if background is not None and float(background) > 2 * background.details["chance"]:
             notes.append(Note("background-predicts-material", {"share": background.value}))
         return notes

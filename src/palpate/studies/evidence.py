@@ -25,9 +25,9 @@ def over_seeds(scores: Sequence[Score]) -> Score:
 
     Returns:
         The mean; ``details["by_seed"]`` has the values. Value or interval is None if one of the
-        seeds has none. Of details remain those that all seeds share and the mean of the matrix;
-        the null, p-values and verdicts of single seeds do not. A single seed is returned as it is,
-        but for ``by_seed``.
+        seeds has none. Of details remain those that all seeds share, the mean of the matrix, and
+        that of the gap (:func:`difference_between`); the null, p-values and verdicts of single
+        seeds do not. A single seed is returned as it is, but for ``by_seed``.
 
     Raises:
         PalpateError: without scores, or if metrics or subjects differ.
@@ -39,6 +39,10 @@ def over_seeds(scores: Sequence[Score]) -> Score:
     if len(values) == 1:
         return replace(first, details={**first.details, "by_seed": values})
     details = {**_shared_details(scores), "by_seed": values}
+    if all("gap" in s.details for s in scores):
+        gaps = ((s.details["gap"], s.details.get("gap_interval")) for s in scores)
+        gap = over_seeds([replace(first, value=v, interval=i, details={}) for v, i in gaps])
+        details |= {"gap": gap.value, "gap_interval": gap.interval}
     notes = list[Note]()
     for score in scores:
         notes += [note for note in score.notes if note not in notes]

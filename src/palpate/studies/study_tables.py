@@ -35,8 +35,6 @@ if TYPE_CHECKING:
 #: Scores by (split of the images, split of the judge): means over seeds.
 Judgments = Mapping[tuple[str, str], "Scores"]
 Cell = Score | str | None
-#: The reading of the TMMD family that tables show; the scores hold the others as well.
-READING = "grouped"
 FAMILY = tuple(map(Measure, ("TMMD", "I-TMMD", "CI-TMMD", "D-TMMD")))
 RETRIEVAL = tuple(
     Measure(f"top-{k}", f"{name} by tactile") for name in ("text", "vision") for k in (1, 5)
@@ -69,14 +67,23 @@ PAPER: Mapping[tuple[int | str, str], Mapping[Measure, str]] = {
 
 @dataclass(frozen=True)
 class Scores:
-    """Scores by what they are of, in the order of their making; readings other than ours aside."""
+    """Scores by what they are of, in the order of their making.
+
+    Tables show our reading of the TMMD family; the paper's is kept aside.
+    """
 
     by_name: Mapping[Key, Score]
 
     @classmethod
+    def of(cls, scores: Iterable[Score]) -> Scores:
+        """The scores of one run."""
+        paper = lambda score: score.settings.get("preset") == "paper"
+        return cls({(s.measure, s.a, s.b, paper(s)): s for s in scores})
+
+    @classmethod
     def over_seeds(cls, seeds: Sequence[Sequence[Score]], stage: str) -> Scores:
         """The means of what each seed scores; a score that a seed lacks is left out."""
-        tables = [{_key(s): s for s in scores} for scores in seeds]
+        tables = [cls.of(scores).by_name for scores in seeds]
         merged: dict[Key, Score] = {}
         for key in tables[0]:
             if not all(key in table for table in tables):
@@ -94,6 +101,11 @@ class Scores:
         return self.by_name.get((measure, subject, None, False))
 
     @property
+    def differences(self) -> list[Score]:
+        """All differences of two subjects, in our reading."""
+        return [s for (_, _, b, paper), s in self.by_name.items() if b is not None and not paper]
+
+    @property
     def of_one(self) -> list[Score]:
         """All scores of one subject each: without differences."""
         return [score for score in self.by_name.values() if score.b is None]
@@ -101,10 +113,6 @@ class Scores:
 
 #: What is measured, of what, compared with what, and whether it is the paper's reading.
 Key = tuple[Measure, str, str | None, bool]
-
-
-def _key(score: Score) -> Key:
-    return score.measure, score.a, score.b, score.settings.get("preset") == "paper"
 
 
 def study_tables(
@@ -132,7 +140,7 @@ def study_tables(
     asked = [s for s in people if s.metric in (PREFERENCE, STRENGTH) and s.b is None]
     votes = {(s.measure, s.a): s for s in asked}
     subjects = [*controls, HALF_PROBES, HALVES]
-    context = _Context(study, judged, probed, methods, subjects, extra, votes)
+    context = _Context(study, judged, Scores.of(probed), methods, subjects, extra, votes)
     return [make[number](context, number) for number in study.tables]
 
 
@@ -140,7 +148,7 @@ def study_tables(
 class _Context:
     study: Study
     judged: Judgments
-    probed: Sequence[Score]
+    probed: Scores
     methods: Sequence[str]
     controls: Sequence[str]
     extra: Sequence[Measure]
@@ -166,7 +174,7 @@ def _of_splits(context: _Context, number: int) -> StudyTable:
             for name in context.present(split, names):
                 label = f"{name}, {split}"
                 knows = judge == split and name == OURS
-                tasked = [_probed(context, t, split) if knows else None for t in tasks]
+                tasked = [context.probed.get(t, split) if knows else None for t in tasks]
                 cells = [context.judged[split, judge].get(m, name) for m in family]
                 if not any(cells):  # scored by other metrics alone
                     continue
@@ -187,11 +195,6 @@ def _of_splits(context: _Context, number: int) -> StudyTable:
     columns = ["images", "judged by encoder of", *heads, *map(measured, family)]
     title = f"Table {number}: {names[number]} by split"
     return StudyTable(title, text, columns, rows, controls=[*dict.fromkeys(controls)])
-
-
-def _probed(context: _Context, task: Measure, split: str) -> Score | None:
-    key = task, split, None
-    return next((s for s in context.probed if (s.measure, s.a, s.b) == key), None)
 
 
 def _of_methods(context: _Context, number: int) -> StudyTable:
