@@ -22,8 +22,8 @@ from palpate.core import atomic_path
 from palpate.sim import MATERIALS, Video, WorldOptions
 from palpate.sim.arrays import f32, resample, to_bytes
 from palpate.sim.gel import PAD_MM, solve_approach
-from palpate.sim.objects import make_object
 from palpate.sim.plan import ObjectRef, VideoPlan, first_contact
+from palpate.sim.video import make_object
 
 #: Gray levels that the stored colored panels are multiples of.
 STEP = 4

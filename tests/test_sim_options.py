@@ -8,9 +8,9 @@ import pytest
 
 from palpate.core import PalpateError
 from palpate.sim import DEFAULT, MATERIALS, MINI_SEEDS, PRESETS, WorldOptions, plan_world
-from palpate.sim.objects import make_object
 from palpate.sim.options import RANGES
 from palpate.sim.plan import ObjectRef, contact_frames, first_contact, written_frames
+from palpate.sim.video import make_object
 
 
 @pytest.mark.parametrize("name", RANGES)

@@ -21,7 +21,6 @@ from palpate._version import __version__
 from palpate.captions.columns import template_texts
 from palpate.captions.prompts import Description, Prompt
 from palpate.captions.querying import Photo, outcomes, pending, photos_of, query_all
-from palpate.captions.reading import SCHEMA
 from palpate.captions.replies import Question, ReplyLog
 from palpate.captions.units import Per, Units, units_of
 from palpate.core import (
@@ -43,6 +42,8 @@ from palpate.data.reading import load
 from palpate.data.texts import TABLE, TEXTS_FORMAT, image_digests, texts_digest, write_texts
 
 RECORD, REPLIES = "record.json", "replies.jsonl"
+_WORDS = pl.List(pl.String)
+SCHEMA = {"id": pl.String(), "text": pl.String(), "adjectives": _WORDS, "flags": _WORDS}
 
 
 class StoppedError(PalpateError):

@@ -20,10 +20,22 @@ import polars as pl
 from numpy.typing import NDArray
 
 from palpate.captions.prompts import REFUSAL
-from palpate.captions.reading import read_captions
 from palpate.captions.vocabulary import Vocabulary, visual_in, words_of
-from palpate.core import FeatureSet, Note, Progress, Score, Split, quiet, require, rng_for, track
+from palpate.core import (
+    FeatureSet,
+    Note,
+    PalpateError,
+    Progress,
+    Score,
+    Split,
+    quiet,
+    require,
+    rng_for,
+    track,
+)
 from palpate.data.manifest import Manifest
+from palpate.data.reading import load
+from palpate.data.texts import TABLE, joined, read_texts
 from palpate.metrics.means import mean_of
 from palpate.metrics.probe import fit_probe
 from palpate.report.calls import Call
@@ -73,7 +85,7 @@ def check_captions(
     """
     arguments = {"captions": captions, "data": data, "split": split, "seed": seed} | options
     call = Call.of("caption check", check_captions, arguments)
-    manifest, flags = read_captions(captions, data, **options)
+    manifest, flags = _read(captions, data, options)
     split = None if split is None else Split.load(split)
     rows = _rows(manifest, flags, split)
     vocabulary = Vocabulary(sorted({*rows["label"]} - {""}))
@@ -97,6 +109,37 @@ def check_captions(
         },
         calls=[call.with_digests(digests)],
     )
+
+
+def _read(
+    captions: Any, data: Any, options: dict[str, Any]
+) -> tuple[Manifest, dict[str, list[str]]]:
+    """The samples with their captions as texts, and the flags by id where they were kept.
+
+    Captions are what ``palpate caption`` wrote, or any samples that have texts.
+
+    Raises:
+        PalpateError: if there are none, or they are of other samples.
+    """
+    if isinstance(captions, str | Path):
+        captions = Path(captions)
+        captions = captions / TABLE if (captions / TABLE).is_file() else captions
+    if data is None:
+        manifest = load(captions, images=False, **options)
+    elif isinstance(captions, Path):
+        manifest = joined(load(data), read_texts(captions), captions, keep=False)
+    else:
+        must = "must be a folder or a table next to samples"
+        raise PalpateError(must, type(captions).__name__, "", argument="captions")
+    must, fix = "must hold captions", "Map the column text, or caption the samples first"
+    texts, got = manifest.table["text"].count(), f"{captions} without any text"
+    require(texts > 0, "captions", must, got, fix=fix)
+    flags: dict[str, list[str]] = {}
+    if isinstance(captions, Path) and captions.suffix == ".parquet":
+        table = pl.read_parquet(captions, glob=False)
+        if table.schema.get("flags") == pl.List(pl.String):
+            flags = dict(table.select("id", "flags").iter_rows())
+    return manifest, flags
 
 
 def _rows(manifest: Manifest, flags: dict[str, list[str]], split: Split | None) -> pl.DataFrame:

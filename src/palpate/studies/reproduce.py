@@ -220,6 +220,7 @@ class _Graph(Nodes):
         self.plan, self.study, self.size = plan, plan.study, plan.size
         # Other weights under the same name make other stages.
         self.clip = Named(self.size.clip, model_stamp("clip", self.size.clip))
+        self.weights = Named(plan.weights, _stamps(plan.weights))
 
     def add_data(self) -> None:
         """World, data and splits."""
@@ -336,7 +337,7 @@ class _Graph(Nodes):
             encoders=encoder,
             methods=methods,
             seed=seed,
-            weights=Named(self.plan.weights, _stamps(self.plan.weights)),
+            weights=self.weights,
             measures=True,
         )
 
