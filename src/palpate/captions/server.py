@@ -191,12 +191,21 @@ class Server:
         return RejectedError(got)
 
     def _models(self) -> list[str]:
-        """Names of the server's models; empty if it does not list them."""
+        """Names of the server's models; empty if it does not list them.
+
+        Raises:
+            PalpateError: if nobody is there, or the key is not accepted.
+        """
         try:
             response = self._request("GET", "models")
+        except httpx2.RequestError as error:
+            raise self._gone(self._reason(error)) from None
+        if response.status_code in (401, 403):
+            raise self._refusal(response.status_code, _parsed(response))
+        try:
             listed = _parsed(response)["data"] if response.status_code == 200 else []
             return [self._cleaned(str(model["id"])) for model in listed]
-        except (httpx2.RequestError, LookupError, TypeError, ValueError):
+        except (LookupError, TypeError, ValueError):
             return []
 
     def _only_model(self) -> str:
@@ -205,14 +214,7 @@ class Server:
         Raises:
             PalpateError: if there is none, or a choice.
         """
-        try:
-            response = self._request("GET", "models")
-        except httpx2.RequestError as error:
-            raise self._gone(self._reason(error)) from None
-        if response.status_code in (401, 403):
-            raise self._refusal(response.status_code, _parsed(response))
-        models = self._models()
-        if len(models) != 1:
+        if len(models := self._models()) != 1:
             got = f"{len(models)} models" if models else "no list of models"
             unlisted = "Name it, or give the base of the API: http://HOST:PORT/v1"
             fix = f"Choose one of {few(models)}" if models else unlisted
