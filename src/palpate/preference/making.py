@@ -119,9 +119,9 @@ def make(  # noqa: PLR0913
     require(32 <= size <= 1024, "size", "must lie in 32 .. 1024", size, 256)
     require(abs(seed) < LARGEST, "seed", "must lie between -2^63 and 2^63", seed, 0)
     until = last_day(until)
-    if output is None and not dry_run:
-        must, fix = "A study needs a folder", "Name a new folder"
-        raise PalpateError(must, "none", fix, example={"output": "study/"})
+    folder = None if output is None or dry_run else Path(output)
+    must = "must be a new folder for the study"
+    require(dry_run or folder is not None, "output", must, "none", "study/")
     sources = read_sources(reference, generated, names, labels)
     methods = [name for name in sources.paths if name not in (REFERENCE, GEL)]
     if task == "pair" and len(methods) < 2:
@@ -163,10 +163,10 @@ def make(  # noqa: PLR0913
     digits = max(2, len(str(raters)))
     codes = [f"r{k:0{digits}d}" for k in range(1, raters + 1)]
     plan = replace(plan, raters=[rater_of(plan, code) for code in codes])
-    if dry_run:
+    if folder is None:
         return plan
     plan = replace(plan, images=encoded(plan, sources, progress))
-    with atomic_folder(Path(str(output))) as part:
+    with atomic_folder(folder) as part:
         plan.save(part / PLAN)
         write_text(part / PAGE, study_page(plan.public()))
     return plan
@@ -228,9 +228,8 @@ def choose_items(
         code = "one-video-materials" if examples else "one-video-classes"
         notes.append(Note(code, {"materials": single}))
     common = sorted(piles, key=lambda name: (-len(piles[name]), name))[:materials]
-    rounds = zip_longest(
-        *(piles[name] for name in common)
-    )  # one of each, then a second of each ...
+    # One of each material, then a second of each ...
+    rounds = zip_longest(*(piles[name] for name in common))
     taken = [item for each in rounds for item in each if item is not None][:n]
     must = "A study needs two items, at most one a video"
     got, fix = f"{len(taken)} of {len(candidates):,} images", "Add images of other videos"

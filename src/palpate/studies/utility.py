@@ -240,7 +240,7 @@ def material_utility(
         A table, whose last rows are the paired gains over real videos alone.
 
     Raises:
-        PalpateError: without labels, or with fewer than two materials.
+        PalpateError: without materials.
     """
     for part, features in {"train": train, "test": test, **generated}.items():
         must, fix = f"The features of {part!r} must have materials", "Pass a labeled manifest"

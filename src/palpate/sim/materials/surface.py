@@ -81,11 +81,8 @@ def draw_surface(name: str, material: Material, n: int, rng: np.random.Generator
     """
     surface = material.draw(Tile(n, rng))
     height, albedo = f32(surface.height), f32(surface.albedo)
-    must, shapes = (
-        f"The material {name!r} must return a height and an albedo of",
-        ((n, n), (n, n, 3)),
-    )
-    got = (height.shape, albedo.shape)
+    must = f"The material {name!r} must return a height and an albedo of"
+    got, shapes = (height.shape, albedo.shape), ((n, n), (n, n, 3))
     require(got == shapes, None, f"{must} shapes {shapes}", got, fix="Correct it")
     finite = bool(np.isfinite(height).all() and np.isfinite(albedo).all())
     require(finite, None, f"{must} finite numbers", "NaN or infinity", fix="Correct it")
