@@ -127,7 +127,7 @@ def test_one_text_for_many_contacts(samples):
     assert [note.code for note in score.notes] == ["captions-common"]
 
 
-def test_texts_that_train_and_test_share(samples, tmp_path):
+def test_texts_that_train_and_test_share(samples):
     manifest = samples(lambda k: f"word{'x' * (k % 30)}")
     parts = {"train": manifest.ids[:60], "test": manifest.ids[60:]}
     results = check_captions(manifest, split=Split.from_ids(**parts))

@@ -456,7 +456,7 @@ def test_no_vote_is_nothing_to_score(study):
         preference.score(study)
 
 
-def test_a_plan_that_was_edited_is_another_study(plan, study, downloads, tmp_path):
+def test_a_plan_that_was_edited_is_another_study(study, downloads, tmp_path):
     text = (study / "plan.json").read_text()
     (tmp_path / "plan.json").write_text(text.replace('"catches": 0.8', '"catches": 0.1'))
     with pytest.raises(PalpateError, match="of study"):
@@ -523,11 +523,10 @@ def test_a_material_that_was_not_shown_has_no_accuracy(tmp_path):
     results.to_html(tmp_path / "page.html")
 
 
-def test_neither_torch_nor_the_server_is_loaded(study, downloads, rated, tmp_path):
+def test_neither_torch_nor_the_server_is_loaded(study, downloads, rated):
     code = f"""
 import sys
 from palpate import preference
-from palpate.report.labels import label_of, subject_of
 preference.make({str(rated.reference)!r}, {[str(m) for m in rated.methods]!r}, dry_run=True)
 preference.score({str(study)!r}, {str(downloads)!r}, replicates=100)
 assert not {{"torch", "starlette", "uvicorn", "diffusers"}} & set(sys.modules)

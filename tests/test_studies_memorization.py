@@ -132,7 +132,7 @@ def call(capsys, *args):
     return commands.call(capsys, "score", *args, "--companions", "none", "--permutations", "0")
 
 
-def test_the_command_reports_planted_copies(capsys, world, tmp_path):
+def test_the_command_reports_planted_copies(capsys, world):
     args = ("--generated", world / "copies", world / "others", "--reference", world / "real")
     args = (*args, "--train", world / "train", "--encoder", "palpate/mini", "--allow-seen")
     status, out, err = call(capsys, *args, "--json")

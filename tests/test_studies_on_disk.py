@@ -1,11 +1,9 @@
 """Studies to their page: forged trees of true layouts, real clips, the worlds."""
 
-from dataclasses import replace
-
 import pytest
 
 from conftest import shared_data
-from forge.studies import STUDY, TINY, forge_clips, forge_hct, forge_touch_and_go
+from forge.studies import forge_clips, forge_hct, forge_touch_and_go
 from palpate.cli import main
 from palpate.report.results import Results
 from palpate.studies.names import NOLEAK, ORIG
@@ -33,14 +31,6 @@ def reaches_the_page(study, forge, rules, numbers, folder):
     printed = {str(row[0]) for row in results.tables[0].rows if str(row[0]).startswith("paper")}
     paper = {f"paper, {ORIG}", f"paper, {NOLEAK}"}
     assert printed == (paper if STUDIES[study].paper else set())
-
-
-@pytest.mark.slow
-def test_the_papers_data_set_reaches_the_page(tmp_path, monkeypatch):
-    tag = replace(STUDIES["tag"], methods=STUDY.methods, presets={"smoke": TINY})
-    monkeypatch.setitem(STUDIES, "tag", tag)
-    rules = {NOLEAK: ("name", "TaG-NoLeak")}
-    reaches_the_page("tag", forge_touch_and_go, rules, (1, 3, 4), tmp_path)
 
 
 @pytest.mark.nightly

@@ -11,7 +11,7 @@ import polars as pl
 import pytest
 
 from forge.commands import call, mistake
-from forge.studies import TINY
+from forge.studies import TINY, forge_touch_and_go
 from palpate.cli import main
 from palpate.core import FeatureSet, Measure, PalpateError, Score, Split, digest_file
 from palpate.core.files import canonical_json
@@ -239,10 +239,6 @@ def rows_of(setting, images):
     return [int(np.flatnonzero((train == image).all(axis=(1, 2, 3)))[0]) for image in images]
 
 
-def columns_of(setting, rows, name):
-    return np.array(setting.train.column(name))[rows], np.array(setting.test.column(name))
-
-
 def of_whole_videos(setting, images):
     """Materials of these images and of the test samples; whole videos stand for whole videos."""
     rows = rows_of(setting, images)
@@ -449,22 +445,26 @@ def test_half_probes_name_train_images_beside_the_real_ones_of_labeled_samples()
 
 @pytest.mark.slow
 def test_a_study_from_its_command_to_its_page(tmp_path, monkeypatch):
-    """Every table, method and control; other people's images; running again builds nothing."""
-    monkeypatch.setitem(STUDIES, WORLD.name, replace(WORLD, presets={"smoke": TINY}))
-    run, command = tmp_path / "run", ["reproduce", WORLD.name, "--preset", "smoke", "-q"]
-    assert main([*command, "-o", str(run)]) == 0
+    """On the paper's data set: every table, method and control; other people's images as well;
+    running again builds nothing."""
+    monkeypatch.setitem(STUDIES, "tag", replace(STUDIES["tag"], presets={"smoke": TINY}))
+    run, root = tmp_path / "run", forge_touch_and_go(tmp_path)
+    command = ["reproduce", "tag", "--root", str(root), "--preset", "smoke", "-q", "-o", str(run)]
+    assert main(command) == 0
     for name in ("results.json", "page.html", "page.md", "tables.tex"):
         assert (run / name).stat().st_size > 0, name
     results = Results.load(run / "results.json")
-    titles = [table.title.partition(":")[0] for table in results.tables]
-    assert titles[:3] == ["Table 1", "Table 3", "Table 4"]
-    assert "Material accuracy by training data" in {table.title for table in results.tables}
+    tables = {table.title.partition(":")[0]: table for table in results.tables}
+    assert [*tables][:3] == ["Table 1", "Table 3", "Table 4"]
+    assert "Material accuracy by training data" in tables
     assert "beyond the paper" in {claim.source for claim in results.claims}
-    rows = [row[0] for row in results.tables[1].rows]
-    assert {*METHODS, *CONTROLS, HALVES, HALF_PROBES} == {*rows}
+    rows = {str(row[0]) for row in tables["Table 3"].rows}
+    printed = {f"paper, {name}" for name in (OURS, "GVST", "Ours w/ BG")}
+    assert rows == {*METHODS, *CONTROLS, HALVES, HALF_PROBES, *printed}
+    assert {f"paper, {split}" for split in SPLITS} < {row[0] for row in tables["Table 1"].rows}
+    assert results.settings["split rule"][NOLEAK]["name"] == "TaG-NoLeak"
     assert len(results.audits) == 2
     assert results.audits[1].leaked_fraction == 0 < results.audits[0].leaked_fraction
-    assert results.claims
     for table in results.tables:
         for cell in (c for row in table.rows for c in row if isinstance(c, Score)):
             assert (run / cell.details["stage"] / "stage.json").is_file()
@@ -474,7 +474,7 @@ def test_a_study_from_its_command_to_its_page(tmp_path, monkeypatch):
     times = {p: p.stat().st_mtime_ns for p in run.glob("*/stage.json")}
     # The images of a method, given as another system's, score as that method's.
     given = f"theirs={run / 'images-gvst-NoLeak-0' / 'images'}"
-    assert main([*command, "-o", str(run), "--method", given]) == 0
+    assert main([*command, "--method", given]) == 0
     changed = {p.parent.name for p, t in times.items() if p.stat().st_mtime_ns != t}
     assert changed == {"scores-NoLeak-by-NoLeak-0", "results"}
     again = Results.load(run / "results.json")

@@ -1,7 +1,6 @@
 """Raters: what they prefer, what they see in a browser and do, and the studies they answer."""
 
 import base64
-import datetime
 import hashlib
 import io
 import json
@@ -17,7 +16,6 @@ from PIL import Image
 from forge.pictures import paint
 from palpate import preference
 from palpate.core import digest_json, rng_for
-from palpate.preference.votes import Vote, Votes
 
 # --- studies by hand in the public form, as the page and the server get them
 
@@ -173,18 +171,11 @@ class Crowd:
         felt += self.left_bias + rng.logistic()
         return "same" if abs(felt) < self.tie_band else "left" if felt > 0 else "right"
 
-    def preference(self, a, b, raters=None, draws=400_000):
-        """The planted truth: preference of a over b among all items, sides, and people.
-
-        Or among the named ``raters`` instead of all people.
-        """
+    def preference(self, a, b, draws=400_000):
+        """The planted truth: preference of a over b among all items, sides, and people."""
         rng, mean = np.random.default_rng(0), self.strengths[a] - self.strengths[b]
-        if raters is None:
-            mean = mean + self.rater_sd * rng.standard_normal(draws)
-        else:
-            own = [self._of_rater(r, a) - self._of_rater(r, b) for r in raters]
-            mean = mean + rng.choice(own, draws)
-        felt = mean + self.item_sd * rng.standard_normal(draws)
+        felt = mean + self.rater_sd * rng.standard_normal(draws)
+        felt += self.item_sd * rng.standard_normal(draws)
         felt += self.left_bias * rng.choice([-1, 1], draws) + rng.logistic(size=draws)
         same = np.abs(felt) < self.tie_band
         share = float(((felt > 0) & ~same).mean() + same.mean() / 2)
@@ -192,19 +183,6 @@ class Crowd:
 
     def _of_rater(self, rater, method):
         return self._rng("rater", rater, method).standard_normal() * self.rater_sd / np.sqrt(2)
-
-    def vote(self, plan, rater, trial, swapped):
-        """The answer as it is read from a download."""
-        at = datetime.datetime(2026, 11, 1, tzinfo=datetime.UTC)
-        return Vote(rater, trial, swapped, self.choice(plan, rater, trial, swapped), 2500, at, 0)
-
-    def votes(self, plan):
-        """The votes of all raters, as they are read from their downloads."""
-        of_rater = {}
-        for rater in plan.raters:
-            shown = ((plan.trial[n], s) for n, s in zip(rater.order, rater.swapped, strict=True))
-            of_rater[rater.code] = {t.id: self.vote(plan, rater.code, t, s) for t, s in shown}
-        return Votes(of_rater)
 
     def download(self, plan, rater):
         """What the page of one rater downloads."""

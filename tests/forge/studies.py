@@ -25,8 +25,13 @@ from palpate.studies.study import PRESETS, Study
 # --- the procedural world in a data set's layout, without the files that only a world has
 
 
-WORLD = {"materials": ("Wood", "Brick", "Grass"), "contacts_per_video": 2, "frames_per_contact": 2}
-FORGED = {"objects_per_material": 6, "seed": 83, **WORLD}
+FORGED = {
+    "materials": ("Wood", "Brick"),
+    "objects_per_material": 6,
+    "contacts_per_video": 2,
+    "frames_per_contact": 2,
+    "seed": 83,
+}
 #: What no data set has.
 ONLY_WORLDS = (
     "world.json",
