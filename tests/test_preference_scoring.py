@@ -332,6 +332,14 @@ def changed(plan, **changes):
     return signed(CROWD.download(plan, "r01") | changes)
 
 
+def read(plan, folder, *downloads):
+    """The votes of files with this content."""
+    paths = [folder / f"{k}.json" for k in range(len(downloads))]
+    for path, content in zip(paths, downloads, strict=True):
+        path.write_text(content if isinstance(content, str) else json.dumps(content))
+    return read_votes(plan, paths)
+
+
 @pytest.mark.parametrize(
     ("change", "words"),
     [
@@ -343,10 +351,8 @@ def changed(plan, **changes):
     ],
 )
 def test_torn_and_edited_votes_are_said(plan, tmp_path, change, words):
-    path = tmp_path / "votes.json"
-    path.write_text(change(json.dumps(changed(plan))))
     with pytest.raises(PalpateError, match=words) as error:
-        read_votes(plan, [path])
+        read(plan, tmp_path, change(json.dumps(changed(plan))))
     assert "download the votes again" in str(error.value)
 
 
@@ -372,10 +378,8 @@ def with_vote(**fields):
     ],
 )
 def test_votes_of_another_plan_or_of_no_page_are_said(plan, tmp_path, change, words):
-    path = tmp_path / "votes.json"
-    path.write_text(json.dumps(signed(change(CROWD.download(plan, "r01")))))
     with pytest.raises(PalpateError, match=words):
-        read_votes(plan, [path])
+        read(plan, tmp_path, signed(change(CROWD.download(plan, "r01"))))
 
 
 def test_the_same_votes_twice_count_once(plan, downloads):
@@ -390,33 +394,24 @@ def test_of_an_undone_vote_the_last_counts(plan, tmp_path):
     first = download["votes"][0]
     other = "left" if first["choice"] != "left" else "right"
     later = changed(plan, votes=[first | {"choice": other, "undone": 1}])
-    paths = [tmp_path / "a.json", tmp_path / "b.json"]
-    for path, content in zip(paths, (later, download), strict=True):
-        path.write_text(json.dumps(content))
-    votes = read_votes(plan, paths)
+    votes = read(plan, tmp_path, later, download)
     assert votes.by_rater["r01"][plan.raters[0].order[0]].choice == other
     assert not votes.notes
 
 
 def test_different_answers_under_one_code_are_said(plan, tmp_path):
     other = Crowd(CROWD.strengths, seed=1).download(plan, "r01")
-    paths = [tmp_path / "a.json", tmp_path / "b.json"]
-    for path, content in zip(paths, (changed(plan), other), strict=True):
-        path.write_text(json.dumps(content))
-    notes = {note.code: note.params for note in read_votes(plan, paths).notes}
+    notes = {note.code: note.params for note in read(plan, tmp_path, changed(plan), other).notes}
     assert notes["votes-differ"]["count"] > 5
 
 
 def test_votes_after_the_last_day_do_not_count(rated, tmp_path):
     plan = rated.make(items=4, raters=1, until="2026-10-01")
-    path = tmp_path / "votes.json"
-    path.write_text(json.dumps(CROWD.download(plan, "r01")))
+    early = changed(plan)
     with pytest.raises(PalpateError, match=f"{len(plan.trials)} after 2026-10-01"):
-        read_votes(plan, [path])
-    early = CROWD.download(plan, "r01")
+        read(plan, tmp_path, early)
     early["votes"][0]["at"] = "2026-09-30T10:00:00Z"
-    path.write_text(json.dumps(signed(early)))
-    votes = read_votes(plan, [path])
+    votes = read(plan, tmp_path, signed(early))
     assert len(votes) == 1
     assert votes.notes == [Note("votes-late", {"count": len(plan.trials) - 1})]
 

@@ -20,7 +20,7 @@ from palpate.preference.scoring import PREFERENCE, STRENGTH
 from palpate.report.results import Results
 from palpate.sim import WorldOptions
 from palpate.sim.presets import MINI_SEEDS
-from palpate.studies import collecting, controls, files, judging, reproduce
+from palpate.studies import collecting, controls, files, judging, reproduce, utility
 from palpate.studies.controls import CONTROLS
 from palpate.studies.graph import Work, digests_of
 from palpate.studies.methods import METHODS, Method, Setting
@@ -448,6 +448,7 @@ def test_a_study_from_its_command_to_its_page(tmp_path, monkeypatch):
     """On the paper's data set: every table, method and control; other people's images as well;
     running again builds nothing."""
     monkeypatch.setitem(STUDIES, "tag", replace(STUDIES["tag"], presets={"smoke": TINY}))
+    monkeypatch.setattr(reproduce, "Draws", partial(utility.Draws, shots=(1, 2), draws=2))
     run, root = tmp_path / "run", forge_touch_and_go(tmp_path)
     command = ["reproduce", "tag", "--root", str(root), "--preset", "smoke", "-q", "-o", str(run)]
     assert main(command) == 0

@@ -162,8 +162,7 @@ class Demo:
             name="world" if data is None else data.name,
             unseen=True,
         )
-        train = preset.train
-        nodes.add("split", make_demo_splits, "data", seed=seed, train=train, measures=True)
+        nodes.add("split", make_demo_splits, "data", seed=seed, train=preset.train, measures=True)
         nodes.add(
             "encoders",
             train_on,
@@ -187,11 +186,27 @@ class Demo:
             autoencoder=autoencoder,
             start=start,
         )
-        after = ("data", "split", "generator")
-        nodes.add("generated", make_images, *after, split=SPLIT, seed=seed, generator=after[-1])
-        after = ("data", "split", "generated", "encoders")
-        size = preset.diffusion.size
-        nodes.add("scores", score_images, *after, seed=seed, size=size, measures=True)
+        nodes.add(
+            "generated",
+            make_images,
+            "data",
+            "split",
+            "generator",
+            split=SPLIT,
+            seed=seed,
+            generator="generator",
+        )
+        nodes.add(
+            "scores",
+            score_images,
+            "data",
+            "split",
+            "generated",
+            "encoders",
+            seed=seed,
+            size=preset.diffusion.size,
+            measures=True,
+        )
         return nodes
 
     def results(self, stages: Mapping[str, Stage], jobs: int = 1) -> Results:
