@@ -374,14 +374,14 @@ def test_a_wrong_key_is_named_by_its_variable_and_never_shown(
     assert "wrong-key" not in error
 
 
-@pytest.mark.parametrize("field", ["error", "detail", "cause", "model", "id", "content"])
+@pytest.mark.parametrize("field", ["error", "detail", "cause", "model", "id", "words"])
 def test_a_key_that_comes_back_in_escapes_is_not_kept(data, tmp_path, monkeypatch, capsys, field):
     key = "sk/planted/7c1f"
     monkeypatch.setenv("PALPATE_CAPTION_KEY", key)
     said = "".join(f"\\u{ord(sign):04x}" for sign in key)
     body = {field: "SAID"} | {"error": {"message": "SAID"}}
     if field not in ("error", "detail", "cause"):
-        body = reply(GOOD + " SAID" * (field == "content"), **body | {"error": 0})[1]
+        body = reply(GOOD + " SAID" * (field == "words"), **body | {"error": 0})[1]
     for escaped in (said, key, key.replace("/", "\\/")):
         fault = json.dumps(body).replace("SAID", escaped).encode()
         with FakeServer(
