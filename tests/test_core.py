@@ -29,7 +29,7 @@ from palpate.core import (
     seed_for,
 )
 from palpate.core.features import to_numpy
-from palpate.report.families import columns
+from palpate.report.tables import columns
 from palpate.studies.stages import run_stage
 
 PROBLEMS = [Problem("a:1", "bad-line", "x"), Problem("a:2", "bad-line", "y")]

@@ -23,7 +23,7 @@ from palpate.evaluation import impact_features
 from palpate.evaluation.impact import nearest_hits, thin
 from palpate.evaluation.impact_features import Source, fit_reduction
 from palpate.leakage.splitting import split as leak_free_split
-from palpate.report.results import Impact
+from palpate.report.records import Impact
 
 
 def videos(materials: int = 4, each: int = 5, frames: int = 6, **columns: object) -> Manifest:

@@ -29,8 +29,8 @@ from forge.results import (
 )
 from palpate.core import SampleRef
 from palpate.report import write_report
-from palpate.report.results import GalleryItem, LeakPair, Results
-from palpate.report.study import Claim, StudyTable
+from palpate.report.records import Claim, GalleryItem, LeakPair, StudyTable
+from palpate.report.results import Results
 
 LONG = "a_recording_with_a_name_that_no_line_of_a_phone_can_hold_2024_11_21_rig_b"
 

@@ -6,12 +6,11 @@ import pytest
 
 from forge.results import Tree, clean_audit, full_audit, full_results, gallery, score
 from palpate.core import Note
-from palpate.report.families import defined, families
 from palpate.report.first_screen import about, annotated, cards, caution, telling_columns
 from palpate.report.page import render_page
+from palpate.report.records import Claim, StudyTable
 from palpate.report.results import Results
-from palpate.report.study import Claim, StudyTable
-from palpate.report.tables import grid
+from palpate.report.tables import defined, families, grid
 
 
 def measured():

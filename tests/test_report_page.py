@@ -34,7 +34,8 @@ from palpate.report.plots import (
     nice_step,
     score_histogram,
 )
-from palpate.report.results import GalleryItem, LeakPair, Results, Signal
+from palpate.report.records import GalleryItem, LeakPair, Signal
+from palpate.report.results import Results
 
 NASTY = "<script>alert(\"x\")</script> & 'quotes'"
 

@@ -10,7 +10,8 @@ from forge.commands import mistake
 from forge.results import full_audit, full_results, images, score, small_audit
 from palpate.cli import main
 from palpate.core import PalpateError
-from palpate.report.results import Audit, LeakPair, Results
+from palpate.report.records import LeakPair
+from palpate.report.results import Audit, Results
 
 
 def test_results_are_a_table_of_scores():

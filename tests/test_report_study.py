@@ -15,13 +15,14 @@ from forge.results import Tree, images, score, study_results, text_note
 from palpate.cli import main
 from palpate.core import SampleRef
 from palpate.report import write_report
-from palpate.report.families import families
+from palpate.report.figures import Panel, panels_of, strips_svg
 from palpate.report.first_screen import telling_columns
+from palpate.report.labels import file_names
 from palpate.report.page import OPEN_CLAIMS, render_page
-from palpate.report.results import GalleryItem, Results
-from palpate.report.strips import Panel, panels_of, strips_svg
-from palpate.report.study import Claim, StudyTable, brief, tally
-from palpate.report.tables import file_names, grid, of_study
+from palpate.report.records import Claim, GalleryItem, StudyTable
+from palpate.report.results import Results
+from palpate.report.study import brief, of_study, tally
+from palpate.report.tables import families, grid
 from palpate.report.terminal import as_text
 from palpate.studies.evidence import in_words
 

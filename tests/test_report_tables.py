@@ -6,11 +6,19 @@ import pytest
 
 from forge.results import difference, score, text_note
 from palpate.core import Note, PalpateError
-from palpate.report.families import columns, families, family_of
-from palpate.report.labels import label_of, subject_of
-from palpate.report.numbers import decimals, number, percent, plural, score_text
+from palpate.report.labels import (
+    decimals,
+    label_of,
+    number,
+    percent,
+    plural,
+    score_text,
+    subject_of,
+)
+from palpate.report.page import heat_tables
 from palpate.report.results import Results
-from palpate.report.tables import grids, heat_tables, listing, of_differences, rankings
+from palpate.report.tables import columns, families, family_of, grids, listing, of_differences
+from palpate.report.terminal import rankings
 
 
 @pytest.mark.parametrize(

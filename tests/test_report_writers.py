@@ -15,7 +15,8 @@ from palpate.core import Note, SampleRef
 from palpate.report import notes
 from palpate.report.audits import pair_lists
 from palpate.report.latex import escape
-from palpate.report.results import LeakPair, Results, Signal
+from palpate.report.records import LeakPair, Signal
+from palpate.report.results import Results
 from palpate.report.terminal import as_text, audit_text, print_result
 
 NASTY = r"100% & {x} $_#^~ <b> \input{a} | `c` [d]"

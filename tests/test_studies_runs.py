@@ -19,8 +19,8 @@ from safetensors.numpy import load_file
 from forge import studies as small_study
 from palpate.core import PalpateError, Score, Split, digest_file, digest_json, short
 from palpate.evaluation.companions import Weights
+from palpate.report.records import Claim, StudyTable
 from palpate.report.results import Results
-from palpate.report.study import Claim, StudyTable
 from palpate.studies.files import read_scores
 from palpate.studies.graph import digests_of, in_order
 from palpate.studies.methods import OURS

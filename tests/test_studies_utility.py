@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from palpate.core import FeatureSet, PalpateError, Score
+from palpate.report.records import StudyTable
 from palpate.report.results import Results
-from palpate.report.study import StudyTable
 from palpate.studies import utility as utility_module
 from palpate.studies.graph import Work
 from palpate.studies.names import CEILING, NEAREST

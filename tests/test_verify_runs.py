@@ -14,8 +14,8 @@ from forge.results import edit
 from palpate.cli import main
 from palpate.core import Score
 from palpate.preference.scoring import PREFERENCE
+from palpate.report.records import Claim, StudyTable
 from palpate.report.results import Results
-from palpate.report.study import Claim, StudyTable
 from palpate.studies import reproduce
 from palpate.studies.names import NOLEAK
 from palpate.studies.reproduce import run_study

@@ -9,8 +9,16 @@ import numpy as np
 from PIL import Image
 
 from palpate.core import Note, SampleRef, Score
-from palpate.report.results import Audit, GalleryItem, Impact, ImpactRow, LeakPair, Results, Signal
-from palpate.report.study import Claim, StudyTable
+from palpate.report.records import (
+    Claim,
+    GalleryItem,
+    Impact,
+    ImpactRow,
+    LeakPair,
+    Signal,
+    StudyTable,
+)
+from palpate.report.results import Audit, Results
 
 #: Gaps of Touch and Go's own split, as `palpate audit` finds them.
 GAPS = {

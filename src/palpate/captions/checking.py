@@ -38,8 +38,7 @@ from palpate.data.reading import load
 from palpate.data.texts import TABLE, joined, read_texts
 from palpate.metrics.means import mean_of
 from palpate.metrics.probe import fit_probe
-from palpate.report.calls import Call
-from palpate.report.results import Results
+from palpate.report.results import Call, Results
 
 #: Words from which a caption is overlong.
 LONGEST = 40

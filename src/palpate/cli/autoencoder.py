@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Any
 
-from palpate.cli.terminal import Terminal, require_extra
-from palpate.cli.training import PRESETS, Training
+from palpate.cli.terminal import Terminal, option_group
+from palpate.cli.training import Training
 
 
-@dataclass(frozen=True, kw_only=True)
+@option_group
 class Options(Training):
     """Train the autoencoder of tactile images that a generator works in, and print its ceiling.
 
@@ -26,17 +25,11 @@ class Options(Training):
 
 def run(options: Options, terminal: Terminal) -> dict[str, Any]:
     """Train, and print how well images outside of train are reconstructed."""
-    require_extra("palpate train autoencoder")
-    preset = PRESETS["train autoencoder"].preset(options.preset, options.settings)
-    options.require_data()
+    preset = options.chosen("train autoencoder")
     from palpate.diffusion.autoencoder_training import train_autoencoder
 
-    with terminal.progress() as progress:
-        model = train_autoencoder(
-            preset=preset, progress=progress, **options.keywords("preset", "settings")
-        )
+    model = terminal.run(train_autoencoder, **options.keywords("settings", preset=preset))
     facts: dict[str, Any] = {"folder": str(options.output), "digest": model.digest}
-    facts |= {"images": model.card["images"], "split": model.card["split"]}
+    facts |= {name: model.card[name] for name in ("images", "split")}
     facts |= {f"ceiling_{name}": value for name, value in model.card.get("ceiling", {}).items()}
-    terminal.facts(f"Autoencoder {options.output}", facts)
-    return facts
+    return terminal.facts(f"Autoencoder {options.output}", facts)

@@ -2,16 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
-import tyro
-
-from palpate.cli.terminal import Common, OutPath, Terminal
+from palpate.cli.terminal import Common, OutPath, PathArgument, Terminal, option_group
 
 
-@dataclass(frozen=True, kw_only=True)
+@option_group
 class Options(Common):
     """Propose a background for each sample: the gel before its contact, else of its video.
 
@@ -19,17 +15,14 @@ class Options(Common):
     or are found in the images.
     """
 
-    source: Annotated[Path, tyro.conf.Positional]
+    source: PathArgument
     """Manifest file, folder of an import, or a data set with its images as files."""
     output: OutPath
     """Folder for the new manifest.parquet; the images stay where they are."""
 
 
-def run(options: Options, terminal: Terminal) -> dict[str, Any]:
+def run(options: Options, terminal: Terminal) -> Any:
     """Propose, and print how many were found."""
     from palpate.data import propose_backgrounds
 
-    with terminal.progress() as progress:
-        proposed = propose_backgrounds(options.source, options.output, progress=progress)
-    terminal.print(str(proposed))
-    return proposed.to_json()
+    return terminal.run(propose_backgrounds, options.source, options.output)

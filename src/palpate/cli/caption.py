@@ -4,18 +4,25 @@ from __future__ import annotations
 
 import json
 import sys
-from dataclasses import dataclass, field
-from pathlib import Path
+from dataclasses import field
 from typing import Annotated, Any, Literal
 
 import tyro
 
-from palpate.cli.terminal import Common, OutPath, Switch, Terminal, error_line
+from palpate.cli.terminal import (
+    Common,
+    OutPath,
+    PathArgument,
+    Switch,
+    Terminal,
+    error_line,
+    option_group,
+)
 from palpate.cli.verbs import FAILED_CHECK
 from palpate.core import PalpateError
 
 
-@dataclass(frozen=True, kw_only=True)
+@option_group
 class Source:
     """Where captions come from: --server or --template."""
 
@@ -28,7 +35,7 @@ class Source:
     """No model: columns in braces (`"{material} of {object}"`), or adjectives of the material."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@option_group
 class RequestOptions:
     """The instruction to the model, and its limits."""
 
@@ -48,7 +55,7 @@ class RequestOptions:
     """Further fields of every request, as a JSON object; null removes a field."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@option_group
 class Options(Common):
     """Describe what each touch feels like, by a vision-language model, once a contact.
 
@@ -57,7 +64,7 @@ class Options(Common):
     reply, or no reply can be used. Then: palpate caption check, palpate import --text.
     """
 
-    data: Annotated[Path, tyro.conf.Positional]
+    data: PathArgument
     """A manifest, the folder of an import, or anything that palpate reads."""
     output: OutPath
     """Folder to write."""
@@ -67,26 +74,20 @@ class Options(Common):
     """Send no photo; print how many requests it takes."""
 
 
-def run(options: Options, terminal: Terminal) -> tuple[dict[str, Any], int]:
+def run(options: Options, terminal: Terminal) -> Any:
     """Caption and print what was written, or the estimate."""
     from palpate.captions import Captions, StoppedError, caption
 
-    template = options.source.template
+    template, body = options.source.template, _object(options.requests.body)
+    text = None if template is None else " ".join(template)
     try:
-        with terminal.progress() as progress:
-            result = caption(
-                progress=progress,
-                **options.keywords(
-                    body=_object(options.requests.body),
-                    template=None if template is None else " ".join(template),
-                ),
-            )
+        result = terminal.run(caption, **options.keywords(body=body, template=text))
     except StoppedError as stop:
         sys.stderr.write(f"palpate caption: {error_line('caption', stop)}\n")
         return stop.to_json(), FAILED_CHECK
-    terminal.print(str(result))
     if not isinstance(result, Captions):
-        return result.to_json(), 0
+        return result
+    terminal.print(str(result))
     for note in result.notes:
         terminal.note(note)
     if not result.record["counts"]["texts"]:

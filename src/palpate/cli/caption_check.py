@@ -2,27 +2,31 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Any
-
-import tyro
+from typing import Any
 
 from palpate.cli.importing import Maps, columns_of
-from palpate.cli.terminal import Common, Files, OptionalOutPath, Terminal
+from palpate.cli.terminal import (
+    Common,
+    Files,
+    OptionalOutPath,
+    PathArgument,
+    Terminal,
+    option_group,
+)
 from palpate.cli.verbs import FAILED_CHECK
 from palpate.core import require
 
 
-@dataclass(frozen=True, kw_only=True)
+@option_group
 class Options(Common):
     """Check captions: labels in the text, material read from the text alone on new videos, text
     that train and test share, refusals, empty and overlong text, one text for many contacts, and
     words of color and shape that no finger feels.
     """
 
-    captions: Annotated[Path, tyro.conf.Positional]
+    captions: PathArgument
     """Folder of palpate caption, a table with the columns id and text, or without --data also
     samples with texts."""
     data: Path | None = None
@@ -55,14 +59,9 @@ def run(options: Options, terminal: Terminal) -> tuple[dict[str, Any], int]:
     check = check_captions
     if columns := columns_of(options.columns):
         check = partial(check, columns=columns)
-    with terminal.progress() as progress:
-        results = check(
-            options.captions,
-            options.data,
-            split=options.split,
-            seed=options.seed,
-            progress=progress,
-        )
+    results = terminal.run(
+        check, options.captions, options.data, split=options.split, seed=options.seed
+    )
     shown = terminal.deliver(results, files)
     flagged = float(results[SHARE, FLAGGED])
     failed = limit is not None and flagged > limit

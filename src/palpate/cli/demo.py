@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
 from palpate.cli.reproduce import run_into
-from palpate.cli.terminal import Common, OutPath, Terminal, require_extra
+from palpate.cli.terminal import Common, OutPath, Terminal, option_group
 
 
-@dataclass(frozen=True, kw_only=True)
+@option_group
 class Options(Common):
     """Run everything once: data, leak-free split, encoders, generator, images, scores, page.
 
@@ -32,7 +31,6 @@ class Options(Common):
 
 def run(options: Options, terminal: Terminal) -> dict[str, Any]:
     """Run the stages and write the page."""
-    require_extra("palpate demo")
     from palpate.studies.demo import Demo
 
     data = options.data and options.data.resolve()

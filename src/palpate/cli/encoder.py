@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import field
 from typing import Any
 
-from palpate.cli.terminal import Switch, Terminal, require_extra
-from palpate.cli.training import PRESETS, EncoderMachine, Training, print_plan
+from palpate.cli.terminal import Switch, Terminal, option_group
+from palpate.cli.training import EncoderMachine, Training
 
 
-@dataclass(frozen=True, kw_only=True)
+@option_group
 class Options(Training):
     """Train the tactile encoder against frozen vision and text encoders (three-way InfoNCE)."""
 
@@ -26,9 +26,7 @@ class Options(Training):
 
 def run(options: Options, terminal: Terminal) -> dict[str, Any]:
     """Train, and print the accuracy of a linear material probe on the test part."""
-    require_extra("palpate train encoder")
-    preset = PRESETS["train encoder"].preset(options.preset, options.settings)
-    options.require_data()
+    preset = options.chosen("train encoder")
     from palpate.encoders.contrastive import plan_encoder, train_encoder
 
     if options.dry_run:
@@ -39,24 +37,19 @@ def run(options: Options, terminal: Terminal) -> dict[str, Any]:
             epochs=options.epochs,
             device=options.machine.device,
         )
-        return print_plan(terminal, f"Plan of {options.output}", plan)
-    with terminal.progress() as progress:
-        encoders = train_encoder(
-            preset=preset, progress=progress, **options.keywords("preset", "settings", "dry_run")
-        )
+        return options.print_plan(terminal, plan)
+    encoders = terminal.run(train_encoder, **options.keywords("settings", "dry_run", preset=preset))
+    card = encoders.card
     facts: dict[str, Any] = {
         "folder": str(options.output),
         "tactile": encoders.digest("tactile"),
         "clip": encoders.name,
-        "split": encoders.card["split"],
-        "text_source": encoders.card["text_source"],
-        "processes": encoders.card["processes"],
-        "learning_rate": encoders.card["options"]["lr"],
+        **{name: card[name] for name in ("split", "text_source", "processes")},
+        "learning_rate": card["options"]["lr"],
     }
-    if missing := encoders.card.get("without_photo"):
+    if missing := card.get("without_photo"):
         facts["samples_without_photo"] = missing
-    for row in encoders.card.get("scores", ()):
+    for row in card.get("scores", ()):
         facts["test_material_accuracy"] = row["value"]
-        facts |= {"interval": row["interval"], "chance": row["chance"]}
-    terminal.facts(f"Encoders {options.output}", facts)
-    return facts
+        facts |= {name: row[name] for name in ("interval", "chance")}
+    return terminal.facts(f"Encoders {options.output}", facts)

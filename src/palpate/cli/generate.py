@@ -2,23 +2,21 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Any, Literal
 
-import tyro
-
-from palpate.cli.terminal import Common, OutPath, Switch, Terminal, require_extra
+from palpate.cli.terminal import Common, OutPath, PathArguments, Switch, Terminal, option_group
 from palpate.core import plain, problem_lines
 
 
-@dataclass(frozen=True, kw_only=True)
+@option_group
 class Options(Common):
     """Make a tactile image for each photo or sample of a data set, or for a text. Run again to
     continue.
     """
 
-    photos: Annotated[tuple[Path, ...], tyro.conf.Positional] = ()
+    photos: PathArguments = ()
     """Photos, a folder of them, or a manifest (its file or the folder of an import)."""
     output: OutPath
     """A .png for one photo; else a folder for images/ and index.json."""
@@ -53,12 +51,10 @@ class Options(Common):
 
 def run(options: Options, terminal: Terminal) -> dict[str, Any]:
     """Generate and print where the images are, and what the generator cannot know."""
-    require_extra("palpate generate")
     from palpate.diffusion.generation import generate
 
     photos: Any = (options.photos[0] if len(options.photos) == 1 else options.photos) or None
-    with terminal.progress() as progress:
-        images = generate(photos, progress=progress, **options.keywords("photos"))
+    images = terminal.run(generate, photos, **options.keywords("photos"))
     for note in images.notes:
         terminal.note(note)
     if options.dry_run:

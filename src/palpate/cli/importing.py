@@ -7,13 +7,12 @@ folders also with ``palpate audit`` and ``palpate split``.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import tyro
 
-from palpate.cli.terminal import Common, OutPath, Switch, Terminal
+from palpate.cli.terminal import Common, OutPath, PathArgument, Switch, Terminal, option_group
 from palpate.core import require
 
 Maps = Annotated[
@@ -23,7 +22,7 @@ Maps = Annotated[
 ]
 
 
-@dataclass(frozen=True, kw_only=True)
+@option_group
 class Reading:
     """How lists, tables and folders are read."""
 
@@ -62,7 +61,7 @@ class Reading:
         return words
 
 
-@dataclass(frozen=True, kw_only=True)
+@option_group
 class TableOptions(Reading):
     """Folders of images, tables, interval lists, Hugging Face data sets."""
 
@@ -84,7 +83,7 @@ class TableOptions(Reading):
         return vars(self) | {"columns": columns_of(self.columns) or None}
 
 
-@dataclass(frozen=True, kw_only=True)
+@option_group
 class FormatOptions:
     """Options of single formats."""
 
@@ -102,7 +101,7 @@ class FormatOptions:
     """
 
 
-@dataclass(frozen=True, kw_only=True)
+@option_group
 class SourceOptions(Common):
     """What names a source and how to read it."""
 
@@ -116,7 +115,7 @@ class SourceOptions(Common):
     formats: FormatOptions = FormatOptions()
 
 
-@dataclass(frozen=True, kw_only=True)
+@option_group
 class Options(SourceOptions):
     """Turn a data set on disk into a manifest.
 
@@ -124,7 +123,7 @@ class Options(SourceOptions):
     Face data set. Eight layouts with their commands: docs/your-data.md.
     """
 
-    source: Annotated[Path, tyro.conf.Positional]
+    source: PathArgument
     """Root of the data set, a table (CSV, TSV, JSON lines, JSON, Parquet), or with `--format hf` a
     name on the hub.
     """
@@ -139,19 +138,11 @@ class Options(SourceOptions):
     source may then also be an import."""
 
 
-def run(options: Options, terminal: Terminal) -> dict[str, Any]:
+def run(options: Options, terminal: Terminal) -> Any:
     """Import and print what was imported."""
     from palpate.data import import_dataset
 
-    with terminal.progress() as progress:
-        imported = import_dataset(
-            options.source,
-            options.output,
-            progress=progress,
-            **options.keywords("source", "output"),
-        )
-    terminal.print(str(imported))
-    return imported.to_json()
+    return terminal.run(import_dataset, **options.keywords())
 
 
 def columns_of(items: Sequence[Sequence[str]]) -> dict[str, str]:

@@ -2,18 +2,17 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
-from palpate.cli.terminal import Common, OptionalOutPath, Switch, Terminal
+from palpate.cli.terminal import Common, OptionalOutPath, Switch, Terminal, option_group
 from palpate.core import plain, require
 
 #: Seconds that a trial takes, for the time a study will take.
 SECONDS = 5
 
 
-@dataclass(frozen=True, kw_only=True)
+@option_group
 class Options(Common):
     """Plan a blinded study: which generator's images do people find closer to the real ones?
 
@@ -64,26 +63,17 @@ def run(options: Options, terminal: Terminal) -> dict[str, Any]:
     apart = not options.output or options.output.resolve() not in [p.resolve() for p in inputs]
     must, fix = "An output must not replace an input", "Choose another folder"
     require(apart, None, must, str(options.output), fix=fix)
-    with terminal.progress() as progress:
-        plan = make(progress=progress, **options.keywords())
+    plan = terminal.run(make, **options.keywords())
     for note in plan.notes:
         terminal.note(note)
     trials = len(plan.trials)
-    facts: dict[str, Any] = {
-        "study": plan.study,
-        "methods": list(plan.methods),
-        "items": len(plan.items),
-        "raters": len(plan.raters),
-        "trials": trials,
-        "minutes": round(trials * SECONDS / 60),
-    }
+    facts: dict[str, Any] = {"study": plan.study, "methods": list(plan.methods)}
+    facts |= {"items": len(plan.items), "raters": len(plan.raters), "trials": trials}
+    facts["minutes"] = round(trials * SECONDS / 60)
     if plan.expected:
         facts["half_width"] = plan.expected["half_width"]
-    if options.output and not options.dry_run:
-        facts |= {
-            "page": str(options.output / "study.html"),
-            "plan": str(options.output / "plan.json"),
-        }
+    if (output := options.output) and not options.dry_run:
+        facts |= {"page": str(output / "study.html"), "plan": str(output / "plan.json")}
     terminal.facts("Study", facts)
     if plan.expected:
         reach = f"about {plan.expected['half_width']:.2f} to each side, by simulation"

@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import field
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
-import tyro
-
-from palpate.cli.terminal import Common, Files, Terminal
+from palpate.cli.terminal import Common, Files, PathArgument, PathArguments, Terminal, option_group
 
 
-@dataclass(frozen=True, kw_only=True)
+@option_group
 class Options(Common):
     """Score the votes of a study: preferences, strengths, agreement, and metrics that agree.
 
@@ -19,9 +17,9 @@ class Options(Common):
     says that it is for these raters.
     """
 
-    study: Annotated[Path, tyro.conf.Positional]
+    study: PathArgument
     """Folder of palpate preference make; votes that its server stored count as well."""
-    votes: Annotated[tuple[Path, ...], tyro.conf.Positional] = ()
+    votes: PathArguments = ()
     """What raters downloaded, or folders of that."""
     metrics: tuple[Path, ...] = ()
     """Which of these agree with people? The JSON of `palpate score -o` of the same methods."""
@@ -38,13 +36,12 @@ def run(options: Options, terminal: Terminal) -> dict[str, Any]:
     options.files.guard(inputs)
     from palpate.preference import score
 
-    with terminal.progress() as progress:
-        results = score(
-            options.study,
-            options.votes,
-            metrics=options.metrics,
-            replicates=options.replicates,
-            seed=options.seed,
-            progress=progress,
-        )
+    results = terminal.run(
+        score,
+        options.study,
+        options.votes,
+        metrics=options.metrics,
+        replicates=options.replicates,
+        seed=options.seed,
+    )
     return terminal.deliver(results, options.files)

@@ -3,16 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
-from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
-import tyro
-
-from palpate.cli.terminal import Common, Terminal
+from palpate.cli.terminal import Common, PathArgument, Terminal, option_group
 
 
-@dataclass(frozen=True, kw_only=True)
+@option_group
 class Options(Common):
     """Serve the page of a study and keep the votes, until Ctrl-C.
 
@@ -20,7 +16,7 @@ class Options(Common):
     study.db in the folder of the study, and each is on disk before it is acknowledged.
     """
 
-    study: Annotated[Path, tyro.conf.Positional]
+    study: PathArgument
     """Folder of palpate preference make."""
     host: str = "127.0.0.1"
     """Address to listen at; 0.0.0.0 is reached from other machines."""
@@ -47,13 +43,5 @@ def run(options: Options, terminal: Terminal) -> dict[str, Any]:
         for rater, link in links.items():
             terminal.print(f"  {rater}  {link}")
 
-    serve(
-        options.study,
-        host=options.host,
-        port=options.port,
-        invite=options.invite,
-        reinvite=options.reinvite,
-        until=options.until,
-        ready=ready,
-    )
+    serve(ready=ready, **options.keywords(reinvite=options.reinvite))
     return facts

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Annotated, Any
 
 import tyro
 from rich.box import SIMPLE_HEAD
 from rich.table import Table
 
-from palpate.cli.terminal import Common, Terminal
+from palpate.cli.terminal import Common, Terminal, option_group
 from palpate.cli.training import PRESETS as TRAININGS
 from palpate.cli.world import WORLDS
 from palpate.core import require_choice
@@ -18,7 +17,7 @@ from palpate.sim.presets import COSTS
 PRESETS = {**TRAININGS, "world": WORLDS}
 
 
-@dataclass(frozen=True, kw_only=True)
+@option_group
 class Options(Common):
     """List the presets of trainings, with what they take and reach, and of worlds; or the fields of
     one, which `--set field=value` changes.

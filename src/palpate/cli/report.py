@@ -2,33 +2,36 @@
 
 from __future__ import annotations
 
-import os
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass, fields, replace
-from functools import reduce
+from dataclasses import fields, replace
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
-import tyro
-
-from palpate.cli.terminal import Common, OutPath, Terminal, guard_output
-from palpate.core import Note, PalpateError, few, inside, read_record, require, short
-from palpate.report.results import AUDIT_FORMAT, RESULTS_FORMAT, Audit, Results
+from palpate.cli.terminal import (
+    Common,
+    OutPath,
+    PathArguments,
+    Terminal,
+    guard_output,
+    option_group,
+)
+from palpate.core import Note, PalpateError, few, inside, require, short
+from palpate.report.results import Results
 
 TITLE = "palpate report"
 #: Names of the files that a folder of figures holds.
 WRITTEN = re.compile(r"(background|pairs|samples|strips)\b.*\.(png|svg)")
 
 
-@dataclass(frozen=True, kw_only=True)
+@option_group
 class Options(Common):
     """Write one self-contained page, with JSON and Markdown of the same results next to it.
 
     Figures for a paper can be written as files, too.
     """
 
-    results: Annotated[tuple[Path, ...], tyro.conf.Positional]
+    results: PathArguments
     """Any of: the JSON of `palpate audit -o`, of `palpate score -o`, or of an earlier page."""
     output: OutPath
     """The page to write (.html)."""
@@ -54,19 +57,28 @@ def run(options: Options, terminal: Terminal) -> dict[str, Any]:
         guard_output(options.output.with_suffix(".md"), options.results, marks)
     _guard_folder(options.figures)
     results = [read(path, options.images) for path in options.results]
-    merged = reduce(join, results, Results(title=options.title))
+    titles = (options.title, *(each.title for each in results))
+    names = [f.name for f in fields(Results) if f.name not in ("title", "settings")]
+    merged = Results(
+        title=next((title for title in titles if title not in ("", TITLE)), TITLE),
+        settings={name: value for each in results for name, value in each.settings.items()},
+        **{name: [item for each in results for item in getattr(each, name)] for name in names},
+    )
     for note in merged.notes:
         if note.code == "images-outside":
             terminal.note(note)
-    merged = replace(merged, notes=[*merged.notes, *_mismatch(merged)])
-    with terminal.progress() as progress:
-        files = write_report(merged, options.output, base=Path(), progress=progress)
+    audited, scored = (
+        {x.split for x in items if x.split} for items in (merged.audits, merged.scores)
+    )
+    if merged.audits and (others := scored - audited):  # no audit is of the scores' split
+        note = Note("other-split", {"splits": ", ".join(map(short, sorted(others)))})
+        merged = replace(merged, notes=[*merged.notes, note])
+    files = terminal.run(write_report, merged, options.output, base=Path())
     paths = {"page": str(files.page), "json": str(files.json), "markdown": str(files.markdown)}
     if options.figures:
         merged.save_figures(options.figures)
         paths["figures"] = str(options.figures)
-    terminal.facts("Report", paths)
-    return paths
+    return terminal.facts("Report", paths)
 
 
 def _guard_folder(folder: Path | None) -> None:
@@ -93,46 +105,14 @@ def read(path: Path, folders: Sequence[Path] = ()) -> Results:
     Raises:
         PalpateError: if it is missing, of another format, or incomplete.
     """
-    data = read_record(path, "results file", form=(RESULTS_FORMAT, AUDIT_FORMAT))
-    try:
-        if data["format"] == AUDIT_FORMAT:
-            results = replace(Audit.from_json(data).to_results(), title="")
-        else:
-            results = Results.from_json(data)
-    except ValueError as error:
-        got = f"a missing, unknown or wrong field ({error})"
-        fix = "Write it again with palpate"
-        raise PalpateError(f"{path} must hold complete results", got, fix) from None
-    outside: set[str] = set()
+    results, outside = Results.load(path), set[str]()
 
-    def place(name: str) -> str | None:
-        if any(
-            inside(root, str(path.parent.absolute() / name)) for root in (path.parent, *folders)
-        ):
-            return os.path.normpath(path.parent / name)
+    def keep(name: str) -> str | None:
+        if any(inside(root, str(Path(name).absolute())) for root in (path.parent, *folders)):
+            return name
         outside.add(name)
         return None
 
-    results = results.with_paths(place)
-    results = results.with_call_paths(lambda name: os.path.normpath(path.parent / name))
+    results = results.with_paths(keep)
     note = Note("images-outside", {"count": len(outside), "file": str(path)})
     return replace(results, notes=[*results.notes, note]) if outside else results
-
-
-def join(first: Results, second: Results) -> Results:
-    """Return both, one after the other; the first title of its own stays."""
-    names = (f.name for f in fields(Results) if f.name not in ("title", "settings"))
-    title = second.title if first.title == TITLE and second.title else first.title
-    return Results(
-        title=title,
-        settings={**first.settings, **second.settings},
-        **{name: [*getattr(first, name), *getattr(second, name)] for name in names},
-    )
-
-
-def _mismatch(results: Results) -> list[Note]:
-    """Return a note if no audit on the page is of the split that the scores are on."""
-    audited, scored = ({x.split for x in of if x.split} for of in (results.audits, results.scores))
-    if not results.audits or not scored - audited:
-        return []
-    return [Note("other-split", {"splits": ", ".join(map(short, sorted(scored - audited)))})]

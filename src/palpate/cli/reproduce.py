@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
-from palpate.cli.terminal import Common, OutPath, Switch, Terminal, require_extra
+from palpate.cli.terminal import Common, OutPath, Switch, Terminal, option_group
 from palpate.core import require
 
 if TYPE_CHECKING:
@@ -20,7 +19,7 @@ if TYPE_CHECKING:
 Study = Literal["world-gelsight", "world-digit", "tag", "hct", "clips"]
 
 
-@dataclass(frozen=True, kw_only=True)
+@option_group
 class Options(Common):
     """Run a whole study of the paper: train, generate, score, and write its tables and page.
 
@@ -67,7 +66,6 @@ class Options(Common):
 
 def run(options: Options, terminal: Terminal) -> dict[str, Any]:
     """Run the stages and write what shows them."""
-    require_extra("palpate reproduce")
     systems = _folders(options.method)
     from palpate.core import write_text
     from palpate.evaluation.companions import Weights
@@ -116,15 +114,9 @@ def run_into(
     free = not output.is_dir() or not any(output.iterdir()) or kept
     must, got = "must be new, empty, or a run folder", f"{output}, with other files"
     require(free, "output", must, got, fix="Choose another folder")
-    with terminal.progress() as progress:
-        results = run_study(
-            plan,
-            output,
-            command=terminal.command,
-            jobs=jobs,
-            print_line=terminal.print_line,
-            progress=progress,
-        )
+    results = terminal.run(
+        run_study, plan, output, command=terminal.command, jobs=jobs, print_line=terminal.print_line
+    )
     page = output / "page.html"
     results.to_html(page)
     terminal.print("")

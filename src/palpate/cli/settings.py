@@ -156,10 +156,9 @@ class PresetTable:
         for part, option in self.options.items():
             if option and path == part:
                 return PalpateError(must, setting, f"Use {option}", argument="set")
-        last = {p: p.rpartition(".")[2] for p in paths}
-        near = [p for p in paths if last[p] == path.rpartition(".")[2]]
-        near = near or difflib.get_close_matches(path, paths, 1, 0.9)
-        near = near or [p for p in paths if difflib.get_close_matches(path, [last[p]], 1, 0.7)]
+        last = {p: p.rpartition(".")[2] for p in (path, *paths)}
+        best = difflib.get_close_matches(last.pop(path), last.values(), 1, 0.7)
+        near = [p for p in paths if last[p] in best]
         fix = f"Did you mean: {' or '.join(near)}" if near else f"See: palpate presets {name}"
         return PalpateError(must, setting, fix, argument="set")
 

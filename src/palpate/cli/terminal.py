@@ -1,9 +1,10 @@
 """What all verbs share: parsing with tyro, progress, results, safe outputs, errors in one line.
 
-A verb's module has a frozen dataclass ``Options`` (its docstring and field docstrings are the help)
-that derives from :class:`Common`, and ``run(options, terminal) -> dict | tuple[dict, int]``: the
-JSON that ``--json`` prints, and an exit status if it is not 0. A nested dataclass is a group of
-options in the help; its option names stay flat.
+A verb's module has a class ``Options`` (its docstring and those of its fields are the help) that
+derives from :class:`Common`, and ``run(options, terminal)``. That returns a record that says itself
+what it is (``str``, ``to_json``, and ``ok``: else the exit status is 1), or the JSON that ``--json``
+prints, or that and an exit status. A nested class is a group of options in the help; its option
+names stay flat.
 """
 
 from __future__ import annotations
@@ -26,11 +27,10 @@ import time
 import traceback
 import warnings
 from collections.abc import Callable, Generator, Mapping, Sequence
-from dataclasses import dataclass
 from functools import partial
 from itertools import dropwhile, takewhile
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, get_type_hints
+from typing import TYPE_CHECKING, Annotated, Any, TypeVar, dataclass_transform, get_type_hints
 
 import docstring_parser
 import tyro
@@ -46,7 +46,7 @@ from tyro._errors import (
     on_parse_error,
 )
 
-from palpate.cli.verbs import BUG, OK, USER_ERROR, VERBS
+from palpate.cli.verbs import BUG, FAILED_CHECK, OK, USER_ERROR, VERBS
 from palpate.core import (
     MissingExtraError,
     Note,
@@ -92,16 +92,26 @@ DEFAULT = tyro.conf.arg(
 #: Of several processes that torchrun started, the first one writes; errors are everyone's,
 #: but for those that all of them raise.
 FIRST = os.environ.get("RANK", "0") == "0"
+T = TypeVar("T")
 #: A flag without its negation: for options that are off by default.
 Switch = Annotated[bool, tyro.conf.FlagCreatePairsOff]
 OutPath = Annotated[Path, tyro.conf.arg(aliases=["-o"])]
+#: What has no name on the command line.
+PathArgument = Annotated[Path, tyro.conf.Positional]
+PathArguments = Annotated[tuple[Path, ...], tyro.conf.Positional]
 OptionalOutPath = Annotated[Path | None, tyro.conf.arg(aliases=["-o"])]
 CONFIG = (tyro.conf.OmitArgPrefixes, tyro.conf.DisallowNone)
 #: What the first 4 KB of a file that palpate wrote as JSON hold.
 JSON_MARK = b'"format": "palpate-'
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass_transform(frozen_default=True, kw_only_default=True)
+def option_group(group: type[T]) -> type[T]:
+    """Make a class a group of options: an immutable record of keywords."""
+    return dataclasses.dataclass(frozen=True, kw_only=True)(group)
+
+
+@option_group
 class Common:
     """Options of every verb."""
 
@@ -136,7 +146,7 @@ def _keywords(options: Any) -> dict[str, Any]:
     return names
 
 
-@dataclass(frozen=True, kw_only=True)
+@option_group
 class Files:
     """What is written."""
 
@@ -216,11 +226,17 @@ class Terminal:
                 write_text(files.latex, results.to_latex())
         return results.to_json() if self.json else {}
 
-    def facts(self, title: str, rows: Mapping[str, Any]) -> None:
-        """Print a two-column table of names and values."""
+    def facts(self, title: str, rows: dict[str, Any]) -> dict[str, Any]:
+        """Print a two-column table of names and values, and return them."""
         self.out.print(title, style="bold", markup=False)
         for line in fact_lines(rows):
             self.print(line)
+        return rows
+
+    def run(self, function: Callable[..., T], *args: Any, **keywords: Any) -> T:
+        """Call a function that reports progress."""
+        with self.progress() as progress:
+            return function(*args, progress=progress, **keywords)
 
     @contextlib.contextmanager
     def progress(self) -> Generator[Progress]:
@@ -539,8 +555,14 @@ def _call(name: str, args: Sequence[str]) -> tuple[Any, int]:
         near = [n for word in words for n in difflib.get_close_matches(word, VERBS, 1)]
         fix = f"Did you mean: palpate {near[0]}" if near else "See: palpate --help"
         raise PalpateError(f"The verb must be one of {', '.join(VERBS)}", repr(name), fix)
-    module = importlib.import_module(f"palpate.cli.{VERBS[name].module}")
+    verb = VERBS[name]
+    module = importlib.import_module(f"palpate.cli.{verb.module}")
     options = parse(name, module.Options, args)
+    if verb.extra:
+        require_extra(f"palpate {name}")
     terminal = Terminal(options, shlex.join(["palpate", *name.split(), *args]))
     answer = module.run(options, terminal)
+    if hasattr(answer, "to_json"):
+        terminal.print(str(answer))
+        return answer.to_json(), OK if getattr(answer, "ok", True) else FAILED_CHECK
     return answer if isinstance(answer, tuple) else (answer, OK)

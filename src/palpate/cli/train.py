@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
-from palpate.cli.terminal import Switch, Terminal, require_extra
-from palpate.cli.training import PRESETS, Training, print_plan
+from palpate.cli.terminal import Switch, Terminal, option_group
+from palpate.cli.training import Training
 from palpate.core import PalpateError, require
 
 
-@dataclass(frozen=True, kw_only=True)
+@option_group
 class Options(Training):
     """Train a generator of tactile images: conditioned on text, later driven by photos."""
 
@@ -39,8 +39,7 @@ class Options(Training):
 
 def run(options: Options, terminal: Terminal) -> dict[str, Any]:
     """Train the autoencoder, if none is given, then the denoiser, and save the pipeline."""
-    require_extra("palpate train generator")
-    preset = PRESETS["train generator"].preset(options.preset, options.settings)
+    preset = options.chosen("train generator")
     for setting in (text for texts in options.settings for text in texts):
         if options.start and not setting.startswith("loop."):
             must = f"{setting} must be left out with a generator to go on from, which keeps its own"
@@ -50,7 +49,6 @@ def run(options: Options, terminal: Terminal) -> dict[str, Any]:
         require(options.epochs >= 1, "epochs", "must be at least 1", options.epochs)
         require(options.steps is None, "epochs", "must be left out beside steps", options.epochs)
         preset = replace(preset, epochs=options.epochs)
-    options.require_data()
     from palpate.diffusion.training import plan_generator, train_generator
 
     if options.dry_run:
@@ -64,26 +62,18 @@ def run(options: Options, terminal: Terminal) -> dict[str, Any]:
             background=options.background,
             device=options.machine.device,
         )
-        return print_plan(terminal, f"Plan of {options.output}", plan)
-    with terminal.progress() as progress:
-        pipeline = train_generator(
-            preset=preset,
-            progress=progress,
-            **options.keywords("preset", "settings", "epochs", "dry_run"),
-        )
-    record = pipeline.training
+        return options.print_plan(terminal, plan)
+    pipeline = terminal.run(
+        train_generator, **options.keywords("settings", "epochs", "dry_run", preset=preset)
+    )
+    record, loop = pipeline.training, pipeline.training["loop"]
     facts = {
         "folder": str(options.output),
         "digest": pipeline.digest,
         "parameters": record["parameters"],
-        "steps": record["loop"]["steps"],
-        "batch": record["loop"]["batch"],
-        "learning_rate": record["loop"]["lr"],
-        "processes": record["processes"],
-        "text_source": record["text_source"],
-        "source": record["source"],
-        "background": record["background"],
+        **{name: loop[name] for name in ("steps", "batch")},
+        "learning_rate": loop["lr"],
+        **{name: record[name] for name in ("processes", "text_source", "source", "background")},
     }
     facts |= {f"ceiling_{name}": value for name, value in (record["ceiling"] or {}).items()}
-    terminal.facts(f"Generator {options.output}", facts)
-    return facts
+    return terminal.facts(f"Generator {options.output}", facts)

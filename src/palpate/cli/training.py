@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, fields
+from dataclasses import field, fields
 from pathlib import Path
-from typing import Annotated, Any, Literal
-
-import tyro
+from typing import Any, Literal
 
 from palpate.cli.settings import PresetTable, Settings
-from palpate.cli.terminal import Common, OutPath, Switch, Terminal
+from palpate.cli.terminal import Common, OutPath, PathArgument, Switch, Terminal, option_group
 from palpate.diffusion.presets import PRESETS as GENERATORS
 from palpate.diffusion.presets import DiffusionPreset
 from palpate.encoders.presets import PRESETS as ENCODERS
@@ -38,7 +36,7 @@ PRESETS = {
 }
 
 
-@dataclass(frozen=True, kw_only=True)
+@option_group
 class Machine:
     """How to run it on the machine at hand; nothing here changes what is computed."""
 
@@ -69,7 +67,7 @@ class Machine:
         return {"device": self.device, "compute": self.compute}
 
 
-@dataclass(frozen=True, kw_only=True)
+@option_group
 class EncoderMachine(Machine):
     """The same for the training of encoders."""
 
@@ -77,11 +75,11 @@ class EncoderMachine(Machine):
     """Rows that the encoder sees at a time; the loss is that of the whole batch."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@option_group
 class Training(Common):
     """What all trainings take."""
 
-    data: Annotated[Path, tyro.conf.Positional]
+    data: PathArgument
     """Manifest file, the folder of an import, or a data set."""
     output: OutPath
     """Folder for what is trained; must be new or empty."""
@@ -97,14 +95,21 @@ class Training(Common):
     machine: Machine = field(default_factory=Machine)
     """How to run it on the machine at hand."""
 
-    def require_data(self) -> None:
-        """Raise ``PalpateError`` if the data are not there, before torch is imported (seconds)."""
+    def chosen(self, verb: str) -> Any:
+        """The preset of a verb with what ``--set`` changes.
+
+        Raises:
+            PalpateError: if there is none, or the data are not there: before torch is imported,
+                which takes seconds.
+        """
         from palpate.data.formats import require_source
 
+        preset = PRESETS[verb].preset(self.preset, self.settings)
         require_source(self.data)
+        return preset
 
-
-def print_plan(terminal: Terminal, title: str, plan: dict[str, Any]) -> dict[str, Any]:
-    """Print what a training would take, and return it."""
-    terminal.facts(title, plan | {"seconds": f"{plan['seconds']:,.0f}"})
-    return plan
+    def print_plan(self, terminal: Terminal, plan: dict[str, Any]) -> dict[str, Any]:
+        """Print what a training would take, and return it."""
+        rows = plan | {"seconds": f"{plan['seconds']:,.0f}"}
+        terminal.facts(f"Plan of {self.output}", rows)
+        return plan

@@ -2,19 +2,18 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated, Any
 
 import tyro
 
 from palpate.cli.importing import SourceOptions
-from palpate.cli.terminal import Switch, Terminal
-from palpate.cli.verbs import FAILED_CHECK
+from palpate.cli.terminal import Switch, Terminal, option_group
 from palpate.core import require
 
 
-@dataclass(frozen=True, kw_only=True)
+@option_group
 class Options(SourceOptions):
     """Check a data set: facts, and what is missing, invalid or suspicious. Nothing is written.
 
@@ -27,18 +26,15 @@ class Options(SourceOptions):
     """Show the known formats, their facts and their options."""
 
 
-def run(options: Options, terminal: Terminal) -> tuple[dict[str, Any], int]:
+def run(options: Options, terminal: Terminal) -> Any:
     """Validate and print the result."""
     from palpate.data import validate
 
     if options.show_list:
-        return _formats(terminal), 0
+        return _formats(terminal)
     fix = "E.g. palpate validate touch_and_go/, or palpate validate --list"
     require(options.source is not None, "source", "must be named", "none", fix=fix)
-    with terminal.progress() as progress:
-        result = validate(progress=progress, **options.keywords("show_list"))
-    terminal.print(str(result))
-    return result.to_json(), 0 if result.ok else FAILED_CHECK
+    return terminal.run(validate, **options.keywords("show_list"))
 
 
 def _formats(terminal: Terminal) -> dict[str, Any]:

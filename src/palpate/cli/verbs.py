@@ -9,11 +9,12 @@ OK, FAILED_CHECK, USER_ERROR, BUG, INTERRUPTED = 0, 1, 2, 70, 130
 
 
 class Verb(NamedTuple):
-    """A verb: its module, what it does, an example."""
+    """A verb: its module, what it does, an example; whether it needs the extra ``all``."""
 
     module: str
     help: str
     example: str
+    extra: bool = False
 
 
 VERBS: dict[str, Verb] = {
@@ -59,16 +60,19 @@ VERBS: dict[str, Verb] = {
         "encoder",
         "Train the tactile encoder against frozen vision and text encoders",
         "palpate train encoder tag/ --split noleak.json -o encoders/",
+        extra=True,
     ),
     "train autoencoder": Verb(
         "autoencoder",
         "Train the autoencoder that a generator works in",
         "palpate train autoencoder tag/ --split noleak.json -o autoencoder/",
+        extra=True,
     ),
     "train generator": Verb(
         "train",
         "Train a generator of tactile images",
         "palpate train generator tag/ --split noleak.json --clip encoders/ -o model/",
+        extra=True,
     ),
     "presets": Verb(
         "presets",
@@ -76,7 +80,10 @@ VERBS: dict[str, Verb] = {
         "palpate presets mini",
     ),
     "generate": Verb(
-        "generate", "Make tactile images for photos", "palpate generate photo.jpg -o tactile.png"
+        "generate",
+        "Make tactile images for photos",
+        "palpate generate photo.jpg -o tactile.png",
+        extra=True,
     ),
     "score": Verb(
         "score",
@@ -102,6 +109,7 @@ VERBS: dict[str, Verb] = {
         "probe",
         "Measure how well an encoder's embeddings predict the material",
         "palpate probe tag/ --split noleak.json --encoder encoders/",
+        extra=True,
     ),
     "report": Verb(
         "report",
@@ -114,11 +122,15 @@ VERBS: dict[str, Verb] = {
         "palpate verify scores.json",
     ),
     "demo": Verb(
-        "demo", "Run everything once, from photos to a page", "palpate demo --data touch_and_go/"
+        "demo",
+        "Run everything once, from photos to a page",
+        "palpate demo --data touch_and_go/",
+        extra=True,
     ),
     "reproduce": Verb(
         "reproduce",
         "Run a whole study of the paper: its tables, with controls, from one command",
         "palpate reproduce world-gelsight -o study/ --seeds 0 1 2",
+        extra=True,
     ),
 }

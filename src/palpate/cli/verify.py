@@ -2,17 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
-import tyro
-
-from palpate.cli.terminal import Common, Terminal
-from palpate.cli.verbs import FAILED_CHECK
+from palpate.cli.terminal import Common, PathArgument, Terminal, option_group
 
 
-@dataclass(frozen=True, kw_only=True)
+@option_group
 class Options(Common):
     """Make the numbers of a results file again from its inputs, and compare them.
 
@@ -20,7 +15,7 @@ class Options(Common):
     missing, or was never a file). Exits with status 1 if something differs.
     """
 
-    results: Annotated[Path, tyro.conf.Positional]
+    results: PathArgument
     """The JSON of `palpate score -o`, `palpate probe -o`, `palpate audit -o`, of a page, or in the
     run folder of `palpate demo` or `palpate reproduce`. It may have been moved with what it was
     made of."""
@@ -29,11 +24,8 @@ class Options(Common):
     another machine adds in another order. Counts and digests must be equal."""
 
 
-def run(options: Options, terminal: Terminal) -> tuple[dict[str, Any], int]:
-    """Verify, print the counts and all that is not the same, write."""
+def run(options: Options, terminal: Terminal) -> Any:
+    """Verify, print the counts and all that is not the same."""
     from palpate.studies.verifying import verify
 
-    with terminal.progress() as progress:
-        checked = verify(options.results, tolerance=options.tolerance, progress=progress)
-    terminal.print(str(checked))
-    return checked.to_json(), 0 if checked.ok else FAILED_CHECK
+    return terminal.run(verify, options.results, tolerance=options.tolerance)

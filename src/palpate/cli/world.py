@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import dataclasses
-from dataclasses import dataclass
 from typing import Any, Literal
 
 from palpate.cli.settings import PresetTable, Settings
-from palpate.cli.terminal import Common, OutPath, Terminal, option_name
+from palpate.cli.terminal import Common, OutPath, Terminal, option_group, option_name
 from palpate.sim import DEFAULT, MINI_SEEDS, PRESETS, SEEN_WARNING, WorldOptions, write_world
 
 #: Fields of a preset that are options of their own.
@@ -18,7 +17,7 @@ FIELDS = (
 WORLDS = PresetTable(PRESETS, {name: option_name("world", name) for name in FIELDS})
 
 
-@dataclass(frozen=True, kw_only=True)
+@option_group
 class Options(Common):
     """Write the procedural world, a synthetic data set, in the layout of Touch and Go.
 
@@ -57,8 +56,7 @@ def run(options: Options, terminal: Terminal) -> dict[str, Any]:
     seen = {"seen_by_shipped_models": SEEN_WARNING} if world.seed in MINI_SEEDS else {}
     if seen:
         terminal.print_line(f"Seed {world.seed}: {SEEN_WARNING}")
-    with terminal.progress() as progress:
-        record = write_world(options.output, world, workers=options.workers, progress=progress)
+    record = terminal.run(write_world, options.output, world, workers=options.workers)
     facts = {"folder": str(record.folder), "digest": record.digest, **record.counts, **seen}
     leak = {f"leak: {k}": v for k, v in record.leak.items()}
     terminal.facts(f"World {options.output} (synthetic)", facts | leak)

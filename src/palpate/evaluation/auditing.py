@@ -12,8 +12,8 @@ from palpate.core import FeatureSet, Note, Progress, Split, quiet, require
 from palpate.data.manifest import MODALITIES, Manifest
 from palpate.evaluation.guard import guard, load_encoders
 from palpate.leakage.auditing import audit as audit_leakage
-from palpate.report.calls import Call
-from palpate.report.results import Audit, Impact
+from palpate.report.records import Impact
+from palpate.report.results import Audit, Call
 
 if TYPE_CHECKING:
     from palpate.encoders.encoder_set import EncoderSet

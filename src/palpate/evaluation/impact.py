@@ -48,7 +48,7 @@ from palpate.leakage.groups import GROUPS
 from palpate.leakage.splitting import split as leak_free_split
 from palpate.metrics.means import Mean, mean_of, spread_of
 from palpate.metrics.probe import fit_probe
-from palpate.report.results import Impact, ImpactRow
+from palpate.report.records import Impact, ImpactRow
 
 #: Train samples of the linear probe; its penalty is chosen by twelve fits.
 PROBE_ROWS = 10_000

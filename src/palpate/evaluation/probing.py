@@ -35,9 +35,9 @@ from palpate.metrics.means import Mean, over_seeds
 from palpate.metrics.paired import differences_of_means
 from palpate.metrics.probe import class_accuracies
 from palpate.metrics.retrieval import TIE, Floats, retrieval, unit_rows
-from palpate.report.calls import Call
 from palpate.report.labels import measured, subject_of
-from palpate.report.results import Match, Results, Strip
+from palpate.report.records import Match, Strip
+from palpate.report.results import Call, Results
 
 if TYPE_CHECKING:
     from palpate.data.manifest import Manifest

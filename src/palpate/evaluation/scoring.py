@@ -25,8 +25,8 @@ from palpate.evaluation.samples import Samples
 from palpate.evaluation.scoring_run import ScoringRun
 from palpate.evaluation.sources import Source, read
 from palpate.metrics import require_same_ids
-from palpate.report.calls import OBJECT, PATH, Call
-from palpate.report.results import GalleryItem, Results
+from palpate.report.records import GalleryItem
+from palpate.report.results import OBJECT, PATH, Call, Results
 
 Preset = Literal["grouped", "paper", "paper-tables", "cmmd"]
 

@@ -45,7 +45,8 @@ from palpate.leakage.signals import (
     signal_table,
     time_gap,
 )
-from palpate.report.results import CANNOT_TELL, MATRIX_ROWS, Audit, Impact, LeakPair
+from palpate.report.records import Impact, LeakPair
+from palpate.report.results import CANNOT_TELL, MATRIX_ROWS, Audit
 
 #: In place of a group where none is known and images alone are compared.
 NO_GROUP = "none"

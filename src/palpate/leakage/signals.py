@@ -28,7 +28,7 @@ from numpy.typing import NDArray
 from palpate.core import Note, Progress, quiet
 from palpate.data.images import file_digest, file_stamp, in_threads
 from palpate.data.manifest import MODALITIES, Manifest
-from palpate.report.results import CAUSES, LeakPair, Signal
+from palpate.report.records import CAUSES, LeakPair, Signal
 
 Ints = NDArray[np.int64]
 #: Pairs kept for each cause that is no leak.

@@ -34,8 +34,7 @@ from palpate.preference.statistics import (
     sign_test,
 )
 from palpate.preference.votes import DATABASE, read_votes
-from palpate.report.calls import Call
-from palpate.report.results import Results
+from palpate.report.results import Call, Results
 
 PREFERENCE, STRENGTH = "human preference", "human strength"
 ACCURACY = "human accuracy of material"

@@ -5,8 +5,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import NamedTuple
 
-from palpate.report.numbers import count, interval, number, plural, score_text
-from palpate.report.results import Audit, ImpactRow, LeakPair
+from palpate.report.labels import count, interval, number, plural, score_text
+from palpate.report.records import ImpactRow, LeakPair
+from palpate.report.results import Audit
 
 
 class PairList(NamedTuple):

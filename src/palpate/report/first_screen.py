@@ -9,11 +9,11 @@ from markupsafe import Markup
 
 from palpate.core import Measure, Score
 from palpate.report import plots
-from palpate.report.families import REAL, Column, Family, baselines, best_by_value, defined
+from palpate.report.labels import interval, number, p_text, percent, plural
 from palpate.report.notes import sentence
-from palpate.report.numbers import interval, number, p_text, percent, plural
 from palpate.report.results import Audit, Results
 from palpate.report.sentences import share_of
+from palpate.report.tables import REAL, Column, Family, baselines, best_by_value, defined
 
 #: Columns of the verdict table, the most telling first; others follow as they come.
 TELLING = tuple(map(Measure, ("TMMD", "material accuracy", "D-TMMD", "CI-TMMD", "SSIM")))
@@ -204,7 +204,7 @@ def _strip_facts(score: Score, column: Column) -> str:
         limits = interval(score.interval, column.digits)
         facts.append(f"{score.a}: {100 * score.level:g} % interval {limits}")
     if score.floor is not None:
-        facts.append(f"dashed: real images {number(score.floor, column.digits)}")
+        facts.append(f"dashed: real images {column.text(score.floor)}")
     return "; ".join(filter(None, [*facts, _against_real(score)])) + "." * bool(facts)
 
 

@@ -14,12 +14,12 @@ from collections.abc import Callable, Iterable, Sequence
 from itertools import zip_longest
 
 from palpate.core import short
-from palpate.report.families import defined, families
+from palpate.report.labels import file_names, number
 from palpate.report.notes import sentence
-from palpate.report.numbers import number
+from palpate.report.records import Claim
 from palpate.report.results import Results
-from palpate.report.study import Claim, tally
-from palpate.report.tables import Cell, Table, file_names, grids, of_study
+from palpate.report.study import of_study, tally
+from palpate.report.tables import Cell, Table, defined, families, grids
 
 #: First line of the file: how the command recognizes its own file.
 MARK = "% palpate: tables of scores"
@@ -61,12 +61,14 @@ def latex_tables(results: Results) -> str:
     Raises:
         PalpateError: if two scores that share a column were not made with the same settings.
     """
-    captions = [(table, table.text) for table in map(of_study, results.tables)]
-    for table in (table for family in families(results.scores) for table in grids(family)):
-        captions.append((table, "; ".join(f"{name} {_short(text)}" for name, text in table.facts)))
-    names = file_names("tab", [table.title for table, _ in captions])
-    parts = [_table(t, caption, name) for (t, caption), name in zip(captions, names, strict=True)]
-    parts.insert(len(results.tables), _claims(results.claims))
+    studied = [of_study(table) for table in results.tables]
+    scored = [table for f in families(results.scores, results.controls) for table in grids(f)]
+    tables = [*studied, *scored]
+    texts = [table.text for table in studied]
+    texts += ["; ".join(f"{k} {_short(v)}" for k, v in table.facts.items()) for table in scored]
+    names = file_names("tab", [table.title for table in tables])
+    parts = list(map(_table, tables, texts, names))
+    parts.insert(len(studied), _claims(results.claims))
     commands = (re.sub(r"[\x00-\x1f\x7f\u2028\u2029]", " ", c) for c in results.commands)
     needs = r"% Needs \usepackage{booktabs} and \usepackage{graphicx}."
     head = [MARK, *(f"% {c}" for c in commands), needs]
@@ -81,7 +83,7 @@ def _table(table: Table, text: str, name: str) -> list[str]:
     rows = [_row(heads), r"\midrule"]
     for row in table.rows:
         rows += [r"\midrule"] * row.rule
-        rows.append(_row([_cell(cell, row.control) for cell in row.cells]))
+        rows.append(_row([_cell(c, table.footnotes(c), row.control) for c in row.cells]))
         below = zip_longest(*(_lines_below(cell) for cell in row.cells), fillvalue="")
         rows += [_row(line) for line in below]
     caption = [table.title, *([text] if text else []), *table.marks("Bold:")]
@@ -93,11 +95,11 @@ def _table(table: Table, text: str, name: str) -> list[str]:
     return _float(caption, columns, rows, [below] * bool(footnotes), name)
 
 
-def _cell(cell: Cell, control: bool) -> str:
+def _cell(cell: Cell, footnotes: Sequence[int], control: bool) -> str:
     if cell.score is None:
         words = escape(cell.value) if isinstance(cell.value, str) else "--"
         return rf"\textit{{{words}}}" if control and cell.value else words
-    marks = _raised(cell.footnotes) if cell.footnotes else ""
+    marks = _raised(footnotes) if footnotes else ""
     if not defined(cell.score):
         return "--" + marks
     text = _math(number(cell.score.value, cell.digits))

@@ -11,12 +11,12 @@ from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 from palpate.core import plain
-from palpate.report.families import Family, families
 from palpate.report.notes import HOW_TO_READ, sentence
+from palpate.report.records import Claim
 from palpate.report.results import Results
 from palpate.report.sentences import purpose, summary_lines
-from palpate.report.study import Claim, tally
-from palpate.report.tables import Head, Table, listing, of_differences, of_study
+from palpate.report.study import of_study, tally
+from palpate.report.tables import Family, Head, Table, families, listing, of_differences
 from palpate.report.terminal import audit_text
 
 _SPECIAL = str.maketrans({c: f"\\{c}" for c in "\\`*_[]|<>"})
@@ -32,7 +32,9 @@ def render_markdown(results: Results) -> str:
     lines = [f"# {esc(results.title)}", "", f"palpate: {esc(purpose(results))}", "", *_items(facts)]
     if results.notes:
         lines += ["## Read this first", "", *_items(map(sentence, results.notes))]
-    tables = [line for family in families(results.scores) for line in _scores(family)]
+    tables = [
+        line for family in families(results.scores, results.controls) for line in _scores(family)
+    ]
     studied = [line for table in map(of_study, results.tables) for line in _table(table)]
     sections = {
         "Claims": _claims(results.claims),
@@ -91,7 +93,7 @@ def _table(table: Table) -> list[str]:
     grid = pipe_table(*table.plain()) if table.rows else []
     lines = [f"### {esc(table.title)}", "", *([esc(table.text), ""] if table.text else []), *grid]
     lines += [line for mark in table.marks("*") for line in (esc(mark), "")]
-    lines += [f"- {esc(name)}: {esc(text)}" for name, text in table.facts]
+    lines += [f"- {esc(name)}: {esc(text)}" for name, text in table.facts.items()]
     lines += [f"- ({k}) {esc(sentence(note))}" for k, note in enumerate(table.notes, 1)]
     return [*lines, ""]
 

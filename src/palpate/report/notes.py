@@ -3,7 +3,8 @@
 Sentences are in the wording of Python or of the command line.
 
 A template is filled with the note's parameters: ``{count:vote}`` is ``2 votes``, ``{files:few}``
-the first of a list, ``{arg:sigma=multi}`` ``sigma='multi'`` in Python and ``--sigma multi`` on the
+the first of a list, ``{few:one text|another}`` one of two texts, ``{reason:undefined}`` the words
+of :data:`WORDS`, and ``{arg:sigma=multi}`` ``sigma='multi'`` in Python and ``--sigma multi`` on the
 command line. Where a template cannot do, the entry is a function of parameters and style.
 """
 
@@ -16,7 +17,7 @@ from string import Formatter
 from typing import Any
 
 from palpate.core import Note, few
-from palpate.report.numbers import number, percent, plural
+from palpate.report.labels import number, percent, plural
 
 #: What every reader of scores needs to know.
 HOW_TO_READ = (
@@ -52,11 +53,23 @@ class Style:
 
 
 class _Template(Formatter):
-    """Lists as ``{materials}`` or ``{files:few}``, numbers as ``{count:vote}`` (2 votes)."""
+    """Fills templates with ``params``, as the head of this module says."""
+
+    def __init__(self, params: Mapping[str, Any]) -> None:
+        self.params = params
 
     def format_field(self, value: Any, format_spec: str) -> str:
+        if "|" in format_spec:
+            yes, no = format_spec.split("|")
+            return yes if value else no
+        if format_spec in WORDS:
+            return self.vformat(WORDS[format_spec][value], (), self.params)
+        if format_spec == "percent":
+            return percent(value or 0.0)
         if isinstance(value, list | tuple):
             return few(value) if format_spec == "few" else ", ".join(map(str, value))
+        if isinstance(value, Mapping):
+            return ", ".join(f"{key} {item}" for key, item in value.items())
         if isinstance(value, int) and re.fullmatch("[a-z ]{2,}", format_spec):
             return plural(value, format_spec)
         return super().format_field(value, format_spec)
@@ -73,43 +86,44 @@ EXCLUDED = {
     "single-samples": "no group has two samples",
     "no-label": "no label",
 }
-_UNDEFINED = {
-    **EXCLUDED,
-    "few-samples": "fewer than {least} samples",
-    "no-pairs": "an average over no pairs",
-    "few-groups": "each set needs two groups, not all shared, for the grouped estimator",
-    "one-sample": "each set needs two samples",
-    "no-class": "no class can be cut into halves",
-    "one-class": "needs two classes that can be cut into halves, has {classes}",
-    "not-separate": "the classes do not separate (a denominator is not positive)",
-    "score": "one of the two scores is",
-    "no-images": "no pair of images has a value",
+#: What a parameter of a note stands for.
+WORDS: dict[str, dict[str, str]] = {
+    "undefined": {
+        **EXCLUDED,
+        "few-samples": "fewer than {least} samples",
+        "no-pairs": "an average over no pairs",
+        "few-groups": "each set needs two groups, not all shared, for the grouped estimator",
+        "one-sample": "each set needs two samples",
+        "no-class": "no class can be cut into halves",
+        "one-class": "needs two classes that can be cut into halves, has {classes}",
+        "not-separate": "the classes do not separate (a denominator is not positive)",
+        "score": "one of the two scores is",
+        "no-images": "no pair of images has a value",
+    },
+    "no-interval": {
+        "too-few": "too few groups or samples to leave one out",
+        "different-units": "the two scores share no units to leave out",
+        "no-units": "there is nothing to leave out",
+        "no-change": "leaving out a unit is undefined, or changes nothing",
+        "few-images": "one image or one group, or no variation between them",
+    },
+    "no-floor": {
+        "classes": "other classes",
+        "groups": "other groups",
+        "group-sizes": "other numbers of samples a group",
+        "sizes": "other numbers of samples",
+    },
+    #: Rule of a study -> what an excluded rater did.
+    "rule": {
+        "catches": "answered {value:percent} of the catch trials right, less than {limit:percent}",
+        "finished": "answered {value:percent} of the trials, less than {limit:percent}",
+        "side": "chose one side in more than {limit:percent} of the votes for a side",
+    },
+    "blank": {
+        "tactile": "tactile images show untouched gel",
+        "vision": "photos show nothing at all",
+    },
 }
-_NO_INTERVAL = {
-    "too-few": "too few groups or samples to leave one out",
-    "different-units": "the two scores share no units to leave out",
-    "no-units": "there is nothing to leave out",
-    "no-change": "leaving out a unit is undefined, or changes nothing",
-    "few-images": "one image or one group, or no variation between them",
-}
-_NO_FLOOR = {
-    "classes": "other classes",
-    "groups": "other groups",
-    "group-sizes": "other numbers of samples a group",
-    "sizes": "other numbers of samples",
-}
-
-
-def _undefined(p: Mapping[str, Any], style: Style) -> str:
-    size = f" (n = {p['n']})" if "n" in p else ""
-    labels = "" if p.get("labeled", True) else " (the samples have no labels)"
-    return "Undefined: " + _UNDEFINED[p["reason"]].format(arg=style, **p) + size + labels
-
-
-def _unstable(p: Mapping[str, Any], _: Style) -> str:
-    unknown = "of unknown error (too few groups)"
-    why = "within two standard errors of 0" if p["known_errors"] else unknown
-    return f"Denominators {why}, so the ratio is unreliable: {few(p['classes'])}"
 
 
 def _excluded_classes(p: Mapping[str, Any], _: Style) -> str:
@@ -121,11 +135,11 @@ def _excluded_classes(p: Mapping[str, Any], _: Style) -> str:
 
 
 METRICS: dict[str, Sentence] = {
-    "undefined": _undefined,
-    "no-interval": lambda p, _: f"No interval: {_NO_INTERVAL[p['reason']]}",
-    "no-floor": lambda p, _: (
-        f"No floor: real images of {_NO_FLOOR[p['reason']]} have another value"
+    "undefined": (
+        "Undefined: {reason:undefined}{n!s: (n = {n})|}{labeled:| (the samples have no labels)}"
     ),
+    "no-interval": "No interval: {reason:no-interval}",
+    "no-floor": "No floor: real images of {reason:no-floor} have another value",
     "within-bound": (
         "Within {bound:.2g} of the exact value, as the bandwidth is narrow for moments"
     ),
@@ -142,7 +156,10 @@ METRICS: dict[str, Sentence] = {
         "halves of whole videos do (preset grouped)"
     ),
     "collapse": "All features are equal: complete collapse, which this metric calls perfect",
-    "unstable-denominators": _unstable,
+    "unstable-denominators": (
+        "Denominators {known_errors:within two standard errors of 0|of unknown error (too few "
+        "groups)}, so the ratio is unreliable: {classes:few}"
+    ),
     "repeated-ids": (
         "Rows with the id of another row (a DistributedSampler pads with repetitions): {count}; "
         "each counts"
@@ -172,15 +189,6 @@ METRICS: dict[str, Sentence] = {
 }
 
 
-def _blank_images(p: Mapping[str, Any], _: Style) -> str:
-    shows = "photos show nothing at all"
-    if p["modality"] == "tactile":
-        by = f" (by {plural(p['pairs'], 'pair')} of backgrounds)" if p["pairs"] else ""
-        shows = f"tactile images show untouched gel{by}"
-    limit = f"under {p['limit']:.2f} gray levels, and were not compared"
-    return f"{p['count']} of {p['of']} {shows}, {limit}"
-
-
 def _equal_names(p: Mapping[str, Any], style: Style) -> str:
     equal = " and ".join(plural(n, f"equal {column}") for column, n in p["equal"].items())
     decided = "bytes and images decide" if p["images"] else "there are no images to compare"
@@ -190,23 +198,11 @@ def _equal_names(p: Mapping[str, Any], style: Style) -> str:
     )
 
 
-def _threshold(p: Mapping[str, Any], unit: str, source: str) -> str:
-    line = (
-        f"Threshold {p['threshold']:.3f} from the best matches of {p['samples']} train images "
-        f"{source} ({plural(p['groups'], unit)}), for {p['rate']:.2%} of unrelated samples"
-    )
-    guess = "; with so few the rate is an extrapolation, by a factor of three or more"
-    return line + guess * bool(p["few"])
-
-
-def _no_null(p: Mapping[str, Any], _: Style) -> str:
-    why = "train images of other videos are as similar as equal ones"
-    if p["threshold"] is None:
-        images = plural(p["images"], "train image")
-        why = f"none of the {images} is known to be unrelated to enough others, by video or order"
-    return f"Cannot tell which similarity is chance: {why}. The page and the table rank the pairs"
-
-
+_THRESHOLD = "Threshold {threshold:.3f} from the best matches of {samples} train images "
+_RATE = (
+    "for {rate:.2%} of unrelated samples"
+    "{few:; with so few the rate is an extrapolation, by a factor of three or more|}"
+)
 #: Column whose groups train and test share -> what the test part then asks for.
 QUESTIONS = {
     "video": "new contacts of known videos",
@@ -238,32 +234,32 @@ def _question(p: Mapping[str, Any], style: Style) -> str:
     return line
 
 
-def _near_frames(p: Mapping[str, Any], _: Style) -> str:
-    if not p["frames"]:
-        return "Flagged at a gap of 0 frames only"
-    return f"Flagged up to {p['frames']} frames; the score is 2^(-gap/{p['frames']})"
-
-
 LEAKAGE: dict[str, Sentence] = {
     "backgrounds-unreadable": (
         "{count} background images cannot be read ({files:few}); their tactile images "
         "were compared as they are"
     ),
-    "blank-images": _blank_images,
-    "cannot-tell-no-null": _no_null,
+    "blank-images": (
+        "{count} of {of} {modality:blank}{pairs: (by {pairs:pair} of backgrounds)|}, under "
+        "{limit:.2f} gray levels, and were not compared"
+    ),
+    "cannot-tell-no-null": (
+        "Cannot tell which similarity is chance: {threshold:train images of other videos are as "
+        "similar as equal ones|none of the {images:train image} is known to be unrelated to enough "
+        "others, by video or order}. The page and the table rank the pairs"
+    ),
     "cannot-tell-untouched": "Nothing can be compared: no image of {part} shows any contact",
     "empty-files": "{count} files are empty (0 bytes) and were not compared",
     "equal-names": _equal_names,
-    "group-few": lambda p, _: (
-        f"There are fewer than {p['parts']} {p['group']}s: whole {p.get('taken', 'contact')}s are "
-        f"kept together instead, and train and test share a {p['group']}"
+    "group-few": (
+        "There are fewer than {parts} {group}s: whole {taken}s are kept together instead, and "
+        "train and test share a {group}"
     ),
     "group-instead": "The manifest knows no videos: the {group} is kept whole",
-    "group-materials": lambda p, _: (
-        f"Only {p['enough']} of {p['materials']} materials occur in {p['parts']} or more "
-        f"{p['group']}s, too few for the {p['group']} to be the group: whole "
-        f"{p.get('taken', 'contact')}s are kept together instead. Train and test then share "
-        f"{p['group']}s, so scores are optimistic for new {p['group']}s"
+    "group-materials": (
+        "Only {enough} of {materials} materials occur in {parts} or more {group}s, too few for the "
+        "{group} to be the group: whole {taken}s are kept together instead. Train and test then "
+        "share {group}s, so scores are optimistic for new {group}s"
     ),
     "group-near-only": "The manifest knows no videos: near-duplicates alone are kept together",
     "group-nulls": (
@@ -294,15 +290,18 @@ LEAKAGE: dict[str, Sentence] = {
     "missing-materials": "Could be in every part, but not together with the others: {materials}",
     "names-only": "No image that {name} names is there: its names alone were compared",
     "names-read": ("Paths were read as {template}; {arg:tactile=TEMPLATE} reads them another way"),
-    "near-frames": _near_frames,
+    "near-frames": (
+        "{frames:Flagged up to {frames} frames; the score is 2^(-gap/{frames})|Flagged at a gap of "
+        "0 frames only}"
+    ),
     "no-group": (
         "Neither videos nor objects, sessions or contacts are known: only samples and images "
         "were compared"
     ),
     "no-materials": "No sample has a material: only the sizes of the parts are balanced",
-    "photos-assumed": lambda p, style: (
-        f"Nothing says what the images of {p['name']} show, so they were taken for photos; if they "
-        f"are tactile images: {style:side=tactile}{'' if style.command_line else ' (in reading)'}"
+    "photos-assumed": (
+        "Nothing says what the images of {name} show, so they were taken for photos; if they are "
+        "tactile images: {arg:side=tactile}{arg.command_line:| (in reading)}"
     ),
     "images-not-found": (
         "No image that the table names is a file below {root}, so images were not read; pass the "
@@ -315,10 +314,11 @@ LEAKAGE: dict[str, Sentence] = {
     "signal-not-counted": "Reported, but not counted as a leak: the audit is not by {group}",
     "signal-nulls": "{count} {part} samples have no {group}: nothing is known of them",
     "split-of-other-manifest": "The split was made for another manifest (the digests differ)",
-    "threshold-order": lambda p, _: _threshold(
-        p, "piece", "far from them in the order of the files, as no videos are known"
+    "threshold-order": (
+        f"{_THRESHOLD}far from them in the order of the files, as no videos are known "
+        f"({{groups:piece}}), {_RATE}"
     ),
-    "threshold-videos": lambda p, _: _threshold(p, "group", "in other videos"),
+    "threshold-videos": f"{_THRESHOLD}in other videos ({{groups:group}}), {_RATE}",
     "validation-leaks": (
         "{count} {group} groups of the validation part occur in train or test as well: "
         "choosing a checkpoint on it leaks"
@@ -360,11 +360,10 @@ EVALUATION: dict[str, Sentence] = {
         "The classes are {clusters} clusters of {of}, not materials: not comparable with scores "
         "over materials"
     ),
-    "synthetic-encoder": lambda p, _: (
-        "The encoder was trained on simulated tactile images alone, and "
-        + ("these are real" if p["real"] else "nothing says whether these are real")
-        + ": what it sees in real ones is unproven. Train an encoder on real images, or trust the "
-        "contact scores"
+    "synthetic-encoder": (
+        "The encoder was trained on simulated tactile images alone, and {real:these are real|"
+        "nothing says whether these are real}: what it sees in real ones is unproven. Train an "
+        "encoder on real images, or trust the contact scores"
     ),
     "seen-images": (
         "The {modality} encoder was trained on {seen:,} of the {n:,} images that it judges here"
@@ -442,17 +441,12 @@ CAPTIONS: dict[str, Sentence] = {
         "materials, got {groups} and {materials}"
     ),
     "captions-no-labels": "The samples have no materials: labels in the text were not looked for",
-    "captions-none": lambda p, _: (
-        "No caption can be used: "
-        + ", ".join(f"{flag} {count}" for flag, count in p["flags"].items())
-    ),
+    "captions-none": "No caption can be used: {flags}",
     "captions-of-columns": (
         "Captions were filled from columns ({template}): they say no more than these do, and "
         "scores that use them measure the label"
     ),
-    "captions-words": lambda p, _: (
-        "Most often: " + ", ".join(f"{word} {count}" for word, count in p["words"].items())
-    ),
+    "captions-words": "Most often: {words}",
 }
 
 
@@ -499,17 +493,6 @@ OTHER: dict[str, Sentence] = {
         "audits say of leaks does not apply to them"
     ),
 }
-#: Rule of a study -> what an excluded rater did.
-RULES = {
-    "catches": "answered {value} of the catch trials right, less than {limit}",
-    "finished": "answered {value} of the trials, less than {limit}",
-    "side": "chose one side in more than {limit} of the votes for a side",
-}
-
-
-def _rater_excluded(p: Mapping[str, Any], _: Style) -> str:
-    why = RULES[p["rule"]].format(value=percent(p["value"] or 0.0), limit=percent(p["limit"]))
-    return f"Rater {p['rater']} is excluded by the rule {p['rule']}, fixed before the votes: {why}"
 
 
 def _human_agreement(p: Mapping[str, Any], _: Style) -> str:
@@ -531,7 +514,9 @@ def _human_agreement(p: Mapping[str, Any], _: Style) -> str:
 
 
 PREFERENCE: dict[str, Sentence] = {
-    "rater-excluded": _rater_excluded,
+    "rater-excluded": (
+        "Rater {rater} is excluded by the rule {rule}, fixed before the votes: {rule:rule}"
+    ),
     "human-agreement": _human_agreement,
     "these-raters": lambda p, _: (
         f"For {'these' if p['count'] > 1 else 'this'} {plural(p['count'], 'rater')} only: "
@@ -585,11 +570,12 @@ SENTENCES: dict[str, Sentence] = METRICS | LEAKAGE | EVALUATION | CAPTIONS | PRE
 def sentence(note: Note, style: Style = PYTHON) -> str:
     """Return a note in words, without a full stop at the end."""
     template = SENTENCES.get(note.code)
+    params = {"arg": style, "n": "", "labeled": True, "taken": "contact", **note.params}
     try:
         if callable(template):
             return template(note.params, style)
         if template is not None:
-            return _Template().vformat(template, (), {"arg": style, **note.params})
+            return _Template(params).vformat(template, (), params)
     except (ArithmeticError, AttributeError, LookupError, TypeError, ValueError):
         pass
     # A note of another version of palpate, or from a file that was edited.

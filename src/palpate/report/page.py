@@ -30,14 +30,16 @@ from palpate.core import (
     Score,
     plain,
     quiet,
+    short,
     write_json,
     write_text,
 )
 from palpate.report import audits, first_screen, labels, plots, sentences, study, tables
-from palpate.report.families import REAL, defined, families
+from palpate.report.labels import count, digits_of, number, percent, plural, where
 from palpate.report.notes import sentence
-from palpate.report.numbers import count, digits_of, number, percent, plural, where
-from palpate.report.results import GalleryItem, LeakPair, Results, Strip
+from palpate.report.records import GalleryItem, LeakPair, Strip
+from palpate.report.results import Results
+from palpate.report.tables import REAL, Cell, Head, Row, Table, defined, families
 from palpate.report.thumbnails import Album, Wanted, fit
 
 #: Samples of the first screen; their images take at most a third of the bytes.
@@ -49,6 +51,15 @@ OPEN_PAIRS, MAX_PAIRS = 6, 24
 OPEN_CLAIMS = 6
 #: A list in the settings is cut here; the JSON keeps it whole.
 LONG_LIST = 24
+#: What the cells of a matrix are.
+DIVERGENCE = (
+    "Row against column; the diagonal compares two halves of one class. Stronger color: farther "
+    "apart."
+)
+CONFUSION = (
+    "Rows: the true class of test samples. Columns: what the classifier called them, as a share of "
+    "the row."
+)
 _DIGEST = re.compile(r"(?:sha256:)?[0-9a-f]{32,128}")
 #: What to cite: palpate, and the paper whose splits, metrics and generator it implements.
 CITATIONS = (
@@ -130,7 +141,7 @@ def render_page(
             larger than ``max_bytes``.
     """
     rows, essential = image_rows(results)
-    by_family = families(results.scores)
+    by_family = families(results.scores, results.controls)
     columns = first_screen.telling_columns(by_family)
     cards = first_screen.cards(results, columns, results.controls)
     samples = gallery_images(results.gallery)
@@ -147,11 +158,11 @@ def render_page(
         "facts": list(results.facts) or ([] if cards else sentences.summary_lines(results)),
         "cards": cards,
         "row_labels": [wanted.label for wanted in samples[0][1]] if samples else [],
-        "studied": list(map(tables.of_study, results.tables)),
+        "studied": list(map(study.of_study, results.tables)),
         "families": by_family,
-        "verdict": tables.grid(columns, results.controls),
+        "verdict": tables.grid(columns),
         "reading": first_screen.annotated(by_family),
-        "heats": tables.heat_tables(_scores_of_methods(results)),
+        "heats": matrices(results),
         "settings": plain(results.settings),
         "citations": CITATIONS,
         "style": Markup(_template("style.css")),
@@ -297,16 +308,38 @@ def in_turns(items: Sequence[GalleryItem]) -> list[GalleryItem]:
     return [item for turn in zip_longest(*queues.values()) for item in turn if item is not None]
 
 
-def _scores_of_methods(results: Results) -> list[Score]:
-    """The scores of methods: without controls, and of several presets the first.
+def matrices(results: Results) -> list[Table]:
+    """Return a table for each score whose details hold a square ``matrix`` of numbers.
 
-    Results of real images alone, as a probe's, are returned whole.
+    Only those of methods, unless there are none: without controls, and of several presets the
+    first. ``details["classes"]`` names its rows, else they are numbered.
     """
     first: dict[Any, Score] = {}
     for score in results.scores:
         if score.a not in {REAL, *results.controls}:
             first.setdefault((score.measure, score.a, score.b), score)
-    return [*first.values()] or [*results.scores]
+    tables: list[Table] = []
+    for score in first.values() or results.scores:
+        matrix: Any = plain(score.details.get("matrix"))
+        if not isinstance(matrix, list) or not all(
+            isinstance(row, list) and len(row) == len(matrix) for row in matrix
+        ):
+            continue
+        names = [*map(str, score.details.get("classes") or range(1, len(matrix) + 1))]
+        values = [abs(v) for row in matrix for v in row if v is not None]
+        digits, top = min(3, labels.decimals(values)), max(values, default=0.0) or 1.0
+        rows = [
+            [Cell(number(v, digits), share=round(max(0.0, v or 0.0) / top, 3)) for v in row]
+            for row in matrix
+        ]
+        parts = [labels.label_of(score), labels.subject_of(score), score.settings.get("preset")]
+        title = ", ".join(map(str, filter(None, parts)))
+        if any(title == table.title for table in tables) and score.reference:
+            title += f", reference {short(score.reference)}"
+        text = CONFUSION if "accuracy" in score.metric else DIVERGENCE
+        laid = [Row([Cell(name), *cells]) for name, cells in zip(names, rows, strict=True)]
+        tables.append(Table(title, text, [*map(Head, ("", *names))], laid))
+    return tables
 
 
 def _lede(results: Results) -> str:

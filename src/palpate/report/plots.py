@@ -15,8 +15,9 @@ import numpy as np
 from markupsafe import Markup, escape
 
 from palpate.core import Score
-from palpate.report.numbers import count, number, score_text
-from palpate.report.results import Audit, Signal
+from palpate.report.labels import count, number, score_text
+from palpate.report.records import Signal
+from palpate.report.results import Audit
 
 WIDTH, HEIGHT, PAD = 148, 22, 7  # pixels of an interval bar
 LEFT, RIGHT = 13.0, 99.0  # percent of a histogram's width

@@ -2,27 +2,47 @@
 
 :class:`Results` holds scores and audits, :class:`Audit` the leaks of one split. Both can show
 themselves: ``print(results)``, ``results.to_html("page.html")``, ``results.to_latex()``,
-``results.to_frame()``.
+``results.to_frame()``. Each has the :class:`Call` that made it, so that ``palpate verify`` can make
+it again: in JSON, an argument that is a path is ``{"$path": path, "$digest": SHA-256}``, of a
+file, of the table of a manifest, or of the weights of an encoder. Folders of images have no digest
+there; ``Call.digests`` has those of the images that were read. An argument that was in memory alone
+(an array, a frame) is ``{"$object": type}``: nobody can read it again.
 """
 
 from __future__ import annotations
 
 import html
+import inspect
 import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from importlib import import_module
-from pathlib import Path
+from pathlib import Path, PurePath
 from typing import TYPE_CHECKING, Any, ClassVar, Self, overload
 
 from palpate.core.errors import PalpateError
-from palpate.core.files import plain, read_record, reading_entry, write_json
+from palpate.core.files import (
+    digest_file,
+    digest_folder,
+    plain,
+    read_record,
+    reading_entry,
+    write_json,
+)
 from palpate.core.notes import Note, SampleRef
 from palpate.core.records import from_plain
 from palpate.core.score import Score
-from palpate.report.calls import Call
 from palpate.report.labels import label_of, subject_of
-from palpate.report.study import Claim, StudyTable
+from palpate.report.records import (
+    Claim,
+    GalleryItem,
+    Impact,
+    LeakPair,
+    Match,
+    Signal,
+    Strip,
+    StudyTable,
+)
 
 if TYPE_CHECKING:
     import polars as pl
@@ -34,136 +54,137 @@ CANNOT_TELL = "cannot tell"
 COMMAND_KEYS = ("format", "skipped", "failed")
 #: Rows of the group-by-part matrix that an audit keeps.
 MATRIX_ROWS = 60
-#: Why two images are similar. Only ``content`` is a leak.
-CAUSES = ("content", "nothing touched")
+#: Keys of a recorded argument.
+PATH, DIGEST, ROWS, OBJECT = "$path", "$digest", "$rows", "$object"
+#: Arguments that are names of files and folders, if there is something of that name.
+FILES = (
+    *("generated", "reference", "encoder", "split", "labels", "groups", "background", "inception"),
+    *(
+        "clip",
+        "lpips",
+        "data",
+        "captions",
+        "train",
+        "train_or_data",
+        "test",
+        "pretrain",
+        "root",
+        "classes",
+    ),
+    *("study", "votes", "metrics", "splits"),
+)
+#: Arguments that change no number.
+SILENT = ("progress", "cache", "threads")
+#: What is read of a manifest's folder, next to images.
+TABLE = "manifest.parquet"
 
 
 @dataclass(frozen=True)
-class LeakPair:
-    """A test sample and the train sample that it leaks from.
+class Call:
+    """A call of a public function.
 
     Attributes:
-        gap: distance in frames, if both lie in one video; else None.
-        score: strength of the signal in [0, 1]; None where only the gap is known.
-        cause: why two images are similar (one of ``CAUSES``).
+        verb: the verb of the command line that makes the same call: ``score``, ``probe`` ...
+        arguments: those that are not the defaults, as JSON; see the head of this module.
+        digests: SHA-256 of what was read, by role, e.g. ``generated ours``, ``tactile encoder``.
     """
 
-    test: SampleRef
-    train: SampleRef
-    gap: int | None
-    score: float | None = None
-    cause: str = ""
+    verb: str
+    arguments: Mapping[str, Any]
+    digests: Mapping[str, str] = field(default_factory=dict)
 
-    @property
-    def has_photos(self) -> bool:
-        """Whether either sample has a photo."""
-        return bool(self.test.vision or self.train.vision)
+    @classmethod
+    def of(cls, verb: str, function: Callable[..., Any], arguments: Mapping[str, Any]) -> Call:
+        """The call of ``function`` with the ``arguments``; their files are digested."""
+        defaults = {n: p.default for n, p in inspect.signature(function).parameters.items()}
+        recorded = {
+            name: _recorded(value, name)
+            for name, value in arguments.items()
+            if name not in SILENT and not _is(value, defaults.get(name, inspect.Parameter.empty))
+        }
+        return cls(verb, recorded)
+
+    def with_digests(self, digests: Mapping[str, Any]) -> Call:
+        """The call with digests, nested ones by both names: ``{"generated": {"ours": ...}}``."""
+        flat: dict[str, str] = {}
+        for name, value in digests.items():
+            if isinstance(value, Mapping):
+                flat |= {f"{name} {key}": str(each) for key, each in value.items()}
+            elif value is not None:
+                flat[name] = str(value)
+        return replace(self, digests=flat)
+
+    def with_paths(self, change: Callable[[str], str]) -> Call:
+        """The call with ``change`` applied to every path."""
+        return replace(self, arguments=_changed(self.arguments, change))
 
 
-@dataclass(frozen=True)
-class Signal:
-    """One kind of leak, over all test samples.
+def _is(value: Any, default: Any) -> bool:
+    """Whether an argument is the default; arrays and frames have no truth."""
+    simple = (str, int, float, bool, tuple, list)
+    plain = isinstance(value, simple) and isinstance(default, simple)
+    return value is default or (plain and value == default)
 
-    Attributes:
-        kind: ``identical sample``, ``identical bytes``, ``shared video`` (or ``object`` ...),
-            ``time gap``, ``near-duplicate vision`` or ``near-duplicate tactile``.
-        checked: test samples that could be checked (a null or unreadable one cannot).
-        flagged: test samples that leak by this signal.
-        threshold: the score from which a sample is flagged.
-        false_positives: the rate at which unrelated samples are flagged, which the threshold was
-            calibrated to; None where the signal is exact.
-        edges, unrelated, matches: histograms of scores over the same bins, of unrelated pairs and
-            of test samples against train (counts; ``len(edges) == len(matches) + 1``); empty where
-            nothing was calibrated.
-        causes: test samples at or over the threshold by cause (``CAUSES``); empty where the signal
-            has one cause.
-        worst: the strongest pairs.
-        notes: what a reader must know.
-        counts: whether flagged samples count as leaking; a shared group other than the audit's is
-            reported but not counted, nor are as many near-duplicates as chance explains.
-        verdict: of near-duplicates: ``leaks``, ``none``, or ``cannot tell`` (``worst`` is then a
-            ranking); '' where the signal is exact.
-        expected: samples that chance alone flags at ``false_positives``; None if not known.
-        measured: the rate at which train images of other videos are flagged by thresholds from
-            the other half of the videos; None if not known.
+
+def _recorded(value: Any, name: str) -> Any:
+    if isinstance(value, Mapping | list | tuple) and name in ("labels", "groups"):
+        return {OBJECT: type(value).__name__}  # one for each sample
+    if isinstance(value, Mapping):
+        # Of a mapping name -> path the argument's role; of options those of the option.
+        return {str(k): _recorded(v, name if name in FILES else str(k)) for k, v in value.items()}
+    if isinstance(value, list | tuple):
+        return [_recorded(item, name) for item in value]
+    if isinstance(value, PurePath) or (
+        isinstance(value, str) and name in FILES and value and is_there(Path(value))
+    ):
+        return _recorded_path(Path(value), name)
+    if value is None or isinstance(value, str | bool | int | float):
+        return value
+    root = getattr(value, "root", None)  # of a manifest: its folder, if that still says the same
+    if isinstance(root, Path) and hasattr(value, "table") and (root / TABLE).is_file():
+        return {**_recorded_path(root, name), ROWS: value.digest}
+    return {OBJECT: type(value).__name__}
+
+
+def _recorded_path(path: Path, name: str) -> dict[str, Any]:
+    record: dict[str, Any] = {PATH: str(path)}
+    if (digest := digest_of(path, name)) is not None:
+        record[DIGEST] = digest
+    return record
+
+
+def is_there(path: Path) -> bool:
+    """Whether there is something at a path; a name that no file can have is none."""
+    return os.path.exists(path)  # noqa: PTH110 - Path.exists raises for some names
+
+
+def digest_of(path: Path, name: str) -> str | None:
+    """SHA-256 of the file, manifest or encoder that the argument ``name`` is; None of others.
+
+    Images that are scored have digests of their own, of those that were read.
     """
-
-    kind: str
-    checked: int
-    flagged: int
-    threshold: float
-    false_positives: float | None = None
-    edges: Sequence[float] = ()
-    unrelated: Sequence[int] = ()
-    matches: Sequence[int] = ()
-    causes: Mapping[str, int] = field(default_factory=dict)
-    worst: Sequence[LeakPair] = ()
-    notes: Sequence[Note] = ()
-    counts: bool = True
-    verdict: str = ""
-    expected: float | None = None
-    measured: float | None = None
-
-    @property
-    def fraction(self) -> float:
-        """Flagged share of the samples that could be checked; 0 if there are none."""
-        return self.flagged / self.checked if self.checked else 0.0
+    if path.is_file():
+        return None if name in ("generated", "reference") else digest_file(path)
+    if (path / TABLE).is_file():
+        return digest_file(path / TABLE)
+    weights = name in ("encoder", "clip") and path.is_dir()
+    return digest_folder(path, "**/*.safetensors") if weights else None
 
 
-@dataclass(frozen=True)
-class ImpactRow:
-    """What leaking costs, for one kind of feature and one classifier: material accuracy, in [0, 1].
-
-    Attributes:
-        features: e.g. ``tactile pixels`` or an encoder's name.
-        classifier: ``1-NN`` or ``linear probe``.
-        given, clean: accuracy on the test part of the given split and of the leak-free one.
-        cost: ``given - clean``.
-        given_interval, clean_interval, cost_interval: 95 %, leaving out whole groups; None with
-            fewer than two.
-        chance: 1 / materials.
-        group: the column that the leak-free splits keep whole.
-        seen: whether the encoder of the features was trained on some of the samples.
-    """
-
-    features: str
-    classifier: str
-    given: float
-    clean: float
-    cost: float
-    given_interval: tuple[float, float] | None
-    clean_interval: tuple[float, float] | None
-    cost_interval: tuple[float, float] | None
-    chance: float
-    group: str
-    seen: bool = False
-
-
-@dataclass(frozen=True)
-class Impact:
-    """What a leak does to scores: the same classifiers under the given and leak-free splits.
-
-    Attributes:
-        rows: one for each kind of features and classifier.
-        headline: one sentence with the number to put in a paper.
-        group: the column kept whole by the leak-free splits and left out for the intervals.
-        clean_splits: digests of the leak-free splits that ``clean`` averages over.
-        settings: seeds, sizes, penalties and digests of features.
-        notes: what a reader must know.
-    """
-
-    rows: Sequence[ImpactRow]
-    headline: str
-    group: str
-    clean_splits: Sequence[str]
-    settings: Mapping[str, Any] = field(default_factory=dict)
-    notes: Sequence[Note] = ()
+def _changed(value: Any, change: Callable[[str], str]) -> Any:
+    if isinstance(value, Mapping):
+        return {
+            key: change(item) if key == PATH and isinstance(item, str) else _changed(item, change)
+            for key, item in value.items()
+        }
+    return [_changed(item, change) for item in value] if isinstance(value, list) else value
 
 
 class Shown:
     """What audits and results share: they print themselves, and are JSON of a format."""
 
     form: ClassVar[str]
+    role: ClassVar[str]
 
     def __str__(self) -> str:
         """The tables, findings, notes and claims, as in the terminal."""
@@ -182,11 +203,25 @@ class Shown:
         """The inverse of :meth:`to_json`; keys that a command adds are ignored."""
         return from_plain(cls, {k: v for k, v in data.items() if k not in COMMAND_KEYS})
 
+    def moved(self, change: Callable[[str], str]) -> Self:
+        """The same with ``change`` applied to the path of every input of its calls."""
+        return _with_paths(self, lambda path: path, change)
+
+    def save(self, path: str | Path) -> None:
+        """Write it as JSON, atomically; paths become relative to its folder."""
+        write_json(Path(path), self.moved(_from_folder(Path(path).parent, Path())).to_json())
+
     @classmethod
-    def _read(cls, path: Path, role: str) -> Self:
-        data = read_record(path, f"{role} file", form=cls.form)
-        with reading_entry(path, f"The {role}"):
-            return cls.from_json(data)
+    def load(cls, path: str | Path) -> Self:
+        """Read it from a file, with paths from the working directory.
+
+        Raises:
+            PalpateError: if the file is missing, or holds something else.
+        """
+        data = read_record(Path(path), f"{cls.role} file", form=cls.form)
+        with reading_entry(Path(path), f"The {cls.role}"):
+            loaded = cls.from_json(data)
+        return loaded.moved(lambda name: os.path.normpath(Path(path).parent / name))
 
 
 @dataclass(frozen=True)
@@ -224,6 +259,7 @@ class Audit(Shown):
     """
 
     form: ClassVar[str] = AUDIT_FORMAT
+    role: ClassVar[str] = "audit"
     name: str
     group: str
     train_samples: int
@@ -284,71 +320,6 @@ class Audit(Shown):
             )
         return self.table
 
-    def save(self, path: str | Path) -> None:
-        """Write the audit as JSON, atomically; paths of inputs become relative to its folder."""
-        change = _from_folder(Path(path).parent, Path())
-        call = self.call and self.call.with_paths(change)
-        write_json(Path(path), replace(self, call=call).to_json())
-
-    @classmethod
-    def load(cls, path: str | Path) -> Audit:
-        """Read an audit file.
-
-        Raises:
-            PalpateError: if it is missing, or no audit.
-        """
-        audit = cls._read(Path(path), "audit")
-        call = audit.call and audit.call.with_paths(_below(Path(path).parent))
-        return replace(audit, call=call)
-
-
-@dataclass(frozen=True)
-class GalleryItem:
-    """One row of the gallery: the photo, the real tactile image, the generated one.
-
-    Attributes:
-        sample: photo and real image.
-        generated: path of the generated image.
-        background: that of the image without contact.
-        method: what generated it.
-    """
-
-    sample: SampleRef
-    generated: str | None
-    background: str | None = None
-    method: str = ""
-
-
-@dataclass(frozen=True)
-class Match:
-    """A key that retrieval put high: its sample, or its text; ``similarity`` is the cosine."""
-
-    sample: SampleRef
-    similarity: float
-    right: bool
-    text: str = ""
-
-
-@dataclass(frozen=True)
-class Strip:
-    """One query and what an encoder finds most similar to it.
-
-    Attributes:
-        query: the sample; ``query_text`` its text, where that is the query.
-        queries, keys: the modalities: ``tactile``, ``vision`` or ``text``.
-        matches: the most similar keys, best first.
-        rank: of the query's own key, from 1; as many as are equal to it share one.
-        subject: which encoder, or split, this is of.
-    """
-
-    query: SampleRef
-    queries: str
-    keys: str
-    matches: Sequence[Match]
-    rank: int
-    subject: str = ""
-    query_text: str = ""
-
 
 @dataclass(frozen=True)
 class Results(Shown):
@@ -371,6 +342,7 @@ class Results(Shown):
     """
 
     form: ClassVar[str] = RESULTS_FORMAT
+    role: ClassVar[str] = "results"
     title: str
     facts: Sequence[str] = ()
     audits: Sequence[Audit] = ()
@@ -472,37 +444,40 @@ class Results(Shown):
             rows.append(row | {"preset": preset, "notes": notes})
         return pl.DataFrame(rows, infer_schema_length=None)
 
+    @classmethod
+    def load(cls, path: str | Path) -> Results:
+        """Read results from a file, or those of an audit, with paths from the working directory.
+
+        Raises:
+            PalpateError: if the file is missing, or holds something else.
+        """
+        data = read_record(Path(path), "results file", form=(RESULTS_FORMAT, AUDIT_FORMAT))
+        if data["format"] == RESULTS_FORMAT:
+            return super().load(path)
+        results = replace(Audit.load(path).to_results(), title="")
+        return results.with_paths(lambda name: os.path.normpath(Path(path).parent / name))
+
+    def moved(self, change: Callable[[str], str]) -> Results:
+        """The results with ``change`` applied to every path, of images as well."""
+        return self.with_paths(change, change)
+
     def relative_to(self, folder: Path, base: Path) -> Results:
         """The results with paths relative to ``folder`` instead of ``base``.
 
         So they stay right when a run folder is moved as a whole.
         """
-        change = _from_folder(folder, base)
-        return self.with_paths(change).with_call_paths(change)
+        return self.moved(_from_folder(folder, base))
 
-    def with_paths(self, change: Callable[[str], str | None]) -> Results:
-        """The results with ``change`` applied to the path of every image; None removes it."""
-        return _with_paths(self, change)
+    def with_paths(
+        self, images: Callable[[str], str | None], inputs: Callable[[str], str] = str
+    ) -> Results:
+        """The results with other paths.
 
-    def with_call_paths(self, change: Callable[[str], str]) -> Results:
-        """The results with ``change`` applied to the path of every input of their calls."""
-        audits = [replace(a, call=a.call and a.call.with_paths(change)) for a in self.audits]
-        return replace(self, audits=audits, calls=[c.with_paths(change) for c in self.calls])
-
-    def save(self, path: str | Path) -> None:
-        """Write the results as JSON, atomically; paths become relative to its folder."""
-        folder = Path(path).parent
-        write_json(Path(path), self.relative_to(folder, base=Path()).to_json())
-
-    @classmethod
-    def load(cls, path: str | Path) -> Results:
-        """Read a results file.
-
-        Raises:
-            PalpateError: if it is missing, or holds no results.
+        Args:
+            images: path of an image -> its new one; None removes it.
+            inputs: path of an input of a call -> its new one.
         """
-        results, change = cls._read(Path(path), "results"), _below(Path(path).parent)
-        return results.with_paths(change).with_call_paths(change)
+        return _with_paths(self, images, inputs)
 
 
 def _from_folder(folder: Path, base: Path) -> Callable[[str], str]:
@@ -511,32 +486,29 @@ def _from_folder(folder: Path, base: Path) -> Callable[[str], str]:
     return lambda name: Path(os.path.relpath(start / name, end)).as_posix()
 
 
-def _below(folder: Path) -> Callable[[str], str]:
-    """Paths from ``folder`` as paths from the working directory."""
-    return lambda name: os.path.normpath(folder / name)
-
-
-#: Fields of a sample, and of a row of the gallery, that are paths of images.
-_PATHS: dict[type, tuple[str, ...]] = {
+#: Fields that are paths of images, of the records that hold any.
+_IMAGES: dict[type, tuple[str, ...]] = {
     SampleRef: ("vision", "tactile", "background"),
     GalleryItem: ("generated", "background"),
+    **dict.fromkeys((LeakPair, Signal, Audit, Match, Strip, Results), ()),
 }
 
 
-def _with_paths(value: Any, change: Callable[[str], str | None]) -> Any:
-    """A result, or a part of one, with ``change`` applied to the path of every image in it."""
+def _with_paths(
+    value: Any, images: Callable[[str], str | None], inputs: Callable[[str], str]
+) -> Any:
+    """A result, or a part of one, with other paths of images and of inputs of calls."""
     if isinstance(value, list | tuple):
-        return [_with_paths(item, change) for item in value]
-    if not isinstance(
-        value, (SampleRef, LeakPair, Signal, Audit, GalleryItem, Match, Strip, Results)
-    ):
+        return [_with_paths(item, images, inputs) for item in value]
+    if isinstance(value, Call):
+        return value.with_paths(inputs)
+    if type(value) not in _IMAGES:
         return value
-    paths, names = _PATHS.get(type(value), ()), [field.name for field in fields(value)]
-    of_image = lambda path: None if path is None else change(path)
-    inside = lambda part: _with_paths(part, change)
-    return replace(
-        value, **{n: (of_image if n in paths else inside)(getattr(value, n)) for n in names}
-    )
+    parts = {field.name: getattr(value, field.name) for field in fields(value)}
+    of_image = lambda path: None if path is None else images(path)
+    inside = lambda part: _with_paths(part, images, inputs)
+    paths = _IMAGES[type(value)]
+    return replace(value, **{n: (of_image if n in paths else inside)(v) for n, v in parts.items()})
 
 
 def _writer(name: str) -> Any:

@@ -5,10 +5,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from palpate.core import Note, Score
-from palpate.report.families import defined, families, family_of
+from palpate.core.score import BETTER
+from palpate.report.labels import count, number, percent, plural, score_text, with_interval
 from palpate.report.notes import question
-from palpate.report.numbers import count, number, percent, plural, score_text, with_interval
-from palpate.report.results import CANNOT_TELL, Audit, Results, Signal
+from palpate.report.records import Signal
+from palpate.report.results import CANNOT_TELL, Audit, Results
+from palpate.report.tables import defined, families, family_of
 
 #: Beginning of a kind of leak -> what it means ({thing} is the rest of the name, {data} what test
 #: is compared with), and the sentence about a share of the test samples. The first match wins.
@@ -203,8 +205,9 @@ def score_line(scores: Sequence[Score]) -> str:
             continue
         values = [f"{score.a} {with_interval(score, column.digits)}" for score in scored[:3]]
         floors = [score.floor for score in scored if score.floor is not None]
-        floor = f"; floor {number(floors[0], column.digits)}" if floors else ""
-        return f"{column.name} ({column.better}): {', '.join(values)}{floor}."
+        floor = f"; floor {column.text(floors[0])}" if floors else ""
+        better = BETTER[scored[0].higher_is_better]
+        return f"{column.name} ({better}): {', '.join(values)}{floor}."
     return ""
 
 

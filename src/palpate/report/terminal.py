@@ -4,14 +4,16 @@ from __future__ import annotations
 
 import io
 from collections.abc import Sequence
+from itertools import pairwise
 
 from rich.console import Console
 from rich.table import Table as Grid
 from rich.text import Text
 
-from palpate.report.families import families
+from palpate.core import Score
+from palpate.report.labels import count, percent
 from palpate.report.notes import COMMAND_LINE, PYTHON, Style, sentence
-from palpate.report.numbers import count, percent
+from palpate.report.records import Claim
 from palpate.report.results import Audit, Results
 from palpate.report.sentences import (
     audit_line,
@@ -20,8 +22,21 @@ from palpate.report.sentences import (
     signal_notes,
     threshold_text,
 )
-from palpate.report.study import Claim, tally
-from palpate.report.tables import Head, Table, listing, of_differences, of_study, rankings
+from palpate.report.study import of_study, tally
+from palpate.report.tables import (
+    Cell,
+    Family,
+    Head,
+    Row,
+    Table,
+    families,
+    listing,
+    of_differences,
+    with_arrow,
+)
+
+#: Title of the rankings, which replace the differences of more than two generators.
+RANKED = "Best first on the same samples: > decided, ~ not decided"
 
 
 def print_result(result: Results | Audit, console: Console, style: Style = COMMAND_LINE) -> None:
@@ -29,7 +44,7 @@ def print_result(result: Results | Audit, console: Console, style: Style = COMMA
     if isinstance(result, Audit):
         console.print(audit_text(result, style), markup=False, soft_wrap=True)
         return
-    for family in () if result.tables else families(result.scores):
+    for family in () if result.tables else families(result.scores, result.controls):
         _print_table(listing(family), console, style)
         if ranked := rankings(family):
             _print_table(ranked, console, style)
@@ -118,3 +133,33 @@ def audit_text(audit: Audit, style: Style = PYTHON) -> str:
         lines.append(audit.impact.headline)
         lines += [f"  {sentence(note, style)}" for note in audit.impact.notes]
     return "\n".join([*lines, *(audit_text(other, style) for other in audit.others)])
+
+
+def rankings(family: Family) -> Table | None:
+    """Return the generators of each metric from best to worst where three or more are compared.
+
+    ``>`` separates neighbors whose paired difference is decided (Holm's p under 0.05), ``~``
+    between the others. Metrics without a better direction have no row.
+    """
+    by_metric: dict[str, list[Score]] = {}
+    for d in family.differences:
+        by_metric.setdefault(with_arrow(d), []).append(d)
+    if max(map(len, by_metric.values()), default=0) < 3:
+        return None
+    orders = [(metric, _ranking(each)) for metric, each in by_metric.items()]
+    rows = [Row([Cell(metric), Cell(order)]) for metric, order in orders if order]
+    return Table(RANKED, "", [Head("metric"), Head("best first")], rows) if rows else None
+
+
+def _ranking(differences: Sequence[Score]) -> str:
+    wins = dict.fromkeys([name for d in differences for name in (d.a, d.b or "")], 0)
+    apart: set[frozenset[str]] = set()
+    for d in differences:
+        better, p = d.details.get("p_better"), d.details.get("p_adjusted")
+        if better is not None:
+            wins[d.a if better > 0.5 else d.b or ""] += 1
+            apart |= {frozenset((d.a, d.b or ""))} if p is not None and p < 0.05 else set()
+    names = sorted(wins, key=lambda name: -wins[name])
+    signs = [">" if frozenset(pair) in apart else "~" for pair in pairwise(names)]
+    steps = (f" {sign} {name}" for sign, name in zip(signs, names[1:], strict=True))
+    return names[0] + "".join(steps) if any(wins.values()) else ""

@@ -21,9 +21,8 @@ import numpy as np
 from scipy import special
 
 from palpate.core import Measure, Score
-from palpate.report.labels import measured
-from palpate.report.numbers import number
-from palpate.report.study import Claim, StudyTable, Verdict
+from palpate.report.labels import measured, number
+from palpate.report.records import Claim, StudyTable, Verdict
 from palpate.studies.evidence import ahead, in_words, side_of
 from palpate.studies.names import BACKGROUND, GVST, NOLEAK, ORIG, OURS
 

@@ -12,8 +12,7 @@ from typing import TYPE_CHECKING, Any
 from palpate.core import Note, Score
 from palpate.diffusion.generated import Generated
 from palpate.evaluation.probing import results_of
-from palpate.report.labels import measured
-from palpate.report.numbers import percent
+from palpate.report.labels import measured, percent
 from palpate.report.results import Audit, Results
 from palpate.studies.claims import effect_table, paper_claims
 from palpate.studies.evidence import difference_between, in_words

@@ -32,9 +32,9 @@ from palpate.evaluation.controls import BACKGROUND
 from palpate.evaluation.scoring import score
 from palpate.leakage.auditing import audit
 from palpate.leakage.splitting import split as leak_free_split
-from palpate.report.families import families
-from palpate.report.numbers import percent, with_interval
+from palpate.report.labels import percent, with_interval
 from palpate.report.results import Results
+from palpate.report.tables import families
 from palpate.sim.options import WorldOptions
 from palpate.sim.presets import PRESETS as WORLDS
 from palpate.studies.controls import nearest_rows

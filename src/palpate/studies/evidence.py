@@ -16,8 +16,7 @@ import numpy as np
 from scipy import special
 
 from palpate.core import Note, Score, plain, require
-from palpate.report.labels import label_of, measured, subject_of
-from palpate.report.numbers import digits_of, number, with_interval
+from palpate.report.labels import digits_of, label_of, measured, number, subject_of, with_interval
 
 
 def over_seeds(scores: Sequence[Score]) -> Score:

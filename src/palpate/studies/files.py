@@ -32,7 +32,8 @@ from palpate.diffusion.generated import Generated
 from palpate.encoders.models import Part, shipped_folder
 from palpate.evaluation.probing import Plan, Probed, plan_of
 from palpate.metrics.means import Mean
-from palpate.report.results import Audit, GalleryItem
+from palpate.report.records import GalleryItem
+from palpate.report.results import Audit
 from palpate.sim.presets import MINI_SEEDS
 from palpate.studies.graph import Work
 from palpate.studies.names import NOLEAK, ORIG, slug

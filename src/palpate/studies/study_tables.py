@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 from palpate.core import Measure, Score
 from palpate.preference.scoring import PREFERENCE, STRENGTH
 from palpate.report.labels import measured
-from palpate.report.study import StudyTable
+from palpate.report.records import StudyTable
 from palpate.studies.evidence import over_seeds
 from palpate.studies.names import (
     FLOOR,

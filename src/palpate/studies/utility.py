@@ -42,8 +42,8 @@ from palpate.metrics.means import Mean, mean_of
 from palpate.metrics.means import over_seeds as over_draws
 from palpate.metrics.paired import differences_of_means
 from palpate.metrics.probe import fit_probe
+from palpate.report.records import Claim, StudyTable
 from palpate.report.results import Results
-from palpate.report.study import Claim, StudyTable
 from palpate.studies.claims import decide
 from palpate.studies.evidence import in_words, over_seeds, side_of
 from palpate.studies.files import control_folders, data_of

@@ -1,6 +1,6 @@
 """Does a results file come out again? What made it is run once more, and the two are compared.
 
-A results file names the calls that made its scores and audits (:mod:`palpate.report.calls`): each
+A results file names the calls that made its scores and audits (:mod:`palpate.report.results`): each
 is made again on the files of today. Results in a run folder name its stages instead: those that
 train must hold the files of their records, and those that measure (splits and audits, probes,
 scores, tables) are built again in a temporary folder from the stored data, images and encoders.
@@ -23,9 +23,18 @@ from typing import Any, Literal
 
 from palpate.core import PalpateError, Progress, few, plain, quiet, read_record, require
 from palpate.core.files import reading_entry
-from palpate.report.calls import OBJECT, PATH, ROWS, Call, is_there
 from palpate.report.labels import label_of, subject_of
-from palpate.report.results import AUDIT_FORMAT, RESULTS_FORMAT, Audit, Results
+from palpate.report.results import (
+    AUDIT_FORMAT,
+    OBJECT,
+    PATH,
+    RESULTS_FORMAT,
+    ROWS,
+    Audit,
+    Call,
+    Results,
+    is_there,
+)
 from palpate.studies.graph import measured_again
 from palpate.studies.stages import stage_outputs
 
