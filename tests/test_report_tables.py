@@ -15,7 +15,7 @@ from palpate.report.labels import (
     score_text,
     subject_of,
 )
-from palpate.report.page import heat_tables
+from palpate.report.page import matrices
 from palpate.report.results import Results
 from palpate.report.tables import columns, families, family_of, grids, listing, of_differences
 from palpate.report.terminal import rankings
@@ -72,8 +72,7 @@ def test_scores_of_a_family_are_one_table_with_what_they_share():
     (table,) = families(scores)
     assert [(c.name, c.size) for c in table.columns] == [("TMMD", "n = 240"), ("I-TMMD", "")]
     assert [row.cells[2].below[-1] for row in grids(table)[0].rows[:2]] == ["n = 100", "n = 200"]
-    assert ("bandwidth σ", "10") in table.facts
-    assert ("TMMD, seed", "1, 2") in table.facts
+    assert (table.facts["bandwidth σ"], table.facts["TMMD, seed"]) == ("10", "1, 2")
     (laid,) = grids(*families([score(seed=1), score(seed=2)]))
     assert [row.cells[0].value for row in laid.rows] == ["a", "a", "real images (floor)"]
 
@@ -132,7 +131,7 @@ def test_the_dagger_needs_a_decided_difference_against_every_other(differences, 
 def test_the_best_by_value_is_among_those_that_are_compared():
     scores = [score(subject=s, value=v) for s, v in (("a", 2.0), ("b", 3.0), ("photo", 1.0))]
     best = [
-        [column.scores[k].a for k in column.best()]
+        [cell.value.a for cell in column.cells if cell.best]
         for all_scores in (scores, [*scores, difference("a", "b")])
         for column in families(all_scores)[0].columns[:1]
     ]
@@ -199,7 +198,7 @@ def test_equal_notes_have_one_number():
     ]
     (table,) = families(scores)
     written = listing(table)
-    assert [row.cells[-1].footnotes for row in written.rows] == [[1, 2], [1, 3]]
+    assert [written.footnotes(row.cells[-1]) for row in written.rows] == [[1, 2], [1, 3]]
     assert written.notes == [copied, text_note("Seen."), other]
 
 
@@ -218,9 +217,13 @@ def test_what_follows_from_the_fields_of_a_score_is_a_note(changes, code):
 
 
 def test_only_square_matrices_of_numbers_are_drawn():
-    matrices = [[[0.1, 2.0], [2.0, None]], [[1.0, 2.0]], "text"]
-    scores = [score("D-TMMD", details={"matrix": m, "classes": ["x", "y"]}) for m in matrices]
-    (heat,) = heat_tables(scores)
-    assert heat.labels == ["x", "y"]
-    assert heat.values == [["0.100", "2.000"], ["2.000", "–"]]
-    assert heat.shares == [[0.05, 1.0], [1.0, 0.0]]
+    grids_of_numbers = [[[0.1, 2.0], [2.0, None]], [[1.0, 2.0]], "text"]
+    scores = [
+        score("D-TMMD", details={"matrix": m, "classes": ["x", "y"]}) for m in grids_of_numbers
+    ]
+    (heat,) = matrices(Results("T", scores=scores))
+    assert [head.label for head in heat.heads] == ["", "x", "y"]
+    assert [[(cell.value, cell.share) for cell in row.cells] for row in heat.rows] == [
+        [("x", 0.0), ("0.100", 0.05), ("2.000", 1.0)],
+        [("y", 0.0), ("2.000", 1.0), ("–", 0.0)],
+    ]

@@ -70,7 +70,10 @@ if TYPE_CHECKING:
 OPTION_NAMES: dict[tuple[str, str], str] = {
     ("audit", "train_or_data"): "TRAIN",
     ("audit", "test"): "TEST",
+    ("audit", "group"): "--by",
     ("caption check", "captions"): "CAPTIONS",
+    ("caption check", "data"): "--data",
+    ("demo", "data"): "--data",
     ("", "columns"): "--map",
     ("train encoder", "batch"): "--set tactile_course.batch",
     ("train generator", "batch"): "--set loop.batch",
@@ -83,6 +86,8 @@ OPTION_NAMES: dict[tuple[str, str], str] = {
     ("", "source"): "PATH",
     ("generate", "photos"): "PATH",
 }
+#: Arguments whose True and False are words of an option.
+WORDED = ("normalize",)
 #: What would break a line of the terminal, or color it.
 _CONTROL = re.compile("[\x00-\x1f\x7f-\x9f\u2028\u2029]")
 #: The default of an option in its help, unless it says nothing.
@@ -463,6 +468,8 @@ def error_line(verb: str, error: PalpateError) -> str:
 def _option(verb: str, argument: str, value: Any) -> str:
     """Return how the command line writes an argument with its value."""
     name = option_name(verb, argument)
+    if isinstance(value, bool) and argument in WORDED:
+        value = "yes" if value else "no"
     if isinstance(value, bool):
         return name if value else name.replace("--", "--no-", 1)
     if isinstance(value, Mapping):  # e.g. columns={"vision": "rgb"}

@@ -32,7 +32,7 @@ def run(options: Options, terminal: Terminal) -> Any:
 
     if options.show_list:
         return _formats(terminal)
-    fix = "E.g. palpate validate touch_and_go/, or palpate validate --list"
+    fix = "See the formats: palpate validate --list"
     require(options.source is not None, "source", "must be named", "none", fix=fix)
     return terminal.run(validate, **options.keywords("show_list"))
 

@@ -18,6 +18,8 @@ FEW = 5
 #: Lines of a printed list of problems, and how many of one kind it lists one by one.
 SHOWN_PROBLEMS = 40
 FEW_PROBLEMS = 3
+#: A sentence that ends in a command or options, for pasting: it has no full stop.
+_COMMAND = re.compile(r"(: |Use |E\.g\. )(palpate |--?\w)")
 
 
 class PalpateError(Exception):
@@ -71,11 +73,11 @@ class PalpateError(Exception):
             example: how an argument with a value is written.
         """
         must = f"{name(self.argument)} {self.must}" if self.argument else self.must
-        parts = [must, f"Got {self.got}", self.fix]
-        if self.example:
-            parts.append("E.g. " + " ".join(example(k, v) for k, v in self.example.items()))
-        sentences = (p if p.endswith("...") else f"{p.rstrip('.')}." for p in parts if p)
-        return " ".join(sentences)
+        parts = [p for p in (must, f"Got {self.got}", self.fix) if p]
+        pasted = [p.endswith("...") or _COMMAND.search(p) is not None for p in parts]
+        words = [p if c else f"{p.rstrip('.')}." for p, c in zip(parts, pasted, strict=True)]
+        examples = [example(k, v) for k, v in self.example.items()]
+        return " ".join([*words, *["E.g."] * bool(examples), *examples])
 
     def to_json(self) -> dict[str, Any]:
         """Return the error as a JSON object: ``error, must, got, fix, argument``."""
