@@ -110,7 +110,7 @@ def test_a_part_and_its_fields_are_not_set_together():
         ("encoder DATA --clip palpate/mini --set tactile_course.lr=-1", "--set tactile_course.lr"),
         ("autoencoder DATA --preset tiny --set autoencoder.lr=-1", "--set autoencoder.lr"),
         ("generator nothing/", "PATH must exist. Got nothing at nothing"),
-        ("generator DATA --set condition.dropout=2", "E.g. --set condition.dropout=0.1."),
+        ("generator DATA --set condition.dropout=2", "E.g. --set condition.dropout=0.1"),
     ],
 )
 def test_what_a_training_refuses_is_named_as_it_is_given(

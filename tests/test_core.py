@@ -41,7 +41,7 @@ PROBLEMS = [Problem("a:1", "bad-line", "x"), Problem("a:2", "bad-line", "y")]
         (PalpateError("A ratio must lie in (0, 1)", "1.5", "Fix."), "(0, 1). Got 1.5. Fix."),
         (
             PalpateError("must lie in (0, 1)", "2", "", argument="val", example={"val": 0.1}),
-            "`val` must lie in (0, 1). Got 2. E.g. val=0.1.",
+            "`val` must lie in (0, 1). Got 2. E.g. val=0.1",
         ),
         (
             ProblemsError(PROBLEMS, "Fix them"),

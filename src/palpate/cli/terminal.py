@@ -1,10 +1,10 @@
 """What all verbs share: parsing with tyro, progress, results, safe outputs, errors in one line.
 
 A verb's module has a class ``Options`` (its docstring and those of its fields are the help) that
-derives from :class:`Common`, and ``run(options, terminal)``. That returns a record that says itself
-what it is (``str``, ``to_json``, and ``ok``: else the exit status is 1), or the JSON that ``--json``
-prints, or that and an exit status. A nested class is a group of options in the help; its option
-names stay flat.
+derives from :class:`Common`, and ``run(options, terminal)``. That returns a record that says by
+itself what it is (``str``, ``to_json``, and ``ok``: else the exit status is 1), or the JSON that
+``--json`` prints, or that and an exit status. A nested class is a group of options in the help; its
+option names stay flat.
 """
 
 from __future__ import annotations
