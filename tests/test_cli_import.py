@@ -152,7 +152,7 @@ def test_a_full_disk_is_reported_in_a_line_and_leaves_nothing(capsys, tag, tmp_p
     output = tmp_path / "full"
     for args in (
         ["import", tag, "-o", output],
-        ["audit", tag / "train.txt", tag / "test.txt", "--table", output / "t.parquet"],
+        ["audit", tag / "train.txt", tag / "test.txt", "-o", output / "t.parquet"],
     ):
         status, _, err = call(capsys, *args, "-q")
         assert status == 2, err

@@ -7,7 +7,8 @@ import pytest
 
 from forge.errors import fails
 from palpate.cli import main
-from palpate.data.naming import name_together, read_names
+from palpate.data.naming import read_names
+from palpate.data.recordings import groups_of, name_recordings
 
 
 def rows_of(kind, numbers):
@@ -32,7 +33,12 @@ def rows_of(kind, numbers):
 
 KINDS = {
     # suffix, options, video and frame of the first test sample, leaking samples of how many
-    "ssvtp": (".csv", ("--ids-in-time", "--near-frames", "1"), (None, 35), (1, 10)),
+    "ssvtp": (
+        ".csv",
+        ("--tactile", "images_tac/image_{frame}_tac.jpg", "--near-frames", "1"),
+        (None, 35),
+        (1, 10),
+    ),
     "intervals": (".txt", (), ("video3", 3500), (50, 100)),
     "interval table": (".csv", (), ("video3", 3500), (50, 100)),
     "nested": (".json", (), ("data1/3-17003.70", 35), (5, 10)),
@@ -48,11 +54,11 @@ def test_a_list_without_images_is_audited_and_answered(kind, tmp_path, capsys, m
     for part, numbers in (("train", range(35)), ("test", range(35, 45))):
         (tmp_path / f"{part}{suffix}").write_text(rows_of(kind, numbers))
     paths = [f"train{suffix}", f"test{suffix}"]
-    assert main(["audit", *paths, *options, "--table", "t.csv", "--json"]) == 1
+    assert main(["audit", *paths, *options, "-o", "t.csv", "--json"]) == 1
     data = json.loads(capsys.readouterr().out)
     assert (data["leaking_samples"], data["test_samples"]) == (leaking, of)
     assert data["identical_samples"] == 0
-    samples = name_together([read_names(tmp_path / f"test{suffix}")[0]])[0][0].table
+    samples = name_recordings([read_names(tmp_path / f"test{suffix}")[0]])[0].table
     if kind != "own":
         assert (samples["video"][0], samples["frame"][0]) == (video, frame)
     assert bool(data["commands"]) == (kind != "ssvtp")  # nothing says what belongs together
@@ -111,9 +117,13 @@ def test_ids_alone_cannot_show_a_leak(tmp_path, capsys):
     for part, numbers in (("train", range(8)), ("test", range(8, 10))):
         (tmp_path / f"{part}.csv").write_text(rows_of("ssvtp", numbers))
     paths = [str(tmp_path / f"{part}.csv") for part in ("train", "test")]
-    assert main(["audit", *paths, "--json"]) == 0
+    assert main(["audit", *paths, "--json"]) == 3
     data = json.loads(capsys.readouterr().out)
-    assert (data["verdict"], data["reason"]) == ("cannot tell", "ids")
+    assert [(q["verdict"], q["reason"]) for q in data["questions"]] == [
+        ("cannot tell", "ids"),
+        ("", "no-frames"),
+        ("", "no-images"),
+    ]
 
 
 def test_what_one_list_hides_the_other_shows(tmp_path):
@@ -121,8 +131,9 @@ def test_what_one_list_hides_the_other_shows(tmp_path):
     for part, numbers in (("train", range(35)), ("test", range(35, 38))):
         (tmp_path / f"{part}.csv").write_text(rows_of("own", numbers))
     lists = [read_names(tmp_path / f"{part}.csv")[0] for part in ("train", "test")]
-    named, template = name_together(lists)
-    assert template == "rig/{video}/touch/{frame:d}.png"
+    named = name_recordings(lists)
+    source = "file names `rig/{video}/touch/{frame:d}.png`"
+    assert groups_of(named[1]) == [("video", source), ("frame", source)]
     rows = named[1].table.select("video", "frame").rows()
     assert rows == [("cup3", 35), ("cup3", 36), ("cup3", 37)]
 
@@ -135,9 +146,9 @@ def test_a_list_of_two_published_data_sets_is_read_row_by_row(tmp_path, capsys):
         rows += [{"gel": ssvtp.format(k)} for k in numbers]
         (tmp_path / f"{part}.json").write_text(json.dumps(rows))
     paths = [tmp_path / f"{part}.json" for part in ("train", "test")]
-    named, names = name_together([read_names(path)[0] for path in paths])
+    named = name_recordings([read_names(path)[0] for path in paths])
     rows = named[1].table.select("video", "frame", "session").rows()
-    assert names == "HCT, SSVTP"
+    assert named[0].facts["video_from"] == "file names of HCT, SSVTP"
     assert rows[0] == ("data1/3-17003.70", 35, "data1/0-17000.70")
     assert rows[10] == (None, 35, None)
     assert main(["audit", *map(str, paths), "--json"]) == 1
@@ -155,7 +166,7 @@ def test_a_template_of_the_photos_is_held_against_the_photos(columns, tmp_path):
         ("tactile", "gel/{frame}.png", "frame", [8, 9, 10, 11]),
     ):
         manifest, problems, _ = read_names(table, **{side: template})
-        ((named,), _) = name_together([manifest], template)
+        (named,) = name_recordings([manifest], template)
         assert (named.column(column), problems) == (values, [])
 
 

@@ -102,8 +102,8 @@ def typed_manifest(path: Path) -> None:
             ("m/manifest.parquet", whole_manifest, f"{command} m/manifest.parquet", words)
             for command, words in (
                 ("caption check m --output", "must not replace an input"),
-                ("audit m m --no-images --table", "must not replace an input"),
-                ("audit a.jpg a.jpg --table", "must be new"),
+                ("audit m m --no-images -o", "must not replace an input"),
+                ("audit a.jpg a.jpg -o", "must be new"),
             )
         ),
     ],

@@ -159,7 +159,8 @@ def test_touch_and_go_at_80_20_is_optimal(published):
     facts = [published.table[c].n_unique() for c in ("id", "video", "material")]
     assert facts == [121861, 126, 19]
     first, second = (split(published, seed=seed) for seed in (0, 1))
-    assert (first.rule["group"], first.rule["status"], first.notes) == ("video", "optimal", [])
+    assert (first.rule["group"], first.rule["status"]) == ("video", "optimal")
+    assert (first.rule["name"], codes(first)) == ("NoLeak", ["recordings"])
     result = audit(published, split=first)
     assert result.groups_shared == 0
     assert len(result.materials) == 19
@@ -198,7 +199,7 @@ def test_folds_cover_every_sample_once_and_name_what_is_rare():
     folds = split(m, folds=3)
     assert sorted(i for s in folds for i in s.ids("test")) == sorted(m.ids)
     assert all(set(s.counts()) == {"train", "test"} for s in folds)
-    assert (folds[0].rule["rare"], codes(folds[0])) == (["Sand"], ["rare-materials"])
+    assert (folds[0].rule["rare"], codes(folds[0])) == (["Sand"], ["recordings", "rare-materials"])
     shares = folds[0].rule["shares"]
     assert shares == {"train": pytest.approx(2 / 3), "test": pytest.approx(1 / 3)}
 
@@ -238,7 +239,8 @@ def test_near_duplicates_alone_make_groups_where_nothing_else_is_known(monkeypat
     monkeypatch.setattr(near, "near_groups", lambda *_, **__: np.arange(20) // 2)
     made = split(m, near="tactile")
     facts = [made.rule[name] for name in ("group", "by", "groups")]
-    assert (facts, codes(made)) == (["near-duplicates", [], 10], ["group-near-only"])
+    notes = ["recordings", "group-near-only", "not-noleak"]  # the images are not there
+    assert (facts, codes(made)) == (["near-duplicates", [], 10], notes)
     assert all(made.parts[str(k)] == made.parts[str(k + 1)] for k in range(0, 20, 2))
 
 
@@ -254,7 +256,7 @@ def test_too_few_videos_fall_back_to_contacts_with_a_note():
     ]
     single = split(Manifest.from_rows(rows, "."))
     assert single.rule["group"] == "contact"
-    assert codes(single) == ["group-few", "no-materials"]
+    assert codes(single) == ["recordings", "group-few", "no-materials", "not-noleak"]
 
 
 def rows_of(samples):
@@ -304,12 +306,12 @@ def test_a_split_says_which_question_it_answers_and_offers_the_other():
         ),
     ):
         made = split(m, by=by, train=0.5)
-        (note,) = made.notes
+        note = made.notes[-1]
         assert (note.code, note.params["other"]) == ("question", other)
         assert words in sentence(note)
         assert split(m, by=other, train=0.5).digest != made.digest  # what it offers works
         result = audit(m, split=made)
-        assert (result.verdict, result.shared["object"][0]) == ("none", shared)
+        assert (result.verdict, result.shared["object"][0]) == ("no leak found", shared)
         asked = "new objects" if by == "object" else "new videos of known objects"
         assert f"the split is for {asked}{headline}." in str(result).splitlines()[0]
 
@@ -339,9 +341,9 @@ def test_what_cannot_be_split_says_why():
 def test_materials_that_cannot_all_be_everywhere_are_named():
     counts = {"a": {"A": 1, "B": 1}, "b": {"A": 1, "C": 1}, "c": {"B": 1, "C": 1}}
     made = split(filled(counts), train=0.5, by="video")
-    assert (len(made.rule["missing"]), codes(made)) == (1, ["missing-materials"])
+    assert (len(made.rule["missing"]), codes(made)) == (1, ["recordings", "missing-materials"])
     rare = split(filled({f"v{k}": {"W": 10, **({"S": 7} if k == 3 else {})} for k in range(10)}))
-    assert (rare.rule["rare"], codes(rare)) == (["S"], ["rare-materials"])
+    assert (rare.rule["rare"], codes(rare)) == (["S"], ["recordings", "rare-materials"])
 
 
 def test_the_record_is_whole_small_and_leak_free(published):

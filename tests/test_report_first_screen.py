@@ -84,7 +84,10 @@ def test_cards_hold_the_leak_the_distance_and_the_material():
     results = Results("T", audits=[full_audit(), clean_audit()], scores=measured())
     columns = telling_columns(families(results.scores))
     leak, distance, material = cards(results, columns)
-    assert [(r.label, r.text) for r in leak.rows] == [("Orig", "99.10 %"), ("NoLeak", "0 %")]
+    assert [(r.label, r.text) for r in leak.rows] == [
+        ("Orig", "leaks, 99.10 %"),
+        ("NoLeak", "no leak found"),
+    ]
     assert "image; median of Orig: 304 frames away." in leak.foot
     assert [r.text for r in distance.rows] == ["1.40", "1.10", "7.00"]
     assert re.search(r'class="null".*class="floor".*class="interval"', distance.strip)
@@ -184,7 +187,7 @@ def test_what_is_said_of_small_runs_of_clean_splits_and_of_the_drawings():
     assert "can decide nothing" in caution(Results("T", settings={"preset": "smoke"}))
     assert caution(Results("T", settings={"preset": "mini"})) == ""
     (card,) = cards(Results("T", audits=[clean_audit()]), [])[:1]
-    assert (card.rows[0].text, card.foot) == ("0 %", "")
+    assert (card.rows[0].text, card.foot) == ("no leak found", "")
     column, chosen = annotated(families([score("SSIM", null=None), score()]))
     assert (column.name, chosen.metric) == ("TMMD", "TMMD")
     assert annotated(families([score(null=None)])) is None

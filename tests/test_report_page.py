@@ -45,7 +45,7 @@ def page_of(results, folder, **options):
 
 
 def test_near_duplicates_show_what_chance_explains(tmp_path):
-    chance = {"verdict": "none", "expected": 1.0, "measured": 0.012, "counts": False}
+    chance = {"verdict": "no leak found", "expected": 1.0, "measured": 0.012, "counts": False}
     calibrated = Signal("near-duplicate tactile", 100, 3, 0.4, 0.01, **chance)
     untold = Signal("near-duplicate vision", 100, 0, 1.0, 0.01, verdict="cannot tell")
     audit = small_audit(signals=[calibrated, untold])
@@ -292,9 +292,9 @@ def test_headline_facts():
     audits = [small_audit(), small_audit(name="NoLeak", **clean)]
     scores = [score(value=None, interval=None), score(subject="GVST")]
     assert summary_lines(Results("t", audits=audits, scores=scores)) == [
-        "Orig: 80.0 % of the test samples share a video with train. 80 of 100 test samples leak "
-        "(80.0 %).",
-        "NoLeak: None of 100 test samples leaks by the one signal checked.",
+        "Orig: leaks. 80.0 % of the test samples share a video with train. 80 of 100 test samples "
+        "leak (80.0 %).",
+        "NoLeak: no leak found. None of 100 test samples leaks by the one signal checked.",
         "TMMD (lower is better): GVST 1.37 [1.01, 1.75]; floor 0.04.",
     ]
     assert summary_lines(Results("t")) == []

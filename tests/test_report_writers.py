@@ -86,7 +86,7 @@ def test_every_note_that_a_room_makes_has_a_sentence(monkeypatch, capsys):
 
 def test_an_audit_is_a_readable_summary_with_a_line_for_a_note_of_several_signals():
     text = str(full_audit())
-    assert text.startswith("Orig: 99.06 % of the test samples share a video with train; ")
+    assert text.startswith("Orig: leaks. 99.06 % of the test samples share a video with train; ")
     assert "29,611 of 29,879 test samples leak (99.10 %)." in text
     assert "  near-duplicate vision   5,210 of 29,879 (17.4 %), score 0.812" in text
     assert "2 test samples have no video." in text

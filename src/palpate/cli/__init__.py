@@ -41,8 +41,8 @@ def main(argv: list[str] | None = None) -> int:
     """Run the command line.
 
     Returns:
-        0 done; 1 a check failed (``audit --fail-over``); 2 a user's mistake, explained in one line;
-        70 a bug in palpate; 130 stopped by Ctrl-C.
+        0 done, or no leak found; 1 a check failed, or a split leaks; 2 a user's mistake, explained
+        in one line; 3 an audit cannot tell; 70 a bug in palpate; 130 stopped by Ctrl-C.
     """
     try:
         with resilient_streams():

@@ -21,12 +21,17 @@ from palpate.cli.terminal import (
     require_extra,
     working_folder,
 )
-from palpate.cli.verbs import FAILED_CHECK
+from palpate.cli.verbs import FAILED_CHECK, OK, UNKNOWN
 from palpate.core import require, write_text
+from palpate.report.labels import percent
+from palpate.report.records import LEAKS
 from palpate.report.results import Audit
 
 TABLE_FORMAT = "palpate-audit-table/1"
-Modality = Literal["vision", "tactile"]
+#: Options that are no arguments of the audit.
+UNPASSED = ("paths", "output", "page", "fail_over")
+#: The largest group of all samples that a split of four to one can keep whole.
+MOST = 0.95
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -37,19 +42,12 @@ class Comparison:
     """What train and test must not share; `auto`: the video, or what is known instead of it."""
     near_frames: int = 30
     """A gap of up to this many frames within a video is a leak by itself."""
-    ids_in_time: Switch = False
-    """The last number of an id or path is a time: samples without a video and frame are as near as
-    these numbers."""
     identity: Literal["auto", "names", "images"] = "auto"
     """What equal names in train and test mean: `names` the same thing, `images` nothing, so that
     bytes and images decide; `auto`: names where both have one root, are of one published data set,
     or have them from columns of tables."""
     images: bool = True
     """Compare image files and their content, not only tables."""
-    modalities: tuple[Modality, ...] = ("vision", "tactile")
-    """The images to compare."""
-    false_positives: float = 0.001
-    """Rate at which unrelated images may pass for near-duplicates."""
     encoder: str | None = None
     """Trained encoders (a folder or an id), by which --impact is measured on embeddings."""
     impact: Switch = False
@@ -63,26 +61,21 @@ class Outputs:
     """What is written."""
 
     output: OptionalOutPath = None
-    """The audit as JSON, for `palpate report`."""
+    """The audit as JSON, for `palpate report`; ending in .parquet or .csv: every signal of every
+    test sample, as a table."""
     page: Path | None = None
     """The audit as one self-contained page (.html)."""
-    table: Path | None = None
-    """Every signal of every test sample (.parquet or .csv)."""
-    worst: int = 12
-    """How many of the strongest pairs to keep for each signal."""
     fail_over: float = 0.0
-    """Exit with status 1 if more than this fraction of the test samples leaks (1: never)."""
-
-    def keywords(self) -> dict[str, Any]:
-        """As arguments of the audit."""
-        return {"worst": self.worst}
+    """Allow leaks of up to this fraction of the test samples: the exit status is 1 only over it (1:
+    never), and stays 3 for what cannot be told."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Options(Common):
     """Check whether a train/test split leaks.
 
-    Leaks are shared videos, near frames, equal files and near-duplicate images.
+    Leaks are shared videos, near frames, equal files and near-duplicate images. The exit status is
+    0 for no leak found, 1 for leaks, 3 for cannot tell.
     """
 
     paths: Annotated[tuple[Path, ...], tyro.conf.Positional]
@@ -107,22 +100,23 @@ def run(options: Options, terminal: Terminal) -> tuple[dict[str, Any], int]:
 
     _check(options)
     outputs = options.outputs
-    output = outputs.output or outputs.page or outputs.table
+    output = outputs.output or outputs.page
     with working_folder(options.cache, output) as cache:
-        with terminal.progress() as progress:
-            result = audit(
-                *options.paths, progress=progress, **options.keywords("paths", cache=cache)
-            )
+        result = terminal.run(audit, *options.paths, **options.keywords(*UNPASSED, cache=cache))
         result = replace(result, commands=_next_commands(options, result))
         _write(outputs, result, terminal)
     terminal.show(result)
     for command in result.commands:
         terminal.print_line(f"Next: {command}")
-    leaked = max(a.leaked_fraction for a in (result, *result.others))
+    audits = (result, *result.others)
+    leaked = max(a.leaked_fraction for a in audits)
     failed = leaked > outputs.fail_over
     if failed and outputs.fail_over:
         terminal.print_line(f"FAIL: leaked fraction {leaked} is over {outputs.fail_over}")
-    return result.to_json() | {"failed": failed}, FAILED_CHECK if failed else 0
+    elif leaked and not failed:
+        terminal.print_line(f"{LEAKS}, {percent(leaked)}, allowed")
+    unknown = UNKNOWN if any(a.open for a in audits) else OK
+    return result.to_json() | {"failed": failed}, FAILED_CHECK if failed else unknown
 
 
 def _check(options: Options) -> None:
@@ -131,7 +125,7 @@ def _check(options: Options) -> None:
     Raises:
         PalpateError: saying which.
     """
-    outputs, table = options.outputs, options.outputs.table
+    outputs = options.outputs
     require(
         len(options.paths) in ((1,) if options.split is not None else (1, 2)),
         None,
@@ -143,15 +137,21 @@ def _check(options: Options) -> None:
     if options.comparison.encoder is not None:
         require_extra("palpate audit --encoder")
     inputs = [*options.paths, *(p for p in (options.split, options.pretrain) if p)]
-    Files(output=outputs.output, page=outputs.page).guard(inputs)
+    if is_table(outputs.output):
+        formats = (TABLE_FORMAT.encode(), b"id,video,frame,material,leaking")
+        guard_output(outputs.output, inputs, formats)
+    Files(output=None if is_table(outputs.output) else outputs.output, page=outputs.page).guard(
+        inputs
+    )
     if outputs.output and outputs.page:
         must, fix = "must not be a file that the page writes", "Choose another file"
         pages = map(outputs.page.with_suffix, (".html", ".json", ".md"))
         require(outputs.output not in pages, "output", must, str(outputs.output), fix=fix)
-    if table is not None:
-        is_table = table.suffix.lower() in (".parquet", ".csv")
-        require(is_table, "table", "must end in .parquet or .csv", table.name)
-        guard_output(table, inputs, (TABLE_FORMAT.encode(), b"id,video,frame,material,leaking"))
+
+
+def is_table(path: Path | None) -> bool:
+    """Whether an output is a table, by its ending."""
+    return path is not None and path.suffix.lower() in (".parquet", ".csv")
 
 
 def _next_commands(options: Options, audit: Audit) -> list[str]:
@@ -161,16 +161,19 @@ def _next_commands(options: Options, audit: Audit) -> list[str]:
     codes = {note.code for note in audit.notes}
     if not audit.leaked_fraction or not joined or "equal-names" in codes:
         return []
+    if audit.groups_in_all and (audit.groups_in_all < 2 or audit.largest_group > MOST):
+        return []  # no split can keep these groups whole
     source = shlex.join([*map(str, paths), *options.reading.arguments()])
     checked = {s.kind: s for s in audit.signals if s.checked and s.kind.startswith("near-dup")}
     sides = [kind.split()[-1] for kind, s in checked.items() if s.flagged or audit.group == "none"]
     near = f" --near {'both' if len(sides) == 2 else sides[0]}" if sides else ""
     if audit.group == "none" and not near:
         return []
-    by = "" if options.comparison.by == "auto" else f" --by {options.comparison.by}"
-    commands = [f"palpate split {source}{by}{near} -o noleak.json"]
+    group = f" --by {audit.group}" if audit.group != "none" else ""
+    by = "" if options.comparison.by == "auto" else group
+    commands = [f"palpate split {source}{group}{near} -o noleak.json"]
     if len(paths) == 1:
-        commands.append(f"palpate audit {source} --split noleak.json")
+        commands.append(f"palpate audit {source}{by} --split noleak.json")
         if not options.comparison.impact and checked and len(audit.materials) > 1:
             split = f" --split {shlex.quote(str(options.split))}" if options.split else ""
             commands.append(f"palpate audit {source}{split} --impact")
@@ -178,14 +181,14 @@ def _next_commands(options: Options, audit: Audit) -> list[str]:
 
 
 def _write(outputs: Outputs, audit: Audit, terminal: Terminal) -> None:
-    if outputs.output:
-        audit.save(outputs.output)
-    if outputs.table and outputs.table.suffix.lower() == ".csv":
-        write_text(outputs.table, audit.to_frame().write_csv())
-    elif outputs.table:
+    if outputs.output and outputs.output.suffix.lower() == ".csv":
+        write_text(outputs.output, audit.to_frame().write_csv())
+    elif outputs.output and is_table(outputs.output):
         from palpate.data.manifest import write_parquet
 
-        write_parquet(audit.to_frame(), outputs.table, {"palpate.format": TABLE_FORMAT})
+        write_parquet(audit.to_frame(), outputs.output, {"palpate.format": TABLE_FORMAT})
+    elif outputs.output:
+        audit.save(outputs.output)
     if outputs.page:
         settings = {"version": __version__}
         results = replace(audit.to_results(), commands=[terminal.command], settings=settings)

@@ -6,14 +6,15 @@ folders also with ``palpate audit`` and ``palpate split``.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import tyro
 
 from palpate.cli.terminal import Common, OutPath, PathArgument, Switch, Terminal, option_group
-from palpate.core import require
+from palpate.core import Note, require
+from palpate.report.records import NO_LEAK
 
 Maps = Annotated[
     tuple[tuple[str, ...], ...],
@@ -41,9 +42,6 @@ class Reading:
     """Folder that paths are relative to (default: the folder of the table)."""
     side: Annotated[Literal["vision", "tactile"] | None, tyro.conf.arg(name="as")] = None
     """What the images of a folder show, if all show one thing."""
-    classes: Path | None = None
-    """Table of classes (`Name: id` or `id,name` per line) for materials that are numbers; -1 is
-    inconclusive and skipped."""
     names: str | None = None
     """Columns of a table without a header line, separated by commas."""
 
@@ -55,7 +53,7 @@ class Reading:
     def arguments(self) -> list[str]:
         """As they were written on the command line."""
         words = [word for group in self.columns for word in ("--map", *group)]
-        for name in ("vision", "tactile", "side", "root", "classes", "names"):
+        for name in ("vision", "tactile", "side", "root", "names"):
             if (value := getattr(self, name)) is not None:
                 words += [f"--{'as' if name == 'side' else name}", str(value)]
         return words
@@ -65,6 +63,9 @@ class Reading:
 class TableOptions(Reading):
     """Folders of images, tables, interval lists, Hugging Face data sets."""
 
+    classes: Path | None = None
+    """Table of classes (`Name: id` or `id,name` per line) for materials that are numbers; -1 is
+    inconclusive and skipped."""
     background: str | None = None
     """Where the tactile images without contact are, as a template."""
     every: int | None = None
@@ -143,6 +144,17 @@ def run(options: Options, terminal: Terminal) -> Any:
     from palpate.data import import_dataset
 
     return terminal.run(import_dataset, **options.keywords())
+
+
+def note_samples(terminal: Terminal, data: Path, rule: Mapping[str, Any]) -> None:
+    """Print what is known of recordings, and what the split of a model shares, by its rule."""
+    from palpate.data.manifest import Manifest, is_manifest
+    from palpate.data.recordings import recordings_note
+
+    if is_manifest(data):
+        terminal.note(recordings_note(Manifest.load(data)))
+    if rule.get("audit", NO_LEAK) != NO_LEAK:
+        terminal.note(Note("not-noleak", {"name": rule["name"], "verdict": rule["audit"]}))
 
 
 def columns_of(items: Sequence[Sequence[str]]) -> dict[str, str]:

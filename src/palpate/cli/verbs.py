@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-#: Exit statuses.
-OK, FAILED_CHECK, USER_ERROR, BUG, INTERRUPTED = 0, 1, 2, 70, 130
+#: Exit statuses (docs/concepts/recordings.md).
+OK, FAILED_CHECK, USER_ERROR, UNKNOWN, BUG, INTERRUPTED = 0, 1, 2, 3, 70, 130
 
 
 class Verb(NamedTuple):

@@ -43,8 +43,8 @@ ROLES = {
     "background": ("background", "backgrounds", "bg", "nocontact"),
 }
 _WEAK = {"image": "vision", "images": "vision", "img": "vision", "pictures": "vision"}
-_ROLE_OF = {word: role for role, words in ROLES.items() for word in words}
-_MEANING = {
+ROLE_OF = {word: role for role, words in ROLES.items() for word in words}
+MEANING = {
     "video": ("video", "clip", "seq", "sequence", "recording", "rec", "run", "take", "trial"),
     "contact": ("contact", "press", "touch", "grasp", "tap", "poke", "interaction"),
     "object": ("object", "obj", "item"),
@@ -53,7 +53,7 @@ _MEANING = {
     "sensor": ("sensor", "gelsight", "digit", "gel"),
     "frame": ("frame", "img", "image"),
 }
-_MEANING_OF = {word: column for column, words in _MEANING.items() for word in words}
+_MEANING_OF = {word: column for column, words in MEANING.items() for word in words}
 _MATERIALS = {name.lower() for name in ADJECTIVES}
 _TOKEN = re.compile(r"[A-Za-z]+|[0-9]+|[^A-Za-z0-9]")
 
@@ -66,7 +66,7 @@ def detect_layout(files: Sequence[str], folder: str) -> dict[str, str]:
         folder: its name, which may say what its only side shows.
     """
     sides = _by_role({path: posixpath.splitext(path)[0] for path in files})
-    if not sides and (roles := {_ROLE_OF[w] for w in _words(folder) if w in _ROLE_OF}):
+    if not sides and (roles := {ROLE_OF[w] for w in _words(folder) if w in ROLE_OF}):
         sides = {min(roles): list(files)} if len(roles) == 1 else {}
     if set(sides) <= {"background"}:
         return {}
@@ -108,14 +108,14 @@ def _by_role(stems: dict[str, str]) -> dict[str, list[str]]:
     shared = set.intersection(*map(set, words.values()))
     sides: dict[str, list[str]] = defaultdict(list)
     for path, own in words.items():
-        strong = [_ROLE_OF[word] for word in own if word in _ROLE_OF and word not in shared]
+        strong = [ROLE_OF[word] for word in own if word in ROLE_OF and word not in shared]
         weak = [_WEAK[word] for word in own if word in _WEAK and word not in shared]
         # The picture of an empty gel may lie in the folder of the tactile images.
         role = "background" if "background" in strong else (strong or weak or [""])[-1]
         sides[role].append(path)
     plain = sides.pop("", [])
     if not sides:
-        roles = {_ROLE_OF[word] for word in shared if word in _ROLE_OF} or {
+        roles = {ROLE_OF[word] for word in shared if word in ROLE_OF} or {
             _WEAK[word] for word in shared if word in _WEAK
         }
         return {min(roles): list(stems)} if len(roles) == 1 else {}
@@ -173,7 +173,14 @@ def template_of(files: Sequence[str], several: bool | None = None) -> str:
     suffix = min(suffixes) if len(suffixes) == 1 else ".*"
     text = "/".join([*map(str, pieces), stem + suffix])
     text = re.sub(r"\**(\{\w+\})\**", r"\1", text)  # a field takes what is next to it
+    text = re.sub(r"(?:\{\w+\}){2,}", _one_field, text)
     return _with_contacts(text, files) if {"video", "name", "frame"} <= fields else text
+
+
+def _one_field(fields: re.Match[str]) -> str:
+    """One field in place of several that no sign separates."""
+    names = re.findall(r"\w+", fields[0])
+    return f"{{{next((name for name in ('video', 'object') if name in names), names[0])}}}"
 
 
 def _with_contacts(text: str, files: Sequence[str]) -> str:

@@ -21,6 +21,7 @@ import polars as pl
 
 from palpate.core import Problem, ProblemsError, write_text
 from palpate.data.manifest import CLIMBS, SCHEMA, Manifest
+from palpate.data.recordings import contact_names
 from palpate.data.tables import INCONCLUSIVE, lines_of, read_categories, text_in
 
 PATH = r"^(?P<video>[^/\\]+)/(?P<stem>[^/\\]+)\.(?P<suffix>[A-Za-z0-9]+)$"
@@ -97,27 +98,6 @@ def read_lists(
     facts = {"source": ", ".join(Path(path).name for path in paths)}
     manifest, contact = Manifest(table, Path(root), facts), every.select("video", "frame")
     return FrameList(manifest, problems, every.height - conclusive.height, rows, contact)
-
-
-def contact_names(
-    videos: Sequence[str] | pl.Series,
-    frames: Sequence[int] | pl.Series,
-    labels: Sequence[object] | pl.Series | None,
-) -> list[str]:
-    """The contact ``video#0001`` that each frame belongs to, in the order given.
-
-    The numbers count the contacts of a video from 1 in the order of frames. Frames are integers in
-    any order; ``labels`` are classes that a contact must not mix.
-    """
-    schema = {"video": pl.String, "frame": pl.Int64}
-    table = pl.DataFrame({"video": videos, "frame": frames}, schema).with_row_index("row")
-    table = table.with_columns(label=pl.lit(0) if labels is None else pl.Series(labels))
-    table = table.sort("video", "frame", maintain_order=True)
-    same = (pl.col(name) == pl.col(name).shift(1) for name in ("video", "label"))
-    first = ~pl.all_horizontal(*same, pl.col("frame").diff() <= 1).fill_null(False)
-    number = first.cast(pl.Int64).cum_sum().over("video").cast(pl.String).str.zfill(4)
-    named = table.with_columns(contact=pl.format("{}#{}", "video", number))
-    return named.sort("row")["contact"].to_list()
 
 
 def write_list(path: Path, rows: Iterable[tuple[str, int]]) -> None:

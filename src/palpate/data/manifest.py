@@ -208,7 +208,9 @@ class Manifest:
             fix = "Rename the videos of one of them"
             raise PalpateError("Joined manifests must not share ids", got, fix)
         names = " + ".join(m.facts.get("dataset", "?") for m in manifests)
-        return cls(table, root, {"dataset": names})
+        first, *further = (m.facts for m in manifests)
+        same = {k: v for k, v in first.items() if all(facts.get(k) == v for facts in further)}
+        return cls(table, root, same | {"dataset": names})
 
     @property
     def synthetic(self) -> bool | None:

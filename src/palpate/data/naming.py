@@ -3,6 +3,7 @@
 =====================================================  =============================================
 source                                                 samples
 =====================================================  =============================================
+lines ``path`` or ``path,label`` of images             one a line
 lines ``video start end [label]``, or a table of such  each frame from start to end, both included
 JSON ``{"train": [[object, contact], ...], ...}``      one an item; a name instead of a number is a
                                                        video, and the second its frame
@@ -10,47 +11,36 @@ JSON or a table with paths of images                   one a row; nested keys ar
                                                        ``image.path``
 =====================================================  =============================================
 
-A path says more by a template (:mod:`palpate.data.templates`); without one the paths of all lists
-together suggest it, so that one list alone cannot hide what varies between them.
+What the paths say more is read from those of all lists together (:mod:`palpate.data.recordings`).
 """
 
 from __future__ import annotations
 
 import json
+import posixpath
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import polars as pl
 
 from palpate.core import PalpateError, Problem, Split
-from palpate.data.detection import ROLES, name_apart, template_of
-from palpate.data.formats import hct
+from palpate.data.detection import ROLES
 from palpate.data.formats.intervals import NEEDED, ORDER
 from palpate.data.images import SUFFIXES
 from palpate.data.manifest import PART_NAMES, SCHEMA, Manifest
 from palpate.data.mapping import compile_maps
+from palpate.data.recordings import LOOKED_AT, PATH, USUAL
 from palpate.data.rows import manifest_rows, read_classes
 from palpate.data.scanning import require_some
 from palpate.data.tables import TABLES, Table, decoded, header_of, lines_of, open_table, table_of
-from palpate.data.templates import Fields, Template
+from palpate.data.templates import Template
 
 #: ``video start end [label]``, separated by spaces, tabs, commas or semicolons.
 INTERVAL = re.compile(r"\s*([^\s,;]+)[\s,;]+(\d{1,9})[\s,;]+(\d{1,9})(?:[\s,;]+([^\s,;]+))?\s*")
 #: Frames that the intervals of one list may have together.
 MOST_FRAMES = 20_000_000
-#: Published lists: name -> pattern of a path, whose groups are columns.
-HCT = (
-    r"(?:.*/)?(?P<video>data\d+/[^/]+-\d+\.\d+)/(?:vision|tactile)/(?P<frame>\d{1,18})-[\d.]+\.\w+"
-)
-KNOWN = {
-    "HCT": HCT,
-    "SSVTP": r"(?:.*/)?images_(?:rgb|tac)/image_(?P<frame>\d{1,18})_(?:rgb|tac)\.\w+",
-}
-#: The column of the paths that a list names.
-PATH = "path"
 
 
 def read_names(path: Path, **options: Any) -> tuple[Manifest, list[Problem], Split | None] | None:
@@ -66,81 +56,33 @@ def read_names(path: Path, **options: Any) -> tuple[Manifest, list[Problem], Spl
         The samples, without images unless they are there; what is wrong with the list; and the
         split that it states. None if it is no such list.
     """
-    if path.suffix.lower() not in TABLES or _is_interval(path):
-        return _intervals(path) if _is_interval(path) else None
+    names = options["names"].split(",") if options.get("names") else []
+    if not names and _is_interval(path):
+        return _intervals(path)
+    if path.suffix.lower() not in TABLES and not names:
+        cells = re.split(r"\s*,\s*", _first_line(path))
+        if not _is_image(cells[0]) or len(cells) > 2:
+            return None
+        names = [PATH, "label"][: len(cells)]
     records = _records(path)
     header = header_of(path) if records is None else list(records.names)
     if set(NEEDED) <= set(header):
         return _intervals(path) if not any(path.parent.glob("*/*")) else None
-    names = options.get("names")
-    table = records or open_table(path, names and [name.strip() for name in names.split(",")])
+    table = records or open_table(path, [name.strip() for name in names])
     return _paths(path, table, records is not None, options)
 
 
-def name_together(
-    manifests: Sequence[Manifest], template: str | None = None
-) -> tuple[list[Manifest], str]:
-    """Fill what the paths of several lists say of their samples.
-
-    Args:
-        manifests: of lists, or others, which stay as they are.
-        template: of the paths; without one they suggest it.
-
-    Returns:
-        The manifests, those without a column of paths as they are, and the template or names of
-        the published lists, or ''.
-    """
-    tables = [m.table for m in manifests]
-    unread = [t for t in tables if PATH in t.columns and (template or not t["video"].count())]
-    paths = [path for table in unread for path in table[PATH].drop_nulls()]
-    if not paths:
-        return list(manifests), ""
-    lists = [
-        next((name for name, p in KNOWN.items() if re.fullmatch(p, path)), "") for path in paths
-    ]
-    published = [] if "" in lists or template else [name for name in KNOWN if name in lists]
-    text = ", ".join(published) or template or template_of(paths)
-    patterns = [re.compile(KNOWN[name]) for name in published]
-    parsed = None if published else Template.parse(text)
-    rows = [_fields(path, patterns, parsed) for path in paths]
-    if parsed is not None:
-        name_apart(rows, parsed.fields)
-    fields = dict(zip(paths, rows, strict=True))
-    named = [
-        replace(m, table=_filled(m.table, fields)) if any(m.table is t for t in unread) else m
-        for m in manifests
-    ]
-    if "HCT" in published:
-        sessions = hct.sessions_of(v for m in named for v in m.table["video"].drop_nulls())
-        session = pl.col("video").replace_strict(sessions, default=None, return_dtype=pl.String)
-        named = [replace(m, table=m.table.with_columns(session=session)) for m in named]
-    return named, "" if template else text
-
-
-def _fields(path: str, patterns: Sequence[re.Pattern[str]], template: Template | None) -> Fields:
-    """What the template, or the first pattern that fits, says of a path."""
-    if template is not None:
-        return template.match(path) or {}
-    return next((m.groupdict() for p in patterns if (m := p.fullmatch(path))), {})
-
-
-def _filled(table: pl.DataFrame, fields: Mapping[str, Fields]) -> pl.DataFrame:
-    """The table with what its paths say in the columns that are empty."""
-    rows = [fields.get(path, {}) for path in table[PATH].to_list()]
-    columns: list[pl.Series] = []
-    for name in dict.fromkeys(name for row in rows for name in row):
-        if name in SCHEMA and not table[name].count():
-            values = pl.Series(name, [row.get(name) for row in rows], pl.String)
-            columns.append(values.cast(SCHEMA[name], strict=False))
-    return table.with_columns(columns)
+def _first_line(path: Path) -> str:
+    """The first line that is not empty."""
+    with open(path, "rb") as file:
+        head = decoded(file.read(1 << 12))
+    return next((line.strip() for line in lines_of(head) if line.strip()), "")
 
 
 def _is_interval(path: Path) -> bool:
     """Whether the first line that is not empty is an interval."""
-    with open(path, "rb") as file:
-        head = decoded(file.read(1 << 12))
-    line = next((line for line in lines_of(head) if line.strip()), "")
-    return INTERVAL.fullmatch(line) is not None
+    match = INTERVAL.fullmatch(_first_line(path))
+    return match is not None and not _is_image(match[1])
 
 
 def _intervals(path: Path) -> tuple[Manifest, list[Problem], None]:
@@ -256,7 +198,8 @@ def _paths(
     root = Path(options.get("root") or path.parent)
     there = {p for p in paths or () if p and (root / p).is_file()} if paths else set[str]()
     stated = {"id", "video", "object"} & cells.keys()
-    plain = there or (not paths and "split" not in cells)
+    mapped = there and {"vision", "tactile"} & cells.keys()
+    plain = mapped or (not paths and "split" not in cells)
     if not (paths or stated) or (plain and not nested):
         return None
     cells = {name: values for name, values in cells.items() if name not in ("background", PATH)}
@@ -266,15 +209,17 @@ def _paths(
     rows, _ = manifest_rows(cells, len(table.lines), table.where, classes, table.problems)
     require_some(len(rows), path, table.problems)
     template = Template.parse(options[side], side) if side and options.get(side) else None
+    odd: list[Problem] = []
     for k, row in rows:
         if image := paths[k] if paths else None:
             row[PATH] = image
             if template and template.match(image) is None:
                 text = f"{image!r} is not like the template {options[side]}"
-                table.problems.append(Problem(table.where(k), "no-match", text))
+                odd.append(Problem(table.where(k), "no-match", text))
         if "frame" in row:
             row["frame"] = int(row["frame"])
         row.setdefault("id", _id(row, table.where(k)))
+    table.problems += odd if len(odd) > (1 - USUAL) * len(rows) else []
     samples = pl.DataFrame([row for _, row in rows], infer_schema_length=None)
     doubled = samples.filter(pl.col("id").is_duplicated())["id"].unique()
     if len(doubled):
@@ -293,7 +238,7 @@ def _paths(
 def _id(row: Mapping[str, Any], where: str) -> str:
     if "video" in row and "frame" in row:
         return f"{row['video']}/{row['frame']}"
-    return str(row.get(PATH, where)).rpartition(".")[0] or where
+    return posixpath.splitext(row[PATH])[0] if row.get(PATH) else where
 
 
 def _path_columns(names: Sequence[str], side: str = "") -> list[str]:
@@ -320,8 +265,8 @@ def _named_images(
     columns |= {n: frame[n].to_list() for n in _path_columns(frame.columns) if n not in columns}
     for name in _path_columns([*columns], side) if side else columns:
         values = columns[name]
-        some = [value for value in values[:100] if value is not None]
-        if some and all(map(_is_image, some)):
+        some = [value for value in values[:LOOKED_AT] if value is not None]
+        if some and sum(map(_is_image, some)) >= USUAL * len(some):
             return side, values
     return side, None
 

@@ -115,7 +115,8 @@ def train_autoencoder(
         model = autoencoder_of(
             manifest, split, options, preset.size, run.stage("autoencoder"), start=start
         )
-        model.card |= {"manifest": manifest.digest, "split": split.digest}
+        rule = {"split": split.digest, "split_rule": dict(split.rule)}
+        model.card |= {"manifest": manifest.digest, **rule}
         if ceiling := measure_ceiling(
             model, manifest, split, preset.size, judge=judge, cache=run.cache, progress=run.progress
         ):

@@ -22,23 +22,16 @@ from numpy.typing import NDArray
 
 from palpate.core import Note, PalpateError, Progress, Split, few, quiet, require, require_choice
 from palpate.data.manifest import MODALITIES, Manifest
-from palpate.leakage.content import shows_nothing
+from palpate.data.recordings import Identity, is_sequence, number_contacts, same_names
 from palpate.leakage.groups import GROUPS, shared_groups
-from palpate.leakage.inputs import (
-    Data,
-    Identity,
-    number_contacts,
-    read_all,
-    rename_unrelated,
-    shared_names,
-)
+from palpate.leakage.inputs import Data, Source, read_all, rename_unrelated
+from palpate.leakage.questions import LARGEST, NO_GROUP, questions
 from palpate.leakage.signals import (
     Flags,
     Gaps,
     by_contact,
     identical_bytes,
     identical_samples,
-    in_time,
     leaking,
     nearest_in_video,
     shared_group,
@@ -46,10 +39,8 @@ from palpate.leakage.signals import (
     time_gap,
 )
 from palpate.report.records import Impact, LeakPair
-from palpate.report.results import CANNOT_TELL, MATRIX_ROWS, Audit
+from palpate.report.results import MATRIX_ROWS, Audit
 
-#: In place of a group where none is known and images alone are compared.
-NO_GROUP = "none"
 #: Right-open bins of the gap histogram, in frames; 30 frames are one second of Touch and Go.
 GAP_EDGES = (0, 1, 3, 10, 30, 60, 90, 150, 300, 600, 900, 1800, 3600)
 
@@ -68,9 +59,9 @@ class _Options:
     modalities: Sequence[str]
     false_positives: float
     worst: int
-    ids_in_time: bool
     cache: Path | None
     progress: Progress
+    skipped: bool = False  # whether many rows of the inputs were
 
 
 def audit(  # noqa: PLR0913
@@ -91,7 +82,6 @@ def audit(  # noqa: PLR0913
     cache: str | Path | None = None,
     root: str | Path | None = None,
     reading: Mapping[str, Any] | None = None,
-    ids_in_time: bool = False,
     skip_bad: bool = False,
     progress: Progress = quiet,
 ) -> Audit:
@@ -121,9 +111,8 @@ def audit(  # noqa: PLR0913
         root: where the paths of tables start; default: the folder of the table.
         reading: how sources are read, as in :func:`palpate.load`: ``columns``, ``names``,
             ``classes``, ``side``, and the templates ``vision`` and ``tactile``, also of paths in
-            lists whose images are not at hand.
-        ids_in_time: the last number of an id or path is a time: gaps of samples without a video and
-            frame are differences of these.
+            lists whose images are not at hand; a stated template whose only level is ``{frame}``
+            says that the numbers of all samples are times of one sequence.
         skip_bad: skip bad rows of lists and tables, and note them.
         progress: callback.
 
@@ -153,7 +142,6 @@ def audit(  # noqa: PLR0913
         modalities,
         false_positives,
         worst,
-        ids_in_time,
         None if cache is None else Path(cache),
         progress,
     )
@@ -163,6 +151,7 @@ def audit(  # noqa: PLR0913
     read = read_all(sources, skip_bad, progress, root, reading)
     parts = [source.manifest for source in read]
     notes = [note for source in read for note in source.notes]
+    options = replace(options, skipped=any(map(_skips_many, read)))
     if by == "contact":
         parts = number_contacts(parts)
     if test is not None:
@@ -177,7 +166,8 @@ def audit(  # noqa: PLR0913
         result = _compare(samples.part(parted, "train"), test_part, options, title, val=val)
         notes += _split_notes(samples, parted, val, result.group)
         result = replace(result, split=parted.digest)
-        if impact is not None and result.reason in ("untouched", "similar"):
+        nothing = {"untouched", "similar"} & {question.reason for question in result.questions}
+        if impact is not None and nothing:
             notes.append(Note("impact-of-nothing"))
         elif impact is not None:
             try:
@@ -191,6 +181,12 @@ def audit(  # noqa: PLR0913
         result = replace(result, others=[against])
     notes = [note for k, note in enumerate(notes) if note not in notes[:k]]  # of train and test
     return replace(result, notes=[*result.notes, *notes])
+
+
+def _skips_many(source: Source) -> bool:
+    """Whether so many rows of a source were skipped that nothing can be told of the samples."""
+    counts = (n.params["count"] for n in source.notes if n.code == "rows-skipped")
+    return any(count > LARGEST * (count + len(source.manifest)) for count in counts)
 
 
 def _stated(splits: Mapping[str, Split]) -> Split:
@@ -250,19 +246,13 @@ def _group(train: Manifest, test: Manifest, options: _Options) -> str:
     for part, samples in (("train", train), ("test", test)):
         must, fix = f"The {part} part must hold samples", "Check the split or list file"
         require(len(samples) > 0, None, must, "none", fix=fix)
-    group = known_group(train, test) if options.by == "auto" else options.by
-    listed = all("path" in part.table.columns for part in (train, test))
-    images = options.images and _with_images(train, test)
-    if group == NO_GROUP and (images or listed or options.ids_in_time):
-        return group
-    if group == NO_GROUP or not (_known(train, group) and _known(test, group)):
-        raise PalpateError(
-            f"Both parts must know the {'video' if group == NO_GROUP else group} of some samples",
-            "a column of nulls",
-            "Audit by another group, or compare images, which needs no group",
-            example={"by": "auto"},
-        )
-    return group
+    if options.by == "auto":
+        return known_group(train, test)
+    must, got = f"Both parts must know the {options.by} of some samples", "a column of nulls"
+    fix = "Audit by another group, or compare images, which needs no group"
+    both = _known(train, options.by) and _known(test, options.by)
+    require(both, None, must, got, fix=fix)
+    return options.by
 
 
 def _compare(
@@ -276,17 +266,29 @@ def _compare(
 ) -> Audit:
     """Audit one part against another."""
     group = _group(train, test, options)
-    shared = shared_names(train, test, options.identity)
+    shared = same_names(train, test, options.identity)
     train, test, equal = rename_unrelated(train, test, shared, (against, "test"))
     a, b = train.table, test.table
     groups = [set(t[group].drop_nulls()) if group != NO_GROUP else set[str]() for t in (a, b)]
     in_both = sorted(groups[0] & groups[1])
     in_shared = int(b[group].is_in(in_both).fill_null(False).sum()) if in_both else 0
-    timed_tables = [in_time(t) if options.ids_in_time else t for t in (a, b)]
+    timed_tables = [a, b]
+    if is_sequence(train) and is_sequence(test):
+        timed_tables = [t.with_columns(video=pl.lit("")) for t in timed_tables]
     gaps = nearest_in_video(*by_contact(*timed_tables))
     flags = _signals(train, test, group, gaps, options, named=shared)
     leaks = leaking(flags, len(test))
-    reason = _reason(train, test, group, flags, options, named=not equal)
+    answers = questions(
+        train,
+        test,
+        group,
+        gaps,
+        flags,
+        equal=equal,
+        asked=options.images,
+        skipped=options.skipped,
+        progress=options.progress,
+    )
     timed = gaps.frames[gaps.frames >= 0]
     last = int(timed.max()) if timed.size else 0
     middle = float(np.median(timed)) if timed.size else None
@@ -320,51 +322,34 @@ def _compare(
         ),
         groups_in_all=len(groups[0] | groups[1]),
         shared={c: n for c, n in shared_groups(a, b).items() if c not in equal},
-        verdict="leaks" if leaks.any() else CANNOT_TELL if reason else "none",
-        reason=reason,
+        questions=answers,
+        largest_group=_largest(a, b, group),
         table=signal_table(test, train, flags, gaps),
     )
 
 
-def _reason(
-    train: Manifest,
-    test: Manifest,
-    group: str,
-    flags: Sequence[Flags],
-    options: _Options,
-    *,
-    named: bool,
-) -> str:
-    """Why a leak might not show; '' where it would. ``named``: equal names say something."""
-    near = [f for f in flags if f.kind.startswith("near-duplicate")]
-    if near:
-        column = near[-1].kind.split()[-1]  # tactile images decide where there are any
-        if shows_nothing([train, test], column, options.progress):
-            return "untouched" if column == "tactile" else "similar"
-    codes = {note.code for f in near[-1:] for note in f.notes}
-    if "cannot-tell-untouched" in codes:
-        return "untouched"
-    if near and group == NO_GROUP and near[-1].verdict == CANNOT_TELL:
-        return "chance"
-    files = [f for f in flags if f.kind == "identical bytes"]
-    if any(np.isfinite(f.score).any() for f in (*near, *files)):
-        return ""
-    if not named:
-        return "names"
-    return "ids" if {f.kind for f in flags} <= {"identical sample", "identical bytes"} else ""
+def _largest(train: pl.DataFrame, test: pl.DataFrame, group: str) -> float:
+    """The share of all samples that are in one group."""
+    if group == NO_GROUP:
+        return 0.0
+    every = pl.concat([train[group], test[group]])
+    sizes = every.drop_nulls().value_counts()["count"]
+    return round(int(sizes.max() or 0) / len(every), 5)  # pyright: ignore[reportArgumentType]
 
 
 def _notes(
     train: Manifest, test: Manifest, group: str, equal: Mapping[str, int], options: _Options
 ) -> list[Note]:
     notes = [Note("no-group")] if group == NO_GROUP else []
+    numbers = [m.table["frame"].drop_nulls() for m in (train, test)]
+    if group == NO_GROUP and len(numbers[0]) and not is_sequence(train):
+        beside = pl.concat([numbers[0] - 1, numbers[0], numbers[0] + 1]).unique()
+        count = int(numbers[1].is_in(beside.implode()).sum())
+        notes += [Note("numbers-next", {"count": count, "of": len(test)})] if count else []
     if equal:
         params = {"equal": dict(equal), "roots": [str(train.root), str(test.root)]}
         images = options.images and _with_images(train, test)
         notes.append(Note("equal-names", params | {"images": images}))
-    for part, samples in (("train", train), ("test", test)):
-        if group != NO_GROUP and (nulls := samples.table[group].null_count()):
-            notes.append(Note("group-nulls", {"count": nulls, "part": part, "group": group}))
     for modality in options.modalities if options.images else ():
         if _known(train, modality) != _known(test, modality):
             notes.append(Note("images-of-one-part", {"modality": modality}))

@@ -1,8 +1,7 @@
-"""Samples for an audit or a split, from whatever names them, and what equal names mean.
+"""Samples for an audit or a split, from whatever names them.
 
-A name is no identity: ``0001.jpg`` of two folders are two files. Equal names mean the same thing
-where both parts have one root, are of one published data set, or have their names from the columns
-of tables, in which somebody declared them. Elsewhere bytes and images decide.
+A name is no identity: ``0001.jpg`` of two folders are two files. What equal names mean is said by
+:mod:`palpate.data.recordings`; where they mean nothing, bytes and images decide.
 """
 
 from __future__ import annotations
@@ -10,30 +9,23 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import polars as pl
 
 from palpate.core import Note, PalpateError, Problem, ProblemsError, Progress, Split, quiet, require
-from palpate.data.formats import FORMATS
 from palpate.data.imported import splits_of
-from palpate.data.listing import categories_in, contact_names, read_lists
-from palpate.data.manifest import MODALITIES, SCHEMA, Manifest, is_manifest
-from palpate.data.naming import name_together, read_names
+from palpate.data.listing import categories_in, read_lists
+from palpate.data.manifest import Manifest, is_manifest
+from palpate.data.naming import read_names
 from palpate.data.reading import is_list, read_samples
+from palpate.data.recordings import NAMES, name_recordings, recordings_note
 
 #: A manifest, a path, several frame lists that are joined, or a polars or pandas frame.
 Data = Any
 FIX = "Correct the lines, or skip the bad ones"
 #: Problems that a note names.
 SHOWN = 40
-#: What equal names mean: the same thing, or nothing, or (auto) what the sources say.
-Identity = Literal["auto", "names", "images"]
-#: Columns of names; those of several samples, which are renamed where they mean nothing.
-NAMES = ("id", "video", "contact", "object", "session")
-PLACE = ["video", "frame"]
-#: Formats of tables in which somebody names things.
-DECLARING = (None, "pairs", "intervals", "hf")
 
 
 @dataclass(frozen=True)
@@ -69,10 +61,7 @@ def read(
         if skipped and not skip_bad:
             raise ProblemsError(skipped, FIX, example={"skip_bad": True})
         splits = {} if split is None else {str(split.rule["name"]): split}
-        columns = {*manifest.filled().columns} | {*manifest.table.columns[len(SCHEMA) :]}
-        bare = "path" in columns and columns.isdisjoint(MODALITIES)
-        notes = [Note("names-only", {"name": str(path and path.name)})] if bare else []
-        return Source(manifest, splits, [*_notes(skipped), *notes])
+        return Source(manifest, splits, _notes(skipped))
     manifest, skipped = read_samples(
         source, skip_bad=skip_bad, root=root, progress=progress, **_options(reading)
     )
@@ -119,8 +108,8 @@ def read_all(
     if problems:
         raise ProblemsError(problems, FIX)
     stated = next((t for t in map((reading or {}).get, ("tactile", "vision")) if t), None)
-    named, template = name_together([part.manifest for part in parts], stated)
-    notes = [Note("names-read", {"template": template})] if template else []
+    named = name_recordings([part.manifest for part in parts], stated)
+    notes = [recordings_note(*named)]
     return [
         Source(
             manifest,
@@ -131,52 +120,6 @@ def read_all(
         )
         for k, (part, manifest) in enumerate(zip(parts, named, strict=True))
     ]
-
-
-def number_contacts(manifests: list[Manifest]) -> list[Manifest]:
-    """Number the contacts of bare frame lists together, so that one name means one contact."""
-    bare = [
-        k
-        for k, m in enumerate(manifests)
-        if set(m.facts) == {"source"} and "path" not in m.table.columns
-    ]
-    if len(bare) < 2 or any(manifests[k].table[c].has_nulls() for k in bare for c in PLACE):
-        return manifests
-    rows = pl.concat([manifests[k].table.select(*PLACE, "material") for k in bare])
-    # A frame in two lists belongs to one contact.
-    distinct = rows.unique(PLACE, maintain_order=True)
-    names = contact_names(*(distinct[name] for name in (*PLACE, "material")))
-    distinct = distinct.with_columns(contact=pl.Series(names, dtype=pl.String))
-    contacts = rows.join(distinct, on=PLACE, how="left", maintain_order="left")
-    numbered = list(manifests)
-    for k in bare:
-        m = manifests[k]
-        numbered[k] = replace(m, table=m.table.with_columns(contacts["contact"].head(len(m))))
-        contacts = contacts.slice(len(m))
-    return numbered
-
-
-def shared_names(train: Manifest, test: Manifest, identity: Identity) -> tuple[str, ...]:
-    """The columns in which equal values of both parts mean the same thing."""
-    facts = [[m.facts.get(fact) for fact in ("format", "dataset", "digest")] for m in (train, test)]
-    published = {form.facts.name for form in FORMATS.values()}
-    same = train.root.resolve() == test.root.resolve() or (
-        facts[0] == facts[1] and (facts[0][1] in published or facts[0][2] is not None)
-    )
-    if identity != "auto":
-        return NAMES if identity == "names" else ()
-    return NAMES if same else tuple(c for c in NAMES if _declares(train, c) and _declares(test, c))
-
-
-def _declares(manifest: Manifest, column: str) -> bool:
-    """Whether the names of a column are from a table, and not from the paths of files."""
-    facts, table = manifest.facts, manifest.table
-    by_path = "source" in facts or any(fact.startswith("template_") for fact in facts)
-    layout = facts.get("layout", "table")
-    if by_path or facts.get("format") not in DECLARING or not layout.startswith("table"):
-        return False
-    stems = [pl.col(c).str.replace(r"\.[^./]+$", "") == pl.col("id") for c in ("tactile", "vision")]
-    return column != "id" or not table.select(pl.any_horizontal(*stems).any()).item()
 
 
 def rename_unrelated(

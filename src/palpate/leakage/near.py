@@ -4,15 +4,15 @@ Every test sample gets the train sample with the most similar image and a score,
 (:mod:`palpate.leakage.calibration`). Images that show nothing, blank photos and untouched gel, are
 named before anything is matched. The answer is one of three verdicts:
 
-===============  =================================================================================
-verdict          when
-===============  =================================================================================
-``leaks``        more samples are over the threshold than chance explains
-``none``         no more than chance explains
-``cannot tell``  nothing was touched, or there is no null: unrelated images are not known to be so,
-                 or are all similar. Samples are ranked; only equal images are flagged: then they
-                 are leaks
-===============  =================================================================================
+=================  ===============================================================================
+verdict            when
+=================  ===============================================================================
+``leaks``          more samples are over the threshold than chance explains
+``no leak found``  no more than chance explains
+``cannot tell``    nothing was touched, or there is no null: unrelated images are not known to be
+                   so, or are all similar. Samples are ranked; only equal images are flagged: then
+                   they are leaks
+=================  ===============================================================================
 
 Images are compared as they are and as if edited, tactile ones with their backgrounds, where these
 are known, and without (:mod:`palpate.leakage.descriptors`); gray copies among colored images by
@@ -47,6 +47,7 @@ from palpate.leakage.matching import (
 from palpate.leakage.neighbors import Floats, Ints
 from palpate.leakage.pool import Pool, pool
 from palpate.leakage.signals import Flags
+from palpate.report.records import CANNOT_TELL, LEAKS, NO_LEAK
 
 #: Nearest images that an image may be linked to in a cluster.
 LINKS = 16
@@ -204,7 +205,8 @@ def _flags(
         score[present] = matches.score[at[present]]
         nearest[present] = first[base[matches.row[at[present]]]]
     thumbs, rows = np.unique(images.images[base], return_index=True)
-    same = present & np.isin(images.images[item], thumbs)
+    same = present.copy()
+    same[present] = np.isin(images.images[item[present]], thumbs)
     score[same] = 1.0
     nearest[same] = first[base[rows[np.searchsorted(thumbs, images.images[item[same]])]]]
     flag = same | (np.nan_to_num(score) >= matches.threshold)
@@ -212,7 +214,7 @@ def _flags(
     verdict = _verdict(matches, images.unit[cut:], score, flag, same, rate=rate)
     score = np.clip(score, 0, 1)
     cause = np.where(flag, "content", "").astype("<U15")
-    cause[(item >= 0) & images.blank[item]] = "nothing touched"
+    cause[np.append(images.blank, False)[item]] = "nothing touched"  # the last for no image
     edges, unrelated_scores, histogram = calibration.histograms(matches.unrelated, score)
     return Flags.of(
         f"near-duplicate {modality}",
@@ -220,7 +222,7 @@ def _flags(
         flag,
         nearest,
         min(matches.threshold, 1.0),
-        counts=verdict == "leaks",
+        counts=verdict == LEAKS,
         false_positives=rate,
         edges=edges,
         unrelated=unrelated_scores,
@@ -230,6 +232,7 @@ def _flags(
         verdict=verdict,
         expected=None if not matches.tails else round(rate * checked, 2),
         measured=matches.measured,
+        unread=float(max((images.item[:cut] < 0).mean(), (images.item[cut:] < 0).mean())),
     )
 
 
@@ -244,10 +247,10 @@ def _verdict(
 ) -> str:
     """Whether the flags are more than chance explains: all of them, or the strongest alone."""
     if same.any() or not flag.any():
-        return "leaks" if same.any() else "none" if matches.tails else "cannot tell"
+        return LEAKS if same.any() else NO_LEAK if matches.tails else CANNOT_TELL
     count = np.isfinite(matches.unrelated).sum()
     if matches.measured and calibration.missed(matches.measured, int(count), rate):
-        return "cannot tell"
+        return CANNOT_TELL
     groups = np.where(unit >= 0, unit, -1 - np.arange(len(unit)))
     strongest = float(np.nanmax(score))
     levels = [
@@ -255,7 +258,7 @@ def _verdict(
         (np.nan_to_num(score) >= strongest, calibration.rate_of(strongest, matches.tails)),
     ]
     beyond = calibration.beyond_chance(levels, groups, int(np.isfinite(score).sum()))
-    return "leaks" if beyond else "none"
+    return LEAKS if beyond else NO_LEAK
 
 
 def _shown(images: Pool, part: slice) -> Ints:

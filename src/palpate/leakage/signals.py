@@ -28,7 +28,7 @@ from numpy.typing import NDArray
 from palpate.core import Note, Progress, quiet
 from palpate.data.images import file_digest, file_stamp, in_threads
 from palpate.data.manifest import MODALITIES, Manifest
-from palpate.report.records import CAUSES, LeakPair, Signal
+from palpate.report.records import CANNOT_TELL, CAUSES, LeakPair, Signal
 
 Ints = NDArray[np.int64]
 #: Pairs kept for each cause that is no leak.
@@ -76,18 +76,6 @@ def by_contact(*tables: pl.DataFrame) -> list[pl.DataFrame]:
     return [t.with_columns(video=pl.coalesce(contact, "video")) for t in tables]
 
 
-def in_time(table: pl.DataFrame) -> pl.DataFrame:
-    """The table where the last number of an id is the frame, and the others are the video."""
-    number = r"^(.*?)(\d{1,18})(\D*)$"
-    both = pl.col("video").is_not_null() & pl.col("frame").is_not_null()
-    frame = pl.col("id").str.extract(number, 2).cast(pl.Int64)
-    video = pl.col("id").str.replace(number, "${1}#${3}")
-    return table.with_columns(
-        video=pl.when(both).then("video").otherwise(video),
-        frame=pl.when(both).then("frame").otherwise(frame),
-    )
-
-
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Flags(Signal):
     """A signal with what it says of every test sample, in their order."""
@@ -98,6 +86,7 @@ class Flags(Signal):
     nearest: Ints
     #: (n,) one of ``CAUSES``, or '' below the threshold; None for exact signals.
     cause: NDArray[np.str_] | None = None
+    unread: float = 0.0  # the share of train or test, the larger, whose image cannot be read
 
     @classmethod
     def of(
@@ -138,7 +127,7 @@ class Flags(Signal):
     def _worst(self, train: Manifest, test: Manifest, gaps: Gaps, worst: int) -> list[LeakPair]:
         """The strongest pairs, one a video first; then a few of each cause that is no leak."""
         paired = self.nearest >= 0
-        ranked = self.flag | (self.verdict == "cannot tell")
+        ranked = self.flag | (self.verdict == CANNOT_TELL)
         chosen = _varied(np.flatnonzero(ranked & paired), self.score, test, worst)
         if self.cause is not None:
             for name in CAUSES[1:]:

@@ -9,6 +9,7 @@ there are parts are named and go along.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, overload
 
@@ -16,10 +17,12 @@ import numpy as np
 
 from palpate.core import Note, PalpateError, Progress, Split, quiet, require
 from palpate.data.manifest import MODALITIES, Manifest
+from palpate.leakage.auditing import audit
 from palpate.leakage.groups import Ints, choose_group, components, nested_groups, shared_groups
 from palpate.leakage.inputs import Data, read, read_all
 from palpate.leakage.noleak import HCT_GROUPS, published
 from palpate.leakage.program import EXACT, RESOLUTION, Optimum, Problem, draw, optimize
+from palpate.report.records import NO_LEAK
 
 RULE_VERSION = 3
 #: The group in rules where near-duplicates alone are kept together.
@@ -71,9 +74,11 @@ def split(  # noqa: PLR0913  # pyright: ignore[reportInconsistentOverload]
 
     Returns:
         A split; with ``folds`` a list. Its rule holds what was achieved:
-        ``deviation`` (the largest, in [0, 1]), ``bound`` (no split by these groups has a smaller
-        one), ``status``, ``limiting`` (the material that deviates most), ``rare`` and ``missing``
-        (materials that are not in every part).
+        ``name`` (``NoLeak`` only if its own audit finds no leak, else what train and test share),
+        ``audit`` (the verdict), ``deviation`` (the largest, in [0, 1]), ``bound`` (no split by
+        these groups has a smaller one), ``status``, ``limiting`` (the
+        material that deviates most), ``rare`` and ``missing`` (materials that are not
+        in every part).
 
     Raises:
         PalpateError: on shares out of range, unknown or null groups, fewer groups than parts, or
@@ -86,9 +91,9 @@ def split(  # noqa: PLR0913  # pyright: ignore[reportInconsistentOverload]
         return published(manifest, train, val, seed, notes)
     (source,) = read_all([data], skip_bad, progress, None, reading, arguments=["data"])
     manifest, notes = source.manifest, source.notes
-    rule: dict[str, Any] = {"name": "NoLeak"}
+    name = "NoLeak"
     if noleak == "hct":
-        by, rule = HCT_GROUPS, {"name": "HCT-NoLeak"}
+        by, name = HCT_GROUPS, "HCT-NoLeak"
     links, near_facts = _near_links(manifest, near, cache, progress)
     shares = {"train": train, "val": val, "test": 1 - train - val}
     if folds is not None:
@@ -98,7 +103,8 @@ def split(  # noqa: PLR0913  # pyright: ignore[reportInconsistentOverload]
     groups = components(manifest, columns, links)
     names, materials, problem = _problem(manifest, groups, columns, list(shares.values()))
     optimum = optimize(problem)
-    rule |= {
+    rule = {
+        "name": name,
         "method": "whole groups, smallest largest deviation of any material's share",
         "version": RULE_VERSION,
         "group": columns[0] if columns else LINKED,
@@ -119,12 +125,13 @@ def split(  # noqa: PLR0913  # pyright: ignore[reportInconsistentOverload]
     for fold, parts in enumerate(part_names):
         if folds is not None:
             shares = {p: parts.count(p) / folds for p in dict.fromkeys(parts)}
-            name = f"NoLeak fold {fold} of {folds}"
-            facts |= {"name": name, "folds": folds, "fold": fold, "shares": shares}
+            facts |= {"folds": folds, "fold": fold, "shares": shares}
         where = {g: parts[k] for g, k in zip(names, assignment.tolist(), strict=True)}
         part_of = {i: where[g] for i, g in zip(manifest.ids, groups, strict=True)}
         more = [*notes, *_question(manifest, part_of), *_notes(manifest, facts)]
-        splits.append(Split(part_of, dict(facts), manifest.digest, more))
+        made = _audited(manifest, Split(part_of, dict(facts), manifest.digest, more), cache)
+        fold_name = f"{made.rule['name']}, fold {fold} of {folds}" if folds else made.rule["name"]
+        splits.append(replace(made, rule={**made.rule, "name": fold_name}))
     return splits[0] if folds is None else splits
 
 
@@ -219,6 +226,28 @@ def _achieved(
         "rare": [columns[m] for m in np.flatnonzero(~problem.possible[:-1])],
         "missing": [f"{columns[m]}: {parts[p]}" for p, m in missing],
     }
+
+
+def _audited(manifest: Manifest, made: Split, cache: str | Path | None) -> Split:
+    """The split with the verdict of its own audit, and a name that says what train and test share.
+
+    The audit is by all that is known of the samples, and by the images that were kept together.
+    """
+    near = made.rule["near"]
+    own = audit(
+        manifest,
+        split=made,
+        images=near is not None,
+        cache=cache,
+        modalities=near["modalities"] if near else MODALITIES,
+    )
+    facts = {**made.rule, "audit": own.verdict}
+    notes = list(made.notes)
+    if own.verdict != NO_LEAK:
+        what = f"{own.group}s shared" if own.groups_shared else own.verdict
+        facts["name"] = f"by {' and '.join(facts['by']) or LINKED}: {what}"
+        notes.append(Note("not-noleak", {"name": facts["name"], "verdict": own.verdict}))
+    return replace(made, rule=facts, notes=notes)
 
 
 def _question(manifest: Manifest, parts: Mapping[str, str]) -> list[Note]:

@@ -234,6 +234,18 @@ def _question(p: Mapping[str, Any], style: Style) -> str:
     return line
 
 
+def _recordings(p: Mapping[str, Any], style: Style) -> str:
+    levels: dict[str, list[str]] = {}
+    for level, source in p["levels"]:
+        levels.setdefault(source, []).append(f"{level}s")
+    if not levels:
+        return "Nothing says which samples are one recording"
+    line = "; ".join(f"{', '.join(names)}: from {source}" for source, names in levels.items())
+    guessed = any(source.startswith("file names") for source in levels)
+    line += f" ({style:tactile=TEMPLATE} reads them another way)" * guessed
+    return line[0].upper() + line[1:]
+
+
 LEAKAGE: dict[str, Sentence] = {
     "backgrounds-unreadable": (
         "{count} background images cannot be read ({files:few}); their tactile images "
@@ -256,16 +268,14 @@ LEAKAGE: dict[str, Sentence] = {
         "train and test share a {group}"
     ),
     "group-instead": "The manifest knows no videos: the {group} is kept whole",
-    "group-materials": (
-        "Only {enough} of {materials} materials occur in {parts} or more {group}s, too few for the "
-        "{group} to be the group: whole {taken}s are kept together instead. Train and test then "
-        "share {group}s, so scores are optimistic for new {group}s"
+    "group-materials": lambda p, style: (
+        f"Only {p['enough']} of {p['materials']} materials occur in {p['parts']} or more "
+        f"{p['group']}s: no split can keep {p['group']}s whole with every material on both sides. "
+        f"Whole {p.get('taken', 'contact')}s are kept together instead, so scores are optimistic "
+        f"for new {p['group']}s. {style:{'by=' + p['group']}} keeps {p['group']}s whole, with "
+        "fewer materials on both sides"
     ),
     "group-near-only": "The manifest knows no videos: near-duplicates alone are kept together",
-    "group-nulls": (
-        "{count} {part} samples have no {group}: they cannot be audited by group and count as"
-        " not shared"
-    ),
     "group-of-data-set": "The data set says so: the {group} is kept whole",
     "images-absent": "{count} of {of} samples have no {modality} image and were not compared",
     "images-of-one-part": "Only one part has {modality} images: they were not compared",
@@ -288,8 +298,6 @@ LEAKAGE: dict[str, Sentence] = {
         ]
     ),
     "missing-materials": "Could be in every part, but not together with the others: {materials}",
-    "names-only": "No image that {name} names is there: its names alone were compared",
-    "names-read": ("Paths were read as {template}; {arg:tactile=TEMPLATE} reads them another way"),
     "near-frames": (
         "{frames:Flagged up to {frames} frames; the score is 2^(-gap/{frames})|Flagged at a gap of "
         "0 frames only}"
@@ -299,6 +307,14 @@ LEAKAGE: dict[str, Sentence] = {
         "were compared"
     ),
     "no-materials": "No sample has a material: only the sizes of the parts are balanced",
+    "numbers-next": (
+        "The number of {count} of {of} test samples is beside one of train: if numbers are times, "
+        "say so by a template whose only field is frame ({arg:tactile=TEMPLATE})"
+    ),
+    "not-noleak": (
+        "This split is called {name!r}, not NoLeak: its own audit says {verdict}, and so do models "
+        "that are trained on it"
+    ),
     "photos-assumed": (
         "Nothing says what the images of {name} show, so they were taken for photos; if they are "
         "tactile images: {arg:side=tactile}{arg.command_line:| (in reading)}"
@@ -309,6 +325,7 @@ LEAKAGE: dict[str, Sentence] = {
     ),
     "question": _question,
     "rare-materials": "In fewer than {parts} groups, so not in every part: {materials}",
+    "recordings": _recordings,
     "rows-skipped": "{count} bad rows were skipped ({problems:few})",
     "samples-in-no-part": "{count} of {of} samples of the manifest are in no part of the split",
     "signal-not-counted": "Reported, but not counted as a leak: the audit is not by {group}",

@@ -14,6 +14,9 @@ from palpate.core import Note, SampleRef, Score
 
 #: Why two images are similar. Only ``content`` is a leak.
 CAUSES = ("content", "nothing touched")
+#: The verdicts on a question and on a split, from worst to best.
+LEAKS, CANNOT_TELL, NO_LEAK = "leaks", "cannot tell", "no leak found"
+VERDICTS = (LEAKS, CANNOT_TELL, NO_LEAK)
 Verdict = Literal["holds", "does not hold", "undecided"]
 
 
@@ -60,7 +63,7 @@ class Signal:
         notes: what a reader must know.
         counts: whether flagged samples count as leaking; a shared group other than the audit's is
             reported but not counted, nor are as many near-duplicates as chance explains.
-        verdict: of near-duplicates: ``leaks``, ``none``, or ``cannot tell`` (``worst`` is then a
+        verdict: of near-duplicates, one of ``VERDICTS`` (with ``cannot tell``, ``worst`` is a
             ranking); '' where the signal is exact.
         expected: samples that chance alone flags at ``false_positives``; None if not known.
         measured: the rate at which train images of other videos are flagged by thresholds from
@@ -87,6 +90,27 @@ class Signal:
     def fraction(self) -> float:
         """Flagged share of the samples that could be checked; 0 if there are none."""
         return self.flagged / self.checked if self.checked else 0.0
+
+
+@dataclass(frozen=True)
+class Question:
+    """One question of an audit, and its answer.
+
+    Attributes:
+        name: ``shared recordings``, ``near in time`` or ``near-duplicates``.
+        verdict: one of ``VERDICTS``; '' where it was not asked.
+        leaking: test samples that a signal of it flags.
+        checked: test samples that could be judged, of ``of``.
+        reason: why it was not asked, or cannot be told for too many samples: then there may be more
+            leaks than ``leaking``; '' else.
+    """
+
+    name: str
+    verdict: str
+    leaking: int = 0
+    checked: int = 0
+    of: int = 0
+    reason: str = ""
 
 
 @dataclass(frozen=True)

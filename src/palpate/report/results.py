@@ -34,11 +34,15 @@ from palpate.core.records import from_plain
 from palpate.core.score import Score
 from palpate.report.labels import label_of, subject_of
 from palpate.report.records import (
+    LEAKS,
+    NO_LEAK,
+    VERDICTS,
     Claim,
     GalleryItem,
     Impact,
     LeakPair,
     Match,
+    Question,
     Signal,
     Strip,
     StudyTable,
@@ -48,8 +52,6 @@ if TYPE_CHECKING:
     import polars as pl
 
 RESULTS_FORMAT, AUDIT_FORMAT = "palpate-results/1", "palpate-audit/1"
-#: The verdict where a leak could not show.
-CANNOT_TELL = "cannot tell"
 #: Keys of their JSON that are no fields.
 COMMAND_KEYS = ("format", "skipped", "failed")
 #: Rows of the group-by-part matrix that an audit keeps.
@@ -247,10 +249,9 @@ class Audit(Shown):
             groups with most test samples first; at most ``MATRIX_ROWS`` of ``groups_in_all``.
         shared: column (video, session, object) that both parts know -> (test groups that are in
             train, test groups): whether the test part asks for new videos, or for new objects.
-        verdict: ``leaks``, ``none``, or ``cannot tell``.
-        reason: why a leak might not show: nothing was touched (``untouched``), images are similar
-            (``similar``), none are known to be unrelated (``chance``), there are none and equal
-            names mean nothing (``names``), or ids alone are known (``ids``).
+        questions: what was asked, each with its verdict.
+        verdict: the worst of theirs.
+        largest_group: the share of all samples that are in one group; 0 where none is known.
         impact: what the leak does to scores, if requested.
         commands: command lines that say what to do next.
         others: audits of the same test part against other data (an encoder's pretraining list).
@@ -285,8 +286,9 @@ class Audit(Shown):
     matrix: Sequence[Mapping[str, Any]] = ()
     groups_in_all: int = 0
     shared: Mapping[str, Sequence[int]] = field(default_factory=dict)
+    questions: Sequence[Question] = ()
+    largest_group: float = 0.0
     verdict: str = ""
-    reason: str = ""
     impact: Impact | None = None
     commands: Sequence[str] = ()
     others: Sequence[Audit] = ()
@@ -297,6 +299,20 @@ class Audit(Shown):
         if self.test_samples:
             share = self.leaking_samples / self.test_samples
             object.__setattr__(self, "leaked_fraction", round(share, 5) or share)
+        asked = {question.verdict for question in self.questions}
+        flagged = LEAKS if self.leaking_samples else NO_LEAK
+        worst = next((verdict for verdict in VERDICTS if verdict in asked), flagged)
+        object.__setattr__(self, "verdict", worst)
+
+    @property
+    def open(self) -> bool:
+        """Whether a question was asked that could not be told for all samples."""
+        return any(question.verdict and question.reason for question in self.questions)
+
+    @property
+    def at_least(self) -> bool:
+        """Whether more samples may share a recording than are known: no share is then said."""
+        return any(q.verdict and q.reason for q in self.questions[:1])
 
     def to_html(self, path: str | Path) -> None:
         """Write a self-contained page, with images of the strongest pairs."""

@@ -8,8 +8,8 @@ from palpate.core import Note, Score
 from palpate.core.score import BETTER
 from palpate.report.labels import count, number, percent, plural, score_text, with_interval
 from palpate.report.notes import question
-from palpate.report.records import Signal
-from palpate.report.results import CANNOT_TELL, Audit, Results
+from palpate.report.records import CANNOT_TELL, LEAKS, NO_LEAK, Signal
+from palpate.report.results import Audit, Results
 from palpate.report.tables import defined, families, family_of
 
 #: Beginning of a kind of leak -> what it means ({thing} is the rest of the name, {data} what test
@@ -97,8 +97,8 @@ def chance_text(signal: Signal) -> str:
     """Return a verdict on near-duplicates, with what chance explains; '' for exact signals."""
     if not signal.verdict:
         return ""
-    none = "no more than chance explains" if signal.flagged else "no leak"
-    words = none if signal.verdict == "none" else signal.verdict
+    chance = signal.verdict == NO_LEAK and signal.flagged
+    words = "no more than chance explains" if chance else signal.verdict
     facts = [] if signal.expected is None else [f"{number(signal.expected)} expected by chance"]
     if signal.false_positives is not None and signal.expected is not None:
         rates = f"promised rate {percent(signal.false_positives)}"
@@ -107,34 +107,57 @@ def chance_text(signal: Signal) -> str:
     return words + (f" ({'; '.join(facts)})" if facts else "")
 
 
-#: Why it is not known whether a split leaks.
+#: Why a question was not asked, or cannot be told for too many samples.
 UNKNOWN = {
-    "untouched": "nothing was touched, so images cannot show what is new",
+    "no-images": "train and test have no images of one kind in common",
+    "images-off": "images were left out",
+    "no-frames": "no frame numbers of one video are known in both",
+    "untouched": "too many images show no contact, so they cannot show what is new",
     "similar": "images of different videos are all similar, so they cannot show what is new",
-    "chance": "no images are known to be unrelated, so none show what similarity is chance",
-    "ids": "ids alone could be compared, since no video, object or image is known",
-    "names": "equal names of different roots mean nothing, and there are no images to compare",
+    "chance": "too few images are known to be unrelated to show what similarity is chance",
+    "unreadable": "too many images are missing or cannot be read",
+    "ids": "nothing says which samples are one recording",
+    "names": "equal names of different roots mean nothing, and no images decide",
+    "nulls": "too many samples lack the group",
+    "skipped": "too many rows were skipped",
+    "frames": "too many samples lack a frame number",
 }
+
+
+def question_lines(audit: Audit) -> list[str]:
+    """Return the answer to each question, asked or not."""
+    lines: list[str] = []
+    for q in audit.questions:
+        counts = f" ({count(q.leaking)} of {count(q.of)})" * bool(q.leaking)
+        why = f": {UNKNOWN[q.reason]}" if q.reason else ""
+        lines.append(f"{q.name}: {q.verdict or 'not asked'}{counts}{why}")
+    return lines
 
 
 def leak_line(audit: Audit) -> str:
     """Return how many test samples any signal flags, and what they ask for."""
     n, total = audit.leaking_samples, plural(audit.test_samples, "test sample")
-    if not n:
-        checked = sum(bool(signal.checked) for signal in audit.signals)
-        signals = "the one signal" if checked == 1 else f"any of the {checked} signals"
-        line = f"None of {total} leaks by {signals} checked."
-        if audit.verdict == CANNOT_TELL:
-            return f"Cannot be judged: {UNKNOWN[audit.reason]}. {line}"
-        return " ".join(filter(None, [line, question_line(audit)]))
-    return (
-        f"{count(n)} of {total} {'leaks' if n == 1 else 'leak'} ({percent(audit.leaked_fraction)})."
-    )
+    why = next((q.reason for q in audit.questions if q.verdict and q.reason), "")
+    if n:
+        leak = "leaks" if n == 1 else "leak"
+        if audit.at_least and n < audit.test_samples:
+            return f"At least {count(n)} of {total} {leak}; there may be more: {UNKNOWN[why]}."
+        return f"{count(n)} of {total} {leak} ({percent(audit.leaked_fraction)})."
+    checked = sum(bool(signal.checked) for signal in audit.signals)
+    signals = "the one signal" if checked == 1 else f"any of the {checked} signals"
+    line = f"None of {total} leaks by {signals} checked."
+    if audit.verdict == CANNOT_TELL:
+        reasons = (UNKNOWN[q.reason] for q in audit.questions if q.verdict == CANNOT_TELL)
+        why = "; ".join(dict.fromkeys(reasons))
+        return f"{why[:1].upper()}{why[1:]}. {line}"
+    return " ".join(filter(None, [line, question_line(audit)]))
 
 
 def share_of(audit: Audit) -> str:
-    """Return the leaking share of the test samples, or that it is not known."""
-    return CANNOT_TELL if audit.verdict == CANNOT_TELL else percent(audit.leaked_fraction)
+    """Return the verdict, with the leaking share of the test samples where it is known."""
+    if audit.verdict != LEAKS or (audit.at_least and audit.leaked_fraction < 1):
+        return audit.verdict
+    return f"{LEAKS}, {percent(audit.leaked_fraction)}"
 
 
 def question_line(audit: Audit) -> str:
@@ -157,7 +180,7 @@ def audit_line(audit: Audit) -> str:
     name = audit.name if audit.against == "train" else f"{audit.name} against {data_of(audit)}"
     if not audit.test_samples:
         return f"{name}: the test part is empty, so nothing can leak."
-    flagged = [s for s in audit.signals if s.flagged and s.counts]
+    flagged = [s for s in audit.signals if s.flagged and s.counts and not audit.at_least]
     strongest = sorted(flagged, key=lambda s: -s.fraction)[:3]
     shares: list[str] = []
     for k, signal in enumerate(strongest):
@@ -165,9 +188,8 @@ def audit_line(audit: Audit) -> str:
         if signal.checked < audit.test_samples:
             whose = f" of the {count(signal.checked)} checked"
         shares.append(f"{percent(signal.fraction)}{whose} {_kind(signal.kind, audit)[1]}")
-    return f"{name}: " + " ".join(
-        [*(["; ".join(shares) + "."] if shares else []), leak_line(audit)]
-    )
+    facts = [f"{audit.verdict}.", *(["; ".join(shares) + "."] if shares else [])]
+    return f"{name}: {' '.join([*facts, leak_line(audit)])}"
 
 
 def purpose(results: Results) -> str:

@@ -19,6 +19,7 @@ from palpate.report.sentences import (
     audit_line,
     cause_texts,
     chance_text,
+    question_lines,
     signal_notes,
     threshold_text,
 )
@@ -113,7 +114,7 @@ def _print_claims(claims: Sequence[Claim], console: Console) -> None:
 
 def audit_text(audit: Audit, style: Style = PYTHON) -> str:
     """Return the finding, a line for each signal, the notes and what leaking costs."""
-    lines = [audit_line(audit)]
+    lines = [audit_line(audit), *(f"  {line}" for line in question_lines(audit))]
     if audit.groups_in_all:
         lines.append(
             f"  {audit.groups_shared} of {audit.groups_in_all} {audit.group} groups are shared"

@@ -58,7 +58,7 @@ from palpate.studies.study_tables import FAMILY, NAMED, Scores
 from palpate.training.run import TrainingRun
 
 #: Name of the split file, without its ending.
-SPLIT = "noleak"
+SPLIT = "split"
 
 
 @dataclass(frozen=True)
@@ -232,7 +232,8 @@ def make_demo_splits(work: Work, *, seed: int, train: float) -> Facts:
         if Split.load(path).ids("test")
     ]
     group = str(clean.rule["group"])
-    name = "NoLeak" if group == "video" else f"NoLeak by {group}"
+    name = str(clean.rule["name"])
+    name = f"{name} by {group}" if name == "NoLeak" and group != "video" else name
     audits.append(measured(split=clean, by=group, name=name))
     if group != "video" and not manifest.table["video"].null_count():
         name = f"{name}, seen by video"
@@ -333,7 +334,7 @@ class Page:
         noleak = audits[True, str(self.split.rule["group"])]
         by_video = audits.get((True, "video"), noleak)
         original = next((a for (ours, _), a in audits.items() if not ours), None)
-        fact = f"NoLeak (whole {noleak.group}s kept together) leaks "
+        fact = f"{noleak.name} (whole {noleak.group}s kept together) leaks "
         fact += percent(noleak.leaked_fraction)
         if original is not None:
             gap = ""
@@ -391,10 +392,10 @@ class Page:
 
     def _next_steps(self) -> list[str]:
         folder = Path(self.stages["data"].folder).parent
-        data, split = folder / "data", folder / "split" / "noleak.json"
+        data, split = folder / "data", folder / "split" / f"{SPLIT}.json"
         model, encoders = folder / "generator" / "model", folder / "encoders" / "encoders"
         return [
-            f"palpate audit {data} --split {split} --worst 50",
+            f"palpate audit {data} --split {split}",
             f"palpate generate YOUR_PHOTOS/ --model {model} -o YOUR_IMAGES/",
             f"palpate score --generated YOUR_IMAGES/ --reference {data} --split {split} "
             f"--encoder {encoders} -o scores.json",

@@ -41,8 +41,8 @@ from palpate.core import Progress, Split, quiet, require, require_choice
 from palpate.data.formats import tvl
 from palpate.data.formats.layout import report_missing_folders, subfolders, suspect_rows
 from palpate.data.images import BROKEN, in_threads, opened
-from palpate.data.listing import contact_names
 from palpate.data.manifest import CLIMBS, Manifest
+from palpate.data.recordings import TRAJECTORY, contact_names, in_time, sessions_of
 from palpate.data.scanning import WORLD, Cells, Facts, Format, Row, Scan, world_facts
 
 FACTS = Facts(
@@ -59,13 +59,9 @@ LOOKS_FOR = (
     "hct/, or dataN/ folders, with trajectories such as 4-1702596295.70/vision/ and .../tactile/"
 )
 FALLBACK = "digit_background.png"
-#: A trajectory folder: a number that is used again, and the start in Unix seconds.
-TRAJECTORY = re.compile(r"\d+-(\d+(?:\.\d+)?)")
 RIG = re.compile(r"data\d+")
 #: The stem of a frame's file: number and latency.
 FRAME = re.compile(r"(\d{1,18})(?:-.*)?")
-#: Seconds between the starts of two folders of one session.
-SESSION_GAP = 60.0
 Swap = Literal["report", "fix"]
 
 
@@ -116,21 +112,6 @@ def scan(source: Path, *, swap: Swap = "report", progress: Progress = quiet) -> 
     return result
 
 
-def sessions_of(videos: Iterable[str]) -> dict[str, str]:
-    """Video -> session, named by its first video; a name without a time is its own session."""
-    sessions: dict[str, str] = {}
-    last: dict[str, tuple[float, str]] = {}
-    for video in sorted(set(videos), key=_in_time):
-        rig, start, _ = _in_time(video)
-        if start >= 0:
-            before, session = last.get(rig, (float("-inf"), ""))
-            sessions[video] = session if start - before <= SESSION_GAP else video
-            last[rig] = (start, sessions[video])
-        else:
-            sessions[video] = video
-    return sessions
-
-
 def write_lists(manifest: Manifest, split: Split, folder: Path) -> list[Path]:
     """Write ``dataN/<part>.csv`` with ``url,tactile,tactile_background,caption``.
 
@@ -163,13 +144,6 @@ def _has_trajectory(folder: Path) -> bool:
     return any({"vision", "tactile"} & set(subfolders(folder / name)) for name in names)
 
 
-def _in_time(video: str) -> tuple[str, float, str]:
-    """Sort key: rig, start (-1 if the name has none), name."""
-    rig, _, folder = video.partition("/")
-    match = TRAJECTORY.fullmatch(folder)
-    return rig, float(match[1]) if match else -1.0, folder
-
-
 def _key(row: Cells) -> tuple[str, int]:
     return row["video"], row["frame"]
 
@@ -185,7 +159,7 @@ def _read_lists(result: Scan, rigs: Sequence[str]) -> list[str]:
     odd = [where for where, row in samples if row["tactile"] != partner(row)]
     text = "photo and tactile image differ in trajectory or file name"
     suspect_rows(result, odd, "unequal-names", text)
-    samples.sort(key=lambda sample: (_in_time(sample[1]["video"]), sample[1]["frame"]))
+    samples.sort(key=lambda sample: (in_time(sample[1]["video"]), sample[1]["frame"]))
     result.rows = samples
     return files
 

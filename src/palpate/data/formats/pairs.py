@@ -188,6 +188,7 @@ def _read_folder(
     text = "videos, which are read with a template of their own"
     result.suspect(result.base, "unmatched", text, videos)
     files = [path for path in files if path.lower().endswith(SUFFIXES)]
+    result.facts |= {"templates": "stated"} if texts else {}
     templates = parsed(texts or templates_of(files, result.base, side))
     matches = {s: _distinct(result, found) for s, found in assign(files, templates).items()}
     for side_, template in templates.items():
