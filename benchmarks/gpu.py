@@ -45,7 +45,7 @@ from palpate.diffusion.presets import preset_of
 from palpate.diffusion.unet import build_unet
 from palpate.encoders.encoder_set import encode_tactile, new_tactile
 from palpate.encoders.losses import in_chunks, three_way
-from palpate.encoders.presets import preset as encoder_preset
+from palpate.encoders.presets import preset_of as encoder_preset
 from palpate.training.engine import Losses, Task, fit
 from palpate.training.options import Compute, LoopOptions
 from palpate.training.steps import Step

@@ -46,13 +46,13 @@ from palpate.encoders.embed import embed_images
 from palpate.encoders.encoder_set import EncoderSet, Preprocess, new_tactile
 from palpate.encoders.losses import in_chunks, three_way
 from palpate.encoders.preprocess import to_unit
-from palpate.encoders.presets import preset
+from palpate.encoders.presets import preset_of
 from palpate.encoders.rows import Rows, augmented, draw, numbers, unit
 from palpate.training.engine import Task, fit
 from palpate.training.options import Compute, RowOrder
 from palpate.training.steps import Step
 
-MINI = preset("mini")
+MINI = preset_of("mini")
 WORDS = ["rough", "smooth", "soft", "hard", "grained", "ribbed", "woven", "sharp", "flat", "warm"]
 
 
@@ -268,7 +268,7 @@ def contrastive_step(model, config, batch, chunk):
 
 def memory(batch=256, chunk=8):
     """Cached gradients of a ViT-Small: small, and equal to the plain batch."""
-    config = preset("tvl-small").tactile_config(768)
+    config = preset_of("tvl-small").tactile_config(768)
     model, began = new_tactile(config, 0), clocks()
     contrastive_step(model, config, batch, chunk)
     seconds = (clocks() - began).tolist()

@@ -51,7 +51,7 @@ from palpate.diffusion.training import Parts, train_pipeline
 from palpate.encoders.contrastive import train_clip, train_tactile
 from palpate.encoders.encoder_set import EncoderSet, load_clip
 from palpate.encoders.models import SHIPPED, shipped_root
-from palpate.encoders.presets import EncoderPreset, preset, preset_of
+from palpate.encoders.presets import EncoderPreset, preset_of
 from palpate.sim import PRESETS, VERSION, WorldOptions, write_world
 from palpate.studies.files import fresh
 from palpate.studies.stages import Stage, run_stage, stored_stage
@@ -72,7 +72,7 @@ WORLDS: dict[str, WorldOptions] = {
     "new gelsight": replace(_BASE, seed=900_050, objects_per_material=10),
     "new digit": replace(_BASE, seed=900_051, objects_per_material=4, look="digit"),
 }
-ENCODER = preset("mini")
+ENCODER = preset_of("mini")
 #: Of the vision encoder when it goes on: more rows to tell apart.
 VISION = replace(ENCODER, clip_course=replace(ENCODER.clip_course, batch=256, lr=2e-3))
 #: Passes over the data. One core sees about 400 images a second in training.

@@ -12,7 +12,7 @@ from typing import Any
 import pytest
 from hypothesis import settings
 
-from forge.worlds import six_videos
+from forge.worlds import by_video, six_videos
 from palpate.data.manifest import Manifest
 
 # A busy machine is no failure: how long an example takes is not tested.
@@ -49,6 +49,16 @@ def real_data() -> Path:
 def small_manifest(tmp_path: Path) -> Manifest:
     """Six videos of three materials, two touches of four frames each, with 32-pixel pictures."""
     return six_videos(tmp_path / "root")
+
+
+@pytest.fixture
+def tag(small_manifest, tmp_path, monkeypatch):
+    """The small data set in `tag` and a split of it by video in `split.json`, where a test runs."""
+    monkeypatch.chdir(tmp_path)
+    split = by_video(small_manifest)
+    small_manifest.save(tmp_path / "tag" / "manifest.parquet")
+    split.save(tmp_path / "split.json")
+    return small_manifest, split
 
 
 @pytest.fixture(scope="session")

@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 from PIL import Image
 
 from forge.models import make_pipeline
+from forge.pictures import write_photos
 from palpate.core import PalpateError, ProblemsError, Split, inside
 from palpate.data.manifest import Manifest
 from palpate.diffusion.generated import Generated, file_name
@@ -20,15 +21,6 @@ from palpate.diffusion.generation import generate, photo_ids
 @pytest.fixture(scope="module")
 def pipeline():
     return make_pipeline()
-
-
-def write_photos(folder: Path, n: int) -> list[Path]:
-    rng = np.random.default_rng(0)
-    folder.mkdir(parents=True, exist_ok=True)
-    paths = [folder / f"{k}.png" for k in range(n)]
-    for path in paths:
-        Image.fromarray(rng.integers(0, 256, (20, 24, 3), dtype=np.uint8)).save(path)
-    return paths
 
 
 def contents(folder: Path) -> dict[str, bytes]:

@@ -101,12 +101,7 @@ def test_sizes_that_do_not_halve_to_8_are_rejected(change):
         replace(TINY, condition=replace(GVST, **change))
 
 
-def test_gvst_from_the_command_line_needs_no_text_and_no_encoder(
-    small_manifest, tmp_path, monkeypatch, capsys
-):
-    monkeypatch.chdir(tmp_path)
-    small_manifest.save(tmp_path / "tag" / "manifest.parquet")
-    by_video(small_manifest).save(tmp_path / "split.json")
+def test_gvst_from_the_command_line_needs_no_text_and_no_encoder(tag, tmp_path, capsys):
     command = ["train", "generator", "tag", "--split", "split.json", "--preset", "tiny"]
     gvst = ["source=resnet", "photo_size=16", "photo_width=4"]
     small = ["--set", *(f"condition.{field}" for field in gvst), "--steps", "2"]
@@ -114,7 +109,7 @@ def test_gvst_from_the_command_line_needs_no_text_and_no_encoder(
     facts = json.loads(capsys.readouterr().out)
     assert (facts["source"], facts["text_source"]) == ("resnet", None)
     assert not (tmp_path / "gvst" / "encoders").exists()
-    photo = str(small_manifest.paths("vision")[0])
+    photo = str(tag[0].paths("vision")[0])
     assert main(["generate", photo, "--model", "gvst", "-o", "t.png"]) == 0
     assert Image.open("t.png").size == (32, 32)
     capsys.readouterr()

@@ -25,7 +25,7 @@ from palpate.diffusion.options import ConditionPolicy
 from palpate.diffusion.pipeline import TactilePipeline
 from palpate.diffusion.presets import TINY
 from palpate.encoders.contrastive import new_clip
-from palpate.encoders.presets import preset
+from palpate.encoders.presets import preset_of
 
 
 def without_encoders(pipeline: TactilePipeline) -> TactilePipeline:
@@ -97,7 +97,7 @@ def test_a_saved_pipeline_makes_the_same_images(tmp_path):
 
 
 def test_encoders_travel_with_the_pipeline(tmp_path):
-    encoders = new_clip(preset("tiny"), ["a rough wall", "a soft cloth"], seed=0)
+    encoders = new_clip(preset_of("tiny"), ["a rough wall", "a soft cloth"], seed=0)
     pipeline = replace(make_pipeline(width=encoders.dim), encoders=encoders)
     pipeline.save(tmp_path / "p")
     again = TactilePipeline.from_pretrained(tmp_path / "p")

@@ -10,7 +10,6 @@ import torch
 from diffusers import UNet2DConditionModel
 from safetensors import safe_open
 
-from forge.worlds import by_video
 from palpate.cli import main
 from palpate.core import PalpateError
 from palpate.diffusion.autoencoder import LatentStats
@@ -27,16 +26,6 @@ from test_training_presets import memory
 #: Weights, gradient, two moments, average; what a checkpoint copies; activations: of ``paper``.
 MEMORY = 17e9
 UNET = {"attention_head_dim": 8, "cross_attention_dim": 128, "sample_size": 16}
-
-
-@pytest.fixture
-def tag(small_manifest, tmp_path, monkeypatch):
-    """A data set and a split of it by video, saved in the working directory."""
-    monkeypatch.chdir(tmp_path)
-    split = by_video(small_manifest)
-    small_manifest.save(tmp_path / "tag" / "manifest.parquet")
-    split.save(tmp_path / "split.json")
-    return small_manifest, split
 
 
 def write_unet(folder, **changes):

@@ -12,18 +12,14 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from forge.pictures import photos
+from forge.pictures import write_photos
 from palpate.diffusion.generated import Generated
 
 
 @pytest.mark.nightly
 @pytest.mark.slow
 def test_two_processes_make_the_images_of_one(tmp_path):
-    folder = tmp_path / "photos"
-    folder.mkdir()
-    for k, image in enumerate(photos(7, 64)):
-        Image.fromarray(image).save(folder / f"{k}.png")
-    (folder / "5.png").write_text("broken")
+    write_photos(folder := tmp_path / "photos", 7, 64)[5].write_text("broken")
     script = tmp_path / "run.py"
     script.write_text(
         "import sys; from palpate.cli import main; from palpate.training.processes import place;"
@@ -52,10 +48,7 @@ def test_two_processes_make_the_images_of_one(tmp_path):
 @pytest.mark.nightly
 @pytest.mark.slow
 def test_a_killed_run_goes_on_to_the_same_images(tmp_path):
-    folder = tmp_path / "photos"
-    folder.mkdir()
-    for k, image in enumerate(photos(24, 64)):
-        Image.fromarray(image).save(folder / f"{k:02}.png")
+    write_photos(folder := tmp_path / "photos", 24, 64)
     command = [sys.executable, "-m", "palpate", "generate", str(folder), "--batch", "2", "-q"]
     whole, killed = tmp_path / "whole", tmp_path / "killed"
     subprocess.run([*command, "-o", str(whole)], check=True)

@@ -27,13 +27,13 @@ from palpate.encoders.contrastive import (
 from palpate.encoders.embed import embed
 from palpate.encoders.encoder_set import EncoderSet, encode_tactile, new_tactile
 from palpate.encoders.losses import clamped_scale, in_chunks, info_nce, soft_targets, three_way
-from palpate.encoders.presets import Augment, preset
+from palpate.encoders.presets import Augment, preset_of
 from palpate.encoders.rows import Rows
 from palpate.training.engine import Task, fit
 from palpate.training.options import Compute
 from palpate.training.run import TrainingRun
 
-TINY = preset("tiny")
+TINY = preset_of("tiny")
 FEELS = {
     "Wood": "grained, firm wood",
     "Metal": "cold, smooth metal",
@@ -222,7 +222,7 @@ def test_one_held_out_sample_is_enough_without_evaluations(world, clip, tmp_path
     ("change", "message"),
     [
         ({"photos": 1}, r"must hold two photos.*Got one, v0/0"),
-        ({"preset": preset("paper")}, "must describe a fresh CLIP"),
+        ({"preset": preset_of("paper")}, "must describe a fresh CLIP"),
         ({"course": {"batch": 1}}, "`clip_course.batch` must be at least 2"),
         ({"course": {"keep": "best"}}, "must keep its last weights and run to its end"),
         ({"course": {"patience": 1}}, "must keep its last weights and run to its end"),
@@ -403,7 +403,7 @@ def test_vision_goes_on_against_the_text_encoder_as_it_is(world, clip, tmp_path)
 
 
 def test_paper_preset_is_the_paper():
-    paper = preset("paper")
+    paper = preset_of("paper")
     course = paper.tactile_course
     assert (course.epochs, course.batch, paper.targets) == (200, 256, "diagonal")
     options = course.options(13_900, seed=0)
@@ -414,7 +414,7 @@ def test_paper_preset_is_the_paper():
     # ViT-L/14 at 224 px with a 768-wide projection
     assert sum(p.numel() for p in tactile.parameters()) == 303_966_208
     with pytest.raises(PalpateError, match="tiny, mini, tvl-tiny"):
-        preset("huge")
+        preset_of("huge")
 
 
 def test_a_vision_encoder_without_text_is_a_partner(world, tmp_path):

@@ -13,10 +13,10 @@ from palpate.encoders import embed as module
 from palpate.encoders.contrastive import new_clip
 from palpate.encoders.embed import embed, embed_images, embed_texts, texts_of
 from palpate.encoders.encoder_set import EncoderSet, Preprocess, new_tactile
-from palpate.encoders.presets import preset
+from palpate.encoders.presets import preset_of
 from test_encoders_contrastive import make_world
 
-TINY = preset("tiny")
+TINY = preset_of("tiny")
 
 
 @pytest.fixture

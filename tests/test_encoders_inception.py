@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 
+from forge.errors import Bomb
 from palpate.core import FeatureSet, PalpateError
 from palpate.encoders.inception import load_inception
 
@@ -77,11 +78,6 @@ def test_the_digest_is_that_of_the_weights(tmp_path, images):
     torch.manual_seed(3)
     other = script(Pooled(), tmp_path / "other.pt")
     assert load_inception(one).digest == load_inception(same).digest != load_inception(other).digest
-
-
-class Bomb:
-    def __reduce__(self):
-        return (pytest.fail, ("unpickled",))
 
 
 def test_files_that_are_no_torchscript_are_rejected_and_never_unpickled(tmp_path):

@@ -5,6 +5,7 @@ import pytest
 import torch
 from safetensors.torch import save_file
 
+from forge.errors import Bomb
 from forge.models import SHAPES, random_states, save_states
 from palpate.core import PalpateError
 from palpate.encoders.perceptual import Lpips, load_lpips, lpips_per_image
@@ -116,11 +117,6 @@ def test_the_digest_is_that_of_the_weights_used(files, states, network, tmp_path
     name = "lin4.model.1.weight"
     torch.save(states[1] | {name: states[1][name] * 2}, tmp_path / "other.pth")
     assert load_lpips(files[0], tmp_path / "other.pth").digest != network.digest
-
-
-class Bomb:
-    def __reduce__(self):
-        return (pytest.fail, ("unpickled",))
 
 
 def test_files_are_rejected_by_name_and_never_unpickled(files, states, tmp_path):

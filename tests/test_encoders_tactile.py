@@ -12,6 +12,7 @@ from PIL import Image
 from safetensors.torch import save_file
 from torch.nn.functional import conv2d, gelu, layer_norm, linear, normalize
 
+from forge.errors import Bomb
 from forge.worlds import by_video
 from palpate import probe, score
 from palpate.core import PalpateError
@@ -19,7 +20,7 @@ from palpate.data.manifest import Manifest
 from palpate.encoders import Encoder, EncoderSet, train_encoder
 from palpate.encoders.embed import embed
 from palpate.encoders.preprocess import prepared_images
-from palpate.encoders.presets import preset
+from palpate.encoders.presets import preset_of
 from palpate.encoders.tactile import load_tactile
 
 WIDTH, DEPTH, HEADS = 128, 2, 2
@@ -257,13 +258,8 @@ def test_what_no_published_file_holds_is_refused_not_cut_or_spread(tmp_path, kin
         load_tactile(write(kind, tmp_path, good | {prefix + name: value}))
 
 
-class Pickled:
-    def __init__(self):
-        self.x = 1
-
-
 def test_pickles_with_code_and_other_files_are_refused(tmp_path):
-    torch.save({"model": tvl(), "code": Pickled()}, tmp_path / "code.ckpt")
+    torch.save({"model": tvl(), "code": Bomb()}, tmp_path / "code.ckpt")
     save_file({"a": torch.zeros(2)}, tmp_path / "a.safetensors")
     weight, old = torch.zeros(2), tmp_path / "old.pth"
     torch.save({"model": {"a": weight}}, old, _use_new_zipfile_serialization=False)
@@ -389,7 +385,7 @@ def test_they_score_probe_and_are_guarded_by_what_their_authors_name(tmp_path, d
 
 
 def test_an_encoder_trains_on_whole_turned_images(tmp_path, digits):
-    kind = replace(preset("tiny"), fitting="pad", turn="left")
+    kind = replace(preset_of("tiny"), fitting="pad", turn="left")
     split = by_video(digits, "v0", "v1", "v2")
     encoders = train_encoder(digits, split, preset=kind, device="cpu", output=tmp_path / "e")
     made = encoders.preprocess("tactile")

@@ -19,7 +19,7 @@ from palpate.cli import main
 from palpate.encoders.contrastive import new_clip, plan_encoder, train_tactile
 from palpate.encoders.encoder_set import EncoderSet, new_tactile
 from palpate.encoders.preprocess import Preprocess
-from palpate.encoders.presets import preset
+from palpate.encoders.presets import preset_of
 from palpate.encoders.tokenizer import train_tokenizer
 from palpate.training.estimate import estimate
 from palpate.training.options import Compute, LoopOptions
@@ -52,8 +52,8 @@ def memory(needed):
 @pytest.mark.parametrize("name", ["mini", "tvl-tiny", "tvl-small", *HEAVY])
 def test_a_preset_takes_a_real_step_of_what_its_plan_says(name, small_manifest, split, tmp_path):
     """With all its layers and pixels, on two samples, one at a time (cached gradients)."""
-    chosen = preset(name)
-    partners = new_clip(replace(preset("tiny"), dim=chosen.dim), WORDS, seed=0)
+    chosen = preset_of(name)
+    partners = new_clip(replace(preset_of("tiny"), dim=chosen.dim), WORDS, seed=0)
     chosen = replace(chosen, tactile_course=replace(chosen.tactile_course, batch=2, epochs=1e-9))
     run = TrainingRun(tmp_path / "run", device="cpu", compute=Compute(chunk=1))
     with memory(MEMORY) if name == "paper" else nullcontext():
@@ -85,13 +85,8 @@ def write_clip(folder):
 
 
 @pytest.mark.slow
-def test_the_paper_s_preset_from_training_to_the_probe(
-    small_manifest, split, tmp_path, monkeypatch, capsys
-):
-    monkeypatch.chdir(tmp_path)
+def test_the_paper_s_preset_from_training_to_the_probe(tag, tmp_path, capsys):
     write_clip(tmp_path / "clip")
-    small_manifest.save(tmp_path / "tag" / "manifest.parquet")
-    split.save(tmp_path / "split.json")
     where = ["tag", "--split", "split.json"]
     size = ["--set", "tactile.width=32", "tactile.layers=2", "tactile.heads=2"]
     size += ["--set", "tactile_course.batch=8"]

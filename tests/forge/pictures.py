@@ -128,6 +128,13 @@ def paint(folder: Path, names, seed: int, suffix=".png", side=32, low=90, high=1
     return images
 
 
+def write_photos(folder: Path, n: int, *size: int) -> list[Path]:
+    """So many random photos, `0.png` and so on, of a side or of a height and a width."""
+    height, width = (*size, *size)[:2] if size else (20, 24)
+    images = np.random.default_rng(0).integers(0, 256, (n, height, width, 3), dtype=np.uint8)
+    return [put(folder / f"{k}.png", Image.fromarray(image)) for k, image in enumerate(images)]
+
+
 def photos(n: int, size: int = 16) -> np.ndarray:
     """Random images (n, size, size, 3)."""
     return np.random.default_rng(0).integers(0, 256, (n, size, size, 3), dtype=np.uint8)

@@ -25,7 +25,7 @@ from palpate.diffusion.gels import gels_of, has_gels
 from palpate.encoders.embed import embed_images
 from palpate.encoders.encoder_set import EncoderSet
 from palpate.encoders.models import pick_device
-from palpate.encoders.rows import evenly
+from palpate.encoders.rows import evenly, with_cells
 from palpate.metrics.images import per_image
 from palpate.metrics.probe import fit_probe, material_accuracy
 from palpate.metrics.tactile import tmmd
@@ -78,9 +78,8 @@ def measure_reconstruction(
 
 def some_whole(part: Manifest, columns: Sequence[str], n: int) -> Manifest:
     """Up to ``n`` samples, evenly, of those that have an image in each of these columns."""
-    cells = zip(part.ids, *(part.column(name) for name in columns), strict=True)
-    complete = [name for name, *images in cells if all(images)]
-    return part.take([complete[k] for k in evenly(len(complete), n)])
+    complete = with_cells(part, *columns)
+    return complete.take([complete.ids[k] for k in evenly(len(complete), n)])
 
 
 def judge_of(

@@ -105,27 +105,25 @@ class Generated:
         folder = Path(folder)
         index = _read_index(folder)
         must, fix = f"{folder} must be finished", "Run the same command again: it continues"
-        require(index["complete"], None, must, "a folder left half done", fix=fix)
-        files = {name: inside(folder / "images", name) for name in index["images"].values()}
+        require(index.complete, None, must, "a folder left half done", fix=fix)
+        files = {name: inside(folder / "images", name) for name in index.images.values()}
         bad = [name for name, path in files.items() if path is None or not path.is_file()]
         must = f"Every image of {folder / 'index.json'} must lie in images/"
         got = f"{len(bad)} that do not, first {bad[:1]}"
         require(not bad, None, must, got, fix="Generate again")
-        skipped = [Problem(**problem) for problem in index["skipped"]]
-        notice = index.get("notice", "")
-        return cls(folder, index["images"], index["settings"], skipped, notice=notice)
+        return cls(folder, index.images, index.settings, index.skipped, notice=index.notice)
 
 
-@dataclass(frozen=True)
-class _Index:
-    """What ``index.json`` holds."""
+@dataclass(frozen=True, kw_only=True)
+class Index:
+    """What ``index.json`` holds; ``digest`` is that of the settings."""
 
-    format: str
-    complete: bool
+    format: str = FORMAT
+    complete: bool = False
     settings: Mapping[str, Any]
     digest: str
-    images: Mapping[str, str]
-    skipped: Sequence[Problem]
+    images: Mapping[str, str] = field(default_factory=dict)
+    skipped: Sequence[Problem] = ()
     notice: str = ""
 
 
@@ -135,19 +133,18 @@ def file_name(sample_id: str) -> str:
     return f"{plain or 'sample'}-{short(hashlib.sha256(sample_id.encode()).hexdigest())}.png"
 
 
-def _read_index(folder: Path) -> dict[str, Any]:
+def _read_index(folder: Path) -> Index:
     index = read_json(folder / "index.json", "index of generated images")
     fits = isinstance(index, dict) and index.get("format") == FORMAT
     must, fix = f"{folder} must hold generated images ({FORMAT})", "Choose another folder"
     require(fits, None, must, "another kind of folder", fix=fix)
     with reading_entry(folder / "index.json", "The index"):
-        from_plain(_Index, index)
-    return index
+        return from_plain(Index, index)
 
 
 def old_index(
     output: Path, settings: Mapping[str, Any] | None = None, digest: str = ""
-) -> dict[str, Any] | None:
+) -> Index | None:
     """Return the index of an earlier run in ``output``; None where it is absent or empty.
 
     Raises:
@@ -155,8 +152,8 @@ def old_index(
     """
     if (output / "index.json").is_file():
         index = _read_index(output)
-        if settings is not None and index["digest"] != digest:
-            old = index["settings"]
+        if settings is not None and index.digest != digest:
+            old = index.settings
             differ = [k for k in {**settings, **old} if settings.get(k) != old.get(k)]
             must, got = "must hold images of the same settings", f"another {', '.join(differ)}"
             raise PalpateError(must, got, "Choose another folder", argument="output")

@@ -33,13 +33,14 @@ from palpate.core import (
     digest_file,
     digest_json,
     locked,
+    plain,
     quiet,
     require,
     write_json,
 )
 from palpate.core.files import canonical_json
 from palpate.data.images import BROKEN, SUFFIXES, check_image, read_image, square
-from palpate.diffusion.generated import FORMAT, Generated, file_name, old_index
+from palpate.diffusion.generated import Generated, Index, file_name, old_index
 from palpate.encoders.models import FIX_MODEL, find_model
 
 if TYPE_CHECKING:  # torch takes seconds to import, and what is checked first needs none of it
@@ -229,12 +230,10 @@ class _Target:
         self.folder = None if single else output
         self.memory: dict[str, Image.Image] = {}
         self.first = first  # of several processes
-        self.index: dict[str, Any] = {}
+        self.index = Index(settings=settings, digest=self.digest)
         if self.folder is not None:
-            index = old_index(self.folder, settings, self.digest)
-            head = {"format": FORMAT, "complete": False, "settings": settings}
-            new = head | {"digest": self.digest, "images": {}, "skipped": []}
-            self.index = (index or new) | {"notice": notice}
+            index = old_index(self.folder, settings, self.digest) or self.index
+            self.index = replace(index, notice=notice, complete=False)
 
     def path(self, sample_id: str) -> Path | None:
         """The file of an image; None in memory."""
@@ -254,11 +253,10 @@ class _Target:
     @contextmanager
     def writing(self) -> Generator[None]:
         """Hold the folder, and mark it as unfinished; of several processes the first one."""
-        self.index["complete"] = False
         folder = self.folder if self.first else None
         with nullcontext() if folder is None else locked(folder):
             if folder is not None:
-                write_json(folder / "index.json", self.index)
+                write_json(folder / "index.json", plain(self.index))
             yield
 
     def keep(self, item: _Item, array: NDArray[np.uint8]) -> _Item:
@@ -283,11 +281,10 @@ class _Target:
         """Complete the index; all images of the target, earlier ones included."""
         files = {} if self.file is None else {i: str(self.file) for i in ids}
         if self.folder is not None:
-            files = self.index["images"] | {i: file_name(i) for i in ids}
-            skips = [asdict(problem) for problem in skipped]
-            self.index |= {"complete": True, "images": files, "skipped": skips}
+            files = {**self.index.images, **{i: file_name(i) for i in ids}}
+            index = replace(self.index, complete=True, images=files, skipped=skipped)
             if self.first:
-                write_json(self.folder / "index.json", self.index)
+                write_json(self.folder / "index.json", plain(index))
         common = (self.settings, skipped, new, self.notice, notes, self.memory)
         return Generated(self.folder, files, *common)
 

@@ -53,7 +53,16 @@ from palpate.encoders.losses import (
 from palpate.encoders.models import digest_tensors, pick_device
 from palpate.encoders.preprocess import CLIP_MEAN, CLIP_STD, digest_images, prepared_images, union
 from palpate.encoders.presets import Course, EncoderPreset, Targets, preset_of
-from palpate.encoders.rows import Rows, augmented, draw, load_split, numbers, train_part, unit
+from palpate.encoders.rows import (
+    Rows,
+    augmented,
+    draw,
+    load_split,
+    numbers,
+    train_part,
+    unit,
+    with_cells,
+)
 from palpate.encoders.tokenizer import train_tokenizer
 from palpate.metrics.probe import material_accuracy
 from palpate.training.engine import Batch, Losses, Task, fit
@@ -116,7 +125,10 @@ def train_encoder(
         elif not isinstance(source, EncoderSet):
             source = load_clip(source)
         encoders = train_tactile(manifest, split, source, chosen, run.stage("tactile"))
-        parts = [_labeled(manifest.part(split, part)) for part in ("train", "test")]
+        parts = [
+            with_cells(manifest.part(split, part), "tactile", "material")
+            for part in ("train", "test")
+        ]
         if len(parts[1]) and len(set(parts[0].column("material"))) > 1:
             with first_alone():
                 features = [embed(p, encoders, cache=run.cache, progress=progress) for p in parts]
@@ -157,12 +169,6 @@ def plan_encoder(
 
     options = chosen.tactile_course.options(len(train), 0)
     return estimate(build, forward, options, len(train), pick_device(device))
-
-
-def _labeled(part: Manifest) -> Manifest:
-    """The samples that have a tactile image and a material."""
-    columns = (part.ids, part.column("tactile"), part.column("material"))
-    return part.take([i for i, image, name in zip(*columns, strict=True) if image and name])
 
 
 class TactileModel(nn.Module):
@@ -264,7 +270,7 @@ def train_tactile(
         "training the tactile encoder",
         len(train),
         lambda step: rows.load(step, course.augment),
-        TactileLoss(rows, preprocess, preset.targets, _chunk(run)),
+        TactileLoss(rows, preprocess, preset.targets, run.compute.chunk),
         digest_json([facts, _stamps(train)]),
         train.ids,
         None if held_rows is None else (len(held), held_rows.load),
@@ -282,11 +288,6 @@ def train_tactile(
         card=card,
         seen={**clip.seen, "tactile": seen},
     )
-
-
-def _chunk(run: TrainingRun) -> int | None:
-    """Rows that an encoder sees at a time."""
-    return run.compute.chunk if run.compute else None
 
 
 def _require_rows(
@@ -386,7 +387,7 @@ def train_clip(
     where = pick_device(connect(str(run.device)))
     train = train_part(manifest, split)
     side = _sides(train)[0]
-    pictured, course = _with_image(train, side), _clip_course(preset)
+    pictured, course = with_cells(train, side), _clip_course(preset)
     with fields_of("clip_course"):
         options = course.options(len(pictured), run.seed)
     with agreed():
@@ -414,7 +415,7 @@ def train_clip(
 
     def loss(module: nn.Module, batch: Batch) -> Losses:
         pixels = preprocess(augmented(unit(batch["images"]), batch))
-        encoded = in_chunks(partial(encode_vision, module), pixels, _chunk(run))
+        encoded = in_chunks(partial(encode_vision, module), pixels, run.compute.chunk)
         some, inverse = torch.unique(batch["phrase"], return_inverse=True)  # each text once
         text = encode_text(module, clip.tokenizer, [distinct[int(k)] for k in some])[inverse]
         text, scale = gather_rows(text), clamped_scale(clip.clip.logit_scale)
@@ -472,16 +473,10 @@ def _sides(train: Manifest) -> list[str]:
     return [side for side in sides if train.table[side].count()] or sides
 
 
-def _with_image(train: Manifest, column: str) -> Manifest:
-    """The rows that have an image in this column."""
-    cells = zip(train.ids, train.column(column), strict=True)
-    return train.take([i for i, image in cells if image])
-
-
 def _stamps(train: Manifest) -> list[str]:
     """What must not have changed on disk for a checkpoint to be continued."""
     sides = [*_sides(train), "background"]
-    return [image_stamp(_with_image(train, side), side) for side in sides]
+    return [image_stamp(with_cells(train, side), side) for side in sides]
 
 
 def _facts(

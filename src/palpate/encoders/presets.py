@@ -305,25 +305,17 @@ TVL = (
 PRESETS = {preset.name: preset for preset in (TINY, MINI, *TVL, PAPER)}
 
 
-def preset(name: str) -> EncoderPreset:
-    """A preset by name.
-
-    Raises:
-        PalpateError: if there is none of that name.
-    """
-    require_choice("preset", name, PRESETS)
-    return PRESETS[name]
-
-
-def preset_of(name: str | EncoderPreset, epochs: float | None = None) -> EncoderPreset:
+def preset_of(preset: str | EncoderPreset, epochs: float | None = None) -> EncoderPreset:
     """A preset as it is, or by name; with so many epochs of the tactile encoder.
 
     Raises:
         PalpateError: if there is none of that name, or the epochs are no positive number.
     """
-    chosen = name if isinstance(name, EncoderPreset) else preset(name)
+    if not isinstance(preset, EncoderPreset):
+        require_choice("preset", preset, PRESETS)
+        preset = PRESETS[preset]
     if epochs is None:
-        return chosen
+        return preset
     must, fix = "must be a positive number", "Leave it out for the preset's length"
     require(0 < epochs < math.inf, "epochs", must, epochs, fix=fix)
-    return replace(chosen, tactile_course=replace(chosen.tactile_course, epochs=epochs))
+    return replace(preset, tactile_course=replace(preset.tactile_course, epochs=epochs))

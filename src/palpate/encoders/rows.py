@@ -48,6 +48,12 @@ def train_part(manifest: Manifest, split: Split) -> Manifest:
     return train
 
 
+def with_cells(part: Manifest, *columns: str) -> Manifest:
+    """The samples that have a value in each of these columns."""
+    cells = zip(part.ids, *map(part.column, columns), strict=True)
+    return part.take([name for name, *values in cells if all(values)])
+
+
 class Rows:
     """The rows of one part of the data, by their number in the manifest.
 
@@ -73,11 +79,11 @@ class Rows:
         self.images = prepared_images(part, "tactile", preprocess, cache, progress)
         self.captions, self.text_source = texts_of(part)
         self.texts = numbers(self.captions)
-        with_photo = torch.tensor([v is not None for v in part.column("vision")])
+        with_photo = torch.tensor([bool(v) for v in part.column("vision")])
         self.without_photo = int((~with_photo).sum()) if with_photo.any() else 0
         self.photo = with_photo.cumsum(0) - 1
         self.photo[~with_photo] = -1
-        pictured = part.take([i for i, has in zip(part.ids, with_photo, strict=True) if has])
+        pictured = with_cells(part, "vision")
         self.text = self.vision = None
         if clip.tokenizer is not None:
             rows = embed(part, clip, "text", cache=cache, progress=progress)

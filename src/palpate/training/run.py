@@ -6,7 +6,7 @@ import shutil
 import tempfile
 from collections.abc import Generator
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -34,7 +34,7 @@ class TrainingRun:
     seed: int = 0
     cache: Path | None = None
     device: str | torch.device = "cpu"
-    compute: Compute | None = None
+    compute: Compute = field(default_factory=Compute)
     progress: Progress = quiet
 
     def stage(self, name: str) -> TrainingRun:
@@ -59,7 +59,7 @@ def run_for(
     """
     device = connect(device)
     with work_folder(None if output is None else Path(output)) as work:
-        yield TrainingRun(work, seed, work / "cache", device, compute, progress)
+        yield TrainingRun(work, seed, work / "cache", device, compute or Compute(), progress)
 
 
 @contextmanager
