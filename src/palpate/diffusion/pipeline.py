@@ -11,7 +11,6 @@ import json
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, fields, replace
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -202,29 +201,27 @@ class TactilePipeline(DiffusionPipeline):
         noise = None if generator is None else self._noise(generator, len(ids))
         self.scheduler.set_timesteps(sampler.steps)
         total = math.ceil(len(ids) / sampler.batch) * len(self.scheduler.timesteps)
-        drawn: list[Image.Image] = []
         bars: Any = self.progress_bar  # wrongly typed in diffusers
         with bars(total=total) as bar:
-            for start in range(0, len(ids), sampler.batch):
-                rows = slice(start, start + sampler.batch)
-                arrays = self.sample(
-                    None if embedded is None else embedded[rows],
-                    ids[rows],
-                    texts=words,
-                    weight=weight,
-                    seed=seed,
-                    sampler=sampler,
-                    background=None if ground is None else ground[rows],
-                    noise=None if noise is None else noise[rows],
-                    on_step=partial(self._on_step, bar, callback_on_step_end),
-                )
-                drawn += map(Image.fromarray, arrays)
-        return ImagePipelineOutput(images=drawn)
 
-    def _on_step(self, bar: Any, callback: Any, step: int, t: Tensor, latents: Tensor) -> Tensor:
-        bar.update()
-        answer = callback(self, step, t, {"latents": latents}) if callback else None
-        return (answer or {}).get("latents", latents)
+            def on_step(step: int, t: Tensor, latents: Tensor) -> Tensor:
+                bar.update()
+                callback = callback_on_step_end
+                answer = callback(self, step, t, {"latents": latents}) if callback else None
+                return (answer or {}).get("latents", latents)
+
+            arrays = self.sample(
+                embedded,
+                ids,
+                texts=words,
+                weight=weight,
+                seed=seed,
+                sampler=sampler,
+                background=ground,
+                noise=noise,
+                on_step=on_step,
+            )
+        return ImagePipelineOutput(images=[Image.fromarray(array) for array in arrays])
 
     def _noise(self, generator: torch.Generator | Sequence[torch.Generator], n: int) -> Tensor:
         """The starting noise of n images, drawn on the generators' own device."""
@@ -449,7 +446,7 @@ class TactilePipeline(DiffusionPipeline):
             background=ground,
             on_step=on_step,
         )
-        return code.decode(self.stats.restore(latents), background)
+        return code.decode(self.stats.restore(latents), background, batch=options.batch)
 
     def to(  # pyright: ignore[reportIncompatibleMethodOverride] - its forms with one or two
         self, device: str | torch.device | torch.dtype | None = None, dtype: Any = None

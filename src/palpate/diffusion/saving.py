@@ -21,7 +21,7 @@ from __future__ import annotations
 import json
 from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from PIL import Image
 
@@ -55,26 +55,22 @@ def write_pipeline(
         index = json.loads(pipeline.to_json_string())
         absent = {} if shared is None else {"autoencoder": [None, None]}
         write_json(part / "model_index.json", index | absent)
-        about = describe(pipeline) | ({} if shared is None else {"shared": shared})
+        encoders = pipeline.encoders
+        about = {
+            "format": FORMAT,
+            "digest": pipeline.digest,
+            "preset": pipeline.preset,
+            "size": pipeline.size,
+            "background": pipeline.background,
+            "condition": asdict(pipeline.denoiser.policy),
+            "schedule": asdict(pipeline.schedule),
+            "sampler": asdict(pipeline.sampler),
+            "latents": asdict(pipeline.stats) | {"factor": pipeline.autoencoder.factor},
+            "autoencoder": pipeline.autoencoder.digest,
+            "encoders": encoders.digest("vision") if encoders else None,
+            "training": dict(pipeline.training),
+            "palpate": __version__,
+            **({} if shared is None else {"shared": shared}),
+        }
         write_json(part / "palpate.json", about)
         write_model_cards(part)
-
-
-def describe(pipeline: TactilePipeline) -> dict[str, Any]:
-    """The content of ``palpate.json``."""
-    encoders = pipeline.encoders
-    return {
-        "format": FORMAT,
-        "digest": pipeline.digest,
-        "preset": pipeline.preset,
-        "size": pipeline.size,
-        "background": pipeline.background,
-        "condition": asdict(pipeline.denoiser.policy),
-        "schedule": asdict(pipeline.schedule),
-        "sampler": asdict(pipeline.sampler),
-        "latents": asdict(pipeline.stats) | {"factor": pipeline.autoencoder.factor},
-        "autoencoder": pipeline.autoencoder.digest,
-        "encoders": encoders.digest("vision") if encoders else None,
-        "training": dict(pipeline.training),
-        "palpate": __version__,
-    }

@@ -44,8 +44,8 @@ def build_unet(
     )
 
 
-def find_unet(source: str | Path) -> tuple[str, Path, str]:
-    """Return what ``from_pretrained`` takes, the folder of ``config.json``, and its subfolder.
+def find_unet(source: str | Path) -> tuple[str, str]:
+    """Return what ``from_pretrained`` takes, and the subfolder of the U-Net.
 
     Args:
         source: a folder or hub id of a U-Net, or of a generator that has one as ``unet``.
@@ -57,7 +57,7 @@ def find_unet(source: str | Path) -> tuple[str, Path, str]:
     inside = "" if (root / "config.json").is_file() else "unet"
     there = (root / inside / "config.json").is_file()
     require(there, None, f"{source} must hold a U-Net of diffusers", "no config.json", fix=FIX_UNET)
-    return name, root / inside, inside
+    return name, inside
 
 
 def load_unet(
@@ -68,7 +68,7 @@ def load_unet(
     Raises:
         PalpateError: if it is none of diffusers, or made for other latents or tokens.
     """
-    name, root, inside = find_unet(source)
+    name, inside = find_unet(source)
     must = f"{source} must hold a UNet2DConditionModel of diffusers"
     unet = load_model(
         UNet2DConditionModel,
@@ -86,5 +86,5 @@ def load_unet(
     must = f"must give embeddings of width {config['cross_attention_dim']}, as the U-Net knows"
     require(policy.width == config["cross_attention_dim"], "clip", must, policy.width)
     plain = config["class_embed_type"] is None and config["in_channels"] == channels + background
-    require(plain, "unet", "must see latents and tokens alone", repr(root.name))
+    require(plain, "unet", "must see latents and tokens alone", str(source))
     return unet.requires_grad_(True)
