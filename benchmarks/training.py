@@ -41,11 +41,12 @@ import numpy as np
 import torch
 
 from palpate.core import quiet, rng_for
+from palpate.data.images import Preprocess
 from palpate.encoders.contrastive import TactileLoss, TactileModel
 from palpate.encoders.embed import embed_images
-from palpate.encoders.encoder_set import EncoderSet, Preprocess, new_tactile
+from palpate.encoders.encoder_set import EncoderSet, new_tactile
 from palpate.encoders.losses import in_chunks, three_way
-from palpate.encoders.preprocess import to_unit
+from palpate.encoders.models import to_unit
 from palpate.encoders.presets import preset_of
 from palpate.encoders.rows import Rows, augmented, draw, numbers, unit
 from palpate.training.engine import Task, fit

@@ -15,8 +15,7 @@ from palpate.diffusion.autoencoder_training import build_autoencoder, fit_autoen
 from palpate.diffusion.ceiling import measure_reconstruction
 from palpate.diffusion.encoding import encode_latents
 from palpate.diffusion.options import AutoencoderOptions
-from palpate.encoders.models import digest_tensors
-from palpate.encoders.preprocess import to_unit
+from palpate.encoders.models import digest_tensors, to_unit
 from palpate.training.run import TrainingRun
 
 SMALL = AutoencoderOptions(

@@ -11,13 +11,14 @@ from PIL import Image
 
 from palpate.cli import main
 from palpate.core import PalpateError, Split
+from palpate.data.images import load_images
 from palpate.data.manifest import Manifest
 from palpate.diffusion.autoencoder import load_autoencoder
 from palpate.diffusion.autoencoder_training import train_autoencoder
 from palpate.diffusion.ceiling import judge_of, measure_ceiling
 from palpate.diffusion.training import train_generator
 from palpate.encoders.encoder_set import EncoderSet, load_clip
-from palpate.encoders.preprocess import digest_images, load_frames
+from palpate.encoders.models import digest_images
 from palpate.sim import WorldOptions, write_world
 
 SIZE = 64
@@ -141,7 +142,7 @@ def test_a_judge_that_was_trained_on_the_images_does_not_judge_them(world, split
     judge, test = EncoderSet.load("palpate/mini"), world.part(split, "test")
     preprocess = judge.preprocess("tactile")
     judge.seen["tactile"] = digest_images(
-        load_frames(preprocess.frames(test, "tactile").files[:3], preprocess)
+        load_images(preprocess.frames(test, "tactile").files[:3], preprocess)
     )
     found = measure_ceiling(Through(lambda x: x), world, split, SIZE, judge=judge)
     assert (found["n"], found["not_judged"]) == (len(test), 3)
@@ -151,7 +152,7 @@ def test_a_judge_that_was_trained_on_the_images_does_not_judge_them(world, split
     for name in ("tmmd", "accuracy_real", "accuracy"):
         assert found[name] == pytest.approx(alone[name], abs=1e-9)
     judge.seen["tactile"] = digest_images(
-        load_frames(preprocess.frames(test, "tactile").files, preprocess)
+        load_images(preprocess.frames(test, "tactile").files, preprocess)
     )
     found = measure_ceiling(Through(lambda x: x), world, split, SIZE, judge=judge)
     assert (found["not_judged"], found["judge"]) == (len(test), judge.digest("tactile"))

@@ -19,7 +19,7 @@ from palpate.cli import main
 from palpate.core import PalpateError
 from palpate.diffusion.autoencoder import load_autoencoder, to_bytes
 from palpate.diffusion.presets import PAPER, TINY
-from palpate.encoders.preprocess import to_unit
+from palpate.encoders.models import to_unit
 
 
 def small_vq(**options):

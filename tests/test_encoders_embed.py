@@ -8,11 +8,12 @@ import torch
 from PIL import Image
 
 from palpate.core import PalpateError, ProblemsError
+from palpate.data.images import Preprocess
 from palpate.data.manifest import Manifest
 from palpate.encoders import embed as module
 from palpate.encoders.contrastive import new_clip
 from palpate.encoders.embed import embed, embed_images, embed_texts, texts_of
-from palpate.encoders.encoder_set import EncoderSet, Preprocess, new_tactile
+from palpate.encoders.encoder_set import EncoderSet, new_tactile
 from palpate.encoders.presets import preset_of
 from test_encoders_contrastive import make_world
 
@@ -90,7 +91,7 @@ def test_second_call_computes_nothing(world, encoders, encoder, tmp_path, count,
     first = embed(world, encoders, encoder, cache=tmp_path / "cache")
     assert sum(count) == (4 if encoder == "text" else 12)  # equal texts are computed once
     count.clear()
-    monkeypatch.setattr(module, "load_frames", None)  # nor is an image decoded
+    monkeypatch.setattr(module, "load_images", None)  # nor is an image decoded
     again = embed(world, encoders, encoder, cache=tmp_path / "cache")
     assert count == []
     assert np.array_equal(again.features, first.features)

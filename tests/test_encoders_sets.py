@@ -14,12 +14,12 @@ from transformers import AutoTokenizer, CLIPModel
 
 from forge.pictures import photos
 from palpate.core import PalpateError
+from palpate.data.images import CLIP_MEAN, CLIP_STD, Preprocess
 from palpate.encoders import encoder_set as module
 from palpate.encoders.contrastive import new_clip
 from palpate.encoders.embed import embed_images, embed_texts
-from palpate.encoders.encoder_set import EncoderSet, Preprocess, load_clip, new_tactile, tokens
-from palpate.encoders.models import pick_device
-from palpate.encoders.preprocess import CLIP_MEAN, CLIP_STD, to_unit
+from palpate.encoders.encoder_set import EncoderSet, load_clip, new_tactile, tokens
+from palpate.encoders.models import pick_device, to_unit
 from palpate.encoders.presets import Augment, preset_of
 from palpate.encoders.rows import augmented, draw
 from palpate.encoders.tokenizer import train_tokenizer

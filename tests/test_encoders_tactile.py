@@ -16,10 +16,10 @@ from forge.errors import Bomb
 from forge.worlds import by_video
 from palpate import probe, score
 from palpate.core import PalpateError
+from palpate.data.images import cached_images
 from palpate.data.manifest import Manifest
 from palpate.encoders import Encoder, EncoderSet, train_encoder
 from palpate.encoders.embed import embed
-from palpate.encoders.preprocess import prepared_images
 from palpate.encoders.presets import preset_of
 from palpate.encoders.tactile import load_tactile
 
@@ -391,11 +391,11 @@ def test_an_encoder_trains_on_whole_turned_images(tmp_path, digits):
     made = encoders.preprocess("tactile")
     assert (made.fitting, made.turn) == ("pad", "left")
     train = digits.part(split, "train")
-    pixels = prepared_images(train, "tactile", made)
+    pixels = cached_images(train, "tactile", made)
     for row, path in zip(pixels, train.paths("tactile"), strict=True):
         assert np.array_equal(row, made.prepare(Image.open(path)))
     assert np.allclose(made.mean, pixels.mean(axis=(0, 1, 2)) / 255, atol=1e-5)
-    cached = prepared_images(train, "tactile", made, tmp_path / "cache")
+    cached = cached_images(train, "tactile", made, tmp_path / "cache")
     assert np.array_equal(cached, pixels)
     again = EncoderSet.load(tmp_path / "e")
     assert again.preprocess("tactile") == made

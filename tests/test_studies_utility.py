@@ -239,7 +239,7 @@ def test_an_encoder_that_saw_test_videos_is_rejected(tmp_path):
     # A test video a class: nothing is left to train its own material on, so no "Ours alone".
     assert {*cells(table)} == {REAL, f"{REAL} + Ours", "gain by Ours"}
     assert cells(table)[REAL][0].split == split.digest
-    from palpate.encoders.preprocess import digest_images
+    from palpate.encoders.models import digest_images
 
     pixels = np.stack([np.asarray(Image.open(p)) for p in manifest.paths("tactile")])
     encoders.seen["tactile"] = np.unique(digest_images(encoders.preprocess("tactile").fit(pixels)))

@@ -16,9 +16,9 @@ from transformers import CLIPConfig, CLIPModel
 
 from forge.worlds import by_video
 from palpate.cli import main
+from palpate.data.images import Preprocess
 from palpate.encoders.contrastive import new_clip, plan_encoder, train_tactile
 from palpate.encoders.encoder_set import EncoderSet, new_tactile
-from palpate.encoders.preprocess import Preprocess
 from palpate.encoders.presets import preset_of
 from palpate.encoders.tokenizer import train_tokenizer
 from palpate.training.estimate import estimate

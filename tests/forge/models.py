@@ -16,6 +16,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import conv2d, group_norm, interpolate, pad, silu
 
+from palpate.data.images import Preprocess
 from palpate.diffusion.autoencoder import LatentStats
 from palpate.diffusion.autoencoder_training import build_autoencoder
 from palpate.diffusion.denoiser import Denoiser
@@ -25,7 +26,7 @@ from palpate.diffusion.presets import TINY
 from palpate.diffusion.unet import build_unet
 from palpate.encoders import models
 from palpate.encoders.contrastive import new_clip
-from palpate.encoders.encoder_set import EncoderSet, Preprocess, new_tactile
+from palpate.encoders.encoder_set import EncoderSet, new_tactile
 from palpate.encoders.presets import TINY as TINY_ENCODERS
 from palpate.training.cards import write_model_cards
 

@@ -3,23 +3,30 @@
 Everything that Pillow reads becomes 8-bit RGB by fixed rules: EXIF orientation is applied; 16-bit
 gray ``v`` becomes ``(v + 128) // 257``, so that 65535 is 255; transparency is laid over white; of
 an animation the first image counts. A batch for a network is the center square, resized by Pillow's
-antialiased bicubic filter. No step depends on the content of other images: the range is never
-stretched.
+antialiased bicubic filter, or what a :class:`Preprocess` says: an image is turned, fitted to the
+encoder's shape (the center of it, the whole of it between black borders, or squashed), and resized;
+for some encoders the sensor's image without contact is subtracted first, and an earlier frame of
+the video follows in three further channels. What results is 8-bit and may be cached; then comes
+``(x / 255 - mean) / std`` per channel. No step depends on the content of other images: the range is
+never stretched.
 """
 
 from __future__ import annotations
 
+import math
 import os
 import struct
 import zlib
-from collections.abc import Callable, Collection, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import suppress
+from dataclasses import KW_ONLY, asdict, dataclass, replace
+from functools import lru_cache
 from itertools import islice
 from pathlib import Path
 from queue import SimpleQueue
 from threading import Event
-from typing import TYPE_CHECKING, BinaryIO, Literal, TypeVar
+from typing import TYPE_CHECKING, Any, BinaryIO, Literal, NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -34,11 +41,14 @@ from palpate.core import (
     digest_file,
     digest_json,
     quiet,
+    read_record,
     require,
     short,
 )
 
 if TYPE_CHECKING:
+    from torch import Tensor
+
     from palpate.data.manifest import Manifest
 
 Check = Literal["decode", "header", "none"]
@@ -51,6 +61,19 @@ BROKEN = (OSError, SyntaxError, ValueError, EOFError, IndexError, TypeError, *_C
 REFETCH = "Fetch these files again, or skip the bad ones with: palpate import"
 #: Pixels of the largest image that is decoded: some twenty bytes each while it becomes RGB.
 LARGEST = 50_000_000
+#: What an image processor may have of these.
+CHOICES = {
+    "fitting": ("crop", "pad", "squash"),
+    "turn": ("none", "left", "portrait"),
+    "resample": (3, 0, 1, 2, 4, 5),
+}
+CLIP_MEAN = (0.48145466, 0.4578275, 0.40821073)
+CLIP_STD = (0.26862954, 0.26130258, 0.27577711)
+#: A square before the crop is at most so many times what the encoder sees.
+MOST_TIMES = 16
+SAVE_AGAIN = "Save the encoders again"
+#: What an image is prepared from: itself, the sensor's no-contact image, an earlier frame.
+Frame = tuple[Path | Image.Image, Path | None, Path | None]
 T = TypeVar("T")
 R = TypeVar("R")
 
@@ -122,35 +145,255 @@ def form_of(source: Path | BinaryIO, check: Check) -> str:
         return str(image.format)
 
 
+class Frames(NamedTuple):
+    """The files of samples, and the names of their sensors ('' if unknown)."""
+
+    files: list[Frame]
+    sensors: list[str]
+
+    @classmethod
+    def alone(cls, images: Sequence[Path | Image.Image]) -> Frames:
+        """Images without further ones, of unknown sensors."""
+        return cls([(image, None, None) for image in images], [""] * len(images))
+
+    def stamps(self, root: Path) -> list[object]:
+        """What changes with the no-contact images, the earlier frames and the sensors."""
+        more = {path for _, *further in self.files for path in further if path is not None}
+        stamp = {path: [os.path.relpath(path, root), *file_stamp(path)] for path in more}
+        return [[[path and stamp[path] for path in more] for _, *more in self.files], self.sensors]
+
+
+@dataclass(frozen=True)
+class Preprocess:
+    """How one encoder prepares its images, in training and in evaluation.
+
+    Attributes:
+        size: side of what the encoder sees, in pixels; its width if ``height`` is given.
+        resize: side of the square before the center crop, in pixels (``size`` for CLIP).
+        mean, std: per channel, of values in [0, 1].
+        fitting: ``crop`` takes the center, ``pad`` the whole between black borders, ``squash`` the
+            whole, whatever its aspect.
+        resample: Pillow's number of the filter: 3 bicubic, 2 bilinear.
+        turn: ``left`` turns by 90 degrees counterclockwise, ``portrait`` turns images that are
+            wider than high clockwise.
+        height: in pixels, of encoders that see no square.
+        subtract: words in the names of sensors whose no-contact image is subtracted: 127 + image -
+            no-contact image, cut to 0..255; ('',) is all sensors.
+        lag: frames between the image and the earlier one whose channels follow; 0: none.
+    """
+
+    size: int
+    resize: int
+    mean: tuple[float, ...] = CLIP_MEAN
+    std: tuple[float, ...] = CLIP_STD
+    _: KW_ONLY
+    fitting: Literal["crop", "pad", "squash"] = "crop"
+    resample: int = 3
+    turn: Literal["none", "left", "portrait"] = "none"
+    height: int | None = None
+    subtract: tuple[str, ...] = ()
+    lag: int = 0
+
+    @classmethod
+    def from_config(cls, path: Path, size: int | None) -> Preprocess:
+        """Read a ``preprocessor_config.json`` of transformers, in old or new spelling.
+
+        Args:
+            path: the file; CLIP's constants are the defaults of its entries.
+            size: the encoder's image side, which the crop must agree with; None: any.
+
+        Raises:
+            PalpateError: if the crop has another size than the encoder, or an entry is malformed.
+        """
+        config = read_record(path, "image processor")
+        try:
+            crop = _side(config.get("crop_size"), size or 224)
+            resize = _side(config.get("size"), crop)
+            if (patches := config.get("max_num_patches")) is not None:  # SigLIP 2 of any aspect
+                resize = crop = round(int(patches) ** 0.5) * int(config["patch_size"])
+            mean, std = config.get("image_mean") or CLIP_MEAN, config.get("image_std") or CLIP_STD
+            (r, g, b), (sr, sg, sb) = map(float, mean), map(float, std)
+            squash = isinstance(config.get("size"), Mapping) and "height" in config["size"]
+            squash = squash or patches is not None
+            shape: dict[str, Any] = {"fitting": "squash" if squash else "crop", "turn": "none"}
+            shape |= {"resample": 3 if config.get("resample") is None else config["resample"]}
+            shape |= config.get("palpate") or {}
+            bad = [f"{k} {shape[k]!r}" for k, choices in CHOICES.items() if shape[k] not in choices]
+            bad += shape.keys() - CHOICES.keys()
+            bad += [f"std {v}" for v in (sr, sg, sb) if not 1e-6 < v < math.inf]
+            bad += [f"mean {v}" for v in (r, g, b) if not math.isfinite(v)]
+            if bad:
+                raise ValueError(", ".join(bad))
+        except (AttributeError, KeyError, TypeError, ValueError) as error:
+            must = f"Size, crop and statistics in {path} must be those of an image processor"
+            raise PalpateError(must, str(error), SAVE_AGAIN) from None
+        if not config.get("do_center_crop", "crop_size" in config or not squash):
+            crop = resize
+        side = size or crop
+        fits = crop == side and 0 < side <= resize <= MOST_TIMES * side
+        must, fix = f"{path} must give the encoder's {side} px", "Set size and crop_size to that"
+        require(fits, None, must, f"{crop} px from {resize} px", fix=fix)
+        if not config.get("do_normalize", True):
+            (r, g, b), (sr, sg, sb) = (0.0,) * 3, (1.0,) * 3
+        return cls(
+            side,
+            resize,
+            (r, g, b),
+            (sr, sg, sb),
+            fitting=shape["fitting"],
+            turn=shape["turn"],
+            resample=shape["resample"],
+        )
+
+    def to_config(self) -> dict[str, Any]:
+        """The same as a ``preprocessor_config.json`` for transformers' ``CLIPImageProcessor``."""
+        return {
+            "image_processor_type": "CLIPImageProcessor",
+            "do_convert_rgb": True,
+            "do_resize": True,
+            "size": {"shortest_edge": self.resize},
+            "resample": self.resample,
+            "do_center_crop": True,
+            "crop_size": {"height": self.size, "width": self.size},
+            "do_rescale": True,
+            "rescale_factor": 1 / 255,
+            "do_normalize": True,
+            "image_mean": list(self.mean),
+            "image_std": list(self.std),
+            "palpate": {name: getattr(self, name) for name in ("fitting", "turn")},
+        }
+
+    @property
+    def plain(self) -> bool:
+        """Whether the center square is all, as :func:`palpate.data.images.square` cuts it."""
+        return replace(self, mean=CLIP_MEAN, std=CLIP_STD) == Preprocess(self.size, self.resize)
+
+    @property
+    def shape(self) -> tuple[int, int, int]:
+        """Height, width and channels of what :meth:`prepare` gives."""
+        return self.height or self.resize, self.resize, 6 if self.lag else 3
+
+    def prepare(
+        self,
+        image: Image.Image,
+        background: Image.Image | None = None,
+        previous: Image.Image | None = None,
+    ) -> NDArray[np.uint8]:
+        """One RGB image as 8-bit (height, width, channels).
+
+        Args:
+            image: the image.
+            background: of the sensor without contact, to be subtracted.
+            previous: the earlier frame; None takes the image twice where there must be one.
+        """
+        frames = [image, previous or image] if self.lag else [image]
+        fitted = [self._fitted(_minus(frame, background)) for frame in frames]
+        return np.concatenate(fitted, axis=2)
+
+    def _fitted(self, image: Image.Image) -> NDArray[np.uint8]:
+        if self.turn == "left" or (self.turn == "portrait" and image.width > image.height):
+            left = self.turn == "left"
+            turn = Image.Transpose.ROTATE_90 if left else Image.Transpose.ROTATE_270
+            image = image.transpose(turn)
+        (width, height), (rows, columns, _) = image.size, self.shape
+        if self.fitting == "pad":
+            side = max(width, height)
+            canvas = Image.new("RGB", (side, side))
+            canvas.paste(image, ((side - width) // 2, (side - height) // 2))
+            image = canvas
+        elif self.fitting == "crop":
+            w = min(width, round(height * columns / rows))
+            h = min(height, round(width * rows / columns))
+            left, top = (width - w) // 2, (height - h) // 2
+            image = image.crop((left, top, left + w, top + h))
+        return np.asarray(image.resize((columns, rows), Image.Resampling(self.resample)))
+
+    def fit(self, images: NDArray[np.uint8]) -> NDArray[np.uint8]:
+        """Images (n, h, w, 3) as :meth:`prepare` gives them; those that are so stay."""
+        if self.plain and images.shape[1:3] == self.shape[:2]:
+            return images
+        fitted = [self.prepare(Image.fromarray(image)) for image in images]
+        return np.stack(fitted) if fitted else images.reshape(0, *self.shape)
+
+    def frames(self, manifest: Manifest, column: str, *, still: bool = False) -> Frames:
+        """The files that samples are prepared from; ``still`` takes no earlier frames.
+
+        Raises:
+            PalpateError: if a sample lacks its image, or the no-contact image of its sensor.
+        """
+        paths, names = manifest.paths(column), manifest.column("sensor")
+        positions = list(zip(manifest.column("video"), manifest.column("frame"), strict=True))
+        at = dict(zip(positions, paths, strict=True)) if self.lag and not still else {}
+        sensors = [(name or "").lower() for name in names]
+        fix = "Fill the column background: palpate background"
+        files: list[Frame] = []
+        for k, (path, gel) in enumerate(zip(paths, manifest.column("background"), strict=True)):
+            need = column == "tactile" and any(word in sensors[k] for word in self.subtract)
+            must = f"The encoder subtracts the no-contact image of {names[k] or 'every sensor'}"
+            require(not need or gel is not None, None, must, f"none for {path.name}", fix=fix)
+            video, frame = positions[k]
+            before = None
+            if video is not None and frame is not None:
+                before = at.get((video, frame - self.lag))
+            files.append((path, manifest.path(gel) if need and gel is not None else None, before))
+        return Frames(files, sensors)
+
+    def normalize(self, unit: Tensor) -> Tensor:
+        """``(x - mean) / std`` for x in [0, 1], (b, channels, h, w)."""
+        times = unit.shape[1] // len(self.mean)
+        mean, std = (unit.new_tensor(v * times).view(1, -1, 1, 1) for v in (self.mean, self.std))
+        return (unit - mean) / std
+
+    def __call__(self, unit: Tensor) -> Tensor:
+        """Center crop and normalization of prepared images in [0, 1], (b, channels, h, w)."""
+        edge = 0 if self.height else (self.resize - self.size) // 2
+        rows = self.height or self.size
+        return self.normalize(unit[..., edge : edge + rows, edge : edge + self.size])
+
+
 def load_images(
-    paths: Sequence[Path],
-    size: int,
+    files: Sequence[Path | Image.Image | Frame],
+    shape: int | Preprocess,
     *,
     progress: Progress = quiet,
     into: NDArray[np.uint8] | None = None,
 ) -> NDArray[np.uint8]:
-    """Load images as one array; a path that occurs twice is decoded once.
+    """Load and prepare images as one array; files that occur twice are decoded once.
+
+    Args:
+        files: images, or each with what else it is prepared from.
+        shape: side of center squares in pixels, or how the images are prepared.
+        progress: progress callback.
+        into: (n, height, width, channels), to be filled.
 
     Returns:
-        (n, size, size, 3), 0 to 255: ``into``, or a new array.
+        (n, height, width, channels), 0 to 255: ``into``, or a new array.
 
     Raises:
         ProblemsError: naming every unreadable file.
     """
-    images = np.empty((len(paths), size, size, 3), np.uint8) if into is None else into
-    rows: dict[Path, list[int]] = {}
-    for k, path in enumerate(paths):
-        rows.setdefault(Path(path), []).append(k)
+    preprocess = shape if isinstance(shape, Preprocess) else Preprocess(shape, shape)
+    images = np.empty((len(files), *preprocess.shape), np.uint8) if into is None else into
+    frames = [file if isinstance(file, tuple) else (file, None, None) for file in files]
+    rows: dict[object, list[int]] = {}
+    for k, frame in enumerate(frames):
+        rows.setdefault(frame if isinstance(frame[0], Path) else k, []).append(k)
+    background = lru_cache(64)(read_image)  # many samples share one
 
-    def decode(path: Path) -> str | None:
+    def decode(at: list[int]) -> Problem | None:
+        image, gel, before = frames[at[0]]
+        file: object = image
         try:
-            images[rows[path]] = square(read_image(path), size)
+            image = read_image(image) if isinstance(image, Path) else image
+            empty = background(file := gel) if gel else None
+            previous = read_image(file := before) if before else None
+            images[at] = preprocess.prepare(image, empty, previous)
         except PalpateError as error:
-            return error.got
+            return Problem(str(file), "bad-image", error.got)
         return None
 
-    decoded = in_threads(decode, rows, "decoding images", progress)
-    problems = [Problem(str(path), "bad-image", reason) for path, reason in decoded if reason]
+    decoded = in_threads(decode, [*rows.values()], "decoding images", progress)
+    problems = [problem for _, problem in decoded if problem]
     if problems:
         raise ProblemsError(sorted(problems, key=lambda p: p.where), REFETCH)
     return images
@@ -159,7 +402,7 @@ def load_images(
 def cached_images(
     manifest: Manifest,
     column: str,
-    size: int,
+    shape: int | Preprocess,
     cache: Path | None = None,
     progress: Progress = quiet,
 ) -> NDArray[np.uint8]:
@@ -168,30 +411,32 @@ def cached_images(
     Args:
         manifest: the samples.
         column: ``vision``, ``tactile`` or ``background``.
-        size: side of the squares, in pixels.
+        shape: as of :func:`load_images`.
         cache: folder for ``<column>-<size>-<digest>.npy``; None keeps the array in memory. The
-            digest covers paths, file sizes, modification times, ``size`` and ``column``, so a
-            changed file is decoded again.
+            digest covers paths, file sizes, modification times, ``column`` and how the images are
+            prepared, so a changed file is decoded again.
         progress: progress callback.
 
     Returns:
-        (n, size, size, 3), 0 to 255, in row order; read-only if it is mapped.
+        (n, height, width, channels), 0 to 255, in row order; read-only if it is mapped.
 
     Raises:
-        PalpateError: if a row has no such image.
+        PalpateError: if a row has no such image, or lacks the no-contact image of its sensor.
         ProblemsError: naming every missing or unreadable file.
     """
-    paths = manifest.paths(column)
+    preprocess = shape if isinstance(shape, Preprocess) else Preprocess(shape, shape)
+    frames = preprocess.frames(manifest, column)
     if cache is None:
-        return load_images(paths, size, progress=progress)
-    key = short(digest_json([2, size, image_stamp(manifest, column)]))
+        return load_images(frames.files, preprocess, progress=progress)
+    geometry = asdict(replace(preprocess, mean=CLIP_MEAN, std=CLIP_STD))
+    stamps = [] if preprocess.plain else frames.stamps(manifest.root)
+    key = short(digest_json([geometry, image_stamp(manifest, column), stamps]))
 
     def fill(images: NDArray[np.uint8]) -> None:
-        load_images(paths, size, progress=progress, into=images)
+        load_images(frames.files, preprocess, progress=progress, into=images)
 
-    return mapped_images(
-        Path(cache) / f"{column}-{size}-{key}.npy", (len(paths), size, size, 3), fill
-    )
+    file = Path(cache) / f"{column}-{preprocess.resize}-{key}.npy"
+    return mapped_images(file, (len(manifest), *preprocess.shape), fill)
 
 
 def mapped_images(
@@ -324,3 +569,20 @@ def _reason(path: Path, error: BaseException) -> str:
     if isinstance(error, Image.UnidentifiedImageError):
         return "not an image"
     return str(error).replace(str(path), path.name) or type(error).__name__
+
+
+def _minus(image: Image.Image, background: Image.Image | None) -> Image.Image:
+    """127 + image - background, cut to 0..255."""
+    if background is None:
+        return image
+    if background.size != image.size:
+        background = background.resize(image.size, Image.Resampling.BICUBIC)
+    difference = np.asarray(image, np.int16) - np.asarray(background, np.int16) + 127
+    return Image.fromarray(difference.clip(0, 255).astype(np.uint8))
+
+
+def _side(value: Any, default: int) -> int:
+    """A side in pixels from a number, ``{"shortest_edge": s}`` or ``{"height": s, "width": s}``."""
+    if isinstance(value, Mapping):
+        value = value.get("shortest_edge", value.get("height"))
+    return default if value is None else int(value)

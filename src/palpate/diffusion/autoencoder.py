@@ -54,8 +54,8 @@ from palpate.encoders.models import (
     round_to_half,
     save_model,
     stated,
+    to_unit,
 )
-from palpate.encoders.preprocess import to_unit
 from palpate.training.cards import write_model_cards
 
 FORMAT = "palpate-autoencoder/1"

@@ -22,8 +22,7 @@ from palpate.diffusion.gels import gels_of
 from palpate.diffusion.options import ConditionPolicy
 from palpate.encoders.embed import embed, exact
 from palpate.encoders.encoder_set import EncoderSet
-from palpate.encoders.models import digest_tensors
-from palpate.encoders.preprocess import prepared_images, to_unit
+from palpate.encoders.models import digest_tensors, to_unit
 from palpate.training.run import TrainingRun
 
 CACHE_FORMAT = "palpate-latents/1"
@@ -138,7 +137,7 @@ def encode_patches(
         float16 (n, count, width).
     """
     preprocess = encoders.preprocess("vision")
-    images = prepared_images(part, "vision", preprocess, folder)
+    images = cached_images(part, "vision", preprocess, folder)
 
     def code(rows: slice) -> NDArray[np.float16]:
         with exact():

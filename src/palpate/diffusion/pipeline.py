@@ -22,7 +22,7 @@ from PIL import Image
 from torch import Tensor, nn
 
 from palpate.core import PalpateError, digest_json, read_record, require, rng_for
-from palpate.data.images import read_image, square
+from palpate.data.images import Preprocess, load_images, read_image, square
 from palpate.diffusion.autoencoder import (
     AnyAutoencoder,
     Autoencoder,
@@ -41,7 +41,7 @@ from palpate.diffusion.denoiser import (
 )
 from palpate.diffusion.options import ConditionPolicy, SamplerOptions, Schedule
 from palpate.diffusion.saving import FORMAT, KEYS, write_pipeline
-from palpate.encoders.embed import embed_texts
+from palpate.encoders.embed import embed_texts, list_images
 from palpate.encoders.encoder_set import EncoderSet, load_clip
 from palpate.encoders.models import (
     FIX_MODEL,
@@ -50,8 +50,8 @@ from palpate.encoders.models import (
     digest_tensors,
     find_model,
     pick_device,
+    to_unit,
 )
-from palpate.encoders.preprocess import Preprocess, list_images, squares, to_unit
 from palpate.training.cards import write_model_cards
 
 COPY_AGAIN = "Copy the whole folder again"
@@ -193,10 +193,10 @@ class TactilePipeline(DiffusionPipeline):
         sampler = self.sampler_with(guidance=guidance, steps=steps)
         if len(ids) == 1:  # not among the copies that fill a batch: a fraction of the time
             sampler = replace(sampler, batch=1)
-        ground = None if gel is None else squares(list_images(gel), self.size)
+        ground = None if gel is None else load_images(list_images(gel), self.size)
         if ground is not None and len(ground) == 1:
             ground = np.broadcast_to(ground, (len(ids), *ground.shape[1:]))
-        embedded = self.embed(squares(images, self.vision_size)) if images else None
+        embedded = self.embed(load_images(images, self.vision_size)) if images else None
         words = None if text is None else self.embed_text(text)
         noise = None if generator is None else self._noise(generator, len(ids))
         self.scheduler.set_timesteps(sampler.steps)

@@ -28,13 +28,12 @@ from transformers import CLIPModel, CLIPVisionModelWithProjection
 
 from palpate._version import __version__
 from palpate.core import Progress, Split, digest_json, digest_lines, fields_of, quiet, require
-from palpate.data.images import image_stamp
+from palpate.data.images import CLIP_MEAN, CLIP_STD, Preprocess, cached_images, image_stamp
 from palpate.data.manifest import Manifest
 from palpate.data.reading import load
 from palpate.encoders.embed import embed, texts_of
 from palpate.encoders.encoder_set import (
     EncoderSet,
-    Preprocess,
     encode_tactile,
     encode_text,
     encode_vision,
@@ -50,8 +49,7 @@ from palpate.encoders.losses import (
     text_targets,
     three_way,
 )
-from palpate.encoders.models import digest_tensors, pick_device
-from palpate.encoders.preprocess import CLIP_MEAN, CLIP_STD, digest_images, prepared_images, union
+from palpate.encoders.models import digest_images, digest_tensors, pick_device, union
 from palpate.encoders.presets import Course, EncoderPreset, Targets, preset_of
 from palpate.encoders.rows import (
     Rows,
@@ -398,7 +396,7 @@ def train_clip(
         Preprocess(preset.image, preset.image) if start is None else start.preprocess("vision")
     )
     with first_alone():
-        images = prepared_images(pictured, side, geometry, run.cache, run.progress)
+        images = cached_images(pictured, side, geometry, run.cache, run.progress)
     if start is None:
         clip = new_clip(preset, texts, run.seed, _with_statistics(preset, images, geometry))
         clip.clip.requires_grad_(True)

@@ -15,9 +15,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from PIL import Image
 
 from palpate.core import (
     FeatureSet,
+    PalpateError,
     Problem,
     ProblemsError,
     Progress,
@@ -28,9 +30,9 @@ from palpate.core import (
     short,
 )
 from palpate.data.captions import NAMED, caption
-from palpate.data.images import REFETCH, image_stamp
+from palpate.data.images import REFETCH, SUFFIXES, Frames, image_stamp, load_images
 from palpate.encoders.encoder_set import MODALITIES, EncoderSet, Modality
-from palpate.encoders.preprocess import Frames, load_frames, to_unit
+from palpate.encoders.models import to_unit
 
 if TYPE_CHECKING:
     from palpate.data.manifest import Manifest
@@ -176,7 +178,7 @@ def embed_frames(
     preprocess, n = encoders.preprocess(modality), len(frames.files)
 
     def load(rows: slice) -> NDArray[np.uint8]:
-        return load_frames(frames.files[rows], preprocess)
+        return load_images(frames.files[rows], preprocess)
 
     return _embedded(
         n, load, encoders, modality, batch=batch, progress=progress, sensors=frames.sensors
@@ -231,3 +233,41 @@ def _cached(file: Path) -> FeatureSet | None:
         return FeatureSet.load(file)
     except Exception:  # of a damaged file NumPy, zipfile and zlib raise many kinds
         return None
+
+
+def list_images(inputs: Any) -> list[Path | Image.Image]:
+    """Images in any form that :meth:`Encoder.encode` takes, as a list of files and PIL images.
+
+    Raises:
+        PalpateError: for arrays of another type or shape, a missing path, or other objects.
+    """
+    if isinstance(inputs, str | Path):
+        path = Path(inputs)
+        if not path.is_dir():
+            return [path]
+        files = (p for p in path.rglob("*") if p.suffix.lower() in SUFFIXES and p.is_file())
+        return [*sorted(files)]
+    if isinstance(inputs, Image.Image):
+        return [inputs.convert("RGB")]
+    if hasattr(inputs, "shape"):
+        return [Image.fromarray(image) for image in _bytes(inputs)]
+    if isinstance(inputs, Sequence):
+        return [image for entry in inputs for image in list_images(entry)]
+    must, fix = "must be files, PIL images, arrays or tensors", "Pass e.g. a list of files"
+    raise PalpateError(must, type(inputs).__name__, fix, argument="images")
+
+
+def _bytes(images: Any) -> NDArray[np.uint8]:
+    """An array or tensor as uint8 (n, h, w, 3)."""
+    array = np.asarray(images.detach().cpu() if hasattr(images, "detach") else images)
+    shape = array.shape
+    array = array[None] if array.ndim == 3 else array
+    if hasattr(images, "detach") and array.ndim == 4 and array.shape[1] == 3:
+        array = array.transpose(0, 2, 3, 1)
+        if array.dtype.kind == "f" and array.size and array.min() >= 0 and array.max() <= 1:
+            array = np.rint(array * 255).astype(np.uint8)
+    rgb = array.ndim == 4 and array.shape[3] == 3 and array.dtype == np.uint8
+    must = "must be uint8 (n, h, w, 3), or a tensor (n, 3, h, w) in [0, 1]"
+    got = f"{array.dtype} of shape {shape}"
+    require(rgb, "images", must, got, fix="Scale to 0..255 and round")
+    return np.ascontiguousarray(array)

@@ -10,11 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from palpate.core import Progress, quiet, require_choice
+from palpate.data.images import Frames, Preprocess
 from palpate.data.manifest import Manifest
-from palpate.encoders.embed import embed, embed_frames, embed_texts
+from palpate.encoders.embed import embed, embed_frames, embed_texts, list_images
 from palpate.encoders.encoder_set import EncoderSet, Modality
 from palpate.encoders.models import pick_device
-from palpate.encoders.preprocess import Frames, Preprocess, list_images
 
 
 @dataclass(frozen=True)

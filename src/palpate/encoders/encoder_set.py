@@ -1,6 +1,6 @@
 """The encoders of one space: frozen vision and text, and a tactile encoder (paper section 3).
 
-Images are prepared by :class:`~palpate.encoders.preprocess.Preprocess`: center square, antialiased
+Images are prepared by :class:`~palpate.data.images.Preprocess`: center square, antialiased
 bicubic to ``resize``, center crop to ``size``, then ``(x / 255 - mean) / std`` per channel, as in
 CLIP's ``preprocessor_config.json``.
 
@@ -53,32 +53,27 @@ from palpate.core import (
     require,
     write_json,
 )
+from palpate.data.images import SAVE_AGAIN, Frames, Preprocess, load_images
 from palpate.encoders.models import (
+    FETCH_AGAIN,
+    Digests,
     Origin,
     architecture,
+    digest_images,
     digest_modules,
     find_encoder,
     find_single,
     first_line,
     is_shipped,
     load_model,
+    load_seen,
     parts_of,
     pick_device,
     round_to_half,
     save_model,
+    save_seen,
     silent,
     stated,
-)
-from palpate.encoders.preprocess import (
-    FETCH_AGAIN,
-    SAVE_AGAIN,
-    Digests,
-    Frames,
-    Preprocess,
-    digest_images,
-    load_frames,
-    load_seen,
-    save_seen,
 )
 from palpate.encoders.tactile import TactileModule, load_tactile
 from palpate.encoders.tokenizer import save_tokenizer
@@ -275,7 +270,7 @@ class EncoderSet:
         for start in range(0, len(seen), batch):
             rows = slice(start, start + batch)
             seen[rows] = np.isin(
-                digest_images(load_frames(frames.files[rows], preprocess)), digests
+                digest_images(load_images(frames.files[rows], preprocess)), digests
             )
             progress("looking for known images", min(start + batch, len(seen)), len(seen))
         return seen

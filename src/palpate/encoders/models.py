@@ -14,6 +14,11 @@ Weights may be saved in 16 bits. They are rounded in the model first, so that wh
 digested is what is written: IEEE 754 half precision has 11 significant bits, so a weight of normal
 size changes by at most 2^-11 = 4.9e-4 of itself; from 65,520 on there is only infinity. Everything
 is computed in 32 bits.
+
+The images that a model was trained on are known by their prepared 8-bit pixels: a digest is the
+first eight bytes of their SHA-256. Names play no part, as two data sets may both have a
+``0001.jpg``. 100,000 digests take 800 kB; that any of 100,000 other images has one of them by
+chance has the probability 100,000^2 / 2^64 = 5e-10.
 """
 
 from __future__ import annotations
@@ -31,7 +36,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 from zipfile import is_zipfile
 
+import numpy as np
+from numpy.typing import NDArray
 from safetensors import SafetensorError
+from safetensors.numpy import load_file, save_file
 
 from palpate.core import PalpateError, require, require_regular
 from palpate.core.files import canonical_json
@@ -53,6 +61,11 @@ PARTS: dict[Part, str] = {
 PREFIX = "palpate/"
 FIX_MODEL = "Make one with: palpate train generator"
 FIX_ENCODERS = "Train one with: palpate train encoder"
+FETCH_AGAIN = "Fetch the encoder again"
+#: Digests of images, (n,) uint64.
+Digests = NDArray[np.uint64]
+#: Their file in the folder of an encoder.
+SEEN = "seen.safetensors"
 HUB_ID = re.compile(r"[A-Za-z0-9][\w.-]*/[A-Za-z0-9][\w.-]*")
 #: Raised for an unreachable hub, absent files, foreign formats and pickled objects.
 UNREADABLE = (
@@ -253,7 +266,7 @@ def read_weights(path: Path, fix: str) -> dict[str, Tensor]:
         PalpateError: if it is unreadable, or holds more than weights.
     """
     import torch
-    from safetensors.torch import load_file
+    from safetensors import torch as safetensors_torch
 
     require_regular(path)
     must = f"{path} must hold weights and nothing else"
@@ -264,7 +277,7 @@ def read_weights(path: Path, fix: str) -> dict[str, Tensor]:
     safe: list[Any] = [argparse.Namespace, (argparse.Namespace, callback)]
     try:
         if path.suffix == ".safetensors":
-            return load_file(path)
+            return safetensors_torch.load_file(path)
         with path.open("rb") as file:
             head = file.read(2)
         if head != b"PK" and not head.startswith(b"\x80"):  # neither torch's archive nor a pickle
@@ -406,3 +419,54 @@ def silent() -> Generator[None]:
         logging.set_verbosity(level)
         if bars:
             logging.enable_progress_bar()
+
+
+def to_unit(
+    images: NDArray[np.uint8], device: torch.device | str = "cpu", *, signed: bool = False
+) -> Tensor:
+    """8-bit images (b, h, w, c) as float32 (b, c, h, w) in [0, 1], or in [-1, 1] if ``signed``."""
+    import torch
+
+    # np.array copies: a mapped cache is read-only, which torch warns about.
+    pixels = torch.from_numpy(np.array(images)).to(device).permute(0, 3, 1, 2).float()
+    return pixels / 127.5 - 1 if signed else pixels / 255
+
+
+def digest_images(images: NDArray[np.uint8]) -> Digests:
+    """Digests (n,) of images (n, h, w, c) in memory or in a mapped file, in their order."""
+    names = (hashlib.sha256(image.tobytes()).digest()[:8] for image in images)
+    return np.frombuffer(b"".join(names), np.uint64)
+
+
+def union(*sets: Digests | None) -> Digests:
+    """The sorted distinct digests of several sets; None is an empty one."""
+    return np.unique(np.concatenate([np.empty(0, np.uint64), *(s for s in sets if s is not None)]))
+
+
+def save_seen(seen: Digests | None, folder: Path) -> None:
+    """Write the digests into the folder of an encoder; None writes nothing."""
+    if seen is not None:
+        save_file({"digests": seen}, folder / SEEN)
+
+
+def load_seen(folder: Path, count: int | None) -> Digests | None:
+    """Read what :func:`save_seen` wrote.
+
+    Args:
+        folder: of the encoder.
+        count: how many there must be, by the card; None for a card without a count.
+
+    Raises:
+        PalpateError: if the file is missing, damaged, or holds another number.
+    """
+    if count is None:
+        return None
+    require_regular(folder / SEEN)
+    must = f"{folder / SEEN} must hold the digests of the {count:,} images of the training"
+    try:
+        seen = load_file(folder / SEEN)["digests"]
+    except (OSError, KeyError, SafetensorError) as error:
+        raise PalpateError(must, str(error), FETCH_AGAIN) from None
+    complete = len(seen) == count and seen.dtype == np.uint64
+    require(complete, None, must, f"{len(seen):,}", fix=FETCH_AGAIN)
+    return seen

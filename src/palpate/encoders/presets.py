@@ -17,7 +17,7 @@ from palpate.training.options import LoopOptions
 if TYPE_CHECKING:
     from transformers import CLIPConfig, CLIPVisionConfig
 
-    from palpate.encoders.preprocess import Preprocess
+    from palpate.data.images import Preprocess
 
 #: ``diagonal``: the paper's, every other row is a negative. ``identical-text``: rows with equal
 #: captions share the target mass of the two text pairs. ``soft-text``: TVL's target of the text
@@ -178,7 +178,7 @@ class EncoderPreset:
     @property
     def preprocess(self) -> Preprocess:
         """How tactile images are prepared; their statistics are the training part's."""
-        from palpate.encoders.preprocess import Preprocess
+        from palpate.data.images import Preprocess
 
         return Preprocess(self.image, self.image, fitting=self.fitting, turn=self.turn)
 

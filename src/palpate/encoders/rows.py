@@ -12,10 +12,10 @@ from torch import Tensor
 from torch.nn.functional import affine_grid, grid_sample
 
 from palpate.core import Progress, Split, quiet, require
+from palpate.data.images import Preprocess, cached_images
 from palpate.data.manifest import Manifest
 from palpate.encoders.embed import embed, texts_of
 from palpate.encoders.encoder_set import EncoderSet
-from palpate.encoders.preprocess import Preprocess, prepared_images
 from palpate.encoders.presets import Augment
 from palpate.training.engine import Batch
 from palpate.training.steps import Step
@@ -76,7 +76,7 @@ class Rows:
     ) -> None:
         """Decode the images, and embed photos and texts."""
         self.manifest = part
-        self.images = prepared_images(part, "tactile", preprocess, cache, progress)
+        self.images = cached_images(part, "tactile", preprocess, cache, progress)
         self.captions, self.text_source = texts_of(part)
         self.texts = numbers(self.captions)
         with_photo = torch.tensor([bool(v) for v in part.column("vision")])

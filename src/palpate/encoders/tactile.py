@@ -37,8 +37,8 @@ from torch.nn.functional import gelu, normalize, scaled_dot_product_attention
 from transformers import CLIPVisionConfig, CLIPVisionModel
 
 from palpate.core import PalpateError
+from palpate.data.images import Preprocess
 from palpate.encoders.models import Origin, read_weights
-from palpate.encoders.preprocess import Preprocess
 
 State = Mapping[str, Tensor]
 NON_COMMERCIAL = "CC-BY-NC-4.0"
