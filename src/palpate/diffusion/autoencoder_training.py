@@ -201,7 +201,16 @@ def fit_autoencoder(
     with seeded(run.seed, "autoencoder" if gels is None else "background autoencoder"):
         model = build_autoencoder(options) if start is None else copy.deepcopy(start)
     model.requires_grad_(True)
-    if isinstance(options, BackgroundOptions) and isinstance(model, BackgroundAutoencoder):
+    begin = None if start is None else start.digest
+
+    def stage(name: str, loss: VQLoss | GelLoss, loop: LoopOptions, folder: Path) -> None:
+        nn.Module.to(model, pick_device(run.device))
+        run_key = digest_json([key, asdict(options), run.seed, begin])
+        task = Task(name, len(images), loss.load, loss, run_key)
+        fit(model, task, loop, folder, compute=run.compute, progress=run.progress)
+
+    if isinstance(options, BackgroundOptions):
+        assert isinstance(model, BackgroundAutoencoder)
         assert gels is not None
         if start is None:
             model.measure(images, gels)
@@ -209,16 +218,6 @@ def fit_autoencoder(
         options = replace(
             options, channels=config["channels"], narrow=config["narrow"], wide=config["wide"]
         )
-    nn.Module.to(model, pick_device(run.device))
-    begin = None if start is None else start.digest
-    key = digest_json([key, asdict(options), run.seed, begin])
-
-    def stage(name: str, loss: VQLoss | GelLoss, loop: LoopOptions, folder: Path) -> None:
-        task = Task(name, len(images), loss.load, loss, key)
-        fit(model, task, loop, folder, compute=run.compute, progress=run.progress)
-
-    if isinstance(options, BackgroundOptions):
-        assert gels is not None
         with fields_of("autoencoder"):
             loop = LoopOptions(
                 options.steps,

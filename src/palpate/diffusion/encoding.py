@@ -16,7 +16,6 @@ from palpate.core import Progress, atomic_path, digest_json, quiet, read_json, s
 from palpate.data.images import cached_images, image_stamp
 from palpate.data.manifest import Manifest
 from palpate.diffusion.autoencoder import AnyAutoencoder, BackgroundAutoencoder
-from palpate.diffusion.denoiser import inputs_of
 from palpate.diffusion.denoiser_training import Rows
 from palpate.diffusion.gels import gels_of
 from palpate.diffusion.options import ConditionPolicy
@@ -70,11 +69,11 @@ def encode_part(
     if encoders is not None:
         for s in policy.modalities:
             conditions[s] = embed(part, encoders, s, cache=cache, progress=progress).features
-        if "patches" in inputs_of(policy):
+        if "patches" in policy.inputs:
             conditions["patches"] = encode_patches(
                 part, encoders, policy.patches, folder=folder, progress=progress
             )
-    if "photos" in inputs_of(policy):
+    if "photos" in policy.inputs:
         conditions["photos"] = cached_images(part, "vision", policy.photo_size, cache, progress)
 
     def code(pixels: NDArray[np.uint8], ground: NDArray[np.uint8] | None, name: str) -> Any:
