@@ -1,4 +1,6 @@
-"""Embeddings of a manifest: nothing is computed twice, nothing stale is used."""
+"""Embeddings of a manifest: nothing is computed twice, nothing stale is used; and `Encoder`, one
+encoder of a set, for images and texts in any form.
+"""
 
 import os
 
@@ -7,12 +9,14 @@ import pytest
 import torch
 from PIL import Image
 
+import palpate as pp
 from palpate.core import PalpateError, ProblemsError
 from palpate.data.images import Preprocess
 from palpate.data.manifest import Manifest
 from palpate.encoders import embed as module
 from palpate.encoders.contrastive import new_clip
 from palpate.encoders.embed import embed, embed_images, embed_texts, texts_of
+from palpate.encoders.encoder import Encoder
 from palpate.encoders.encoder_set import EncoderSet, new_tactile
 from palpate.encoders.presets import preset_of
 from test_encoders_contrastive import make_world
@@ -206,3 +210,77 @@ def test_embed_texts_in_any_order(encoders):
     result = embed_texts(texts, encoders, batch=2)
     assert np.array_equal(result[0], result[2])
     assert np.abs(result[[1]] - embed_texts(["rough and hard"], encoders)).max() < 1e-5
+
+
+# --- one encoder
+
+
+@pytest.fixture
+def files(tmp_path):
+    images = np.random.default_rng(0).integers(0, 256, (3, 16, 16, 3), dtype=np.uint8)
+    (folder := tmp_path / "files").mkdir()
+    for k, image in enumerate(images):
+        Image.fromarray(image).save(folder / f"{k}.png")
+    return folder, images
+
+
+@pytest.mark.parametrize("modality", ["vision", "tactile"])
+def test_images_in_any_form_give_the_same_embeddings(encoders, files, modality):
+    folder, images = files
+    encoder = Encoder(encoders, modality)
+    base = encoder.encode(images)
+    assert (base.shape, base.dtype, encoder.dim) == ((3, 8), np.float32, 8)
+    assert np.allclose(np.linalg.norm(base, axis=1), 1, atol=1e-6)
+    paths = sorted(folder.iterdir())
+    channels_first = torch.from_numpy(images).permute(0, 3, 1, 2)
+    rows = [{"id": p.stem, modality: p.name} for p in paths]
+    for form in (
+        folder,
+        str(folder),
+        paths,
+        list(map(str, paths)),
+        list(map(Image.open, paths)),
+        [paths[0], Image.open(paths[1]), images[2]],
+        torch.from_numpy(images),
+        channels_first,
+        channels_first / 255,
+        Manifest.from_rows(rows, folder),
+    ):
+        assert np.allclose(encoder.encode(form), base, atol=1e-6)
+    for one in (paths[1], images[1], Image.open(paths[1]), channels_first[1]):
+        assert np.allclose(encoder.encode(one), base[1:2], atol=1e-6)
+    assert np.allclose(encoder.encode(images, batch=2), base, atol=1e-5)
+    assert encoder.encode([]).shape == (0, 8)
+    assert encoder.digest == encoders.digest(modality)
+
+
+def test_texts(encoders):
+    encoder = Encoder(encoders, "text")
+    both = encoder.encode(["a rough wall", "a soft cloth"])
+    assert np.allclose(encoder.encode("a soft cloth"), both[1:], atol=1e-5)
+    with torch.no_grad():
+        assert np.allclose(both, encoders.encode("text", ["a rough wall", "a soft cloth"]))
+
+
+def test_the_shipped_encoder_by_the_door(files):
+    encoder = pp.Encoder.from_pretrained("palpate/mini", modality="tactile")
+    assert encoder.encode(files[1]).shape == (3, 128)
+    with pytest.raises(PalpateError, match=r"`modality` must be one of vision, text, tactile"):
+        pp.Encoder.from_pretrained("palpate/mini", modality="touch")
+    with pytest.raises(TypeError, match="modality"):
+        pp.Encoder.from_pretrained("palpate/mini")
+
+
+def test_other_inputs_are_refused(encoders, files):
+    encoder = Encoder(encoders, "tactile")
+    for inputs, message in (
+        (files[1] / 255.0, "`images` must be uint8"),
+        (files[1][..., 0], "`images` must be uint8"),
+        (torch.zeros(1, 3, 4, 4) + 2, "`images` must be uint8"),
+        ({"a": 1}, "`images` must be files, PIL images"),
+        (files[0] / "gone.png", "gone.png: "),
+    ):
+        with pytest.raises(PalpateError, match=message):
+            encoder.encode(inputs)
+    with pytest.raises(PalpateError, match=r"must be one of vision, text\."):
+        Encoder(encoders.without_tactile(), "tactile")
