@@ -21,9 +21,8 @@ from palpate.encoders.contrastive import new_clip, plan_encoder, train_tactile
 from palpate.encoders.encoder_set import EncoderSet, new_tactile
 from palpate.encoders.presets import preset_of
 from palpate.encoders.tokenizer import train_tokenizer
-from palpate.training.estimate import estimate
 from palpate.training.options import Compute, LoopOptions
-from palpate.training.run import TrainingRun
+from palpate.training.run import TrainingRun, estimate
 
 WORDS = ["rough, hard", "soft, warm", "smooth, cold"]
 MEMORY = 14e9  # of the largest: weights, gradient, moments, their copies for the checkpoint

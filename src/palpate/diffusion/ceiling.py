@@ -22,7 +22,7 @@ from palpate.data.images import cached_images
 from palpate.data.manifest import Manifest
 from palpate.diffusion.autoencoder import AnyAutoencoder, BackgroundAutoencoder
 from palpate.diffusion.gels import gels_of, has_gels
-from palpate.encoders.embed import embed_images
+from palpate.encoders.embed import embed_images, words_of
 from palpate.encoders.encoder_set import EncoderSet
 from palpate.encoders.models import pick_device
 from palpate.encoders.rows import evenly, with_cells
@@ -166,7 +166,7 @@ def _measured(  # noqa: PLR0917 - the arguments of measure_ceiling
         ground = None if ground is None else ground[~seen]
 
     def features(part: Manifest, pixels: NDArray[np.uint8]) -> FeatureSet:
-        labels, groups = _words(part.column("material")), _words(part.column("video"))
+        labels, groups = words_of(part, "material"), words_of(part, "video")
         rows = embed_images(pixels, judge, progress=progress)
         return FeatureSet(part.ids, rows, labels, groups, scores["judge"])
 
@@ -184,7 +184,3 @@ def _measured(  # noqa: PLR0917 - the arguments of measure_ceiling
             scores["accuracy_real"] = material_accuracy(fitted, real, probe=probe).value
             scores["accuracy"] = material_accuracy(fitted, ours, probe=probe).value
     return {name: value for name, value in scores.items() if value is not None}
-
-
-def _words(column: Sequence[Any]) -> list[str] | None:
-    return None if all(v is None for v in column) else ["" if v is None else str(v) for v in column]

@@ -188,8 +188,6 @@ class TactilePipeline(DiffusionPipeline):
         if ids is None:
             ids = [i.name if isinstance(i, Path) else str(k) for k, i in enumerate(images)]
             ids = ids if images else [str(text)]
-        if images:
-            _require_one_each(ids, len(images))
         sampler = self.sampler_with(guidance=guidance, steps=steps)
         if len(ids) == 1:  # not among the copies that fill a batch: a fraction of the time
             sampler = replace(sampler, batch=1)
@@ -258,7 +256,7 @@ class TactilePipeline(DiffusionPipeline):
             asdict(self.schedule),
             asdict(self.denoiser.policy),
             self.size,
-            *self._digests(),
+            *_digests(self.autoencoder, self.encoders),
             architecture(self.denoiser.unet.config),
             digest_tensors(weights),
             None if gel is None else digest_tensors({"gel": gel}),
@@ -413,8 +411,9 @@ class TactilePipeline(DiffusionPipeline):
         )
         if words is not None and len(words) == 1:
             words = words.expand(len(ids), *words.shape[1:])
-        for rows in (photos, words):
-            _require_one_each(ids, len(ids) if rows is None else len(rows))
+        for n in (len(rows) for rows in (photos, words) if rows is not None):
+            got, fix = f"{len(ids)} ids, {n} conditions", "Pass one row per id"
+            require(len(ids) == n, None, "Every id needs one condition", got, fix=fix)
         if background is None and self.gel is not None:
             background = np.broadcast_to(self.gel, (len(ids), *self.gel.shape))
         must = "must be given for a generator that sees the gel, and only for one"
@@ -496,7 +495,8 @@ class TactilePipeline(DiffusionPipeline):
         )
         require(self.other_scheduler is None, None, must, got, fix="Set it back")
         must = f"A pipeline that refers to {shared} must use its autoencoder and vision encoder"
-        same = shared is None or self._digests() == _digests(*_shared_parts(shared))
+        own = _digests(self.autoencoder, self.encoders)
+        same = shared is None or own == _digests(*_shared_parts(shared))
         require(same, None, must, "others", fix="Leave out shared, or train on these")
         write_pipeline(self, Path(folder), half=half, shared=shared)
 
@@ -515,9 +515,6 @@ class TactilePipeline(DiffusionPipeline):
         """Upload palpate's cards: before this call diffusers replaces them by a blank one."""
         write_model_cards(Path(working_dir))
         return super()._upload_folder(working_dir, *args, **options)
-
-    def _digests(self) -> tuple[str, str | None]:
-        return _digests(self.autoencoder, self.encoders)
 
     @classmethod
     def from_pretrained(  # pyright: ignore[reportIncompatibleMethodOverride]
@@ -567,11 +564,6 @@ class TactilePipeline(DiffusionPipeline):
         must = f"The weights in {folder} must match its palpate.json"
         require(pipeline.digest == about["digest"], None, must, "other weights", fix=COPY_AGAIN)
         return pipeline.to(device)
-
-
-def _require_one_each(ids: Sequence[str], n: int) -> None:
-    got, fix = f"{len(ids)} ids, {n} conditions", "Pass one row per id"
-    require(len(ids) == n, None, "Every id needs one condition", got, fix=fix)
 
 
 def _step_noise(seed: int, sample_id: str) -> torch.Generator:

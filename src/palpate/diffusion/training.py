@@ -41,10 +41,9 @@ from palpate.encoders.embed import texts_of
 from palpate.encoders.encoder_set import EncoderSet, load_clip
 from palpate.encoders.models import is_hub_id, pick_device
 from palpate.encoders.rows import load_split, train_part
-from palpate.training.estimate import estimate
 from palpate.training.options import Compute
 from palpate.training.processes import connect, first_alone, place
-from palpate.training.run import TrainingRun, run_for
+from palpate.training.run import TrainingRun, estimate, run_for
 
 DRAWN = 8  # samples outside of train that are drawn while the denoiser trains
 
@@ -195,7 +194,7 @@ def plan_generator(
     Without an autoencoder latents are those of the preset's, or of an f4 of three channels.
 
     Returns:
-        see :func:`palpate.training.estimate.estimate`.
+        see :func:`palpate.training.run.estimate`.
     """
     begin = None if start is None else TactilePipeline.from_pretrained(start)
     chosen = _preset(preset, begin)
@@ -359,8 +358,10 @@ def _geometry(unet: UNetOptions | str) -> dict[str, Any]:
 
 
 def _digests(encoders: EncoderSet | None) -> dict[str, str | None]:
-    names = [] if encoders is None else encoders.modalities
-    return {s: encoders.digest(s) if encoders and s in names else None for s in ("vision", "text")}
+    return {
+        s: encoders.digest(s) if encoders and s in encoders.modalities else None
+        for s in ("vision", "text")
+    }
 
 
 def _drawn(

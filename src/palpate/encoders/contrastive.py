@@ -64,10 +64,9 @@ from palpate.encoders.rows import (
 from palpate.encoders.tokenizer import train_tokenizer
 from palpate.metrics.probe import material_accuracy
 from palpate.training.engine import Batch, Losses, Task, fit
-from palpate.training.estimate import estimate
 from palpate.training.options import Compute, LoopOptions
 from palpate.training.processes import agreed, connect, first_alone, gather_rows, place
-from palpate.training.run import TrainingRun, run_for
+from palpate.training.run import TrainingRun, estimate, run_for
 from palpate.training.steps import Step, seeded
 
 
@@ -154,7 +153,7 @@ def plan_encoder(
     """What :func:`train_encoder` would take; only the manifest is read.
 
     Returns:
-        see :func:`palpate.training.estimate.estimate`.
+        see :func:`palpate.training.run.estimate`.
     """
     chosen, split = preset_of(preset, epochs), load_split(data, split)
     train = train_part(load(data), split)

@@ -97,7 +97,7 @@ def embed(
     if modality != "text":
         frames = encoders.preprocess(modality).frames(manifest, modality, still=still)
         inputs = [image_stamp(manifest, modality), *frames.stamps(manifest.root)]
-    label, group = _column(manifest, "material"), _column(manifest, groups)
+    label, group = words_of(manifest, "material"), words_of(manifest, groups)
     key = digest_json(["palpate-embedding/1", digest, manifest.ids, inputs, label, group])
     file = Path(cache) / f"{modality}-{short(key)}.npz" if cache else None
     if file is not None and (cached := _cached(file)) is not None:
@@ -222,7 +222,8 @@ def _require(modality: str, batch: int) -> None:
     require(batch >= 1, "batch", "must be at least 1", batch, 128)
 
 
-def _column(manifest: Manifest, name: str) -> list[str] | None:
+def words_of(manifest: Manifest, name: str) -> list[str] | None:
+    """A column as texts, '' for none; None where all are."""
     values = manifest.column(name)
     return None if all(v is None for v in values) else ["" if v is None else str(v) for v in values]
 
