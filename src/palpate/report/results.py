@@ -41,7 +41,6 @@ from palpate.report.records import (
     GalleryItem,
     Impact,
     LeakPair,
-    Match,
     Question,
     Signal,
     Strip,
@@ -116,10 +115,6 @@ class Call:
                 flat[name] = str(value)
         return replace(self, digests=flat)
 
-    def with_paths(self, change: Callable[[str], str]) -> Call:
-        """The call with ``change`` applied to every path."""
-        return replace(self, arguments=_changed(self.arguments, change))
-
 
 def _is(value: Any, default: Any) -> bool:
     """Whether an argument is the default; arrays and frames have no truth."""
@@ -173,15 +168,6 @@ def digest_of(path: Path, name: str) -> str | None:
     return digest_folder(path, "**/*.safetensors") if weights else None
 
 
-def _changed(value: Any, change: Callable[[str], str]) -> Any:
-    if isinstance(value, Mapping):
-        return {
-            key: change(item) if key == PATH and isinstance(item, str) else _changed(item, change)
-            for key, item in value.items()
-        }
-    return [_changed(item, change) for item in value] if isinstance(value, list) else value
-
-
 class Shown:
     """What audits and results share: they print themselves, and are JSON of a format."""
 
@@ -205,9 +191,20 @@ class Shown:
         """The inverse of :meth:`to_json`; keys that a command adds are ignored."""
         return from_plain(cls, {k: v for k, v in data.items() if k not in COMMAND_KEYS})
 
+    def with_paths(
+        self, images: Callable[[str], str | None], inputs: Callable[[str], str] = str
+    ) -> Self:
+        """The same with other paths.
+
+        Args:
+            images: path of an image -> its new one; None removes it.
+            inputs: path of an input of a call -> its new one.
+        """
+        return self.from_json(_with_paths(self.to_json(), images, inputs))
+
     def moved(self, change: Callable[[str], str]) -> Self:
         """The same with ``change`` applied to the path of every input of its calls."""
-        return _with_paths(self, lambda path: path, change)
+        return self.with_paths(str, change)
 
     def save(self, path: str | Path) -> None:
         """Write it as JSON, atomically; paths become relative to its folder."""
@@ -484,17 +481,6 @@ class Results(Shown):
         """
         return self.moved(_from_folder(folder, base))
 
-    def with_paths(
-        self, images: Callable[[str], str | None], inputs: Callable[[str], str] = str
-    ) -> Results:
-        """The results with other paths.
-
-        Args:
-            images: path of an image -> its new one; None removes it.
-            inputs: path of an input of a call -> its new one.
-        """
-        return _with_paths(self, images, inputs)
-
 
 def _from_folder(folder: Path, base: Path) -> Callable[[str], str]:
     """Paths from ``base`` as paths from ``folder``."""
@@ -502,29 +488,30 @@ def _from_folder(folder: Path, base: Path) -> Callable[[str], str]:
     return lambda name: Path(os.path.relpath(start / name, end)).as_posix()
 
 
-#: Fields that are paths of images, of the records that hold any.
-_IMAGES: dict[type, tuple[str, ...]] = {
-    SampleRef: ("vision", "tactile", "background"),
-    GalleryItem: ("generated", "background"),
-    **dict.fromkeys((LeakPair, Signal, Audit, Match, Strip, Results), ()),
-}
+#: Fields of a record, and those that are paths of images.
+_IMAGES = (
+    ({field.name for field in fields(SampleRef)}, ("vision", "tactile", "background")),
+    ({field.name for field in fields(GalleryItem)}, ("generated", "background")),
+)
 
 
 def _with_paths(
     value: Any, images: Callable[[str], str | None], inputs: Callable[[str], str]
 ) -> Any:
-    """A result, or a part of one, with other paths of images and of inputs of calls."""
-    if isinstance(value, list | tuple):
+    """JSON with other paths of images and of inputs of calls."""
+    if isinstance(value, list):
         return [_with_paths(item, images, inputs) for item in value]
-    if isinstance(value, Call):
-        return value.with_paths(inputs)
-    if type(value) not in _IMAGES:
+    if not isinstance(value, dict):
         return value
-    parts = {field.name: getattr(value, field.name) for field in fields(value)}
-    of_image = lambda path: None if path is None else images(path)
-    inside = lambda part: _with_paths(part, images, inputs)
-    paths = _IMAGES[type(value)]
-    return replace(value, **{n: (of_image if n in paths else inside)(v) for n, v in parts.items()})
+    changes = dict.fromkeys(
+        (n for keys, names in _IMAGES if keys == value.keys() for n in names), images
+    )
+    changes[PATH] = inputs
+    inside = lambda item: _with_paths(item, images, inputs)
+    return {
+        key: changes[key](item) if key in changes and isinstance(item, str) else inside(item)
+        for key, item in value.items()
+    }
 
 
 def _writer(name: str) -> Any:
