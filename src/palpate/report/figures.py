@@ -7,7 +7,7 @@ have no title, which belongs into the caption.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import takewhile
 from pathlib import Path
 from typing import Any
@@ -20,7 +20,7 @@ from palpate.report import audits
 from palpate.report.first_screen import COLUMNS, TELLING, telling_columns
 from palpate.report.labels import digits_of, file_names, with_interval
 from palpate.report.page import gallery_images, in_turns, material_of, pair_images
-from palpate.report.plots import HEIGHT, axis_of, axis_row, bar, ticks_of
+from palpate.report.plots import HEIGHT, axis_of, axis_row, bar
 from palpate.report.results import Audit, Results
 from palpate.report.study import of_study
 from palpate.report.tables import FLOOR, REAL, Row, Table, families, grid
@@ -231,9 +231,7 @@ def strips_svg(title: str, panels: Sequence[Panel]) -> Markup:
     for panel in panels:
         scores = [score for _, score, _ in panel.rows]
         methods = [score for _, score, control in panel.rows if not control]
-        if axis := axis_of(methods) or axis_of(scores):
-            ticks, digits = ticks_of(axis.low, axis.high, 4)
-            axis = replace(axis, ticks=ticks, digits=digits, width=AXIS)
+        axis = axis_of(methods, 4, AXIS) or axis_of(scores, 4, AXIS)
         parts.append(_text(0, y + 12, panel.title, WIDTH, "title"))
         y += LINE
         for label, score, control in panel.rows:

@@ -136,7 +136,7 @@ def _score_card(
 ) -> Card:
     first, share = scores[0], "accuracy" in column.measure.metric
     mark = baselines(first).get("chance") if share else first.floor
-    axis = strip_axis(scores, STRIP)
+    axis = plots.axis_of(scores, 6, STRIP)
     small = UNIT if share or axis is None else replace(axis, ticks=(), width=UNIT.width)
     rows: list[CardRow] = []
     for score in scores:
@@ -187,15 +187,6 @@ def _compared(
     more = {id(score): score for score in (*rivals, *scores)}
     more = [score for k, score in more.items() if k not in map(id, (*front, *back))]
     return [*front, *more[: CARD_ROWS - len(front) - len(back)], *back]
-
-
-def strip_axis(scores: Sequence[Score], width: float) -> plots.Axis | None:
-    """Return an axis of scores, with their intervals, nulls and floors; None without any."""
-    axis = plots.axis_of(scores)
-    if axis is None:
-        return None
-    ticks, digits = plots.ticks_of(axis.low, axis.high, 6)
-    return replace(axis, ticks=ticks, digits=digits, width=width)
 
 
 def _strip_facts(score: Score, column: Column) -> str:

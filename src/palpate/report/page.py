@@ -34,12 +34,12 @@ from palpate.core import (
     write_json,
     write_text,
 )
-from palpate.report import audits, first_screen, labels, plots, sentences, study, tables
-from palpate.report.labels import count, digits_of, number, percent, plural, where
+from palpate.report import audits, first_screen, labels, notes, plots, sentences, study, tables
+from palpate.report.labels import number, plural, where
 from palpate.report.notes import sentence
 from palpate.report.records import GalleryItem, LeakPair, Strip
 from palpate.report.results import Results
-from palpate.report.tables import REAL, Cell, Head, Row, Table, defined, families
+from palpate.report.tables import REAL, Cell, Head, Row, Table, families
 from palpate.report.thumbnails import Album, Wanted, fit
 
 #: Samples of the first screen; their images take at most a third of the bytes.
@@ -386,26 +386,21 @@ def environment() -> Environment:
         lstrip_blocks=True,
         auto_reload=False,
     )
-    functions: dict[str, Any] = {
-        "open_pairs": OPEN_PAIRS,
-        "long_list": LONG_LIST,
-        "READING": first_screen.READING,
-        "open_claims": OPEN_CLAIMS,
-        "digits_of": digits_of,
-        "verdict_marks": study.MARKS,
+    functions = {
+        name: value
+        for module in (audits, first_screen, labels, notes, plots, sentences, study, tables)
+        for name, value in vars(module).items()
+        if getattr(value, "__module__", "") == module.__name__
     }
-    for module in (audits, first_screen, labels, plots, sentences, study, tables):
-        functions |= {k: v for k, v in vars(module).items() if callable(v)}
-    env.globals.update(functions)
-    words: dict[str, Any] = {"count": count, "number": number}
-    words |= {"percent": percent, "plural": plural, "is_defined": defined}
-    env.filters.update(words)
-    env.filters.update(
-        label=lambda key: str(key).replace("_", " "),
-        leaf=_leaf,
-        plain=plain,
-        unbroken=_unbroken,
-        sentence=sentence,
+    env.filters.update(functions, leaf=_leaf, plain=plain, unbroken=_unbroken)
+    env.filters["label"] = lambda key: str(key).replace("_", " ")
+    env.globals.update(
+        functions,
+        open_pairs=OPEN_PAIRS,
+        long_list=LONG_LIST,
+        READING=first_screen.READING,
+        open_claims=OPEN_CLAIMS,
+        verdict_marks=study.MARKS,
     )
     return env
 

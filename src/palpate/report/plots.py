@@ -56,8 +56,14 @@ def ticks_of(low: float, high: float, parts: int) -> tuple[list[float], int]:
     return [round(k * step, 12) for k in range(first, last + 1)], digits
 
 
-def axis_over(values: Iterable[float | None]) -> Axis | None:
-    """Return the axis that holds all finite ``values``, with zero if they come near it."""
+def axis_over(values: Iterable[float | None], parts: int = 3, width: float = WIDTH) -> Axis | None:
+    """Return the axis that holds all finite ``values``, with zero if they come near it.
+
+    Args:
+        values: in units of the score.
+        parts: most parts that its ticks cut it into.
+        width: in pixels.
+    """
     finite = [v for v in values if v is not None and math.isfinite(v)]
     if not finite:
         return None
@@ -70,14 +76,14 @@ def axis_over(values: Iterable[float | None]) -> Axis | None:
         margin = abs(high) * 0.1 or 1.0
         low, high = low - margin, high + margin
     margin = 0.02 * (high - low)
-    return Axis(low - margin, high + margin, *ticks_of(low, high, 3))
+    low, high = low - margin, high + margin
+    return Axis(low, high, *ticks_of(low, high, parts), width)
 
 
-def axis_of(scores: Iterable[Score]) -> Axis | None:
-    """Return the axis that holds values, intervals, nulls and floors of one column."""
-    return axis_over(
-        v for s in scores for v in (s.value, s.floor, *(s.interval or ()), *(s.null or ()))
-    )
+def axis_of(scores: Iterable[Score], parts: int = 3, width: float = WIDTH) -> Axis | None:
+    """Return the axis that holds values, intervals, nulls and floors of scores."""
+    values = (v for s in scores for v in (s.value, s.floor, *(s.interval or ()), *(s.null or ())))
+    return axis_over(values, parts, width)
 
 
 def bar(
