@@ -16,12 +16,18 @@ import polars as pl
 import pytest
 
 from forge.pictures import write_image
+from forge.results import full_audit
 from palpate.cli import main
 from palpate.core import PalpateError, atomic_folder, atomic_path, locked
 from palpate.data.manifest import Manifest
 
 INDEX = '{"format": "palpate-generated/1", "complete": true, "settings": {}, "digest": "x", '
 RESULTS = '{"format": "palpate-results/1", "title": "t"%s}'
+
+
+def audit_with(**fields):
+    """A file of an audit, of which some fields are others."""
+    return json.dumps(full_audit().to_json() | fields)
 
 
 def zip_named_npy(path: Path) -> None:
@@ -89,11 +95,16 @@ def typed_manifest(path: Path) -> None:
                 (', "wrong": 3', "unknown field wrong"),
             )
         ),
-        (
-            "r.json",
-            '{"format": "palpate-results/1", "title": 3}',
-            "report r.json -o p.html",
-            "title",
+        *(
+            ("r.json", text, "report r.json -o p.html", words)
+            for text, words in (
+                ('{"format": "palpate-results/1", "title": 3}', "title"),
+                (audit_with(format="other"), "must have the format palpate-results/1"),
+                (audit_with(new=1), "new"),
+                (audit_with(signals=5), "int"),
+                (audit_with(others=[{"name": "x"}]), "missing"),
+                (audit_with(impact={"rows": []}), "headline"),
+            )
         ),
         ("a.txt", "", "audit a.txt b\udcff.txt", "must be UTF-8"),
         ("a.txt", "", ["audit", "a.txt", ""], "not empty"),

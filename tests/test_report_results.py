@@ -6,7 +6,6 @@ from pathlib import Path
 
 import pytest
 
-from forge.commands import mistake
 from forge.results import full_audit, full_results, images, score, small_audit
 from palpate.cli import main
 from palpate.core import PalpateError
@@ -74,20 +73,3 @@ def test_the_command_merges_files_of_results_and_audits(capsys, tmp_path):
     again = ["report", str(tmp_path / "page.json"), "-o", str(tmp_path / "again.html"), "--json"]
     assert main(again) == 0
     assert json.loads(capsys.readouterr().out.partition("\n{")[2].join(["{", ""]))["page"]
-
-
-@pytest.mark.parametrize(
-    ("change", "words"),
-    [
-        ({"format": "other"}, "must have the format palpate-results/1"),
-        ({"new": 1}, "new"),
-        ({"signals": 5}, "int"),
-        ({"others": [{"name": "x"}]}, "missing"),
-        ({"impact": {"rows": []}}, "headline"),
-    ],
-)
-def test_the_command_rejects_incomplete_files(capsys, tmp_path, change, words):
-    path = tmp_path / "a.json"
-    path.write_text(json.dumps(full_audit().to_json() | change))
-    mistake(capsys, words, "report", path, "-o", tmp_path / "page.html", "-q")
-    assert not (tmp_path / "page.html").exists()
