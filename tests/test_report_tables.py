@@ -138,6 +138,26 @@ def test_the_best_by_value_is_among_those_that_are_compared():
     assert best == [["photo"], ["a"]]
 
 
+@pytest.mark.parametrize("control", ["background only", "nearest photo"])
+def test_no_mark_falls_on_a_control_and_none_where_one_method_is_left(control):
+    scores = [score(subject=s, value=v) for s, v in (("a", 2.0), ("b", 3.0), (control, 1.0))]
+    for several, best in ((scores, ["a"]), (scores[1:], [])):
+        (family,) = families(several, ["nearest photo"])
+        for table in (listing(family), *grids(family)):
+            marked = [row for row in table.rows if any(cell.best for cell in row.cells)]
+            assert [
+                next(c.value for c in r.cells if c.value in ("a", "b", control)) for r in marked
+            ] == best
+
+
+def test_a_floor_has_the_decimals_of_its_first_digit():
+    scores = [
+        score(subject="a", value=123.4, interval=(110.0, 140.0), floor=0.05, null=(-0.3, 4.0))
+    ]
+    (family,) = families(scores)
+    assert listing(family).plain()[1][0][2:7] == ["123", "[110, 140]", "[-0.3, 4]", "0.05", "240"]
+
+
 def test_more_than_two_generators_are_ranked():
     def pair(a, b, p_better, p):
         d = difference(a, b)
