@@ -341,7 +341,7 @@ def test_unpaired_images_are_an_error_and_disjoint_ones_a_note(tmp_path):
     for seed, (name, ids) in enumerate({"real": "123", "some": "124", "other": "789"}.items()):
         paint(tmp_path / name, [*ids], seed)
     real = tmp_path / "real"
-    words = r"some: .*1 not generated: '3'; 1 without reference: '4'"
+    words = r"some: .*1 not in generated: '3'; 1 not in reference: '4'"
     with pytest.raises(PalpateError, match=words):
         score(tmp_path / "some", real, companions=["ssim"])
     options = {"encoder": "palpate/mini", "presets": ["paper"], "permutations": 0}

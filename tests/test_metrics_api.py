@@ -36,7 +36,7 @@ FUNCTIONS = {
     "per_image": f"metric, {IMAGES}",
     "prdc": "generated, reference, k=5, **options",
     "psnr": TWO_SETS,
-    "require_same_ids": "generated_ids, reference_ids",
+    "require_same_ids": "a, b, names=('generated', 'reference')",
     "ssim": TWO_SETS,
     "tmmd": TWO_SETS,
 }
@@ -88,9 +88,9 @@ def test_arrays_tensors_lists_and_feature_sets_give_the_same_scores(metric):
     assert values(x, y) != same  # without groups other intervals, at least
 
 
-def test_kid_is_the_unbiased_polynomial_mmd():
-    x, y = sets()
-    kernel = lambda a, b: (a @ b.T / 6 + 1) ** 3
+def test_kid_is_the_unbiased_polynomial_mmd_of_float32_features_to_many_digits():
+    x, y = np.random.default_rng(0).normal(size=(2, 600, 64)).astype(np.float32)
+    kernel = lambda a, b: (a.astype(float) @ b.T / 64 + 1) ** 3
     off = lambda k: (k.sum() - np.trace(k)) / (len(k) * (len(k) - 1))
     expected = off(kernel(x, x)) + off(kernel(y, y)) - 2 * kernel(x, y).mean()
     score = kid(x, y)

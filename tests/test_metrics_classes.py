@@ -2,8 +2,8 @@
 
 import numpy as np
 import pytest
-from scipy import stats
 
+from forge.scores import jackknife, without_each
 from palpate.core import FeatureSet
 from palpate.metrics import ci_tmmd, compare, d_tmmd, four_scores, i_tmmd
 from palpate.report.labels import label_of, measured
@@ -51,8 +51,8 @@ def in_errors(s):
     left = [keep(s, np.array(s.groups) != v) for v in sorted(set(s.groups))]
     out = np.array([means_off_diagonal(d_tmmd(of, **OFF_DIAGONAL)) for of in left])
     means = means_off_diagonal(score)
-    error = lambda v: np.sqrt((len(v) - 1) / len(v) * ((v - v.mean(axis=0)) ** 2).sum(axis=0))
-    return score, means / error(out), means.mean() / error(out.mean(axis=1))
+    errors = [jackknife(0.0, column)[0] for column in out.T]
+    return score, means / errors, means.mean() / jackknife(0.0, out.mean(axis=1))[0]
 
 
 @pytest.mark.parametrize(
@@ -195,10 +195,8 @@ def test_where_classes_are_left_out_so_they_are_of_differences():
     delta = np.subtract(one, two)
     of_metric = {measured(d): d for d in found.differences}
     d = of_metric["CI-TMMD"]
-    error = delta.std(ddof=1) / np.sqrt(5)
-    reach = stats.t.ppf(0.975, 4) * error
     assert (label_of(d), d.value) == ("CI-TMMD difference", pytest.approx(delta.mean(), abs=1e-9))
-    assert d.interval == pytest.approx((delta.mean() - reach, delta.mean() + reach), abs=1e-9)
+    assert d.interval == jackknife(delta.mean(), without_each(delta))[1]
     assert d.interval_method == "paired leave-one-class-out jackknife, t, 4 df"
     left_out = {label_of(s): s.details.get("left_out") for s in found.scores}
     assert left_out["CI-TMMD"] == left_out["CI-TMMD E"] == "class"

@@ -1,13 +1,14 @@
 """Contact metrics: masks and values by hand and by loops, empty gel, the world, the real clips."""
 
 import json
-import math
 
 import numpy as np
 import pytest
-from scipy import ndimage, stats
+from scipy import ndimage
 from world_statistics import change, contact_area
 
+from forge.pictures import slow_ssim
+from forge.scores import jackknife, without_each
 from palpate.core import Note, PalpateError, require_comparable
 from palpate.metrics import background_digest, contact, contact_mask, contact_scores
 from palpate.metrics.contact import contact_per_image
@@ -204,28 +205,11 @@ def test_the_negative_of_a_contact_is_not_similar(sigma):
     assert similarity.value < 0 < similarity.details["empty"]
 
 
-def slow_maps(x, y):
-    """SSIM and contrast-structure at every pixel of two (h, w), by windows on mirrored images."""
-    at = np.arange(11) - 5
-    window = np.exp(-(at[:, None] ** 2 + at[None] ** 2) / (2 * 1.5**2))
-    window /= window.sum()
-    c1, c2 = (0.01 * 0.25) ** 2, (0.03 * 0.25) ** 2
-    similarity, structure = np.empty(x.shape), np.empty(x.shape)
-    wide = [np.pad(v, 5, mode="reflect") for v in (x, y)]
-    for i, j in np.ndindex(x.shape):
-        u, v = (w[i : i + 11, j : j + 11] for w in wide)
-        mu, mv = (window * u).sum(), (window * v).sum()
-        vu, vv = (window * (u - mu) ** 2).sum(), (window * (v - mv) ** 2).sum()
-        uv = (window * (u - mu) * (v - mv)).sum()
-        luminance = (2 * mu * mv + c1) / (mu**2 + mv**2 + c1)
-        structure[i, j] = (2 * uv + c2) / (vu + vv + c2)
-        negative = luminance < 0 and structure[i, j] < 0
-        similarity[i, j] = (-luminance if negative else luminance) * structure[i, j]
-    return similarity, structure
-
-
-def slow_ssim(made, real, mask):
-    return np.mean([slow_maps(made[..., k], real[..., k])[0][mask].mean() for k in range(3)])
+def looped_ssim(made, real, mask):
+    """With a window at every pixel of mirrored images."""
+    wide = [np.pad(v, ((5, 5), (5, 5), (0, 0)), mode="reflect") for v in (made, real)]
+    maps = (slow_ssim(*(v[..., k] for v in wide), 0.25)[0] for k in range(3))
+    return np.mean([values[mask].mean() for values in maps])
 
 
 def test_values_equal_loops_over_the_mask():
@@ -240,12 +224,12 @@ def test_values_equal_loops_over_the_mask():
         both = (d[mask] ** 2 + e[mask] ** 2).sum()
         expected = {
             RESIDUAL: error / both,
-            SSIM: slow_ssim(e, d, mask),
+            SSIM: looped_ssim(e, d, mask),
             IOU: (mask & made_masks[n]).sum() / union.sum(),
         }
         for metric, value in expected.items():
             assert values[metric][n] == pytest.approx(value, abs=1e-12), metric
-        expected = slow_ssim(np.zeros_like(d), d, mask)
+        expected = looped_ssim(np.zeros_like(d), d, mask)
         assert empty[SSIM][n] == pytest.approx(expected, abs=1e-12)
 
 
@@ -340,8 +324,7 @@ def test_directions_and_intervals():
     assert [s.metric for s in scores] == [RESIDUAL, SSIM, IOU]
     assert [s.higher_is_better for s in scores] == [False, True, True]
     values = measured(made, real, background)[RESIDUAL]
-    reach = stats.t.ppf(0.975, 5) * values.std(ddof=1) / math.sqrt(6)
-    assert scores[0].interval == pytest.approx((values.mean() - reach, values.mean() + reach))
+    assert scores[0].interval == jackknife(values.mean(), without_each(values))[1]
     assert scores[0].details["highest"][0]["value"] == values.max()
     gray = [v.mean(axis=3, keepdims=True) for v in (made, real, background)]
     assert 0 < contact_residual(*gray).value < 2

@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import linalg, stats
 
-from forge.scores import codes
+from forge.scores import codes, jackknife
 from forge.scores import numbered as features
 from palpate.core import FeatureSet, Note, Score
 from palpate.metrics import distributions
@@ -73,8 +73,7 @@ def test_the_interval_is_the_leave_one_group_out_jackknife_over_both_sets(width)
     score = fid(features(x, a), features(y, b))
     names = sorted({*a, *b})
     out = [definition(x[np.array(a) != g], y[np.array(b) != g]) for g in names]
-    reach = stats.t.ppf(0.975, 6) * np.sqrt(6 / 7 * ((np.array(out) - np.mean(out)) ** 2).sum())
-    assert score.interval == pytest.approx((score.value - reach, score.value + reach), rel=1e-6)
+    assert score.interval == jackknife(score.value, out, close=1e-6 * score.value)[1]
     assert score.interval_method == "leave-one-group-out jackknife, t, 6 df"
     assert (score.details["units"], score.details["unit"]) == (7, "group")
 
@@ -98,25 +97,17 @@ def test_many_groups_are_left_out_in_blocks_of_whole_groups_of_about_equal_size(
     assert Score.from_json(score.to_json()) == score
 
 
-def test_without_groups_the_interval_says_that_rows_are_taken_as_independent():
-    rng = np.random.default_rng(8)
-    one, two = rng.normal(size=(2, 90, 3))
-    for a, b in [(None, None), (["v"] * 90, None)]:
-        score = fid(features(one, a), features(two, b))
-        assert score.interval is not None
-        assert "rows, taken as independent" in score.interval_method
-    small = fid(features(one[:2]), features(two[:2]))
-    assert small.interval is None  # one row is left
-    assert "no-interval-few-units" in codes(small)
-
-
-def test_one_group_gives_no_interval():
-    rng = np.random.default_rng(9)
-    one, two = rng.normal(size=(2, 30, 3))
-    score = fid(features(one, ["v"] * 30), features(two, ["v"] * 30))
-    assert score.interval is None
-    assert score.interval_method == ""
-    assert "no-interval-few-units" in codes(score)
+def test_intervals_over_rows_say_so_and_one_unit_gives_none():
+    one, two = np.random.default_rng(8).normal(size=(2, 90, 3))
+    video = ["v"] * 90
+    for n, a, b in [(90, None, None), (90, video, None), (2, None, None), (90, video, video)]:
+        score = fid(features(one[:n], a), features(two[:n], b))
+        if n == 90 and b is None:
+            assert score.interval is not None
+            assert "rows, taken as independent" in score.interval_method
+        else:  # one row is left, or none
+            assert (score.interval, score.interval_method) == (None, "")
+            assert "no-interval-few-units" in codes(score)
 
 
 @pytest.mark.slow
@@ -175,11 +166,11 @@ def test_the_difference_of_two_fids_is_left_one_out_as_a_whole(width):
     assert found.scores == singles
     (one,) = found.differences
     kept = [np.array(groups) != f"v{k}" for k in range(7)]
-    out = np.array([definition(x[k], y[k]) - definition(z[k], y[k]) for k in kept])
-    error = np.sqrt(6 / 7 * ((out - out.mean()) ** 2).sum())
-    value, reach = definition(x, y) - definition(z, y), stats.t.ppf(0.975, 6) * error
+    out = [definition(x[k], y[k]) - definition(z[k], y[k]) for k in kept]
+    value = definition(x, y) - definition(z, y)
+    error, interval = jackknife(value, out, close=1e-5)
     assert one.value == pytest.approx(value, rel=1e-6)
-    assert one.interval == pytest.approx((value - reach, value + reach), rel=1e-5)
+    assert one.interval == interval
     assert one.details["p_better"] == pytest.approx(stats.t.cdf(-value / error, 6), rel=1e-4)
     assert one.details["better"] == ("b" if value > 0 else "a")
     assert one.interval_method == "paired leave-one-group-out jackknife, t, 6 df"

@@ -5,10 +5,10 @@ import math
 
 import numpy as np
 import pytest
-from scipy import stats
 from skimage.metrics import structural_similarity
 
-from forge.scores import codes
+from forge.pictures import slow_ssim
+from forge.scores import codes, jackknife, without_each
 from palpate.core import Note, PalpateError, require_comparable
 from palpate.metrics.images import (
     WEIGHTS,
@@ -105,12 +105,10 @@ def test_tensors_and_lists_give_the_same_scores():
 def test_intervals_over_images_and_over_groups():
     a, b = images(2)
     values, score = ssim_per_image(a, b), ssim(a, b)
-    reach = stats.t.ppf(0.975, 5) * values.std(ddof=1) / math.sqrt(6)
-    assert score.interval == pytest.approx((values.mean() - reach, values.mean() + reach))
+    assert score.interval == jackknife(values.mean(), without_each(values))[1]
     grouped = ssim(a, b, groups=["u", "v", "w"] * 2)
-    means = np.array([values[k::3].mean() for k in range(3)])
-    reach = stats.t.ppf(0.975, 2) * means.std(ddof=1) / math.sqrt(3)
-    assert grouped.interval == pytest.approx((means.mean() - reach, means.mean() + reach))
+    means = [values[k::3].mean() for k in range(3)]
+    assert grouped.interval == jackknife(np.mean(means), without_each(means))[1]
     assert grouped.interval_method == "leave-one-group-out jackknife, t, 2 df"
     for score in (ssim(a, b, groups=["u"] * 6), ssim(a[:1], b[:1]), ssim(a, a)):
         assert (score.interval, codes(score)) == (None, ["no-interval-over-images"])
@@ -142,23 +140,6 @@ def test_means_exclude_what_has_no_value_and_stay_in_their_bounds():
 # ---- MS-SSIM
 
 
-def slow_terms(x, y):
-    """Mean SSIM and mean contrast-structure of two (h, w) in [0, 1], window by window."""
-    at = np.arange(11) - 5
-    window = np.exp(-(at[:, None] ** 2 + at[None] ** 2) / (2 * 1.5**2))
-    window /= window.sum()
-    whole, structure = [], []
-    for i in range(x.shape[0] - 10):
-        for j in range(x.shape[1] - 10):
-            u, v = x[i : i + 11, j : j + 11], y[i : i + 11, j : j + 11]
-            mu, mv = (window * u).sum(), (window * v).sum()
-            vu, vv = (window * (u - mu) ** 2).sum(), (window * (v - mv) ** 2).sum()
-            uv = (window * (u - mu) * (v - mv)).sum()
-            structure.append((2 * uv + 0.0009) / (vu + vv + 0.0009))
-            whole.append(structure[-1] * (2 * mu * mv + 0.0001) / (mu**2 + mv**2 + 0.0001))
-    return np.mean(whole), np.mean(structure)
-
-
 def slow_halved(x):
     x = x[: x.shape[0] // 2 * 2, : x.shape[1] // 2 * 2]
     return (x[::2, ::2] + x[1::2, ::2] + x[::2, 1::2] + x[1::2, 1::2]) / 4
@@ -169,7 +150,7 @@ def slow_ms_ssim(x, y, scales, weights):
     for channel in range(x.shape[2]):
         u, v, product = x[..., channel] / 255, y[..., channel] / 255, 1.0
         for j in range(scales):
-            whole, structure = slow_terms(u, v)
+            whole, structure = (terms.mean() for terms in slow_ssim(u, v))
             product *= max(0.0, whole if j == scales - 1 else structure) ** weights[j]
             u, v = slow_halved(u), slow_halved(v)
         products.append(product)

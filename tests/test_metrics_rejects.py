@@ -136,7 +136,7 @@ COMPARED = [
     (lambda: compare_fid({}, rows(Y)), ["must hold a generator"]),
     (
         lambda: compare({"a": G, "b": G.take(list(G.ids)[1:])}, G),
-        ["1 missing and 0 surplus ids, first 'c0v0/000'"],
+        ["ids of 'a' and 'b' must be the same", "1 not in 'b': 'c0v0/000'"],
     ),
     (
         lambda: compare({"a": G, "b": change(G, groups=list(G.groups)[::-1])}, G),
@@ -144,7 +144,7 @@ COMPARED = [
     ),
     (lambda: compare({"a": G, "b": change(G, labels=None)}, G), ["must have the same labels"]),
     (lambda: compare({"a": G, "b": change(G, encoder="f" * 64)}, G), ["one encoder"]),
-    (lambda: compare_fid({"a": rows(X), "b": rows(X[:-1])}, rows(Y)), ["same samples"]),
+    (lambda: compare_fid({"a": rows(X), "b": rows(X[:-1])}, rows(Y)), ["1 not in 'b': '7'"]),
     (
         lambda: compare_fid({"a": rows(X, LETTERS[:8]), "b": rows(X, LETTERS[7::-1])}, rows(Y)),
         ["same groups"],
@@ -225,12 +225,12 @@ IMAGES = [
     *(
         (lambda ids=ids: require_same_ids(*ids), words)
         for ids, words in [
-            (("ab", "abcdefgh"), ["6 not generated: 'c', 'd', ", ", 'g' and 1 more"]),
-            (("axb", "ab"), ["1 without reference: 'x'"]),
-            (("ax", "ab"), ["1 not generated: 'b'; 1 without reference: 'x'"]),
+            (("ab", "abcdefgh"), ["6 not in generated: 'c', 'd', ", ", 'g' and 1 more"]),
+            (("axb", "ab"), ["1 not in reference: 'x'"]),
+            (("ax", "ab"), ["1 not in generated: 'b'; 1 not in reference: 'x'"]),
             (("aab", "ab"), ["generated id must be unique. Got 1 repeated: 'a'"]),
             (("ab", "abb"), ["reference id must be unique. Got 1 repeated: 'b'"]),
-            (("", "a"), ["1 not generated: 'a'"]),
+            (("", "a"), ["1 not in generated: 'a'"]),
             (("", ""), ["Got none"]),
         ]
     ),

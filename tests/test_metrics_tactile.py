@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from scipy import stats
 
+from forge.scores import jackknife, without_each
 from palpate.core import FeatureSet, PalpateError, Score, require_comparable
 from palpate.metrics import PRESETS, ci_tmmd, d_tmmd, four_scores, i_tmmd, tmmd
 from palpate.metrics.mmd import build_table, half_of, sample_units
@@ -194,14 +194,6 @@ def test_grouped_matrix_leaves_out_pairs_of_one_video():
     assert matrix[0][0] == close(average_over_group_halvings(keep(s, a), "unbiased"))
 
 
-def recomputed_interval(value, replicates):
-    """The 95 % jackknife interval from the values without each unit."""
-    replicates, g = np.array(replicates), len(replicates)
-    error = np.sqrt((g - 1) / g * ((replicates - np.mean(replicates)) ** 2).sum())
-    reach = stats.t.ppf(0.975, g - 1) * error
-    return close((value - reach, value + reach))
-
-
 @pytest.mark.parametrize("preset", ["grouped", "paper"])
 @pytest.mark.parametrize("shared", [True, False])
 def test_tmmd_jackknife_equals_leaving_each_group_out(preset, shared):
@@ -213,7 +205,7 @@ def test_tmmd_jackknife_equals_leaving_each_group_out(preset, shared):
     names = sorted({*g.groups, *r.groups})
     out = [[keep(s, np.array(s.groups) != v) for s in (g, r)] for v in names]
     replicates = [tmmd(*sets, preset=preset).value for sets in out]
-    assert score.interval == recomputed_interval(score.value, replicates)
+    assert score.interval == jackknife(score.value, replicates)[1]
     assert score.interval_method == f"leave-one-group-out jackknife, t, {len(names) - 1} df"
 
 
@@ -246,7 +238,7 @@ def test_free_jackknife_equals_leaving_each_group_out():
     ):
         score = metric(s)
         assert value(s) == close(score.value)
-        assert score.interval == recomputed_interval(score.value, [value(of) for of in out])
+        assert score.interval == jackknife(score.value, [value(of) for of in out])[1]
         assert "leave-one-group-out" in score.interval_method
 
 
@@ -264,7 +256,7 @@ def test_jackknife_of_random_halves_keeps_the_halves():
     half = half_of(s.ids, np.zeros(18, dtype=int), plan)
     out = [[(half == h) & (groups != v) for h in (0, 1)] for v in sorted(set(groups))]
     replicates = [mmd2(s.features[first], s.features[second]) for first, second in out]
-    assert score.interval == recomputed_interval(score.value, replicates)
+    assert score.interval == jackknife(score.value, replicates)[1]
     assert "random-halves" in codes(score)
     assert score.seed == 3
 
@@ -278,7 +270,7 @@ def test_without_groups_the_interval_leaves_out_samples_and_says_so():
         tmmd(*(s.take([j for j in s.ids if not (t is s and j == i)]) for s in (g, r))).value
         for t, i in everyone
     ]
-    assert score.interval == recomputed_interval(score.value, out)
+    assert score.interval == jackknife(score.value, out)[1]
     assert "samples taken as independent" in score.interval_method
     same_ids = tmmd(g, change(r, ids=g.ids))  # a generated touch and its reference are one unit
     assert same_ids.details["units"] == 9
@@ -301,8 +293,7 @@ def test_two_groups_a_class_give_an_interval_over_classes():
     score = ci_tmmd(s)
     each = np.array([v["value"] for v in score.details["per_class"].values()])
     assert "leave-one-class-out" in score.interval_method
-    reach = stats.t.ppf(0.975, 4) * each.std(ddof=1) / np.sqrt(5)
-    assert score.interval == close((each.mean() - reach, each.mean() + reach))
+    assert score.interval == jackknife(each.mean(), without_each(each))[1]
     assert d_tmmd(s).interval is not None
 
 

@@ -138,3 +138,22 @@ def write_photos(folder: Path, n: int, *size: int) -> list[Path]:
 def photos(n: int, size: int = 16) -> np.ndarray:
     """Random images (n, size, size, 3)."""
     return np.random.default_rng(0).integers(0, 256, (n, size, size, 3), dtype=np.uint8)
+
+
+def slow_ssim(x, y, data_range=1.0):
+    """SSIM and its contrast-structure of two (h, w), window by window inside them."""
+    at = np.arange(11) - 5
+    window = np.exp(-(at[:, None] ** 2 + at[None] ** 2) / (2 * 1.5**2))
+    window /= window.sum()
+    c1, c2 = (0.01 * data_range) ** 2, (0.03 * data_range) ** 2
+    similarity, structure = np.empty((2, x.shape[0] - 10, x.shape[1] - 10))
+    for i, j in np.ndindex(similarity.shape):
+        u, v = (w[i : i + 11, j : j + 11] for w in (x, y))
+        mu, mv = (window * u).sum(), (window * v).sum()
+        vu, vv = (window * (u - mu) ** 2).sum(), (window * (v - mv) ** 2).sum()
+        uv = (window * (u - mu) * (v - mv)).sum()
+        luminance = (2 * mu * mv + c1) / (mu**2 + mv**2 + c1)
+        structure[i, j] = (2 * uv + c2) / (vu + vv + c2)
+        negative = luminance < 0 and structure[i, j] < 0
+        similarity[i, j] = (-luminance if negative else luminance) * structure[i, j]
+    return similarity, structure

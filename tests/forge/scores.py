@@ -1,6 +1,8 @@
 """Sets and images that the tests of scoring share."""
 
 import numpy as np
+import pytest
+from scipy import stats
 
 from palpate.core import FeatureSet
 from palpate.report.labels import label_of, subject_of
@@ -44,3 +46,17 @@ def by_key(results) -> dict:
 def codes(results) -> list[str]:
     """Codes of the results' notes."""
     return [note.code for note in results.notes]
+
+
+def jackknife(value, out, close=1e-9):
+    """The standard error from the values without each unit, and the 95 % interval around one."""
+    out = np.array(out)
+    error = np.sqrt((len(out) - 1) / len(out) * ((out - out.mean()) ** 2).sum())
+    reach = stats.t.ppf(0.975, len(out) - 1) * error
+    return error, pytest.approx((value - reach, value + reach), abs=close)
+
+
+def without_each(values):
+    """The means without each value."""
+    values = np.array(values)
+    return (values.sum() - values) / (len(values) - 1)

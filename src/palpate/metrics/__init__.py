@@ -6,7 +6,8 @@ On pairs of images: SSIM, PSNR and MS-SSIM; residual, SSIM and IoU of the contac
 
 from palpate.metrics.contact import background_digest, contact_mask, contact_scores
 from palpate.metrics.distributions import compare_fid, fid, prdc
-from palpate.metrics.images import PerImage, ms_ssim, per_image, psnr, require_same_ids, ssim
+from palpate.metrics.images import PerImage, ms_ssim, per_image, psnr, ssim
+from palpate.metrics.inputs import require_same_ids
 from palpate.metrics.kernels import Gaussian, Polynomial
 from palpate.metrics.mmd import PRESETS, Options
 from palpate.metrics.paired import Comparison, compare, compare_tmmd, four_scores

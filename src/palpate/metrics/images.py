@@ -17,7 +17,6 @@ sensor itself; :mod:`palpate.metrics.contact` compares the contact alone.
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Literal
@@ -27,7 +26,7 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from palpate._version import __version__
-from palpate.core import Note, Score, few, require
+from palpate.core import Note, Score, require
 from palpate.metrics.inputs import Array, as_array, checked_names, to_host
 from palpate.metrics.intervals import score_of, spread_of_values
 
@@ -179,28 +178,6 @@ def per_image(
     settings |= {"scales": scales, "downsampling": "2 x 2 mean", "weights": weights}
     fewer = Note("fewer-scales", {"scales": scales, "least": least_side(len(WEIGHTS))})
     return PerImage(metric, values, (0.0, 1.0), settings, [fewer] * (scales < len(WEIGHTS)))
-
-
-def require_same_ids(generated_ids: Sequence[str], reference_ids: Sequence[str]) -> None:
-    """Check that both lists have the same ids, each once, in any order.
-
-    Raises:
-        PalpateError: if an id is repeated, or is in one list only; the first few are named.
-    """
-    generated, reference = ([str(v) for v in ids] for ids in (generated_ids, reference_ids))
-    for name, ids in (("generated", generated), ("reference", reference)):
-        repeated = [i for i, count in Counter(ids).items() if count > 1]
-        must, got = f"Every {name} id must be unique", few(map(repr, repeated))
-        got = f"{len(repeated)} repeated: {got}"
-        require(not repeated, None, must, got, fix="Keep one image an id")
-    missing, surplus = set(reference) - set(generated), set(generated) - set(reference)
-    lists = (("not generated", missing), ("without reference", surplus))
-    got = "; ".join(
-        f"{len(ids)} {title}: {few(map(repr, sorted(ids)))}" for title, ids in lists if ids
-    )
-    fix = "Score the same samples in both: take() the common ids if that is what you mean"
-    must, same = "Generated and reference ids must be the same set", not (missing or surplus)
-    require(same and len(reference) > 0, None, must, got or "none", fix=fix)
 
 
 def image_pairs(

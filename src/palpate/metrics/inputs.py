@@ -15,7 +15,8 @@ import mmap
 import os
 import sys
 import warnings
-from collections.abc import Callable, Generator, Iterable, Iterator
+from collections import Counter
+from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from typing import Any, Literal, TypeVar
@@ -24,7 +25,7 @@ import numpy as np
 from array_api_compat import array_namespace, device
 from numpy.typing import NDArray
 
-from palpate.core import FeatureSet, PalpateError, PalpateWarning, require
+from palpate.core import FeatureSet, PalpateError, PalpateWarning, few, require
 from palpate.core.features import Array, Index, is_missing
 
 Normalize = Literal["check"] | bool
@@ -251,8 +252,7 @@ def _warn_widened(name: str, kind: str) -> None:
 def rows_text(bad: NDArray[np.bool_]) -> str:
     """``"3 rows (0, 4, 7)"`` for a boolean mask of rows."""
     at = np.flatnonzero(bad)
-    first = ", ".join(str(int(i)) for i in at[:5])
-    return f"{at.size} row{'s' * (at.size != 1)} ({first}{', ...' * (at.size > 5)})"
+    return f"{at.size} row{'s' * (at.size != 1)} ({few(at)})"
 
 
 def copies_across(x: Any, y: Any) -> int | None:
@@ -308,6 +308,29 @@ def require_one_encoder(a: FeatureSet, b: FeatureSet, both: str) -> None:
     got = f"digests {digests[0][:12]} and {digests[1][:12]}"
     same = "" in digests or digests[0] == digests[1]
     require(same, None, must, got, fix="Embed both with the same encoder")
+
+
+def require_same_ids(
+    a: Sequence[str], b: Sequence[str], names: tuple[str, str] = ("generated", "reference")
+) -> None:
+    """Check that both lists have the same ids, each once, in any order; ``names`` of the two.
+
+    Raises:
+        PalpateError: if an id is repeated, or is in one list only; the first few are named.
+    """
+    each = [[str(v) for v in ids] for ids in (a, b)]
+    for name, ids in zip(names, each, strict=True):
+        repeated = [i for i, count in Counter(ids).items() if count > 1]
+        must, got = f"Every {name} id must be unique", few(map(repr, repeated))
+        got = f"{len(repeated)} repeated: {got}"
+        require(not repeated, None, must, got, fix="Keep one sample an id")
+    first, second = map(set, each)
+    lists = zip(names, (second - first, first - second), strict=True)
+    got = [f"{len(ids)} not in {name}: {few(map(repr, sorted(ids)))}" for name, ids in lists if ids]
+    must = f"The ids of {names[0]} and {names[1]} must be the same"
+    fix = "Score the same samples in both: take() the common ids if that is what you mean"
+    same = first == second and len(second) > 0
+    require(same, None, must, "; ".join(got) or "none", fix=fix)
 
 
 T = TypeVar("T")

@@ -29,7 +29,7 @@ import numpy as np
 
 from palpate.core import FeatureSet, Note, Score, require, require_comparable
 from palpate.core.features import Array
-from palpate.metrics.inputs import feature_sets, require_one_encoder
+from palpate.metrics.inputs import feature_sets, require_one_encoder, require_same_ids
 from palpate.metrics.intervals import Interval, Scored, Spread, spread_of_values
 from palpate.metrics.means import Mean, spread_of
 from palpate.metrics.mmd import build_table, shared_ids
@@ -230,13 +230,9 @@ def same_samples(generators: Mapping[str, Any]) -> dict[str, FeatureSet]:
 
 def _ordered(first: FeatureSet, first_name: str, other: FeatureSet, name: str) -> FeatureSet:
     """``other`` in the order of ``first``."""
-    a, b = set(first.ids), set(other.ids)
-    both = f"{name!r} and {first_name!r}"
-    odd = [f"first {i!r}" for i in (*sorted(a - b), *sorted(b - a))] or ["repeated ids"]
-    got = f"{len(a - b)} missing and {len(b - a)} surplus ids, {odd[0]}"
-    must, fix = f"{both} must have the same samples, each once", "Generate for the same manifest"
-    same = a == b and len(a) == len(first.ids) == len(other.ids)
-    require(same, None, must, got, fix=f"{fix} and split")
+    names = repr(first_name), repr(name)
+    require_same_ids(first.ids, other.ids, names)
+    both = " and ".join(names)
     require_one_encoder(first, other, both)
     other = other if list(other.ids) == list(first.ids) else other.take(list(first.ids))
     for column in ("labels", "groups"):

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import io
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from hashlib import blake2b
 from typing import Any
@@ -35,28 +35,28 @@ from palpate.metrics.kernels import gaussian, kernel_sums
 from palpate.metrics.mmd import build_table, largest_bound, mmd_matrix, plan_for, unit_index
 from palpate.metrics.tactile import copied_rows, tmmd_of
 
-COLUMNS = ("ids", "groups")
-
 
 @dataclass(frozen=True)
 class Batch:
-    """Rows of one update: (n, d) float32 or float64; n ids and groups, or None."""
+    """Rows of one update, of real samples or of generated ones.
 
-    features: NDArray[Any]
+    Attributes:
+        arrays: ``features``, (n, d) float32 or float64; (n,) ``ids`` and ``groups`` if given.
+        real: whether these are real samples.
+    """
+
+    arrays: Mapping[str, NDArray[Any]]
     real: bool = False
-    ids: list[str] | None = None
-    groups: list[str] | None = None
 
-    def columns(self) -> dict[str, list[str]]:
-        """The ids and groups that there are."""
-        columns = {name: getattr(self, name) for name in COLUMNS}
-        return {name: values for name, values in columns.items() if values is not None}
+    @property
+    def features(self) -> NDArray[Any]:
+        """(n, d)."""
+        return self.arrays["features"]
 
     def to_bytes(self) -> NDArray[np.uint8]:
         """The batch as bytes: size and ``real`` as int64, then an npz; several may be joined."""
-        names = [(name, np.array(v, dtype=str)) for name, v in self.columns().items()]
         buffer = io.BytesIO()
-        np.savez(buffer, allow_pickle=False, features=self.features, **dict(names))
+        np.savez(buffer, allow_pickle=False, **self.arrays)
         head = np.array([buffer.getbuffer().nbytes, self.real], dtype="<i8").view(np.uint8)
         return np.concatenate([head, np.frombuffer(buffer.getvalue(), dtype=np.uint8)])
 
@@ -67,8 +67,7 @@ class Batch:
             size, real = (int(v) for v in joined[:16].view("<i8"))
             stop = 16 + size
             with np.load(io.BytesIO(joined[16:stop].tobytes()), allow_pickle=False) as data:
-                names = [data[name].tolist() if name in data else None for name in COLUMNS]
-                yield cls(data["features"], bool(real), *names)
+                yield cls(dict(data), bool(real))
             joined = joined[stop:]
 
 
@@ -78,7 +77,7 @@ def require_like(batch: Batch, before: Sequence[Batch]) -> None:
         widths = [b.features.shape[1] for b in (other, batch)]
         must, fix = "must have the same width in all updates", "Embed all with the same encoder"
         require(widths[0] == widths[1], "features", must, f"{widths[0]} and {widths[1]}", fix=fix)
-        both = [", ".join(b.columns()) or "none" for b in (other, batch)]
+        both = [", ".join(b.arrays) for b in (other, batch)]
         same = not len(batch.features) or batch.real != other.real or both[0] == both[1]
         must = "All updates of one set must give the same of ids and groups"
         require(same, None, must, " and ".join(both), fix="Give each always, or never")
@@ -86,13 +85,10 @@ def require_like(batch: Batch, before: Sequence[Batch]) -> None:
 
 def joined(batches: Sequence[Batch], real: bool, encoder: str | None) -> FeatureSet:
     """The rows of a set in the order of arrival."""
-    batches = [b for b in batches if b.real == real]
-    features = np.concatenate([b.features for b in batches])
-    of_batches = [b.columns() for b in batches]
-    ids, groups = (
-        [v for columns in of_batches for v in columns[name]] if name in of_batches[0] else None
-        for name in COLUMNS
-    )
+    each = [b.arrays for b in batches if b.real == real]
+    arrays = {name: np.concatenate([a[name] for a in each]) for name in each[0]}
+    features = arrays["features"]
+    ids, groups = (arrays[n].tolist() if n in arrays else None for n in ("ids", "groups"))
     ids = ids or row_ids(features, "real" if real else "generated")
     return FeatureSet(ids, features, None, groups, encoder)
 
@@ -159,8 +155,11 @@ class TMMD:
         name = f"The {'real' if real else 'generated'} features of this update"
         x = checked_features(name, to_host(features), normalize=False, least=0)
         checked_features(name, x, normalize=self.plan.normalize, least=0)
-        names = (checked_names(c, v, len(x)) for c, v in (("ids", ids), ("groups", groups)))
-        batch = Batch(np.array(x, order="C"), bool(real), *names)  # buffers are often used again
+        arrays = {"features": np.array(x, order="C")}  # buffers are often used again
+        for column, values in (("ids", ids), ("groups", groups)):
+            if (names := checked_names(column, values, len(x))) is not None:
+                arrays[column] = np.array(names, dtype=str)
+        batch = Batch(arrays, bool(real))
         require_like(batch, self.batches)
         if len(batch.features):
             self.batches.append(batch)

@@ -358,20 +358,21 @@ def d_tmmd_of(table: Table) -> Scored:
     sums = table.halves(kept)
     design = design_of(sums.totals, plan)
 
-    def matrix_of(t: Totals) -> Array:  # D (C, C), of Eq. 5 on the diagonal and of Eq. 6 off it
-        matrix = mmd_matrix(whole_sets(t), plan.estimator, plan.scale)
-        np.fill_diagonal(matrix, self_distances(t, plan, design)[0])
-        return matrix
+    def matrix_of(t: Totals) -> tuple[Array, float]:  # D (C, C), and the mean E
+        matrix = mmd_matrix(whole_sets(t), plan.estimator, plan.scale)  # Eq. 6
+        own, excess = self_distances(t, plan, design)
+        np.fill_diagonal(matrix, own)  # Eq. 5
+        return matrix, float(excess.mean())
 
     def statistic(t: Totals) -> Array:
-        matrix = matrix_of(t)
+        matrix, excess = matrix_of(t)
         inter = float(denominators(matrix, "mean_off_diagonal").mean())
         ratio = d_ratio(matrix, plan.denominator, plan.aggregate)
         pooled = d_ratio(matrix, plan.denominator, "ratio_of_means")
-        excess = float(self_distances(t, plan)[1].mean()) / (inter or np.nan)
-        return np.array([ratio, excess, pooled, inter, *denominators(matrix, plan.denominator)])
+        each = denominators(matrix, plan.denominator)
+        return np.array([ratio, excess / (inter or np.nan), pooled, inter, *each])
 
-    est, matrix = class_estimate(sums, statistic, table.unit), matrix_of(sums.totals)
+    est, (matrix, _) = class_estimate(sums, statistic, table.unit), matrix_of(sums.totals)
     _, excess, pooled, inter, *below = est.spreads
     # A ratio over a mean that may well be 0 is noise.
     apart = inter.value > (2 * inter.error if np.isfinite(inter.error) else 0.0)
