@@ -28,7 +28,7 @@ from numpy.typing import NDArray
 
 from palpate.core import FeatureSet, Score, require
 from palpate.metrics.inputs import Array, require_one_encoder
-from palpate.metrics.intervals import Spread, jackknife_errors
+from palpate.metrics.intervals import Spread, jackknife_error
 
 #: Side that contact pixels are averaged to.
 SIDE = 32
@@ -166,7 +166,7 @@ def _spread(
     names = np.unique(np.concatenate(groups))
     kept = [(drawn[groups[0] != g], test[groups[1] != g]) for g in names]
     replicates = np.array([statistic(*pair) for pair in kept if min(map(len, pair))])
-    error, df = float(jackknife_errors(replicates[:, None])[0]), len(names) - 1
+    error, df = jackknife_error(replicates), len(names) - 1
     method = f"leave-one-video-out jackknife, t, {df} df"
     return Spread(statistic(drawn, test), error, df, method)
 

@@ -140,7 +140,7 @@ def _fid(
         units = list(blocks.names)
         without = (_without_each(v, at, len(units), center) for v, at in sets)
         replicates = np.array([_distance(*pair) for pair in zip(*without, strict=True)])
-    spread = Spread.of(value, replicates, blocks.method)
+    spread = Spread.of(value, replicates, blocks.details["left_out"], blocks.tail)
     n, d = min(len(x), len(y)), x.shape[1]
     notes.append(Note("fid-biased") if n > d else Note("fid-mostly-bias", {"n": n, "d": d}))
     notes += [Note("no-interval-few-units")] if not spread.known else []
@@ -229,7 +229,7 @@ class _Blocks(NamedTuple):
     y: Index
     names: Sequence[str]
     details: dict[str, Any]
-    method: str
+    tail: str = ""
 
 
 def _rows(
@@ -256,8 +256,7 @@ def _draw_blocks(n: int, m: int, groups: Sequence[list[str] | None], seed: int) 
         x, y, units, unit = of_row[:n], of_row[n:], len(names), "group"
         if units <= BLOCKS:
             details = {"units": units, "unit": unit, "left_out": "group"}
-            method = f"leave-one-group-out jackknife, t, {units - 1} df"
-            return _Blocks(x, y, names.tolist(), details, method)
+            return _Blocks(x, y, names.tolist(), details)
         # the largest group first into the block that has least, ties at random: nearly equal sizes
         size = np.bincount(x, minlength=units) / n + np.bincount(y, minlength=units) / m
         order, load, block = rng.permutation(units), np.zeros(BLOCKS), np.zeros(units, np.intp)
@@ -266,8 +265,8 @@ def _draw_blocks(n: int, m: int, groups: Sequence[list[str] | None], seed: int) 
             load[block[u]] += size[u]
         x, y, count, members = block[x], block[y], BLOCKS, f"whole groups ({units} groups)"
     details = {"units": units, "unit": unit, "left_out": "block"}
-    method = f"leave-one-block-out jackknife, {count} random blocks of {members}, t, {count - 1} df"
-    return _Blocks(x, y, [f"block {b}" for b in range(count)], details, method)
+    tail = f", random blocks of {members}"
+    return _Blocks(x, y, [f"block {b}" for b in range(count)], details, tail)
 
 
 def prdc(generated: Any, reference: Any, k: int = 5, **options: Any) -> list[Score]:

@@ -223,13 +223,14 @@ LEVEL = 0.95
 BATCH = 256
 
 
-def jackknife_errors(replicates: Array) -> Array:
-    """Standard errors (K,) from leave-one-out values (G, K); NaN if one is undefined or G < 2."""
+def jackknife_error(replicates: Array) -> float:
+    """Standard error from leave-one-out values (G,); NaN if one is undefined or G < 2."""
     g = len(replicates)
     if g < 2:
-        return np.full(replicates.shape[1:], np.nan)
+        return np.nan
     with np.errstate(invalid="ignore"):
-        return np.sqrt((g - 1) / g * ((replicates - replicates.mean(axis=0)) ** 2).sum(axis=0))
+        drift = replicates - np.mean(replicates)
+        return float(np.sqrt((g - 1) / g * (drift**2).sum()))
 
 
 @dataclass(frozen=True)
@@ -242,10 +243,11 @@ class Spread:
     method: str
 
     @classmethod
-    def of(cls, value: float, replicates: Array, method: str = "") -> Spread:
-        """A value with its jackknife, from the values (G,) without each group."""
-        error = float(jackknife_errors(replicates[:, None])[0])
-        return cls(value, error, len(replicates) - 1, method)
+    def of(cls, value: float, replicates: Array, unit: str = "group", tail: str = "") -> Spread:
+        """A value with its jackknife, from the values (G,) without each unit."""
+        df = len(replicates) - 1
+        method = f"leave-one-{unit}-out jackknife, t, {df} df{tail}"
+        return cls(value, jackknife_error(replicates), df, method)
 
     @property
     def known(self) -> bool:
@@ -275,11 +277,8 @@ def spread_of_values(values: Array, groups: Sequence[str] | None) -> Spread:
     of_group = np.unique(np.asarray(groups, dtype=str), return_inverse=True)[1]
     total, size = np.bincount(of_group, values), np.bincount(of_group)
     value = float(values.mean()) if n else np.nan
-    if len(size) < 2:
-        return Spread(value, np.nan, 0, "")
-    without = (total.sum() - total) / (n - size)
-    method = f"leave-one-{each}-out jackknife, t, {len(size) - 1} df{tail}"
-    return Spread.of(value, without, method)
+    with np.errstate(invalid="ignore", divide="ignore"):  # of one group nothing is left
+        return Spread.of(value, (total.sum() - total) / (n - size), each, tail)
 
 
 def score_of(
@@ -312,9 +311,8 @@ def estimate(sums: PairSums, statistic: Callable[[Totals], Array], unit: str) ->
     """The statistics on all samples, with their leave-one-unit-out jackknife."""
     replicates = np.array([statistic(t) for t in sums.leave_one_out()], dtype=np.float64)
     tail = "" if unit == "group" else ", samples taken as independent"
-    method = f"leave-one-{unit}-out jackknife, t, {len(replicates) - 1} df{tail}"
     pairs = zip(statistic(sums.totals), replicates.T, strict=True)
-    return Estimate([Spread.of(*pair, method) for pair in pairs], replicates, sums.units)
+    return Estimate([Spread.of(*pair, unit, tail) for pair in pairs], replicates, sums.units)
 
 
 def class_estimate(sums: PairSums, statistic: Callable[[Totals], Array], unit: str) -> Estimate:
@@ -329,11 +327,9 @@ def class_estimate(sums: PairSums, statistic: Callable[[Totals], Array], unit: s
     if classes < 3 or np.isfinite(over_units.spreads[0].error):
         return over_units
     without = np.array([statistic(without_set(sums.totals, c))[:4] for c in range(classes)])
-    reason = f"(a class has too few {unit}s to leave one out)"
-    method = f"leave-one-class-out jackknife, t, {classes - 1} df {reason}"
-    first, further = over_units.spreads[: without.shape[1]], over_units.spreads[without.shape[1] :]
-    spreads = [Spread.of(s.value, v, method) for s, v in zip(first, without.T, strict=True)]
-    spreads += [Spread(s.value, np.nan, classes - 1, method) for s in further]
+    tail, left = f" (a class has too few {unit}s to leave one out)", iter(without.T)
+    none = np.full(classes, np.nan)
+    spreads = [Spread.of(s.value, next(left, none), "class", tail) for s in over_units.spreads]
     return Estimate(spreads, without, over_units.units, of_classes=True)
 
 

@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 
 from palpate.core import Score
 from palpate.metrics.inputs import Array
-from palpate.metrics.intervals import Spread, jackknife_errors, score_of
+from palpate.metrics.intervals import Spread, jackknife_error, score_of
 
 #: (..., K) means -> (...) their statistic.
 Statistic = Callable[[Array], Array]
@@ -109,10 +109,9 @@ def spread_of(
     g, s = len(names), len(by_seed)
     value = float(statistic(by_seed.mean(axis=0)))
     replicates = statistic(without.mean(axis=1).T)
-    of_groups = float(jackknife_errors(replicates[:, None])[0]) ** 2 if g > 1 else np.nan
     if s == 1:
-        method = f"leave-one-group-out jackknife, t, {g - 1} df"
-        return Spread(value, float(np.sqrt(of_groups)), g - 1, method)
+        return Spread.of(value, replicates)
+    of_groups = jackknife_error(replicates) ** 2
     of_seeds = float(np.var(statistic(by_seed), ddof=1)) / s
     parts = of_groups**2 / max(g - 1, 1) + of_seeds**2 / (s - 1)
     df = (of_groups + of_seeds) ** 2 / parts if parts > 0 else g - 1

@@ -267,8 +267,7 @@ def difference(a: Scored, b: Scored, floor: Scored | None = None) -> Score:
         reason = "different-units" if a.units else "no-units"
         return _paired(x, y, Spread(x.value - y.value, np.nan, 0, ""), {}, reason)
     unit = x.details.get("left_out", x.details["unit"])
-    method = f"leave-one-{unit}-out jackknife, t, {len(a.units) - 1} df"
-    spread = Spread.of(x.value - y.value, a.replicates - b.replicates, method)
+    spread = Spread.of(x.value - y.value, a.replicates - b.replicates, unit)
     p = 2 * min(spread.shares()) if spread.known else None
     details: dict[str, Any] = {"p_value": p}
     if x.higher_is_better is not None:
