@@ -1,17 +1,5 @@
 """The vocabulary that every room shares; needs NumPy alone."""
 
-from palpate.core.errors import (
-    MissingExtraError,
-    PalpateError,
-    PalpateWarning,
-    Problem,
-    ProblemsError,
-    few,
-    fields_of,
-    problem_lines,
-    require,
-    require_choice,
-)
 from palpate.core.features import FeatureSet
 from palpate.core.files import (
     atomic_folder,
@@ -35,8 +23,23 @@ from palpate.core.files import (
     write_json,
     write_text,
 )
-from palpate.core.notes import Note, SampleRef
-from palpate.core.progress import Progress, quiet, track
+from palpate.core.messages import (
+    MissingExtraError,
+    Note,
+    PalpateError,
+    PalpateWarning,
+    Problem,
+    ProblemsError,
+    Progress,
+    SampleRef,
+    few,
+    fields_of,
+    problem_lines,
+    quiet,
+    require,
+    require_choice,
+    track,
+)
 from palpate.core.score import Measure, Score, require_comparable
 from palpate.core.split import PARTS, Split
 

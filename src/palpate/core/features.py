@@ -13,8 +13,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from palpate.core.errors import PalpateError, few, require_rows
 from palpate.core.files import atomic_path
+from palpate.core.messages import PalpateError, few, require_rows
 
 Array = NDArray[np.float64]
 Index = NDArray[np.intp]

@@ -21,7 +21,7 @@ from typing import Any
 
 import numpy as np
 
-from palpate.core.errors import PalpateError
+from palpate.core.messages import PalpateError
 
 #: The error numbers of a full disk, a quota and a limit on file sizes.
 NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)

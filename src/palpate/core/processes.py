@@ -13,7 +13,7 @@ from contextlib import contextmanager
 from multiprocessing.connection import wait
 from typing import Any
 
-from palpate.core.errors import PalpateError
+from palpate.core.messages import PalpateError
 
 
 @contextmanager

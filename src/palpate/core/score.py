@@ -8,9 +8,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, Literal, NamedTuple
 
-from palpate.core.errors import PalpateError
 from palpate.core.files import plain, short
-from palpate.core.notes import Note
+from palpate.core.messages import Note, PalpateError
 from palpate.core.records import from_plain
 
 #: Settings that must agree before two scores may share a column.

@@ -19,9 +19,8 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-from palpate.core.errors import PalpateError
 from palpate.core.files import digest_lines, plain, read_record, short, write_json
-from palpate.core.notes import Note
+from palpate.core.messages import Note, PalpateError
 from palpate.core.records import from_plain
 
 PARTS = ("train", "val", "test")

@@ -49,7 +49,7 @@ from palpate.core import (
     inside,
     require,
 )
-from palpate.core.errors import require_rows
+from palpate.core.messages import require_rows
 
 IMAGE_COLUMNS = ("vision", "tactile", "background")
 _WORDS = ("video", "frame", "contact", "object", "session", "material", "text")

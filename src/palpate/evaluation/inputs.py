@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
 from palpate.core import Note, PalpateError, Split, require
-from palpate.core.errors import require_rows
+from palpate.core.messages import require_rows
 from palpate.evaluation.embedding_files import GROUPS, LABELS, first_of, require_ids, text_column
 from palpate.evaluation.samples import Samples, picked
 from palpate.evaluation.sources import KINDS, Source, is_image_file, read, without_suffix

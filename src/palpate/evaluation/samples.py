@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from palpate.core import FeatureSet, PalpateError, Progress, digest_file, digest_json, short
-from palpate.core.errors import require_rows
+from palpate.core.messages import require_rows
 
 if TYPE_CHECKING:
     from palpate.data.manifest import Manifest

@@ -20,7 +20,6 @@ from importlib import import_module
 from pathlib import Path, PurePath
 from typing import TYPE_CHECKING, Any, ClassVar, Self, overload
 
-from palpate.core.errors import PalpateError
 from palpate.core.files import (
     digest_file,
     digest_folder,
@@ -29,7 +28,7 @@ from palpate.core.files import (
     reading_entry,
     write_json,
 )
-from palpate.core.notes import Note, SampleRef
+from palpate.core.messages import Note, PalpateError, SampleRef
 from palpate.core.records import from_plain
 from palpate.core.score import Score
 from palpate.report.labels import label_of, subject_of

@@ -26,8 +26,8 @@ from pathlib import Path
 from typing import Any
 
 from palpate._version import __version__
-from palpate.core.errors import PalpateError
 from palpate.core.files import canonical_json, digest_folder, digest_json, read_json, write_json
+from palpate.core.messages import PalpateError
 
 FORMAT = "palpate-stage/1"
 #: Facts of a stage (JSON) for its record.

@@ -1,17 +1,22 @@
-"""Errors for people: what must hold, what was given instead, and how to fix it.
+"""What rooms tell front ends: errors, notes, references to samples, and progress.
 
-Everything that a user can get wrong raises a :class:`PalpateError`; the command line prints it
-without a traceback and exits with status 2.
+* Errors are for people: what must hold, what was given instead, and how to fix it. Everything that
+  a user can get wrong raises a :class:`PalpateError`; the command line prints it without a
+  traceback and exits with status 2.
+* A note is what a reader must know about a number, as a code with parameters. Rooms make notes;
+  :mod:`palpate.report.notes` has the sentence of each code. No program parses a sentence.
+* Progress is counted in the rooms and drawn by the command line: a room that works for long takes
+  ``progress: Progress = quiet`` and calls ``progress("decoding", 3, 100)``.
 """
 
 from __future__ import annotations
 
 import re
 from collections import Counter
-from collections.abc import Callable, Generator, Iterable, Mapping, Sequence
+from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass
-from typing import Any
+from dataclasses import asdict, dataclass, field
+from typing import Any, Protocol, TypeVar
 
 #: Names that a list in a sentence has.
 FEW = 5
@@ -233,3 +238,52 @@ class MissingExtraError(PalpateError):
     def __init__(self, package: str, extra: str, purpose: str) -> None:
         must, got = f"{purpose} needs the package {package}", "no such package in this environment"
         super().__init__(must, got, f"In palpate's checkout run: pip install -e '.[{extra}]'")
+
+
+@dataclass(frozen=True)
+class Note:
+    """One thing that a reader must know.
+
+    Attributes:
+        code: stable and lower-case, words joined by hyphens (``"copied-rows"``).
+        params: what the sentence is filled with; plain JSON values.
+    """
+
+    code: str
+    params: Mapping[str, Any] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class SampleRef:
+    """A sample. Image paths are absolute or relative to the results file; None = no image."""
+
+    id: str
+    video: str | None = None
+    frame: int | None = None
+    material: str | None = None
+    vision: str | None = None
+    tactile: str | None = None
+    background: str | None = None
+
+
+T = TypeVar("T")
+
+
+class Progress(Protocol):
+    """Called with the task, the amount done, the total (0 = unknown), and a short remark."""
+
+    def __call__(self, task: str, done: int, total: int, remark: str = "", /) -> None:
+        """Report once."""
+
+
+def quiet(task: str, done: int, total: int, remark: str = "") -> None:
+    """Show nothing."""
+
+
+def track(items: Iterable[T], task: str, progress: Progress) -> Iterator[T]:
+    """Yield ``items`` and report after each."""
+    count = len(items) if isinstance(items, Sequence) else 0
+    progress(task, 0, count)
+    for done, item in enumerate(items, 1):
+        yield item
+        progress(task, done, count)
