@@ -1,6 +1,7 @@
 """Whether the error bars hold: coverage of 95 % intervals, and rejections of a true null.
 
     python benchmarks/metric_coverage.py 600 > docs/studies/metric_coverage.md    # seven minutes
+    python benchmarks/metric_coverage.py 2000 --misses    # TMMD alone: where intervals miss
 
 Frames of a video are drawn as ``normalized(mean + class + video + frame)``: Gaussian effects in 16
 dimensions, unit-norm rows. A replicate draws new videos of 3 to 8 frames; a generator adds a shift,
@@ -150,7 +151,7 @@ class Tally:
         return (low <= truth) & (truth <= high)
 
 
-def tally_tmmd(model, truth, videos, paired, replicates, seed, frames=0):
+def tally_tmmd(model, truth, videos, paired, replicates, seed, frames=0, permutations=199):
     """TMMD with a shift, and p-values without; the first ``frames`` replicates also groupless."""
     tallies = {name: Tally() for name in ("TMMD", "TMMD, frames", "TMMD null", "TMMD null, frames")}
     rejected = {"videos": [], "frames": []}
@@ -158,7 +159,7 @@ def tally_tmmd(model, truth, videos, paired, replicates, seed, frames=0):
         rng = rng_for(seed, "metric coverage", f"{videos} {paired} {r}")
         for shift, name in ((1.0, "TMMD"), (0.0, "TMMD null")):
             sets = draw_pair(model, rng, videos, paired, shift)
-            options = {"seed": r, "permutations": 0 if shift else 199}
+            options = {"seed": r, "permutations": 0 if shift else permutations}
             scores = {"videos": tmmd(*sets, **options)}
             if r < frames:
                 bare = [FeatureSet(s.ids, s.features) for s in sets]
@@ -166,7 +167,7 @@ def tally_tmmd(model, truth, videos, paired, replicates, seed, frames=0):
             for unit, score in scores.items():
                 tally = tallies[name + (", frames" if unit == "frames" else "")]
                 tally.add(score.value, score.interval, truth.tmmd[shift])
-                if not shift:
+                if not shift and permutations:
                     rejected[unit].append(score.details["p_value"] <= 0.05)
     return tallies, {unit: np.array(hits) for unit, hits in rejected.items()}
 
@@ -232,6 +233,23 @@ def cell(tally):
     return f"{100 * np.mean(tally.covered):.1f} % ({np.nanmean(value - truth):+.4f})"
 
 
+def misses(replicates, videos=(10, 20, 40)):
+    """Intervals of TMMD that hold the truth, lie below it, and lie above it, in percent."""
+    model, rows = Model.make(), defaultdict(list)
+    truth = truth_of(model)
+    for count in videos:
+        for kind in KINDS:
+            pair = kind == "paired"
+            tallies, _ = tally_tmmd(model, truth, count, pair, replicates, 0, permutations=0)
+            for name in ("TMMD", "TMMD null"):
+                _, low, high, exact = tallies[name].table.T
+                shares = [
+                    100 * np.mean(v) for v in (tallies[name].covered, high < exact, low > exact)
+                ]
+                rows[f"{name}, {kind}"].append("{:.1f} ({:.1f}, {:.1f})".format(*shares))
+    return table("videos", videos, rows)
+
+
 def table(unit, counts, rows):
     """Cells by name, a column for each number of ``unit``."""
     head = f"| | {' | '.join(f'{count} {unit}' for count in counts)} |"
@@ -269,6 +287,9 @@ def tables(replicates, videos=(12, 24, 40)):
 
 if __name__ == "__main__":
     replicates = int(sys.argv[1]) if len(sys.argv) > 1 else 600
+    if "--misses" in sys.argv:
+        print("\n".join(misses(replicates)))
+        sys.exit()
     print("# Whether the error bars of the metrics hold\n")
     print(
         f"Written by `python benchmarks/metric_coverage.py {replicates}`, "
