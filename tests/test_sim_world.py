@@ -20,7 +20,12 @@ from palpate.sim.plan import contact_frames, contact_rows
 
 TINY = dataclasses.replace(PRESETS["tiny"], size=32, tile=64, mixed=0.3, two_videos=0.25)
 LEAKY = dataclasses.replace(
-    TINY, objects_per_material=4, two_videos=0.5, contacts_per_video=3, frames_per_contact=3
+    TINY,
+    size=16,
+    objects_per_material=4,
+    two_videos=0.5,
+    contacts_per_video=3,
+    frames_per_contact=3,
 )
 IMAGES = ("vision", "tactile", "background")
 CELLS = ("id", "video", "frame", "contact", "object", "material", "text", "sensor")

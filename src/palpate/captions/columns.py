@@ -46,13 +46,13 @@ def _columns(template: str) -> list[str]:
         PalpateError: if there is none, or anything else in braces.
     """
     must = "must be a text with columns in braces"
-    example, fix = {"template": "{material} of {object}"}, f"Columns are {', '.join(SCHEMA)}"
+    example, fix = "{material} of {object}", f"Columns are {', '.join(SCHEMA)}"
     try:
         fields = [field[1:] for field in Formatter().parse(template) if field[1] is not None]
     except ValueError as error:
-        raise PalpateError(must, str(error), "", argument="template", example=example) from None
+        words = {"template": example}
+        raise PalpateError(must, str(error), "", argument="template", example=words) from None
     odd = [str(name) for name, *form in fields if name not in SCHEMA or any(form)]
-    if odd or not fields:
-        got = f"{{{odd[0]}}}" if odd else f"{template!r}, which names none"
-        raise PalpateError(must, got, fix, argument="template", example=example)
+    got = f"{{{odd[0]}}}" if odd else f"{template!r}, which names none"
+    require(bool(fields) and not odd, "template", must, got, example, fix=fix)
     return [str(name) for name, *_ in fields]

@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from queue import Empty, SimpleQueue
-from typing import TYPE_CHECKING, TypeVar
+from typing import TYPE_CHECKING
 
 from PIL import Image
 
@@ -32,8 +32,6 @@ CTRL_C = 0.2
 # One photo at a time: a photo is read in many small steps, and threads that take turns after each
 # of them need half as much time again.
 _READING = threading.Lock()
-T = TypeVar("T")
-R = TypeVar("R")
 
 
 @dataclass(frozen=True)
@@ -65,6 +63,10 @@ def photos_of(
         sample = "" if row is None else ids[row]
         photos.append(Photo(sample, path, None if digest is None else question.key(digest)))
     return photos
+
+
+#: Of a request: the key of its photo, and what is wrong with it.
+Ended = tuple[str, Problem | None]
 
 
 def prepared(path: Path) -> bytes:
@@ -133,7 +135,7 @@ def query_all(
         PalpateError: if the server fails, or takes no request at all.
     """
 
-    def work(photo: Photo) -> tuple[str, Problem | None]:
+    def work(photo: Photo) -> Ended:
         key, path = str(photo.key), str(photo.path)
         try:
             image = prepared(Path(path))
@@ -188,15 +190,15 @@ def _replies(image: bytes, question: Question, server: Server) -> Iterator[Reply
 
 
 def in_daemons(
-    function: Callable[[T], R], items: Iterable[T], threads: int
-) -> Iterator[R | BaseException]:
+    function: Callable[[Photo], Ended], items: Iterable[Photo], threads: int
+) -> Iterator[Ended | BaseException]:
     """Yield results, or what was raised, as they finish; a caller that leaves waits for nothing.
 
     Other than :func:`palpate.data.images.in_threads`, which waits for its threads: a request may
     hang for minutes. No item and no result is None.
     """
     lock, stop, source = threading.Lock(), threading.Event(), iter(items)
-    results: SimpleQueue[R | BaseException | None] = SimpleQueue()  # None: a thread has ended
+    results: SimpleQueue[Ended | BaseException | None] = SimpleQueue()  # None: a thread ended
 
     def work() -> None:
         while not stop.is_set():
