@@ -13,9 +13,9 @@ import multiprocessing
 import os
 import signal
 import traceback
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import partial
+from functools import cached_property, partial
 from multiprocessing.connection import wait
 from multiprocessing.process import BaseProcess
 from pathlib import Path
@@ -157,7 +157,6 @@ def run_graph(
     require(jobs >= 1, "jobs", "must be at least 1", jobs)
     run = _Run(in_order(nodes), Path(folder), device, jobs, print_line, progress)
     with locked(run.folder):
-        run.take_finished()
         if jobs == 1:
             _run_here(run)
         else:
@@ -172,7 +171,8 @@ def plan_graph(nodes: Sequence[Node], folder: Path) -> dict[str, bool]:
     same files.
     """
     run = _Run(in_order(nodes), Path(folder))
-    run.take_finished()
+    while run.next_task():
+        pass
     return {node.name: node.name in run.stages for node in run.ordered}
 
 
@@ -247,30 +247,33 @@ class _Run:
     stages: dict[str, Stage] = field(default_factory=dict[str, Stage])
     begun: set[str] = field(default_factory=set[str])
 
-    def ready(self) -> Iterator[tuple[Node, dict[str, Stage]]]:
-        """The nodes that may begin, in order, with the stages that they read."""
+    @cached_property
+    def digests(self) -> dict[str, str]:
+        return digests_of(self.ordered)
+
+    def next_task(self) -> tuple[Node, dict[str, Stage]] | None:
+        """Begin the next node that may be built, of the stages that it reads; None without one.
+
+        What needs no work is taken on the way: from the start, or once what it reads has been made
+        again.
+        """
         for node in self.ordered:
-            if node.name not in {*self.stages, *self.begun} and self.stages.keys() >= {*node.after}:
-                yield node, {name: self.stages[name] for name in node.after}
-
-    def take_finished(self) -> None:
-        """Take what needs no work, from now on or once what it reads has been made again."""
-        digests = digests_of(self.ordered)
-        for node, before in self.ready():
+            if node.name in {*self.stages, *self.begun} or not self.stages.keys() >= {*node.after}:
+                continue
+            before = {name: self.stages[name] for name in node.after}
             outputs = {name: stage.outputs for name, stage in before.items()}
-            stage = finished_stage(self.folder / node.name, digests[node.name], outputs)
-            if stage is not None:
-                self.stages[node.name] = stage
-                self.print_line(f"{node.name}: already done ({stage.seconds:.0f} s then)")
-
-    def begin(self, node: Node) -> None:
-        self.begun.add(node.name)
-        self.show()
+            stage = finished_stage(self.folder / node.name, self.digests[node.name], outputs)
+            if stage is None:
+                self.begun.add(node.name)
+                self.show()
+                return node, before
+            self.stages[node.name] = stage
+            self.print_line(f"{node.name}: already done ({stage.seconds:.0f} s then)")
+        return None
 
     def end(self, stage: Stage) -> None:
         self.begun.remove(stage.folder.name)
         self.stages[stage.folder.name] = stage
-        self.take_finished()
         self.show()
         if len(self.stages) < len(self.ordered):
             self.print_line(f"{len(self.stages)} of {len(self.ordered)} stages")
@@ -315,8 +318,7 @@ def _run_here(run: _Run) -> None:
         run.show()
         run.progress(step, done, total, remark)
 
-    while task := next(run.ready(), None):
-        run.begin(task[0])
+    while task := run.next_task():
         run.end(_build_node(run.folder, run.device, task, run.print_line, report))
 
 
@@ -324,15 +326,16 @@ def _run_in_workers(run: _Run) -> None:
     workers: dict[Channel, BaseProcess] = {}
     idle: list[Channel] = []
     try:
-        while len(run.stages) < len(run.ordered):
-            while (idle or len(workers) < run.jobs) and (task := next(run.ready(), None)):
+        while True:
+            while (idle or len(workers) < run.jobs) and (task := run.next_task()):
                 worker = idle.pop() if idle else _start_worker(workers, run)
                 try:
                     worker.send(task)
                 except OSError:  # it died while it was idle
                     _raise_dead(workers[worker])
-                run.begin(task[0])
-            for worker in wait([w for w in workers if w not in idle], timeout=1.0):
+            if not (running := [w for w in workers if w not in idle]):
+                break
+            for worker in wait(running, timeout=1.0):
                 try:
                     kind, value = cast("Channel", worker).recv()
                 except (EOFError, OSError):
