@@ -4,6 +4,7 @@ import ast
 import contextlib
 import re
 import shlex
+from dataclasses import fields
 from importlib import import_module
 from pathlib import Path
 
@@ -97,6 +98,9 @@ def examples():
 def test_examples_are_written_as_the_options_of_a_verb(verb):
     """Those of the arguments that it has, the last of each."""
     options = import_module(f"palpate.cli.{VERBS[verb].module}").Options
+    unnamed = [f.name for f in fields(options) if re.search("Positional|PathArg", f.type)]
+    written = [terminal.option_name(verb, name) for name in unnamed if name != "manifest"]
+    assert not [name for name in written if name.startswith("--")]
     strings, words = terminal.option_strings(options), {}
     for argument, value in examples():
         if (name := terminal.option_name(verb, argument)) in strings:

@@ -65,6 +65,8 @@ from palpate.core.files import NO_ROOM, is_stream
 if TYPE_CHECKING:
     from palpate.report.results import Audit, Results
 
+#: Arguments that are paths without a name on the command line.
+_PATHS = ("data", "source", "photos", "paths", "study", "votes", "results")
 #: Verb and argument of its function -> how the command line writes it, where that is not the
 #: argument's own name ("--sigma"). '' is every verb.
 OPTION_NAMES: dict[tuple[str, str], str] = {
@@ -82,9 +84,8 @@ OPTION_NAMES: dict[tuple[str, str], str] = {
     ("train generator", "method"): "--set sampler.method",
     ("presets", "name"): "NAME",
     ("", "side"): "--as",
-    ("", "data"): "PATH",
-    ("", "source"): "PATH",
-    ("generate", "photos"): "PATH",
+    ("reproduce", "study"): "STUDY",
+    **{("", name): "PATH" for name in _PATHS},
 }
 #: Arguments whose True and False are words of an option.
 WORDED = ("normalize",)
