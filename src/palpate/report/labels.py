@@ -152,6 +152,6 @@ def file_names(kind: str, titles: Sequence[str]) -> list[str]:
     for title in titles:
         words = re.sub("[^a-z0-9]+", "-", title.lower()).strip("-")[:48].strip("-")
         name = words if words.startswith(f"{kind}-") else f"{kind}-{words}".strip("-")
-        same = (f"{name}-{k}" for k in itertools.count(2))
-        names.append(name if name not in names else next(n for n in same if n not in names))
+        same = itertools.chain([name], (f"{name}-{k}" for k in itertools.count(2)))
+        names.append(next(n for n in same if n not in names))
     return names

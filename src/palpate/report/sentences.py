@@ -85,12 +85,12 @@ def cause_texts(signal: Signal) -> list[str]:
 
 def signal_notes(audit: Audit) -> list[tuple[str, Note]]:
     """Return the notes of signals, each once, with the kinds that have it."""
-    kinds: dict[str, list[str]] = {}
-    notes = {repr(note): note for s in audit.signals for note in s.notes}
-    for signal in audit.signals:
-        for note in signal.notes:
-            kinds.setdefault(repr(note), []).append(signal.kind)
-    return [(", ".join(kinds[key]), note) for key, note in notes.items()]
+    notes = [note for signal in audit.signals for note in signal.notes]
+    return [
+        (", ".join(signal.kind for signal in audit.signals if note in signal.notes), note)
+        for k, note in enumerate(notes)
+        if note not in notes[:k]
+    ]
 
 
 def chance_text(signal: Signal) -> str:

@@ -440,14 +440,12 @@ def _references(scores: Sequence[Score]) -> list[int]:
     measure. A score without one (I-, CI-, D-TMMD) goes with the last of its subject that has one,
     else with the first after it.
     """
-    digests: dict[tuple[Measure, str | None], list[str]] = {}
-    index: list[int | None] = []
-    for score in scores:
-        listed = digests.setdefault((score.measure, score.encoder), [])
-        if score.reference is not None and score.reference not in listed:
-            listed.append(score.reference)
-        index.append(None if score.reference is None else listed.index(score.reference))
-    rows = list(zip(((s.a, s.b) for s in scores), index, strict=True))
+    digests: dict[tuple[Measure, str | None], dict[str, int]] = {}
+    rows: list[tuple[tuple[str, str | None], int | None]] = []
+    for s in scores:
+        listed = digests.setdefault((s.measure, s.encoder), {})
+        k = None if s.reference is None else listed.setdefault(s.reference, len(listed))
+        rows.append(((s.a, s.b), k))
     last = {subject: k for subject, k in reversed(rows) if k is not None}
     result: list[int] = []
     for subject, k in rows:
