@@ -172,6 +172,8 @@ class Shown:
 
     form: ClassVar[str]
     role: ClassVar[str]
+    #: Whether the paths of its images start from the folder of its file.
+    own_images: ClassVar[bool] = False
 
     def __str__(self) -> str:
         """The tables, findings, notes and claims, as in the terminal."""
@@ -202,12 +204,14 @@ class Shown:
         return self.from_json(_with_paths(self.to_json(), images, inputs))
 
     def moved(self, change: Callable[[str], str]) -> Self:
-        """The same with ``change`` applied to the path of every input of its calls."""
-        return self.with_paths(str, change)
+        """The same with ``change`` applied to the paths that start from the folder of its file."""
+        return self.with_paths(change if self.own_images else str, change)
 
     def save(self, path: str | Path) -> None:
         """Write it as JSON, atomically; paths become relative to its folder."""
-        write_json(Path(path), self.moved(_from_folder(Path(path).parent, Path())).to_json())
+        change = _from_folder(Path(path).parent, Path())
+        images = change if self.own_images else str
+        write_json(Path(path), _with_paths(self.to_json(), images, change))
 
     @classmethod
     def load(cls, path: str | Path) -> Self:
@@ -355,6 +359,7 @@ class Results(Shown):
 
     form: ClassVar[str] = RESULTS_FORMAT
     role: ClassVar[str] = "results"
+    own_images: ClassVar[bool] = True
     title: str
     facts: Sequence[str] = ()
     audits: Sequence[Audit] = ()
@@ -468,10 +473,6 @@ class Results(Shown):
             return super().load(path)
         results = replace(Audit.load(path).to_results(), title="")
         return results.with_paths(lambda name: os.path.normpath(Path(path).parent / name))
-
-    def moved(self, change: Callable[[str], str]) -> Results:
-        """The results with ``change`` applied to every path, of images as well."""
-        return self.with_paths(change, change)
 
     def relative_to(self, folder: Path, base: Path) -> Results:
         """The results with paths relative to ``folder`` instead of ``base``.
