@@ -202,8 +202,8 @@ def test_chains_of_imports_are_short_and_none_runs_back_to_the_door():
 @pytest.mark.parametrize(
     ("words", "files"),
     [
-        ("score --generated a --reference b --encoder palpate/mini", 42),
-        ("generate b/0.png -o t.png", 18),  # of them core/messages, by its checks in one line
+        ("score --generated a --reference b --encoder palpate/mini", 35),
+        ("generate b/0.png -o t.png", 14),  # of them core/messages, by its checks in one line
     ],
 )
 def test_the_main_paths_stay_short(tmp_path, words, files):
