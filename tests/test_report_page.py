@@ -5,6 +5,7 @@ import io
 import json
 import re
 import xml.etree.ElementTree as ET
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -34,10 +35,10 @@ from palpate.report.plots import (
     nice_step,
     score_histogram,
 )
-from palpate.report.records import GalleryItem, LeakPair, Signal
+from palpate.report.records import Claim, GalleryItem, LeakPair, Signal, StudyTable
 from palpate.report.results import Results
 
-NASTY = "<script>alert(\"x\")</script> & 'quotes'"
+NASTY = "<script>alert(1)</script> & \"q\" 'q' 100% $x_1$ \\input{a} | `c` [d]"
 
 
 def page_of(results, folder, **options):
@@ -189,14 +190,26 @@ def test_text_is_escaped_everywhere(tmp_path):
     nasty = score(NASTY, NASTY, notes=(note,), settings={NASTY: NASTY}, details=details)
     item = GalleryItem(sample, f"{NASTY}.png", NASTY)
     settings = {NASTY: {NASTY: [NASTY]}}
+    table = StudyTable(NASTY, NASTY, [NASTY, NASTY], [[NASTY, nasty], [NASTY, None]], True, [NASTY])
     results = Results(NASTY, [f"9 {NASTY}"], [audit], [nasty], [item], settings, [note], [NASTY])
+    claims = [Claim(NASTY, NASTY, "holds", NASTY, [nasty])]
+    results = replace(results, tables=[table], claims=claims)
     html = page_of(results, tmp_path)
     tree = Tree(html)
     assert html.count("<script") == 1
-    assert tree.text.count(" ".join(NASTY.split())) > 20
+    assert tree.text.count(" ".join(NASTY.split())) > 30
     assert all(re.fullmatch(r"[a-z-]+[12]?|viewBox", k) for _, attrs in tree.tags for k in attrs)
-    markdown = re.sub(r"```.*?```|`[^`]*`", "", results.to_markdown(), flags=re.S)
+    code = r"```.*?```|(?<![`\\])(`+)(?!`).*?(?<!`)\1(?!`)"
+    markdown = re.sub(code, "", results.to_markdown(), flags=re.S)
     assert not re.search(r"(?<!\\)<", markdown)
+    latex = "\n".join(li for li in results.to_latex().splitlines() if not li.startswith("%"))
+    assert not re.search(r"\\input|\$x_1\$", latex)
+    assert str(results).count(NASTY[:20]) > 5
+    drawn = {"svg", "title", "desc", "style", "rect", "path", "text", "line", "circle"}
+    for path in results.save_figures(tmp_path / "f"):
+        assert path.parent.name == "f"
+        if path.suffix == ".svg":
+            assert {tag.tag.rpartition("}")[2] for tag in ET.parse(path).iter()} <= drawn
 
 
 def test_missing_and_broken_images_become_placeholders(tmp_path):
