@@ -137,18 +137,14 @@ def _earlier(card: Mapping[str, Any]) -> Iterator[Mapping[str, Any]]:
         card = before
 
 
-def write_model_cards(folder: Path) -> list[Path]:
+def write_model_cards(folder: Path) -> None:
     """Write ``README.md`` next to every ``palpate.json`` at or below ``folder``.
 
     A folder that only holds models gets a ``README.md`` that lists them.
 
-    Returns:
-        The files written.
-
     Raises:
         PalpateError: if a ``palpate.json`` is unreadable or of another format.
     """
-    folder = Path(folder)
     models = {
         file.parent: read_json(file, "model card") for file in sorted(folder.rglob("palpate.json"))
     }
@@ -157,7 +153,6 @@ def write_model_cards(folder: Path) -> list[Path]:
         pages[folder] = _contents(folder, models)
     for path, text in pages.items():
         write_text(path / "README.md", text)
-    return [path / "README.md" for path in pages]
 
 
 def _contents(folder: Path, models: Mapping[Path, Mapping[str, Any]]) -> str:
