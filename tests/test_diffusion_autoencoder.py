@@ -8,8 +8,7 @@ import pytest
 import torch
 from diffusers import VQModel
 
-from forge.errors import Bomb
-from palpate.core import PalpateError
+from forge.errors import Bomb, fails
 from palpate.diffusion.autoencoder import Autoencoder, LatentStats, load_autoencoder, to_bytes
 from palpate.diffusion.autoencoder_training import build_autoencoder, fit_autoencoder, k_means
 from palpate.diffusion.ceiling import measure_reconstruction
@@ -95,8 +94,7 @@ def test_batches_agree():
     assert torch.allclose(model.encode(images, batch=2), model.encode(images, batch=7), atol=1e-6)
     assert model.encode(images[:0]).shape == (0, 3, 4, 4)
     assert model.decode(torch.zeros(0, 3, 4, 4)).shape == (0, 16, 16, 3)
-    with pytest.raises(PalpateError, match="multiples of 4"):
-        model.encode(np.zeros((1, 18, 16, 3), np.uint8))
+    fails("multiples of 4", model.encode, np.zeros((1, 18, 16, 3), np.uint8))
 
 
 def test_saved_model_is_the_same_and_tampering_is_noticed(tmp_path):
@@ -111,8 +109,7 @@ def test_saved_model_is_the_same_and_tampering_is_noticed(tmp_path):
     card = json.loads((tmp_path / "ae" / "palpate.json").read_text())
     card["digest"] = "0" * 64
     (tmp_path / "ae" / "palpate.json").write_text(json.dumps(card))
-    with pytest.raises(PalpateError, match="must match"):
-        load_autoencoder(tmp_path / "ae")
+    fails("must match", load_autoencoder, tmp_path / "ae")
 
 
 def test_a_plain_vqmodel_folder_loads_with_patch_1(tmp_path):
@@ -144,8 +141,7 @@ def test_an_old_bin_loads_as_weights_only(tmp_path):
     torch.save(model.net.state_dict(), tmp_path / "vq" / "diffusion_pytorch_model.bin")
     assert load_autoencoder(tmp_path / "vq").digest == model.digest
     torch.save({"x": Bomb()}, tmp_path / "vq" / "diffusion_pytorch_model.bin")
-    with pytest.raises(PalpateError, match="diffusers VQModel"):
-        load_autoencoder(tmp_path / "vq")
+    fails("diffusers VQModel", load_autoencoder, tmp_path / "vq")
 
 
 def test_other_options_in_the_same_folder_train_anew(tmp_path):
@@ -236,10 +232,8 @@ def test_a_card_that_cannot_be_used_is_reported(tmp_path):
     ]
     for content, word in cases:
         file.write_text(json.dumps(content))
-        with pytest.raises(PalpateError, match=word):
-            load_autoencoder(tmp_path / "ae")
+        fails(word, load_autoencoder, tmp_path / "ae")
     file.write_text(json.dumps(about))
     weights = next((tmp_path / "ae").glob("*.safetensors"))
     weights.write_bytes(weights.read_bytes()[:50])
-    with pytest.raises(PalpateError, match="must be a diffusers VQModel"):
-        load_autoencoder(tmp_path / "ae")
+    fails("must be a diffusers VQModel", load_autoencoder, tmp_path / "ae")

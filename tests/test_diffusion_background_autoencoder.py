@@ -10,6 +10,7 @@ import pytest
 import torch
 from PIL import Image
 
+from forge.errors import fails
 from forge.models import StandInEncoders, arrays
 from forge.pictures import photos
 from palpate.core import PalpateError, Split
@@ -90,8 +91,7 @@ def test_saved_and_loaded_it_is_the_same(trained, tmp_path):
     )
     note = tmp_path / "a" / "palpate.json"
     note.write_text(json.dumps(json.loads(note.read_text()) | {"digest": "0" * 64}))
-    with pytest.raises(PalpateError, match="must match palpate"):
-        load_autoencoder(tmp_path / "a")
+    fails("must match palpate", load_autoencoder, tmp_path / "a")
 
 
 def test_it_goes_on_from_a_folder_in_its_own_shape(trained, tmp_path):
@@ -177,8 +177,7 @@ def test_generate_takes_the_manifests_gels_the_users_or_the_stock_gel(trained, t
     bare = Manifest.from_rows([{k: row[k] for k in ("id", "vision")} for row in rows], tmp_path)
     assert len(generate(bare, model=made).images) == 2
     (tmp_path / "gel1.png").write_text("broken")
-    with pytest.raises(PalpateError, match="`gel` must be an image"):
-        generate(bare, model=made, gel=tmp_path / "gel1.png")
+    fails("`gel` must be an image", generate, bare, model=made, gel=tmp_path / "gel1.png")
 
 
 def bare(folder, backgrounds: int) -> Manifest:
@@ -207,8 +206,7 @@ def test_all_samples_name_their_gel_or_none(tmp_path, backgrounds):
     )
     train = lambda: train_generator(manifest, split, "palpate/mini", preset=preset)
     if backgrounds == 4:
-        with pytest.raises(PalpateError, match="must have a background image"):
-            train()
+        fails("must have a background image", train)
         return
     made = train()
     assert made.training["gel"] == ("manifest" if backgrounds else "median")

@@ -11,7 +11,7 @@ from diffusers import AutoencoderKL, VQModel
 from safetensors.torch import save_file
 
 import palpate as pp
-from forge.errors import Bomb
+from forge.errors import Bomb, fails
 from forge.models import VQ_F4, decode, encode, make_encoders, make_state
 from forge.pictures import photos
 from forge.worlds import by_video
@@ -148,8 +148,7 @@ def renamed(old, new):
 )
 def test_weights_that_do_not_fit_are_named(tmp_path, change, message):
     path = write(tmp_path / "x.ckpt", change(make_state(**VQ_F4)))
-    with pytest.raises(PalpateError, match=message):
-        load_autoencoder(path)
+    fails(message, load_autoencoder, path)
 
 
 def test_files_that_are_no_plain_weights_are_rejected(tmp_path, monkeypatch):
@@ -169,10 +168,8 @@ def test_files_that_are_no_plain_weights_are_rejected(tmp_path, monkeypatch):
     ):
         if content is not None:
             (tmp_path / name).write_bytes(content)
-        with pytest.raises(PalpateError, match=message):
-            load_autoencoder(name)
-    with pytest.raises(PalpateError, match=r"no folder missing\. Name a .*\.ckpt of latent"):
-        load_autoencoder("missing")
+        fails(message, load_autoencoder, name)
+    fails(r"no folder missing\. Name a .*\.ckpt of latent", load_autoencoder, "missing")
 
 
 # --- diffusers folders -------------------------------------------------------------------------
@@ -198,8 +195,7 @@ def test_folders_of_other_models_are_rejected(tmp_path):
         ("empty", "Got no model in config.json"),
         ("text", r"config\.json"),
     ):
-        with pytest.raises(PalpateError, match=message):
-            load_autoencoder(tmp_path / name)
+        fails(message, load_autoencoder, tmp_path / name)
 
 
 # --- in a generator ----------------------------------------------------------------------------

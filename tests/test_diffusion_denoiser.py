@@ -9,6 +9,7 @@ import pytest
 import torch
 from safetensors.torch import load_file, save_file
 
+from forge.errors import fails
 from palpate.core import PalpateError
 from palpate.diffusion.autoencoder import LatentStats
 from palpate.diffusion.denoiser import Denoiser, build_scheduler, guided, sample, starting_noise
@@ -69,8 +70,7 @@ def test_the_papers_preset_says_what_the_paper_says():
     )
     assert PAPER.latent_scale == "one"
     assert preset_of("mini") is MINI
-    with pytest.raises(PalpateError, match="tiny, mini, small, paper"):
-        preset_of("huge")
+    fails("tiny, mini, small, paper", preset_of, "huge")
 
 
 @pytest.mark.parametrize("name", PRESETS)
@@ -112,10 +112,8 @@ def test_tokens_are_normalized_scaled_and_shifted():
         moved / moved.norm(dim=1, keepdim=True) * 12**0.5,
         atol=1e-5,
     )
-    with pytest.raises(PalpateError, match="mean of vision"):
-        shifted.tokens(c, "vision")
-    with pytest.raises(PalpateError, match=r"\(n, 12\)"):
-        shifted.tokens(torch.randn(5, 11), "text")
+    fails("mean of vision", shifted.tokens, c, "vision")
+    fails(r"\(n, 12\)", shifted.tokens, torch.randn(5, 11), "text")
 
 
 def test_condition_and_background_reach_the_output():
@@ -270,8 +268,7 @@ def test_pairs_find_texts_by_their_photos():
 def test_a_memory_needs_what_it_remembers(tmp_path, changes, without, words):
     conditions = {k: v for k, v in data()[1].items() if k != without}
     policy = replace(POLICY, gap="pairs", **changes)
-    with pytest.raises(PalpateError, match=words):
-        train(tmp_path, policy=policy, conditions=conditions)
+    fails(words, train, tmp_path, policy=policy, conditions=conditions)
 
 
 def test_training_remembers_each_text_once_with_the_mean_of_its_photos(tmp_path):

@@ -10,6 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from PIL import Image
 
+from forge.errors import fails
 from forge.models import make_pipeline
 from forge.pictures import write_photos
 from palpate.core import PalpateError, ProblemsError, Split, inside
@@ -59,8 +60,7 @@ def test_a_folder_has_an_index_and_the_images_of_the_pipeline(pipeline, tmp_path
     for file, a, b in zip(loaded.paths, direct, memory.images, strict=True):
         assert np.array_equal(np.asarray(Image.open(file)), np.asarray(a))
         assert np.array_equal(np.asarray(a), np.asarray(b))
-    with pytest.raises(PalpateError, match="must have been generated"):
-        loaded.path("nope")
+    fails("must have been generated", loaded.path, "nope")
 
 
 def test_a_resumed_folder_equals_an_uninterrupted_one(pipeline, tmp_path):
@@ -74,8 +74,7 @@ def test_a_resumed_folder_equals_an_uninterrupted_one(pipeline, tmp_path):
 
     with pytest.raises(KeyboardInterrupt):
         generate(tmp_path / "in", output=tmp_path / "b", progress=stop, **common)
-    with pytest.raises(PalpateError, match="half done"):
-        Generated.load(tmp_path / "b")
+    fails("half done", Generated.load, tmp_path / "b")
     there = len([*(tmp_path / "b" / "images").iterdir()])
     assert 4 <= there < 7  # writing is behind sampling
     resumed = generate(tmp_path / "in", output=tmp_path / "b", **common)
@@ -162,10 +161,8 @@ def test_a_manifest_with_backgrounds(tmp_path):
         made = generate(source, model=pipeline, split=split)
         assert made.ids == ["v/0", "v/2"]
     bare = Manifest.from_rows([{k: row[k] for k in ("id", "vision")} for row in rows], tmp_path)
-    with pytest.raises(PalpateError, match="background"):
-        generate(bare, model=pipeline)
-    with pytest.raises(PalpateError, match="photos alone"):
-        generate(tmp_path / "0.png", model=pipeline)
+    fails("background", generate, bare, model=pipeline)
+    fails("photos alone", generate, tmp_path / "0.png", model=pipeline)
     (tmp_path / "0.png").write_text("broken")
     with pytest.raises(ProblemsError) as caught:
         generate(manifest.take(["v/2"]), model=pipeline)
@@ -211,8 +208,7 @@ def test_wrong_inputs_and_outputs_are_explained(pipeline, tmp_path):
         (photo, "out.jpg", "must be a .png or a folder"),
         (tmp_path / "in", "in/0.png", "must not replace an input"),
     ):
-        with pytest.raises(PalpateError, match=message):
-            generate(photos, model=pipeline, output=tmp_path / output)
+        fails(message, generate, photos, model=pipeline, output=tmp_path / output)
     assert photo_ids([tmp_path / "in"]) == {"0.png": photo}
 
 
@@ -221,8 +217,7 @@ def test_an_index_that_points_outside_is_rejected(pipeline, tmp_path):
     index = json.loads((tmp_path / "out" / "index.json").read_text())
     index["images"][made.ids[0]] = "../../in/0.png"
     (tmp_path / "out" / "index.json").write_text(json.dumps(index))
-    with pytest.raises(PalpateError, match="must lie in images/"):
-        Generated.load(tmp_path / "out")
+    fails("must lie in images/", Generated.load, tmp_path / "out")
 
 
 def test_photos_of_every_kind_give_the_image_of_what_they_show(pipeline, tmp_path):

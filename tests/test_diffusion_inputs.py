@@ -11,6 +11,7 @@ import pytest
 import torch
 from PIL import Image
 
+from forge.errors import fails
 from forge.models import arrays, make_encoders, make_pipeline
 from forge.pictures import photos
 from forge.worlds import by_video
@@ -89,8 +90,7 @@ def test_photos_drive_it_without_encoders_and_it_comes_back_from_its_folder(tmp_
         (lambda: pipeline.denoiser.condition(None, torch.randn(1, 8)), "knows photos alone"),
         (lambda: learned(tmp_path / "n", ConditionPolicy(width=8)), "need conditions of text"),
     ):
-        with pytest.raises(PalpateError, match=message):
-            call()
+        fails(message, call)
 
 
 @pytest.mark.parametrize(

@@ -16,6 +16,7 @@ from huggingface_hub import ModelCard
 from PIL import Image
 from safetensors.torch import load_file, save_file
 
+from forge.errors import fails
 from forge.models import arrays, make_pipeline
 from forge.pictures import photos
 from palpate.core import PalpateError
@@ -92,8 +93,7 @@ def test_a_saved_pipeline_makes_the_same_images(tmp_path):
     assert scheduler.config.beta_end == 0.0195
     suffixes = {p.suffix for p in tmp_path.rglob("*") if p.is_file()}
     assert suffixes == {".json", ".md", ".safetensors"}
-    with pytest.raises(PalpateError, match="absent or an empty folder"):
-        pipeline.save(tmp_path / "p")
+    fails("absent or an empty folder", pipeline.save, tmp_path / "p")
 
 
 def test_encoders_travel_with_the_pipeline(tmp_path):
@@ -128,8 +128,7 @@ def test_the_background_variant_uses_its_background():
     ground = photos(2, 32)
     a, b = (arrays(pipeline(photos(2), gel=g)) for g in (ground, ground[::-1].copy()))
     assert not np.array_equal(a, b)
-    with pytest.raises(PalpateError, match="`background` must be given for a generator that sees"):
-        pipeline(photos(2))
+    fails("`background` must be given for a generator that sees", pipeline, photos(2))
     with pytest.raises(PalpateError, match="and only for one"):
         make_pipeline()(photos(2), gel=ground)
     with pytest.raises(PalpateError, match="one image of 32 pixels square per photo"):
@@ -155,14 +154,12 @@ def test_the_background_variant_uses_its_background():
     ],
 )
 def test_mistakes_are_explained(call, message):
-    with pytest.raises(PalpateError, match=message):
-        call(make_pipeline())
+    fails(message, call, make_pipeline())
 
 
 def test_guidance_needs_condition_dropout():
     pipeline = make_pipeline(policy=ConditionPolicy(width=6, dropout=0.0))
-    with pytest.raises(PalpateError, match="must be 1 for a generator trained without"):
-        pipeline(photos(1))
+    fails("must be 1 for a generator trained without", pipeline, photos(1))
     assert len(pipeline(photos(1), guidance=1.0).images) == 1
 
 
@@ -197,10 +194,8 @@ def test_a_changed_folder_is_rejected(tmp_path):
     ]
     for content, message in cases:
         file.write_text(json.dumps(content))
-        with pytest.raises(PalpateError, match=message):
-            TactilePipeline.from_pretrained(tmp_path / "p")
-    with pytest.raises(PalpateError, match="no folder"):
-        TactilePipeline.from_pretrained(tmp_path / "nowhere")
+        fails(message, TactilePipeline.from_pretrained, tmp_path / "p")
+    fails("no folder", TactilePipeline.from_pretrained, tmp_path / "nowhere")
 
 
 @pytest.mark.parametrize("many", [False, True], ids=["one generator", "one each"])
@@ -296,8 +291,7 @@ def test_another_scheduler_samples_and_belongs_to_the_settings(tmp_path):
         alone = pipeline.sample(c[2:4], ["c", "d"], seed=0)
         assert np.abs(alone.astype(int) - made[2:4]).max() <= 1
         assert pipeline.other_scheduler["_class_name"] == kind.__name__
-        with pytest.raises(PalpateError, match="sampler's scheduler"):
-            pipeline.save(tmp_path / "p")
+        fails("sampler's scheduler", pipeline.save, tmp_path / "p")
     assert pipeline.digest == base
     assert replace(pipeline).other_scheduler is None
 
@@ -330,8 +324,7 @@ def test_parts_that_do_not_fit_are_rejected(parts, got):
     if got is None:
         assert replace(make_pipeline(), **parts).background
         return
-    with pytest.raises(PalpateError, match=got):
-        replace(make_pipeline(), **parts)
+    fails(got, replace, make_pipeline(), **parts)
 
 
 @pytest.mark.parametrize(

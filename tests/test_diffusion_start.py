@@ -3,11 +3,11 @@
 from dataclasses import replace
 from pathlib import Path
 
-import pytest
 import torch
 
+from forge.errors import fails
 from forge.models import make_encoders, make_pipeline
-from palpate.core import PalpateError, Split
+from palpate.core import Split
 from palpate.data.manifest import Manifest
 from palpate.diffusion.autoencoder import LatentStats
 from palpate.diffusion.denoiser_training import Rows, train_denoiser
@@ -71,8 +71,7 @@ def test_other_encoders_autoencoders_and_schedules_are_rejected(small_manifest, 
         ({"autoencoder": other}, "another autoencoder"),
         ({"preset": replace(preset, schedule=Schedule(prediction="flow"))}, "another schedule"),
     ):
-        with pytest.raises(PalpateError, match=word):
-            run(**change)
+        fails(word, run, **change)
     made = run()
     assert made.stats == start.stats
     assert made.training["start"] == start.digest

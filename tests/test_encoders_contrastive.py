@@ -11,6 +11,7 @@ import torch
 from PIL import Image
 from transformers import Dinov2Config, Dinov2Model
 
+from forge.errors import fails
 from palpate.core import PalpateError, Split, rng_for, seed_for
 from palpate.data.manifest import Manifest
 from palpate.diffusion.presets import TINY as DIFFUSION
@@ -208,8 +209,7 @@ def test_a_training_of_the_tactile_encoder_that_cannot_be(world, clip, tmp_path,
     manifest, split = Manifest.from_rows(rows, world.root), change.get("split", held)
     preset = quick(tactile_course=replace(TINY.tactile_course, **change.get("course", {})))
     where = TrainingRun(tmp_path, device=change.get("device", "cpu"))
-    with pytest.raises(PalpateError, match=message):
-        train_tactile(manifest, split, clip, preset, where)
+    fails(message, train_tactile, manifest, split, clip, preset, where)
 
 
 def test_one_held_out_sample_is_enough_without_evaluations(world, clip, tmp_path):
@@ -253,8 +253,7 @@ def test_a_test_part_without_materials_or_tactile_images_costs_no_training(world
 
 @pytest.mark.parametrize("change", [{"crop": 5}, {"crop": -1}, {"gain": -0.1}])
 def test_views_out_of_range(change):
-    with pytest.raises(PalpateError, match=f"`{next(iter(change))}` must lie in"):
-        Augment(**change)
+    fails(f"`{next(iter(change))}` must lie in", Augment, **change)
 
 
 def test_gradient_goes_to_the_tactile_encoder_and_the_temperature_only(world):
@@ -413,8 +412,7 @@ def test_paper_preset_is_the_paper():
         tactile = contrastive.CLIPVisionModelWithProjection(paper.tactile_config(768))
     # ViT-L/14 at 224 px with a 768-wide projection
     assert sum(p.numel() for p in tactile.parameters()) == 303_966_208
-    with pytest.raises(PalpateError, match="tiny, mini, tvl-tiny"):
-        preset_of("huge")
+    fails("tiny, mini, tvl-tiny", preset_of, "huge")
 
 
 def test_a_vision_encoder_without_text_is_a_partner(world, tmp_path):
@@ -427,8 +425,7 @@ def test_a_vision_encoder_without_text_is_a_partner(world, tmp_path):
     options = {"preset": TINY, "clip": tmp_path / "dino", "device": "cpu"}
     rows = [{**r, "vision": None} if k else r for k, r in enumerate(world.table.to_dicts())]
     bare = Manifest.from_rows(rows, world.root)
-    with pytest.raises(PalpateError, match="must have two photos to teach"):
-        train_encoder(bare, by_video(world), **options)
+    fails("must have two photos to teach", train_encoder, bare, by_video(world), **options)
     train_encoder(world, by_video(world), output=tmp_path / "e", **options)
     encoders = EncoderSet.load(tmp_path / "e")
     assert encoders.modalities == ["vision", "tactile"]

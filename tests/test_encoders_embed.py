@@ -10,6 +10,7 @@ import torch
 from PIL import Image
 
 import palpate as pp
+from forge.errors import fails
 from palpate.core import PalpateError, ProblemsError
 from palpate.data.images import Preprocess
 from palpate.data.manifest import Manifest
@@ -176,8 +177,7 @@ def test_mistakes_are_explained(world, encoders, tmp_path, cached):
         (world, encoders, "tactile", 0, "`batch` must be at least 1"),
         (world, encoders.without_tactile(), "tactile", 1, "tactile encoder"),
     ):
-        with pytest.raises(PalpateError, match=words):
-            embed(manifest, of, modality, batch=batch, cache=cache)
+        fails(words, embed, manifest, of, modality, batch=batch, cache=cache)
     for k in (1, 8):  # in two batches: both are named
         world.paths("tactile")[k].write_bytes(b"no image")
     with pytest.raises(ProblemsError) as caught:
@@ -280,7 +280,5 @@ def test_other_inputs_are_refused(encoders, files):
         ({"a": 1}, "`images` must be files, PIL images"),
         (files[0] / "gone.png", "gone.png: "),
     ):
-        with pytest.raises(PalpateError, match=message):
-            encoder.encode(inputs)
-    with pytest.raises(PalpateError, match=r"must be one of vision, text\."):
-        Encoder(encoders.without_tactile(), "tactile")
+        fails(message, encoder.encode, inputs)
+    fails(r"must be one of vision, text\.", Encoder, encoders.without_tactile(), "tactile")

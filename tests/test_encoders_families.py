@@ -19,9 +19,9 @@ from transformers import (
     SiglipModel,
 )
 
+from forge.errors import fails
 from forge.worlds import by_video
 from palpate import probe
-from palpate.core import PalpateError
 from palpate.data.manifest import Manifest
 from palpate.encoders import Encoder, EncoderSet
 from palpate.encoders.tokenizer import save_tokenizer, train_tokenizer
@@ -133,8 +133,7 @@ def test_texts_of_siglip_are_lower_case_and_padded_without_a_mask(tmp_path, name
 
 def test_other_models_are_named(tmp_path):
     (tmp_path / "config.json").write_text(json.dumps({"model_type": "bert"}))
-    with pytest.raises(PalpateError, match=r"must be one of clip, siglip, .*'bert'"):
-        EncoderSet.load(tmp_path)
+    fails(r"must be one of clip, siglip, .*'bert'", EncoderSet.load, tmp_path)
 
 
 CARDS = {
@@ -172,6 +171,5 @@ def test_a_probe_prints_the_license_and_refuses_data_of_the_models_card(tmp_path
     assert notes.keys() == {"vision", "text"}
     assert "whose license is mit" in sentence(notes["vision"])
     seen = Manifest(table, small_manifest.root, {"dataset": "HCT"})
-    with pytest.raises(PalpateError, match="images of HCT, with which its authors trained it"):
-        probe(seen, split, **options)
+    fails("images of HCT, with which its authors trained it", probe, seen, split, **options)
     assert Encoder.from_pretrained("palpate/mini", modality="text").license == "apache-2.0"

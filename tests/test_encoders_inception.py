@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from forge.errors import Bomb
+from forge.errors import Bomb, fails
 from palpate.core import FeatureSet, PalpateError
 from palpate.encoders.inception import load_inception
 
@@ -91,8 +91,7 @@ def test_files_that_are_no_torchscript_are_rejected_and_never_unpickled(tmp_path
     (tmp_path / "empty.pt").write_bytes(b"")
     for name in ("inception-v3.pkl", "state.pth", "bomb.pth", "empty.pt"):
         words = f"{name} must be a TorchScript module.*pickles are never loaded"
-        with pytest.raises(PalpateError, match=words):
-            load_inception(tmp_path / name)
+        fails(words, load_inception, tmp_path / name)
 
 
 def test_modules_without_features_and_other_images_are_rejected(tmp_path, images):
@@ -107,8 +106,7 @@ def test_modules_without_features_and_other_images_are_rejected(tmp_path, images
         (plain, images[0], rgb),
         (plain, images[..., :1], rgb),
     ):
-        with pytest.raises(PalpateError, match=words):
-            embed(bad, path)
+        fails(words, embed, bad, path)
 
 
 def test_progress_and_mapped_files(tmp_path, images):

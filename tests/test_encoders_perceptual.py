@@ -5,9 +5,8 @@ import pytest
 import torch
 from safetensors.torch import save_file
 
-from forge.errors import Bomb
+from forge.errors import Bomb, fails
 from forge.models import SHAPES, random_states, save_states
-from palpate.core import PalpateError
 from palpate.encoders.perceptual import Lpips, load_lpips, lpips_per_image
 
 STEPS = {0: (4, 2), 3: (1, 2), 6: (1, 1), 8: (1, 1), 10: (1, 1)}
@@ -135,8 +134,7 @@ def test_files_are_rejected_by_name_and_never_unpickled(files, states, tmp_path)
         (files[1], files[0], r"weights of AlexNet and of LPIPS\. Got 'features\.0\.weight'"),
         (files[0], "vgg.pth", r"the weights of AlexNet and of LPIPS.*\[1, 256, 1, 1\]"),
     ):
-        with pytest.raises(PalpateError, match=words):
-            load_lpips(tmp_path / backbone, tmp_path / heads)
+        fails(words, load_lpips, tmp_path / backbone, tmp_path / heads)
 
 
 @pytest.mark.parametrize(
@@ -155,10 +153,8 @@ def test_files_are_rejected_by_name_and_never_unpickled(files, states, tmp_path)
 )
 def test_bad_images_are_rejected(network, change, match):
     first, second = pairs()
-    with pytest.raises(PalpateError, match=match):
-        lpips_per_image(first, change(second), network)
-    with pytest.raises(PalpateError, match=r"at least 32 x 32 for LPIPS\. Got 32 x 31"):
-        lpips_per_image(*pairs(2, 32, 31), network)
+    fails(match, lpips_per_image, first, change(second), network)
+    fails(r"at least 32 x 32 for LPIPS\. Got 32 x 31", lpips_per_image, *pairs(2, 32, 31), network)
 
 
 def test_the_layout_is_torchvisions():

@@ -12,6 +12,7 @@ from PIL import Image
 from safetensors.torch import load_file, save_file
 from transformers import AutoTokenizer, CLIPModel
 
+from forge.errors import fails
 from forge.pictures import photos
 from palpate.core import PalpateError
 from palpate.data.images import CLIP_MEAN, CLIP_STD, Preprocess
@@ -112,8 +113,7 @@ def test_encoders_survive_a_folder(encoders, tmp_path):
         assert np.array_equal(first, second)
     assert np.array_equal(embed_texts(TEXTS, again), embed_texts(TEXTS, encoders))
     assert not [p for p in (tmp_path / "set").rglob("*") if p.suffix in (".bin", ".pt", ".pkl")]
-    with pytest.raises(PalpateError, match="empty folder"):
-        encoders.save(tmp_path / "set")
+    fails("empty folder", encoders.save, tmp_path / "set")
     encoders.without_tactile().save(tmp_path / "two")
     assert EncoderSet.load(tmp_path / "two").tactile is None
 
@@ -140,47 +140,37 @@ def test_changed_weights_on_disk_are_noticed(encoders, tmp_path):
     tensors = load_file(file)
     tensors["visual_projection.weight"][0, 0] += 0.5
     save_file(tensors, file, metadata={"format": "pt"})
-    with pytest.raises(PalpateError, match=r"tactile encoder .* digest"):
-        EncoderSet.load(tmp_path / "set")
+    fails(r"tactile encoder .* digest", EncoderSet.load, tmp_path / "set")
 
 
 def test_folders_that_are_no_clip(clip, tmp_path, monkeypatch):
     clip.save(tmp_path / "clip")
     folder = tmp_path / "clip" / "clip"
     (folder / "preprocessor_config.json").unlink()
-    with pytest.raises(
-        PalpateError, match=r"image processor must exist.*no file .*preprocessor_config\.json"
-    ):
-        load_clip(folder)
+    fails(r"image processor must exist.*no file .*preprocessor_config\.json", load_clip, folder)
     clip.save(tmp_path / "cut")
     weights = tmp_path / "cut" / "clip" / "model.safetensors"
     weights.write_bytes(weights.read_bytes()[:100])
-    with pytest.raises(PalpateError, match="must be a CLIP model"):
-        load_clip(tmp_path / "cut")
+    fails("must be a CLIP model", load_clip, tmp_path / "cut")
     clip.save(tmp_path / "hole")
     weights = tmp_path / "hole" / "clip" / "model.safetensors"
     tensors = load_file(weights)
     del tensors["visual_projection.weight"]
     save_file(tensors, weights, metadata={"format": "pt"})
-    with pytest.raises(PalpateError, match="1 weights are missing, first visual_projection"):
-        load_clip(tmp_path / "hole")
+    fails("1 weights are missing, first visual_projection", load_clip, tmp_path / "hole")
     (tmp_path / "cut" / "palpate.json").write_text("{}")
-    with pytest.raises(PalpateError, match="palpate-encoders"):
-        EncoderSet.load(tmp_path / "cut")
-    with pytest.raises(PalpateError, match="no folder"):
-        EncoderSet.load(tmp_path / "nothing")
+    fails("palpate-encoders", EncoderSet.load, tmp_path / "cut")
+    fails("no folder", EncoderSet.load, tmp_path / "nothing")
 
     def unreachable(*args, **kwargs):
         raise OSError("We couldn't connect to the hub\nand many more lines")
 
     rejection = r"couldn't connect to the hub\. Pass a folder that holds config\.json, model\.safe"
     monkeypatch.setattr(huggingface_hub, "snapshot_download", unreachable)  # called first
-    with pytest.raises(PalpateError, match=rejection):
-        load_clip("openai/clip-vit-base-patch32")
+    fails(rejection, load_clip, "openai/clip-vit-base-patch32")
     monkeypatch.setattr(huggingface_hub, "snapshot_download", lambda *_, **__: folder)
     monkeypatch.setattr(module.CLIPModel, "from_pretrained", unreachable)
-    with pytest.raises(PalpateError, match=rejection):
-        load_clip("openai/clip-vit-base-patch32")
+    fails(rejection, load_clip, "openai/clip-vit-base-patch32")
 
 
 @pytest.mark.parametrize(
@@ -194,13 +184,11 @@ def test_folders_that_are_no_clip(clip, tmp_path, monkeypatch):
     ],
 )
 def test_unknown_and_missing_encoders(clip, modality, kind, words):
-    with pytest.raises(PalpateError, match=words):
-        embed_images(photos(5).astype(kind), clip, modality)
+    fails(words, embed_images, photos(5).astype(kind), clip, modality)
 
 
 def test_devices():
-    with pytest.raises(PalpateError, match="device"):
-        pick_device("cuda:99")
+    fails("device", pick_device, "cuda:99")
     assert pick_device("cpu").type == "cpu"
 
 
@@ -311,5 +299,4 @@ def test_an_image_processor_that_nobody_writes_is_refused(tmp_path, change):
     path.write_text(json.dumps(good.to_config()))
     assert Preprocess.from_config(path, 16) == good  # 0 is the nearest pixel, not the default
     path.write_text(json.dumps(good.to_config() | change))
-    with pytest.raises(PalpateError, match=r"preprocessor_config\.json must"):
-        Preprocess.from_config(path, 16)
+    fails(r"preprocessor_config\.json must", Preprocess.from_config, path, 16)

@@ -12,7 +12,7 @@ from PIL import Image
 from safetensors.torch import save_file
 from torch.nn.functional import conv2d, gelu, layer_norm, linear, normalize
 
-from forge.errors import Bomb
+from forge.errors import Bomb, fails
 from forge.worlds import by_video
 from palpate import probe, score
 from palpate.core import PalpateError
@@ -219,8 +219,7 @@ def test_a_missing_further_or_permuted_name_is_refused(tmp_path, kind):
     }
     for message, change in changes.items():
         state = {k: v.clone() for k, v in (good | change).items() if v is not None}
-        with pytest.raises(PalpateError, match=message):
-            load_tactile(write(kind, tmp_path, state))
+        fails(message, load_tactile, write(kind, tmp_path, state))
 
 
 def drawn(*shape):
@@ -273,8 +272,7 @@ def test_pickles_with_code_and_other_files_are_refused(tmp_path):
         "old.pth": "must hold weights and nothing else",
         "b.safetensors": "must hold weights and nothing else",
     }.items():
-        with pytest.raises(PalpateError, match=words):
-            load_tactile(tmp_path / name)
+        fails(words, load_tactile, tmp_path / name)
     with pytest.raises(PalpateError, match=r"Pass the \.safetensors file of facebook/sparsh"):
         EncoderSet.load(tmp_path / "code.ckpt")
 
@@ -330,8 +328,7 @@ def test_frames_backgrounds_and_sensors_come_from_the_manifest(tmp_path, digits)
     changed = np.abs(still - features).max(axis=1) > 1e-6
     assert changed.tolist() == [frame - 5 in frames for frame in frames]
     bare = Manifest(some.table.with_columns(background=pl.lit(None, pl.String)), some.root)
-    with pytest.raises(PalpateError, match="subtracts the no-contact image of DIGIT"):
-        embed(bare, encoders)
+    fails("subtracts the no-contact image of DIGIT", embed, bare, encoders)
     other = Manifest(bare.table.with_columns(sensor=pl.lit("GelSight'17")), some.root)
     assert len(embed(other, encoders).features) == len(some)  # these never had one
 
@@ -350,8 +347,7 @@ def test_sensors_of_anytouch(tmp_path, digits):
     assert np.allclose(made["DIGIT"], made["digit-3"])
     assert not np.allclose(made["DIGIT"], made["GelSight'17"])
     unknown = Manifest(table.with_columns(sensor=pl.lit(None, pl.String)), digits.root)
-    with pytest.raises(PalpateError, match="names have one of digit"):
-        embed(unknown, encoders)
+    fails("names have one of digit", embed, unknown, encoders)
     with pytest.raises(PalpateError, match=r"checkpoint\.pth#digit"):
         Encoder(encoders, "tactile").encode(digits.paths("tactile")[:1])
     assert Encoder(fixed, "tactile").encode(digits.paths("tactile")[:1]).shape == (1, 48)

@@ -14,6 +14,7 @@ import pytest
 import torch
 from safetensors.torch import load_file
 
+from forge.errors import fails
 from forge.models import arrays, make_encoders, make_pipeline, write_shipped
 from forge.pictures import photos
 from palpate.core import PalpateError, digest_folder
@@ -83,8 +84,7 @@ def test_a_folder_of_the_same_name_does_not_shadow_what_ships(mini):
 def test_names_of_no_model_are_explained(mini, load, no_network):
     message = r"must be one of palpate/mini\. Got 'palpate/.*folder .* is written \./palpate"
     for name in ("palpate/maxi", "palpate/", "palpate/mini/", "palpate/mini/../mini"):
-        with pytest.raises(PalpateError, match=message):
-            load(name)
+        fails(message, load, name)
     for name in ("no-such", "a/b/c", "../x", "", "./palpate/mini"):
         with pytest.raises(PalpateError) as error:
             load(name)
@@ -95,8 +95,7 @@ def test_names_of_no_model_are_explained(mini, load, no_network):
 def test_an_installation_without_the_files_says_so(tmp_path, monkeypatch):
     monkeypatch.setattr(shipped, "shipped_root", lambda: tmp_path)
     words = r"palpate/mini must lie in the installed package\. Got no encoders in"
-    with pytest.raises(PalpateError, match=words):
-        EncoderSet.load("palpate/mini")
+    fails(words, EncoderSet.load, "palpate/mini")
 
 
 def test_what_may_be_asked_of_the_hub(tmp_path, monkeypatch):
@@ -183,8 +182,7 @@ def test_rounding_is_refused_where_it_makes_infinity():
         other = torch.nn.Linear(2, 1, bias=False)
         other.weight.data = torch.tensor([[0.1, 0.2]])
         module.weight.data = torch.tensor([[bad, 0.1, 0.1]])
-        with pytest.raises(PalpateError, match=r"finite and below 65,520.*m\.weight"):
-            round_to_half({"a": other, "m": module})
+        fails(r"finite and below 65,520.*m\.weight", round_to_half, {"a": other, "m": module})
         assert other.weight.tolist() == torch.tensor([[0.1, 0.2]]).tolist()
 
 
@@ -215,8 +213,7 @@ def test_a_generator_that_refers_carries_no_copies_and_checks_what_it_finds(
     with pytest.raises(PalpateError, match="must find the parts of palpate/mini that it was train"):
         TactilePipeline.from_pretrained("palpate/mini")
     (folder / "palpate.json").write_text(json.dumps(about | {"shared": "../../encoders"}))
-    with pytest.raises(PalpateError, match="`shared` must be one of palpate/mini"):
-        TactilePipeline.from_pretrained("palpate/mini")
+    fails("`shared` must be one of palpate/mini", TactilePipeline.from_pretrained, "palpate/mini")
 
 
 def test_a_card_is_made_of_the_json_alone(mini):
@@ -267,8 +264,7 @@ def test_a_card_says_what_it_must(mini):
     for line in lines:
         assert f"\n{line}\n" in body, line
     assert len(text) < 2500
-    with pytest.raises(PalpateError, match="`format` must be one of palpate-clip/1"):
-        model_card({"format": "other"})
+    fails("`format` must be one of palpate-clip/1", model_card, {"format": "other"})
 
 
 def size(folder: Path) -> int:

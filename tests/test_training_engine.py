@@ -15,6 +15,7 @@ from safetensors import safe_open
 from tensorboardX.proto.event_pb2 import Event
 from torch import nn
 
+from forge.errors import fails
 from palpate.core import PalpateError, PalpateWarning, quiet
 from palpate.training import engine
 from palpate.training.engine import Losses, Task
@@ -337,8 +338,7 @@ def test_the_first_process_goes_alone_and_before_the_others(tmp_path, on_two_pro
 
 @pytest.mark.parametrize("clip", [None, 1.0])
 def test_finite_loss_with_infinite_gradient_is_reported(tmp_path, clip):
-    with pytest.raises(PalpateError, match="gradient"):
-        fit(Net(), overflowing({2}), N, options(clip_norm=clip), tmp_path)
+    fails("gradient", fit, Net(), overflowing({2}), N, options(clip_norm=clip), tmp_path)
 
 
 def test_no_clip_leaves_gradients_alone(tmp_path):
@@ -352,11 +352,9 @@ def test_no_rows_no_parameters_no_steps_bad_options(tmp_path):
     net = Net()
     assert fit(net, loss, N, options(steps=0), tmp_path) == []
     assert same(weights(net), weights(Net()))
-    with pytest.raises(PalpateError, match="at least one sample"):
-        fit(Net(), loss, 0, options(), tmp_path)
+    fails("at least one sample", fit, Net(), loss, 0, options(), tmp_path)
     assert fit(Net(), loss, 1, options(), tmp_path / "one")[-1]["step"] == STEPS - 1
-    with pytest.raises(PalpateError, match="parameters"):
-        fit(Net().requires_grad_(False), loss, N, options(), tmp_path)
+    fails("parameters", fit, Net().requires_grad_(False), loss, N, options(), tmp_path)
     for change in (
         {"batch": 0},
         {"steps": -1},
@@ -369,16 +367,14 @@ def test_no_rows_no_parameters_no_steps_bad_options(tmp_path):
         {"keep": "best", "evaluations": 0},
         {"patience": 1, "evaluations": 0},
     ):
-        with pytest.raises(PalpateError, match=f"`{next(iter(change))}` must"):
-            options(**change)
+        fails(f"`{next(iter(change))}` must", options, **change)
 
 
 def test_broken_checkpoint_is_reported(tmp_path):
     fit(Net(), loss, N, options(), tmp_path)
     file = tmp_path / "checkpoint.safetensors"
     file.write_bytes(file.read_bytes()[:50])
-    with pytest.raises(PalpateError, match=r"checkpoint\.safetensors"):
-        fit(Net(), loss, N, options(), tmp_path)
+    fails(r"checkpoint\.safetensors", fit, Net(), loss, N, options(), tmp_path)
 
 
 @pytest.mark.parametrize("batch", [1, 4, 11, 12, 17, 22, 23])

@@ -8,6 +8,7 @@ import pytest
 import torch
 from PIL import Image
 
+from forge.errors import fails
 from palpate.cli import main
 from palpate.core import PalpateError, Split
 from palpate.data.manifest import Manifest
@@ -158,8 +159,7 @@ def test_a_set_of_encoders_or_a_clip_conditions_a_generator(tag, tmp_path):
     ],
 )
 def test_mistakes_are_explained(tag, call, message):
-    with pytest.raises(PalpateError, match=message):
-        call(*tag)
+    fails(message, call, *tag)
 
 
 def test_the_split_that_lies_with_the_data_is_the_default(tag, tmp_path, capsys):
@@ -190,8 +190,7 @@ def test_what_is_rejected_leaves_no_folder_and_keeps_another_run_s(tag, tmp_path
 def test_several_processes_need_torch_with_its_distributed_part(monkeypatch):
     monkeypatch.setenv("WORLD_SIZE", "2")
     monkeypatch.setattr(torch.distributed, "is_available", lambda: False)
-    with pytest.raises(PalpateError, match="a build without it"):
-        connect("cpu")
+    fails("a build without it", connect, "cpu")
     monkeypatch.setenv("WORLD_SIZE", "1")
     assert connect("cpu") == "cpu"
     assert place() == (0, 1)
