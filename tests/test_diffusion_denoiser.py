@@ -371,9 +371,8 @@ def test_a_broken_folder_is_rejected(tmp_path, harm):
     else:
         del tensors[harm.removeprefix("no ")]
         save_file(tensors, extra)
-    with pytest.raises(PalpateError, match="must be as palpate writes it") as caught:
-        Denoiser.load(folder, policy)
-    assert str(folder) in caught.value.must
+    caught = fails("must be as palpate writes it", Denoiser.load, folder, policy)
+    assert str(folder) in caught.must
 
 
 # --- the sampler

@@ -13,7 +13,7 @@ from PIL import Image
 from forge.errors import fails
 from forge.models import make_pipeline
 from forge.pictures import write_photos
-from palpate.core import PalpateError, ProblemsError, Split, inside
+from palpate.core import PalpateError, Split, inside
 from palpate.data.manifest import Manifest
 from palpate.diffusion.generated import Generated, file_name
 from palpate.diffusion.generation import generate, photo_ids
@@ -118,9 +118,8 @@ def test_broken_photos_are_reported_at_once_or_skipped(pipeline, tmp_path):
     paths[1].write_bytes(paths[1].read_bytes()[:80])
     paths[3].write_text("no image")
     table = {f"v/{p.stem}": p for p in paths} | {"v/gone": tmp_path / "gone.png"}
-    with pytest.raises(ProblemsError) as caught:
-        generate(table, model=pipeline, output=tmp_path / "out")
-    names = sorted(Path(p.where).name for p in caught.value.problems)
+    caught = fails("", generate, table, model=pipeline, output=tmp_path / "out")
+    names = sorted(Path(p.where).name for p in caught.problems)
     assert names == ["1.png", "3.png", "gone.png"]
     assert not (tmp_path / "out").exists()
     made = generate(table, model=pipeline, output=tmp_path / "out", skip_bad=True)
@@ -138,9 +137,8 @@ def test_many_photos_are_read_while_others_are_sampled(pipeline, tmp_path):
     good = [paths[k].read_bytes() for k in (60, 70)]
     for k in (60, 70):
         paths[k].write_text("broken")
-    with pytest.raises(ProblemsError) as caught:
-        generate(order, **common)
-    assert [Path(p.where).name for p in caught.value.problems] == ["60.png", "70.png"]
+    caught = fails("", generate, order, **common)
+    assert [Path(p.where).name for p in caught.problems] == ["60.png", "70.png"]
     made = [*(tmp_path / "out" / "images").iterdir()]
     assert len(made) == 32, "those that were read before it"
     for k, content in zip((60, 70), good, strict=True):
@@ -164,9 +162,8 @@ def test_a_manifest_with_backgrounds(tmp_path):
     fails("background", generate, bare, model=pipeline)
     fails("photos alone", generate, tmp_path / "0.png", model=pipeline)
     (tmp_path / "0.png").write_text("broken")
-    with pytest.raises(ProblemsError) as caught:
-        generate(manifest.take(["v/2"]), model=pipeline)
-    assert Path(caught.value.problems[0].where).name == "0.png"
+    caught = fails("", generate, manifest.take(["v/2"]), model=pipeline)
+    assert Path(caught.problems[0].where).name == "0.png"
 
 
 def test_one_photo_becomes_one_png_that_says_what_it_is(pipeline, tmp_path):

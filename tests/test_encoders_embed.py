@@ -11,7 +11,7 @@ from PIL import Image
 
 import palpate as pp
 from forge.errors import fails
-from palpate.core import PalpateError, ProblemsError
+from palpate.core import PalpateError
 from palpate.data.images import Preprocess
 from palpate.data.manifest import Manifest
 from palpate.encoders import embed as module
@@ -180,11 +180,8 @@ def test_mistakes_are_explained(world, encoders, tmp_path, cached):
         fails(words, embed, manifest, of, modality, batch=batch, cache=cache)
     for k in (1, 8):  # in two batches: both are named
         world.paths("tactile")[k].write_bytes(b"no image")
-    with pytest.raises(ProblemsError) as caught:
-        embed(world, encoders, "tactile", batch=3, cache=cache)
-    assert [p.where for p in caught.value.problems] == [
-        str(world.paths("tactile")[k]) for k in (1, 8)
-    ]
+    caught = fails("", embed, world, encoders, "tactile", batch=3, cache=cache)
+    assert [p.where for p in caught.problems] == [str(world.paths("tactile")[k]) for k in (1, 8)]
 
 
 def test_texts_come_from_the_manifest_or_from_what_is_known(world):

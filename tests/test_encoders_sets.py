@@ -271,9 +271,8 @@ def test_a_card_that_cannot_be_used_is_named(encoders, tmp_path, place):
         (about | {"seen": {"vision": "7"}}, other),
     ):
         file.write_text(json.dumps(content))
-        with pytest.raises(PalpateError, match=message) as caught:
-            EncoderSet.load(tmp_path / "t")
-        assert str(file) in caught.value.must
+        caught = fails(message, EncoderSet.load, tmp_path / "t")
+        assert str(file) in caught.must
 
 
 @pytest.mark.parametrize(

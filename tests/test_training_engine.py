@@ -267,9 +267,8 @@ def test_a_loss_that_is_not_finite_names_its_rows_and_is_not_kept(tmp_path):
 
 def test_only_a_checkpoint_that_there_is_is_said_to_be_kept(tmp_path):
     def message(compute, last):
-        with pytest.raises(PalpateError) as caught:
-            fit(Net(), overflowing({last}), N, options(), tmp_path, compute)
-        return str(caught.value)
+        caught = fails("", fit, Net(), overflowing({last}), N, options(), tmp_path, compute)
+        return str(caught)
 
     assert message(NEVER, 3).endswith("or lower the learning rate.")
     assert message(ALWAYS, 3).endswith("the last checkpoint is kept.")
@@ -284,9 +283,8 @@ def test_of_several_processes_each_names_the_bad_rows_of_the_whole_batch(
     def message():
         broken = Net()
         broken.data[row] = math.nan
-        with pytest.raises(PalpateError, match="must be finite") as caught:
-            fit(broken, loss, N, options(), tmp_path)
-        return [caught.value.got, caught.value.shared]
+        caught = fails("must be finite", fit, broken, loss, N, options(), tmp_path)
+        return [caught.got, caught.shared]
 
     assert on_two_processes(message) == [[f"nan at step 4, with row {row}", True]] * 2
 
@@ -317,9 +315,8 @@ def test_who_waits_for_a_process_that_has_ended_says_so(on_two_processes, wait):
     def message():
         if place()[0]:
             return None  # and ends
-        with pytest.raises(PalpateError, match="All processes must stay alive") as caught:
-            wait()
-        return caught.value.got
+        caught = fails("All processes must stay alive", wait)
+        return caught.got
 
     got, _ = on_two_processes(message)
     assert got.startswith("one has ended")
