@@ -18,7 +18,7 @@ from forge.worlds import by_video
 from palpate.cli import main
 from palpate.core import PalpateError
 from palpate.diffusion.autoencoder import LatentStats
-from palpate.diffusion.denoiser import Denoiser, PhotoMap
+from palpate.diffusion.denoiser import Denoiser, PhotoMap, inputs_of, lengths_of, slots_of
 from palpate.diffusion.denoiser_training import DiffusionLoss, Rows, train_denoiser
 from palpate.diffusion.generation import generate
 from palpate.diffusion.options import ConditionPolicy
@@ -153,7 +153,7 @@ def test_patches_follow_their_embedding_and_are_null_where_there_are_none():
     # A bare embedding is known, too.
     assert torch.equal(condition(photo[:, 0])[:, 1], condition(photo)[:, 1])
     # A photo in the place of a text brings its embedding alone.
-    assert not replace(PATCHES, source="text").inputs
+    assert not inputs_of(replace(PATCHES, source="text"))
 
 
 @pytest.mark.parametrize("source", ["vision", "both"])
@@ -170,8 +170,8 @@ def test_patches_are_dropped_with_their_embedding_and_alone(source):
     )
     batch = loss.load(Step(0, np.arange(n), 0))
     dropped = batch["dropped"][:, :, 0]
-    assert dropped.shape[1] == sum(policy.lengths)
-    slots = policy.slots
+    assert dropped.shape[1] == sum(lengths_of(policy))
+    slots = slots_of(policy)
     photo, patches = dropped[:, slots - 1], dropped[:, slots:]
     assert bool((patches == patches[:, :1]).all())  # they go as a whole
     known = ~patches[:, 0]

@@ -52,7 +52,6 @@ from torch import Tensor, nn
 
 from palpate.core import PalpateError, atomic_path, require, require_regular, rng_for
 from palpate.diffusion.options import (
-    PHOTO_TOKENS,
     SOURCES,
     ConditionPolicy,
     Method,
@@ -66,10 +65,30 @@ from palpate.encoders.models import UNREADABLE, first_line, load_model, round_to
 MEMORY = ("memory", "keys")
 #: Temperature of its weights.
 TAU = 0.02
+#: Tokens of a photo: a map of 8 x 8.
+PHOTO_TOKENS = 64
 #: (z_t (n, c, h, w), t (n,), tokens (n, k, d), background or None) -> prediction (n, c, h, w).
 Predictor = Callable[[Tensor, Tensor, Tensor, Tensor | None], Tensor]
 #: (index of the step, t, latents after it) -> the latents to go on with.
 OnStep = Callable[[int, Tensor, Tensor], Tensor]
+
+
+def slots_of(policy: ConditionPolicy) -> int:
+    """Embeddings that a sample is conditioned on at once: text and photo, one, or none."""
+    return {"both": 2, "resnet": 0}.get(policy.source, 1)
+
+
+def inputs_of(policy: ConditionPolicy) -> tuple[str, ...]:
+    """What else tokens are made of: the ``photos``, or their ``patches``."""
+    if policy.source == "resnet":
+        return ("photos",)
+    return ("patches",) if policy.patches and policy.source in ("vision", "both") else ()
+
+
+def lengths_of(policy: ConditionPolicy) -> tuple[int, ...]:
+    """Tokens of each embedding, then of each input."""
+    tokens = {"photos": PHOTO_TOKENS, "patches": policy.patches}
+    return (1,) * slots_of(policy) + tuple(tokens[name] for name in inputs_of(policy))
 
 
 class PhotoMap(nn.Module):
@@ -139,9 +158,9 @@ class Denoiser(nn.Module):
         used = means if means is not None and self.pairs else {}
         self.register_buffer("means", torch.stack([used.get(s, fill).float() for s in SOURCES]))
         self.maps = nn.ModuleDict()
-        if "photos" in policy.inputs:
+        if "photos" in inputs_of(policy):
             self.maps["photos"] = PhotoMap(policy)
-        if "patches" in policy.inputs:
+        if "patches" in inputs_of(policy):
             width = patch_width or policy.width
             parts = nn.LayerNorm(width), nn.Linear(width, policy.width)
             self.maps["patches"] = nn.Sequential(*parts)
@@ -201,18 +220,18 @@ class Denoiser(nn.Module):
             photo = self._unit(photos, "vision")
         if texts is not None:
             text = self._unit(texts.to(self.device), "text")
-        first = photo if self.policy.slots == 1 else None  # of two slots the photo has its own
+        first = photo if slots_of(self.policy) == 1 else None  # of two slots the photo has its own
         if photo is not None and self.pairs:
             first, photo = self.recall(photo)
         if text is not None:
             mixed = text if first is None else weight * first + (1 - weight) * text
             first = nn.functional.normalize(mixed, dim=1)
         n = len(next(e for e in (photo, text) if e is not None))
-        slots = (first,) if self.policy.slots == 1 else (first, photo)
+        slots = (first,) if slots_of(self.policy) == 1 else (first, photo)
         parts = [None if e is None else self._token(e) for e in slots]
-        parts += [patches for _ in self.policy.inputs]
+        parts += [patches for _ in inputs_of(self.policy)]
         null = self.null_tokens(n)
-        lengths = zip(parts, self.policy.lengths, strict=True)
+        lengths = zip(parts, lengths_of(self.policy), strict=True)
         return torch.cat([null[:, :k] if p is None else p for p, k in lengths], dim=1)
 
     def _map(self, photos: Tensor | None, texts: Tensor | None) -> Tensor:
@@ -253,7 +272,7 @@ class Denoiser(nn.Module):
 
     def null_tokens(self, n: int) -> Tensor:
         """The unconditional tokens (n, k, d), zeros: of all embeddings and inputs."""
-        shape = (n, sum(self.policy.lengths), self.policy.width)
+        shape = (n, sum(lengths_of(self.policy)), self.policy.width)
         return torch.zeros(shape, device=self.device)
 
     def forward(
@@ -271,8 +290,8 @@ class Denoiser(nn.Module):
         first = None
         if self.unet.config["class_embed_type"] == "projection":
             vectors = (
-                tokens[:, : self.policy.slots]
-                if self.policy.slots
+                tokens[:, : slots_of(self.policy)]
+                if slots_of(self.policy)
                 else tokens.mean(1, keepdim=True)
             )
             first = vectors.flatten(1)
@@ -327,7 +346,7 @@ class Denoiser(nn.Module):
         require_regular(Path(folder) / "condition.safetensors")
         try:
             extra = load_file(Path(folder) / "condition.safetensors")
-            patches = "patches" in policy.inputs
+            patches = "patches" in inputs_of(policy)
             width = extra["maps.patches.1.weight"].shape[1] if patches else None
             model = cls(unet, policy, patch_width=width)
             wanted = {k for k in model.state_dict() if not k.startswith("unet.")}

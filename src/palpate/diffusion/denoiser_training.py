@@ -24,7 +24,7 @@ from torch import Tensor, nn
 
 from palpate.core import digest_json, require
 from palpate.diffusion.autoencoder import LatentStats
-from palpate.diffusion.denoiser import Denoiser
+from palpate.diffusion.denoiser import Denoiser, inputs_of, lengths_of, slots_of
 from palpate.diffusion.options import SOURCES, ConditionPolicy, Schedule, Source, UNetOptions
 from palpate.diffusion.presets import DiffusionPreset
 from palpate.diffusion.unet import build_unet, load_unet
@@ -48,7 +48,7 @@ class Rows:
     Attributes:
         latents: (n, c, h, w) of the autoencoder, not normalized; a memory map will do.
         conditions: embeddings (n, d) by source; those of ``policy.sources`` are needed, others only
-            give their mean. By name ``policy.inputs``, arrays or memory maps: ``patches``,
+            give their mean. By name ``inputs_of(policy)``, arrays or memory maps: ``patches``,
             states (n, k, w), or ``photos`` of GVST (n, s, s, 3).
         background: rows -> (n, g, h, w), what the variant w/ BG sees of the gel, by the statistics
             of the latents.
@@ -102,7 +102,7 @@ def train_denoiser(
         channels, side = rows.latents.shape[1:3]
         net = new_unet(start, preset.unet, policy, side, channels=channels, background=gel)
         memory = _memory(tables) if policy.gap == "pairs" else None
-        width = conditions["patches"].shape[2] if "patches" in policy.inputs else None
+        width = conditions["patches"].shape[2] if "patches" in inputs_of(policy) else None
         model = Denoiser(net, policy, means, memory, width)
         model.to(pick_device(run.device))
     if start is not None:
@@ -120,7 +120,7 @@ def train_denoiser(
             stats=stats,
             schedule=preset.schedule,
             policy=policy,
-            inputs={name: part.conditions[name] for name in policy.inputs},
+            inputs={name: part.conditions[name] for name in inputs_of(policy)},
         )
 
     loss, held = loss_of(rows), None
@@ -169,7 +169,7 @@ def _require_conditions(policy: ConditionPolicy, conditions: Mapping[str, Any]) 
     must = "must be text or both with gap='pairs': other photos would find their own text"
     fits = not pairs or "text" in policy.sources
     require(fits, "condition.source", must, policy.source, fix="Take gap='none'")
-    needed = [*dict.fromkeys((*policy.sources, *policy.inputs, *(SOURCES if pairs else ())))]
+    needed = [*dict.fromkeys((*policy.sources, *inputs_of(policy), *(SOURCES if pairs else ())))]
     missing = [name for name in needed if name not in conditions]
     settings = f"source={policy.source!r} and gap={policy.gap!r}"
     must = f"{settings} need conditions of {', '.join(needed)}"
@@ -213,7 +213,7 @@ class DiffusionLoss:
         self.latents, self.tokens, self.background = latents, dict(tokens), background
         self.stats, self.schedule, self.policy = stats, schedule, policy
         self.inputs = dict(inputs or {})
-        self.lengths = torch.tensor(policy.lengths)
+        self.lengths = torch.tensor(lengths_of(policy))
         self.alphas = schedule.alphas()
 
     def load(self, step: Step) -> Batch:
@@ -260,7 +260,7 @@ class DiffusionLoss:
             return None
         tokens = torch.cat([self.tokens[s][step.rows] for s in self.policy.sources], dim=1)
         if self.policy.noise:
-            noise = step.randn(self.policy.slots, self.policy.width)
+            noise = step.randn(slots_of(self.policy), self.policy.width)
             tokens = nn.functional.normalize(tokens + self.policy.noise * noise, dim=2)
             tokens = tokens * self.policy.width**0.5
         return tokens
@@ -268,7 +268,7 @@ class DiffusionLoss:
     def _dropped(self, step: Step) -> Tensor:
         """Which embeddings and inputs (n, parts, 1) are dropped; patches also with their photo."""
         draws = step.rand(len(self.lengths), 1)
-        dropped, slots = draws < self.policy.dropout, self.policy.slots
+        dropped, slots = draws < self.policy.dropout, slots_of(self.policy)
         if "patches" in self.inputs:
             dropped[:, slots:] = dropped[:, slots - 1 : slots] | (draws[:, slots:] < DROP_PATCHES)
         return dropped

@@ -16,6 +16,7 @@ from palpate.core import Progress, atomic_path, digest_json, quiet, read_json, s
 from palpate.data.images import cached_images, image_stamp
 from palpate.data.manifest import Manifest
 from palpate.diffusion.autoencoder import AnyAutoencoder, BackgroundAutoencoder
+from palpate.diffusion.denoiser import inputs_of
 from palpate.diffusion.denoiser_training import Rows
 from palpate.diffusion.gels import gels_of
 from palpate.diffusion.options import ConditionPolicy
@@ -69,11 +70,11 @@ def encode_part(
     if encoders is not None:
         for s in policy.modalities:
             conditions[s] = embed(part, encoders, s, cache=cache, progress=progress).features
-        if "patches" in policy.inputs:
+        if "patches" in inputs_of(policy):
             conditions["patches"] = encode_patches(
                 part, encoders, policy.patches, folder=folder, progress=progress
             )
-    if "photos" in policy.inputs:
+    if "photos" in inputs_of(policy):
         conditions["photos"] = cached_images(part, "vision", policy.photo_size, cache, progress)
 
     def code(pixels: NDArray[np.uint8], ground: NDArray[np.uint8] | None, name: str) -> Any:

@@ -12,8 +12,6 @@ Source = Literal["text", "vision"]
 Sources = Literal["text", "vision", "both", "resnet"]
 SOURCES: tuple[Source, ...] = ("text", "vision")
 Method = Literal["ddim", "dpm"]
-#: Tokens of a photo: a map of 8 x 8.
-PHOTO_TOKENS = 64
 
 
 @dataclass(frozen=True)
@@ -147,24 +145,6 @@ class ConditionPolicy:
         if not self.sources:
             return ()
         return SOURCES if "text" in self.sources else ("vision",)
-
-    @property
-    def slots(self) -> int:
-        """Embeddings that a sample is conditioned on at once: text and photo, one, or none."""
-        return len(self.sources)
-
-    @property
-    def inputs(self) -> tuple[str, ...]:
-        """What else tokens are made of: the ``photos``, or their ``patches``."""
-        if self.source == "resnet":
-            return ("photos",)
-        return ("patches",) if self.patches and "vision" in self.sources else ()
-
-    @property
-    def lengths(self) -> tuple[int, ...]:
-        """Tokens of each embedding, then of each input."""
-        tokens = {"photos": PHOTO_TOKENS, "patches": self.patches}
-        return (1,) * self.slots + tuple(tokens[name] for name in self.inputs)
 
 
 @dataclass(frozen=True)

@@ -29,7 +29,7 @@ from palpate.diffusion.autoencoder import (
 )
 from palpate.diffusion.autoencoder_training import autoencoder_of, build_autoencoder
 from palpate.diffusion.ceiling import judge_of, measure_ceiling, some_whole
-from palpate.diffusion.denoiser import Denoiser
+from palpate.diffusion.denoiser import Denoiser, lengths_of
 from palpate.diffusion.denoiser_training import Rows, new_unet, train_denoiser
 from palpate.diffusion.encoding import encode_part
 from palpate.diffusion.gels import gels_of, has_gels
@@ -385,7 +385,7 @@ def _drawn(
 def _require_same(start: TactilePipeline, parts: Parts, policy: ConditionPolicy) -> None:
     """A denoiser goes on only in the space that it knows."""
     vision = start.encoders.digest("vision") if start.encoders else None
-    policies = [(p.source, *p.lengths) for p in (start.denoiser.policy, policy)]
+    policies = [(p.source, *lengths_of(p)) for p in (start.denoiser.policy, policy)]
     pairs = {
         "autoencoder": (start.autoencoder.digest, parts.autoencoder.digest),
         "vision encoder": (vision, _digests(parts.encoders)["vision"]),

@@ -8,6 +8,7 @@ from typing import Any
 from diffusers.models.unets.unet_2d_condition import UNet2DConditionModel
 
 from palpate.core import require
+from palpate.diffusion.denoiser import slots_of
 from palpate.diffusion.options import ConditionPolicy, UNetOptions
 from palpate.encoders.models import find_single, is_hub_id, load_model
 
@@ -37,7 +38,7 @@ def build_unet(
         norm_num_groups=options.groups,
         class_embed_type="projection" if options.modulate else None,
         projection_class_embeddings_input_dim=(
-            max(1, policy.slots) * policy.width if options.modulate else None
+            max(1, slots_of(policy)) * policy.width if options.modulate else None
         ),
         attention_head_dim=heads,
     )
