@@ -84,11 +84,13 @@ def encode_part(
         )
 
     latents, seen = code(images, gels if own else None, ""), None
-    if isinstance(autoencoder, BackgroundAutoencoder) and background:
-        seen = lambda rows, _: autoencoder.gel(gels[rows])
-    elif background:
-        coded = code(gels, None, "background")
-        seen = lambda rows, stats: stats.normalize(torch.as_tensor(coded[rows]))
+    if background:
+        assert gels is not None
+        if isinstance(autoencoder, BackgroundAutoencoder):
+            seen = lambda rows, _: autoencoder.gel(gels[rows])
+        else:
+            coded = code(gels, None, "background")
+            seen = lambda rows, stats: stats.normalize(torch.as_tensor(coded[rows]))
     return Rows(latents, conditions, seen, part.ids, gels=gels)
 
 
