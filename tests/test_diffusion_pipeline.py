@@ -129,8 +129,7 @@ def test_the_background_variant_uses_its_background():
     a, b = (arrays(pipeline(photos(2), gel=g)) for g in (ground, ground[::-1].copy()))
     assert not np.array_equal(a, b)
     fails("`background` must be given for a generator that sees", pipeline, photos(2))
-    with pytest.raises(PalpateError, match="and only for one"):
-        make_pipeline()(photos(2), gel=ground)
+    fails("and only for one", make_pipeline(), photos(2), gel=ground)
     with pytest.raises(PalpateError, match="one image of 32 pixels square per photo"):
         pipeline.sample(torch.randn(2, 6), ["a", "b"], seed=0, background=ground[:, :16])
 

@@ -128,59 +128,48 @@ def measure_ceiling(
         ``not_measured`` says what was wrong with a file. None also on all processes but the first.
     """
     train, held = manifest.part(split, "train"), manifest.part(split, "val", "test")
-    gels = isinstance(autoencoder, BackgroundAutoencoder) and has_gels(held)
-    held = some_whole(held, ["tactile", "background"] if gels else ["tactile"], SCORED)
+    coded = isinstance(autoencoder, BackgroundAutoencoder)  # against the gels
+    columns = ["tactile", "background"] if coded and has_gels(held) else ["tactile"]
+    held = some_whole(held, columns, SCORED)
     if not len(held) or place()[0]:
         return None
     try:
-        return _measured(autoencoder, train, held, size, judge, cache, progress)
+        ground = None
+        if coded:
+            gels = gels_of(train, size, cache, progress)  # the stock gel is that of the training
+            ground = gels_of(held, size, cache, progress, like=gels)
+        images = np.asarray(cached_images(held, "tactile", size, cache, progress))
+        scores: dict[str, Any] = asdict(measure_reconstruction(autoencoder, images, ground))
+        if judge is None:
+            return scores
+        scores["judge"] = judge.digest("tactile")
+        seen = judge.saw("tactile", held, progress=progress)
+        if seen.any():
+            scores["not_judged"] = int(seen.sum())
+            if seen.all():
+                return scores
+            new = [name for name, old in zip(held.ids, seen, strict=True) if not old]
+            held, images = held.take(new), images[~seen]
+            ground = None if ground is None else ground[~seen]
+
+        def features(part: Manifest, pixels: NDArray[np.uint8]) -> FeatureSet:
+            labels, groups = words_of(part, "material"), words_of(part, "video")
+            rows = embed_images(pixels, judge, progress=progress)
+            return FeatureSet(part.ids, rows, labels, groups, scores["judge"])
+
+        decoded = autoencoder.decode(autoencoder.encode(images, ground), ground)
+        real, ours = features(held, images), features(held, decoded)
+        with suppress(PalpateError):  # too few samples or videos
+            score = tmmd(ours, real)
+            scores |= {"tmmd": score.value, "tmmd_interval": score.interval}
+        if len({*train.column("material")} - {None}) > 1:
+            some = evenly(len(train), FITTED)
+            pixels = np.asarray(cached_images(train, "tactile", size, cache, progress)[some])
+            with suppress(PalpateError):  # no material outside of train
+                fitted = features(train.take([train.ids[k] for k in some]), pixels)
+                probe = fit_probe(fitted)
+                scores["accuracy_real"] = material_accuracy(fitted, real, probe=probe).value
+                scores["accuracy"] = material_accuracy(fitted, ours, probe=probe).value
+        return {name: value for name, value in scores.items() if value is not None}
     except PalpateError as error:  # of a file: no reason to lose the training
         return {"not_measured": str(error)}
-
-
-def _measured(  # noqa: PLR0917 - the arguments of measure_ceiling
-    autoencoder: AnyAutoencoder,
-    train: Manifest,
-    held: Manifest,
-    size: int,
-    judge: EncoderSet | None,
-    cache: Path | None,
-    progress: Progress,
-) -> dict[str, Any]:
-    ground = None
-    if isinstance(autoencoder, BackgroundAutoencoder):
-        gels = gels_of(train, size, cache, progress)  # the stock gel is that of the training
-        ground = gels_of(held, size, cache, progress, like=gels)
-    images = np.asarray(cached_images(held, "tactile", size, cache, progress))
-    scores: dict[str, Any] = asdict(measure_reconstruction(autoencoder, images, ground))
-    if judge is None:
-        return scores
-    scores["judge"] = judge.digest("tactile")
-    seen = judge.saw("tactile", held, progress=progress)
-    if seen.any():
-        scores["not_judged"] = int(seen.sum())
-        if seen.all():
-            return scores
-        new = [name for name, old in zip(held.ids, seen, strict=True) if not old]
-        held, images = held.take(new), images[~seen]
-        ground = None if ground is None else ground[~seen]
-
-    def features(part: Manifest, pixels: NDArray[np.uint8]) -> FeatureSet:
-        labels, groups = words_of(part, "material"), words_of(part, "video")
-        rows = embed_images(pixels, judge, progress=progress)
-        return FeatureSet(part.ids, rows, labels, groups, scores["judge"])
-
-    decoded = autoencoder.decode(autoencoder.encode(images, ground), ground)
-    real, ours = features(held, images), features(held, decoded)
-    with suppress(PalpateError):  # too few samples or videos
-        score = tmmd(ours, real)
-        scores |= {"tmmd": score.value, "tmmd_interval": score.interval}
-    if len({*train.column("material")} - {None}) > 1:
-        some = evenly(len(train), FITTED)
-        pixels = np.asarray(cached_images(train, "tactile", size, cache, progress)[some])
-        with suppress(PalpateError):  # no material outside of train
-            fitted = features(train.take([train.ids[k] for k in some]), pixels)
-            probe = fit_probe(fitted)
-            scores["accuracy_real"] = material_accuracy(fitted, real, probe=probe).value
-            scores["accuracy"] = material_accuracy(fitted, ours, probe=probe).value
-    return {name: value for name, value in scores.items() if value is not None}
