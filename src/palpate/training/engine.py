@@ -161,7 +161,14 @@ class _Run:
         self, module: nn.Module, task: Task, options: LoopOptions, folder: Path, compute: Compute
     ) -> None:
         self.part = place()
-        batch = _require_batch(task, options, self.part[1])
+        fix = "Check the split: is its train part empty?"
+        require(task.n >= 1, None, f"{task.name} needs at least one sample", "none", fix=fix)
+        batch = min(options.batch, task.n)
+        if batch % self.part[1]:
+            must = f"must be a multiple of the {self.part[1]} processes"
+            got = f"{batch}" + (", all training samples" if batch == task.n else "")
+            fix = "Choose another, or another number of processes"
+            raise shared(PalpateError(must, got, fix, argument="batch"))
         self.module, self.task, self.options = module, task, options
         self.folder, self.compute = folder, compute
         self.parameters = {k: p for k, p in module.named_parameters() if p.requires_grad}
@@ -500,19 +507,6 @@ class _Run:
             if f"{MOMENTS[0]}.{name}" in tensors:
                 state = {m: tensors[f"{m}.{name}"].to(p.device) for m in MOMENTS}
                 self.optimizer.state[p] = state | {"step": state["step"].to(counter)}
-
-
-def _require_batch(task: Task, options: LoopOptions, processes: int) -> int:
-    """Check that there are rows, and that processes share a batch equally; return its size."""
-    fix = "Check the split: is its train part empty?"
-    require(task.n >= 1, None, f"{task.name} needs at least one sample", "none", fix=fix)
-    batch = min(options.batch, task.n)
-    if batch % processes:
-        must = f"must be a multiple of the {processes} processes"
-        got = f"{batch}" + (", all training samples" if batch == task.n else "")
-        fix = "Choose another, or another number of processes"
-        raise shared(PalpateError(must, got, fix, argument="batch"))
-    return batch
 
 
 def _copies(tensors: dict[str, Tensor]) -> dict[str, Tensor]:
