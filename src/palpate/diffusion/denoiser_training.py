@@ -105,8 +105,10 @@ def train_denoiser(
         width = conditions["patches"].shape[2] if "patches" in inputs_of(policy) else None
         model = Denoiser(net, policy, means, memory, width)
         model.to(pick_device(run.device))
-    if start is not None:
-        _copy_weights(start, model)
+    trained = {} if start is None else dict(start.named_parameters())
+    for name, own in model.named_parameters():  # of the U-Net, and what else both have learned
+        if name in trained:
+            own.data.copy_(trained[name].data)
 
     def loss_of(part: Rows) -> DiffusionLoss:
         with torch.no_grad():
@@ -128,8 +130,8 @@ def train_denoiser(
         held = (len(held_out.latents), loss_of(held_out).load)
     records = (stats, preset.unet, policy, preset.schedule)
     settings = [asdict(record) for record in records if not isinstance(record, str)]
-    trained = start is not None or isinstance(preset.unet, str)
-    begin = [digest_tensors(model.state_dict())] if trained else []
+    fresh = start is None and not isinstance(preset.unet, str)
+    begin = [] if fresh else [digest_tensors(model.state_dict())]
     key = digest_json([rows.key, rows.background is not None, *settings, *begin])
     n = len(rows.latents)
     task = Task("generator", n, loss.load, loss, key, rows.ids, held, samples)
@@ -185,14 +187,6 @@ def _memory(tables: Mapping[Source, Tensor]) -> tuple[Tensor, Tensor]:
     texts, which, counts = tables["text"].unique(dim=0, return_inverse=True, return_counts=True)
     photos = torch.zeros_like(texts).index_add_(0, which, tables["vision"])
     return texts, photos / counts[:, None]
-
-
-def _copy_weights(source: Denoiser, target: Denoiser) -> None:
-    """Copy the U-Net, and what else both have learned."""
-    weights = dict(source.named_parameters())
-    for name, own in target.named_parameters():
-        if name in weights:
-            own.data.copy_(weights[name].data)
 
 
 class DiffusionLoss:

@@ -132,7 +132,10 @@ def train_generator(  # noqa: PLR0913 - a public verb
         judge = judge_of(judge, run.device)
         manifest, split = load(data), load_split(data, split)
         encoders = load_clip(clip) if isinstance(clip, str | Path) else clip
-        _require_encoders(_policy(chosen, encoders), encoders)
+        needed = _policy(chosen, encoders).modalities
+        missing = [m for m in needed if encoders is None or m not in encoders.modalities]
+        must, got = f"must have {' and '.join(needed)}", f"no {' and no '.join(missing)}"
+        require(not missing, "clip", must, got, fix="Pass a CLIP")
         if autoencoder is None:
             assert options is not None
             code = autoencoder_of(manifest, split, options, chosen.size, run.stage("autoencoder"))
@@ -169,13 +172,6 @@ def _preset(
 
 def _policy(preset: DiffusionPreset, encoders: EncoderSet | None) -> ConditionPolicy:
     return preset.condition_for(preset.condition.width if encoders is None else encoders.dim)
-
-
-def _require_encoders(policy: ConditionPolicy, encoders: EncoderSet | None) -> None:
-    names = () if encoders is None else encoders.modalities
-    missing = [modality for modality in policy.modalities if modality not in names]
-    must, got = f"must have {' and '.join(policy.modalities)}", f"no {' and no '.join(missing)}"
-    require(not missing, "clip", must, got, fix="Pass a CLIP")
 
 
 def plan_generator(
