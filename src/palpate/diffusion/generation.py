@@ -135,12 +135,12 @@ def generate(  # noqa: PLR0913 - a public verb, step by step
     require(photos is not None or text is not None, None, must, "none", fix=fix)
     require(0 <= weight <= 1, "weight", "must lie in [0, 1]", f"{weight:g}", fix="1 is the photo")
     output = None if output is None else Path(output)
-    place, gathered = (0, 1), dict
+    rank, size, gathered = 0, 1, dict
     if int(os.environ.get("WORLD_SIZE", "1")) > 1:
         from palpate.training import processes
 
         device = processes.connect(device)
-        place, gathered = processes.place(), processes.merged
+        (rank, size), gathered = processes.place(), processes.merged
     items = [_Item(str(text), None)] if photos is None else _items(photos, split, part)
     paths = [item.vision or Path(item.id) for item in items]
     single = _is_single(output, paths)
@@ -159,7 +159,7 @@ def generate(  # noqa: PLR0913 - a public verb, step by step
     words = None if text is None else model.embed_text(text)
     settings = _settings(model, sampler, seed)
     settings |= {"text": text, "weight": None if photos is None else weight} if text else {}
-    target = _Target(output, single, settings, model.notice, place[0] == 0)
+    target = _Target(output, single, settings, model.notice, rank == 0)
     items = _on_gels(items, model, gel)
     notes = _notes(model, text, gel)
     if dry_run:
@@ -186,7 +186,7 @@ def generate(  # noqa: PLR0913 - a public verb, step by step
             )
             yield from zip(chunk, images, strict=True)
 
-    reader = _Reader(model, items[place[0] :: place[1]], target, skip_bad)
+    reader = _Reader(model, items[rank::size], target, skip_bad)
     ready = iter(reader)
     first = [*islice(ready, 1)]  # few photos are all read before anything is written
     bad = reader.checked(gathered(reader.bad))
