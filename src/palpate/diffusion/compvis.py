@@ -66,9 +66,9 @@ def read_compvis(path: Path) -> VQModel:
         PalpateError: if the file is unreadable, holds more than weights, or not exactly one such
             autoencoder.
     """
-    whole = read_weights(path, FIX_PICKLE)
-    inner = {k.removeprefix(PREFIX): v for k, v in whole.items() if k.startswith(PREFIX)}
-    state = {k: v for k, v in (inner or whole).items() if not k.startswith(LEFT)}
+    content = read_weights(path, FIX_PICKLE)
+    inner = {k.removeprefix(PREFIX): v for k, v in content.items() if k.startswith(PREFIX)}
+    state = {k: v for k, v in (inner or content).items() if not k.startswith(LEFT)}
     config = _geometry(path, state)
     with torch.device("meta"):
         model = VQModel(**config)
