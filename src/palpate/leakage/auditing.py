@@ -267,7 +267,7 @@ def _compare(
     """Audit one part against another."""
     group = _group(train, test, options)
     shared = same_names(train, test, options.identity)
-    train, test, equal = rename_unrelated(train, test, shared, (against, "test"))
+    test, equal = rename_unrelated(train, test, shared)
     a, b = train.table, test.table
     groups = [set(t[group].drop_nulls()) if group != NO_GROUP else set[str]() for t in (a, b)]
     in_both = sorted(groups[0] & groups[1])

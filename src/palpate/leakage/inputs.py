@@ -123,37 +123,27 @@ def read_all(
 
 
 def rename_unrelated(
-    train: Manifest, test: Manifest, shared: Sequence[str], parts: tuple[str, str]
-) -> tuple[Manifest, Manifest, dict[str, int]]:
-    """Rename what has equal names in both parts without being the same thing.
+    train: Manifest, test: Manifest, shared: Sequence[str]
+) -> tuple[Manifest, dict[str, int]]:
+    """Rename what has the same name in train without being the same thing.
 
     Args:
         train: samples.
         test: the samples to distinguish from them.
         shared: columns whose names mean the same thing in both.
-        parts: prefixes of the names, for ``train`` and ``test``.
 
     Returns:
-        Both parts (ids stay as they are), and how many names of which column are equal.
+        The test samples (ids stay as they are), and how many names of which column are equal.
     """
     equal: dict[str, int] = {}
     for column in (c for c in NAMES if c not in shared):
-        both = train.table[column].drop_nulls().unique()
-        both = both.filter(both.is_in(test.table[column].implode()))
-        if len(both):
-            equal[column] = len(both)
-        if len(both) and column != "id":
-            train, test = (
-                replace(m, table=m.table.with_columns(_prefixed(column, both, part)))
-                for m, part in zip((train, test), parts, strict=True)
-            )
-    return train, test, equal
-
-
-def _prefixed(column: str, names: pl.Series, part: str) -> pl.Expr:
-    name = pl.col(column)
-    renamed = pl.format("{}: {}", pl.lit(part), name)
-    return pl.when(name.is_in(names.implode())).then(renamed).otherwise(name).alias(column)
+        name = pl.col(column)
+        both = name.is_in(train.table[column].drop_nulls().unique().implode())
+        if count := test.table.filter(both)[column].n_unique():
+            equal[column] = count
+            other = pl.when(both).then(pl.format("test: {}", name)).otherwise(name).alias(column)
+            test = replace(test, table=test.table.with_columns(name if column == "id" else other))
+    return test, equal
 
 
 def _join(
