@@ -164,25 +164,14 @@ def name_recordings(manifests: Sequence[Manifest], template: str | None = None) 
         as they are.
     """
     bare = [_unread(m, manifests, stated=template is not None) for m in manifests]
-    columns = [_column_of_names(m) for m, own in zip(manifests, bare, strict=True) if own]
-    column = next((c for c in (PATH, "tactile", "vision") if columns and set(columns) == {c}), "")
-    names = [
-        own.table[column or _column_of_names(own)]
-        .str.replace_all("\\", "/", literal=True)
-        .str.replace(r"^(?:[A-Za-z]:)?(?:\.?/)+", "")  # where a machine has it
-        .to_list()
-        if own is not None
-        else []
-        for own in bare
-    ]
+    names = [[] if own is None else _names_of(own) for own in bare]
     rows, levels, source = _read([[n for n in own if n] for own in names if own], template)
     if not levels:
         return list(manifests)
-    named: list[Manifest] = []
-    for manifest, own, paths in zip(manifests, bare, names, strict=True):
-        named.append(
-            manifest if own is None else _filled(own, [rows.get(p) for p in paths], source)
-        )
+    named = [
+        m if own is None else _filled(own, [rows.get(name) for name in paths], source)
+        for m, own, paths in zip(manifests, bare, names, strict=True)
+    ]
     return _with_sessions(named) if "HCT" in source else named
 
 
@@ -204,10 +193,12 @@ def _templates(manifest: Manifest) -> dict[str, str]:
     return {k: text for k, text in manifest.facts.items() if k.startswith("template_")}
 
 
-def _column_of_names(manifest: Manifest) -> str:
+def _names_of(manifest: Manifest) -> list[str | None]:
+    """The paths of samples, without the place that a machine has them in; their ids without any."""
     table = manifest.table
     columns = (c for c in (PATH, "tactile", "vision") if c in table.columns and table[c].count())
-    return next(columns, "id")
+    names = table[next(columns, "id")].str.replace_all("\\", "/", literal=True)
+    return names.str.replace(r"^(?:[A-Za-z]:)?(?:\.?/)+", "").to_list()
 
 
 def _read(
@@ -259,10 +250,9 @@ def _suggested(paths: Sequence[str], inputs: Sequence[Sequence[str]]) -> str:
     roles = "|".join(ROLE_OF)
     folder = re.compile(rf"(?i)(?:(?:{roles}|images?|frames?)[_\-. ]?)+")
     end = re.compile(rf"(?i)(?<=[_\-. ])(?:{roles})(?=\.\w+$)")
+    own = [_folders(some) for some in map(set(paths).intersection, inputs) if some]
     if len({match[0] for path in paths if (match := end.search(path))}) > 1:
         paths = [end.sub("*", path) for path in paths]
-    chosen = set(paths)
-    own = [_folders(some) for some in map(chosen.intersection, inputs) if some]
     shown = {
         k
         for k, values in enumerate(_folders(paths))
