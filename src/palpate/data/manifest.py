@@ -179,8 +179,9 @@ class Manifest:
         Raises:
             PalpateError: if the split names ids that the manifest lacks.
         """
-        ids = self.take(split.ids(*parts)).ids
-        return replace(self, table=self.table.filter(pl.col("id").is_in(ids)))
+        ids = split.ids(*parts)
+        table = self.table.filter(pl.col("id").is_in(ids))
+        return replace(self, table=table if len(table) == len(ids) else self.take(ids).table)
 
     def prefixed(self, prefix: str) -> Manifest:
         """The same samples with ``prefix`` before their ids, videos, contacts and sessions."""

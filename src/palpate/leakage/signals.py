@@ -154,8 +154,10 @@ def identical_samples(
     ``named`` are the columns in which equal names mean the same thing; without ``id`` and ``video``
     nothing can be checked.
     """
-    row = {name: k for k, name in enumerate(train.ids)} if "id" in named else {}
-    same = np.array([row.get(name, -1) for name in test.ids], np.int64)
+    ids = train.table.select("id").with_row_index("row").unique("id", keep="last")
+    ids = ids if "id" in named else ids.clear()
+    rows = test.table.select("id").join(ids, on="id", how="left", maintain_order="left")["row"]
+    same = rows.cast(pl.Int64).fill_null(-1).to_numpy()
     nearest = np.where(same >= 0, same, np.where(gaps.frames == 0, gaps.row, -1))
     flag = nearest >= 0
     score = np.where(bool({"id", "video"} & {*named}), flag, np.nan).astype(np.float32)

@@ -14,11 +14,12 @@ from pathlib import Path
 from typing import Any, overload
 
 import numpy as np
+import polars as pl
 
 from palpate.core import Note, PalpateError, Progress, Split, quiet, require
 from palpate.data.manifest import MODALITIES, Manifest
 from palpate.leakage.auditing import audit
-from palpate.leakage.groups import Ints, choose_group, components, nested_groups, shared_groups
+from palpate.leakage.groups import Ints, choose_group, components, nested_groups
 from palpate.leakage.inputs import Data, read, read_all
 from palpate.leakage.noleak import HCT_GROUPS, published
 from palpate.leakage.program import EXACT, RESOLUTION, Optimum, Problem, draw, optimize
@@ -128,7 +129,7 @@ def split(  # noqa: PLR0913  # pyright: ignore[reportInconsistentOverload]
             facts |= {"folds": folds, "fold": fold, "shares": shares}
         where = {g: parts[k] for g, k in zip(names, assignment.tolist(), strict=True)}
         part_of = {i: where[g] for i, g in zip(manifest.ids, groups, strict=True)}
-        more = [*notes, *_question(manifest, part_of), *_notes(manifest, facts)]
+        more = [*notes, *_notes(manifest, facts)]
         made = _audited(manifest, Split(part_of, dict(facts), manifest.digest, more), cache)
         fold_name = f"{made.rule['name']}, fold {fold} of {folds}" if folds else made.rule["name"]
         splits.append(replace(made, rule={**made.rule, "name": fold_name}))
@@ -189,12 +190,13 @@ def _problem(
         got = f"{len(names)} {kind} group(s)"
         raise PalpateError(must, got, "Choose a finer group", example={"by": "contact"})
     materials: list[str] = sorted(manifest.table["material"].drop_nulls().unique())
-    row, column = ({name: k for k, name in enumerate(x)} for x in (names, materials))
+    row, column = (
+        series.rank("dense").cast(pl.Int64).fill_null(0).to_numpy() - 1
+        for series in (pl.Series(groups), manifest.table["material"])
+    )
     counts = np.zeros((len(names), len(materials) + 1), np.int64)
-    for group, material in zip(groups, manifest.column("material"), strict=True):
-        counts[row[group], -1] += 1
-        if material is not None:
-            counts[row[group], column[material]] += 1
+    np.add.at(counts, (row, -1), 1)
+    np.add.at(counts, (row[column >= 0], column[column >= 0]), 1)
     biggest = int(counts[:, -1].argmax())
     largest, wanted = float(counts[biggest, -1] / len(groups)), 1 - max(target)
     must = f"The smaller parts must get at least {LEAST_FILL:.0%} of their wanted {wanted:.1%}"
@@ -242,7 +244,7 @@ def _audited(manifest: Manifest, made: Split, cache: str | Path | None) -> Split
         modalities=near["modalities"] if near else MODALITIES,
     )
     facts = {**made.rule, "audit": own.verdict}
-    notes = list(made.notes)
+    notes = [*made.notes, *_question(manifest, own.shared)]
     if own.verdict != NO_LEAK:
         what = f"{own.group}s shared" if own.groups_shared else own.verdict
         facts["name"] = f"by {' and '.join(facts['by']) or LINKED}: {what}"
@@ -250,13 +252,8 @@ def _audited(manifest: Manifest, made: Split, cache: str | Path | None) -> Split
     return replace(made, rule=facts, notes=notes)
 
 
-def _question(manifest: Manifest, parts: Mapping[str, str]) -> list[Note]:
-    """Whether the split is for new objects or for known ones, and what makes the other."""
-    if not {"train", "test"} <= set(parts.values()):
-        return []
-    split = Split(parts)
-    train, test = (manifest.part(split, part).table for part in ("train", "test"))
-    shared = shared_groups(train, test)
+def _question(manifest: Manifest, shared: Mapping[str, Sequence[int]]) -> list[Note]:
+    """Whether a split is for new objects or for known ones, and what makes the other."""
     coarse = next((c for c in ("object", "session") if c in shared), None)
     if coarse is None:
         return []
