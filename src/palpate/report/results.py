@@ -462,7 +462,7 @@ class Results(Shown):
         return pl.DataFrame(rows, infer_schema_length=None)
 
     @classmethod
-    def load(cls, path: str | Path) -> Results:
+    def load(cls, path: str | Path) -> Self:
         """Read results from a file, or those of an audit, with paths from the working directory.
 
         Raises:
@@ -471,7 +471,8 @@ class Results(Shown):
         data = read_record(Path(path), "results file", form=(RESULTS_FORMAT, AUDIT_FORMAT))
         if data["format"] == RESULTS_FORMAT:
             return super().load(path)
-        results = replace(Audit.load(path).to_results(), title="")
+        audit = Audit.load(path)
+        results = cls(title="", audits=[audit, *audit.others])
         return results.with_paths(lambda name: os.path.normpath(Path(path).parent / name))
 
     def relative_to(self, folder: Path, base: Path) -> Results:
