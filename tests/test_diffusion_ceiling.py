@@ -201,6 +201,7 @@ def test_trainings_print_the_ceiling_of_the_data_that_they_are_given(
     assert load_autoencoder(tmp_path / "a").card["ceiling"]["tmmd"] == found["ceiling_tmmd"]
     assert "| psnr |" in (tmp_path / "a" / "README.md").read_text()
     given = ["--autoencoder", str(tmp_path / "a"), "--clip", "palpate/mini", "--steps", "2"]
+    given += ["--set", "sampler.steps=2"]  # of the samples that are drawn
     assert main(["train", "generator", folder, *common, *given, "-o", str(tmp_path / "g")]) == 0
     again = json.loads(capsys.readouterr().out)
     assert again["ceiling_psnr"] == pytest.approx(found["ceiling_psnr"], abs=0.01)

@@ -213,7 +213,7 @@ def test_the_papers_preset_runs_on_a_file(tag, tmp_path):
     write(tmp_path / "tiny-vq-f4.ckpt", make_state(**VQ_F4))
     (manifest, split), encoders = tag, make_encoders()
     unet = replace(PAPER.unet, widths=(32, 32, 64, 64), head_width=16, groups=16)
-    tiny = replace(PAPER, size=64, unet=unet, epochs=1, loop=replace(PAPER.loop, batch=8))
+    tiny = replace(PAPER, size=32, unet=unet, epochs=1, loop=replace(PAPER.loop, batch=8))
     tiny = replace(tiny, sampler=replace(PAPER.sampler, steps=4))
     common = {"preset": tiny, "autoencoder": "tiny-vq-f4.ckpt", "device": "cpu"}
     made = pp.train_generator(manifest, split, encoders, output="model", **common)
@@ -221,7 +221,7 @@ def test_the_papers_preset_runs_on_a_file(tag, tmp_path):
     assert pipeline.digest == made.digest
     assert pipeline.autoencoder.card["source"]["file"] == "tiny-vq-f4.ckpt"
     assert pipeline.stats.scale == "one"
-    side = 64 // pipeline.autoencoder.factor
+    side = 32 // pipeline.autoencoder.factor
     assert pipeline.denoiser.unet.config["sample_size"] == side
     about = json.loads((tmp_path / "model" / "autoencoder" / "config.json").read_text())
     assert about["_class_name"] == type(made.autoencoder.net).__name__
