@@ -7,7 +7,9 @@ from typing import Any, Literal
 
 from palpate.cli.settings import PresetTable, Settings
 from palpate.cli.terminal import Common, OutPath, Terminal, option_group, option_name
-from palpate.sim import DEFAULT, MINI_SEEDS, PRESETS, SEEN_WARNING, WorldOptions, write_world
+from palpate.sim.options import WorldOptions
+from palpate.sim.presets import DEFAULT, MINI_SEEDS, PRESETS, SEEN_WARNING
+from palpate.sim.writer import write_world
 
 #: Fields of a preset that are options of their own.
 FIELDS = (
