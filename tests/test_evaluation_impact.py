@@ -19,9 +19,7 @@ from palpate.core.records import from_plain
 from palpate.data.importing import import_dataset
 from palpate.data.manifest import Manifest
 from palpate.evaluation import impact as module
-from palpate.evaluation import impact_features
-from palpate.evaluation.impact import nearest_hits, thin
-from palpate.evaluation.impact_features import Source, fit_reduction
+from palpate.evaluation.impact import Source, fit_reduction, nearest_hits, thin
 from palpate.leakage.splitting import split as leak_free_split
 from palpate.report.records import Impact
 
@@ -253,7 +251,7 @@ def test_each_kind_of_pixels_has_a_row(small_manifest: Manifest, tmp_path: Path)
 
 
 def test_tactile_minus_background_is_the_difference(small_manifest: Manifest) -> None:
-    sources = impact_features.pixel_sources(small_manifest)
+    sources = module.pixel_sources(small_manifest)
     at = np.array([3, 17])
     by_name = {s.name: s.read(at) for s in sources}
     raw = [

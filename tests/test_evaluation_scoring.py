@@ -14,8 +14,9 @@ from forge.pictures import paint
 from forge.scores import DIM, FRAMES, GROUPS, IDS, by_key, codes, feature_sets, unit
 from palpate.core import FeatureSet, PalpateError, Score, Split
 from palpate.core.score import require_comparable
+from palpate.data import samples
 from palpate.data.manifest import Manifest
-from palpate.evaluation import companions, family, samples, score, scoring_run
+from palpate.evaluation import score, scorers
 from palpate.evaluation.controls import matched_features
 from palpate.metrics import Polynomial, compare, contact_scores, distance, i_tmmd, ssim
 from palpate.metrics.distributions import prdc_rows
@@ -191,8 +192,7 @@ def test_collapse_and_copies_are_noted():
 
 
 def test_of_many_rows_only_fid_is_computed_by_default(monkeypatch):
-    monkeypatch.setattr(companions, "MANY", 10)
-    monkeypatch.setattr(family, "MANY", 10)
+    monkeypatch.setattr(scorers, "MANY", 10)
     results = score({"g": SETS["far"]}, SETS["real"], permutations=0)
     assert {m for m, _, _ in by_key(results) if "(embeddings)" in m} == {"FID (embeddings)"}
     assert [n.params.get("name") for n in results.notes] == [None, "kid", "prdc"]
@@ -542,9 +542,7 @@ def test_an_interrupted_run_goes_on_from_its_embeddings(
     plain = by_key(score(made, small_manifest, **options))
     cache = tmp_path / "cache"
     with monkeypatch.context() as stop:
-        stop.setattr(
-            scoring_run, "score_family", lambda *_, **__: (_ for _ in ()).throw(KeyboardInterrupt)
-        )
+        stop.setattr(scorers, "compare", lambda *_, **__: (_ for _ in ()).throw(KeyboardInterrupt))
         with pytest.raises(KeyboardInterrupt):
             score(made, small_manifest, cache=cache, **options)
     assert len([*cache.rglob("tactile-*.npz")]) == 3

@@ -175,4 +175,4 @@ def test_embeddings_take_embeddings_of_train(capsys, tmp_path, monkeypatch):
     (tmp_path / "a.png").rename(tmp_path / "folder" / "a.png")
     status, _, err = call(capsys, *args[:4], "--train", "folder")
     assert status == 2
-    assert "train must be of the kind of the reference" in err or "--train" in err
+    assert "folder (images)" in err

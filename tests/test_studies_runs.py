@@ -18,7 +18,7 @@ from safetensors.numpy import load_file
 
 from forge import studies as small_study
 from palpate.core import PalpateError, Score, Split, digest_file, digest_json, short
-from palpate.evaluation.companions import Weights
+from palpate.evaluation.scorers import Weights
 from palpate.report.records import Claim, StudyTable
 from palpate.report.results import Results
 from palpate.studies.files import read_scores

@@ -68,7 +68,7 @@ def run(options: Options, terminal: Terminal) -> dict[str, Any]:
     """Run the stages and write what shows them."""
     systems = _folders(options.method)
     from palpate.core import write_text
-    from palpate.evaluation.companions import Weights
+    from palpate.evaluation.scorers import Weights
     from palpate.studies.graph import plan_graph
     from palpate.studies.reproduce import Plan
     from palpate.studies.study import STUDIES

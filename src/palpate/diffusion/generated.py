@@ -21,18 +21,10 @@ from typing import Any
 
 from PIL import Image
 
-from palpate.core import (
-    Note,
-    PalpateError,
-    Problem,
-    inside,
-    read_json,
-    reading_entry,
-    require,
-    short,
-)
+from palpate.core import Note, PalpateError, Problem, read_json, reading_entry, require, short
 from palpate.core.records import from_plain
 from palpate.data.images import read_image
+from palpate.data.samples import generated_files
 
 FORMAT = "palpate-generated/1"
 
@@ -104,13 +96,7 @@ class Generated:
         """
         folder = Path(folder)
         index = _read_index(folder)
-        must, fix = f"{folder} must be finished", "Run the same command again: it continues"
-        require(index.complete, None, must, "a folder left half done", fix=fix)
-        files = {name: inside(folder / "images", name) for name in index.images.values()}
-        bad = [name for name, path in files.items() if path is None or not path.is_file()]
-        must = f"Every image of {folder / 'index.json'} must lie in images/"
-        got = f"{len(bad)} that do not, first {bad[:1]}"
-        require(not bad, None, must, got, fix="Generate again")
+        generated_files(folder, vars(index))  # checks them
         return cls(folder, index.images, index.settings, index.skipped, notice=index.notice)
 
 

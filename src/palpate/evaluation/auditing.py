@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, Any
 
 from palpate.core import FeatureSet, Note, Progress, Split, quiet, require
 from palpate.data.manifest import MODALITIES, Manifest
-from palpate.evaluation.guard import guard, load_encoders
 from palpate.leakage.auditing import audit as audit_leakage
 from palpate.report.records import Impact
 from palpate.report.results import Audit, Call
@@ -62,6 +61,8 @@ def audit(
 
     @lru_cache
     def encoders() -> EncoderSet:
+        from palpate.encoders.models import load_encoders
+
         return load_encoders(encoder, progress)
 
     def embed(samples: Manifest, modality: Any) -> FeatureSet:
@@ -75,7 +76,10 @@ def audit(
         features: Any = "pixels"
         notes: list[Note] = []
         seen: list[str] = []
-        if encoder is not None:  # every sample is in the test part of some leak-free split
+        if encoder is not None:
+            from palpate.encoders.models import guard
+
+            # every sample is in the test part of some leak-free split
             judged = samples.take([i for part in ("train", "test") for i in split.ids(part)])
             features = {}
             for m in encoders().modalities:

@@ -16,13 +16,13 @@ from itertools import cycle
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from palpate.core import FeatureSet, Progress, Score, rng_for
+from palpate.core import FeatureSet, Score, rng_for
+from palpate.data.images import load_images
+from palpate.data.samples import Samples
 from palpate.metrics.probe import fit_probe, material_accuracy
 
 if TYPE_CHECKING:
-    from palpate.evaluation.companions import Features
-    from palpate.evaluation.inputs import Inputs
-    from palpate.evaluation.samples import Samples
+    from palpate.evaluation.scorers import Bench
 
 #: Rows of the tables that are not generators.
 BACKGROUND, SAME_MATERIAL, REAL = "background only", "real, same material", "real"
@@ -88,43 +88,38 @@ def matched_features(train: FeatureSet, test: FeatureSet, seed: int) -> FeatureS
     return replace(test, features=train.features[rows], encoder=train.encoder)
 
 
-def control_samples(
-    inputs: Inputs, size: int, seed: int, cache: Path, progress: Progress
-) -> dict[str, Samples]:
-    """The controls that the reference allows, as large as the generated images (``size``)."""
-    real, train = inputs.reference, inputs.train
-    if train is None or real.manifest is None or train.manifest is None:
+def control_samples(bench: Bench) -> dict[str, Samples]:
+    """The controls that the reference allows, as large as the generated images."""
+    real, train = bench.reference, bench.train
+    if train is None or real.rows is not None:
         return {}
     controls: dict[str, Samples] = {}
-    base = replace(real, manifest=None)
     if real.has_background:
-        gel = real.pixels(size, cache, progress, "background")
-        controls[BACKGROUND] = replace(base, source=BACKGROUND, images=gel)
+        gels = bench.pixels(real, "background")
+        controls[BACKGROUND] = replace(real, source=BACKGROUND, rows=gels)
     rows_of: dict[str, list[int]] = {}
     for row, material in enumerate(train.labels or ()):
         rows_of.setdefault(material, []).append(row)
     if real.labels and all(material in rows_of for material in real.labels):
-        from palpate.data.images import load_images
-
         paths, chosen = train.manifest.paths("tactile"), list[Path]()
         for i, material in zip(real.ids, real.labels, strict=True):
             rows = rows_of[material]
-            chosen.append(paths[rows[int(rng_for(seed, "control", i).integers(len(rows)))]])
-        images = load_images(chosen, size, progress=progress)
-        controls[SAME_MATERIAL] = replace(base, source=SAME_MATERIAL, images=images)
+            chosen.append(paths[rows[int(rng_for(bench.seed, "control", i).integers(len(rows)))]])
+        images = load_images(chosen, bench.size, progress=bench.progress)
+        controls[SAME_MATERIAL] = replace(real, source=SAME_MATERIAL, rows=images)
     return controls
 
 
-def material_accuracies(train: FeatureSet, features: Features) -> list[Score]:
+def material_accuracies(bench: Bench) -> list[Score]:
     """Accuracy of a probe fitted to the train part, on every subject and on the test part."""
-    if train.labels is None or len({*train.labels} - {""}) < 2:
+    train, sets = bench.train_features, bench.tactile
+    if train is None or train.labels is None or len({*train.labels} - {""}) < 2:
         return []
     probe = fit_probe(train)
     # The images of the same material are train images, which the probe was fitted to.
-    controls = {n: s for n, s in features.controls.items() if n != SAME_MATERIAL}
-    subjects = {**features.generators, **controls, REAL: features.reference}
+    controls = {n: s for n, s in sets.controls.items() if n != SAME_MATERIAL}
     return [
-        material_accuracy(train, s, probe=probe, subject=name, split=features.settings.split)
-        for name, s in subjects.items()
+        material_accuracy(train, s, probe=probe, subject=name, split=bench.split)
+        for name, s in {**sets.generators, **controls, REAL: sets.reference}.items()
         if s.labels is not None and any(s.labels)
     ]

@@ -21,7 +21,8 @@ than a real image with its noise: read its score next to the autoencoder's recon
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Any
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,6 +30,10 @@ from numpy.typing import NDArray
 from palpate.core import FeatureSet, Score, require
 from palpate.metrics.inputs import Array, require_one_encoder
 from palpate.metrics.intervals import Spread, jackknife_error
+
+if TYPE_CHECKING:
+    from palpate.data.samples import Samples
+    from palpate.evaluation.scorers import Bench
 
 #: Side that contact pixels are averaged to.
 SIDE = 32
@@ -38,6 +43,41 @@ QUANTILE = 0.05
 CELLS = 1 << 22
 PIXELS, FEATURES = "contact pixels", "tactile features"
 SHARE, NEARNESS = "memorized share", "nearness to train"
+
+
+def memorized(bench: Bench) -> list[Score]:
+    """How near each generator's images lie to its train images, in every space there is."""
+    real, train, scores = bench.reference, bench.seen, list[Score]()
+    assert train is not None  # `score` calls this where it is known
+    if bench.encoders is not None or real.embedded:
+        sets, base = bench.tactile, bench.features(train)
+        for name, x in sets.generators.items():
+            scores += memorization(x, sets.reference, base, subject=name, split=bench.split)
+    if real.embedded:
+        return scores
+    train = replace(train, gel=real.gel if train.gel is None else train.gel)
+    paired = all({*samples.ids} <= {*real.ids} for samples in bench.generators.values())
+    gels = real.has_background and train.has_background and paired
+    mean = None if gels else np.mean(bench.pixels(train), axis=0, dtype=np.float64)
+    base, test = (_contact_rows(bench, samples, samples, mean) for samples in (train, real))
+    for name, samples in bench.generators.items():
+        scores += memorization(
+            _contact_rows(bench, samples, real, mean),
+            test,
+            base,
+            space=PIXELS,
+            subject=name,
+            split=bench.split,
+            settings={"ground": "no-contact images" if gels else "mean train image"},
+        )
+    return scores
+
+
+def _contact_rows(bench: Bench, samples: Samples, real: Samples, mean: Any) -> FeatureSet:
+    """Pixels without what is there before contact: no-contact images of ``real``, or a mean."""
+    if mean is None:
+        mean = bench.pixels(real if samples is real else real.take(samples.ids), "background")
+    return samples.feature_set(contact_rows(bench.pixels(samples), mean), None)
 
 
 def contact_rows(images: NDArray[np.uint8], ground: NDArray[Any]) -> NDArray[np.float32]:

@@ -30,7 +30,6 @@ from palpate.core import (
 )
 from palpate.core.features import is_missing
 from palpate.core.files import canonical_json
-from palpate.evaluation.guard import guard, load_encoders
 from palpate.metrics.means import Mean, over_seeds
 from palpate.metrics.paired import differences_of_means
 from palpate.metrics.probe import class_accuracies
@@ -137,6 +136,7 @@ def probe(  # noqa: PLR0913 - one argument a choice
     arguments = locals()
     require_choice("modality", modality, ("tactile", "vision"))
     from palpate.data.reading import load
+    from palpate.encoders.models import load_encoders
 
     manifest = load(data)
     splits, encoders = named(split, "split"), named(encoder, "encoder")
@@ -206,6 +206,7 @@ def measure(
         PalpateError: if nothing can be measured.
     """
     from palpate.encoders.embed import embed
+    from palpate.encoders.models import guard
 
     folder = None if cache is None else Path(cache)
     embedded = partial(embed, groups=plan.group, cache=folder, progress=progress)

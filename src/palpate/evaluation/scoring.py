@@ -1,47 +1,78 @@
 """Scores of generated tactile images, or of their embeddings: one flow for all inputs.
 
-Read and align (:mod:`palpate.evaluation.inputs`), embed and score
-(:mod:`palpate.evaluation.scoring_run`): the TMMD family (:mod:`palpate.evaluation.family`),
-companions (:mod:`palpate.evaluation.companions`) and controls of a split
-(:mod:`palpate.evaluation.controls`); then notes and results.
+Everything is read (:mod:`palpate.data.samples`) and aligned by id on a bench; each score is a
+function of the bench (:mod:`palpate.evaluation.scorers`, :mod:`palpate.evaluation.controls`,
+:mod:`palpate.evaluation.memorization`); then notes and results.
+
+What a source lacks is completed from the keyword ``labels`` (which also replaces what a source
+has), then, for a generator, from the reference, by id. What is known of a part of the ids only is
+an error: scores of some of the samples would pass for scores of all.
 """
 
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
+import polars as pl
+
 from palpate.core import Note, PalpateError, Progress, Score, Split, quiet, require, rng_for
-from palpate.evaluation.companions import Chosen, Name, Outcome, Settings, Weights, choose
-from palpate.evaluation.controls import BACKGROUND, REAL, SAME_MATERIAL
-from palpate.evaluation.family import Family
-from palpate.evaluation.guard import guard, load_encoders
-from palpate.evaluation.inputs import REFERENCE, Inputs, read_inputs
-from palpate.evaluation.samples import Samples
-from palpate.evaluation.scoring_run import ScoringRun
-from palpate.evaluation.sources import Source, read
-from palpate.metrics import require_same_ids
+from palpate.core.messages import require_rows
+from palpate.data.samples import (
+    Samples,
+    labeled,
+    labeled_as,
+    named_sources,
+    one_image,
+    read_labels,
+    read_samples,
+    with_full_ids,
+)
+from palpate.evaluation.clusters import clustered, of_clusters
+from palpate.evaluation.controls import (
+    BACKGROUND,
+    REAL,
+    SAME_MATERIAL,
+    control_samples,
+    material_accuracies,
+)
+from palpate.evaluation.memorization import memorized
+from palpate.evaluation.scorers import (
+    PAIRS,
+    REFERENCE,
+    Bench,
+    Name,
+    Preset,
+    Weights,
+    bandwidths,
+    choose,
+    companion,
+    tmmd_family,
+)
+from palpate.metrics.images import require_same_ids
 from palpate.report.records import GalleryItem
 from palpate.report.results import OBJECT, PATH, Call, Results
 
-Preset = Literal["grouped", "paper", "paper-tables", "cmmd"]
+#: Rows of the gallery.
+GALLERY = 40
 
 
 def score(  # noqa: PLR0913
-    generated: Source,
-    reference: Source,
+    generated: Any,
+    reference: Any,
     *,
     encoder: Any = None,
     split: Split | str | Path | None = None,
     names: Sequence[str] | None = None,
-    labels: Source = None,
+    labels: Any = None,
     group: str = "auto",
-    background: Source = None,
-    train: Source = None,
+    background: Any = None,
+    train: Any = None,
     presets: Sequence[Preset] | None = None,
     sigma: float | str | Sequence[float | str] | None = None,
     normalize: Literal["check"] | bool = "check",
@@ -87,7 +118,7 @@ def score(  # noqa: PLR0913
             rows).
         normalize: for embeddings that are not of unit length: raise, divide by the norm, or keep
             them.
-        companions: further scores (:mod:`palpate.evaluation.companions`); an empty list is none.
+        companions: further scores (:mod:`palpate.evaluation.scorers`); an empty list is none.
             Default: all whose inputs are there.
         controls: whether a split scores its controls.
         inception: TorchScript file of Inception, for FID and KID as published.
@@ -116,235 +147,294 @@ def score(  # noqa: PLR0913
     """
     call = Call.of("score", score, locals())
     split = None if split is None else Split.load(split)
-    labels, clusters = _clusters(labels)
+    clusters = _cluster_count(labels)
     sigmas = (sigma,) if isinstance(sigma, int | float | str) else tuple(sigma or ())
-    family = Family(
-        presets=tuple(dict.fromkeys(presets or ())), sigmas=tuple(dict.fromkeys(sigmas))
-    )
-    common = Settings(
+    reserved = (REFERENCE,) if split is None else (REFERENCE, BACKGROUND, SAME_MATERIAL, REAL)
+    sources = named_sources(generated, names, reserved)
+    real = read_samples(reference, REFERENCE)
+    images, weights = not real.embedded, Weights(inception=inception, clip=clip, lpips=lpips)
+    of_images = {"encoder": encoder, "cache": cache, "background": background, **vars(weights)}
+    for name, value in of_images.items():
+        usable = images or value is None
+        require(usable, name, "must go with images", "embeddings", fix="Drop it")
+    bench = Bench(
+        generators={name: read_samples(source, name) for name, source in sources.items()},
+        reference=real if background is None else replace(real, gel=one_image(background)),
+        seen=None if train is None else read_samples(train, "train"),
+        weights=weights,
+        presets=tuple(dict.fromkeys(presets or ())),
+        sigmas=tuple(dict.fromkeys(sigmas)),
+        normalize=normalize,
+        permutations=permutations,
         seed=seed,
         split=split.digest if split else None,
-        permutations=permutations,
-        normalize=normalize,
+        progress=progress,
     )
-    inputs = read_inputs(
-        generated,
-        reference,
-        names=names,
-        labels=labels,
-        group=group,
-        background=background,
-        split=split,
-        reserved=(REFERENCE,) if split is None else (REFERENCE, BACKGROUND, SAME_MATERIAL, REAL),
-    )
-    seen = None if train is None else _train_samples(train, inputs, split)
-    weights = Weights(inception=inception, clip=clip, lpips=lpips)
-    images = inputs.reference.features is None
+    bench = aligned(bench, None if clusters else labels, split, group)
     fix = "Pass an encoder, or request only companions that compare pixels, e.g. ssim"
     possible = not images or encoder is not None or bool(companions)
     require(possible, "encoder", "must be given for images", "none", "palpate/mini", fix=fix)
-    for name, value in {"encoder": encoder, "cache": cache, **vars(weights)}.items():
-        require(images or not value, name, "must go with images", "embeddings", fix="Drop it")
-    chosen, pairs = _companions(inputs, companions, weights, encoder)
-    encoders = load_encoders(encoder, progress) if images else None
-    of_encoder: list[Note] = []
-    if encoders is not None:
-        judged: Any = inputs.reference.manifest or inputs.reference.images
+    chosen = _companions(bench, companions, encoder=encoder is not None)
+    encoders, of_encoder = None, list[Note]()
+    if encoder is not None:
+        from palpate.encoders.models import guard, load_encoders
+
+        encoders = load_encoders(encoder, progress)
+        judged: Any = bench.reference.manifest if real.rows is None else bench.reference.rows
         of_encoder = guard(
             encoders, "tactile", judged, split=split, allow_seen=allow_seen, progress=progress
         )
-    digest = encoders.digest("tactile") if encoders is not None else ""
     with tempfile.TemporaryDirectory() if cache is None else nullcontext(cache) as folder:
-        run = ScoringRun(
-            inputs=inputs,
-            family=family,
-            settings=common,
-            encoders=encoders,
-            weights=weights,
-            cache=Path(folder),
-            keep=cache is not None,
-            progress=progress,
-            seen=seen,
-        )
-        run, origin = run.clustered(clusters) if clusters else (run, "")
-        outcome = run.score(chosen, pairs=pairs, controls=controls)
-        outcome = _with_clusters(outcome, clusters, origin) if clusters else outcome
-    outcome.scores = with_warnings(outcome.scores, inputs, split, digest, of_encoder)
-    settings = _settings(replace(run, inputs=inputs), outcome)
+        bench = replace(bench, encoders=encoders, cache=Path(folder), keep=cache is not None)
+        bench, origin = clustered(bench, clusters) if clusters else (bench, "")
+        embeds = encoders is not None or not images
+        learns = embeds and images and bench.train is not None
+        if controls and learns:
+            bench = replace(bench, controls=control_samples(bench))
+        scorers: list[Callable[[Bench], list[Score]]] = [tmmd_family] * embeds
+        scorers += [partial(companion, name=n, default=companions is None) for n in chosen]
+        scorers += [material_accuracies] * learns
+        scorers += [memorized] * (bench.seen is not None)
+        scores = [s for scorer in scorers for s in scorer(bench)]
+        scores = of_clusters(scores, clusters, origin) if clusters else scores
+        settings = _settings(bench, scores)
+    if images:
+        digest = settings["digests"][REFERENCE]
+        scores = [replace(s, reference=digest) if s.m else s for s in scores]
     settings |= {"split rule": dict(split.rule)} if split is not None else {}
     settings |= {"encoder": str(encoder)} if encoders is not None else {}
+    scores = _with_warnings(scores, bench, of_encoder)
     return Results(
-        title=f"Scores of {', '.join(inputs.generators)}",
-        scores=[*outcome.scores, *outcome.differences],
-        gallery=_gallery(inputs, seed),
+        title=f"Scores of {', '.join(bench.generators)}",
+        scores=sorted(scores, key=lambda s: s.b is not None),
+        gallery=_gallery(bench),
         settings=settings,
-        notes=outcome.notes,
-        calls=[_named(call, inputs).with_digests(_digests_read(settings))],
+        notes=bench.notes,
+        calls=[_with_names(call, bench).with_digests(_digests_read(settings))],
     )
 
 
-def _train_samples(source: Source, inputs: Inputs, split: Split | None) -> Samples:
-    """What the generators were trained on.
+def _cluster_count(labels: Any) -> int:
+    """How many clusters stand in for labels: 8 for ``cluster:8``, 0 for anything else.
 
     Raises:
-        PalpateError: if it is of another kind than the reference, or cannot be read.
+        PalpateError: if it is no number of at least 2.
     """
-    train, real = read(source, "train"), inputs.reference
-    alike = (train.features is None) == (real.features is None)
-    must, fix = "must be of the kind of the reference", "Pass images with images"
-    got = "embeddings" if real.features is None else "images"
-    require(alike, "train", must, got, fix=fix)
-    if split is not None and not {*train.ids}.isdisjoint(split.parts):
-        train = train.take([i for i in train.ids if split.parts.get(i) == "train"])
-    return train
+    word, _, count = str(labels).partition(":") if isinstance(labels, str | Path) else ("", "", "")
+    if word != "cluster":
+        return 0
+    must = "must be a file, or cluster: and a number of at least 2"
+    several = count.isdecimal() and int(count) >= 2
+    require(several, "labels", must, f"{str(labels)!r}", "cluster:8")
+    return int(count)
 
 
-def _named(call: Call, inputs: Inputs) -> Call:
+def aligned(bench: Bench, labels: Any, split: Split | None, group: str) -> Bench:
+    """The samples with what is known of each, by id; with a split, of its test part.
+
+    Arguments as of :func:`score`. Samples that all have ids of the reference are in its order.
+
+    Raises:
+        PalpateError: if images are mixed with embeddings, or ids, labels or groups are known for a
+            part of the samples only.
+    """
+    real, seen = bench.reference, bench.seen
+    _require_one_kind([real, *bench.generators.values(), *[seen] * (seen is not None)])
+    table = read_labels(labels)
+    listed = [] if table is None else table["id"].to_list()
+    real, full = labeled(real, table), [*real.ids, *listed]
+    generators = {n: labeled(with_full_ids(s, full), table) for n, s in bench.generators.items()}
+    of_samples = any({*listed} & {*s.ids} for s in (real, *generators.values()))
+    must = "The labels must hold ids of the samples"
+    require(not listed or of_samples, "labels", must, "other ids")
+    if real.numbered:  # row k of a generator is not row k of the reference
+        real = real.with_columns(pl.Series("id", [f"{REFERENCE} {i}" for i in real.ids]))
+    generators = {name: labeled_as(samples, real) for name, samples in generators.items()}
+    train = None
+    if split is not None:
+        everything, (real, train) = real, _parts(real, split)
+        for name, samples in generators.items():
+            generators[name] = _test_part(bench, name, samples, real, everything)
+        if seen is not None and not {*seen.ids}.isdisjoint(split.parts):
+            seen = seen.take([i for i in seen.ids if split.parts.get(i) == "train"])
+    fix = "Check the split: is its test part empty?"
+    require(len(real) > 0, None, "The reference must hold samples", "none", fix=fix)
+    generators = {
+        name: s.take(real.ids) if {*s.ids} == {*real.ids} else s for name, s in generators.items()
+    }
+    kept = str(split.rule.get("group", "video")) if split else "video"
+    group = _group_of([real, *generators.values()], group, kept)
+    return replace(
+        bench,
+        generators={name: replace(s, group=group) for name, s in generators.items()},
+        reference=replace(real, group=group),
+        train=train and replace(train, group=group),
+        seen=seen and replace(seen, group=group),
+    )
+
+
+def _require_one_kind(sets: Sequence[Samples]) -> None:
+    """Raise if images are mixed with embeddings."""
+    kinds = ["embeddings" if s.embedded else "images" for s in sets]
+    got = ", ".join(f"{s.source} ({kind})" for s, kind in zip(sets, kinds, strict=True))
+    must = "Generated, reference and train must all be images, or all embeddings"
+    fix = "Embed the images first, or pass them all"
+    require(len({*kinds}) == 1, None, must, got, fix=fix)
+
+
+def _parts(real: Samples, split: Split) -> tuple[Samples, Samples | None]:
+    """The test part of the reference, and its train part if it has all of it."""
+    must = "must go with a reference that has ids"
+    require(not real.numbered, "split", must, real.source, fix="Save it with ids")
+    ids = {*real.ids}
+    real.take([i for i in split.ids("test") if i not in ids])  # raises for missing ids
+    test, train = ([i for i in real.ids if split.parts.get(i) == p] for p in ("test", "train"))
+    complete = train and len(train) == len(split.ids("train"))
+    return real.take(test), real.take(train) if complete else None
+
+
+def _test_part(
+    bench: Bench, name: str, samples: Samples, real: Samples, everything: Samples
+) -> Samples:
+    """The samples of the test part; all of them if the reference has none of their ids."""
+    ids, wanted = {*samples.ids}, {*real.ids}
+    if samples.numbered or ids.isdisjoint(everything.ids):
+        return samples
+    must = f"{name!r} must have every sample of the split's test part"
+    fix = "Generate these too, or pass the split it was generated for"
+    require_rows(samples.ids, real.ids, must, fix)
+    part = samples.take([i for i in samples.ids if i in wanted])
+    skipped = {"name": name, "skipped": len(samples) - len(part), "n": len(samples)}
+    bench.notes.extend([Note("outside-test-part", skipped)] * (skipped["skipped"] > 0))
+    return part
+
+
+def _group_of(sets: Sequence[Samples], requested: str, kept: str) -> str:
+    """The column of what stays together."""
+    if requested == "auto":
+        return next((c for c in (kept, "video") if any(s.column(c) for s in sets)), kept)
+    for samples in sets:
+        must, got = "must be known for every input", f"{requested!r}, unknown in {samples.source}"
+        fix = "Pass labels with that column, or the default group"
+        require(samples.column(requested) is not None, "group", must, got, fix=fix)
+    return requested
+
+
+def _companions(bench: Bench, requested: Sequence[str] | None, *, encoder: bool) -> list[str]:
+    """What is compared next to the TMMD family.
+
+    Raises:
+        PalpateError: on a companion whose inputs are not there; if pairs are requested where some
+            images have no reference.
+    """
+    real, generators, notes = bench.reference, bench.generators, bench.notes
+    chosen = choose(
+        requested,
+        bench.weights,
+        images=not real.embedded,
+        encoder=encoder or real.embedded,
+        background=real.has_background,
+    )
+    if len(generators) > 1 and len({frozenset(s.ids) for s in generators.values()}) > 1:
+        notes.append(Note("no-differences"))
+    elif len(generators) > 1 and all(s.numbered for s in generators.values()):
+        notes.append(Note("row-pairs"))
+    if not {*chosen} & {*PAIRS}:
+        return chosen
+    if real.numbered:  # pairs by position are taken on request alone
+        by_row = all(s.numbered and len(s) == len(real) for s in generators.values())
+        unpaired = [] if requested is not None and by_row else [*generators]
+    else:
+        unpaired = [name for name, s in generators.items() if s.ids != real.ids]
+        for name in unpaired if requested is not None else ():
+            try:
+                require_same_ids(generators[name].ids, real.ids)
+            except PalpateError as error:
+                fix = "Score the same samples on both sides, or request companions without pairs"
+                example = {"companions": ["fid", "kid", "prdc"]}
+                must = f"{name}: {error.must}"
+                raise PalpateError(must, error.got, fix, example=example) from None
+    if unpaired:
+        notes.append(Note("no-pairs", {"names": unpaired}))
+    return [n for n in chosen if n not in PAIRS] if len(unpaired) == len(generators) else chosen
+
+
+def _with_names(call: Call, bench: Bench) -> Call:
     """The call with the names of the generators, whatever their folders come to be called."""
     generated = call.arguments["generated"]
     if isinstance(generated, Mapping) and not {PATH, OBJECT} & {*generated}:
         return call  # a mapping has names
-    return replace(call, arguments={**call.arguments, "names": [*inputs.generators]})
+    return replace(call, arguments={**call.arguments, "names": [*bench.generators]})
 
 
 def _digests_read(settings: Mapping[str, Any]) -> dict[str, Any]:
-    """Of everything that was read: images, or files of embeddings; encoder and split."""
+    """Of everything that was read: images, or embeddings; encoder and split."""
     files: Mapping[str, Any] = settings.get("embeddings", {})
     return {**settings["digests"], **{f"rows of {n}": f["digest"] for n, f in files.items()}}
 
 
-def _clusters(labels: Source) -> tuple[Source, int]:
-    """Labels, and how many clusters stand in for them: ``cluster:8`` -> (None, 8)."""
-    word, _, count = str(labels).partition(":") if isinstance(labels, str | Path) else ("", "", "")
-    if word != "cluster":
-        return labels, 0
-    must = "must be a file, or cluster: and a number of at least 2"
-    several = count.isdecimal() and int(count) >= 2
-    require(several, "labels", must, f"{str(labels)!r}", "cluster:8")
-    return None, int(count)
-
-
-def _with_clusters(outcome: Outcome, clusters: int, origin: str) -> Outcome:
-    """Scores that looked at classes, and their differences, say that these are clusters."""
-    of_classes = {s.measure for s in outcome.scores if "classes" in s.details}
-    for scores in (outcome.scores, outcome.differences):
-        scores[:] = [
-            replace(
-                s,
-                settings={**s.settings, "labels": f"cluster:{clusters} of {origin}"},
-                notes=[*s.notes, Note("pseudo-labels", {"clusters": clusters, "of": origin})],
-            )
-            if s.measure in of_classes
-            else s
-            for s in scores
-        ]
-    return outcome
-
-
-def _companions(
-    inputs: Inputs, requested: Sequence[str] | None, weights: Weights, encoder: Any
-) -> tuple[Chosen, bool]:
-    """What is compared next to the TMMD family, and whether every image has its reference.
-
-    Raises:
-        PalpateError: on a companion whose inputs are not there; where some images have no
-            reference, which is a mistake.
-    """
-    real, generators = inputs.reference, inputs.generators
-    images = real.features is None
-    chosen = choose(
-        requested,
-        weights,
-        images=images,
-        encoder=encoder is not None or not images,
-        background=real.has_background,
-    )
-    if not chosen.pairs:
-        return chosen, False
-    if real.numbered:  # pairs by position are taken on request alone
-        by_row = all(s.numbered and len(s) == len(real) for s in generators.values())
-        return chosen, not chosen.default and by_row
-    if chosen.default and not any({*s.ids} & {*real.ids} for s in generators.values()):
-        return chosen, False
-    for name, samples in generators.items():
-        try:
-            require_same_ids(samples.ids, real.ids)
-        except PalpateError as error:
-            fix = "Score the same samples on both sides, or request companions without pairs"
-            example = {"companions": ["fid", "kid", "prdc"]}
-            raise PalpateError(f"{name}: {error.must}", error.got, fix, example=example) from None
-    return chosen, True
-
-
-def _settings(run: ScoringRun, outcome: Outcome) -> dict[str, Any]:
+def _settings(bench: Bench, scores: Sequence[Score]) -> dict[str, Any]:
     """Digests and options, for the page and for a later comparison."""
-    real, generators, common = run.inputs.reference, run.inputs.generators, run.settings
-    digests: dict[str, Any] = {"split": common.split} if common.split else {}
-    digests |= {"train": run.seen.digest} if run.seen is not None else {}
-    options: dict[str, Any] = {"group": run.inputs.group, "seed": common.seed}
+    real, generators = bench.reference, bench.generators
+    digests: dict[str, Any] = {"split": bench.split} if bench.split else {}
+    digests |= {"train": bench.seen.digest} if bench.seen is not None else {}
+    options: dict[str, Any] = {"group": real.group, "seed": bench.seed}
     settings: dict[str, Any] = {"digests": digests, "options": options}
-    if real.features is None:
+    if not real.embedded:
         digests[REFERENCE] = real.digest
         digests["generated"] = {name: s.digest for name, s in generators.items()}
-        sources = {n: dict(s.generator) for n, s in generators.items() if s.generator is not None}
+        sources = {n: dict(s.settings) for n, s in generators.items() if s.settings is not None}
         settings |= {"generated": sources} if sources else {}
-        if run.encoders is None:  # scores of pixels have no kernel
+        if bench.encoders is None:  # scores of pixels have no kernel
             return settings
-        digests["tactile encoder"] = run.encoders.digest("tactile")
+        digests["tactile encoder"] = bench.encoders.digest("tactile")
     else:
-        compared = next((s.reference for s in outcome.scores if s.reference), None)
+        compared = next((s.reference for s in scores if s.reference), None)
         digests |= {k: v for k, v in {"encoder": real.encoder, REFERENCE: compared}.items() if v}
         settings["embeddings"] = {
             name: {"file": s.source, "rows": len(s), "digest": s.digest}
             for name, s in {**generators, REFERENCE: real}.items()
         }
-    columns = run.family.columns(grouped=False, rows=len(real))
-    options["sigma"] = list(run.family.sigmas) or [sigma for _, sigma in columns]
-    options |= {"permutations": common.permutations, "normalize": common.normalize}
+    columns = bandwidths(bench, grouped=False, rows=len(real))
+    options["sigma"] = list(bench.sigmas) or [sigma for _, sigma in columns]
+    options |= {"permutations": bench.permutations, "normalize": bench.normalize}
     return settings
 
 
-#: Rows of the gallery.
-GALLERY = 40
-
-
-def _gallery(inputs: Inputs, seed: int) -> list[GalleryItem]:
+def _gallery(bench: Bench) -> list[GalleryItem]:
     """Some of the samples that are files on both sides, chosen by seed alone."""
-    real, drawn = inputs.reference.manifest, next(iter(inputs.generators.values())).manifest
-    if real is None or drawn is None:
+    real, drawn = bench.reference, next(iter(bench.generators.values()))
+    if real.rows is not None or drawn.rows is not None:
         return []
-    rows = {row["id"]: row for row in real.table.iter_rows(named=True)}
-    files = dict(zip(drawn.ids, drawn.paths("tactile"), strict=True))
-    shared = sorted({*rows} & {*files}, key=lambda i: rng_for(seed, "gallery", i).random())
+    rows = {row["id"]: row for row in real.manifest.table.iter_rows(named=True)}
+    files = dict(zip(drawn.ids, drawn.manifest.paths("tactile"), strict=True))
+    shared = sorted({*rows} & {*files}, key=lambda i: rng_for(bench.seed, "gallery", i).random())
     items: list[GalleryItem] = []
     for i in shared[:GALLERY]:
         background = rows[i]["background"]
-        gel = str(real.path(background).resolve()) if background else None
-        items.append(GalleryItem(real.ref(rows[i]), str(files[i].resolve()), gel))
+        gel = str(real.manifest.path(background).resolve()) if background else None
+        items.append(GalleryItem(real.manifest.ref(rows[i]), str(files[i].resolve()), gel))
     return items
 
 
-def with_warnings(
-    scores: Sequence[Score],
-    inputs: Inputs,
-    split: Split | None,
-    digest: str,
-    of_encoder: Sequence[Note],
+def _with_warnings(
+    scores: Sequence[Score], bench: Bench, of_encoder: Sequence[Note]
 ) -> list[Score]:
     """The scores with notes on the encoder, and on generators that may have seen test samples."""
+    digest = bench.encoders and bench.encoders.digest("tactile")
     of_generator = {
         name: [Note("generator-of-other-split")]
-        for name, s in inputs.generators.items()
-        if split is not None
-        and s.generator is not None
-        and {s.generator.get("split"), *s.generator.get("earlier_splits", ())} != {split.digest}
+        for name, s in bench.generators.items()
+        if bench.split is not None
+        and s.settings is not None
+        and {s.settings.get("split"), *s.settings.get("earlier_splits", ())} != {bench.split}
     }
     return [
         replace(
             s,
             notes=[
                 *s.notes,
-                *(of_encoder if s.encoder == digest else []),
+                *(of_encoder if digest and s.encoder == digest else []),
                 *of_generator.get(s.a, []),
             ],
         )

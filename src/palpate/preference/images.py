@@ -19,9 +19,14 @@ from PIL import Image, ImageFilter
 
 from palpate.core import Note, Progress, require, track
 from palpate.data.images import read_image, square
-from palpate.evaluation.inputs import complete, keywords_of, named_sources, with_full_ids
-from palpate.evaluation.samples import Samples
-from palpate.evaluation.sources import read
+from palpate.data.samples import (
+    Samples,
+    labeled,
+    named_sources,
+    read_labels,
+    read_samples,
+    with_full_ids,
+)
 from palpate.preference.plan import COPY, EXAMPLE, GEL, REFERENCE, SAME, Item, Plan
 
 QUALITY = 92
@@ -49,11 +54,10 @@ def read_sources(
     Raises:
         PalpateError: if one has no image files, or no id is common.
     """
-    keywords = keywords_of(labels, "video", exact=False)
-    real = complete(_files(read(reference, REFERENCE)), keywords)
+    real = labeled(_files(read_samples(reference, REFERENCE)), read_labels(labels))
     reserved = (REFERENCE, GEL, COPY, EXAMPLE, SAME)
     sources = named_sources(generated, names, reserved).items()
-    methods = {name: with_full_ids(_files(read(s, name)), real.ids) for name, s in sources}
+    methods = {name: with_full_ids(_files(read_samples(s, name)), real.ids) for name, s in sources}
     ids = {name: {*samples.ids} for name, samples in methods.items()}
     every = {*real.ids}
     common = every.intersection(*ids.values())
@@ -72,7 +76,7 @@ def read_sources(
     items = [Item(i, label or None, group or None) for i, label, group in rows if i in common]
     notes += [Note("videos-unknown")] * (not any(item.video for item in items))
     paths = {name: _paths(samples) for name, samples in [(REFERENCE, real), *methods.items()]}
-    if real.has_background and real.manifest is not None:
+    if real.has_background:
         paths[GEL] = dict(zip(real.ids, real.manifest.paths("background"), strict=True))
     return Sources(items, paths, notes)
 
@@ -83,14 +87,13 @@ def _files(samples: Samples) -> Samples:
     Raises:
         PalpateError: if they are embeddings or arrays.
     """
-    got = f"{samples.source}, {'arrays' if samples.features is None else 'embeddings'}"
+    got = f"{samples.source}, {'embeddings' if samples.embedded else 'arrays'}"
     fix = "Pass a folder of images or a manifest"
-    require(samples.manifest is not None, None, "People look at image files", got, fix=fix)
+    require(samples.rows is None, None, "People look at image files", got, fix=fix)
     return samples
 
 
 def _paths(samples: Samples) -> dict[str, Path]:
-    assert samples.manifest is not None
     return dict(zip(samples.ids, samples.manifest.paths("tactile"), strict=True))
 
 

@@ -420,10 +420,10 @@ EVALUATION: dict[str, Sentence] = {
     "kid-interval": (
         "The spread over random subsets that others print with KID is no interval; this one is"
     ),
-    "no-differences": (
-        "No differences between generators: their rows have no ids, and differ in number"
+    "no-differences": "No differences between generators: they are not of the same samples",
+    "no-pairs": (
+        "Scores of pairs of images skipped for {names}: the ids are not those of the reference"
     ),
-    "no-pairs": "Scores of pairs of images skipped: generated and reference share no id",
     "outside-test-part": (
         "{name}: {skipped} of {n} samples lie outside the split's test part, and were skipped"
     ),

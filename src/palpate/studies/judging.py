@@ -21,8 +21,8 @@ from palpate.data.manifest import Manifest
 from palpate.diffusion.generated import Generated
 from palpate.encoders.embed import embed, embed_images
 from palpate.encoders.encoder_set import EncoderSet, load_clip
-from palpate.evaluation.companions import Weights
 from palpate.evaluation.probing import measure
+from palpate.evaluation.scorers import Weights
 from palpate.evaluation.scoring import score
 from palpate.metrics import tmmd
 from palpate.metrics.means import mean_of

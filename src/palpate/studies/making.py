@@ -17,6 +17,7 @@ import numpy as np
 
 from palpate.core import Split, require, write_json
 from palpate.data.manifest import Manifest
+from palpate.data.samples import read_samples
 from palpate.diffusion.autoencoder import BackgroundAutoencoder, load_autoencoder
 from palpate.diffusion.autoencoder_training import autoencoder_of
 from palpate.diffusion.ceiling import measure_reconstruction
@@ -29,7 +30,6 @@ from palpate.encoders import train_encoder
 from palpate.encoders.embed import texts_of
 from palpate.encoders.encoder_set import load_clip
 from palpate.encoders.models import pick_device
-from palpate.evaluation.sources import read as read_samples
 from palpate.leakage.auditing import audit
 from palpate.leakage.splitting import split as leak_free_split
 from palpate.sim.options import WorldOptions

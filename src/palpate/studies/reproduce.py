@@ -21,8 +21,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from palpate.core import Progress, digest_file, quiet, require, require_choice
-from palpate.evaluation.companions import Weights
-from palpate.evaluation.sources import read as read_samples
+from palpate.data.samples import read_samples
+from palpate.evaluation.scorers import Weights
 from palpate.preference.scoring import PREFERENCE
 from palpate.report.results import Results
 from palpate.sim.options import WorldOptions

@@ -33,10 +33,10 @@ from numpy.typing import NDArray
 
 from palpate.core import FeatureSet, Progress, Score, Split, quiet, require, rng_for
 from palpate.data.manifest import Manifest
+from palpate.data.samples import read_samples
 from palpate.encoders.embed import embed
 from palpate.encoders.encoder_set import EncoderSet
-from palpate.evaluation.guard import guard
-from palpate.evaluation.sources import read
+from palpate.encoders.models import guard
 from palpate.metrics.inputs import Array
 from palpate.metrics.means import Mean, mean_of
 from palpate.metrics.means import over_seeds as over_draws
@@ -378,8 +378,7 @@ def embed_generated(
     Raises:
         PalpateError: if the folder is none of images, or an id is not in the manifest.
     """
-    files = read(str(images), "generated").manifest
-    assert files is not None  # a folder holds images
+    files = read_samples(str(images), "generated").manifest
     paths = [str(path.resolve()) for path in files.paths("tactile")]
     part = manifest.take(files.ids)
     part = replace(part, table=part.table.with_columns(pl.Series("tactile", paths)))

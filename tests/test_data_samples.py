@@ -1,4 +1,4 @@
-"""What can be scored: every kind of source gives the same samples, aligned by id."""
+"""What can be scored: every kind of source gives the same samples, aligned by id on a bench."""
 
 import json
 import pickle
@@ -11,11 +11,11 @@ import pytest
 from PIL import Image
 
 from forge.pictures import paint
-from palpate.core import FeatureSet, PalpateError, Split
+from palpate.core import FeatureSet, PalpateError, Split, quiet
 from palpate.data.manifest import Manifest
-from palpate.evaluation.embedding_files import read_embeddings
-from palpate.evaluation.inputs import read_inputs
-from palpate.evaluation.sources import read
+from palpate.data.samples import named_sources, read_samples
+from palpate.evaluation.scorers import Bench
+from palpate.evaluation.scoring import aligned as aligned_on
 
 N = 4
 ROWS = ["v0/1", "007", 'odd "name", [x]', "grün"]
@@ -25,10 +25,10 @@ X = np.random.default_rng(0).normal(size=(N, 3)).astype(np.float32)
 
 def test_a_file_of_features_gives_its_columns(tmp_path):
     FeatureSet(ROWS, X, MATERIALS, VIDEO, "e" * 64).save(tmp_path / "x.npz")
-    samples = read(tmp_path / "x.npz", "x")
+    samples = read_samples(tmp_path / "x.npz", "x")
     assert (samples.ids, samples.labels, samples.groups) == (ROWS, MATERIALS, VIDEO)
-    assert (samples.encoder, samples.numbered, samples.features.dtype) == ("e" * 64, False, "f4")
-    assert np.array_equal(samples.features, X)
+    assert (samples.encoder, samples.numbered, samples.rows.dtype) == ("e" * 64, False, "f4")
+    assert np.array_equal(samples.rows, X)
 
 
 @pytest.mark.parametrize("kind", ["tensor", "list", "FeatureSet"])
@@ -39,8 +39,8 @@ def test_every_kind_of_object_gives_the_same_embeddings(kind):
         source = [list(map(float, row)) for row in X]
     else:
         source = FeatureSet(ROWS, X, MATERIALS, VIDEO)
-    samples = read(source, "x")
-    assert np.allclose(samples.features, X, atol=1e-7)
+    samples = read_samples(source, "x")
+    assert np.allclose(samples.rows, X, atol=1e-7)
     known = (ROWS, MATERIALS, VIDEO) if kind == "FeatureSet" else (list("0123"), None, None)
     assert (samples.ids, samples.labels, samples.groups) == known
 
@@ -59,7 +59,7 @@ def test_every_kind_of_source_gives_the_same_images(tmp_path, kind):
         "tensor": lambda: pytest.importorskip("torch").from_numpy(images / 255).permute(0, 3, 1, 2),
         "manifest": lambda: Manifest.from_rows(rows, folder),
     }[kind]()
-    samples = read(source, "x")
+    samples = read_samples(source, "x")
     assert samples.numbered == (kind in ("PIL", "uint8", "tensor"))
     assert samples.ids == (list("012") if samples.numbered else list("abc"))
     assert samples.side == 32
@@ -68,9 +68,9 @@ def test_every_kind_of_source_gives_the_same_images(tmp_path, kind):
 
 def test_half_precision_is_widened_and_files_are_mapped(tmp_path):
     np.save(tmp_path / "x.npy", X.astype(np.float16))
-    assert read_embeddings(tmp_path / "x.npy").features.dtype == np.float32
+    assert read_samples(tmp_path / "x.npy", "x").rows.dtype == np.float32
     np.save(tmp_path / "y.npy", X)
-    assert isinstance(read(tmp_path / "y.npy", "y").features, np.memmap)
+    assert isinstance(read_samples(tmp_path / "y.npy", "y").rows, np.memmap)
 
 
 def test_no_pickle_is_ever_loaded(tmp_path):
@@ -84,7 +84,7 @@ def test_no_pickle_is_ever_loaded(tmp_path):
         (tmp_path / name).write_bytes(pickle.dumps(Bomb()))
     for name in ("x.npy", "x.npz", "x.pkl", "raw.npy"):
         with pytest.raises(PalpateError, match="pickle"):
-            read(tmp_path / name, "x")
+            read_samples(tmp_path / name, "x")
     assert not (tmp_path / "exploded").exists()
 
 
@@ -117,7 +117,7 @@ def damaged(folder: Path) -> list[str]:
 def test_damaged_and_foreign_files_are_named(tmp_path):
     for name in [*damaged(tmp_path), "absent.npy"]:
         with pytest.raises(PalpateError, match=name.replace(".", r"\.")):
-            read(tmp_path / name, "x")
+            read_samples(tmp_path / name, "x")
 
 
 @pytest.mark.parametrize(
@@ -135,9 +135,12 @@ def test_other_objects_are_rejected(source, words):
         aligned(source, X)
 
 
-def aligned(generated, reference, **keywords):
-    options = {"names": None, "labels": None, "group": "auto", "split": None, "background": None}
-    return read_inputs(generated, reference, reserved=("reference",), **options | keywords)
+def aligned(generated, reference, *, names=None, labels=None, split=None, group="auto"):
+    sources = named_sources(generated, names, ("reference",))
+    made = {name: read_samples(source, name) for name, source in sources.items()}
+    real = read_samples(reference, "reference")
+    bench = Bench(generators=made, reference=real, progress=quiet)
+    return aligned_on(bench, labels, split, group)
 
 
 def sets(ids=ROWS, labels=None, groups=None) -> FeatureSet:
@@ -167,7 +170,7 @@ def test_labels_and_groups_come_from_the_keywords_then_the_source_then_the_refer
     inputs = aligned(sets(), sets(ROWS, MATERIALS, VIDEO), **keywords)
     for samples in (inputs.reference, *inputs.generators.values()):
         assert (samples.labels, samples.groups) == (labels, groups)
-    assert inputs.group == kind
+    assert inputs.reference.group == kind
 
 
 def test_files_of_labels_give_ids_to_rows_without(tmp_path):
@@ -184,16 +187,15 @@ def test_files_of_labels_give_ids_to_rows_without(tmp_path):
     ("generated", "keywords", "words"),
     [
         (sets(), {"group": "contact"}, "`group` must be known for every input\\. Got 'contact'"),
-        (sets([*ROWS[:3], "x"]), {}, "gives labels and groups by id. Got 1 of 4 without"),
-        (sets(), {"labels": TABLE[:3]}, "Got 1 of 4 of .* without, first 'grün'"),
+        (sets([*ROWS[:3], "x"]), {}, "gives material and video by id. Got 1 of 4 without"),
+        (sets(), {"labels": TABLE[:3]}, "the labels, .* Got 1 of 4 without, first 'grün'"),
         (sets(), {"labels": TABLE.with_columns(id=pl.lit("z"))}, "must occur once"),
         (sets(), {"labels": {"z": "m"}}, "must hold ids of the samples"),
         (sets(), {"labels": TABLE.select("material")}, "must have a column id"),
-        (sets(), {"labels": "absent.csv"}, "absent.csv must be a CSV or Parquet file"),
+        (sets(), {"labels": "absent.csv"}, "must be a file. Got no file absent.csv"),
         (X[:3], {"labels": TABLE}, "as many rows"),
         (sets(OWN, None, VIDEO), {"labels": CONTACTS, "group": "contact"}, "known for every"),
-        (sets(OWN, None, VIDEO), {"labels": TABLE.select("id", group="contact")}, "one kind"),
-        (np.zeros((2, 8, 8, 3), np.uint8), {}, "both be images, or both embeddings"),
+        (np.zeros((2, 8, 8, 3), np.uint8), {}, "all be images, or all embeddings"),
         ([sets(), sets()], {"names": ["a"]}, "`names` must name every generator. Got 1 for 2"),
         ([sets(), sets()], {"names": ["a", "a"]}, "must differ"),
         ({"reference": sets()}, {}, "`names` must not be 'reference'"),
@@ -211,7 +213,7 @@ def test_a_split_selects_the_test_part_of_every_set():
     split = Split.from_ids(**parts, rule=rule, manifest="m" * 64)
     inputs = aligned({"all": sets(), "own": sets(list("abcd"))}, sets(ROWS, MATERIALS), split=split)
     assert inputs.reference.ids == inputs.generators["all"].ids == ROWS[2:]
-    assert (inputs.train.ids, inputs.group) == (ROWS[:2], "contact")
+    assert (inputs.train.ids, inputs.reference.group) == (ROWS[:2], "contact")
     assert inputs.generators["own"].ids == list("abcd")  # ids of its own cannot be parted
     [note] = inputs.notes
     assert (note.code, note.params["skipped"]) == ("outside-test-part", 2)
@@ -257,11 +259,11 @@ def test_a_folder_of_generate_may_not_name_files_outside_it(tmp_path, name):
     index |= {"digest": "", "notice": "", "skipped": [], "images": {"a": name}}
     (tmp_path / "out" / "index.json").write_text(json.dumps(index))
     if name == "1.png":
-        samples = read(tmp_path / "out", "x")
-        assert (samples.ids, samples.generator) == (["a"], {"split": "s"})
+        samples = read_samples(tmp_path / "out", "x")
+        assert (samples.ids, samples.settings) == (["a"], {"split": "s"})
     else:
         with pytest.raises(PalpateError, match="must lie in images/"):
-            read(tmp_path / "out", "x")
+            read_samples(tmp_path / "out", "x")
 
 
 def test_paths_that_are_not_utf8_are_rejected(tmp_path):
@@ -271,6 +273,6 @@ def test_paths_that_are_not_utf8_are_rejected(tmp_path):
     except (OSError, UnicodeError):
         pytest.skip("file names of this system are UTF-8")
     with pytest.raises(PalpateError, match="Paths of images must be UTF-8"):
-        read(odd, "x")
+        read_samples(odd, "x")
     np.save(odd / "x.npy", X)
     assert aligned(odd / "x.npy", X).generators.keys() == {"x"}

@@ -1,0 +1,599 @@
+"""What is scored: images or features of samples, next to a table of what is known of each.
+
+Three loaders read all that can be scored:
+
+- image files: a folder, a manifest, a folder of ``palpate generate``, a list of files. The id of an
+  image in a folder is its path below the folder, with ``/`` and without the suffix;
+- images in memory: an array or tensor, a list of arrays or PIL images;
+- features: an array (n, d), a :class:`palpate.core.FeatureSet`, ``.npy`` (memory-mapped), or
+  ``.npz`` with ``features`` (n, d) and optionally ``ids``, ``labels``, ``groups`` (n strings each)
+  and ``encoder``, which is what ``FeatureSet.save`` writes. No pickle is ever loaded.
+
+Rows without ids are numbered. Further columns come from a table of labels, by id.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import zipfile
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property, lru_cache
+from pathlib import Path, PurePosixPath
+from typing import Any, cast
+
+import numpy as np
+import polars as pl
+from numpy.typing import NDArray
+from PIL import Image
+
+from palpate.core import (
+    FeatureSet,
+    PalpateError,
+    ProblemsError,
+    Progress,
+    digest_file,
+    digest_json,
+    inside,
+    read_json,
+    reading_entry,
+    require,
+    require_regular,
+    short,
+)
+from palpate.core.features import is_missing, to_numpy
+from palpate.core.messages import require_rows
+from palpate.data.images import BROKEN, cached_images, load_images, opened, read_image, square
+from palpate.data.images import SUFFIXES as IMAGES
+from palpate.data.manifest import SCHEMA, Manifest, is_manifest
+from palpate.data.tables import open_table, table_of
+
+#: Decoded images of more bytes than this are kept in a file of the cache.
+IN_MEMORY = 1 << 30
+#: Bytes that an array of an archive may unpack to, and times its packed size on top: floats hardly
+#: shrink, so more is a decompression bomb.
+UNPACKED, MOST_TIMES = 1 << 28, 20
+FEATURES = (".npy", ".npz")
+KINDS = (
+    "a folder of images, a manifest, a folder of palpate generate, or embeddings "
+    f"({', '.join(FEATURES)})"
+)
+#: Columns that a table of labels may have, and other names of theirs.
+LABELS = ("material", "object", "session", "video", "contact")
+_NAMES = {name: name for name in ("id", *LABELS)} | {"label": "material", "group": "video"}
+
+
+@dataclass(frozen=True)
+class Samples:
+    """Samples of one generator, or of the reference.
+
+    Attributes:
+        source: path or name, for errors.
+        manifest: a row a sample, with its image files where ``rows`` is None (column ``tactile``; a
+            reference may have ``vision`` and ``background``).
+        rows: images (n, h, w, 3) uint8, or features (n, d), possibly memory-mapped.
+        numbered: whether the ids are row numbers, which pair nothing.
+        group: column of what stays together.
+        encoder: digest of the encoder that made the features.
+        gel: one no-contact image (h, w, 3) for all of a reference.
+        settings: of ``palpate generate``, for its folders.
+    """
+
+    source: str
+    manifest: Manifest
+    rows: NDArray[Any] | None = None
+    numbered: bool = False
+    group: str = "video"
+    encoder: str | None = None
+    gel: NDArray[np.uint8] | None = field(default=None, repr=False)
+    settings: Mapping[str, Any] | None = None
+
+    def __len__(self) -> int:
+        return len(self.manifest)
+
+    @property
+    def ids(self) -> list[str]:
+        """The ids, each once."""
+        return self.manifest.ids
+
+    @property
+    def embedded(self) -> bool:
+        """Whether these are features."""
+        return self.rows is not None and self.rows.ndim == 2
+
+    @property
+    def labels(self) -> list[str] | None:
+        """The materials."""
+        return self.column("material")
+
+    @property
+    def groups(self) -> list[str] | None:
+        """What stays together."""
+        return self.column(self.group)
+
+    def column(self, name: str) -> list[str] | None:
+        """A column of the table, '' where it is unknown; None where it is for all."""
+        values = self.manifest.column(name)
+        return [v or "" for v in values] if any(values) else None
+
+    def with_columns(self, *columns: pl.Series) -> Samples:
+        """The samples with other columns of text in their table."""
+        table = self.manifest.table.with_columns(*columns)
+        return replace(self, manifest=replace(self.manifest, table=table))
+
+    @property
+    def has_background(self) -> bool:
+        """Whether every sample has its no-contact image, or there is one for all."""
+        known = not self.manifest.table["background"].null_count()
+        return self.gel is not None or (self.rows is None and known)
+
+    def take(self, ids: Sequence[str]) -> Samples:
+        """The samples of ``ids``, in that order.
+
+        Raises:
+            PalpateError: if an id is missing.
+        """
+        must = f"{self.source} must have every id of the split's test part"
+        at = require_rows(self.ids, ids, must, "Use the split that was made for it")
+        manifest = replace(self.manifest, table=self.manifest.table[at])
+        return replace(self, manifest=manifest, rows=None if self.rows is None else self.rows[at])
+
+    def feature_set(self, features: NDArray[Any], encoder: str | None) -> FeatureSet:
+        """Features of these samples with their ids, materials and groups.
+
+        Raises:
+            PalpateError: on NaN or infinity; the rows are named.
+        """
+        try:
+            return FeatureSet(self.ids, features, self.labels, self.groups, encoder)
+        except PalpateError as error:
+            raise PalpateError(f"{self.source}: {error.must}", error.got, error.fix) from None
+
+    @cached_property
+    def side(self) -> int:
+        """The shorter side of the images.
+
+        Raises:
+            PalpateError: if they differ in size.
+        """
+        if self.rows is not None:
+            return min(self.rows.shape[1:3])
+        sizes = {path: _image_size(path) for path in self.manifest.paths("tactile")}
+        first = next(iter(sizes))
+        other = next((p for p, size in sizes.items() if size != sizes[first]), None)
+        if other is not None:
+            got = " and ".join("{} of {} x {}".format(p.name, *sizes[p]) for p in (first, other))
+            must = f"All images of {self.source} must have one size for scores of pixels"
+            fix, example = "Resize them, or request other companions", {"companions": ["fid"]}
+            raise PalpateError(must, got, fix, example=example)
+        return min(sizes[first])
+
+    def pixels(
+        self, size: int, cache: Path, progress: Progress, column: str = "tactile"
+    ) -> NDArray[np.uint8]:
+        """The images as squares, (n, size, size, 3); many of them memory-mapped from the cache."""
+        if column == "background" and self.gel is not None:
+            gel = square(Image.fromarray(self.gel), size)
+            return np.broadcast_to(gel, (len(self), *gel.shape))
+        if self.rows is not None:
+            return np.stack([square(Image.fromarray(image), size) for image in self.rows])
+        if len(self) * size * size * 3 > IN_MEMORY:
+            return cached_images(self.manifest, column, size, self.folder(cache, column), progress)
+        return load_images(self.manifest.paths(column), size, progress=progress)
+
+    def folder(self, cache: Path, column: str = "tactile") -> Path:
+        """A folder of the cache for the bytes of these images, whatever their names and times."""
+        return cache / short(self.image_digest(column))
+
+    def image_digest(self, column: str = "tactile") -> str:
+        """SHA-256 over id and bytes of every image, in any order: the same for a copied folder."""
+        if self.rows is None:
+            paths = self.manifest.paths(column)
+            digests = [_file_digest(path, path.stat().st_ctime_ns) for path in paths]
+        else:
+            digests = [hashlib.sha256(image.tobytes()).hexdigest() for image in self.rows]
+        return digest_json(sorted(map(list, zip(self.ids, digests, strict=True))))
+
+    @property
+    def digest(self) -> str:
+        """Digest of ids and images, or of ids and features."""
+        if self.embedded:
+            return self.feature_set(cast("NDArray[Any]", self.rows), None).digest
+        return self.image_digest()
+
+
+@lru_cache(maxsize=1 << 20)
+def _file_digest(path: Path, _changed: int) -> str:
+    """SHA-256 of a file, read once per run unless its time of change differs."""
+    return digest_file(path)
+
+
+def _image_size(path: Path) -> tuple[int, int]:
+    try:
+        with opened(path) as image:  # reads the header alone
+            return image.size
+    except BROKEN:
+        return read_image(path).size  # raises the reason
+
+
+def read_samples(source: Any, name: str) -> Samples:
+    """Read one source, which errors call ``name`` if it is no path; see the head of this module.
+
+    Raises:
+        PalpateError: if it is nothing that can be scored, or empty.
+    """
+    items: list[Any] = list(cast("Any", source)) if isinstance(source, list | tuple) else []
+    if isinstance(source, str | Path):
+        samples = _of_path(Path(source))
+    elif isinstance(source, Manifest):
+        samples = Samples(name, source)
+    elif isinstance(source, FeatureSet):
+        columns = {"labels": source.labels, "groups": source.groups}
+        texts = {
+            name: ["" if is_missing(v) else str(v) for v in values]
+            for name, values in columns.items()
+            if values is not None
+        }
+        samples = _features(source.features, name, list(source.ids), source.encoder, **texts)
+    elif items and isinstance(items[0], str | Path):
+        paths = [Path(item).absolute() for item in items]
+        ids = [without_suffix(p.name) for p in paths]
+        ids = ids if len(set(ids)) == len(ids) else [without_suffix(str(p)) for p in paths]
+        samples = Samples(name, _manifest(Path.cwd(), id=ids, tactile=[str(p) for p in paths]))
+    else:
+        samples = _of_arrays(items or source, name)
+    must = f"There must be samples in {samples.source}"
+    require(len(samples) > 0, None, must, "none", fix=f"Pass {KINDS}")
+    return samples
+
+
+def one_image(source: Any) -> NDArray[np.uint8]:
+    """An image (h, w, 3): a file, an array or a PIL image."""
+    one = read_samples([source], "background")
+    path = [] if one.rows is not None else one.manifest.paths("tactile")
+    return np.asarray(read_image(path[0])) if path else cast("NDArray[Any]", one.rows)[0]
+
+
+def _manifest(root: Path, **columns: Sequence[str]) -> Manifest:
+    """Columns of text as a manifest; those left out, and '', are null."""
+    table = pl.DataFrame(
+        {name: [v or None for v in values] for name, values in columns.items()},
+        schema=dict.fromkeys(columns, pl.String),
+    )
+    absent = (pl.lit(None, kind).alias(name) for name, kind in SCHEMA.items())
+    return Manifest(
+        table.with_columns(c for c in absent if c.meta.output_name() not in columns).select(
+            *SCHEMA
+        ),
+        root,
+    )
+
+
+# Image files
+
+
+def _of_path(path: Path) -> Samples:
+    must, got = "What is scored must exist", f"nothing at {path}"
+    require(path.exists(), None, must, got, fix=f"Pass {KINDS}")
+    require_regular(path)
+    if path.is_file() and not is_manifest(path):
+        must, fix = f"{path} must be {KINDS}", "Pass one of these; pickles are never loaded"
+        got = path.suffix or "no suffix"
+        require(path.suffix.lower() in FEATURES, None, must, got, fix=fix)
+        return _of_feature_file(path)
+    require_utf8("Paths of images", os.path.realpath(path))
+    if is_manifest(path):
+        manifest = Manifest.load(path)
+        kinds = ("empty", "null-id", "duplicate-id")
+        problems = [p for p in manifest.problems() if "tactile" in p.text or p.kind in kinds]
+        if problems:
+            raise ProblemsError(problems, "Fix the rows, or import again and skip them")
+        return Samples(str(path), manifest)
+    index = path / "index.json"
+    content: Any = read_json(index, "index of generated images") if index.is_file() else None
+    if isinstance(content, dict) and str(content.get("format")).startswith("palpate-generated/"):
+        with reading_entry(index, "The index"):
+            files, settings = generated_files(path, content), dict(content["settings"])
+        manifest = _manifest(path, id=[*files], tactile=[*files.values()])
+        return Samples(str(path), manifest, settings=settings)
+    files = _files_below(path)
+    return Samples(str(path), _manifest(path, id=[*files], tactile=[*files.values()]))
+
+
+def generated_files(folder: Path, index: Mapping[str, Any]) -> dict[str, str]:
+    """Id -> file below a finished folder of ``palpate generate``, by its index.
+
+    Raises:
+        PalpateError: if it was left half done, or names a file that is missing or outside.
+    """
+    must, fix = f"{folder} must be finished", "Run the same command again: it continues"
+    require(index["complete"], None, must, "a folder left half done", fix=fix)
+    names = [*index["images"].values()]
+    paths = [inside(folder / "images", name) for name in names]
+    bad = [n for n, p in zip(names, paths, strict=True) if p is None or not p.is_file()]
+    must = f"Every image of {folder / 'index.json'} must lie in images/"
+    got = f"{len(bad)} that do not, first {bad[:1]}"
+    require(not bad, None, must, got, fix="Generate again")
+    return {i: f"images/{name}" for i, name in index["images"].items()}
+
+
+def _files_below(path: Path) -> dict[str, str]:
+    """Id -> image file, relative to the folder."""
+    files: dict[str, str] = {}
+    for file in sorted(path.rglob("*")):
+        relative = file.relative_to(path).as_posix()
+        hidden = any(part.startswith(".") for part in relative.split("/"))
+        if hidden or not is_image_file(file) or not file.is_file():
+            continue
+        require_utf8(f"File names in {path}", relative)
+        name = without_suffix(relative)
+        must = f"Images in {path} must differ in name, suffixes aside"
+        got = f"{files.get(name)!r} and {relative!r}"
+        require(name not in files, None, must, got, fix="Rename one of them")
+        files[name] = relative
+    return files
+
+
+def require_utf8(subject: str, text: str) -> None:
+    """Raise if a path or a file name cannot be written down as UTF-8."""
+    try:
+        text.encode()
+    except UnicodeEncodeError:
+        raise PalpateError(f"{subject} must be UTF-8", ascii(text), "Rename it") from None
+
+
+def is_image_file(path: str | Path) -> bool:
+    """Whether a path has the suffix of an image."""
+    return PurePosixPath(path).suffix.lower() in IMAGES
+
+
+def without_suffix(name: str) -> str:
+    """A path without the suffix of an image; another suffix is part of the name."""
+    return name[: -len(PurePosixPath(name).suffix)] if is_image_file(name) else name
+
+
+# Arrays
+
+
+def _of_arrays(source: Any, name: str) -> Samples:
+    """An array or tensor of features or images, or a list of rows or images."""
+    try:
+        several = isinstance(source, list)
+        array = np.stack([_array(item) for item in source]) if several else _array(source)
+    except (TypeError, ValueError) as error:
+        fix = f"Pass {KINDS}, an array or tensor, or a list of images of one size"
+        raise PalpateError(f"{name} must be something to score", str(error), fix) from None
+    if array.ndim == 2:
+        return _features(array, name)
+    images = as_images(array, name)
+    ids = [str(k) for k in range(len(images))]
+    return Samples(name, _manifest(Path(), id=ids), images, numbered=True)
+
+
+def _array(value: Any) -> NDArray[Any]:
+    return to_numpy(value.convert("RGB") if hasattr(value, "getbands") else value)
+
+
+def as_images(array: NDArray[Any], name: str) -> NDArray[np.uint8]:
+    """(n, h, w, c) or (n, c, h, w) of uint8, or of floats in [0, 1], as (n, h, w, 3) uint8.
+
+    Raises:
+        PalpateError: on another shape, type or range.
+    """
+    if array.ndim == 3:
+        array = array[..., None]
+    if array.ndim == 4 and array.shape[1] in (1, 3) and array.shape[3] not in (1, 3):
+        array = np.moveaxis(array, 1, 3)
+    unit = array.dtype.kind == "f" and array.size and array.min() >= 0 and array.max() <= 1
+    colors = array.ndim == 4 and array.shape[3] in (1, 3)
+    must = f"{name} must be features (n, d), or images of uint8 or of floats in [0, 1]"
+    got, fix = f"{array.dtype} of shape {array.shape}", "Scale and reshape it"
+    require(colors and (unit or array.dtype == np.uint8), None, must, got, fix=fix)
+    array = np.round(array * 255).astype(np.uint8) if unit else array
+    return np.ascontiguousarray(np.broadcast_to(array, (*array.shape[:3], 3)))
+
+
+# Features
+
+
+def _of_feature_file(path: Path) -> Samples:
+    try:
+        if path.suffix.lower() == ".npz":
+            arrays = _arrays_in(path)
+            x, encoder = arrays.pop("features"), [*arrays.pop("encoder", ()), None][0]
+        else:
+            arrays, encoder = {}, None
+            x = np.load(path, mmap_mode="r", allow_pickle=False)
+            if not isinstance(x, np.ndarray):
+                raise ValueError("an archive of arrays, which is named .npz")
+    except KeyError as error:
+        must, fix = f"{path} must hold features under the name 'features'", "Save them so"
+        raise PalpateError(must, f"no {error}", fix) from None
+    except Exception as error:  # a damaged file raises many kinds in NumPy, zipfile and zlib
+        reason = (str(error).splitlines() or [type(error).__name__])[0]
+        must = f"{path} must be a whole {path.suffix} file without pickles"
+        raise PalpateError(must, reason, "Write it again") from None
+    return _features(x, str(path), arrays.pop("ids", None), encoder, **arrays)
+
+
+def _arrays_in(path: Path) -> dict[str, Any]:
+    """``features`` of an archive, and its columns as lists of strings."""
+    with zipfile.ZipFile(path) as archive:
+        for entry in archive.infolist():
+            if entry.file_size > UNPACKED + MOST_TIMES * entry.compress_size:
+                size, packed = entry.file_size / 1e9, entry.compress_size / 1e6
+                raise ValueError(f"{entry.filename} unpacks to {size:.1f} GB from {packed:.1f} MB")
+    with np.load(path, allow_pickle=False) as data:
+        columns = {n: data[n] for n in ("ids", "labels", "groups", "encoder") if n in data}
+        lists = {name: [str(v) for v in values.reshape(-1)] for name, values in columns.items()}
+        return {"features": data["features"], **lists}
+
+
+def _features(
+    x: NDArray[Any],
+    source: str,
+    ids: Sequence[Any] | None = None,
+    encoder: str | None = None,
+    *,
+    labels: Sequence[str] = (),
+    groups: Sequence[str] = (),
+) -> Samples:
+    """Features of samples; half precision is widened to float32.
+
+    Raises:
+        PalpateError: if they are no floats (n, d), columns have other lengths, or an id is empty or
+            occurs twice.
+    """
+    floats = x.dtype.kind == "f" and x.ndim == 2 and 0 not in x.shape
+    must = f"The features in {source} must be floats of shape (n, d), n and d at least 1"
+    fix = "Save one row of the encoder's output per sample"
+    require(floats, None, must, f"{x.dtype} of shape {x.shape}", fix=fix)
+    names = [str(k) for k in (range(len(x)) if ids is None else ids)]
+    columns = {"ids": names, "labels": labels, "groups": groups}
+    for name, column in columns.items():
+        must = f"{name} in {source} must have one entry per row ({len(x)})"
+        require(len(column) in (len(x), 0), None, must, len(column), fix="Write it again")
+        require_utf8(f"{name} in {source}", "".join(column))
+    require_ids(names, source)
+    texts = {"id": names, "material": labels, "video": groups}
+    manifest = _manifest(Path(), **{name: column for name, column in texts.items() if column})
+    x = x.astype(np.float32) if x.dtype.itemsize < 4 else x
+    return Samples(source, manifest, x, ids is None, encoder=encoder)
+
+
+def require_ids(ids: Sequence[str], source: str) -> None:
+    """Raise if an id is empty or occurs twice."""
+    row = next((k for k, name in enumerate(ids, 1) if not name), 0)
+    must = f"Every row of {source} must have an id"
+    require(row == 0, None, must, f"none in row {row}", fix="Fill the ids")
+    repeated = [i for i, n in Counter(ids).items() if n > 1]
+    got = f"{len(repeated)} that occur more than once, first {''.join(repeated[:1])!r}"
+    must = f"Every id in {source} must occur once"
+    require(not repeated, None, must, got, fix="Keep one row per id")
+
+
+# Names and labels
+
+
+def named_sources(
+    generated: Any, names: Sequence[str] | None, reserved: Sequence[str]
+) -> dict[str, Any]:
+    """Name -> source of every generator; names must differ, and must not be those of a control."""
+    if isinstance(generated, Mapping):
+        sources = dict(cast("Mapping[str, Any]", generated))
+    else:
+        several = isinstance(generated, list | tuple) and not _is_image_list(generated)
+        items: list[Any] = list(cast("Sequence[Any]", generated)) if several else [generated]
+        got, fix = f"{len(names or ())} for {len(items)}", "Pass one name each"
+        complete = not names or len(names) == len(items)
+        require(complete, "names", "must name every generator", got, fix=fix)
+        chosen = list(names or [_name_of(item, k, len(items)) for k, item in enumerate(items)])
+        must, got = "must differ from generator to generator", ", ".join(map(repr, chosen))
+        distinct = len(set(chosen)) == len(chosen) and "" not in chosen
+        require(distinct, "names", must, got, fix=fix)
+        sources = dict(zip(chosen, items, strict=True))
+    must = "must hold something to score"
+    require(len(sources) > 0, "generated", must, "nothing", fix=f"Pass {KINDS}")
+    must = f"must not be {' or '.join(map(repr, reserved))}, which the tables have already"
+    for name, source in sources.items():
+        got, fix = f"{name!r} for {source}", "Pass another name"
+        require(name not in reserved, "names", must, got, fix=fix)
+    return sources
+
+
+def _is_image_list(items: Sequence[Any]) -> bool:
+    """Whether a list holds images of one generator: PIL images, arrays (h, w, c), files."""
+    return bool(items) and all(
+        is_image_file(item)
+        if isinstance(item, str | Path)
+        else hasattr(item, "getbands") or getattr(item, "ndim", 0) == 3
+        for item in items
+    )
+
+
+def _name_of(item: Any, k: int, count: int) -> str:
+    if not isinstance(item, str | Path):
+        return "generated" if count == 1 else f"generated {k + 1}"
+    path = Path(os.path.realpath(item))
+    name = path.stem if path.is_file() else path.name
+    name = path.parent.name if name in ("touches", "images") else name
+    return name.encode(errors="surrogateescape").decode(errors="replace")
+
+
+def read_labels(source: Any) -> pl.DataFrame | None:
+    """A table with the column ``id`` and some of ``LABELS``.
+
+    Args:
+        source: a table (:mod:`palpate.data.tables`), id -> material, one material per row, or None.
+            The column ``label`` stands for ``material``, ``group`` for ``video``.
+
+    Raises:
+        PalpateError: if it is none of these, rows are bad, or ids are missing or repeated.
+    """
+    if source is None:
+        return None
+    if isinstance(source, str | Path):
+        table = open_table(Path(source))
+    elif hasattr(source, "columns") or (isinstance(source, list) and isinstance(source[0], dict)):
+        table = table_of(cast("Any", source), "labels")
+    else:
+        values = source.items() if isinstance(source, Mapping) else enumerate(source)
+        table = table_of([{"id": str(i), "material": value} for i, value in values], "labels")
+    columns = {_NAMES[c]: c for c in reversed(table.names) if c in _NAMES}
+    must = f"{table.name} must have a column id, and material or video"
+    got, usable = f"the columns {', '.join(table.names)}", "id" in columns and len(columns) > 1
+    require(usable, None, must, got, fix="Add the column, or rename it")
+    cells = table.read([*columns.values()])
+    if table.problems:
+        raise ProblemsError(table.problems, "Correct these rows")
+    require_ids(cells[columns["id"]].fill_null("").to_list(), table.name)
+    return cells.select(pl.col(name).alias(own) for own, name in columns.items())
+
+
+def with_full_ids(samples: Samples, full: Sequence[str]) -> Samples:
+    """Image files whose ids are full ids but for the suffix take the full ids."""
+    if samples.rows is not None:
+        return samples
+    exact, bare = {*full}, {without_suffix(i): i for i in reversed(full)}
+    ids = [i if i in exact else bare.get(without_suffix(i), i) for i in samples.ids]
+    if len(set(ids)) < len(ids):  # two names that one id could mean
+        return samples
+    return samples.with_columns(pl.Series("id", ids, pl.String))
+
+
+def labeled(samples: Samples, table: pl.DataFrame | None, source: str = "the labels") -> Samples:
+    """Samples with the columns of a table, by id; those without any id in it stay.
+
+    Raises:
+        PalpateError: if some of the ids are not in the table, which errors call ``source``.
+    """
+    if table is None:
+        return samples
+    if samples.numbered:
+        must = f"{samples.source}, which has no ids, must have as many rows as {source}"
+        got = f"{len(samples)} and {len(table)}"
+        require(len(table) == len(samples), None, must, got, fix="Give them ids")
+        samples = replace(samples.with_columns(table["id"]), numbered=False)
+    known = {*table["id"]}
+    missing = [i for i in samples.ids if i not in known]
+    if len(missing) == len(samples):
+        return samples
+    columns = " and ".join(table.columns[1:])
+    must = f"Every id of {samples.source} must be in {source}, which gives {columns} by id"
+    got = f"{len(missing)} of {len(samples)} without, first {next(iter(missing), '')!r}"
+    fix = "Remove these, or pass labels for every id"
+    require(not missing, None, must, got, fix=fix)
+    rows = samples.manifest.table.select("id").join(table, "id", "left", maintain_order="left")
+    return samples.with_columns(*rows.drop("id"))
+
+
+def labeled_as(samples: Samples, other: Samples) -> Samples:
+    """Samples with what another set knows of the same ids, and they do not; errors as
+    :func:`labeled`.
+    """
+    mine, theirs = samples.manifest.filled(), other.manifest.filled()
+    lacking = [c for c in LABELS if c in theirs.columns and c not in mine.columns]
+    table = theirs.select("id", *lacking) if lacking and not samples.numbered else None
+    return labeled(samples, table, other.source)
