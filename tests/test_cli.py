@@ -102,8 +102,8 @@ def test_help_is_wrapped_by_the_terminal_and_says_no_empty_default(capsys):
     ("argv", "arguments"),
     [
         (
-            "score --generated a b --reference r --sigma 10 median --no-controls",
-            {"generated": ("a", "b"), "sigma": (10.0, "median"), "controls": False, "names": None},
+            "score --generated a b --reference r --sigma 10 median --group frame",
+            {"generated": ("a", "b"), "sigma": (10.0, "median"), "group": "frame", "names": None},
         ),
         (
             "import d -o m --map vision=rgb 'video=substr(rgb, 1, 2)' --map id=n --every 0",

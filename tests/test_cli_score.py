@@ -48,7 +48,7 @@ def test_options_reach_the_function_and_json_is_its_result(capsys, sets):
         "id,material\n" + "".join(f"{i},{m}\n" for i, m in zip(IDS, LABELS, strict=True))
     )
     Split.from_ids(train=IDS[24:], test=IDS[:24], rule={}, manifest="m").save(Path("s.json"))
-    options = ("--sigma", "10", "median", "--normalize", "yes", "--presets", "paper", "--seed", "3")
+    options = ("--sigma", "10", "median", "--normalize", "yes", "--presets", "paper")
     files = ("--labels", "labels.csv", "--split", "s.json", "--names", "ours")
     status, out, err = call(capsys, PAIR, *options, *files, "--json")
     assert status == 0, err
@@ -64,7 +64,6 @@ def test_options_reach_the_function_and_json_is_its_result(capsys, sets):
         presets=["paper"],
         companions=[],
         permutations=0,
-        seed=3,
     )
     assert {k: s.value for k, s in scores.items()} == {k: s.value for k, s in by_key(want).items()}
     assert json.loads(out)["commands"][0].startswith("palpate score --generated near.npz")
@@ -85,7 +84,7 @@ def test_embeddings_load_no_torch_and_the_results_make_a_page(sets):
     code = (
         "import sys; from palpate.cli import main\n"
         "args = 'score --generated near.npz far.npz --reference real.npz -q '\n"
-        "args += '-o s.json --latex t.tex --page p.html'\n"
+        "args += '-o s.json --page p.html'\n"
         "assert main(args.split()) == 0\n"
         "assert not {'torch', 'transformers', 'safetensors'} & set(sys.modules)\n"
         "assert main(['report', 's.json', '-o', 'page.html', '-q']) == 0"
@@ -94,7 +93,6 @@ def test_embeddings_load_no_torch_and_the_results_make_a_page(sets):
     assert done.returncode == 0, done.stderr
     scores = Results.load(Path("s.json")).scores
     assert {subject_of(s) for s in scores} == {"near", "far", "near - far"}
-    assert Path("t.tex").read_text().startswith("% palpate")
     assert Path("page.html").is_file()
     assert "TMMD" in Path("p.html").read_text()
     assert Path("p.json").is_file()
@@ -126,10 +124,9 @@ def test_scores_of_pixels_need_no_torch(tmp_path):
         (f"{PAIR} --labels absent.csv", "absent.csv"),
         (f"{PAIR} --companions none fid", "--companions must be none, or names"),
         ("--generated near.npz --reference nowhere", "nothing at nowhere"),
-        (f"{PAIR} -o s.x --latex s.x", "--latex must not be the file of the results"),
         (f"{PAIR} -o near.npz", "must not replace an input"),
         (f"{PAIR} -o folder", "folder must be writable"),
-        (f"{PAIR} --latex mine", "mine must be new"),
+        (f"{PAIR} -o mine", "mine must be new"),
         (f"{PAIR} --page mine", "--page must end in .html"),
         (f"{PAIR} --cache real.npz", "--cache must not be an input"),
     ],

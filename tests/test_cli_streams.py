@@ -62,10 +62,10 @@ def test_readers_that_go_away_leave_the_status(here, unread, args, status):
 
 def test_a_reader_that_goes_away_loses_no_file_and_no_status(here, unread):
     how = {"stdout": unread, "stderr": subprocess.PIPE, "text": True}
-    done = palpate(*SCORE, "-o", "o.json", "--latex", "o.tex", "-q", **how)
+    done = palpate(*SCORE, "-o", "o.json", "--page", "o.html", "-q", **how)
     assert (done.returncode, done.stderr) == (0, "")
     assert Results.load(Path("o.json")).scores
-    assert Path("o.tex").is_file()
+    assert Path("o.html").is_file()
     assert not Path(".o.json.work").exists()
     done = palpate(*AUDIT, **how)
     assert (done.returncode, "Traceback" in done.stderr) == (1, False)

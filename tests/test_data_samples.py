@@ -213,9 +213,9 @@ def test_a_split_selects_the_test_part_of_every_set():
     split = Split.from_ids(**parts, rule=rule, manifest="m" * 64)
     inputs = aligned({"all": sets(), "own": sets(list("abcd"))}, sets(ROWS, MATERIALS), split=split)
     assert inputs.reference.ids == inputs.generators["all"].ids == ROWS[2:]
-    assert (inputs.train.ids, inputs.reference.group) == (ROWS[:2], "contact")
+    assert (inputs.train.ids, inputs.reference.group) == (ROWS[:2], "frame")  # contacts: unknown
     assert inputs.generators["own"].ids == list("abcd")  # ids of its own cannot be parted
-    [note] = inputs.notes
+    note = inputs.notes[0]
     assert (note.code, note.params["skipped"]) == ("outside-test-part", 2)
     words = r"every sample of the split's test part\. Got 1 of 2 missing"
     with pytest.raises(PalpateError, match=words):

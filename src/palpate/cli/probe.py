@@ -9,8 +9,8 @@ from typing import Annotated, Any, Literal
 import tyro
 
 from palpate.cli.terminal import Common, Files, OptionalOutPath, Switch, Terminal, require_extra
-from palpate.cli.training import EncoderMachine
 from palpate.core import require
+from palpate.training.options import Compute
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -57,6 +57,29 @@ class Training:
 
 
 @dataclass(frozen=True, kw_only=True)
+class Machine:
+    """How to train on the machine at hand, as in `palpate train encoder`."""
+
+    device: str = "auto"
+    """auto, cpu, cuda, mps."""
+    precision: Literal["float32", "bf16", "fp16"] = "float32"
+    """Of matrix products; the weights stay float32."""
+    tf32: bool = True
+    """Let float32 products on CUDA round their factors to 10 bits."""
+    gradient_checkpointing: Switch = False
+    """Compute activations twice instead of keeping them."""
+    checkpoint_minutes: float = 5.0
+    """Time between checkpoints."""
+    chunk: int | None = None
+    """Rows that the encoder sees at a time; the loss is that of the whole batch."""
+
+    @property
+    def compute(self) -> Compute:
+        """The settings as the rooms take them."""
+        return Compute(**{k: v for k, v in vars(self).items() if k != "device"})
+
+
+@dataclass(frozen=True, kw_only=True)
 class Options(Common):
     """Score what an encoder's embeddings know: classes, by a linear probe and k-NN fitted to the
     train part, and which text and image belong to a sample, by retrieval within the test part.
@@ -78,8 +101,7 @@ class Options(Common):
     """Folder for embeddings, which an interrupted run finds again."""
     probing: Probing = field(default_factory=Probing)
     training: Training = field(default_factory=Training)
-    machine: EncoderMachine = field(default_factory=EncoderMachine)
-    """How to train on the machine at hand."""
+    machine: Machine = field(default_factory=Machine)
 
 
 def run(options: Options, terminal: Terminal) -> dict[str, Any]:
@@ -106,7 +128,9 @@ def run(options: Options, terminal: Terminal) -> dict[str, Any]:
                 seeds=training.seeds,
                 work=training.work,
                 device=options.machine.device,
-                compute=options.machine.compute,
+                compute=Compute(
+                    **{k: v for k, v in vars(options.machine).items() if k != "device"}
+                ),
                 print_line=terminal.print_line,
                 progress=progress,
                 **vars(options.probing),

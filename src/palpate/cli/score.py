@@ -8,7 +8,7 @@ from typing import Annotated, Any, Literal
 
 import tyro
 
-from palpate.cli.terminal import Common, Files, Switch, Terminal, working_folder
+from palpate.cli.terminal import Common, Files, OptionalOutPath, Switch, Terminal, working_folder
 from palpate.core import require
 
 #: What the word of an option means.
@@ -27,9 +27,10 @@ class Samples:
     labels: str | None = None
     """CSV or Parquet file with the columns id, material, video: instead of the inputs' own; or for
     materials `cluster:8`, eight clusters of the reference's photos (else features)."""
-    group: Literal["auto", "video", "contact", "object"] = "auto"
-    """What stays together in halves and intervals; `auto` takes what the split kept whole, else the
-    video."""
+    group: Literal["auto", "object", "session", "video", "contact", "frame"] = "auto"
+    """What stays together in halves, intervals and tests; `frame`: no two images are of one
+    recording. `auto` takes what columns or names show: the coarsest that has eight recordings or
+    more, or that the two sides do not share."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -57,12 +58,8 @@ class Metrics:
     """Folder or hub id of a CLIP: CMMD of its features, as published."""
     lpips: Annotated[tuple[Path, Path] | None, tyro.conf.arg(metavar="BACKBONE HEADS")] = None
     """The two files of LPIPS: AlexNet's weights and the heads."""
-    controls: bool = True
-    """With a split: score the no-contact image and real images of the same material as well."""
     permutations: int = 999
     """Relabelings of the permutation test of TMMD; 0 for none."""
-    seed: int = 0
-    """Of random halves, permutations and the control images."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -93,14 +90,17 @@ class Options(Common):
     cache: Path | None = None
     """Folder for embeddings and decoded images. Default: one next to -o, for a run that is
     interrupted; removed at the end."""
-    files: Files = field(default_factory=Files)
+    output: OptionalOutPath = None
+    """The results as JSON, for `palpate report`."""
+    page: Path | None = None
+    """The same as one self-contained page (.html), with .json and .md next to it."""
     samples: Samples = field(default_factory=Samples)
     metrics: Metrics = field(default_factory=Metrics)
 
 
 def run(options: Options, terminal: Terminal) -> dict[str, Any]:
-    """Score, print the tables, write JSON and LaTeX."""
-    files, labels = options.files, options.samples.labels
+    """Score, print the tables, write JSON and a page."""
+    files, labels = Files(output=options.output, page=options.page), options.samples.labels
     paths = (options.reference, options.split, options.train, labels and Path(labels))
     inputs = [path for path in (*paths, *options.generated) if path]
     files.guard(inputs)
@@ -113,7 +113,7 @@ def run(options: Options, terminal: Terminal) -> dict[str, Any]:
     require(alone, "companions", "must be none, or names", " ".join(companions or ()))
     from palpate.evaluation.scoring import score
 
-    output = files.output or files.page or files.latex
+    output = files.output or files.page
     has_images = options.reference.is_dir() or options.encoder
     with working_folder(cache, output if has_images else None) as folder:
         with terminal.progress() as progress:
@@ -122,8 +122,7 @@ def run(options: Options, terminal: Terminal) -> dict[str, Any]:
                 options.reference,
                 progress=progress,
                 **options.keywords(
-                    "generated",
-                    "reference",
+                    *("generated", "reference", "output", "page"),
                     companions=() if companions == ("none",) else companions,
                     normalize=NORMALIZE[options.metrics.normalize],
                     cache=folder,

@@ -75,7 +75,7 @@ class Samples:
             reference may have ``vision`` and ``background``).
         rows: images (n, h, w, 3) uint8, or features (n, d), possibly memory-mapped.
         numbered: whether the ids are row numbers, which pair nothing.
-        group: column of what stays together.
+        group: level of what stays together.
         encoder: digest of the encoder that made the features.
         gel: one no-contact image (h, w, 3) for all of a reference.
         settings: of ``palpate generate``, for its folders.
@@ -110,15 +110,15 @@ class Samples:
 
     @property
     def groups(self) -> list[str] | None:
-        """What stays together."""
-        return self.column(self.group)
+        """What stays together; None where no two samples do (``frame``)."""
+        return None if self.group == "frame" else self.column(self.group)
 
     def column(self, name: str) -> list[str] | None:
         """A column of the table, '' where it is unknown; None where it is for all."""
         values = self.manifest.column(name)
         return [v or "" for v in values] if any(values) else None
 
-    def with_columns(self, *columns: pl.Series) -> Samples:
+    def with_columns(self, *columns: pl.Series | pl.Expr) -> Samples:
         """The samples with other columns of text in their table."""
         table = self.manifest.table.with_columns(*columns)
         return replace(self, manifest=replace(self.manifest, table=table))
@@ -383,6 +383,9 @@ def as_images(array: NDArray[Any], name: str) -> NDArray[np.uint8]:
         PalpateError: on another shape, type or range.
     """
     if array.ndim == 3:
+        one, fix = array.shape[2] in (1, 3, 4), "Pass a list of images"
+        must, got = f"{name} must be several images (n, h, w, 3)", f"one of shape {array.shape}"
+        require(not one, None, must, got, fix=fix)
         array = array[..., None]
     if array.ndim == 4 and array.shape[1] in (1, 3) and array.shape[3] not in (1, 3):
         array = np.moveaxis(array, 1, 3)
@@ -426,8 +429,8 @@ def _arrays_in(path: Path) -> dict[str, Any]:
                 size, packed = entry.file_size / 1e9, entry.compress_size / 1e6
                 raise ValueError(f"{entry.filename} unpacks to {size:.1f} GB from {packed:.1f} MB")
     with np.load(path, allow_pickle=False) as data:
-        columns = {n: data[n] for n in ("ids", "labels", "groups", "encoder") if n in data}
-        lists = {name: [str(v) for v in values.reshape(-1)] for name, values in columns.items()}
+        names = [name for name in ("ids", "labels", "groups", "encoder") if name in data]
+        lists = {name: [str(v) for v in data[name].reshape(-1)] for name in names}
         return {"features": data["features"], **lists}
 
 

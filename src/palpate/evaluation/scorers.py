@@ -121,6 +121,7 @@ class Bench:
         split: digest of the split, or None.
         cache: folder for embeddings and decoded images.
         keep: whether the folder outlives the call.
+        sure: whether it is known what belongs together, so that intervals and p-values are right.
         progress: called with what is done.
         notes: what was assumed or skipped; scores add to them.
     """
@@ -140,6 +141,7 @@ class Bench:
     split: str | None = None
     cache: Path = Path()
     keep: bool = False
+    sure: bool = True
     progress: Progress
     notes: list[Note] = field(default_factory=list[Note])
 
@@ -381,7 +383,8 @@ def tmmd_family(bench: Bench) -> list[Score]:
             ]
             for s in (_with_kernel(bench, s, sigma) for s in (*of_family, *result.differences)):
                 scores.append(s)
-                if s.kind == "excess" and s.floor and s.interval and s.interval[1] < s.floor:
+                below = bench.sure and s.kind == "excess" and s.floor and s.interval
+                if below and s.interval[1] < s.floor:
                     params = {"metric": measured(s), "subject": s.a}
                     bench.notes.append(Note("below-floor", params))
         bench.progress("TMMD family", done + 1, len(columns))

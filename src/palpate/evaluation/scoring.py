@@ -12,7 +12,7 @@ an error: scores of some of the samples would pass for scores of all.
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import replace
 from functools import partial
@@ -21,8 +21,10 @@ from typing import Any, Literal
 
 import polars as pl
 
-from palpate.core import Note, PalpateError, Progress, Score, Split, quiet, require, rng_for
+from palpate.core import Note, Progress, Score, Split, few, quiet, require, rng_for
 from palpate.core.messages import require_rows
+from palpate.data.manifest import Manifest
+from palpate.data.recordings import LEVELS, name_recordings, source_of
 from palpate.data.samples import (
     Samples,
     labeled,
@@ -54,12 +56,17 @@ from palpate.evaluation.scorers import (
     companion,
     tmmd_family,
 )
-from palpate.metrics.images import require_same_ids
+from palpate.metrics.inputs import require_same_ids
+from palpate.report.labels import measured
 from palpate.report.records import GalleryItem
 from palpate.report.results import OBJECT, PATH, Call, Results
 
 #: Rows of the gallery.
 GALLERY = 40
+#: The fewest recordings a side that intervals and p-values are made of.
+LEAST = 8
+#: What ids get to be read as names of files.
+SUFFIX = ".png"
 
 
 def score(  # noqa: PLR0913
@@ -103,8 +110,11 @@ def score(  # noqa: PLR0913
             material, video; id -> material; or one material per row. ``"cluster:8"`` takes eight
             clusters of the reference's photos (without photos or encoder: of its features) for
             materials, by id; a note of CI- and D-TMMD says so.
-        group: the column whose values stay together in halves and intervals; ``auto`` takes what
-            the split kept whole, else the video.
+        group: what stays together in halves, intervals and tests: ``object``, ``session``,
+            ``video``, ``contact``, or ``frame`` where no two samples are of one recording. ``auto``
+            takes, of samples that both sides have, the coarsest level of eight units or more (with
+            a split from what it kept whole on), of other samples the coarsest that the two sides do
+            not share. Where nothing is known, or units are fewer, there are no intervals and no p.
         background: one image (or its file) of the sensor without contact, for all real images: what
             contact scores need where the reference is no manifest with backgrounds.
         train: what the generator was trained on, of the same kind as the reference: adds how near
@@ -197,6 +207,7 @@ def score(  # noqa: PLR0913
         scorers += [memorized] * (bench.seen is not None)
         scores = [s for scorer in scorers for s in scorer(bench)]
         scores = of_clusters(scores, clusters, origin) if clusters else scores
+        scores = scores if bench.sure else [_without_intervals(s) for s in scores]
         settings = _settings(bench, scores)
     if images:
         digest = settings["digests"][REFERENCE]
@@ -209,7 +220,7 @@ def score(  # noqa: PLR0913
         scores=sorted(scores, key=lambda s: s.b is not None),
         gallery=_gallery(bench),
         settings=settings,
-        notes=bench.notes,
+        notes=[*bench.notes, *_verdict_of_two(bench, scores)],
         calls=[_with_names(call, bench).with_digests(_digests_read(settings))],
     )
 
@@ -250,7 +261,8 @@ def aligned(bench: Bench, labels: Any, split: Split | None, group: str) -> Bench
     if real.numbered:  # row k of a generator is not row k of the reference
         real = real.with_columns(pl.Series("id", [f"{REFERENCE} {i}" for i in real.ids]))
     generators = {name: labeled_as(samples, real) for name, samples in generators.items()}
-    train = None
+    real, *made = _with_names_read([real, *generators.values()])
+    generators, train = dict(zip(generators, made, strict=True)), None
     if split is not None:
         everything, (real, train) = real, _parts(real, split)
         for name, samples in generators.items():
@@ -262,15 +274,85 @@ def aligned(bench: Bench, labels: Any, split: Split | None, group: str) -> Bench
     generators = {
         name: s.take(real.ids) if {*s.ids} == {*real.ids} else s for name, s in generators.items()
     }
-    kept = str(split.rule.get("group", "video")) if split else "video"
-    group = _group_of([real, *generators.values()], group, kept)
+    bench = replace(bench, generators=generators, reference=real, train=train, seen=seen)
+    return _with_groups(bench, group, str(split.rule.get("group")) if split else "")
+
+
+def _with_names_read(sets: Sequence[Samples]) -> list[Samples]:
+    """The sets with the recordings that the names of files show, or ids, read together."""
+    suffix = pl.concat_str("id", pl.lit(SUFFIX)).alias("tactile")
+    files = [s if s.rows is None else s.with_columns(suffix) for s in sets if not s.numbered]
+    manifests = iter(name_recordings([s.manifest for s in files]))
+    named = [s if s.numbered else replace(s, manifest=next(manifests)) for s in sets]
+    return [
+        s.with_columns(own.manifest.table["tactile"], *_alone(s.manifest))
+        for s, own in zip(named, sets, strict=True)
+    ]
+
+
+def _alone(manifest: Manifest) -> Iterator[pl.Expr]:
+    """Samples whose names show no recording, where others' do, are recordings of their own."""
+    for level in LEVELS[:-1]:
+        if f"{level}_from" in manifest.facts:
+            yield pl.col(level).fill_null(pl.col("id"))
+
+
+def _with_groups(bench: Bench, requested: str, kept: str) -> Bench:
+    """The samples with what stays together, and what a reader must know of it.
+
+    Samples that both sides have (pairs): the coarsest level with enough units, from what a split
+    kept whole on. Other samples: the coarsest level of which one side has units that the other has
+    not; of what both have, none is there by chance.
+
+    Raises:
+        PalpateError: on a level that is not known for all.
+    """
+    real, notes = bench.reference, bench.notes
+    sets = [real, *bench.generators.values()]
+    levels = [level for level in LEVELS[:-1] if all(s.column(level) for s in sets)]
+    must, got = "must be known for every input", f"{requested!r}, and {few(levels)} known"
+    fix = "Pass labels with that column, or the default group"
+    require(requested in ("auto", "frame", *levels), "group", must, got, fix=fix)
+    units = {level: [{*(s.column(level) or ())} for s in sets] for level in levels}
+    enough = [level for level in levels if min(map(len, units[level])) >= LEAST]
+    paired = all({*s.ids} <= {*real.ids} for s in bench.generators.values())
+    apart = [n for n in levels if not paired and any(own != units[n][0] for own in units[n])]
+    inner = levels[levels.index(kept) :] if paired and kept in levels else levels
+    right = [*apart, *(level for level in inner if level in enough), *inner, "frame"][0]
+    group = right if requested == "auto" else requested
+    if LEVELS.index(group) > LEVELS.index(right):
+        group = group if paired else right
+        notes.append(Note("group-finer", {"group": requested, "level": right, "used": group}))
+    doubt = None
+    if group == "frame" != requested:
+        doubt = Note("groups-unknown")
+    elif group not in ("frame", *enough):
+        count = min(map(len, units[group]))
+        doubt = Note("groups-few", {"level": group, "count": count, "least": LEAST})
+    if group != "frame":
+        source = source_of(real.manifest, group).replace(f"{SUFFIX}`", "`")
+        notes.append(Note("groups", {"level": group, "source": source}))
+    notes += [doubt] * (doubt is not None)
+    grouped = {name: replace(s, group=group) for name, s in bench.generators.items()}
     return replace(
         bench,
-        generators={name: replace(s, group=group) for name, s in generators.items()},
+        generators=grouped,
         reference=replace(real, group=group),
-        train=train and replace(train, group=group),
-        seen=seen and replace(seen, group=group),
+        train=bench.train and replace(bench.train, group=group),
+        seen=bench.seen and replace(bench.seen, group=group),
+        permutations=bench.permutations if doubt is None else 0,
+        sure=doubt is None,
     )
+
+
+def _without_intervals(score: Score) -> Score:
+    """A score whose spread nobody knows: its value alone."""
+    uncertain = ("interval", "p_value", "p_better", "p_adjusted", "p_difference")
+    gone = [name for name in score.details if name.endswith(uncertain)]
+    details = {**score.details, **dict.fromkeys(gone)}
+    details |= {"decided": False} if "decided" in details else {}
+    kept = [note for note in score.notes if note.code != "independent-samples"]
+    return replace(score, interval=None, interval_method="", details=details, notes=kept)
 
 
 def _require_one_kind(sets: Sequence[Samples]) -> None:
@@ -309,17 +391,6 @@ def _test_part(
     return part
 
 
-def _group_of(sets: Sequence[Samples], requested: str, kept: str) -> str:
-    """The column of what stays together."""
-    if requested == "auto":
-        return next((c for c in (kept, "video") if any(s.column(c) for s in sets)), kept)
-    for samples in sets:
-        must, got = "must be known for every input", f"{requested!r}, unknown in {samples.source}"
-        fix = "Pass labels with that column, or the default group"
-        require(samples.column(requested) is not None, "group", must, got, fix=fix)
-    return requested
-
-
 def _companions(bench: Bench, requested: Sequence[str] | None, *, encoder: bool) -> list[str]:
     """What is compared next to the TMMD family.
 
@@ -347,16 +418,25 @@ def _companions(bench: Bench, requested: Sequence[str] | None, *, encoder: bool)
     else:
         unpaired = [name for name, s in generators.items() if s.ids != real.ids]
         for name in unpaired if requested is not None else ():
-            try:
-                require_same_ids(generators[name].ids, real.ids)
-            except PalpateError as error:
-                fix = "Score the same samples on both sides, or request companions without pairs"
-                example = {"companions": ["fid", "kid", "prdc"]}
-                must = f"{name}: {error.must}"
-                raise PalpateError(must, error.got, fix, example=example) from None
+            require_same_ids(generators[name].ids, real.ids, (name, REFERENCE))
     if unpaired:
         notes.append(Note("no-pairs", {"names": unpaired}))
     return [n for n in chosen if n not in PAIRS] if len(unpaired) == len(generators) else chosen
+
+
+def _verdict_of_two(bench: Bench, scores: Sequence[Score]) -> list[Note]:
+    """Which of two generators is better by which metrics; of three, tables rank them."""
+    if len(bench.generators) != 2:
+        return []
+    a, b = bench.generators
+    better: dict[str, list[str]] = {a: [], b: [], "": []}
+    for d in scores:
+        if d.b is not None and d.value is not None and d.details.get("better"):
+            winner = d.details["better"] if d.details.get("decided") else ""
+            every = [name for names in better.values() for name in names]
+            better[winner] += [measured(d)] * (measured(d) not in every)
+    params = {"a": a, "b": b, "by_a": better[a], "by_b": better[b], "open": better[""]}
+    return [Note("verdict-of-two", params)] if any(better.values()) else []
 
 
 def _with_names(call: Call, bench: Bench) -> Call:

@@ -352,6 +352,14 @@ def _materials_excluded(params: Mapping[str, Any], _: Style) -> str:
     return f"Excluded ({len(params['materials'])} of {params['total']} materials): {materials}"
 
 
+def _verdict_of_two(p: Mapping[str, Any], _: Style) -> str:
+    parts = [
+        f"{p[name]} is better by {', '.join(p[f'by_{name}'])}" for name in "ab" if p[f"by_{name}"]
+    ]
+    parts += [f"not decided by {', '.join(p['open'])}"] * bool(p["open"])
+    return "; ".join(parts)
+
+
 EVALUATION: dict[str, Sentence] = {
     "few-test-groups": (
         "A test part holds {count} {group} group(s) only: the intervals are wide, and too trusting "
@@ -421,6 +429,21 @@ EVALUATION: dict[str, Sentence] = {
         "The spread over random subsets that others print with KID is no interval; this one is"
     ),
     "no-differences": "No differences between generators: they are not of the same samples",
+    "groups": "Intervals and p are by {level}; {level}s: from {source}",
+    "group-finer": (
+        "Several {group}s are of one {level}: intervals and p are by {used}, and by {level} they "
+        "are right"
+    ),
+    "groups-few": (
+        "No intervals and no p: {count} {level}s a side are known, and {least} are the fewest that "
+        "tell how much {level}s differ"
+    ),
+    "groups-unknown": (
+        "No intervals and no p: nothing says which images are of one recording, and frames of one "
+        "are nearly copies. Name files <video>_<frame>, give a table with id and video by "
+        "{arg:labels=videos.csv}, or say that no two belong together by {arg:group=frame}"
+    ),
+    "verdict-of-two": _verdict_of_two,
     "no-pairs": (
         "Scores of pairs of images skipped for {names}: the ids are not those of the reference"
     ),
