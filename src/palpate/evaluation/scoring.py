@@ -426,7 +426,7 @@ def _companions(bench: Bench, requested: Sequence[str] | None, *, encoder: bool)
 
 def _verdict_of_two(bench: Bench, scores: Sequence[Score]) -> list[Note]:
     """Which of two generators is better by which metrics; of three, tables rank them."""
-    if len(bench.generators) != 2:
+    if len(bench.generators) != 2 or not bench.sure:
         return []
     a, b = bench.generators
     better: dict[str, list[str]] = {a: [], b: [], "": []}
