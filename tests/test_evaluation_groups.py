@@ -127,6 +127,8 @@ def test_samples_of_both_sides_take_the_coarsest_level_of_eight():
         results = score(made, real, labels=labels, **FAST)
         assert results.settings["options"]["group"] == level
         assert "groups-few" not in codes(results)
+    labels[0]["object"] = "another"  # a video of two objects is cut by none
+    assert score(made, real, labels=labels, **FAST).settings["options"]["group"] == "video"
     split = Split.from_ids(train=[], test=real.ids, rule={"group": "video"}, manifest="m" * 64)
     labels = columns_of({"a": real}, 8)
     assert (

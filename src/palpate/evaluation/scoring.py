@@ -313,8 +313,12 @@ def _with_groups(bench: Bench, requested: str, kept: str) -> Bench:
     must, got = "must be known for every input", f"{requested!r}, and {few(levels)} known"
     fix = "Pass labels with that column, or the default group"
     require(requested in ("auto", "frame", *levels), "group", must, got, fix=fix)
-    units = {level: [{*(s.column(level) or ())} for s in sets] for level in levels}
-    enough = [level for level in levels if min(map(len, units[level])) >= LEAST]
+    units = {level: [{*(s.column(level) or ())} for s in sets] for level in LEVELS[:-1]}
+    enough = [level for level, own in units.items() if min(map(len, own)) >= LEAST]
+    # What the data ask for, coarse to fine.
+    levels = [
+        n for k, n in enumerate(levels) if not any(_cuts(s, n, levels[k + 1 :]) for s in sets)
+    ]
     paired = all({*s.ids} <= {*real.ids} for s in bench.generators.values())
     apart = [n for n in levels if not paired and any(own != units[n][0] for own in units[n])]
     inner = levels[levels.index(kept) :] if paired and kept in levels else levels
@@ -343,6 +347,12 @@ def _with_groups(bench: Bench, requested: str, kept: str) -> Bench:
         permutations=bench.permutations if doubt is None else 0,
         sure=doubt is None,
     )
+
+
+def _cuts(samples: Samples, level: str, finer: Sequence[str]) -> bool:
+    """Whether a unit of a finer level is of several of this one: a video that shows two objects."""
+    table = samples.manifest.table
+    return any(len(table.select(level, n).unique()) > table[n].n_unique() for n in finer)
 
 
 def _without_intervals(score: Score) -> Score:
