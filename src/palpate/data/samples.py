@@ -230,13 +230,13 @@ def read_samples(source: Any, name: str) -> Samples:
     elif isinstance(source, Manifest):
         samples = Samples(name, source)
     elif isinstance(source, FeatureSet):
-        columns = {"labels": source.labels, "groups": source.groups}
-        texts = {
-            name: ["" if is_missing(v) else str(v) for v in values]
-            for name, values in columns.items()
-            if values is not None
-        }
-        samples = _features(source.features, name, list(source.ids), source.encoder, **texts)
+        labels, groups = (
+            () if column is None else ["" if is_missing(v) else str(v) for v in column]
+            for column in (source.labels, source.groups)
+        )
+        samples = _features(
+            source.features, name, source.ids, source.encoder, labels=labels, groups=groups
+        )
     elif items and isinstance(items[0], str | Path):
         paths = [Path(item).absolute() for item in items]
         ids = [without_suffix(p.name) for p in paths]
@@ -418,7 +418,8 @@ def _of_feature_file(path: Path) -> Samples:
         reason = (str(error).splitlines() or [type(error).__name__])[0]
         must = f"{path} must be a whole {path.suffix} file without pickles"
         raise PalpateError(must, reason, "Write it again") from None
-    return _features(x, str(path), arrays.pop("ids", None), encoder, **arrays)
+    labels, groups = (arrays.get(name, ()) for name in ("labels", "groups"))
+    return _features(x, str(path), arrays.get("ids"), encoder, labels=labels, groups=groups)
 
 
 def _arrays_in(path: Path) -> dict[str, Any]:
