@@ -230,13 +230,11 @@ def read_samples(source: Any, name: str) -> Samples:
     elif isinstance(source, Manifest):
         samples = Samples(name, source)
     elif isinstance(source, FeatureSet):
-        labels, groups = (
+        columns = (
             () if column is None else ["" if is_missing(v) else str(v) for v in column]
             for column in (source.labels, source.groups)
         )
-        samples = _features(
-            source.features, name, source.ids, source.encoder, labels=labels, groups=groups
-        )
+        samples = _features(source.features, name, source.ids, source.encoder, *columns)
     elif items and isinstance(items[0], str | Path):
         paths = [Path(item).absolute() for item in items]
         ids = [without_suffix(p.name) for p in paths]
@@ -418,8 +416,8 @@ def _of_feature_file(path: Path) -> Samples:
         reason = (str(error).splitlines() or [type(error).__name__])[0]
         must = f"{path} must be a whole {path.suffix} file without pickles"
         raise PalpateError(must, reason, "Write it again") from None
-    labels, groups = (arrays.get(name, ()) for name in ("labels", "groups"))
-    return _features(x, str(path), arrays.get("ids"), encoder, labels=labels, groups=groups)
+    columns = (arrays.get(name, ()) for name in ("labels", "groups"))
+    return _features(x, str(path), arrays.get("ids"), encoder, *columns)
 
 
 def _arrays_in(path: Path) -> dict[str, Any]:
@@ -440,11 +438,9 @@ def _features(
     source: str,
     ids: Sequence[Any] | None = None,
     encoder: str | None = None,
-    *,
-    labels: Sequence[str] = (),
-    groups: Sequence[str] = (),
+    *columns: Sequence[str],
 ) -> Samples:
-    """Features of samples; half precision is widened to float32.
+    """Features of samples with columns (labels, groups); half precision is widened to float32.
 
     Raises:
         PalpateError: if they are no floats (n, d), columns have other lengths, or an id is empty or
@@ -455,8 +451,8 @@ def _features(
     fix = "Save one row of the encoder's output per sample"
     require(floats, None, must, f"{x.dtype} of shape {x.shape}", fix=fix)
     names = [str(k) for k in (range(len(x)) if ids is None else ids)]
-    columns = {"ids": names, "labels": labels, "groups": groups}
-    for name, column in columns.items():
+    labels, groups = columns or ((), ())
+    for name, column in {"ids": names, "labels": labels, "groups": groups}.items():
         must = f"{name} in {source} must have one entry per row ({len(x)})"
         require(len(column) in (len(x), 0), None, must, len(column), fix="Write it again")
         require_utf8(f"{name} in {source}", "".join(column))
