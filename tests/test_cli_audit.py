@@ -210,7 +210,7 @@ def test_mistakes_are_one_line_each(tmp_path, small_manifest, capsys):
         tmp_path / "s.json"
     )
     (tmp_path / "l.txt").write_text("v/1.jpg,0\n")
-    (tmp_path / "bad.txt").write_text("v1.jpg\n")
+    (tmp_path / "bad.txt").write_text("v1\n")
     one, split, lines = tmp_path / "m", tmp_path / "s.json", tmp_path / "l.txt"
     for args, words in [
         ([one], "neither test samples nor a split"),
