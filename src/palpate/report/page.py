@@ -394,14 +394,14 @@ def environment() -> Environment:
     }
     env.filters.update(functions, leaf=_leaf, plain=plain, unbroken=_unbroken)
     env.filters["label"] = lambda key: str(key).replace("_", " ")
-    env.globals.update(
-        functions,
-        open_pairs=OPEN_PAIRS,
-        long_list=LONG_LIST,
-        READING=first_screen.READING,
-        open_claims=OPEN_CLAIMS,
-        verdict_marks=study.MARKS,
-    )
+    settings: dict[str, Any] = {
+        "open_pairs": OPEN_PAIRS,
+        "long_list": LONG_LIST,
+        "READING": first_screen.READING,
+        "open_claims": OPEN_CLAIMS,
+        "verdict_marks": study.MARKS,
+    }
+    env.globals.update(functions | settings)
     return env
 
 
