@@ -1,5 +1,6 @@
 """The streaming class against the function: batches, pickles, bad input."""
 
+import io
 import pickle
 
 import numpy as np
@@ -84,6 +85,14 @@ def test_pickled_in_the_middle():
     first, second = np.arange(0, 41), np.arange(41, len(g.ids))
     a = pickle.loads(pickle.dumps(both(make(), g, r, order=first)))
     assert same(both(pickle.loads(pickle.dumps(a)), g, r, order=second).compute(), whole)
+
+
+def test_bytes_of_another_process_unpickle_nothing():
+    buffer = io.BytesIO()
+    np.savez(buffer, features=np.array([{}], dtype=object))
+    head = np.array([buffer.getbuffer().nbytes, 0], "<i8").view(np.uint8)
+    with pytest.raises(ValueError, match="allow_pickle"):
+        next(Batch.read(np.concatenate([head, np.frombuffer(buffer.getvalue(), np.uint8)])))
 
 
 @pytest.mark.parametrize("keeps", [False, True])
