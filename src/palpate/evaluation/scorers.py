@@ -198,13 +198,15 @@ class Bench:
         return self._sets(name, sets, self.features(self.reference))
 
     def _sets(self, name: str, sets: Mapping[str, FeatureSet], reference: FeatureSet) -> Sets:
-        parts = ({n: sets[n] for n in part} for part in (self.generators, self.controls))
-        return Sets(name, *parts, reference)
+        generators, controls = (
+            {n: sets[n] for n in part} for part in (self.generators, self.controls)
+        )
+        return Sets(name, generators, controls, reference)
 
     @cached_property
     def train_features(self) -> FeatureSet | None:
         """Features of the train part."""
-        return self.train and self.features(self.train)
+        return None if self.train is None else self.features(self.train)
 
     @cached_property
     def inception(self) -> Sets:
@@ -383,8 +385,8 @@ def tmmd_family(bench: Bench) -> list[Score]:
             ]
             for s in (_with_kernel(bench, s, sigma) for s in (*of_family, *result.differences)):
                 scores.append(s)
-                below = bench.sure and s.kind == "excess" and s.floor and s.interval
-                if below and s.interval[1] < s.floor:
+                interval = s.interval if bench.sure and s.kind == "excess" else None
+                if interval and s.floor and interval[1] < s.floor:
                     params = {"metric": measured(s), "subject": s.a}
                     bench.notes.append(Note("below-floor", params))
         bench.progress("TMMD family", done + 1, len(columns))

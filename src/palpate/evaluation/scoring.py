@@ -250,7 +250,7 @@ def aligned(bench: Bench, labels: Any, split: Split | None, group: str) -> Bench
             part of the samples only.
     """
     real, seen = bench.reference, bench.seen
-    _require_one_kind([real, *bench.generators.values(), *[seen] * (seen is not None)])
+    _require_one_kind([real, *bench.generators.values(), *([] if seen is None else [seen])])
     table = read_labels(labels)
     listed = [] if table is None else table["id"].to_list()
     real, full = labeled(real, table), [*real.ids, *listed]
@@ -396,8 +396,9 @@ def _test_part(
     fix = "Generate these too, or pass the split it was generated for"
     require_rows(samples.ids, real.ids, must, fix)
     part = samples.take([i for i in samples.ids if i in wanted])
-    skipped = {"name": name, "skipped": len(samples) - len(part), "n": len(samples)}
-    bench.notes.extend([Note("outside-test-part", skipped)] * (skipped["skipped"] > 0))
+    if skipped := len(samples) - len(part):
+        params = {"name": name, "skipped": skipped, "n": len(samples)}
+        bench.notes.append(Note("outside-test-part", params))
     return part
 
 
