@@ -336,7 +336,7 @@ def _with_groups(bench: Bench, requested: str, kept: str) -> Bench:
     if group != "frame":
         source = source_of(real.manifest, group).replace(f"{SUFFIX}`", "`")
         notes.append(Note("groups", {"level": group, "source": source}))
-    notes += [doubt] * (doubt is not None)
+    notes += filter(None, [doubt])
     grouped = {name: replace(s, group=group) for name, s in bench.generators.items()}
     return replace(
         bench,
