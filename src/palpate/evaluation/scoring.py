@@ -337,10 +337,9 @@ def _with_groups(bench: Bench, requested: str, kept: str) -> Bench:
         source = source_of(real.manifest, group).replace(f"{SUFFIX}`", "`")
         notes.append(Note("groups", {"level": group, "source": source}))
     notes += filter(None, [doubt])
-    grouped = {name: replace(s, group=group) for name, s in bench.generators.items()}
     return replace(
         bench,
-        generators=grouped,
+        generators={name: replace(s, group=group) for name, s in bench.generators.items()},
         reference=replace(real, group=group),
         train=bench.train and replace(bench.train, group=group),
         seen=bench.seen and replace(bench.seen, group=group),
