@@ -225,7 +225,7 @@ def rival_scores(name, train, test, modality, encoder=None):
     """(n_test,) the highest similarity with train."""
     if name == "encoder":
         from palpate.encoders.embed import embed
-        from palpate.encoders.models import load_encoders
+        from palpate.encoders.guard import load_encoders
         from palpate.leakage.descriptors import unit
 
         encoders = load_encoders(encoder, quiet)

@@ -16,7 +16,8 @@ from palpate.core import PalpateError
 from palpate.data.manifest import Manifest
 from palpate.encoders import Encoder, EncoderSet, train_encoder
 from palpate.encoders.contrastive import train_tactile
-from palpate.encoders.models import digest_images, guard, union
+from palpate.encoders.guard import guard
+from palpate.encoders.models import digest_images, union
 from palpate.encoders.presets import preset_of
 from palpate.report.notes import COMMAND_LINE, sentence
 from palpate.report.terminal import audit_text

@@ -137,7 +137,7 @@ def _check(options: Options) -> None:
     if options.comparison.encoder is not None:
         require_extra("palpate audit --encoder")
     inputs = [*options.paths, *(p for p in (options.split, options.pretrain) if p)]
-    if is_table(outputs.output):
+    if outputs.output is not None and is_table(outputs.output):
         formats = (TABLE_FORMAT.encode(), b"id,video,frame,material,leaking")
         guard_output(outputs.output, inputs, formats)
     Files(output=None if is_table(outputs.output) else outputs.output, page=outputs.page).guard(

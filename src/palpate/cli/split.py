@@ -16,8 +16,10 @@ from palpate.core import atomic_folder, require, require_new_folder
 
 Column = Literal["auto", "video", "object", "session", "contact", "domain", "sensor"]
 #: Facts of the rule that are printed.
-PRINTED = ("name", "audit", "group", "by", "groups", "deviation", "bound", "status", "limiting")
-PRINTED += ("rare", "missing")
+PRINTED = (
+    *("name", "audit", "group", "by", "groups", "deviation", "bound", "status", "limiting"),
+    *("rare", "missing"),
+)
 
 
 @dataclass(frozen=True, kw_only=True)

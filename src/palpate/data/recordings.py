@@ -169,7 +169,7 @@ def name_recordings(manifests: Sequence[Manifest], template: str | None = None) 
     if not levels:
         return list(manifests)
     named = [
-        m if own is None else _filled(own, [rows.get(name) for name in paths], source)
+        m if own is None else _filled(own, [rows.get(name or "") for name in paths], source)
         for m, own, paths in zip(manifests, bare, names, strict=True)
     ]
     return _with_sessions(named) if "HCT" in source else named

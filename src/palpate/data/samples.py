@@ -305,16 +305,20 @@ def generated_files(folder: Path, index: Mapping[str, Any]) -> dict[str, str]:
 
     Raises:
         PalpateError: if it was left half done, or names a file that is missing or outside.
+        ValueError: if the names are no texts.
     """
     must, fix = f"{folder} must be finished", "Run the same command again: it continues"
     require(index["complete"], None, must, "a folder left half done", fix=fix)
-    names = [*index["images"].values()]
+    images = index["images"]
+    names = [*images.values()] if isinstance(images, Mapping) else [images]
+    if kinds := {type(name).__name__ for name in names} - {"str"}:
+        raise ValueError(f"images of type {min(kinds)}")
     paths = [inside(folder / "images", name) for name in names]
     bad = [n for n, p in zip(names, paths, strict=True) if p is None or not p.is_file()]
     must = f"Every image of {folder / 'index.json'} must lie in images/"
     got = f"{len(bad)} that do not, first {bad[:1]}"
     require(not bad, None, must, got, fix="Generate again")
-    return {i: f"images/{name}" for i, name in index["images"].items()}
+    return {i: f"images/{name}" for i, name in images.items()}
 
 
 def _files_below(path: Path) -> dict[str, str]:

@@ -24,7 +24,6 @@ from PIL import Image
 from palpate.core import Note, PalpateError, Problem, read_json, reading_entry, require, short
 from palpate.core.records import from_plain
 from palpate.data.images import read_image
-from palpate.data.samples import generated_files
 
 FORMAT = "palpate-generated/1"
 
@@ -94,6 +93,8 @@ class Generated:
             PalpateError: if it has no index, was left half done, or names a file that is missing or
                 outside.
         """
+        from palpate.data.samples import generated_files
+
         folder = Path(folder)
         index = _read_index(folder)
         generated_files(folder, vars(index))  # checks them

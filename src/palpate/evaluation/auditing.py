@@ -61,7 +61,7 @@ def audit(
 
     @lru_cache
     def encoders() -> EncoderSet:
-        from palpate.encoders.models import load_encoders
+        from palpate.encoders.guard import load_encoders
 
         return load_encoders(encoder, progress)
 
@@ -77,7 +77,7 @@ def audit(
         notes: list[Note] = []
         seen: list[str] = []
         if encoder is not None:
-            from palpate.encoders.models import guard
+            from palpate.encoders.guard import guard
 
             # every sample is in the test part of some leak-free split
             judged = samples.take([i for part in ("train", "test") for i in split.ids(part)])

@@ -136,7 +136,7 @@ def probe(  # noqa: PLR0913 - one argument a choice
     arguments = locals()
     require_choice("modality", modality, ("tactile", "vision"))
     from palpate.data.reading import load
-    from palpate.encoders.models import load_encoders
+    from palpate.encoders.guard import load_encoders
 
     manifest = load(data)
     splits, encoders = named(split, "split"), named(encoder, "encoder")
@@ -206,7 +206,7 @@ def measure(
         PalpateError: if nothing can be measured.
     """
     from palpate.encoders.embed import embed
-    from palpate.encoders.models import guard
+    from palpate.encoders.guard import guard
 
     folder = None if cache is None else Path(cache)
     embedded = partial(embed, groups=plan.group, cache=folder, progress=progress)

@@ -187,7 +187,7 @@ def score(  # noqa: PLR0913
     chosen = _companions(bench, companions, encoder=encoder is not None)
     encoders, of_encoder = None, list[Note]()
     if encoder is not None:
-        from palpate.encoders.models import guard, load_encoders
+        from palpate.encoders.guard import guard, load_encoders
 
         encoders = load_encoders(encoder, progress)
         judged: Any = bench.reference.manifest if real.rows is None else bench.reference.rows

@@ -195,7 +195,7 @@ def _problem(
         for series in (pl.Series(groups), manifest.table["material"])
     )
     counts = np.zeros((len(names), len(materials) + 1), np.int64)
-    np.add.at(counts, (row, -1), 1)
+    np.add.at(counts[:, -1], row, 1)
     np.add.at(counts, (row[column >= 0], column[column >= 0]), 1)
     biggest = int(counts[:, -1].argmax())
     largest, wanted = float(counts[biggest, -1] / len(groups)), 1 - max(target)
@@ -241,7 +241,7 @@ def _audited(manifest: Manifest, made: Split, cache: str | Path | None) -> Split
         split=made,
         images=near is not None,
         cache=cache,
-        modalities=near["modalities"] if near else MODALITIES,
+        modalities=near["modalities"] if near else [*MODALITIES],
     )
     facts = {**made.rule, "audit": own.verdict}
     notes = [*made.notes, *_question(manifest, own.shared)]

@@ -36,7 +36,7 @@ from palpate.data.manifest import Manifest
 from palpate.data.samples import read_samples
 from palpate.encoders.embed import embed
 from palpate.encoders.encoder_set import EncoderSet
-from palpate.encoders.models import guard
+from palpate.encoders.guard import guard
 from palpate.metrics.inputs import Array
 from palpate.metrics.means import Mean, mean_of
 from palpate.metrics.means import over_seeds as over_draws
