@@ -99,6 +99,7 @@ def test_the_optimum_is_that_of_brute_force_and_every_seed_reaches_it(rows, targ
     [
         ([[0, 3, 9], [3, 9, 0], [1, 5, 3], [5, 9, 20]], (0.6, 0.2, 0.2)),  # "Solve error"
         ([[5, 9, 1], [1, 9, 9], [9, 2, 2], [9, 9, 0]], (0.7, 0.3)),  # a wrong optimum, "proven"
+        ([[0, 0, 9], [2, 1, 3], [0, 2, 9], [5, 9, 0]], (0.7, 0.3)),  # another, by presolve
     ],
 )
 def test_a_program_that_highs_fails_at_is_solved(rows, target):
