@@ -1,7 +1,7 @@
 """One case: a command on inputs that were broken at random, and what may come of it.
 
-Allowed is exit 0, 1, or 2 with a message of one line (and its indented list), and nothing but whole
-files in the output folder. Everything else is a failure.
+Allowed is exit 0, 1, 3, or 2 with a message of one line (and its indented list), and nothing but
+whole files in the output folder. Everything else is a failure.
 """
 
 import contextlib
@@ -93,7 +93,7 @@ def run(args: Sequence[str], folder: Path) -> tuple[int | str, str, str]:
 
 
 def _ending(status: int | str, out: str, err: str, as_json: bool) -> Iterator[str]:
-    if status not in (0, 1, 2):
+    if status not in (0, 1, 2, 3):
         yield f"status {status}: {place(err if isinstance(status, int) else status)}"
         return
     if "Traceback" in err:

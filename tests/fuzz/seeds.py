@@ -191,6 +191,7 @@ def _results(folder: Path) -> None:
 
 
 def call(*args: str | Path) -> None:
-    """Run a command that must succeed."""
-    if status := main([*map(str, args), "-q"]):
+    """Run a command that must succeed; tiny sets have too few images to tell whether they leak."""
+    status = main([*map(str, args), "-q"])
+    if status not in (0, 3 if args[0] == "audit" else 0):
         raise RuntimeError(f"{args} ended with {status}")
