@@ -58,7 +58,7 @@ COMMANDS: dict[str, int] = {
     "validate IN/hct": 1,
     "validate IN/table/rows.csv": 2,
     "validate IN/pairs --json": 1,
-    "audit IN/lists/train.txt IN/lists/test.txt -o OUT/a.json --page OUT/a.html": 6,
+    "audit IN/lists/train.txt IN/lists/test.txt -o OUT/b.json --page OUT/a.html": 6,
     "audit IN/table/rows.csv IN/table/rows.jsonl --fail-over 0.5": 2,
     "audit IN/manifest --split IN/split/split.json -o OUT/a.json --page OUT/p.html": 6,
     "audit IN/manifest IN/manifest --no-images -o OUT/a.parquet": 2,
@@ -70,7 +70,7 @@ COMMANDS: dict[str, int] = {
     "score --generated IN/vectors/a.npy --reference IN/vectors/b.npy --permutations 9": 5,
     "score --generated IN/vectors/a.npz --reference IN/vectors/b.npz -o OUT/s.json": 4,
     "score --generated IN/vectors/a.npy --reference IN/vectors/b.npz "
-    "--labels IN/vectors/labels.csv --latex OUT/t.tex --permutations 0": 4,
+    "--labels IN/vectors/labels.csv --page OUT/t.html --permutations 0": 4,
     "score --generated IN/generated --reference IN/manifest -o OUT/s.json "
     "--companions ssim psnr --permutations 0": 4,
     "score --generated IN/manifest --reference IN/manifest --split IN/split/split.json "
