@@ -154,7 +154,9 @@ def test_a_page_a_table_and_json_are_written_whole(folders, capsys):
     Path("q.json").write_text('{"a": 1}')
     for flags in ("-o a/vision/a1.png", "-o q.json", "--page q.html"):
         assert run(capsys, "a", "b", flags)[0] == 2, flags
-    assert run(capsys, "a b --page r.html -o r.json")[0] == 2
+    assert run(capsys, "a b --page r.html -o r.md")[0] == 2
+    assert run(capsys, "a b --page r.html -o r.json")[0] == 1
+    assert json.loads(Path("r.json").read_text()) == json.loads(Path("a.json").read_text())
     assert Path("q.json").read_text() == '{"a": 1}'
 
 

@@ -9,6 +9,7 @@ import pytest
 from palpate import probe
 from palpate.cli import main
 from palpate.core import PalpateError, Split
+from palpate.data.manifest import SCHEMA
 from palpate.report.results import Results
 
 pytest.importorskip("torch")
@@ -152,7 +153,8 @@ def test_several_labels_and_rows_without_one(manifest, split, encoders):
     results = probe(table, split, encoder=encoders, label=labels, top=())
     tested = [v for v, i in zip(hard, table.ids, strict=True) if split.parts[i] == "test"]
     assert results["hardness accuracy", "real"].n == len(tested) - tested.count(None)
-    assert [note.code for note in results.notes] == ["probe-unlabeled", "probe-one-class"]
+    codes = [note.code for note in results.notes]
+    assert codes == ["recordings", "groups-few", "probe-unlabeled", "probe-one-class"]
     assert not [s for s in results if "sensor" in s.metric]
     assert results["material accuracy", "real"].n == 24
 
@@ -165,7 +167,7 @@ def test_samples_without_a_partner_are_left_out_and_counted(manifest, split, enc
     ways, kinds = ("vision by tactile", "tactile by vision"), ("top-1", "median rank")
     assert [label_of(s) for s in results] == [f"{kind} of 18 ({w})" for kind in kinds for w in ways]
     codes = [note.code for note in results.notes]
-    assert codes == ["probe-no-label", "probe-no-partner", "probe-some-partners"]
+    assert codes[2:] == ["probe-no-label", "probe-no-partner", "probe-some-partners"]
 
 
 def test_a_vision_encoder_needs_no_tactile_encoder(manifest, split):
@@ -173,6 +175,42 @@ def test_a_vision_encoder_needs_no_tactile_encoder(manifest, split):
     results = probe(manifest, split, encoder=alone, modality="vision", top=(1,))
     assert "probe-no-encoder" in {note.code for note in results.notes}
     assert results["top-1 of 24 (text by vision)", "real"].n == 24
+
+
+@pytest.mark.parametrize("named", [True, False])
+def test_what_belongs_together_is_asked_as_a_score_asks(manifest, split, encoders, named):
+    """Names show the videos; where nothing does, or they are fewer than eight, no interval."""
+    nulls = {c: pl.lit(None, SCHEMA[c]) for c in ("video", "contact", "frame")}
+    bare = with_columns(manifest, **nulls)
+    if not named:  # the same files under names that say nothing
+        ids = [chr(97 + k // 26) + chr(97 + k % 26) for k in range(len(bare))]
+        for i, path in zip(ids, manifest.paths("tactile"), strict=True):
+            (manifest.root / f"{i}.png").write_bytes(path.read_bytes())
+        paths = pl.Series([f"{i}.png" for i in ids])
+        bare = with_columns(bare, id=pl.Series(ids), tactile=paths, vision=pl.lit(None, pl.String))
+        split = Split(dict(zip(ids, map(split.parts.get, manifest.ids), strict=True)), split.rule)
+    results = probe(bare, split, encoder=encoders, top=())
+    assert all(s.interval is None for s in results)
+    codes = {note.code: note.params for note in results.notes}
+    levels = dict(codes["recordings"]["levels"])
+    if named:
+        assert levels["video"] == "file names `{video}/tactile/{frame:d}.png`"
+        assert codes["groups-few"] == {"level": "video", "count": 3, "least": 8}
+    else:
+        assert not levels
+        assert "groups-unknown" in codes
+        frames = probe(bare, split, encoder=encoders, top=(), group="frame")
+        assert all(s.interval for s in frames if s.value not in (0, 1))
+
+
+def test_what_a_split_shares_is_said(manifest, split, encoders):
+    leaking = replace(split_of(manifest, "v0"), rule={"name": "Orig"})
+    part = {i: "train" if k % 2 else "test" for k, i in enumerate(manifest.ids)}
+    results = probe(manifest, replace(leaking, parts=part), encoder=encoders, top=())
+    (note,) = [note for note in results.notes if note.code == "split-shares"]
+    assert note.params == {"name": "Orig", "group": "video", "count": 6, "of": 6}
+    codes = {note.code for note in probe(manifest, split, encoder=encoders, top=()).notes}
+    assert "split-shares" not in codes
 
 
 @pytest.mark.parametrize(

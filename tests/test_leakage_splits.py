@@ -465,6 +465,7 @@ def test_the_published_split_by_command(capsys, tmp_path, real_data):
         (["LISTS", "-o", "x", "--noleak", "hct", "--folds", "3"], "has its rule"),
         (["LISTS", "-o", "x", "--seeds", "2", "--folds", "3"], "must go without --folds"),
         (["LISTS", "-o", "x", "--seeds", "0"], "--seeds must be at least 1"),
+        (["LISTS", "-o", "s.json", "--seeds", "2"], "--output must be a folder, without the"),
         (["LISTS", "-o", "x", "--folds", "1"], "--folds must be at least 2"),
         (["LISTS", "-o", "x", "--by", "object"], "80 of 80 samples without"),
         (["LISTS", "-o", "x", "--near", "tactile"], "need tactile images"),

@@ -167,10 +167,19 @@ def test_the_split_that_lies_with_the_data_is_the_default(tag, tmp_path, capsys)
     assert main(common) == 2
     assert "--split must be given unless one lies with the data" in capsys.readouterr().err
     (tmp_path / "tag" / "splits").mkdir()
-    tag[1].save(tmp_path / "tag" / "splits" / "Orig.json")
+    shared = {i: "test" if k % 4 == 0 else "train" for k, i in enumerate(tag[1].parts)}
+    split = Split(shared, {"name": "Orig", "method": "official"})
+    split.save(tmp_path / "tag" / "splits" / "Orig.json")
     assert main([*common, "--dry-run"]) == 0
-    assert main([*common, "--json", "--epochs", "0.1"]) == 0
-    assert EncoderSet.load(tmp_path / "e").card["split"] == tag[1].digest
+    assert main([*common, "--epochs", "0.1"]) == 0
+    card = EncoderSet.load(tmp_path / "e").card
+    assert card["split"] == split.digest
+    # What the split shares is said, and stays with the model.
+    words = " ".join(capsys.readouterr().err.split())
+    assert "Videos: from the column video; contacts: from the column contact" in words
+    assert "The split 'Orig' is not NoLeak: 6 of 6 videos of its test part are in train" in words
+    assert card["split_rule"]["shared"] == {"video": [6, 6]}
+    assert '"shared": {"video": [6, 6]}' in (tmp_path / "e" / "README.md").read_text()
 
 
 def test_what_is_rejected_leaves_no_folder_and_keeps_another_run_s(tag, tmp_path):

@@ -145,7 +145,7 @@ def _check(options: Options) -> None:
     )
     if outputs.output and outputs.page:
         must, fix = "must not be a file that the page writes", "Choose another file"
-        pages = map(outputs.page.with_suffix, (".html", ".json", ".md"))
+        pages = map(outputs.page.with_suffix, (".html", ".md"))
         require(outputs.output not in pages, "output", must, str(outputs.output), fix=fix)
 
 
@@ -181,6 +181,10 @@ def _next_commands(options: Options, audit: Audit) -> list[str]:
 
 
 def _write(outputs: Outputs, audit: Audit, terminal: Terminal) -> None:
+    if outputs.page:  # first: an output that has the name of the page's own JSON stays
+        settings = {"version": __version__}
+        results = replace(audit.to_results(), commands=[terminal.command], settings=settings)
+        results.to_html(outputs.page)
     if outputs.output and outputs.output.suffix.lower() == ".csv":
         write_text(outputs.output, audit.to_frame().write_csv())
     elif outputs.output and is_table(outputs.output):
@@ -189,7 +193,3 @@ def _write(outputs: Outputs, audit: Audit, terminal: Terminal) -> None:
         write_parquet(audit.to_frame(), outputs.output, {"palpate.format": TABLE_FORMAT})
     elif outputs.output:
         audit.save(outputs.output)
-    if outputs.page:
-        settings = {"version": __version__}
-        results = replace(audit.to_results(), commands=[terminal.command], settings=settings)
-        results.to_html(outputs.page)

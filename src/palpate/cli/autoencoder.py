@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from typing import Any
 
-from palpate.cli.importing import note_samples
 from palpate.cli.terminal import Terminal, option_group
 from palpate.cli.training import Training
 
@@ -30,7 +29,7 @@ def run(options: Options, terminal: Terminal) -> dict[str, Any]:
     from palpate.diffusion.autoencoder_training import train_autoencoder
 
     model = terminal.run(train_autoencoder, **options.keywords("settings", preset=preset))
-    note_samples(terminal, options.data, model.card["split_rule"])
+    options.note_split(terminal, model.card["split_rule"])
     facts: dict[str, Any] = {"folder": str(options.output), "digest": model.digest}
     facts |= {name: model.card[name] for name in ("images", "split")}
     facts |= {f"ceiling_{name}": value for name, value in model.card.get("ceiling", {}).items()}

@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import field
 from typing import Any
 
-from palpate.cli.importing import note_samples
 from palpate.cli.terminal import Switch, Terminal, option_group
 from palpate.cli.training import EncoderMachine, Training
 
@@ -41,7 +40,7 @@ def run(options: Options, terminal: Terminal) -> dict[str, Any]:
         return options.print_plan(terminal, plan)
     encoders = terminal.run(train_encoder, **options.keywords("settings", "dry_run", preset=preset))
     card = encoders.card
-    note_samples(terminal, options.data, card["split_rule"])
+    options.note_split(terminal, card["split_rule"])
     facts: dict[str, Any] = {
         "folder": str(options.output),
         "tactile": encoders.digest("tactile"),

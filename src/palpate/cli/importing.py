@@ -6,15 +6,14 @@ folders also with ``palpate audit`` and ``palpate split``.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import tyro
 
 from palpate.cli.terminal import Common, OutPath, PathArgument, Switch, Terminal, option_group
-from palpate.core import Note, require
-from palpate.report.records import NO_LEAK
+from palpate.core import require
 
 Maps = Annotated[
     tuple[tuple[str, ...], ...],
@@ -144,17 +143,6 @@ def run(options: Options, terminal: Terminal) -> Any:
     from palpate.data import import_dataset
 
     return terminal.run(import_dataset, **options.keywords())
-
-
-def note_samples(terminal: Terminal, data: Path, rule: Mapping[str, Any]) -> None:
-    """Print what is known of recordings, and what the split of a model shares, by its rule."""
-    from palpate.data.manifest import Manifest, is_manifest
-    from palpate.data.recordings import recordings_note
-
-    if is_manifest(data):
-        terminal.note(recordings_note(Manifest.load(data)))
-    if rule.get("audit", NO_LEAK) != NO_LEAK:
-        terminal.note(Note("not-noleak", {"name": rule["name"], "verdict": rule["audit"]}))
 
 
 def columns_of(items: Sequence[Sequence[str]]) -> dict[str, str]:

@@ -5,7 +5,6 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any, Literal
 
-from palpate.cli.importing import note_samples
 from palpate.cli.terminal import Common, OptionalOutPath, Switch, Terminal, option_group
 from palpate.core import plain, require
 
@@ -65,7 +64,6 @@ def run(options: Options, terminal: Terminal) -> dict[str, Any]:
     must, fix = "An output must not replace an input", "Choose another folder"
     require(apart, None, must, str(options.output), fix=fix)
     plan = terminal.run(make, **options.keywords())
-    note_samples(terminal, options.reference, {})
     for note in plan.notes:
         terminal.note(note)
     trials = len(plan.trials)

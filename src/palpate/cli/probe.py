@@ -21,9 +21,10 @@ class Probing:
     """Whose encoder."""
     label: tuple[str, ...] = ("material",)
     """Columns to predict."""
-    group: Literal["auto", "video", "contact", "object"] = "auto"
-    """What stays together in cross-validation and intervals; `auto` takes what the split kept
-    whole, else the video."""
+    group: Literal["auto", "object", "session", "video", "contact", "frame"] = "auto"
+    """What stays together in cross-validation and intervals, as in `palpate score`: `auto` takes
+    the coarsest of eight units or more, from what the split kept whole on; `frame`: no two images
+    are of one recording."""
     top: tuple[int, ...] = (1, 5, 10)
     """Ranks within which retrieval must find a right key."""
     pool: int | None = None

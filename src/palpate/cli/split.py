@@ -140,7 +140,11 @@ def _check(options: Options, several: bool) -> None:
         )
         one = not several and bool(options.paths)
         require(one, "lists", must, got, fix="Make the split alone")
-    if not several:
+    if several:
+        must = "must be a folder, without the ending of a file, for several splits"
+        plain, got = options.output.suffix != ".json", options.output.name
+        require(plain, "output", must, got, fix=f"E.g. -o {options.output.stem}/")
+    else:
         guard_output(options.output, options.paths)
     for folder in (options.output if several else None, options.lists):
         if folder is not None:

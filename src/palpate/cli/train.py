@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import Any
 
-from palpate.cli.importing import note_samples
 from palpate.cli.terminal import Switch, Terminal, option_group
 from palpate.cli.training import Training
 from palpate.core import PalpateError, require
@@ -68,7 +67,7 @@ def run(options: Options, terminal: Terminal) -> dict[str, Any]:
         train_generator, **options.keywords("settings", "epochs", "dry_run", preset=preset)
     )
     record, loop = pipeline.training, pipeline.training["loop"]
-    note_samples(terminal, options.data, record["split_rule"])
+    options.note_split(terminal, record["split_rule"])
     facts = {
         "folder": str(options.output),
         "digest": pipeline.digest,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import field, fields
 from pathlib import Path
 from typing import Any, Literal
@@ -113,3 +114,10 @@ class Training(Common):
         rows = plan | {"seconds": f"{plan['seconds']:,.0f}"}
         terminal.facts(f"Plan of {self.output}", rows)
         return plan
+
+    def note_split(self, terminal: Terminal, rule: Mapping[str, Any]) -> None:
+        """Print what is known of recordings, and what the split of a model shares."""
+        from palpate.data.recordings import rule_notes
+
+        for note in rule_notes(rule):
+            terminal.note(note)

@@ -41,9 +41,10 @@ from palpate.core.messages import (
     track,
 )
 from palpate.core.score import Measure, Score, require_comparable
-from palpate.core.split import PARTS, Split
+from palpate.core.split import NO_LEAK, PARTS, Split
 
 __all__ = [
+    "NO_LEAK",
     "PARTS",
     "FeatureSet",
     "Measure",

@@ -24,6 +24,8 @@ from palpate.core.messages import Note, PalpateError
 from palpate.core.records import from_plain
 
 PARTS = ("train", "val", "test")
+#: The verdict of an audit by which a split is called NoLeak.
+NO_LEAK = "no leak found"
 FORMAT = "palpate-split/1"
 
 

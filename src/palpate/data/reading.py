@@ -12,6 +12,7 @@ from palpate.data.formats import Format, recognized, require_options
 from palpate.data.listing import LINE, read_list
 from palpate.data.manifest import IMAGE_COLUMNS, SCHEMA, Manifest, is_manifest
 from palpate.data.mapping import compile_maps
+from palpate.data.recordings import name_recordings
 from palpate.data.rows import manifest_rows, read_classes
 from palpate.data.scanning import Scan, finished, manifest_of, raise_if, require_some
 from palpate.data.tables import TABLES, Table, decoded, header_of, lines_of, open_table, table_of
@@ -29,7 +30,7 @@ def load(
     progress: Progress = quiet,
     **options: Any,
 ) -> Manifest:
-    """Load samples without writing anything.
+    """Load samples without writing anything, with the recordings that their names show.
 
     Args:
         source: a manifest file or the folder of an import; a frame list (``video/frame.jpg,label``
@@ -59,7 +60,7 @@ def load(
         got = f"{source}, whose images are inside videos or tables"
         fix = f"Import it first: palpate import {source} -o DIR"
         raise PalpateError("must have its images as files", got, fix, argument="source")
-    return manifest
+    return name_recordings([manifest])[0]
 
 
 def read_samples(

@@ -26,11 +26,11 @@ from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import polars as pl
 
-from palpate.core import Note
+from palpate.core import NO_LEAK, Note, Split, few, require
 from palpate.data.manifest import IMAGE_COLUMNS, PART_NAMES, SCHEMA, Manifest
 from palpate.data.templates import Fields, Template
 
@@ -55,6 +55,8 @@ SESSION_GAP = 60.0
 USUAL, LOOKED_AT = 0.95, 50_000
 #: Frames that a recording must have on average, and its numbers from first to last for each.
 FRAMES, SPREAD = 2, 100
+#: The fewest recordings a side that intervals and p-values are made of.
+LEAST = 8
 #: What equal names of two inputs mean: the same, nothing, or (auto) what their sources say.
 Identity = Literal["auto", "names", "images"]
 
@@ -70,6 +72,92 @@ def recordings_note(*manifests: Manifest) -> Note:
     every = [groups_of(m) for m in manifests]
     levels = [pair for pair in every[0] if all(pair in pairs for pairs in every[1:])]
     return Note("recordings", {"levels": [list(pair) for pair in levels]})
+
+
+def shared_groups(train: pl.DataFrame, test: pl.DataFrame) -> dict[str, tuple[int, int]]:
+    """Column -> (test groups that are in train, test groups), of those that both parts know."""
+    shared: dict[str, tuple[int, int]] = {}
+    for column in ("video", "session", "object"):
+        base, queries = (set(t[column].drop_nulls()) for t in (train, test))
+        if base and queries:
+            shared[column] = len(base & queries), len(queries)
+    return shared
+
+
+def described(manifest: Manifest, split: Split) -> Split:
+    """The split with a rule that says what is known of its samples, and what its parts share.
+
+    It travels with what is trained or probed on the split; :func:`rule_notes` reads it.
+    """
+    train, test = (manifest.part(split, part).table for part in ("train", "test"))
+    facts = {"recordings": groups_of(manifest), "shared": shared_groups(train, test)}
+    return replace(split, rule={**split.rule, **facts})
+
+
+def rule_notes(rule: Mapping[str, Any]) -> list[Note]:
+    """What is known of the samples of a :func:`described` split, and that it is no NoLeak."""
+    notes = [Note("recordings", {"levels": [list(pair) for pair in rule["recordings"]]})]
+    name, verdict = rule.get("name", "split"), rule.get("audit")
+    group = next((column for column, (count, _) in rule["shared"].items() if count), None)
+    if verdict not in (None, NO_LEAK):
+        notes.append(Note("not-noleak", {"name": name, "verdict": verdict}))
+    elif verdict is None and group is not None:
+        count, total = rule["shared"][group]
+        params = {"name": name, "group": group, "count": count, "of": total}
+        params = {"name": name, "group": group, "count": count, "of": total}
+        notes.append(Note("split-shares", params))
+    return notes
+
+
+def resampled_by(
+    tables: Sequence[pl.DataFrame], requested: str, kept: str, *, paired: bool
+) -> tuple[str, Note | None, list[Note]]:
+    """The level whose units are left out and exchanged, for intervals, tests and folds.
+
+    Samples that all sides have (pairs): the coarsest level with enough units, from what a split
+    kept whole on. Other samples: the coarsest level of which one side has units that the first has
+    not; of what both have, none is there by chance.
+
+    Args:
+        tables: what is known of each side.
+        requested: a level, ``frame`` where no two samples are of one recording, or ``auto``.
+        kept: the level that the split kept whole, if there is one.
+        paired: whether all sides have the same samples.
+
+    Returns:
+        The level; why it carries neither intervals nor p, or None; and what to know of it.
+
+    Raises:
+        PalpateError: on a level that is not known for all.
+    """
+    named = LEVELS[:-1]
+    units = {level: [{*t[level].drop_nulls()} for t in tables] for level in named}
+    levels = [level for level in named if all(units[level])]
+    must, got = "must be known for every input", f"{requested!r}, and {few(levels)} known"
+    fix = "Pass labels with that column, or the default group"
+    require(requested in ("auto", "frame", *levels), "group", must, got, fix=fix)
+    enough = [level for level, own in units.items() if min(map(len, own)) >= LEAST]
+    # What the data ask for, coarse to fine.
+    levels = [n for k, n in enumerate(levels) if not any(_cuts(t, levels[k:]) for t in tables)]
+    apart = [n for n in levels if not paired and any(own != units[n][0] for own in units[n])]
+    inner = levels[levels.index(kept) :] if paired and kept in levels else levels
+    right = [*apart, *(level for level in inner if level in enough), *inner, "frame"][0]
+    group, notes, doubt = right if requested == "auto" else requested, list[Note](), None
+    if LEVELS.index(group) > LEVELS.index(right):
+        group = group if paired else right
+        notes.append(Note("group-finer", {"group": requested, "level": right, "used": group}))
+    if group == "frame" != requested:
+        doubt = Note("groups-unknown")
+    elif group not in ("frame", *enough):
+        count = min(map(len, units[group]))
+        doubt = Note("groups-few", {"level": group, "count": count, "least": LEAST})
+    return group, doubt, notes
+
+
+def _cuts(table: pl.DataFrame, levels: Sequence[str]) -> bool:
+    """Whether a unit of a finer level is of several of the first: a video of two objects."""
+    level, *finer = levels
+    return any(len(table.select(level, n).unique()) > table[n].n_unique() for n in finer)
 
 
 def source_of(manifest: Manifest, level: str) -> str:
@@ -177,16 +265,17 @@ def name_recordings(manifests: Sequence[Manifest], template: str | None = None) 
 
 def _unread(manifest: Manifest, manifests: Sequence[Manifest], *, stated: bool) -> Manifest | None:
     """The samples without what their own names alone suggested; None if all is declared."""
-    templates = _templates(manifest)
+    templates, facts = _templates(manifest), dict(manifest.facts)
+    suggested = [c for c in LEVELS if facts.pop(f"{c}_from", None)]
     if published(manifest) or (templates and (stated or "templates" in manifest.facts)):
         return None
     if templates and all(templates == _templates(m) for m in manifests):
         return None  # they were read alike
     fields = {name for text in templates.values() for name in Template.parse(text).fields}
-    cleared = [pl.lit(None, SCHEMA[c]).alias(c) for c in LEVELS if c in fields]
+    cleared = [pl.lit(None, SCHEMA[c]).alias(c) for c in LEVELS if c in {*fields, *suggested}]
     table = manifest.table.with_columns(cleared)
     unknown = table["video"].null_count() == len(table) or (stated and PATH in table.columns)
-    return replace(manifest, table=table) if unknown else None
+    return replace(manifest, table=table, facts=facts) if unknown else None
 
 
 def _templates(manifest: Manifest) -> dict[str, str]:

@@ -48,6 +48,7 @@ from palpate.core.messages import require_rows
 from palpate.data.images import BROKEN, cached_images, load_images, opened, read_image, square
 from palpate.data.images import SUFFIXES as IMAGES
 from palpate.data.manifest import SCHEMA, Manifest, is_manifest
+from palpate.data.recordings import LEVELS, name_recordings
 from palpate.data.tables import open_table, table_of
 
 #: Decoded images of more bytes than this are kept in a file of the cache.
@@ -60,6 +61,8 @@ KINDS = (
     "a folder of images, a manifest, a folder of palpate generate, or embeddings "
     f"({', '.join(FEATURES)})"
 )
+#: What ids get to be read as names of files.
+SUFFIX = ".png"
 #: Columns that a table of labels may have, and other names of theirs.
 LABELS = ("material", "object", "session", "video", "contact")
 _NAMES = {name: name for name in ("id", *LABELS)} | {"label": "material", "group": "video"}
@@ -601,3 +604,21 @@ def labeled_as(samples: Samples, other: Samples) -> Samples:
     lacking = [c for c in LABELS if c in theirs.columns and c not in mine.columns]
     table = theirs.select("id", *lacking) if lacking and not samples.numbered else None
     return labeled(samples, table, other.source)
+
+
+def with_recordings(sets: Sequence[Samples]) -> list[Samples]:
+    """The sets with the recordings that the names of files show, or ids, read together."""
+    suffix = pl.concat_str("id", pl.lit(SUFFIX)).alias("tactile")
+    files = [s if s.rows is None else s.with_columns(suffix) for s in sets if not s.numbered]
+    manifests = iter(name_recordings([s.manifest for s in files]))
+    named = [s if s.numbered else replace(s, manifest=next(manifests)) for s in sets]
+    return [
+        s.with_columns(own.manifest.table["tactile"], *_alone(s.manifest))
+        for s, own in zip(named, sets, strict=True)
+    ]
+
+
+def _alone(manifest: Manifest) -> list[pl.Expr]:
+    """Samples whose names show no recording, where others' do, are recordings of their own."""
+    levels = [level for level in LEVELS[:-1] if f"{level}_from" in manifest.facts]
+    return [pl.col(level).fill_null(pl.col("id")) for level in levels]

@@ -34,7 +34,6 @@ from torch.nn.functional import avg_pool2d, interpolate
 from palpate.core import Progress, Split, digest_json, fields_of, quiet, require, rng_for
 from palpate.data.images import cached_images, image_stamp
 from palpate.data.manifest import Manifest
-from palpate.data.reading import load
 from palpate.diffusion.autoencoder import (
     AnyAutoencoder,
     Autoencoder,
@@ -47,7 +46,7 @@ from palpate.diffusion.options import AutoencoderOptions, BackgroundOptions
 from palpate.diffusion.presets import DiffusionPreset, preset_of
 from palpate.encoders.encoder_set import EncoderSet
 from palpate.encoders.models import pick_device
-from palpate.encoders.rows import load_split, train_part
+from palpate.encoders.rows import load_samples, train_part
 from palpate.training.engine import Batch, Losses, Task, fit
 from palpate.training.options import Compute, LoopOptions
 from palpate.training.processes import first_alone, gather_rows
@@ -109,7 +108,7 @@ def train_autoencoder(
     assert options is not None
     with run_for(output, seed, device, compute, progress) as run:
         judge = judge_of(judge, run.device)
-        manifest, split = load(data), load_split(data, split)
+        manifest, split = load_samples(data, split)
         if start is not None and not isinstance(start, AnyAutoencoder):
             start = load_autoencoder(start)
         model = autoencoder_of(

@@ -20,7 +20,6 @@ from palpate._version import __version__
 from palpate.core import PalpateError, Progress, Split, digest_json, digest_lines, quiet, require
 from palpate.data.images import cached_images, image_stamp
 from palpate.data.manifest import Manifest
-from palpate.data.reading import load
 from palpate.diffusion.autoencoder import (
     AnyAutoencoder,
     BackgroundAutoencoder,
@@ -40,7 +39,7 @@ from palpate.diffusion.unet import find_unet
 from palpate.encoders.embed import texts_of
 from palpate.encoders.encoder_set import EncoderSet, load_clip
 from palpate.encoders.models import is_hub_id, pick_device
-from palpate.encoders.rows import load_split, train_part
+from palpate.encoders.rows import load_samples, train_part
 from palpate.training.options import Compute
 from palpate.training.processes import connect, first_alone, place
 from palpate.training.run import TrainingRun, estimate, run_for
@@ -130,7 +129,7 @@ def train_generator(  # noqa: PLR0913 - a public verb
     require(fits, "autoencoder", must, "none", fix="Pass a folder or a file")
     with run_for(output, seed, device, compute, progress) as run:
         judge = judge_of(judge, run.device)
-        manifest, split = load(data), load_split(data, split)
+        manifest, split = load_samples(data, split)
         encoders = load_clip(clip) if isinstance(clip, str | Path) else clip
         needed = _policy(chosen, encoders).modalities
         missing = [m for m in needed if encoders is None or m not in encoders.modalities]
@@ -194,7 +193,7 @@ def plan_generator(
     """
     begin = None if start is None else TactilePipeline.from_pretrained(start)
     chosen = _preset(preset, begin)
-    train = train_part(load(data), load_split(data, split))
+    train = train_part(*load_samples(data, split))
     policy = _policy(chosen, None if clip is None else load_clip(clip))
     if autoencoder is not None:
         code = load_autoencoder(autoencoder)

@@ -30,7 +30,6 @@ from palpate._version import __version__
 from palpate.core import Progress, Split, digest_json, digest_lines, fields_of, quiet, require
 from palpate.data.images import CLIP_MEAN, CLIP_STD, Preprocess, cached_images, image_stamp
 from palpate.data.manifest import Manifest
-from palpate.data.reading import load
 from palpate.encoders.embed import embed, texts_of
 from palpate.encoders.encoder_set import (
     EncoderSet,
@@ -55,7 +54,7 @@ from palpate.encoders.rows import (
     Rows,
     augmented,
     draw,
-    load_split,
+    load_samples,
     numbers,
     train_part,
     unit,
@@ -114,7 +113,7 @@ def train_encoder(
         PalpateError: if the train part is empty, or a sample of it lacks an image.
     """
     chosen = preset_of(preset, epochs)
-    manifest, split = load(data), load_split(data, split)
+    manifest, split = load_samples(data, split)
     with run_for(output, seed, device, compute, progress) as run:
         source = clip or chosen.pretrained
         if source is None:
@@ -155,8 +154,8 @@ def plan_encoder(
     Returns:
         see :func:`palpate.training.run.estimate`.
     """
-    chosen, split = preset_of(preset, epochs), load_split(data, split)
-    train = train_part(load(data), split)
+    chosen = preset_of(preset, epochs)
+    train = train_part(*load_samples(data, split))
 
     def forward(model: nn.Module, rows: int, where: torch.device) -> Tensor:
         return encode_tactile(model, torch.zeros(rows, 3, chosen.image, chosen.image, device=where))

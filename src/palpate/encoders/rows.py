@@ -14,6 +14,8 @@ from torch.nn.functional import affine_grid, grid_sample
 from palpate.core import Progress, Split, quiet, require
 from palpate.data.images import Preprocess, cached_images
 from palpate.data.manifest import Manifest
+from palpate.data.reading import load
+from palpate.data.recordings import described
 from palpate.encoders.embed import embed, texts_of
 from palpate.encoders.encoder_set import EncoderSet
 from palpate.encoders.presets import Augment
@@ -21,19 +23,25 @@ from palpate.training.engine import Batch
 from palpate.training.steps import Step
 
 
-def load_split(data: Manifest | str | Path, split: Split | str | Path | None = None) -> Split:
-    """A split as it is, or from its file, or the only one that lies with the data.
+def load_samples(
+    data: Manifest | str | Path, split: Split | str | Path | None = None
+) -> tuple[Manifest, Split]:
+    """Samples, and a split of them: as it is, from its file, or the only one that lies with them.
+
+    Returns:
+        Both; the split's rule says what train and test share, so that every model carries it.
 
     Raises:
-        PalpateError: if there is none with the data, or several.
+        PalpateError: if there is no split with the data, or several.
     """
-    if split is not None:
-        return Split.load(split)
-    files = sorted(Path(data).glob("splits/*.json")) if isinstance(data, str | Path) else []
-    must, fix = "must be given unless one lies with the data", "Make one with: palpate split"
-    got = ", ".join(path.name for path in files) or "none there"
-    require(len(files) == 1, "split", must, got, fix=fix)
-    return Split.load(files[0])
+    if split is None:
+        files = sorted(Path(data).glob("splits/*.json")) if isinstance(data, str | Path) else []
+        must, fix = "must be given unless one lies with the data", "Make one with: palpate split"
+        got = ", ".join(path.name for path in files) or "none there"
+        require(len(files) == 1, "split", must, got, fix=fix)
+        split = files[0]
+    manifest = load(data)
+    return manifest, described(manifest, Split.load(split))
 
 
 def train_part(manifest: Manifest, split: Split) -> Manifest:

@@ -30,6 +30,8 @@ from palpate.core import (
 )
 from palpate.core.features import is_missing
 from palpate.core.files import canonical_json
+from palpate.data.recordings import described, resampled_by, rule_notes
+from palpate.metrics.intervals import without_interval
 from palpate.metrics.means import Mean, over_seeds
 from palpate.metrics.paired import differences_of_means
 from palpate.metrics.probe import class_accuracies
@@ -54,7 +56,8 @@ class Plan:
 
     Attributes: see :func:`probe`; ``pools`` are the test samples that every split has of each
     other modality; ``axis`` is what several subjects differ in (``encoder``, ``split``), '' for
-    one; ``trained`` if an encoder was trained for each split.
+    one; ``trained`` if an encoder was trained for each split; ``sure`` if it is known what belongs
+    together; ``notes`` say so.
     """
 
     modality: Modality = "tactile"
@@ -68,6 +71,8 @@ class Plan:
     axis: str = ""
     trained: bool = False
     pools: Mapping[str, int] = field(default_factory=dict[str, int])
+    sure: bool = True
+    notes: Sequence[Note] = ()
 
     @property
     def settings(self) -> dict[str, Any]:
@@ -112,8 +117,10 @@ def probe(  # noqa: PLR0913 - one argument a choice
         modality: whose encoder.
         label: columns to predict; those that the data lack, or that have one value in train, are
             left out, with a note.
-        group: column whose values stay together in cross-validation and intervals; ``auto`` takes
-            what the split kept whole, else the video.
+        group: level whose units stay together in cross-validation and intervals, as in
+            :func:`palpate.score`: ``auto`` takes the coarsest with eight units or more, from what
+            the split kept whole on. Where nothing is known, or units are fewer, there are no
+            intervals.
         top: ranks within which retrieval must find a right key; none skips retrieval.
         pool: rank among so many test samples drawn at random. Default: all, and under several
             splits as many as the smallest test part has.
@@ -176,8 +183,12 @@ def plan_of(manifest: Manifest, splits: Mapping[str, Split], plan: Plan) -> Plan
     for name in labels:
         manifest.column(name)  # raises for a column that is not there
     require(min(plan.top, default=1) >= 1, "top", "must be ranks from 1", [*plan.top])
-    groups = {str(split.rule.get("group", "video")) for split in splits.values()}
-    group = plan.group if plan.group != "auto" else groups.pop() if len(groups) == 1 else "video"
+    kept = {str(split.rule["group"]) for split in splits.values() if "group" in split.rule}
+    parts = [manifest.part(s, part).table for s in splits.values() for part in ("train", "test")]
+    parts = [table for table in parts if len(table)]
+    only = kept.pop() if len(kept) == 1 else ""
+    group, doubt, notes = resampled_by(parts, plan.group, only, paired=True)
+    notes += [n for s in splits.values() for n in rule_notes(described(manifest, s).rule)]
     sizes = [len(split.ids("test")) for split in splits.values()]
     must = f"must lie in 2 to {min(sizes)}, the number of test samples"
     require(plan.pool is None or 2 <= plan.pool <= min(sizes), "pool", must, plan.pool)
@@ -187,7 +198,15 @@ def plan_of(manifest: Manifest, splits: Mapping[str, Split], plan: Plan) -> Plan
     tests = [test.take(_with(test, plan.modality)) for test in tests]
     counts = {other: [len(_with(test, other)) for test in tests] for other in _others(plan)}
     pools = {other: min((n for n in ns if n > 1), default=0) for other, ns in counts.items()}
-    return replace(plan, label=labels, top=tuple(plan.top), group=group, pools=pools)
+    return replace(
+        plan,
+        label=labels,
+        top=tuple(plan.top),
+        group=group,
+        pools=pools,
+        sure=doubt is None,
+        notes=[*notes, *filter(None, [doubt])],
+    )
 
 
 def measure(
@@ -209,7 +228,8 @@ def measure(
     from palpate.encoders.guard import guard
 
     folder = None if cache is None else Path(cache)
-    embedded = partial(embed, groups=plan.group, cache=folder, progress=progress)
+    groups = "id" if plan.group == "frame" else plan.group
+    embedded = partial(embed, groups=groups, cache=folder, progress=progress)
     seen = partial(guard, split=split, allow_seen=plan.allow_seen, progress=progress)
     parts = [manifest.part(split, part) for part in ("train", "test")]
     count = sum(map(len, parts))
@@ -343,7 +363,10 @@ def results_of(
         scores += [median for run in seeds if single for median in run.medians]
     differences = [d for sets in by_measure.values() for d in differences_of_means(sets)]
     all_runs = [run for seeds in runs.values() for run in seeds]
-    notes = list({canonical_json(note): note for run in all_runs for note in run.notes}.values())
+    scores = [*scores, *differences]
+    scores = scores if plan.sure else [without_interval(s) for s in scores]
+    every = [*plan.notes, *(note for run in all_runs for note in run.notes)]
+    notes = list({canonical_json(note): note for note in every}.values())
     names = ("modality", "label", "group", "top", "pool", "text_threshold", "seed")
     digests = {"manifest": manifest.digest}
     digests |= {
@@ -352,8 +375,8 @@ def results_of(
     rules = {name: dict(s.rule) for name, s in splits.items()}
     return Results(
         title=title,
-        facts=[_drop(d) for d in differences if plan.axis == "split"],
-        scores=[*scores, *differences],
+        facts=[_drop(d) for d in scores if plan.axis == "split" and d.b is not None],
+        scores=scores,
         strips=[strip for seeds in runs.values() for strip in seeds[0].strips],
         notes=notes,
         settings={

@@ -12,7 +12,7 @@ an error: scores of some of the samples would pass for scores of all.
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import replace
 from functools import partial
@@ -21,11 +21,11 @@ from typing import Any, Literal
 
 import polars as pl
 
-from palpate.core import Note, Progress, Score, Split, few, quiet, require, rng_for
+from palpate.core import Note, Progress, Score, Split, quiet, require, rng_for
 from palpate.core.messages import require_rows
-from palpate.data.manifest import Manifest
-from palpate.data.recordings import LEVELS, name_recordings, source_of
+from palpate.data.recordings import resampled_by, source_of
 from palpate.data.samples import (
+    SUFFIX,
     Samples,
     labeled,
     labeled_as,
@@ -34,6 +34,7 @@ from palpate.data.samples import (
     read_labels,
     read_samples,
     with_full_ids,
+    with_recordings,
 )
 from palpate.evaluation.clusters import clustered, of_clusters
 from palpate.evaluation.controls import (
@@ -57,16 +58,13 @@ from palpate.evaluation.scorers import (
     tmmd_family,
 )
 from palpate.metrics.inputs import require_same_ids
+from palpate.metrics.intervals import without_interval
 from palpate.report.labels import measured
 from palpate.report.records import GalleryItem
 from palpate.report.results import OBJECT, PATH, Call, Results
 
 #: Rows of the gallery.
 GALLERY = 40
-#: The fewest recordings a side that intervals and p-values are made of.
-LEAST = 8
-#: What ids get to be read as names of files.
-SUFFIX = ".png"
 
 
 def score(  # noqa: PLR0913
@@ -207,7 +205,7 @@ def score(  # noqa: PLR0913
         scorers += [memorized] * (bench.seen is not None)
         scores = [s for scorer in scorers for s in scorer(bench)]
         scores = of_clusters(scores, clusters, origin) if clusters else scores
-        scores = scores if bench.sure else [_without_intervals(s) for s in scores]
+        scores = scores if bench.sure else [without_interval(s) for s in scores]
         settings = _settings(bench, scores)
     if images:
         digest = settings["digests"][REFERENCE]
@@ -261,7 +259,7 @@ def aligned(bench: Bench, labels: Any, split: Split | None, group: str) -> Bench
     if real.numbered:  # row k of a generator is not row k of the reference
         real = real.with_columns(pl.Series("id", [f"{REFERENCE} {i}" for i in real.ids]))
     generators = {name: labeled_as(samples, real) for name, samples in generators.items()}
-    real, *made = _with_names_read([real, *generators.values()])
+    real, *made = with_recordings([real, *generators.values()])
     generators, train = dict(zip(generators, made, strict=True)), None
     if split is not None:
         everything, (real, train) = real, _parts(real, split)
@@ -278,65 +276,20 @@ def aligned(bench: Bench, labels: Any, split: Split | None, group: str) -> Bench
     return _with_groups(bench, group, str(split.rule.get("group")) if split else "")
 
 
-def _with_names_read(sets: Sequence[Samples]) -> list[Samples]:
-    """The sets with the recordings that the names of files show, or ids, read together."""
-    suffix = pl.concat_str("id", pl.lit(SUFFIX)).alias("tactile")
-    files = [s if s.rows is None else s.with_columns(suffix) for s in sets if not s.numbered]
-    manifests = iter(name_recordings([s.manifest for s in files]))
-    named = [s if s.numbered else replace(s, manifest=next(manifests)) for s in sets]
-    return [
-        s.with_columns(own.manifest.table["tactile"], *_alone(s.manifest))
-        for s, own in zip(named, sets, strict=True)
-    ]
-
-
-def _alone(manifest: Manifest) -> Iterator[pl.Expr]:
-    """Samples whose names show no recording, where others' do, are recordings of their own."""
-    for level in LEVELS[:-1]:
-        if f"{level}_from" in manifest.facts:
-            yield pl.col(level).fill_null(pl.col("id"))
-
-
 def _with_groups(bench: Bench, requested: str, kept: str) -> Bench:
     """The samples with what stays together, and what a reader must know of it.
-
-    Samples that both sides have (pairs): the coarsest level with enough units, from what a split
-    kept whole on. Other samples: the coarsest level of which one side has units that the other has
-    not; of what both have, none is there by chance.
 
     Raises:
         PalpateError: on a level that is not known for all.
     """
-    real, notes = bench.reference, bench.notes
-    sets = [real, *bench.generators.values()]
-    levels = [level for level in LEVELS[:-1] if all(s.column(level) for s in sets)]
-    must, got = "must be known for every input", f"{requested!r}, and {few(levels)} known"
-    fix = "Pass labels with that column, or the default group"
-    require(requested in ("auto", "frame", *levels), "group", must, got, fix=fix)
-    units = {level: [{*(s.column(level) or ())} for s in sets] for level in LEVELS[:-1]}
-    enough = [level for level, own in units.items() if min(map(len, own)) >= LEAST]
-    # What the data ask for, coarse to fine.
-    levels = [
-        n for k, n in enumerate(levels) if not any(_cuts(s, n, levels[k + 1 :]) for s in sets)
-    ]
-    paired = all({*s.ids} <= {*real.ids} for s in bench.generators.values())
-    apart = [n for n in levels if not paired and any(own != units[n][0] for own in units[n])]
-    inner = levels[levels.index(kept) :] if paired and kept in levels else levels
-    right = [*apart, *(level for level in inner if level in enough), *inner, "frame"][0]
-    group = right if requested == "auto" else requested
-    if LEVELS.index(group) > LEVELS.index(right):
-        group = group if paired else right
-        notes.append(Note("group-finer", {"group": requested, "level": right, "used": group}))
-    doubt = None
-    if group == "frame" != requested:
-        doubt = Note("groups-unknown")
-    elif group not in ("frame", *enough):
-        count = min(map(len, units[group]))
-        doubt = Note("groups-few", {"level": group, "count": count, "least": LEAST})
+    real, sets = bench.reference, bench.generators.values()
+    paired = all({*s.ids} <= {*real.ids} for s in sets)
+    tables = [s.manifest.table for s in (real, *sets)]
+    group, doubt, notes = resampled_by(tables, requested, kept, paired=paired)
     if group != "frame":
         source = source_of(real.manifest, group).replace(f"{SUFFIX}`", "`")
         notes.append(Note("groups", {"level": group, "source": source}))
-    notes += filter(None, [doubt])
+    bench.notes.extend([*notes, *filter(None, [doubt])])
     return replace(
         bench,
         generators={name: replace(s, group=group) for name, s in bench.generators.items()},
@@ -346,22 +299,6 @@ def _with_groups(bench: Bench, requested: str, kept: str) -> Bench:
         permutations=bench.permutations if doubt is None else 0,
         sure=doubt is None,
     )
-
-
-def _cuts(samples: Samples, level: str, finer: Sequence[str]) -> bool:
-    """Whether a unit of a finer level is of several of this one: a video that shows two objects."""
-    table = samples.manifest.table
-    return any(len(table.select(level, n).unique()) > table[n].n_unique() for n in finer)
-
-
-def _without_intervals(score: Score) -> Score:
-    """A score whose spread nobody knows: its value alone."""
-    uncertain = ("interval", "p_value", "p_better", "p_adjusted", "p_difference")
-    gone = [name for name in score.details if name.endswith(uncertain)]
-    details = {**score.details, **dict.fromkeys(gone)}
-    details |= {"decided": False} if "decided" in details else {}
-    kept = [note for note in score.notes if note.code != "independent-samples"]
-    return replace(score, interval=None, interval_method="", details=details, notes=kept)
 
 
 def _require_one_kind(sets: Sequence[Samples]) -> None:

@@ -22,8 +22,14 @@ from numpy.typing import NDArray
 
 from palpate.core import Note, PalpateError, Progress, Split, few, quiet, require, require_choice
 from palpate.data.manifest import MODALITIES, Manifest
-from palpate.data.recordings import Identity, is_sequence, number_contacts, same_names
-from palpate.leakage.groups import GROUPS, shared_groups
+from palpate.data.recordings import (
+    Identity,
+    is_sequence,
+    number_contacts,
+    same_names,
+    shared_groups,
+)
+from palpate.leakage.groups import GROUPS
 from palpate.leakage.inputs import Data, Source, read_all, rename_unrelated
 from palpate.leakage.questions import LARGEST, NO_GROUP, questions
 from palpate.leakage.signals import (

@@ -86,16 +86,6 @@ def _lacks(table: pl.DataFrame, column: str, parts: int) -> Note | None:
     return Note("group-materials", params | {"materials": materials.height})
 
 
-def shared_groups(train: pl.DataFrame, test: pl.DataFrame) -> dict[str, tuple[int, int]]:
-    """Column -> (test groups that are in train, test groups), of those that both parts know."""
-    shared: dict[str, tuple[int, int]] = {}
-    for column in ("video", "session", "object"):
-        base, queries = (set(t[column].drop_nulls()) for t in (train, test))
-        if base and queries:
-            shared[column] = len(base & queries), len(queries)
-    return shared
-
-
 def components(manifest: Manifest, by: Sequence[str], links: Sequence[Ints] = ()) -> list[str]:
     """The group of each sample.
 

@@ -442,3 +442,13 @@ def _studentized(second: Array, sums: PairSums, unit: Any, estimator: str) -> tu
     drift = without - without.mean(axis=1, keepdims=True)
     error = np.sqrt((units - 1) / units * (drift**2).sum(axis=1))
     return value, np.where(error > 0, error, np.nan)
+
+
+def without_interval(score: Score) -> Score:
+    """A score whose spread nobody knows: its value alone."""
+    uncertain = ("interval", "p_value", "p_better", "p_adjusted", "p_difference")
+    gone = [name for name in score.details if name.endswith(uncertain)]
+    details = {**score.details, **dict.fromkeys(gone)}
+    details |= {"decided": False} if "decided" in details else {}
+    kept = [note for note in score.notes if note.code != "independent-samples"]
+    return replace(score, interval=None, interval_method="", details=details, notes=kept)

@@ -19,6 +19,7 @@ from PIL import Image, ImageFilter
 
 from palpate.core import Note, Progress, require, track
 from palpate.data.images import read_image, square
+from palpate.data.recordings import recordings_note
 from palpate.data.samples import (
     Samples,
     labeled,
@@ -26,6 +27,7 @@ from palpate.data.samples import (
     read_labels,
     read_samples,
     with_full_ids,
+    with_recordings,
 )
 from palpate.preference.plan import COPY, EXAMPLE, GEL, REFERENCE, SAME, Item, Plan
 
@@ -58,6 +60,8 @@ def read_sources(
     reserved = (REFERENCE, GEL, COPY, EXAMPLE, SAME)
     sources = named_sources(generated, names, reserved).items()
     methods = {name: with_full_ids(_files(read_samples(s, name)), real.ids) for name, s in sources}
+    real, *named = with_recordings([real, *methods.values()])
+    methods = dict(zip(methods, named, strict=True))
     ids = {name: {*samples.ids} for name, samples in methods.items()}
     every = {*real.ids}
     common = every.intersection(*ids.values())
@@ -66,7 +70,8 @@ def read_sources(
     fix = "Ids are paths below each folder, without suffix: give them equal names"
     must = "Methods must have images of the reference's ids"
     require(bool(common), None, must, got, fix=fix)
-    notes = [
+    notes = [recordings_note(real.manifest)]
+    notes += [
         Note("items-left-out", {"name": n, "missing": len(every - i), "unknown": len(i - every)})
         for n, i in ids.items()
         if i != every

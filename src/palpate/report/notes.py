@@ -330,6 +330,10 @@ LEAKAGE: dict[str, Sentence] = {
     "samples-in-no-part": "{count} of {of} samples of the manifest are in no part of the split",
     "signal-not-counted": "Reported, but not counted as a leak: the audit is not by {group}",
     "signal-nulls": "{count} {part} samples have no {group}: nothing is known of them",
+    "split-shares": (
+        "The split {name!r} is not NoLeak: {count} of {of} {group}s of its test part are in train, "
+        "so a model that is trained on it has seen them"
+    ),
     "split-of-other-manifest": "The split was made for another manifest (the digests differ)",
     "threshold-order": (
         f"{_THRESHOLD}far from them in the order of the files, as no videos are known "
@@ -440,8 +444,8 @@ EVALUATION: dict[str, Sentence] = {
     ),
     "groups-unknown": (
         "No intervals and no p: nothing says which images are of one recording, and frames of one "
-        "are nearly copies. Name files <video>_<frame>, give a table with id and video by "
-        "{arg:labels=videos.csv}, or say that no two belong together by {arg:group=frame}"
+        "are nearly copies. Name files <video>_<frame>, give a table with id and video (of scores "
+        "{arg:labels=videos.csv}), or say that no two belong together by {arg:group=frame}"
     ),
     "verdict-of-two": _verdict_of_two,
     "no-pairs": (

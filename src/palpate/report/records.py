@@ -10,12 +10,12 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
-from palpate.core import Note, SampleRef, Score
+from palpate.core import NO_LEAK, Note, SampleRef, Score
 
 #: Why two images are similar. Only ``content`` is a leak.
 CAUSES = ("content", "nothing touched")
 #: The verdicts on a question and on a split, from worst to best.
-LEAKS, CANNOT_TELL, NO_LEAK = "leaks", "cannot tell", "no leak found"
+LEAKS, CANNOT_TELL = "leaks", "cannot tell"
 VERDICTS = (LEAKS, CANNOT_TELL, NO_LEAK)
 Verdict = Literal["holds", "does not hold", "undecided"]
 
