@@ -50,7 +50,7 @@ def test_a_photo_becomes_an_image_with_a_notice(place, capsys):
 def test_a_dry_run_is_one_line_and_writes_nothing(place, capsys):
     dry = ("photos", "-o", "a", "--guidance", "1", "--steps", "3", "--dry-run")
     status, out, _ = call(capsys, *dry)
-    assert (status, out) == (0, "2 images to make, 6 network evaluations\n")
+    assert (status, out) == (0, "2 images to make, 6 passes through the network\n")
     assert not (place / "a").exists()
     assert call(capsys, *dry[:-1], "-q")[0] == 0
     for path in (place / "a" / "images").glob("a_*"):

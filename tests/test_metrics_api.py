@@ -10,7 +10,7 @@ import pytest
 from palpate import metrics
 from palpate.core import FeatureSet
 from palpate.metrics import cmmd, fid, kid, prdc, tmmd
-from palpate.report.notes import SENTENCES
+from palpate.report.note_texts import SENTENCES
 
 TWO_SETS, ONE_SET = "generated, reference, **options", "generated, **options"
 IMAGES = "generated, reference"

@@ -1,4 +1,7 @@
-"""Captions: what each touch feels like in words, by a vision-language model, and their check."""
+"""Captions: what each touch feels like in words, by a vision-language model, and their check.
+
+Names are imported on first use; importing this package loads no client of a server.
+"""
 
 from __future__ import annotations
 
@@ -12,7 +15,8 @@ if TYPE_CHECKING:
     from palpate.captions.checking import check_captions
     from palpate.captions.prompts import Prompt
 
-#: Public name -> its module, imported on first use.
+__all__ = ["Captions", "Estimate", "Prompt", "StoppedError", "caption", "check_captions"]
+#: Public name -> the module that it is imported from.
 _MODULES = {
     "Captions": "captioning",
     "Estimate": "captioning",
@@ -21,7 +25,5 @@ _MODULES = {
     "caption": "captioning",
     "check_captions": "checking",
 }
-
-__all__ = ["Captions", "Estimate", "Prompt", "StoppedError", "caption", "check_captions"]
 
 __getattr__ = partial(import_name, __name__, _MODULES)

@@ -1,10 +1,15 @@
 """Do captions give labels away, and can they be used?
 
-Shares of captions, each caption of a contact counted once: those that name their label (with
-inflections and synonyms) or any material, with words that no finger feels, with digits, refusals,
-empty, overlong, the commonest text, and test captions that train has word for word. And how well
-the material is predicted from the text alone on new videos: a bag of words, logistic regression,
-five folds over whole videos, with and without the names of materials.
+A caption should describe what is felt without naming the material: a generator or encoder trained
+on names learns the label instead of the touch. Two kinds of scores say how far that holds:
+
+* *Shares of captions*, each text of a contact counted once: those that name their label (with
+  inflections and synonyms) or any material, with words for what no finger feels (``visual words``),
+  with digits, refusals, empty, overlong, the commonest text, and test captions that train has word
+  for word.
+* *Accuracy of the material from the text alone* on new videos, by a bag of words and logistic
+  regression, five folds over whole videos: as it is, and with the names of materials masked. Near 1
+  with masked names, the text is a code of the label in other words.
 """
 
 from __future__ import annotations
@@ -40,18 +45,22 @@ from palpate.metrics.means import mean_of
 from palpate.metrics.probe import fit_probe
 from palpate.report.results import Call, Results
 
-#: Words from which a caption is overlong.
-LONGEST = 40
-#: Share of captions with one text from which that is worth a note, and accuracy without names from
-#: which the text is a code of the label.
-COMMON, CODE = 0.05, 0.9
+#: A caption of more words is overlong.
+MOST_WORDS = 40
+#: A text that more than this share of the captions have is worth a note.
+COMMON = 0.05
+#: Above this accuracy without the names of materials, the text is a code of the label.
+CODE = 0.9
+#: The predictor of materials: folds over videos, L2 penalty, commonest words in the bag.
 FOLDS, PENALTY, WORDS = 5, 1e-2, 500
 SETTINGS = {"words": WORDS, "penalty": PENALTY, "folds": FOLDS}
-SHOWN_WORDS = 12
+#: Words of a share that are kept in its details.
+LISTED_WORDS = 12
+#: Metric of the shares, and the subjects of some.
 SHARE, FLAGGED, NAMING = "share of captions", "flagged", "naming a material"
 LABEL, VISUAL = "naming their label", "visual words"
 #: Shares whose words a note lists.
-LISTED = (NAMING, LABEL, VISUAL)
+WITH_WORDS = (NAMING, LABEL, VISUAL)
 
 
 def check_captions(
@@ -88,9 +97,9 @@ def check_captions(
     split = None if split is None else Split.load(split)
     rows = _rows(manifest, flags, split)
     vocabulary = Vocabulary(sorted({*rows["label"]} - {""}))
-    scores, notes = _shares(rows, vocabulary), list[Note]()
+    scores, notes = _faults(rows, vocabulary), list[Note]()
     if split is not None:
-        scores.append(_shared(rows))
+        scores.append(_copied(rows))
     if not any(rows["label"]):
         notes.append(Note("captions-no-labels"))
     else:
@@ -142,7 +151,7 @@ def _read(
 
 
 def _rows(manifest: Manifest, flags: dict[str, list[str]], split: Split | None) -> pl.DataFrame:
-    """Captions, one a contact and text.
+    """A row for each different text of a contact.
 
     Returns:
         ``text``, ``label`` and ``part`` of the split, ``""`` for none; ``group``, the recording;
@@ -162,18 +171,21 @@ def _rows(manifest: Manifest, flags: dict[str, list[str]], split: Split | None) 
     )
 
 
-def _shares(rows: pl.DataFrame, vocabulary: Vocabulary) -> list[Score]:
-    """Shares of captions that have something wrong; the union of most comes first."""
-    kinds: dict[str, Callable[[str], Sequence[str]]] = {
+def _faults(rows: pl.DataFrame, vocabulary: Vocabulary) -> list[Score]:
+    """The share of captions with each fault; first of those with any but naming a material.
+
+    Naming another material than its own gives no label away.
+    """
+    words_by_fault: dict[str, Callable[[str], Sequence[str]]] = {
         NAMING: vocabulary.naming,
         VISUAL: visual_in,
         "digits": lambda text: [c for c in text if c.isdigit()],
         "refusals": lambda text: ["refusal"] if REFUSAL.search(text) else [],
         "empty": lambda text: [] if text else ["empty"],
-        f"over {LONGEST} words": lambda text: ["long"] * (len(words_of(text)) > LONGEST),
+        f"over {MOST_WORDS} words": lambda text: ["long"] * (len(words_of(text)) > MOST_WORDS),
     }
     texts, labels = rows["text"].to_list(), rows["label"].to_list()
-    hits = {name: [function(text) for text in texts] for name, function in kinds.items()}
+    hits = {name: [function(text) for text in texts] for name, function in words_by_fault.items()}
     if any(labels):
         pairs = zip(texts, labels, strict=True)
         named = [vocabulary.naming(text, label) if label else [] for text, label in pairs]
@@ -182,25 +194,25 @@ def _shares(rows: pl.DataFrame, vocabulary: Vocabulary) -> list[Score]:
     hits["refusals"] = [words or ["refusal"] * refused for words, refused in pairs]
     counted = [words for name, words in hits.items() if name != NAMING]
     flagged = [[word for words in row for word in words] for row in zip(*counted, strict=True)]
-    scores = [_share(name, words, rows) for name, words in {FLAGGED: flagged, **hits}.items()]
+    scores = [_share_of(name, words, rows) for name, words in {FLAGGED: flagged, **hits}.items()]
     text, count = Counter(texts).most_common(1)[0]
-    common = _share("the commonest text", [[t] * (t == text) for t in texts], rows)
+    common = _share_of("the commonest text", [[t] * (t == text) for t in texts], rows)
     if count > max(1, COMMON * len(texts)) and text:
         common = replace(common, notes=[Note("captions-common", {"text": text, "count": count})])
     return [*scores, common]
 
 
-def _share(name: str, words: Sequence[Sequence[str]], rows: pl.DataFrame) -> Score:
+def _share_of(name: str, words: Sequence[Sequence[str]], rows: pl.DataFrame) -> Score:
     """The share of captions with words of a kind, and those words."""
     hits = np.array([bool(row) for row in words])
     score = mean_of(SHARE, hits, rows["group"].to_list(), estimator="mean", subject=name).score
     counts = Counter(word for row in words for word in set(row))
-    listed = dict(counts.most_common(SHOWN_WORDS))
-    notes = [Note("captions-words", {"words": listed})] if name in LISTED and listed else []
+    listed = dict(counts.most_common(LISTED_WORDS))
+    notes = [Note("captions-words", {"words": listed})] if name in WITH_WORDS and listed else []
     return replace(score, higher_is_better=False, details={"words": listed}, notes=notes)
 
 
-def _shared(rows: pl.DataFrame) -> Score:
+def _copied(rows: pl.DataFrame) -> Score:
     """The share of test captions that train has word for word."""
     train, test = (rows.filter(pl.col("part") == part) for part in ("train", "test"))
     texts = {text.lower() for text in train["text"] if text}
@@ -208,7 +220,7 @@ def _shared(rows: pl.DataFrame) -> Score:
     both = bool(texts) and len(test) > 0
     require(both, "split", must, got, fix="Use the split of these samples")
     words = [[text] * (text.lower() in texts) for text in test["text"]]
-    return _share("test captions that train has", words, test)
+    return _share_of("test captions that train has", words, test)
 
 
 def _accuracies(
@@ -219,14 +231,13 @@ def _accuracies(
     labels, groups, lines = (rows[name].to_list() for name in ("label", "group", "text"))
     names, number = np.unique(np.array(groups), return_inverse=True)
     if len(names) < 2 * FOLDS or len(set(labels)) < 2:
-        few = Note("captions-few", {"groups": len(names), "materials": len(set(labels))})
-        return [], [few]
+        return [], [Note("captions-few", {"groups": len(names), "materials": len(set(labels))})]
     fold = np.argsort(rng_for(seed, "caption folds").permutation(len(names)))[number] % FOLDS
     masked = [vocabulary.masked(text) for text in lines]
     predicted: dict[str, NDArray[Any]] = {}
     texts = {"text": lines, "text without names of materials": masked}
-    for subject, used in track(list(texts.items()), "predicting materials from texts", progress):
-        predicted[subject] = _predicted(used, labels, groups, fold)
+    for subject, each in track(list(texts.items()), "predicting materials from texts", progress):
+        predicted[subject] = _predicted(each, labels, groups, fold)
     predicted["commonest material"] = _majority(labels, fold)
     scores: list[Score] = []
     for subject, materials in predicted.items():
@@ -236,8 +247,8 @@ def _accuracies(
             metric, hits, groups, subject=subject, estimator="mean", settings=settings, seed=seed
         )
         scores.append(replace(result.score, higher_is_better=False))
-    bare = scores[1].value or 0.0
-    notes = [Note("captions-code", {"accuracy": bare})] if bare > CODE else []
+    without_names = scores[1].value or 0.0
+    notes = [Note("captions-code", {"accuracy": without_names})] if without_names > CODE else []
     return [replace(scores[0], notes=notes), *scores[1:]], []
 
 

@@ -1,10 +1,10 @@
 """Any server that speaks the OpenAI-compatible protocol: ``POST URL/chat/completions``.
 
 Structured output is requested by the top-level ``response_format`` alone, which vLLM, SGLang,
-Ollama, llama.cpp, LM Studio and hosted models share; servers may ignore it, so replies are read as
-if none did. Busy or failing servers (429, 5xx, broken connections, time-outs) get the request again
-after ``Retry-After`` or a doubling pause. The key comes from an environment variable and is in no
-file, log or error.
+Ollama, llama.cpp, LM Studio and hosted models share; servers may ignore it, so a reply is read as
+text that may hold anything (:mod:`palpate.captions.replies`). Busy or failing servers (429, 5xx,
+broken connections, time-outs) get the request again after ``Retry-After`` or a doubling pause. The
+key comes from an environment variable and is in no file, log or error.
 """
 
 from __future__ import annotations
@@ -30,9 +30,9 @@ except ImportError:
 KEY_VARIABLE = "PALPATE_CAPTION_KEY"
 #: How often a request is sent to a busy or failing server.
 TRIES = 6
-#: Longest pause before another try, in seconds.
+#: Longest pause that we choose before another try, in seconds.
 LONGEST_PAUSE = 60.0
-#: Longest wait that a server may request, in seconds.
+#: Longest pause that a server may request, in seconds; we give up if it requests more.
 LONGEST_WAIT = 600.0
 #: Statuses after which the same request may well succeed, next to 5xx.
 BUSY = (408, 409, 425, 429)
@@ -91,14 +91,15 @@ class Server:
             message, usage = choice["message"], answer.get("usage") or {}
             refusal, finish = message.get("refusal"), str(choice.get("finish_reason") or "stop")
             raw = str(message.get("content") or refusal or "")
-            tokens = (usage.get(name) or 0 for name in ("prompt_tokens", "completion_tokens"))
-            inward, outward = map(int, tokens)
+            prompt, completion = (
+                int(usage.get(name) or 0) for name in ("prompt_tokens", "completion_tokens")
+            )
             return Reply(
                 raw=self._cleaned(raw)[:LONGEST],
                 model=self._cleaned(str(answer.get("model") or self.model)),
                 refused=bool(refusal) or finish == "content_filter",
                 finish=self._cleaned(finish),
-                tokens=(inward, outward),
+                tokens=(prompt, completion),
             )
         except (LookupError, TypeError, ValueError, AttributeError) as error:
             got = f"{type(error).__name__} at {str(error)[:80]}"
@@ -129,7 +130,7 @@ class Server:
             RejectedError: if the server does not take this request.
             PalpateError: if it does not answer any more, or takes no request.
         """
-        failure, wait = self._gone("no request"), 0.0
+        failure, wait = self._unreachable("no request"), 0.0
         for k in range(TRIES):
             if wait and self._closed.wait(wait):
                 break
@@ -137,7 +138,7 @@ class Server:
             try:
                 response = self._request("POST", "chat/completions", json=payload)
             except httpx2.RequestError as error:
-                failure = self._gone(self._reason(error))
+                failure = self._unreachable(self._reason(error))
                 if isinstance(error, httpx2.ConnectError) and not self._answered:
                     break  # nobody is there, and nobody was
                 continue
@@ -146,14 +147,16 @@ class Server:
             status = _status(response.status_code, answer)
             if status in BUSY or status >= 500:
                 reason = f"status {status}: {self._message(answer)}"
-                failure = self._gone(reason)
+                failure = self._unreachable(reason)
                 wait = _retry_after(response.headers.get("Retry-After", ""), wait)
                 if wait > LONGEST_WAIT:
                     reason += f" (it asks to wait {wait:.0f} s)"
-                    failure = self._gone(reason, "Wait that long, or send fewer requests at once")
+                    failure = self._unreachable(
+                        reason, "Wait that long, or send fewer requests at once"
+                    )
                     break
             elif status != 200:
-                raise self._refusal(status, answer)
+                raise self._rejection(status, answer)
             elif isinstance(answer, str):
                 failure = RejectedError(f"the reply is no JSON: {self._cleaned(answer)[:80]!r}")
             else:
@@ -162,17 +165,19 @@ class Server:
 
     def _request(self, method: str, path: str, **content: Any) -> Any:
         if self._closed.is_set():
-            raise self._gone("closed")
+            raise self._unreachable("closed")
         return self._client.request(method, path, **content)
 
-    def _gone(self, reason: str, fix: str = "Check its address and that it runs") -> Exception:
-        """Nobody is there any more, or was."""
+    def _unreachable(
+        self, reason: str, fix: str = "Check its address and that it runs"
+    ) -> Exception:
+        """The error of a server that does not answer, any more or at all."""
         must, got = "must be a server that answers", f"{self.url}: {reason}"
         fix += ", then run the same command again"
         return PalpateError(must, got, fix, argument="server")
 
-    def _refusal(self, status: int, answer: Any) -> Exception:
-        """What a status other than 200 means."""
+    def _rejection(self, status: int, answer: Any) -> Exception:
+        """The error that a status other than 200 means: of the server, or of this request alone."""
         got = f"status {status}: {self._message(answer)}"
         if status in (401, 403):
             where = f"the environment variable {KEY_VARIABLE}"
@@ -199,9 +204,9 @@ class Server:
         try:
             response = self._request("GET", "models")
         except httpx2.RequestError as error:
-            raise self._gone(self._reason(error)) from None
+            raise self._unreachable(self._reason(error)) from None
         if response.status_code in (401, 403):
-            raise self._refusal(response.status_code, _parsed(response))
+            raise self._rejection(response.status_code, _parsed(response))
         try:
             listed = _parsed(response)["data"] if response.status_code == 200 else []
             return [self._cleaned(str(model["id"])) for model in listed]

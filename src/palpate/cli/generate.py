@@ -23,28 +23,31 @@ class Options(Common):
     text: str | None = None
     """What is felt, e.g. "rough, porous stone"; alone, or next to photos for all of them."""
     weight: float = 0.5
-    """With photos and a text: the share of the photo."""
+    """With photos and a text: how much the photo counts, in [0, 1]; the text has the rest."""
     gel: Path | None = None
-    """Picture of your gel without contact; the images are made on it (default: the background of
-    each sample, else the model's stock gel)."""
+    """Picture of your sensor's gel without contact; the images are made on it (default: the
+    no-contact image of each sample, else the model's stock gel, a typical one)."""
     model: str = "palpate/mini"
-    """Folder of `palpate train generator`, hub id, or palpate/mini (a synthetic world alone)."""
+    """Folder of `palpate train generator`, hub id, or palpate/mini (which knows a synthetic world
+    alone)."""
     split: Path | None = None
     """With a manifest: take one part of this split (default: all samples)."""
     part: Literal["train", "val", "test"] = "test"
     """Which part of the split."""
     seed: int = 0
-    """Of the noise; an image depends on the seed and its id alone."""
+    """Of the noise; an image depends on the seed and the id of its sample alone."""
     guidance: float | None = None
-    """Scale of classifier-free guidance (default: the model's; 1 is none)."""
+    """How strongly the condition is followed: the scale of classifier-free guidance (default: the
+    model's; 1 is none)."""
     steps: int | None = None
-    """Sampling steps (default: the model's)."""
+    """Denoising steps (default: the model's)."""
     batch: int | None = None
     """Images at a time; the images do not depend on it."""
     skip_bad: Switch = False
     """Skip unreadable photos and list them."""
     dry_run: Switch = False
-    """Write nothing; print how many images are missing, and network evaluations."""
+    """Write nothing; print how many images are missing, and how many passes through the network
+    they take."""
     device: str = "auto"
     """auto, cpu, cuda, mps."""
 
@@ -59,7 +62,7 @@ def run(options: Options, terminal: Terminal) -> dict[str, Any]:
         terminal.note(note)
     if options.dry_run:
         terminal.print(
-            f"{images.missing:,} images to make, {images.evaluations:,} network evaluations"
+            f"{images.missing:,} images to make, {images.evaluations:,} passes through the network"
         )
         return {"missing": images.missing, "evaluations": images.evaluations}
     facts: dict[str, Any] = {

@@ -38,9 +38,9 @@ class Metrics:
     """What is computed, and how."""
 
     presets: tuple[Literal["grouped", "paper", "paper-tables", "cmmd"], ...] = ()
-    """Readings of the TMMD family: `paper` is the formula to the letter, `grouped` keeps whole
-    videos together. Default: both; without groups `paper`, and `grouped` for TMMD of images whose
-    ids are those of the reference."""
+    """Readings of TMMD, I-TMMD, CI-TMMD and D-TMMD: `paper` is the formula to the letter, `grouped`
+    keeps whole videos together. Default: both; without groups `paper`, and `grouped` for TMMD of
+    images whose ids are those of the reference."""
     sigma: Annotated[
         tuple[float | Literal["median", "multi"], ...],
         tyro.conf.arg(metavar="NUMBER|median|multi ..."),
@@ -51,7 +51,7 @@ class Metrics:
     normalize: Literal["check", "yes", "no"] = "check"
     """Embeddings that are not of unit length: stop, divide by the norm, or keep them."""
     companions: tuple[Companion, ...] | None = None
-    """Scores next to the TMMD family. Default: all whose inputs are there; `none` for none."""
+    """Further metrics. Default: all whose inputs are there; `none` for none."""
     inception: Path | None = None
     """TorchScript file of Inception: FID and KID of its features, as published."""
     clip: str | None = None

@@ -12,29 +12,31 @@ from palpate.core import PalpateError, require
 
 @option_group
 class Options(Training):
-    """Train a generator of tactile images: conditioned on text, later driven by photos."""
+    """Train a generator of tactile images: latent diffusion, conditioned on text or photo."""
 
     clip: str | None = None
-    """Encoders that condition the generator: folder of `palpate train encoder` or of a CLIP, hub
-    id, or palpate/mini. `--set condition.source=resnet` needs none."""
+    """Frozen encoders of text and photo, whose embeddings condition the generator: folder of
+    `palpate train encoder` or of a CLIP, hub id, or palpate/mini. `--set condition.source=resnet`
+    needs none."""
     autoencoder: str | None = None
     """Pretrained autoencoder: folder or hub id of a diffusers VQModel, a .ckpt of vq-f4 of latent
     diffusion, or palpate/mini. Default: a small one, trained first on the train part."""
     start: str | None = None
-    """Generator of palpate to go on from: its folder, or palpate/mini. Its encoders and autoencoder
-    stand for those that are not given, and the preset gives the training loop alone. Default:
-    random weights."""
+    """Generator of palpate to go on from: its folder, or palpate/mini. It brings its encoders and
+    autoencoder, unless others are given; of the preset only the training loop (`loop.`) counts.
+    Default: random weights."""
     background: Switch = False
-    """The variant that also sees the no-contact image."""
+    """The denoiser also sees the no-contact image of each sample."""
     judge: str = "palpate/mini"
-    """Encoders whose tactile encoder judges, by TMMD and by material, what of images outside of
-    train survives the autoencoder; or none."""
+    """Encoders whose tactile encoder measures what the autoencoder loses: how far its
+    reconstructions of real images outside of train are from them, by TMMD and by material; or
+    none."""
     epochs: int | None = None
     """Passes over the train part. Default: the preset's length."""
     steps: int | None = None
     """Optimizer steps, in place of epochs. Default: the preset's length."""
     dry_run: Switch = False
-    """Print parameters, steps and time, and stop."""
+    """Train nothing; print parameters, steps and the expected time."""
 
 
 def run(options: Options, terminal: Terminal) -> dict[str, Any]:

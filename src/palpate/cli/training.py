@@ -44,17 +44,17 @@ class Machine:
     device: str = "auto"
     """auto, cpu, cuda, mps."""
     precision: Literal["float32", "bf16", "fp16"] = "float32"
-    """Of matrix products; the weights stay float32. bf16 is float32 on an x86 CPU without bf16."""
+    """Of matrix products; the weights stay float32. On an x86 CPU without bf16, bf16 is float32."""
     tf32: bool = True
     """Let float32 products on CUDA round their factors to 10 bits."""
     compile: Switch = False
     """Compile the loss with torch.compile: minutes at the start, faster steps."""
     channels_last: Switch = False
-    """Memory layout of convolutions."""
+    """Store images with channels last, which some GPUs convolve faster."""
     gradient_checkpointing: Switch = False
-    """Compute activations twice instead of keeping them."""
+    """Compute activations twice instead of keeping them: less memory, slower."""
     checkpoint_minutes: float = 5.0
-    """Time between checkpoints."""
+    """Minutes between checkpoints."""
     trackers: tuple[Literal["tensorboard", "wandb"], ...] = ()
     """Where the log goes, too."""
 
@@ -88,9 +88,10 @@ class Training(Common):
     """Split file; only its train part is trained on. Default: the one that lies in `splits/` with
     the data."""
     preset: str = "mini"
-    """Size and course; `palpate presets` lists all, with what each takes."""
+    """Networks, schedule and length of the training; `palpate presets` lists all, with what each
+    costs."""
     settings: Settings = ()
-    """Fields of the preset, as `loop.lr=3e-4`; `palpate presets NAME` lists all."""
+    """Change fields of the preset, as `loop.lr=3e-4`; `palpate presets NAME` lists all."""
     seed: int = 0
     """Of everything random: weights, order, augmentation, noise."""
     machine: Machine = field(default_factory=Machine)

@@ -4,7 +4,7 @@
   a user can get wrong raises a :class:`PalpateError`; the command line prints it without a
   traceback and exits with status 2.
 * A note is what a reader must know about a number, as a code with parameters. Rooms make notes;
-  :mod:`palpate.report.notes` has the sentence of each code. No program parses a sentence.
+  :mod:`palpate.report.note_texts` has the sentence of each code. No program parses a sentence.
 * Progress is counted in the rooms and drawn by the command line: a room that works for long takes
   ``progress: Progress = quiet`` and calls ``progress("decoding", 3, 100)``.
 """

@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from palpate.diffusion.training import train_generator
 
 __all__ = ["Generated", "TactilePipeline", "generate", "train_autoencoder", "train_generator"]
+#: Public name -> the module that it is imported from.
 _MODULES = {
     "Generated": "generated",
     "TactilePipeline": "pipeline",

@@ -29,7 +29,7 @@ from palpate.encoders.embed import exact
 from palpate.encoders.models import digest_modules, read_weights
 from palpate.metrics.images import image_pairs
 
-#: Below this the last stage has no pixel left that saw the whole image.
+#: Shortest side in pixels; under 31 the second pooling leaves nothing.
 SMALLEST = 32
 #: Per channel, of pixels in [-1, 1]; constants of LPIPS v0.1.
 SHIFT, SCALE = (-0.030, -0.088, -0.188), (0.458, 0.448, 0.450)
@@ -42,7 +42,7 @@ LAYERS = (
     (8, 384, 256, 3, 1, 1),
     (10, 256, 256, 3, 1, 1),
 )
-#: Stages after a 3 x 3 maximum of stride 2.
+#: Stages (from 0) whose input is first pooled: a 3 x 3 maximum of stride 2.
 POOLED = (1, 2)
 BACKBONE_URL = "https://download.pytorch.org/models/alexnet-owt-7be5be79.pth"
 HEADS_URL = (
@@ -72,7 +72,7 @@ class Lpips(nn.Module):
         self.digest = ""
 
     def stages_of(self, pixels: Tensor) -> list[Tensor]:
-        """Return five stages (b, c, h', w') of unit norm of pixels (b, 3, h, w) in [-1, 1]."""
+        """f_1 ... f_5 (b, c, h', w'), of unit norm over channels, of pixels (b, 3, h, w)."""
         x = (pixels - self.get_buffer("shift")) / self.get_buffer("scale")
         features: list[Tensor] = []
         for k, stage in enumerate(self.stages):

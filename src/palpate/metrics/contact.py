@@ -51,7 +51,7 @@ Mask = NDArray[np.bool_]
 #: Data range of the SSIM of differences.
 SSIM_RANGE = 0.25
 _SSIM_SETTINGS = WINDOW_SETTINGS | {"border": "mirror", "data_range": SSIM_RANGE}
-#: Metric -> bounds, direction, further settings.
+#: Metric -> bounds, whether higher is better, settings of its own.
 METRICS: dict[str, tuple[tuple[float, float], bool, dict[str, Any]]] = {
     "contact residual": ((0, 2), False, {"energy": "both"}),
     "contact SSIM": ((-1, 1), True, _SSIM_SETTINGS),
@@ -87,87 +87,6 @@ def contact_mask(tactile: Any, background: Any) -> Mask:
     background = _for_all(background, tactile)
     x, gel = image_pairs(tactile, background, arguments=("tactile", "background"))
     return np.stack([mask_of(as_unit(a), as_unit(b))[0] for a, b in zip(x, gel, strict=True)])
-
-
-def _for_all(background: Any, images: Any) -> Any:
-    """One background (h, w, c) repeated for all images (n, h, w, c); a stack as it is."""
-    if getattr(background, "ndim", 4) != 3:
-        return background
-    gel = np.asarray(to_host(background))
-    return np.broadcast_to(gel, (len(images), *gel.shape))
-
-
-def mask_of(image: Array, background: Array, markers: Mask | None = None) -> tuple[Mask, Mask]:
-    """Contact mask (h, w) of one image, and the pixels on or next to a marker.
-
-    ``markers`` of the background, where they are known.
-    """
-    side = min(image.shape[:2])
-    near = marker_mask(image) | (marker_mask(background) if markers is None else markers)
-    if side >= 48:  # a smaller image has markers of a pixel, and hardly two of gel between them
-        near = _dilated(near, side // 96)
-    sigma = side / 48
-    change = _fill(image - background, ~near, side / 32)
-    change = ndimage.gaussian_filter(change, (sigma, sigma, 0))
-    # white noise of two images after the blur
-    noise = np.sqrt(2) * _noise(background, ~near) / (2 * np.sqrt(np.pi) * max(sigma, 0.5))
-    mask = np.sqrt((change**2).mean(axis=2)) > max(LEAST, TIMES_NOISE * noise)
-    if mask.mean() < SMALLEST:
-        return np.zeros_like(mask), near
-    return _dilated(mask, side // 64), near
-
-
-def background_digest(images: Any) -> str:
-    """Sixteen digits for the different images of a stack, or one, in any order and dtype.
-
-    Contact scores against other backgrounds are not comparable.
-    """
-    rows = {
-        hashlib.sha256(np.rint(as_unit(image) * 65535).astype("<u2").tobytes()).digest()
-        for image in image_stack("background", _for_all(images, range(1)))
-    }
-    return hashlib.sha256(b"".join(sorted(rows))).hexdigest()[:16]
-
-
-def _dilated(mask: Mask, pixels: int) -> Mask:
-    return np.asarray(ndimage.binary_dilation(mask, iterations=max(1, pixels)), bool)
-
-
-def marker_mask(image: Array) -> Mask:
-    """The pixels (h, w) of an image (h, w, c) in [0, 1] that are a marker."""
-    gray = image @ LUMA if image.shape[2] == 3 else image[..., 0]
-    # a median over a sixth of the side changes slowly, and costs the fourth power of the side
-    step = max(1, min(gray.shape) // 64)
-    small = gray[::step, ::step]
-    width = min(small.shape) // 6 | 1
-    windows = sliding_window_view(np.pad(small, width // 2, mode="symmetric"), (width, width))
-    middle = width * width // 2  # twice as fast as scipy's median filter, and the same
-    around = np.partition(windows.reshape(*small.shape, -1), middle, axis=2)[..., middle]
-    around = around.repeat(step, 0).repeat(step, 1)[: gray.shape[0], : gray.shape[1]]
-    return gray < MARKER * around
-
-
-def _fill(image: Array, keep: Mask, sigma: float) -> Array:
-    """``image`` (h, w, c) with the pixels not kept replaced by a blur of the kept ones around."""
-    weights = keep[..., None].astype(np.float64)
-    blur = (sigma, sigma, 0)
-    around = ndimage.gaussian_filter(image * weights, blur)
-    around /= np.maximum(ndimage.gaussian_filter(weights, blur), 1e-6)
-    return np.where(keep[..., None], image, around)
-
-
-def _noise(background: Array, keep: Mask) -> float:
-    """Standard deviation of a pixel's noise away from the markers.
-
-    1.4826 times the median size of a second difference in both directions, whose weights have the
-    norm 6. 0 where hardly a pixel is away from the markers.
-    """
-    away = np.asarray(ndimage.binary_erosion(keep, np.ones((3, 3)), border_value=1), bool)
-    if away.mean() < 1 / 16:
-        return 0.0
-    kernel = np.outer([1, -2, 1], [1, -2, 1])[..., None]
-    change = np.abs(ndimage.convolve(background, kernel, mode="mirror"))
-    return 1.4826 * float(np.median(change[away])) / 6
 
 
 def contact_scores(
@@ -208,54 +127,142 @@ def contact_per_image(
     as :func:`contact_scores`.
     """
     backgrounds = _for_all(background, reference)
-    y, gel = image_pairs(reference, backgrounds, arguments=("reference", "background"))
-    require_side(y.shape[1:3], "contact metrics")
-    stacks = {name: image_pairs(x, y)[0] for name, x in generated.items()}
-    n, area = len(y), np.zeros(len(y))
+    real, gels = image_pairs(reference, backgrounds, arguments=("reference", "background"))
+    require_side(real.shape[1:3], "contact metrics")
+    stacks = {name: image_pairs(images, real)[0] for name, images in generated.items()}
+    n = len(real)
     names = checked_names("ids", ids, n) or [str(i) for i in range(n)]
-    empty, *each = np.full((1 + len(stacks), len(METRICS), n), np.nan)
-    for i, images in enumerate(zip(y, gel, strict=True)):
-        tactile, none = map(as_unit, images)
-        markers = marker_mask(none)
-        mask, near_marker = mask_of(tactile, none, markers)
-        kept, real = mask & ~near_marker, tactile - none
-        if not kept.any():
+    area, empty = np.zeros(n), np.full((len(METRICS), n), np.nan)
+    values = {name: empty.copy() for name in stacks}
+    for i, pair in enumerate(zip(real, gels, strict=True)):
+        tactile, gel = map(as_unit, pair)
+        markers = marker_mask(gel)
+        mask, near_marker = mask_of(tactile, gel, markers)
+        contact, compared = tactile - gel, mask & ~near_marker
+        if not compared.any():
             continue
-        area[i], empty[:, i] = mask.mean(), (*_compare(np.zeros_like(real), real, kept), 0.0)
-        for x, values in zip(stacks.values(), each, strict=True):
-            image = as_unit(x[i])
-            other = mask_of(image, none, markers)[0]
-            iou = (mask & other).sum() / (mask | other).sum()
-            values[:, i] = (*_compare(image - none, real, kept), iou)
-    lacks = np.flatnonzero(area == 0)
-    notes = [Note("no-contact", {"count": len(lacks), "n": n})] * (len(lacks) > 0)
-    common = {"no_contact": {"count": len(lacks), "ids": [names[i] for i in lacks[:10]]}}
-    common |= {"area": _mean(area[area > 0])}
-    settings = SETTINGS | {"size": list(y.shape[1:3]), "background": background_digest(background)}
+        area[i] = mask.mean()
+        empty[:, i] = *_residual_and_ssim(np.zeros_like(contact), contact, compared), 0.0
+        for name, images in stacks.items():
+            image = as_unit(images[i])
+            generated_mask = mask_of(image, gel, markers)[0]
+            iou = (mask & generated_mask).sum() / (mask | generated_mask).sum()
+            values[name][:, i] = *_residual_and_ssim(image - gel, contact, compared), iou
+    without = np.flatnonzero(area == 0)
+    notes = [Note("no-contact", {"count": len(without), "n": n})] * (len(without) > 0)
+    shared = {"no_contact": {"count": len(without), "ids": [names[i] for i in without[:10]]}}
+    shared |= {"area": _mean(area[area > 0])}
+    size = list(real.shape[1:3])
+    settings = SETTINGS | {"size": size, "background": background_digest(background)}
     return {
         name: [
             PerImage(
                 metric,
-                values[k],
+                of_metric,
                 bounds,
                 settings | further,
                 notes,
-                {"empty": _mean(empty[k]), **common},
-                up,
+                {"empty": _mean(of_empty), **shared},
+                higher_is_better,
             )
-            for k, (metric, (bounds, up, further)) in enumerate(METRICS.items())
+            for (metric, (bounds, higher_is_better, further)), of_metric, of_empty in zip(
+                METRICS.items(), of_name, empty, strict=True
+            )
         ]
-        for name, values in zip(stacks, each, strict=True)
+        for name, of_name in values.items()
     }
 
 
-def _compare(x: Array, y: Array, kept: Mask) -> tuple[float, float]:
-    """Residual and SSIM of two differences (h, w, c) on the pixels ``kept``."""
-    error, energy, generated = (float((v[kept] ** 2).mean()) for v in (x - y, y, x))
-    residual = error / (energy + generated) if energy + generated else np.nan
-    return residual, float(local_maps(x, y, "mirror", SSIM_RANGE)[0][kept].mean())
+def _residual_and_ssim(x: Array, y: Array, at: Mask) -> tuple[float, float]:
+    """Residual and SSIM of a generated and a real difference (h, w, c), on the pixels ``at``."""
+    error, real, generated = (float((v[at] ** 2).mean()) for v in (x - y, y, x))
+    residual = error / (real + generated) if real + generated else np.nan
+    return residual, float(local_maps(x, y, "mirror", SSIM_RANGE)[0][at].mean())
 
 
 def _mean(values: Array) -> float | None:
     finite = values[np.isfinite(values)]
     return float(finite.mean()) if len(finite) else None
+
+
+def _for_all(background: Any, images: Any) -> Any:
+    """One background (h, w, c) repeated for all images (n, h, w, c); a stack as it is."""
+    if getattr(background, "ndim", 4) != 3:
+        return background
+    gel = np.asarray(to_host(background))
+    return np.broadcast_to(gel, (len(images), *gel.shape))
+
+
+def background_digest(images: Any) -> str:
+    """Sixteen digits for the different images of a stack, or one, in any order and dtype.
+
+    16 bits a channel, so that uint8 and float of one image agree. Contact scores against other
+    backgrounds are not comparable.
+    """
+    rows = {
+        hashlib.sha256(np.rint(as_unit(image) * 65535).astype("<u2").tobytes()).digest()
+        for image in image_stack("background", _for_all(images, [0]))  # one image: a stack of one
+    }
+    return hashlib.sha256(b"".join(sorted(rows))).hexdigest()[:16]
+
+
+def mask_of(image: Array, background: Array, markers: Mask | None = None) -> tuple[Mask, Mask]:
+    """Contact mask (h, w) of one image, and the pixels on or next to a marker.
+
+    ``markers``: those of the background; None to look for them.
+    """
+    side = min(image.shape[:2])
+    near = marker_mask(image) | (marker_mask(background) if markers is None else markers)
+    if side >= 48:  # a smaller image has markers of a pixel, and hardly two of gel between them
+        near = _dilated(near, side // 96)
+    sigma = side / 48
+    change = _fill(image - background, ~near, side / 32)
+    change = ndimage.gaussian_filter(change, (sigma, sigma, 0))
+    # of white noise, that of two images: a Gaussian blur leaves 1 / (2 sqrt(pi) sigma) of its sd
+    noise = np.sqrt(2) * _noise(background, ~near) / (2 * np.sqrt(np.pi) * max(sigma, 0.5))
+    mask = np.sqrt((change**2).mean(axis=2)) > max(LEAST, TIMES_NOISE * noise)
+    if mask.mean() < SMALLEST:
+        return np.zeros_like(mask), near
+    return _dilated(mask, side // 64), near
+
+
+def marker_mask(image: Array) -> Mask:
+    """The pixels (h, w) of an image (h, w, c) in [0, 1] that are a marker."""
+    gray = image @ LUMA if image.shape[2] == 3 else image[..., 0]
+    # a median over a sixth of the side changes slowly, and costs the fourth power of the side
+    step = max(1, min(gray.shape) // 64)
+    small = gray[::step, ::step]
+    width = min(small.shape) // 6 | 1
+    windows = sliding_window_view(np.pad(small, width // 2, mode="symmetric"), (width, width))
+    middle = width * width // 2  # twice as fast as scipy's median filter, and the same
+    around = np.partition(windows.reshape(*small.shape, -1), middle, axis=2)[..., middle]
+    around = around.repeat(step, 0).repeat(step, 1)[: gray.shape[0], : gray.shape[1]]
+    return gray < MARKER * around
+
+
+def _fill(image: Array, keep: Mask, sigma: float) -> Array:
+    """``image`` (h, w, c) with the pixels not kept replaced by a blur of the kept ones around."""
+    weights = keep[..., None].astype(np.float64)
+    blur = (sigma, sigma, 0)
+    around = ndimage.gaussian_filter(image * weights, blur)
+    around /= np.maximum(ndimage.gaussian_filter(weights, blur), 1e-6)
+    return np.where(keep[..., None], image, around)
+
+
+def _noise(background: Array, keep: Mask) -> float:
+    """Standard deviation of a pixel's noise away from the markers.
+
+    1.4826 times the median size of normal noise is its standard deviation; that of the second
+    difference in both directions, which flat gel does not have, is 6 (the norm of its weights)
+    times a pixel's. 0 where hardly a pixel is away from the markers.
+    """
+    away = np.asarray(ndimage.binary_erosion(keep, np.ones((3, 3)), border_value=1), bool)
+    if away.mean() < 1 / 16:
+        return 0.0
+    kernel = np.outer([1, -2, 1], [1, -2, 1])[..., None]
+    change = np.abs(ndimage.convolve(background, kernel, mode="mirror"))
+    return 1.4826 * float(np.median(change[away])) / 6
+
+
+def _dilated(mask: Mask, pixels: int) -> Mask:
+    return np.asarray(ndimage.binary_dilation(mask, iterations=max(1, pixels)), bool)

@@ -13,10 +13,10 @@ from palpate._lazy import import_name
 from palpate.report.results import Audit, Results
 
 if TYPE_CHECKING:
+    from palpate.report.findings import summary_lines
     from palpate.report.page import write_report
-    from palpate.report.sentences import summary_lines
 
 __all__ = ["Audit", "Results", "summary_lines", "write_report"]
-_MODULES = {"summary_lines": "sentences", "write_report": "page"}
+_MODULES = {"summary_lines": "findings", "write_report": "page"}
 
 __getattr__ = partial(import_name, __name__, _MODULES)

@@ -9,10 +9,10 @@ from markupsafe import Markup
 
 from palpate.core import Measure, Score
 from palpate.report import plots
+from palpate.report.findings import share_of
 from palpate.report.labels import interval, number, p_text, percent, plural
 from palpate.report.notes import sentence
 from palpate.report.results import Audit, Results
-from palpate.report.sentences import share_of
 from palpate.report.tables import REAL, Column, Family, baselines, best_by_value, defined
 
 #: Columns of the verdict table, the most telling first; others follow as they come.

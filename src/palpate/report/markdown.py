@@ -11,10 +11,11 @@ from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 from palpate.core import plain
-from palpate.report.notes import HOW_TO_READ, sentence
+from palpate.report.findings import purpose, summary_lines
+from palpate.report.note_texts import HOW_TO_READ
+from palpate.report.notes import sentence
 from palpate.report.records import Claim
 from palpate.report.results import Results
-from palpate.report.sentences import purpose, summary_lines
 from palpate.report.study import of_study, tally
 from palpate.report.tables import Family, Head, Table, families, listing, of_differences
 from palpate.report.terminal import audit_text

@@ -34,7 +34,7 @@ from palpate.core import (
     write_json,
     write_text,
 )
-from palpate.report import audits, first_screen, labels, notes, plots, sentences, study, tables
+from palpate.report import audits, findings, first_screen, labels, notes, plots, study, tables
 from palpate.report.labels import number, plural, where
 from palpate.report.notes import sentence
 from palpate.report.records import GalleryItem, LeakPair, Strip
@@ -155,7 +155,7 @@ def render_page(
         "about": first_screen.about(results, date, __version__),
         "purpose": _lede(results),
         "caution": first_screen.caution(results),
-        "facts": list(results.facts) or ([] if cards else sentences.summary_lines(results)),
+        "facts": list(results.facts) or ([] if cards else findings.summary_lines(results)),
         "cards": cards,
         "row_labels": [wanted.label for wanted in samples[0][1]] if samples else [],
         "studied": list(map(study.of_study, results.tables)),
@@ -344,10 +344,8 @@ def matrices(results: Results) -> list[Table]:
 
 def _lede(results: Results) -> str:
     """What the page shows; of audits alone, the question that the split asks."""
-    lines = (
-        [] if results.scores or results.gallery else map(sentences.question_line, results.audits)
-    )
-    return next(filter(None, lines), "") or sentences.purpose(results)
+    lines = [] if results.scores or results.gallery else map(findings.question_line, results.audits)
+    return next(filter(None, lines), "") or findings.purpose(results)
 
 
 def _album_notes(album: Album, wanted: int) -> list[str]:
@@ -388,7 +386,7 @@ def environment() -> Environment:
     )
     functions = {
         name: value
-        for module in (audits, first_screen, labels, notes, plots, sentences, study, tables)
+        for module in (audits, findings, first_screen, labels, notes, plots, study, tables)
         for name, value in vars(module).items()
         if getattr(value, "__module__", "") == module.__name__
     }

@@ -11,11 +11,7 @@ from rich.table import Table as Grid
 from rich.text import Text
 
 from palpate.core import Score
-from palpate.report.labels import count, percent
-from palpate.report.notes import COMMAND_LINE, PYTHON, Style, sentence
-from palpate.report.records import Claim
-from palpate.report.results import Audit, Results
-from palpate.report.sentences import (
+from palpate.report.findings import (
     audit_line,
     cause_texts,
     chance_text,
@@ -23,6 +19,11 @@ from palpate.report.sentences import (
     signal_notes,
     threshold_text,
 )
+from palpate.report.labels import count, percent
+from palpate.report.note_texts import Style
+from palpate.report.notes import COMMAND_LINE, PYTHON, sentence
+from palpate.report.records import Claim
+from palpate.report.results import Audit, Results
 from palpate.report.study import of_study, tally
 from palpate.report.tables import (
     Cell,

@@ -1,8 +1,9 @@
 """What generation is for: do generated images train a classifier for real touch?
 
-A linear probe on the features of a tactile encoder, tested on real images of new videos, is trained
-on k real videos a class, on these plus all generated images, and on the generated images of k
-videos a class alone; k = 1, 2, 4, 8, as far as every tested class has k videos.
+A linear probe on the features of a tactile encoder names the material of real images of new videos.
+It is trained on k real videos of every class, on these plus all generated images, and on the
+generated images of k videos of every class alone; k = 1, 2, 4, 8, as far as every tested class has
+k videos.
 
 **What must not happen.** The encoder must not have seen the test videos (:func:`utility` checks it
 by their pixels), and no classifier may be trained on an image that was generated for a photo of the
@@ -62,9 +63,13 @@ GAIN = "gain by "
 
 @dataclass(frozen=True)
 class Training:
-    """What is trained on: features or None, and videos a class of each.
+    """What a probe is trained on.
 
-    ``of_generated`` 0: as many videos of a class as every fold can leave.
+    Attributes:
+        real: features of real images, or None.
+        generated: features of generated images, or None.
+        of_real: videos of every class that are drawn of ``real``.
+        of_generated: the same of ``generated``; 0: as many of a class as every fold can leave.
     """
 
     real: FeatureSet | None = None
@@ -78,8 +83,8 @@ class Draws:
     """How videos are drawn.
 
     Attributes:
-        shots: numbers k of videos a class.
-        draws: how often.
+        shots: numbers k of videos a class, a column of the table each.
+        draws: how often k videos are drawn.
         folds: of the test videos, where generated images are of these.
         seed: of draws and folds.
         l2: penalty of the probe; with k videos a class there is nothing to choose it by.
@@ -92,20 +97,17 @@ class Draws:
     l2: float = 1e-2
 
     def rows(self, features: FeatureSet, shots: int | Mapping[str, int], draw: int) -> list[int]:
-        """Rows of k videos of every class, or of so many of each, the same videos in every set.
+        """Rows of ``shots`` videos of every class, or of ``shots[label]`` of each.
 
-        The first k of an order by (seed, draw, class, video): nested in k.
+        They are the first in a random order by (seed, draw, class, video): the same videos in every
+        set of features, and those of a larger k hold those of a smaller one.
         """
-        count = lambda label: shots if isinstance(shots, int) else shots[label]
-        chosen = {
-            (label, video)
-            for label, videos in _videos(features).items()
-            for video in sorted(videos, key=lambda v: self._place(draw, label, v))[: count(label)]
-        }
+        chosen: set[tuple[str, str]] = set()
+        for label, videos in _videos(features).items():
+            order = lambda v, c=label: rng_for(self.seed, "utility", draw, c, v).random()
+            count = shots if isinstance(shots, int) else shots[label]
+            chosen |= {(label, video) for video in sorted(videos, key=order)[:count]}
         return [k for k, pair in enumerate(_pairs(features)) if pair in chosen]
-
-    def _place(self, draw: int, label: str, video: str) -> float:
-        return float(rng_for(self.seed, "utility", draw, label, video).random())
 
     def fold_of(self, test: FeatureSet, generated: FeatureSet | None) -> NDArray[np.intp]:
         """The fold (n,) of every test row; all in one where no video was generated for.
@@ -154,29 +156,35 @@ def picked(features: FeatureSet, rows: Iterable[int]) -> FeatureSet:
 
 
 def _hits(draws: Draws, draw: int, test: FeatureSet, training: Training) -> Array:
-    """Whether a probe is right on every test row; generated images are those of other folds."""
+    """Whether a probe is right on every test row (n,): 1 or 0.
+
+    There is a probe a fold; its generated images are those of the videos of the other folds.
+    """
     real, generated, pairs = training.real, training.generated, _pairs(test)
     fold = draws.fold_of(test, generated)
-    parts = [np.flatnonzero(fold == number) for number in np.unique(fold)]
-    tested = [{pairs[k][1] for k in rows} for rows in parts]
+    tested = {k: {v for (_, v), f in zip(pairs, fold, strict=True) if f == k} for k in {*fold}}
+    drawn = [] if real is None else [picked(real, draws.rows(real, training.of_real, draw))]
     hits = np.zeros(len(fold))
-    for rows, names in zip(parts, tested, strict=True):
-        sets: list[FeatureSet] = []
-        if real is not None:
-            sets.append(picked(real, draws.rows(real, training.of_real, draw)))
+    for number, videos in tested.items():
+        sets = [*drawn]
         if generated is not None:
-            videos = _videos(generated).items()
-            # As many of a class as are left by the fold that tests most.
-            left = {
-                c: len(of_class) - max(len(of_class & t) for t in tested) for c, of_class in videos
-            }
-            free = [k for k, (_, video) in enumerate(_pairs(generated)) if video not in names]
-            free = picked(generated, free)
-            shots = training.of_generated or left
+            rest = [k for k, (_, video) in enumerate(_pairs(generated)) if video not in videos]
+            free = picked(generated, rest)
+            shots = training.of_generated or _left_by_every_fold(generated, tested.values())
             sets.append(picked(free, draws.rows(free, shots, draw)))
+        rows = np.flatnonzero(fold == number)
         named = _named(_joined(sets), test.features[rows], draws.l2)
         hits[rows] = [name == pairs[k][0] for name, k in zip(named, rows, strict=True)]
     return hits
+
+
+def _left_by_every_fold(features: FeatureSet, tested: Iterable[set[str]]) -> dict[str, int]:
+    """Class -> its videos without those of the fold that tests most of them."""
+    folds = list(tested)
+    return {
+        label: len(videos) - max(len(videos & fold) for fold in folds)
+        for label, videos in _videos(features).items()
+    }
 
 
 def _joined(parts: Sequence[FeatureSet]) -> FeatureSet:

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from palpate.core import Note, Score
 from palpate.core.score import BETTER
 from palpate.report.labels import count, number, percent, plural, score_text, with_interval
-from palpate.report.notes import question
+from palpate.report.note_texts import question
 from palpate.report.records import CANNOT_TELL, LEAKS, NO_LEAK, Signal
 from palpate.report.results import Audit, Results
 from palpate.report.tables import defined, families, family_of
