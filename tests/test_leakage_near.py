@@ -2,6 +2,7 @@
 
 from itertools import product
 from pathlib import Path
+from unittest.mock import Mock
 
 import numpy as np
 import polars as pl
@@ -10,8 +11,10 @@ from PIL import Image
 from threadpoolctl import threadpool_limits
 
 from forge.leaks import MATERIALS, NoiseVideo, crop, make_leaky, save
+from palpate.data.images import check_image
 from palpate.data.manifest import Manifest
-from palpate.leakage.calibration import beyond_chance
+from palpate.leakage import thumbnails as module
+from palpate.leakage.calibration import Tail, beyond_chance
 from palpate.leakage.descriptors import OFFSET, EditIndex, Whitened
 from palpate.leakage.near import near_duplicates, near_groups
 from palpate.leakage.thumbnails import thumbnail, thumbnails
@@ -160,6 +163,25 @@ def test_rubbish_files_and_modes_are_told_and_never_raised(tmp_path):
     assert np.array_equal(np.isnan(flags.score), bad)
     assert not flags.flag[bad].any()
     assert "images-unreadable" in [note.code for note in flags.notes]
+
+
+def test_why_an_image_cannot_be_read(tmp_path, monkeypatch):
+    """In the words of a whole check, else of the error, else by its name."""
+    path = tmp_path / "cut.jpg"
+    Image.fromarray(photo(3)).save(path)
+    path.write_bytes(path.read_bytes()[:600])
+    assert thumbnail(path) == check_image(path)
+    for error, words in ((OSError("no luck"), "no luck"), (OSError(), "OSError")):
+        monkeypatch.setattr(module, "check_image", lambda path: None)
+        monkeypatch.setattr(module, "opened", Mock(side_effect=error))
+        assert thumbnail(path) == words
+
+
+def test_equal_images_of_a_null_are_finite():
+    """Cosines of 1 are far out in the tail, not infinitely far."""
+    tail = Tail.of(np.append(np.linspace(0.1, 0.8, 40), [1.0, 1.0]), np.arange(42), 1.0)
+    assert np.isfinite([tail.scale, tail.surprise(1.0), tail.surprise_at(0.01)]).all()
+    assert tail.surprise(1.0) > tail.surprise(0.9)
 
 
 def test_cache_and_processes_change_nothing(tmp_path, monkeypatch):

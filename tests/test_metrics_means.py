@@ -48,6 +48,11 @@ def test_no_change_without_any_video_is_no_evidence_of_certainty():
     assert [note.code for note in score.notes] == ["no-interval"]
 
 
+def test_seeds_that_agree_without_any_variation_have_the_degrees_of_freedom_of_videos():
+    spread = spread_of([[mean_of("m", [1, 1, 1], list("pqr"), subject="a")] * 2])
+    assert (spread.value, spread.error, spread.df) == (1, 0, 2)
+
+
 def test_seeds_widen_the_interval_by_their_deviation():
     runs = [mean_of("m", v, list("ppqq"), subject="a") for v in ([1, 0, 1, 1], [0, 0, 1, 1])]
     spread = spread_of([runs])

@@ -106,6 +106,13 @@ def test_grouped_radii_skip_the_same_group(block, monkeypatch):
     assert plain[0].interval == expected_interval("Precision", by_matrices(x, y, 3)[0], a)
 
 
+def test_as_many_rows_outside_a_group_as_neighbors_are_enough():
+    x, groups = np.random.default_rng(6).normal(size=(6, 3)), list("aaabbb")
+    scores = prdc(features(x, groups), features(x + 1, groups), 3)
+    for score, rows in zip(scores, by_matrices(x, x + 1, 3, groups, groups), strict=True):
+        assert score.value == pytest.approx(rows.mean())
+
+
 def test_without_groups_the_radii_measure_the_frame_rate():
     """Other videos against videos: the more frames, the worse they score without groups."""
     rng = np.random.default_rng(3)

@@ -4,6 +4,7 @@ from itertools import permutations
 
 import numpy as np
 import pytest
+from scipy import stats
 
 from palpate.core import FeatureSet
 from palpate.metrics import retrieval as module
@@ -126,6 +127,17 @@ def test_a_pool_of_all_is_no_pool_and_ranks_over_the_pool_are_skipped():
         "top-1 of 6 (b by a)",
         "top-5 of 6 (b by a)",
     ]
+
+
+def test_the_interval_of_the_median_rank_by_hand():
+    """The share of ranks up to the median is 1 / 2 with an interval; its limits are quantiles."""
+    ranks, groups = np.arange(1.0, 41.0), [f"v{k}" for k in range(40)]
+    score = module._median(ranks, groups, {}, {"subject": "x"})
+    below = ranks <= 20.5
+    error = np.sqrt(((below - 0.5) ** 2).sum() / 40 / 39)  # the jackknife of a mean
+    half = stats.t.ppf(0.975, 39) * error
+    assert score.value == 20.5
+    assert score.interval == (np.ceil(40 * (0.5 - half)), np.ceil(40 * (0.5 + half)))
 
 
 def test_the_interval_of_the_median_rank_holds_it_as_often_as_promised():
