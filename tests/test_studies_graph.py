@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from palpate.core import PalpateError, locked
-from palpate.studies.graph import Named, Node, plan_graph, run_graph
+from palpate.studies.graph import Named, Node, Nodes, plan_graph, run_graph
 
 
 def write(work, *, text):
@@ -31,7 +31,7 @@ def built(lines):
     return {line.removesuffix(": ...") for line in lines if line.endswith(": ...")}
 
 
-DIAMOND = [node("d", "b", "c"), node("a"), node("b", "a"), node("c", "a")]
+DIAMOND = [node("a"), node("b", "a"), node("c", "a"), node("d", "b", "c")]
 
 
 def texts(folder):
@@ -43,7 +43,7 @@ def test_each_node_reads_what_the_nodes_before_it_wrote(tmp_path, jobs):
     lines = []
     stages = run_graph(DIAMOND, tmp_path, jobs=jobs, print_line=lines.append)
     assert texts(tmp_path) == {"a": "a", "b": "ab", "c": "ac", "d": "abacd"}
-    assert list(stages) == ["d", "a", "b", "c"]
+    assert list(stages) == ["a", "b", "c", "d"]
     assert built(lines) == {*"abcd"}
     processes = {s.facts["process"] for s in stages.values()}
     assert (os.getpid() in processes) == (jobs == 1)
@@ -56,14 +56,14 @@ def test_each_node_reads_what_the_nodes_before_it_wrote(tmp_path, jobs):
 @pytest.mark.parametrize(
     ("changed", "names"),
     [
-        (node("b", "a", text="other"), {"b", "d"}),
-        (node("b", "a", version=2), {"b", "d"}),
-        (node("b", "a", "c"), {"b", "d"}),
+        (node("c", "a", text="other"), {"c", "d"}),
+        (node("c", "a", version=2), {"c", "d"}),
+        (node("c", "a", "b"), {"c", "d"}),
     ],
 )
 def test_a_changed_node_builds_itself_and_what_reads_it(tmp_path, changed, names):
     run_graph(DIAMOND, tmp_path)
-    nodes = [changed if n.name == "b" else n for n in DIAMOND]
+    nodes = [changed if n.name == "c" else n for n in DIAMOND]
     planned, lines = plan_graph(nodes, tmp_path), []
     assert {name for name, done in planned.items() if not done} == names
     run_graph(nodes, tmp_path, print_line=lines.append)
@@ -85,24 +85,26 @@ def test_what_reads_a_stage_is_built_again_where_that_has_other_files(tmp_path, 
 
 
 def test_a_plan_writes_nothing_and_is_in_order(tmp_path):
-    nodes = [node("b", "a"), node("a")]
-    assert [*plan_graph(nodes, tmp_path / "run").items()] == [("a", False), ("b", False)]
+    nodes = [node("b"), node("a", "b")]
+    assert [*plan_graph(nodes, tmp_path / "run").items()] == [("b", False), ("a", False)]
     assert not (tmp_path / "run").exists()
 
 
 @pytest.mark.parametrize(
-    ("nodes", "words"),
+    ("name", "after", "words"),
     [
-        ([node("a"), node("b"), node("a")], "must have a name of its own. Got a"),
-        ([node("a", "c")], "Stage a must come after stages of the same graph. Got c"),
-        ([node("a"), node("b", "d"), node("c", "b"), node("d", "c")], "itself. Got b, c, d"),
-        ([node("a/b")], "must be that of a folder. Got a/b"),
+        ("a", (), "must have a name of its own, that of a folder. Got a"),
+        ("b/c", (), "must have a name of its own, that of a folder. Got b/c"),
+        (".b", (), "must have a name of its own, that of a folder. Got .b"),
+        ("b", ("a", "c", "b"), "Stage b must come after stages of the same graph. Got b, c"),
     ],
 )
-def test_a_graph_that_cannot_be_run(tmp_path, nodes, words):
+def test_a_node_that_cannot_be_run(name, after, words):
+    nodes = Nodes()
+    nodes.add("a", write, text="a")
     with pytest.raises(PalpateError, match=words):
-        run_graph(nodes, tmp_path / "run")
-    assert not (tmp_path / "run").exists()
+        nodes.add(name, write, *after, text="b")
+    assert [node.name for node in nodes] == ["a"]
 
 
 def fail(work, *, error):

@@ -22,7 +22,7 @@ from palpate.evaluation.scorers import Weights
 from palpate.report.records import Claim, StudyTable
 from palpate.report.results import Results
 from palpate.studies.files import read_scores
-from palpate.studies.graph import digests_of, in_order
+from palpate.studies.graph import digests_of
 from palpate.studies.methods import OURS
 from palpate.studies.names import SPLITS
 from palpate.studies.reproduce import Plan, run_study
@@ -38,7 +38,7 @@ def kind_of(node) -> str:
     return node.call.__name__
 
 
-NODES = in_order(small_study.plan().nodes())
+NODES = small_study.plan().nodes()
 KINDS = list(dict.fromkeys(map(kind_of, NODES)))
 
 
@@ -62,7 +62,7 @@ def digests(study: str, preset: str) -> dict[str, str]:
     """Kind of stage -> digest over what each of them reads."""
     nodes, of_kind = Plan(STUDIES[study], preset=preset).nodes(), {}
     read = digests_of(nodes)
-    for node in in_order(nodes):
+    for node in nodes:
         of_kind.setdefault(kind_of(node), []).append(read[node.name])
     return {kind: short(digest_json(values)) for kind, values in of_kind.items()}
 

@@ -1,10 +1,12 @@
 """A graph of stages: each node a call that fills a folder and reads those of earlier nodes.
 
-The digest of a node's stage holds its options and those of the nodes before it
-(:mod:`palpate.studies.stages`), so that a changed option builds again what depends on it and
-nothing else; its record holds those of their files, so that it is built again after a stage that
-was made again with other files (trained on a GPU, say). Nodes that do not depend on each other may
-be built by several processes; the result does not depend on how many.
+A node declares a stage: its name, the call, the call's options, and the nodes that it reads. To run
+the graph is to build the stages that are missing, in the order of the nodes. The digest of a stage
+holds its options and the digests of the stages that it reads (:mod:`palpate.studies.stages`), so
+that a changed option builds again what depends on it and nothing else; its record holds the digests
+of their files, so that it is built again after a stage that was made again with other files
+(trained on a GPU, say). Nodes that do not depend on each other may be built by several processes;
+the result does not depend on how many.
 """
 
 from __future__ import annotations
@@ -14,7 +16,7 @@ import os
 import signal
 import traceback
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import cached_property, partial
 from multiprocessing.connection import wait
 from multiprocessing.process import BaseProcess
@@ -23,14 +25,7 @@ from typing import Any, NoReturn, cast
 
 from palpate.core import PalpateError, Progress, few, locked, quiet, require
 from palpate.core.processes import exit_with_parent
-from palpate.studies.stages import (
-    PrintLine,
-    Stage,
-    finished_stage,
-    run_stage,
-    stage_digest,
-    stored_stage,
-)
+from palpate.studies.stages import PrintLine, Stage, finished_stage, run_stage, stage_digest
 
 Channel = Any  # one end of a pipe, whose type depends on the system
 
@@ -61,9 +56,9 @@ class Work:
 
 @dataclass(frozen=True)
 class Named:
-    """An option that a digest knows by another name than its value.
+    """An option whose value is no JSON, or not all that matters: a digest takes ``name`` for it.
 
-    A function by its source, a model by its weights, a file by its bytes.
+    Of a function that is its source, of a model its weights, of a file its bytes.
     """
 
     value: Any
@@ -79,7 +74,7 @@ class Node:
         call: called with a :class:`Work` and the options; fills the folder and returns facts
             (JSON). For several processes a function of a module.
         options: of the call; all of them enter the digest, those that are :class:`Named` by name.
-        after: names of earlier nodes; their digests enter its own.
+        after: names of the earlier nodes that it reads; their digests enter its own.
         version: raised by hand when the stage comes to write other bytes.
         measures: it trains nothing: ``palpate verify`` builds it again, to compare.
     """
@@ -103,7 +98,7 @@ class Node:
 
 
 class Nodes(list[Node]):
-    """The nodes of a study, in their order."""
+    """The nodes of a study, each after those that it reads."""
 
     def add(
         self,
@@ -115,7 +110,18 @@ class Nodes(list[Node]):
         version: int = 1,
         **options: Any,
     ) -> None:
-        """Append a :class:`Node`."""
+        """Append a :class:`Node`.
+
+        Raises:
+            PalpateError: for a name that is taken or no folder's, or an unknown ``after``.
+        """
+        names = {node.name for node in self}
+        free = Path(name).name == name and not name.startswith(".") and name not in names
+        must = "A stage must have a name of its own, that of a folder"
+        require(free, None, must, name, fix="Rename it")
+        unknown, fix = sorted({*after} - names), "Add it first, or correct the name"
+        must = f"Stage {name} must come after stages of the same graph"
+        require(not unknown, None, must, few(unknown), fix=fix)
         self.append(Node(name, call, options, after, version, measures))
 
 
@@ -134,7 +140,7 @@ def run_graph(
     at a time holds the folder.
 
     Args:
-        nodes: of the graph; those that are ready are begun in this order.
+        nodes: of the graph, each after those that it reads.
         folder: run folder.
         device: ``auto``, ``cpu``, ``cuda`` or ``mps``.
         jobs: processes that build nodes; 1: this one. Each computes with OMP_NUM_THREADS threads,
@@ -147,15 +153,14 @@ def run_graph(
         the stages by name, in the order of ``nodes``.
 
     Raises:
-        PalpateError: for two nodes of one name, an unknown ``after``, a circle, a folder that
-            another run holds, or under ``torchrun``; or the first that a node raises: finished
-            stages stay.
+        PalpateError: for a folder that another run holds, or under ``torchrun``; or the first that
+            a node raises: finished stages stay.
     """
     processes = os.environ.get("WORLD_SIZE", "1")
     fix = "Run it once without torchrun, with several jobs"
     require(processes == "1", None, "A study must be begun by one process", processes, fix=fix)
     require(jobs >= 1, "jobs", "must be at least 1", jobs)
-    run = _Run(in_order(nodes), Path(folder), device, jobs, print_line, progress)
+    run = _Run(nodes, Path(folder), device, jobs, print_line, progress)
     with locked(run.folder):
         if jobs == 1:
             _run_here(run)
@@ -170,75 +175,59 @@ def plan_graph(nodes: Sequence[Node], folder: Path) -> dict[str, bool]:
     What comes after a stage that is not done may turn out to be, if that is made again with the
     same files.
     """
-    run = _Run(in_order(nodes), Path(folder))
+    run = _Run(nodes, Path(folder))
     while run.next_task():
         pass
-    return {node.name: node.name in run.stages for node in run.ordered}
-
-
-def measured_again(
-    nodes: Sequence[Node], folder: Path, target: Path, progress: Progress = quiet
-) -> dict[str, Stage]:
-    """All stages of a run: those that measure are built below ``target``, the others as stored.
-
-    Raises:
-        PalpateError: if a stage is not there.
-    """
-    stages: dict[str, Stage] = {}
-    for done, node in enumerate(in_order(nodes)):
-        progress("stages", done, len(nodes), node.name)
-        stage = stored_stage(folder / node.name)
-        if node.measures:
-            again = target / node.name
-            again.mkdir()
-            after = {name: stages[name].folder for name in node.after}
-            facts = dict(node.build(Work(again, after, target / "cache")) or {})
-            stage = replace(stage, folder=again, record={**stage.record, "facts": facts})
-        stages[node.name] = stage
-    return stages
-
-
-def in_order(nodes: Sequence[Node]) -> list[Node]:
-    """Return the nodes so that each comes after those it reads, otherwise in the order given.
-
-    Raises:
-        PalpateError: for two nodes of one name, a name that is no folder's, an unknown ``after``,
-            or a circle.
-    """
-    names = [node.name for node in nodes]
-    twice = sorted({name for name in names if names.count(name) > 1})
-    bad = [name for name in names if Path(name).name != name or name.startswith(".")]
-    must = "Each stage must have a name of its own"
-    require(not twice, None, must, few(twice), fix="Rename one")
-    must = "The name of a stage must be that of a folder"
-    require(not bad, None, must, few(bad), fix="Rename it")
-    for node in nodes:
-        unknown, fix = sorted({*node.after} - {*names}), "Add it, or correct the name"
-        must = f"Stage {node.name} must come after stages of the same graph"
-        require(not unknown, None, must, few(unknown), fix=fix)
-    ordered: dict[str, Node] = {}
-    while len(ordered) < len(nodes):
-        ready = (n for n in nodes if n.name not in ordered and ordered.keys() >= {*n.after})
-        if (node := next(ready, None)) is None:
-            circle = few(name for name in names if name not in ordered)
-            raise PalpateError("No stage may come after itself", circle, "Break the circle")
-        ordered[node.name] = node
-    return list(ordered.values())
+    return {node.name: node.name in run.stages for node in nodes}
 
 
 def digests_of(nodes: Sequence[Node]) -> dict[str, str]:
     """What names each stage: the digest of what it reads, by name."""
     digests: dict[str, str] = {}
-    for node in in_order(nodes):
+    for node in nodes:
         digests[node.name] = stage_digest(node.name, node.inputs(digests), node.version)
     return digests
 
 
+@dataclass(frozen=True)
+class _Task:
+    """A node that can be built: the stages that it reads are there."""
+
+    node: Node
+    before: Mapping[str, Stage]
+    folder: Path
+    device: str
+
+    def build(self, print_line: PrintLine, progress: Progress) -> Stage:
+        """Build the stage, in this process."""
+        node, before = self.node, self.before
+
+        def report(step: str, done: int, total: int, remark: str = "") -> None:
+            progress(f"{node.name}: {step}", done, total, remark)
+
+        def fill(folder: Path) -> Mapping[str, Any] | None:
+            after = {name: stage.folder for name, stage in before.items()}
+            return node.build(Work(folder, after, self.folder / "cache", self.device, report))
+
+        try:
+            return run_stage(
+                self.folder / node.name,
+                node.inputs({name: stage.digest for name, stage in before.items()}),
+                fill,
+                version=node.version,
+                read={name: stage.outputs for name, stage in before.items()},
+                print_line=print_line,
+            )
+        except Exception:
+            print_line(f"{node.name}: stopped by an error")
+            raise
+
+
 @dataclass
 class _Run:
-    """All nodes of a run: what is done, and what is running."""
+    """All nodes of a run: which stages are there, and which are being built."""
 
-    ordered: Sequence[Node]
+    nodes: Sequence[Node]
     folder: Path
     device: str = "auto"
     jobs: int = 1
@@ -249,15 +238,15 @@ class _Run:
 
     @cached_property
     def digests(self) -> dict[str, str]:
-        return digests_of(self.ordered)
+        return digests_of(self.nodes)
 
-    def next_task(self) -> tuple[Node, dict[str, Stage]] | None:
-        """Begin the next node that may be built, of the stages that it reads; None without one.
+    def next_task(self) -> _Task | None:
+        """Begin the next node that can be built; None without one.
 
         What needs no work is taken on the way: from the start, or once what it reads has been made
         again.
         """
-        for node in self.ordered:
+        for node in self.nodes:
             if node.name in {*self.stages, *self.begun} or not self.stages.keys() >= {*node.after}:
                 continue
             before = {name: self.stages[name] for name in node.after}
@@ -266,7 +255,7 @@ class _Run:
             if stage is None:
                 self.begun.add(node.name)
                 self.show()
-                return node, before
+                return _Task(node, before, self.folder, self.device)
             self.stages[node.name] = stage
             self.print_line(f"{node.name}: already done ({stage.seconds:.0f} s then)")
         return None
@@ -275,42 +264,11 @@ class _Run:
         self.begun.remove(stage.folder.name)
         self.stages[stage.folder.name] = stage
         self.show()
-        if len(self.stages) < len(self.ordered):
-            self.print_line(f"{len(self.stages)} of {len(self.ordered)} stages")
+        if len(self.stages) < len(self.nodes):
+            self.print_line(f"{len(self.stages)} of {len(self.nodes)} stages")
 
     def show(self) -> None:
-        self.progress("all stages", len(self.stages), len(self.ordered))
-
-
-def _build_node(
-    folder: Path,
-    device: str,
-    task: tuple[Node, Mapping[str, Stage]],
-    print_line: PrintLine,
-    progress: Progress,
-) -> Stage:
-    """Build a node of the stages that it reads, in this process."""
-    node, before = task
-
-    def report(step: str, done: int, total: int, remark: str = "") -> None:
-        progress(f"{node.name}: {step}", done, total, remark)
-
-    def build(partial_folder: Path) -> Mapping[str, Any] | None:
-        after = {name: stage.folder for name, stage in before.items()}
-        return node.build(Work(partial_folder, after, folder / "cache", device, report))
-
-    try:
-        return run_stage(
-            folder / node.name,
-            node.inputs({name: stage.digest for name, stage in before.items()}),
-            build,
-            version=node.version,
-            read={name: stage.outputs for name, stage in before.items()},
-            print_line=print_line,
-        )
-    except Exception:
-        print_line(f"{node.name}: stopped by an error")
-        raise
+        self.progress("all stages", len(self.stages), len(self.nodes))
 
 
 def _run_here(run: _Run) -> None:
@@ -319,7 +277,7 @@ def _run_here(run: _Run) -> None:
         run.progress(step, done, total, remark)
 
     while task := run.next_task():
-        run.end(_build_node(run.folder, run.device, task, run.print_line, report))
+        run.end(task.build(run.print_line, report))
 
 
 def _run_in_workers(run: _Run) -> None:
@@ -368,8 +326,7 @@ def _start_worker(workers: dict[Channel, BaseProcess], run: _Run) -> Channel:
     environment |= {"OMP_NUM_THREADS": threads}
     context = multiprocessing.get_context("spawn")
     ours, theirs = context.Pipe()
-    arguments = (theirs, environment, run.folder, run.device)
-    process = context.Process(target=_work, args=arguments)
+    process = context.Process(target=_work, args=(theirs, environment))
     process.start()
     theirs.close()
     workers[ours] = process
@@ -384,7 +341,7 @@ def _raise_dead(process: BaseProcess) -> NoReturn:
     raise PalpateError("The processes of a study must stay alive", got, fix)
 
 
-def _work(channel: Channel, environment: Mapping[str, str], folder: Path, device: str) -> None:
+def _work(channel: Channel, environment: Mapping[str, str]) -> None:
     """Build the nodes that arrive, in a worker, until its parent ends."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent handles Ctrl-C
     exit_with_parent()
@@ -398,8 +355,8 @@ def _work(channel: Channel, environment: Mapping[str, str], folder: Path, device
 
     while True:
         try:
-            task = channel.recv()
-            send("stage", _build_node(folder, device, task, partial(send, "line"), report))
+            task: _Task = channel.recv()
+            send("stage", task.build(partial(send, "line"), report))
         except Exception as error:
             error.add_note(traceback.format_exc())  # a traceback is not sent along
             send("error", error)

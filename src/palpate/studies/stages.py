@@ -96,8 +96,8 @@ def run_stage(
         print_line(f"{name}: already done ({stage.seconds:.0f} s then)")
         return stage
     print_line(f"{name}: ...")
-    inputs = {"digest": digest, "version": version, "inputs": inputs, "read": read}
-    stage = _build(folder, json.loads(canonical_json(inputs)), build)
+    record = {"digest": digest, "version": version, "inputs": inputs, "read": read}
+    stage = _build(folder, json.loads(canonical_json(record)), build)
     print_line(f"{name}: done in {stage.seconds:.0f} s")
     return stage
 

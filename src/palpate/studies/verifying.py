@@ -15,7 +15,7 @@ from __future__ import annotations
 import tempfile
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from importlib import import_module
 from pathlib import Path
@@ -35,8 +35,8 @@ from palpate.report.results import (
     Results,
     is_there,
 )
-from palpate.studies.graph import measured_again
-from palpate.studies.stages import stage_outputs
+from palpate.studies.graph import Work
+from palpate.studies.stages import Stage, stage_outputs, stored_stage
 
 FORMAT = "palpate-verification/1"
 #: Verb -> module and function of its calls.
@@ -247,7 +247,18 @@ def _run_again(
             with reading_entry(file, "The settings"):
                 demo = settings["study"] == Demo.name
                 plan = Demo.again(settings) if demo else plan_again(settings, folder)
-                stages = measured_again(plan.nodes(), folder, Path(target), progress)
+                stages, nodes = dict[str, Stage](), plan.nodes()
+                for done, node in enumerate(nodes):
+                    progress("stages", done, len(nodes), node.name)
+                    stage = stored_stage(folder / node.name)
+                    if node.measures:  # built again of what is stored, and of what was built again
+                        (again := Path(target, node.name)).mkdir()
+                        after = {name: stages[name].folder for name in node.after}
+                        facts = dict(node.build(Work(again, after, Path(target, "cache"))) or {})
+                        stage = replace(
+                            stage, folder=again, record={**stage.record, "facts": facts}
+                        )
+                    stages[node.name] = stage
                 return _items(plan.results(stages)) | items, reasons
         except (PalpateError, OSError) as error:
             return items, [*reasons, " ".join(str(error).split())]
