@@ -2,6 +2,7 @@
 
 import inspect
 import re
+from dataclasses import fields
 from pathlib import Path
 
 import numpy as np
@@ -9,7 +10,8 @@ import pytest
 
 from palpate import metrics
 from palpate.core import FeatureSet
-from palpate.metrics import cmmd, fid, kid, prdc, tmmd
+from palpate.metrics import Options, cmmd, fid, kid, prdc, tmmd
+from palpate.metrics.mmd import Settings
 from palpate.report.note_texts import SENTENCES
 
 TWO_SETS, ONE_SET = "generated, reference, **options", "generated, **options"
@@ -20,10 +22,10 @@ FUNCTIONS = {
     "ci_tmmd": ONE_SET,
     "cmmd": TWO_SETS,
     "compare": "generators, reference, *, floor=None, **options",
-    "compare_fid": "generators, reference, **options",
+    "compare_fid": "generators, reference, *, seed=0, split=None",
     "compare_tmmd": "generators, reference, **options",
     "contact_mask": "tactile, background",
-    "contact_scores": f"{IMAGES}, background, *, ids=None, **options",
+    "contact_scores": f"{IMAGES}, background, **options",
     "d_tmmd": ONE_SET,
     "distance": (
         "generated, reference, *, groups=None, reference_groups=None, block=1024, **options"
@@ -114,3 +116,8 @@ def test_every_note_has_a_sentence():
     codes = set(re.findall(r'Note\(\s*"([a-z-]+)"', source))
     assert len(codes) > 10
     assert codes - set(SENTENCES) == set()
+
+
+def test_an_editor_completes_what_options_are() -> None:
+    """The typed keywords of metrics are the fields of the record that holds them."""
+    assert [*Settings.__annotations__] == [field.name for field in fields(Options)]

@@ -20,12 +20,10 @@ from palpate.core import FeatureSet, Score, rng_for
 from palpate.data.images import load_images
 from palpate.data.samples import Samples
 from palpate.metrics.probe import fit_probe, material_accuracy
+from palpate.report.tables import BACKGROUND, REAL, SAME_MATERIAL
 
 if TYPE_CHECKING:
     from palpate.evaluation.scorers import Bench
-
-#: Rows of the tables that are not generators.
-BACKGROUND, SAME_MATERIAL, REAL = "background only", "real, same material", "real"
 
 #: Materials and videos of n rows, '' where unknown.
 Columns = tuple[Collection[str], Collection[str]]

@@ -37,13 +37,7 @@ from palpate.data.samples import (
     with_recordings,
 )
 from palpate.evaluation.clusters import clustered, of_clusters
-from palpate.evaluation.controls import (
-    BACKGROUND,
-    REAL,
-    SAME_MATERIAL,
-    control_samples,
-    material_accuracies,
-)
+from palpate.evaluation.controls import control_samples, material_accuracies
 from palpate.evaluation.memorization import memorized
 from palpate.evaluation.scorers import (
     PAIRS,
@@ -62,6 +56,7 @@ from palpate.metrics.intervals import without_interval
 from palpate.report.labels import measured
 from palpate.report.records import GalleryItem
 from palpate.report.results import OBJECT, PATH, Call, Results
+from palpate.report.tables import BACKGROUND, REAL, SAME_MATERIAL
 
 #: Rows of the gallery.
 GALLERY = 40

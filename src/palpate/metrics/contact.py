@@ -26,7 +26,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, Unpack
 
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
@@ -37,6 +37,7 @@ from palpate.core import Note, Score
 from palpate.metrics.images import (
     WINDOW_SETTINGS,
     Array,
+    ImageOptions,
     PerImage,
     as_unit,
     image_pairs,
@@ -90,12 +91,7 @@ def contact_mask(tactile: Any, background: Any) -> Mask:
 
 
 def contact_scores(
-    generated: Any,
-    reference: Any,
-    background: Any,
-    *,
-    ids: Sequence[str] | None = None,
-    **options: Any,
+    generated: Any, reference: Any, background: Any, **options: Unpack[ImageOptions]
 ) -> list[Score]:
     """Mean contact residual, SSIM and IoU, over the images that show contact.
 
@@ -103,7 +99,6 @@ def contact_scores(
         generated: (n, h, w, 3 or 1) array or tensor, uint8 or float in [0, 1]; h, w >= 11.
         reference: the same shape: the real tactile image of each generated one.
         background: the same shape, or one image (h, w, c) for all: the real gel without contact.
-        ids: n names.
         **options: of :meth:`palpate.metrics.PerImage.score`.
 
     Returns:
@@ -113,8 +108,8 @@ def contact_scores(
     Raises:
         PalpateError: on other shapes, dtypes or ranges, or images smaller than the window.
     """
-    each = contact_per_image({"": generated}, reference, background, ids)[""]
-    return [metric.score(ids=ids, **options) for metric in each]
+    each = contact_per_image({"": generated}, reference, background, options.get("ids"))[""]
+    return [metric.score(**options) for metric in each]
 
 
 def contact_per_image(

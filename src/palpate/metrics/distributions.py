@@ -41,7 +41,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Unpack
 
 import numpy as np
 from scipy import linalg
@@ -51,12 +51,13 @@ from palpate.core import FeatureSet, Note, Score, require, rng_for
 from palpate.metrics.inputs import (
     Array,
     Index,
+    PairColumns,
     checked_names,
     checked_pair,
     checked_whole,
     copies_across,
-    feature_sets,
     require_one_encoder,
+    with_columns,
 )
 from palpate.metrics.intervals import Scored, Spread, score_of, spread_of_values
 from palpate.metrics.paired import Comparison, compared, same_samples
@@ -74,7 +75,15 @@ BLOCK = 1 << 23
 TIE = 1e-12
 
 
-def fid(generated: Any, reference: Any, **options: Any) -> Score:
+class FidOptions(PairColumns, total=False):
+    """What :func:`fid` takes by name."""
+
+    subject: str
+    seed: int
+    split: str | None
+
+
+def fid(generated: Any, reference: Any, **options: Unpack[FidOptions]) -> Score:
     """FID between generated and real samples; lower is better.
 
     Args:
@@ -92,19 +101,24 @@ def fid(generated: Any, reference: Any, **options: Any) -> Score:
         PalpateError: on features that cannot be used, unequal widths, fewer than two rows, or
             encoders of different digests.
     """
-    x, y = feature_sets(options, generated=generated, reference=reference)
-    return _fid(x, y, **options).score
+    (x, y), settings = with_columns(options, generated=generated, reference=reference)
+    return _fid(x, y, **settings).score
 
 
 def compare_fid(
-    generators: Mapping[str, FeatureSet], reference: FeatureSet, **options: Any
+    generators: Mapping[str, FeatureSet],
+    reference: FeatureSet,
+    *,
+    seed: int = 0,
+    split: str | None = None,
 ) -> Comparison:
     """FID of several generators on the same samples, with paired differences.
 
     Args:
         generators: name -> features; all with the same ids (any order), labels and groups.
         reference: features of the real samples.
-        **options: of :func:`fid`.
+        seed: as of :func:`fid`.
+        split: digest of the split, kept in the scores.
 
     Returns:
         Differences of FID at this n, in which the biases of the two need not be equal.
@@ -113,7 +127,8 @@ def compare_fid(
         PalpateError: if generators differ in ids, labels, groups or encoder, or as :func:`fid`.
     """
     sets = same_samples(generators)
-    result = compared({n: [_fid(s, reference, subject=n, **options)] for n, s in sets.items()})
+    each = {n: [_fid(s, reference, subject=n, seed=seed, split=split)] for n, s in sets.items()}
+    result = compared(each)
     note = Note("fid-difference-biased")
     differences = [replace(d, notes=(note,)) if d.interval else d for d in result.differences]
     return replace(result, differences=differences)
@@ -269,7 +284,15 @@ def _draw_blocks(n: int, m: int, groups: Sequence[list[str] | None], seed: int) 
     return _Blocks(x, y, [f"block {b}" for b in range(count)], details, tail)
 
 
-def prdc(generated: Any, reference: Any, k: int = 5, **options: Any) -> list[Score]:
+class PrdcOptions(PairColumns, total=False):
+    """What :func:`prdc` takes by name."""
+
+    grouped: bool | None
+    subject: str
+    split: str | None
+
+
+def prdc(generated: Any, reference: Any, k: int = 5, **options: Unpack[PrdcOptions]) -> list[Score]:
     """Precision, recall, density and coverage, in that order; higher is better for all four.
 
     Args:
@@ -289,8 +312,8 @@ def prdc(generated: Any, reference: Any, k: int = 5, **options: Any) -> list[Sco
         PalpateError: on features that cannot be used, unequal widths, encoders of different
             digests, or (grouped) a group outside which there are fewer than k rows.
     """
-    x, y = feature_sets(options, generated=generated, reference=reference)
-    return prdc_rows(x, y, k, **options)[0]
+    (x, y), settings = with_columns(options, generated=generated, reference=reference)
+    return prdc_rows(x, y, k, **settings)[0]
 
 
 def prdc_rows(

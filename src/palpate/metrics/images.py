@@ -19,7 +19,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Literal
+from typing import Any, Literal, TypedDict, Unpack
 
 import numpy as np
 from numpy.typing import NDArray
@@ -39,7 +39,16 @@ WINDOW_SETTINGS = {"window": WINDOW, "sigma": SIGMA, "k1": K1, "k2": K2}
 WEIGHTS = (0.0448, 0.2856, 0.3001, 0.2363, 0.1333)
 
 
-def ssim(generated: Any, reference: Any, **options: Any) -> Score:
+class ImageOptions(TypedDict, total=False):
+    """What :meth:`PerImage.score` takes."""
+
+    ids: Sequence[str] | None
+    groups: Sequence[str] | None
+    subject: str
+    split: str | None
+
+
+def ssim(generated: Any, reference: Any, **options: Unpack[ImageOptions]) -> Score:
     """Mean SSIM over pairs of images; 1 is identical.
 
     Args:
@@ -53,7 +62,7 @@ def ssim(generated: Any, reference: Any, **options: Any) -> Score:
     return per_image("SSIM", generated, reference).score(**options)
 
 
-def psnr(generated: Any, reference: Any, **options: Any) -> Score:
+def psnr(generated: Any, reference: Any, **options: Unpack[ImageOptions]) -> Score:
     """Mean PSNR in dB over the pairs of images that are not identical.
 
     Arguments and errors as :func:`ssim`; images may be smaller than its window.
@@ -61,7 +70,7 @@ def psnr(generated: Any, reference: Any, **options: Any) -> Score:
     return per_image("PSNR", generated, reference).score(**options)
 
 
-def ms_ssim(generated: Any, reference: Any, **options: Any) -> Score:
+def ms_ssim(generated: Any, reference: Any, **options: Unpack[ImageOptions]) -> Score:
     """Mean MS-SSIM over pairs of images, of as many scales as these hold; 1 is identical.
 
     Arguments and errors as :func:`ssim`. Weights of fewer than five scales are divided by their

@@ -16,10 +16,10 @@ import os
 import sys
 import warnings
 from collections import Counter
-from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
-from typing import Any, Literal, TypeVar
+from typing import Any, Literal, TypedDict, TypeVar
 
 import numpy as np
 from array_api_compat import array_namespace, device
@@ -47,18 +47,47 @@ def check(holds: bool, name: str, must: str, got: Any, fix: str, **example: Any)
         raise PalpateError(must, str(got), fix, argument=argument, example=example)
 
 
-def feature_sets(options: dict[str, Any], **features: Any) -> list[FeatureSet]:
-    """Features by role (``generated``, ``reference``) as :class:`FeatureSet`.
+class Columns(TypedDict, total=False):
+    """Columns of a set of features: one entry a row, in a list, an array, a series or a tensor."""
 
-    Their columns ``ids``, ``labels`` and ``groups``, of another role than ``generated`` after its
-    name and ``_``, and ``encoder`` are taken out of ``options``. Without ids, rows get the name of
-    the role and their number: rows of two arrays without ids are different samples.
+    ids: Any
+    labels: Any
+    groups: Any
+    encoder: str | None
+
+
+class PairColumns(Columns, total=False):
+    """The same of generated features, and those of the reference."""
+
+    reference_ids: Any
+    reference_labels: Any
+    reference_groups: Any
+
+
+def feature_sets(**features: Any) -> list[FeatureSet]:
+    """Features by role (``generated``, ``reference``) as :class:`FeatureSet`, without columns.
+
+    Raises:
+        PalpateError: on what does not turn into rows.
+    """
+    return with_columns({}, **features)[0]
+
+
+def with_columns(
+    options: Mapping[str, Any], **features: Any
+) -> tuple[list[FeatureSet], dict[str, Any]]:
+    """Features by role with those ``options`` that are their columns, and the other options.
+
+    Columns are ``ids``, ``labels`` and ``groups``, of another role than ``generated`` after its
+    name and ``_``, and ``encoder``. Without ids, rows get the name of the role and their number:
+    rows of two arrays without ids are different samples.
 
     Raises:
         PalpateError: on what does not turn into rows, or columns of another length.
     """
-    encoder = options.pop("encoder", None)
-    return [_feature_set(role, x, options, encoder) for role, x in features.items()]
+    settings = {**options}
+    encoder = settings.pop("encoder", None)
+    return [_feature_set(role, x, settings, encoder) for role, x in features.items()], settings
 
 
 def _feature_set(

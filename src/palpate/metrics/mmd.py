@@ -51,14 +51,16 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
-from typing import Any, Literal, get_args
+from typing import Any, Literal, TypedDict, get_args
 
 import numpy as np
 
 from palpate.core import FeatureSet, require, require_choice, seed_for
 from palpate.core.features import Array, Index, is_missing
 from palpate.metrics.inputs import (
+    Columns,
     Normalize,
+    PairColumns,
     check,
     checked_features,
     checked_names,
@@ -164,6 +166,33 @@ class Options:
     seed: int = 0
     subject: str = "generated"
     split: str | None = None
+
+
+class Settings(TypedDict, total=False):
+    """What a call may set of :class:`Options`."""
+
+    preset: Literal["paper", "paper-tables", "cmmd", "grouped"] | None
+    estimator: Estimator
+    halves: Halves
+    denominator: Denominator
+    aggregate: Aggregate
+    sigma: Sigma
+    kernel: Kernel | None
+    scale: float
+    normalize: Normalize
+    backend: Backend
+    permutations: int
+    seed: int
+    subject: str
+    split: str | None
+
+
+class SetOptions(Settings, Columns, total=False):
+    """Settings, and the columns of one set."""
+
+
+class PairOptions(Settings, PairColumns, total=False):
+    """Settings, and the columns of two sets."""
 
 
 PRESETS: dict[str, Options] = {

@@ -23,7 +23,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import accumulate, combinations
-from typing import Any
+from typing import Any, Unpack
 
 import numpy as np
 
@@ -32,7 +32,7 @@ from palpate.core.features import Array
 from palpate.metrics.inputs import feature_sets, require_one_encoder, require_same_ids
 from palpate.metrics.intervals import Interval, Scored, Spread, spread_of_values
 from palpate.metrics.means import Mean, spread_of
-from palpate.metrics.mmd import build_table, shared_ids
+from palpate.metrics.mmd import Settings, build_table, shared_ids
 from palpate.metrics.tactile import ci_tmmd_of, d_tmmd_of, i_tmmd_of, tmmd_of
 
 #: Designs that differ by less have one floor: the change is far below the noise of any floor.
@@ -90,7 +90,7 @@ def _mean_excess(score: Score, classes: Sequence[str]) -> float | None:
 
 
 def four_scores(
-    generated: Any, reference: Any, *, floor: Any = None, **options: Any
+    generated: Any, reference: Any, *, floor: Any = None, **options: Unpack[Settings]
 ) -> list[Score]:
     """TMMD, I-TMMD, CI-TMMD and D-TMMD from one sweep over the pairs.
 
@@ -106,7 +106,7 @@ def four_scores(
     Raises:
         PalpateError: as the single metrics do.
     """
-    x, y = feature_sets({}, generated=generated, reference=reference)
+    x, y = feature_sets(generated=generated, reference=reference)
     subject = options.pop("subject", "generated")
     scores, _ = _four_of_each({subject: x}, y, floor, options)
     return [result.score for result in scores[subject]]
@@ -123,7 +123,7 @@ def _four_of_each(
     scores = {name: _four(s, reference, {**options, "subject": name}) for name, s in sets.items()}
     if floor is None:
         return scores, [None] * 4
-    (floor,), first = feature_sets({}, floor=floor), next(iter(sets.values()))
+    (floor,), first = feature_sets(floor=floor), next(iter(sets.values()))
     require_one_encoder(first, floor, "Generated and floor")
     must, got = "The floor must be scored like the generated samples", "groups in one of the two"
     same = (floor.groups is None) == (first.groups is None)
@@ -158,7 +158,7 @@ class Comparison:
 
 
 def compare(
-    generators: Mapping[str, Any], reference: Any, *, floor: Any = None, **options: Any
+    generators: Mapping[str, Any], reference: Any, *, floor: Any = None, **options: Unpack[Settings]
 ) -> Comparison:
     """TMMD, I-, CI- and D-TMMD of several generators on the same samples, with paired differences.
 
@@ -175,7 +175,7 @@ def compare(
     Raises:
         PalpateError: if generators differ in ids, labels, groups or encoder, or as the metrics do.
     """
-    (reference,) = feature_sets({}, reference=reference)
+    (reference,) = feature_sets(reference=reference)
     scores, floors = _four_of_each(same_samples(generators), reference, floor, options)
     return compared({n: _with_excess(s) for n, s in scores.items()}, _with_excess(floors))
 
@@ -196,7 +196,9 @@ def compared(
     return Comparison([s.score for row in sets.values() for s in row if s], differences)
 
 
-def compare_tmmd(generators: Mapping[str, Any], reference: Any, **options: Any) -> Comparison:
+def compare_tmmd(
+    generators: Mapping[str, Any], reference: Any, **options: Unpack[Settings]
+) -> Comparison:
     """As :func:`compare`, TMMD alone.
 
     With ``kernel=Polynomial()``, ``normalize=False`` and ``preset="paper"`` it is KID, with
@@ -205,7 +207,7 @@ def compare_tmmd(generators: Mapping[str, Any], reference: Any, **options: Any) 
     Raises:
         PalpateError: as :func:`compare`.
     """
-    (reference,) = feature_sets({}, reference=reference)
+    (reference,) = feature_sets(reference=reference)
     sets = same_samples(generators)
     return compared(
         {
@@ -223,7 +225,7 @@ def same_samples(generators: Mapping[str, Any]) -> dict[str, FeatureSet]:
     """
     must, fix = "must hold a generator", "Pass its features by name"
     require(len(generators) > 0, "generators", must, "none", fix=fix)
-    sets = {name: feature_sets({}, generated=x)[0] for name, x in generators.items()}
+    sets = {name: feature_sets(generated=x)[0] for name, x in generators.items()}
     first = next(iter(sets))
     return {name: _ordered(sets[first], first, x, name) for name, x in sets.items()}
 

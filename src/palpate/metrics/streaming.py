@@ -16,7 +16,7 @@ import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from hashlib import blake2b
-from typing import Any
+from typing import Any, Unpack
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,7 +32,14 @@ from palpate.metrics.inputs import (
     to_host,
 )
 from palpate.metrics.kernels import gaussian, kernel_sums
-from palpate.metrics.mmd import build_table, largest_bound, mmd_matrix, plan_for, unit_index
+from palpate.metrics.mmd import (
+    Settings,
+    build_table,
+    largest_bound,
+    mmd_matrix,
+    plan_for,
+    unit_index,
+)
 from palpate.metrics.tactile import copied_rows, tmmd_of
 
 
@@ -121,7 +128,11 @@ class TMMD:
     """
 
     def __init__(
-        self, *, encoder: str | None = None, reset_real_features: bool = True, **options: Any
+        self,
+        *,
+        encoder: str | None = None,
+        reset_real_features: bool = True,
+        **options: Unpack[Settings],
     ) -> None:
         self.encoder, self.reset_real_features, self.options = encoder, reset_real_features, options
         self.plan = plan_for(options, grouped=True)  # checks; groups are known with the rows
@@ -198,7 +209,7 @@ def distance(
     groups: Any = None,
     reference_groups: Any = None,
     block: int = 1024,
-    **options: Any,
+    **options: Unpack[Settings],
 ) -> Score:
     """Squared MMD between two sets of features (paper, Eq. 2), without an interval.
 

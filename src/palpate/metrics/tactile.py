@@ -25,9 +25,9 @@ Inception. CMMD (Jayasumana et al., arXiv 2401.09603): the biased one with a Gau
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any, get_args
+from typing import Any, Unpack, get_args
 
 import numpy as np
 
@@ -35,7 +35,7 @@ from palpate._version import __version__
 from palpate.core import Note, Score
 from palpate.core.features import Array, Index
 from palpate.core.files import plain
-from palpate.metrics.inputs import feature_sets
+from palpate.metrics.inputs import with_columns
 from palpate.metrics.intervals import (
     NONE,
     Estimate,
@@ -55,6 +55,8 @@ from palpate.metrics.mmd import (
     Aggregate,
     Denominator,
     Options,
+    PairOptions,
+    SetOptions,
     Table,
     build_table,
     design_of,
@@ -79,7 +81,7 @@ SETTINGS = {
 }
 
 
-def tmmd(generated: Any, reference: Any, **options: Any) -> Score:
+def tmmd(generated: Any, reference: Any, **options: Unpack[PairOptions]) -> Score:
     """TMMD: dist^2 between generated and real samples (paper, Eq. 2).
 
     Args:
@@ -111,11 +113,11 @@ def tmmd(generated: Any, reference: Any, **options: Any) -> Score:
         >>> tmmd(x, y, normalize=True).n
         50
     """
-    x, y = feature_sets(options, generated=generated, reference=reference)
-    return tmmd_of(build_table(x, y, options)).score
+    (x, y), settings = with_columns(options, generated=generated, reference=reference)
+    return tmmd_of(build_table(x, y, settings)).score
 
 
-def i_tmmd(generated: Any, **options: Any) -> Score:
+def i_tmmd(generated: Any, **options: Unpack[SetOptions]) -> Score:
     """I-TMMD: dist^2 between two halves of the generated samples (paper, Eq. 3).
 
     With ``halves="group"`` the value is the average over halvings by whole groups, in closed form
@@ -137,7 +139,7 @@ def i_tmmd(generated: Any, **options: Any) -> Score:
     return i_tmmd_of(_table(generated, options)).score
 
 
-def ci_tmmd(generated: Any, **options: Any) -> Score:
+def ci_tmmd(generated: Any, **options: Unpack[SetOptions]) -> Score:
     """CI-TMMD: the mean over classes of dist^2 between two halves of a class (paper, Eq. 4).
 
     A class (``labels``) counts with at least four samples and, for halves by group, two groups of
@@ -150,7 +152,7 @@ def ci_tmmd(generated: Any, **options: Any) -> Score:
     return ci_tmmd_of(_table(generated, options)).score
 
 
-def d_tmmd(generated: Any, **options: Any) -> Score:
+def d_tmmd(generated: Any, **options: Unpack[SetOptions]) -> Score:
     """D-TMMD: how much a class differs from itself, against how much from the others (Eq. 5-7).
 
     ``denominator``: ``"sum"`` over c' including c (Eq. 7), ``"mean"`` of the same, or
@@ -168,13 +170,13 @@ def d_tmmd(generated: Any, **options: Any) -> Score:
     return d_tmmd_of(_table(generated, options)).score
 
 
-def _table(generated: Any, options: dict[str, Any]) -> Table:
+def _table(generated: Any, options: SetOptions) -> Table:
     """The table of one set."""
-    (x,) = feature_sets(options, generated=generated)
-    return build_table(x, None, options)
+    (x,), settings = with_columns(options, generated=generated)
+    return build_table(x, None, settings)
 
 
-def kid(generated: Any, reference: Any, **options: Any) -> Score:
+def kid(generated: Any, reference: Any, **options: Unpack[PairOptions]) -> Score:
     """KID between generated and real features, times 1000; lower is better.
 
     Args:
@@ -186,11 +188,16 @@ def kid(generated: Any, reference: Any, **options: Any) -> Score:
     Raises:
         PalpateError: as :func:`palpate.metrics.tmmd`.
     """
-    defaults = {"kernel": Polynomial(), "preset": "paper", "normalize": False, "permutations": 0}
-    return _named("KID", generated, reference, defaults | options)
+    defaults: PairOptions = {
+        "kernel": Polynomial(),
+        "preset": "paper",
+        "normalize": False,
+        "permutations": 0,
+    }
+    return _named("KID", generated, reference, {**defaults, **options})
 
 
-def cmmd(generated: Any, reference: Any, **options: Any) -> Score:
+def cmmd(generated: Any, reference: Any, **options: Unpack[PairOptions]) -> Score:
     """CMMD between generated and real embeddings, times 1000; lower is better.
 
     Args:
@@ -201,10 +208,11 @@ def cmmd(generated: Any, reference: Any, **options: Any) -> Score:
     Raises:
         PalpateError: as :func:`palpate.metrics.tmmd`.
     """
-    return _named("CMMD", generated, reference, {"preset": "cmmd", "permutations": 0} | options)
+    defaults: PairOptions = {"preset": "cmmd", "permutations": 0}
+    return _named("CMMD", generated, reference, {**defaults, **options})
 
 
-def _named(name: str, generated: Any, reference: Any, options: Mapping[str, Any]) -> Score:
+def _named(name: str, generated: Any, reference: Any, options: PairOptions) -> Score:
     score = tmmd(generated, reference, **options)
     settings = {k: v for k, v in score.settings.items() if k != "preset"}
     return replace(score, metric=name, settings=settings)

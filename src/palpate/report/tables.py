@@ -89,8 +89,11 @@ FAMILIES: tuple[tuple[str, str, tuple[str, ...]], ...] = (
 )
 #: Name of a baseline -> its key in the details of a score.
 BASELINES = {"no contact": "empty", "chance": "chance", "majority": "majority"}
-#: The ``a`` of scores of real images, and of controls wherever they are scored.
-REAL, CONTROLS = "real", ("background only", "real, same material")
+#: The ``a`` of scores of real images, and of the controls of every table
+#: (:mod:`palpate.evaluation.controls`).
+REAL = "real"
+BACKGROUND, SAME_MATERIAL = "background only", "real, same material"
+CONTROLS = (BACKGROUND, SAME_MATERIAL)
 #: Row of a table that has floors.
 FLOOR = "real images (floor)"
 #: What a preset of the TMMD family means, for the head of its table.

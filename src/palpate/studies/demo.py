@@ -28,13 +28,12 @@ from palpate.encoders.contrastive import train_tactile
 from palpate.encoders.encoder_set import EncoderSet, load_clip
 from palpate.encoders.presets import PRESETS as ENCODERS
 from palpate.encoders.presets import EncoderPreset, preset_of
-from palpate.evaluation.controls import BACKGROUND
 from palpate.evaluation.scoring import score
 from palpate.leakage.auditing import audit
 from palpate.leakage.splitting import split as leak_free_split
 from palpate.report.labels import percent, with_interval
 from palpate.report.results import Results
-from palpate.report.tables import families
+from palpate.report.tables import BACKGROUND, families
 from palpate.sim.options import WorldOptions
 from palpate.sim.presets import PRESETS as WORLDS
 from palpate.studies.controls import nearest_rows
