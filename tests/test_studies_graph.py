@@ -11,7 +11,8 @@ from pathlib import Path
 import pytest
 
 from palpate.core import PalpateError, locked
-from palpate.studies.graph import Named, Node, Nodes, plan_graph, run_graph
+from palpate.studies.graph import Named, Node, Nodes
+from palpate.studies.running import plan_graph, run_graph
 
 
 def write(work, *, text):
@@ -190,7 +191,8 @@ def test_work_within_a_node_is_reported_under_its_name(tmp_path, jobs):
 SCRIPT = """
 import sys, time
 from pathlib import Path
-from palpate.studies.graph import Node, run_graph
+from palpate.studies.graph import Node
+from palpate.studies.running import run_graph
 
 def grow(work):
     # Lines, one after the other, each of which holds what came before; resumes.

@@ -69,8 +69,8 @@ def run(options: Options, terminal: Terminal) -> dict[str, Any]:
     systems = _folders(options.method)
     from palpate.core import write_text
     from palpate.evaluation.scorers import Weights
-    from palpate.studies.graph import plan_graph
     from palpate.studies.reproduce import Plan
+    from palpate.studies.running import plan_graph
     from palpate.studies.study import STUDIES
 
     output = options.output

@@ -5,7 +5,7 @@
     world -> data -> split -> encoders -> generator -> generated -> scores
 
 Each stage is kept in the run folder under the digest of what it read
-(:mod:`palpate.studies.graph`): a killed run resumes from its last finished stage, and a
+(:mod:`palpate.studies.stages`): a killed run resumes from its last finished stage, and a
 changed option rebuilds only what depends on it. ``world`` is skipped where data is given. Training
 goes on from the models that ship.
 """

@@ -30,11 +30,12 @@ from palpate.sim.presets import MINI_SEEDS
 from palpate.studies import making
 from palpate.studies.collecting import collect
 from palpate.studies.files import data_stamp, function_stamp, model_stamp, require_unseen
-from palpate.studies.graph import Named, Node, Nodes, run_graph
+from palpate.studies.graph import Named, Node, Nodes
 from palpate.studies.judging import judge_images, probe_encoders
 from palpate.studies.making import Training
 from palpate.studies.methods import Method, shipped
 from palpate.studies.names import NOLEAK, SHIPPED, SPLITS, images_node, scores_node, slug
+from palpate.studies.running import run_graph
 from palpate.studies.stages import PrintLine, Stage, record_of
 from palpate.studies.study import STUDIES, Preset, Study
 from palpate.studies.utility import USEFUL, Draws, measure_utility

@@ -19,8 +19,9 @@ from palpate.encoders import EncoderSet
 from palpate.evaluation.probing import Plan, Probed, measure, named, plan_of, results_of
 from palpate.report.results import Results
 from palpate.studies.files import model_stamp
-from palpate.studies.graph import Named, Nodes, run_graph
+from palpate.studies.graph import Named, Nodes
 from palpate.studies.making import make_encoders
+from palpate.studies.running import run_graph
 from palpate.studies.stages import PrintLine
 from palpate.training.options import Compute
 
