@@ -64,7 +64,7 @@ def test_walking_skips_hidden_files_and_follows_links_once(tmp_path):
         (tmp_path / path).touch()
     (tmp_path / "d" / "b" / "circle").symlink_to(tmp_path / "d")
     (tmp_path / "d" / "out").symlink_to(tmp_path / "far")
-    assert walk(tmp_path / "d") == (["a.png", "b/10.png", "b/2.png"], ["out"])
+    assert walk(tmp_path / "d") == (["a.png", "b/10.png", "b/2.png", "out/1.png"], ["b/circle"])
 
 
 def sides(**templates):

@@ -257,7 +257,7 @@ def _with_siblings(samples: dict[Path, list[dict[str, Any]]], root: Path) -> lis
     folders = {path.parent for path in samples}
     if len(folders) > 1:
         return list(samples)
-    frames = FolderFrames(folders.pop(), root)
+    frames = FolderFrames(folders.pop())
     numbers = [(path, rows[0]["frame"]) for path, rows in samples.items()]
     if any(k is None or not frames.has(k) or frames.path(k) != path for path, k in numbers):
         return list(samples)

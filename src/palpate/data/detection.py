@@ -26,6 +26,7 @@ from typing import Literal
 
 from palpate.core import PalpateError, few, require
 from palpate.data.captions import ADJECTIVES
+from palpate.data.foreign import counted
 from palpate.data.manifest import DIGITS, PART_NAMES, SCHEMA
 from palpate.data.scanning import Cells, Scan
 from palpate.data.templates import Fields, Matches, Template, assign, join, walk
@@ -71,8 +72,107 @@ def detect_layout(files: Sequence[str], folder: str) -> dict[str, str]:
     if set(sides) <= {"background"}:
         return {}
     several = any(map(_several, sides.values()))
-    templates = {side: template_of(sides[side], several) for side in ROLES if side in sides}
-    return _alike(templates, sides)
+    sides = {side: sides[side] for side in ROLES if side in sides}
+    together = _together(sides, several)
+    if together and _fit(files, together):
+        return together
+    apart = _faced(_alike({side: template_of(sides[side], several) for side in sides}, sides))
+    return together if together and _contradict([*apart.values()]) else apart
+
+
+#: In place of the word that says what an image shows.
+_ROLE = "\ue000"
+
+
+def _together(sides: Mapping[str, Sequence[str]], several: bool) -> dict[str, str]:
+    """The templates by what the paths of all sides have in common but for the words of their side.
+
+    So a folder that one side lacks, or has alone, is a field of both, with the values that each
+    has. Empty where the sides differ by more than those words.
+    """
+    stems = {side: [posixpath.splitext(path) for path in files] for side, files in sides.items()}
+    own = {s: set.intersection(*(set(_words(stem)) for stem, _ in stems[s])) for s in sides}
+    shared = set.intersection(*own.values())
+    bare: list[str] = []
+    written: dict[str, tuple[str, ...]] = {}
+    for side in sides:
+        roles = {word for word in own[side] - shared if word in ROLE_OF or word in _WEAK}
+        for stem, _ in stems[side]:
+            tokens = _TOKEN.findall(stem)
+            marked = tuple(t for t in tokens if t.lower() in roles)
+            if written.setdefault(side, marked) != marked or not marked:
+                return {}
+            bare.append("".join(_ROLE if t in marked else t for t in tokens) + ".x")
+    count = len(next(iter(written.values())))
+    text = template_of(bare, several)
+    template = Template.parse(text)
+    plain = all(map(template.match, bare)) and text.count(_ROLE) == count
+    if len(sides) < 2 or not plain or any(len(words) != count for words in written.values()):
+        return {}
+    templates: dict[str, str] = {}
+    for side, words in written.items():
+        suffixes = {suffix for _, suffix in stems[side]}
+        parts = text.removesuffix(".x").split(_ROLE)
+        path = "".join(map("".join, zip(parts, (*words, ""), strict=True)))
+        templates[side] = path + (min(suffixes) if len(suffixes) == 1 else ".*")
+    return templates
+
+
+def _contradict(texts: Sequence[str]) -> bool:
+    """Whether folders that no word of a side names face each other by two names."""
+    folders = [text.split("/")[:-1] for text in texts]
+    return len(set(map(len, folders))) == 1 and any(
+        len(set(names)) > 1
+        and not any("{" in name or ROLE_OF.keys() & set(_words(name)) for name in names)
+        for names in zip(*folders, strict=True)
+    )
+
+
+def _faced(templates: dict[str, str]) -> dict[str, str]:
+    """The templates, where a constant that faces a field of another side is that field.
+
+    ``cup_{frame:d}.png`` next to ``{object}_{frame:d}_touch.png`` is ``{object}_{frame:d}.png``: it
+    is the photo of one object and not of all.
+    """
+    for side in templates:
+        for facing in (text for other, text in templates.items() if other != side):
+            pieces, others = templates[side].split("/"), facing.split("/")
+            fields = {*Template.parse(templates[side]).fields}
+            if len(pieces) == len(others):
+                pairs = zip(pieces, others, strict=True)
+                templates[side] = "/".join(_facing(a, b, fields) for a, b in pairs)
+    return templates
+
+
+def _facing(piece: str, facing: str, fields: set[str]) -> str:
+    """One piece of a template, with the fields of the piece that it faces."""
+    field = re.compile(r"(\{\w+[^{}]*\})")
+    both = [mark for mark in field.findall(facing) if mark in field.findall(piece)]
+    split = re.compile("(" + "|".join(map(re.escape, both)) + ")") if both else re.compile("(\0)")
+    mine, theirs = split.split(piece), split.split(facing)
+    if len(mine) != len(theirs):
+        return piece
+    for k, (text, other) in enumerate(zip(mine, theirs, strict=True)):
+        names = re.findall(r"\{(\w+)", other)
+        if names and not fields & set(names) and not field.search(text):
+            stems = [re.sub(r"\.[\w*]+$", "", part) for part in (text, other)]
+            pattern = "".join(
+                f"(?P<{part[1:-1].partition(':')[0]}>{'[0-9]+' if ':d' in part else '[^/]+'})"
+                if field.fullmatch(part)
+                else "".join(
+                    "[A-Za-z]+" if t.lower() in ROLE_OF else re.escape(t)
+                    for t in _TOKEN.findall(part)
+                )
+                for part in field.split(stems[1])
+            )
+            if match := re.fullmatch(pattern, stems[0]):
+                spans = sorted(
+                    (match.span(n), m) for n, m in zip(names, field.findall(other), strict=True)
+                )
+                for (first, last), mark in reversed(spans):
+                    mine[k] = mine[k][:first] + mark + mine[k][last:]
+                fields.update(names)
+    return "".join(mine)
 
 
 def _alike(templates: dict[str, str], sides: Mapping[str, Sequence[str]]) -> dict[str, str]:
@@ -310,16 +410,20 @@ def _literal(text: str) -> str:
 
 
 def walked(result: Scan, suffixes: tuple[str, ...]) -> list[str]:
-    """The files of these suffixes below the root.
+    """The files of these suffixes below the root; what else lies there is counted.
 
-    Links that leave it and names that are not UTF-8, which no table can hold, are reported.
+    Names that are not UTF-8, which no table can hold, are reported.
     """
-    files, outside = walk(result.base, suffixes)
+    every, again = walk(result.base)
+    files = [name for name in every if name.lower().endswith(suffixes)]
     for name in (odd := [f for f in files if any("\ud800" <= c <= "\udfff" for c in f)]):
         result.problem(ascii(name), "bad-encoding", "the name of the file is not UTF-8")
-    files = [name for name in files if name not in odd]
-    text = "links to folders outside the root, which are not followed"
-    result.suspect(result.base, "outside-root", text, outside)
+    files = [name for name in files if name not in odd] if odd else files
+    text = "links to folders that are read already"
+    result.suspect(result.base, "linked-twice", text, again)
+    text = "files that are not read"
+    result.suspect(result.base, "unread", text, counted(every))
+    result.met = True
     return files
 
 
@@ -379,11 +483,15 @@ def templates_of(
 
 
 def _fit(files: Sequence[str], templates: Mapping[str, str]) -> bool:
-    """Whether templates join most of the files that they match."""
+    """Whether templates join most of the files of a side, a frame of one with one of the other."""
     matches = assign(files, {side: Template.parse(text) for side, text in templates.items()})
     with contextlib.suppress(PalpateError):
         rows, _ = join(matches)
-        return 2 * len(rows) >= max(map(len, matches.values()))
+        both = [side for side in SIDES if side in matches]
+        numbered = len(both) == 2 and all("{frame" in templates[side] for side in both)
+        samples = len({tuple(v for n, v in row.items() if n not in matches) for row in rows})
+        shared = numbered and any(len({row[s] for row in rows}) < samples for s in both)
+        return not shared and 2 * len(rows) >= min(len(matches[side]) for side in both)
     return False
 
 

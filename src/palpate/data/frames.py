@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from palpate.core import atomic_path, inside, require_regular
+from palpate.core import atomic_path, require_regular
 from palpate.data.contacts import SIZE, thumbnail
 from palpate.data.images import SUFFIXES, VIDEOS, read_image
 from palpate.data.manifest import DIGITS
@@ -42,13 +42,11 @@ class FolderFrames:
     Attributes:
         source: the folder.
         numbers: the frames in it, in order; a folder may have gaps.
-        leaving: frames that are links to files outside ``root``; they do not count.
         duplicates: (name, name that is read) of further images of the same number.
     """
 
-    def __init__(self, folder: Path, root: Path) -> None:
+    def __init__(self, folder: Path) -> None:
         self.source = folder
-        self.leaving: set[int] = set()
         self.duplicates: list[tuple[str, str]] = []
         self._names: dict[int, str] = {}
         with os.scandir(folder) as entries:
@@ -59,17 +57,15 @@ class FolderFrames:
                 first = self._names.setdefault(int(stem), entry.name)
                 if first != entry.name:
                     self.duplicates.append((entry.name, first))
-                elif entry.is_symlink() and inside(root, os.path.relpath(entry.path, root)) is None:
-                    self.leaving.add(int(stem))
-        self.numbers: Sequence[int] = sorted(self._names.keys() - self.leaving)
+        self.numbers: Sequence[int] = sorted(self._names)
 
     def __len__(self) -> int:
         """Number of positions, gaps included."""
         return max(self._names, default=-1) + 1
 
     def has(self, k: int) -> bool:
-        """Whether frame ``k`` is a file inside the root."""
-        return k in self._names and k not in self.leaving
+        """Whether frame ``k`` is there."""
+        return k in self._names
 
     def path(self, k: int) -> Path:
         """The file of frame ``k``."""
@@ -89,9 +85,8 @@ class FolderFrames:
 
 
 class VideoFrames:
-    """Frames of a video or stack, cached as images in ``cache``; as for folders, without links."""
+    """Frames of a video or stack, cached as images in ``cache``; the methods of a folder."""
 
-    leaving: frozenset[int] = frozenset()
     duplicates: tuple[tuple[str, str], ...] = ()
 
     def __init__(self, source: Path, cache: Path, size: int | None) -> None:

@@ -27,6 +27,7 @@ from __future__ import annotations
 
 import io
 import os
+import re
 from collections.abc import Generator, Iterable, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, replace
@@ -62,6 +63,8 @@ MODALITIES = {"vision": "vision", "tactile": "tactile"}
 FORMAT = "palpate-manifest/1"
 #: Prefix of the keys of facts in the metadata.
 FACT = "palpate.fact."
+#: The fact ``links`` where images were met behind links that leave the root.
+FOLLOWED = "followed"
 #: Digits of a frame number, which has 64 bits; a longer one is none.
 DIGITS = 18
 #: What tools call the parts of a split.
@@ -239,7 +242,8 @@ class Manifest:
 
         @cache
         def wrong(value: str) -> tuple[str, str] | None:
-            path = inside(self.root, value)
+            followed = self.facts.get("links") == FOLLOWED and not re.search(CLIMBS, value)
+            path = self.root / value if followed else inside(self.root, value)
             if path is None:
                 return "outside-root", f"{value!r} leaves the root"
             return None if path.is_file() else ("missing-file", f"no file {value!r}")

@@ -27,6 +27,7 @@ import polars as pl
 
 from palpate.core import PalpateError, Problem, Split
 from palpate.data.detection import ROLES
+from palpate.data.foreign import require_native
 from palpate.data.formats.intervals import NEEDED, ORDER
 from palpate.data.images import SUFFIXES
 from palpate.data.manifest import PART_NAMES, SCHEMA, Manifest
@@ -56,6 +57,7 @@ def read_names(path: Path, **options: Any) -> tuple[Manifest, list[Problem], Spl
         The samples, without images unless they are there; what is wrong with the list; and the
         split that it states. None if it is no such list.
     """
+    require_native(path)
     names = options["names"].split(",") if options.get("names") else []
     if not names and _is_interval(path):
         return _intervals(path)

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from palpate.core import PalpateError, Problem, Progress, quiet, require, require_regular
+from palpate.data.foreign import require_native
 from palpate.data.formats import Format, recognized, require_options
 from palpate.data.listing import LINE, read_list
 from palpate.data.manifest import IMAGE_COLUMNS, SCHEMA, Manifest, is_manifest
@@ -84,6 +85,7 @@ def read_samples(
     path = Path(source)
     require_regular(path)
     if format == "auto" and path.exists():
+        require_native(path)
         if is_manifest(path):
             return Manifest.load(path, options.get("root")), []
         if path.is_file() and (path.suffix.lower() not in TABLES or is_list(path)):

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import inspect
 import posixpath
+import re
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, fields
@@ -29,7 +30,7 @@ from palpate.core import (
     require,
 )
 from palpate.data.images import Check, check_image, in_threads
-from palpate.data.manifest import IMAGE_COLUMNS, Manifest
+from palpate.data.manifest import CLIMBS, FOLLOWED, IMAGE_COLUMNS, Manifest
 
 #: Manifest column -> cell; ``split`` may hold the part of the data set's own split.
 Cells = dict[str, Any]
@@ -109,6 +110,8 @@ class Scan:
     split_rule: dict[str, Any] = field(default_factory=dict)
     inconclusive: int = 0  # rows skipped because their label marks the material as unclear
     more: tuple[str, ...] = ()  # columns beyond those of every manifest
+    #: Whether the paths were met on the disk and not written by somebody: links are followed.
+    met: bool = False
 
     def problem(self, where: object, kind: str, text: str) -> None:
         """Report something that makes a row or file unusable."""
@@ -208,7 +211,10 @@ def _checked_paths(scan: Scan) -> list[Row]:
         )
         resolved = inside(root, written) if unusual or path.is_symlink() else path
         if resolved is None or leaves(folder):
-            return "outside-root", f"the path {written!r} leaves the root {scan.base}"
+            if not scan.met or re.search(CLIMBS, written):
+                return "outside-root", f"the path {written!r} leaves the root {scan.base}"
+            scan.facts["links"] = FOLLOWED
+            resolved = path
         try:
             if not path.is_file():
                 return "missing-file", f"no file {written!r} in {scan.base}"
@@ -295,8 +301,12 @@ def _default_id(where: str, row: Cells) -> tuple[str, str]:
 
 def raise_if(problems: Sequence[Problem], skip_bad: bool) -> None:
     """Raise all problems at once unless they are to be skipped."""
-    if problems and not skip_bad:
-        raise ProblemsError(problems, FIX, example={"skip_bad": True})
+    if not problems or skip_bad:
+        return
+    if any("leaves the root" in problem.text for problem in problems):
+        fix = "Name the folder that the paths start in, or skip the bad rows"
+        raise ProblemsError(problems, fix, example={"root": "FOLDER"})
+    raise ProblemsError(problems, FIX, example={"skip_bad": True})
 
 
 def require_some(samples: int, source: object, skipped: Sequence[Problem]) -> None:

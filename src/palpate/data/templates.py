@@ -125,27 +125,27 @@ def _piece(token: re.Match[str], name: str | None, spec: str, *, loose: bool) ->
 def walk(root: Path, suffixes: tuple[str, ...] = ("",)) -> tuple[list[str], list[str]]:
     """All files below a folder, in the order of their names; hidden ones are skipped.
 
+    Links to folders are followed, wherever they lead: the user named the folder that holds them.
+
     Returns:
-        Paths below the root, and links to folders outside it, which are not followed; other links
-        are followed once.
+        Paths below the root, and links to folders that were read already (circles too).
     """
     files: list[str] = []
-    outside: list[str] = []
+    again: list[str] = []
     seen: set[str] = set()
-    home = os.path.realpath(root)
     for folder, below, names in os.walk(root, followlinks=True):
         real = os.path.realpath(folder)
         relative = os.path.relpath(folder, root).replace(os.sep, "/")
         prefix = "" if relative == "." else f"{relative}/"
-        if real in seen or os.path.commonpath((real, home)) != home:
-            outside += [] if real in seen else [relative]
+        if real in seen:
+            again.append(relative)
             below.clear()
             continue
         seen.add(real)
         below[:] = sorted(name for name in below if not name.startswith("."))
         names = (n for n in sorted(names) if not n.startswith(".") and n.lower().endswith(suffixes))
         files += [prefix + name for name in names]
-    return files, outside
+    return files, again
 
 
 def assign(files: Sequence[str], templates: Mapping[str, Template]) -> dict[str, Matches]:

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from palpate.core import PalpateError, few, require, require_choice, require_regular
+from palpate.data.foreign import copied_links, counted, foreign, require_native
 from palpate.data.formats import (
     hct,
     huggingface,
@@ -65,6 +66,7 @@ def recognized(
     require_regular(source)
     if name == "auto" or not FORMATS[name].remote:
         require_source(source)
+        require_native(source)
     if name == "auto":
         templates = {c: text for c in IMAGE_COLUMNS if (text := (options or {}).get(c))}
         looks = (n for n, form in FORMATS.items() if form.detect(source))
@@ -73,6 +75,8 @@ def recognized(
     if not name:
         must = f"must hold images, videos, a table or a known data set ({', '.join(FORMATS)})"
         fix = "Check the path, or write a table of its images"
+        inner = sorted(source.iterdir()) if source.is_dir() else ()
+        fix = next((ways[1] for path in inner if (ways := foreign(path))), fix)
         if source.is_dir() and (source / "manifest.parquet").is_file():
             fix = "This is an import: name the data set that it was made from"
         raise PalpateError(must, _contents(source), fix, argument="source")
@@ -99,5 +103,9 @@ def _contents(source: Path) -> str:
     """What a source holds, in short."""
     if source.is_file():
         return f"the file {source.name}"
+    if links := copied_links(source):
+        return f"files that were links to folders, which a copy did not keep: {links}"
     names = sorted(p.name + "/" * p.is_dir() for p in source.iterdir())
+    if unread := counted(names):
+        return f"a folder with {few(unread)}"
     return f"a folder with {few(names)}" if names else "an empty folder"

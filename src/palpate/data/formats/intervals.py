@@ -28,7 +28,6 @@ from pathlib import Path
 from palpate.core import PalpateError, Problem, Progress, quiet, require
 from palpate.data.formats.layout import require_videos
 from palpate.data.formats.recordings import Recordings, Row
-from palpate.data.frames import FolderFrames
 from palpate.data.images import Check
 from palpate.data.listing import FrameTable
 from palpate.data.mapping import compile_maps
@@ -241,12 +240,9 @@ def _frames(work: Recordings, contact: str, interval: Interval, every: int) -> l
     missing: set[int] = set()
     for modality, source in work.frames[video].items():
         if lacking := [k for k in numbers if not source.has(k)]:
-            leaves = isinstance(source, FolderFrames) and not source.leaving.isdisjoint(lacking)
             text = f"no {modality} image of {len(lacking)} of the frames of {contact}, the first "
             text += f"of them {lacking[0]}, in {source.source}"
-            text += ": a link that leaves it" * leaves
-            kind = "outside-root" if leaves else "missing-file"
-            work.scan.problem(where, kind, text)
+            work.scan.problem(where, "missing-file", text)
             missing.update(lacking)
     frames = (k for k in numbers if k not in missing)
     return [Row(where, f"{video}/{k:010d}", video, k, contact, "") for k in frames]

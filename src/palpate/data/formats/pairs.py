@@ -68,7 +68,9 @@ def detect(source: Path) -> bool:
     if source.is_file():
         suffix = source.suffix.lower()
         return suffix in TABLES and (suffix != ".json" or bool(header_of(source)))
-    files = (name for _, _, names in islice(os.walk(source), 500) for name in names)
+    files = (
+        name for _, _, names in islice(os.walk(source, followlinks=True), 500) for name in names
+    )
     return any(name.lower().endswith(SUFFIXES) for name in files)
 
 

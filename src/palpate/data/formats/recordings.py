@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any
 
 import polars as pl
 
-from palpate.core import PalpateError, Problem, Progress, inside, read_json, require, write_json
+from palpate.core import PalpateError, Problem, Progress, read_json, require, write_json
 from palpate.data.frames import FolderFrames, Frames, VideoFrames, streams_of
 from palpate.data.images import Check, check_image, in_threads
 from palpate.data.scanning import Into, Scan, raise_if, require_some
@@ -97,6 +97,8 @@ class Recordings:
     modalities: tuple[str, ...] = MODALITIES  # those that every recording has
 
     def __post_init__(self) -> None:
+        self.home = self.scan.base  # before extracted frames move the root
+        self.scan.met = True
         require(self.size is None or self.size >= 1, "size", "must be at least 1 pixel", self.size)
 
     @property
@@ -132,9 +134,7 @@ class Recordings:
             if source is None:
                 return "missing-video", f"the recording {name!r} has no {modality} frames"
             if source.is_dir():
-                if inside(self.scan.base, os.path.relpath(source, self.scan.base)) is None:
-                    return "outside-root", f"{source} is a link that leaves the data set"
-                opened[modality] = FolderFrames(source, self.scan.base)
+                opened[modality] = FolderFrames(source)
                 continue
             cache = self.out / "images" / name / modality
             try:
@@ -153,11 +153,8 @@ class Recordings:
             return False
         missing = [frames for frames in opened.values() if not frames.has(row.frame)]
         for frames in missing:
-            kind, text = "missing-file", f"no image of frame {row.frame} in {frames.source}"
-            if row.frame in frames.leaving:
-                kind = "outside-root"
-                text = f"{frames.path(row.frame)} is a link that leaves the data set"
-            self.scan.problem(row.where, kind, text)
+            text = f"no image of frame {row.frame} in {frames.source}"
+            self.scan.problem(row.where, "missing-file", text)
         return not missing
 
     def usable(
@@ -387,7 +384,10 @@ class Recordings:
 
         @cache
         def folder(path: Path) -> str:
-            return Path(os.path.relpath(os.path.realpath(path), root)).as_posix()
+            """Relative to the root, by the names of links below the data set."""
+            top = next((t for t in (self.home, self.out) if path.is_relative_to(t)), path)
+            real = Path(os.path.realpath(top)) / path.relative_to(top)
+            return Path(os.path.relpath(real, root)).as_posix()
 
         def relative(frames: Frames, path: Path | None) -> str | None:
             if path is None or (isinstance(frames, VideoFrames) and not self.extracted):

@@ -75,7 +75,9 @@ def detect(source: Path) -> bool:
     """Whether this is a folder with videos or stacks below it, and without images."""
     if not source.is_dir() or has_listed_videos(source):
         return False
-    files = [name for _, _, names in islice(os.walk(source), 500) for name in names]
+    files = [
+        name for _, _, names in islice(os.walk(source, followlinks=True), 500) for name in names
+    ]
     images = any(name.lower().endswith(SUFFIXES) for name in files)
     return not images and any(name.lower().endswith(MOVING) for name in files)
 
