@@ -15,8 +15,10 @@ PYTEST = OMP_NUM_THREADS=1 HF_HUB_OFFLINE=1 $(BIN)/python -m pytest -q -n $(WORK
 PIP    = $(BIN)/python -m pip install --quiet --disable-pip-version-check
 # Spinning threads make two busy cores several times slower than one.
 export OMP_WAIT_POLICY := passive
+# Compiled modules are kept: each test that starts a process would compile them again.
+export PYTHONDONTWRITEBYTECODE :=
 
-.PHONY: help demo record test test-fast test-slow nightly coverage lint format docs wheel lock clean
+.PHONY: help demo record test test-fast nightly coverage lint format docs wheel lock clean
 
 help:            ## list the targets
 	@grep -E '^[a-z-]+: .*##' $(MAKEFILE_LIST) | sed -E 's/:[^#]*##/\t/' | expand -t 14
@@ -28,13 +30,11 @@ record:          ## RUN=runs/study: pack results, page, tables and figures of a 
 	mkdir -p dist
 	tar -czf dist/record-$(notdir $(RUN:/=)).tar.gz -C $(RUN) results.json page.html page.md tables.tex figures
 
-test: test-fast test-slow  ## all tests, fast ones first
+test: $(DEV)     ## all tests but nightly ones, fast ones first
+	$(PYTEST) -m "not nightly"
 
 test-fast: $(DEV)  ## tests of under about five seconds each
 	$(PYTEST) -m "not slow and not browser and not nightly"
-
-test-slow: $(DEV)  ## the slow ones, and the page in a browser
-	$(PYTEST) -m "(slow or browser) and not nightly"
 
 nightly: $(DEV)  ## what takes longer: tests of minutes, what must not change, the metrics at full size, the shipped models scored again, the study of splits, small, 50 raters in browsers
 	$(PYTEST) -m nightly

@@ -31,6 +31,11 @@ ARGS = [
 ]
 
 
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Fast tests first: what is broken shows early."""
+    items.sort(key=lambda item: any(map(item.get_closest_marker, ("slow", "browser", "nightly"))))
+
+
 def shared_data() -> Path | None:
     """The folder of shared real data, or None."""
     place = Path(os.environ.get("PALPATE_SHARED_DATA", TOP.parent / "shared" / "data"))

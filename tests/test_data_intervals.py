@@ -176,7 +176,7 @@ def test_mistakes(tmp_path):
     assert tree(tmp_path / "out") == set()
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_the_real_clips_by_intervals_are_those_by_frames(real_data, tmp_path):
     pytest.importorskip("av", reason="PyAV is not installed")
     root = real_data / "touch_and_go" / "clips"

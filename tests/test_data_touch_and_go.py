@@ -271,7 +271,7 @@ def test_links_below_the_data_set_are_followed(tmp_path, what):
     assert result.manifest.table["tactile"].str.starts_with("dataset/a/gelsight_frame/").all()
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_the_five_real_clips(real_data, tmp_path):
     result = import_touch_and_go(real_data / "touch_and_go" / "clips", tmp_path / "out")
     table = result.manifest.require_valid().table

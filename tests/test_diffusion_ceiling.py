@@ -163,7 +163,7 @@ def test_none_is_no_judge():
     assert judge_of("none") is None
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_samples_that_are_drawn_have_a_gel_and_whole_files(world, split, tmp_path):
     """What is only drawn and scored costs no training: without gels, or with a broken file."""
     train, test = split.ids("train")[::4], split.ids("test")[-20:]
@@ -185,7 +185,7 @@ def test_samples_that_are_drawn_have_a_gel_and_whole_files(world, split, tmp_pat
             assert not drawn
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_trainings_print_the_ceiling_of_the_data_that_they_are_given(
     world, split, tmp_path, capsys
 ):

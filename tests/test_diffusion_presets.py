@@ -63,10 +63,8 @@ def step_and_sample(preset, folder, channels):
     assert torch.isfinite(made).all()
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    ("preset", "channels"), [(SMALL, 8), pytest.param(PAPER, 3, marks=pytest.mark.nightly)]
-)
+@pytest.mark.nightly
+@pytest.mark.parametrize(("preset", "channels"), [(SMALL, 8), (PAPER, 3)])
 def test_a_preset_takes_a_real_step(preset, channels, tmp_path):
     with memory(MEMORY) if preset is PAPER else nullcontext():
         step_and_sample(preset, tmp_path / "run", channels)

@@ -39,7 +39,11 @@ QUICK = {
     "score": ["--permutations", "19"],
     "world": ["--preset", "tiny", "--size", "16", "--materials", "2", "--workers", "1"],
 }
-SLOW = {"docs/start/train.md": pytest.mark.slow, "docs/start/reproduce.md": pytest.mark.nightly}
+SLOW = {
+    "docs/start/train.md": pytest.mark.slow,
+    "docs/start/generate.md": pytest.mark.nightly,
+    "docs/start/reproduce.md": pytest.mark.nightly,
+}
 #: Pages that `make docs` writes.
 MADE = {"commands.md"}
 

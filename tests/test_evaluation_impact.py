@@ -336,7 +336,7 @@ sys.exit("torch" in sys.modules)
     assert "under the given split" in done.stdout
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_the_five_real_clips_can_be_compared_by_contact_only(
     real_data: Path, tmp_path: Path
 ) -> None:

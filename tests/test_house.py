@@ -198,7 +198,7 @@ def test_chains_of_imports_are_short_and_none_runs_back_to_the_door():
     assert len(longest) <= 18, "\n".join(longest)
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 @pytest.mark.parametrize(
     ("words", "files"),
     [

@@ -220,7 +220,7 @@ def test_many_rows_of_one_image_and_tiny_sets_are_answered(tmp_path):
     assert np.isnan(near_duplicates(empty, few, "vision").score).all()
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_real_clips_without_metadata(real_data, tmp_path):
     from palpate.data.importing import import_dataset
 

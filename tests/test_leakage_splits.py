@@ -174,7 +174,7 @@ def test_touch_and_go_at_80_20_is_optimal(published):
     assert second.rule["deviation"] == pytest.approx(0.039332, abs=1e-6)
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_touch_and_go_in_folds_and_three_parts(published):
     folds = split(published, folds=5, val=0.2)
     assert sorted(i for s in folds for i in s.ids("test")) == sorted(published.ids)

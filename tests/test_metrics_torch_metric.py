@@ -87,7 +87,7 @@ def other_settings(number, folder):
     torch.distributed.destroy_process_group()
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_processes_of_different_settings_are_refused(tmp_path):
     torch.multiprocessing.spawn(other_settings, (tmp_path,), nprocs=2)
     assert any("same settings" in (tmp_path / str(k)).read_text() for k in range(2))

@@ -56,6 +56,7 @@ def test_served_the_clock_of_the_server_ends_the_study(chromium, tmp_path, until
         page.wait_for_selector(f"{shown}:not([hidden])")
 
 
+@pytest.mark.nightly
 def test_raters_at_the_page_from_disk_are_recovered(chromium, study, tmp_path):
     plan = Plan.load(study)
     url = (study / "study.html").as_uri()
@@ -67,6 +68,7 @@ def test_raters_at_the_page_from_disk_are_recovered(chromium, study, tmp_path):
     require_recovered(preference.score(study, tmp_path, replicates=400))
 
 
+@pytest.mark.nightly
 def test_raters_at_the_server_are_recovered(chromium, study, tmp_path):
     plan = Plan.load(study)
     with Serving(tmp_path, plan.public()) as server:

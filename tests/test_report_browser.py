@@ -189,8 +189,7 @@ def screenshot(page, name):
     page.screenshot(path=folder / f"{name}.png", full_page=True)
 
 
-@pytest.mark.parametrize("scheme", ["light", "dark"])
-@pytest.mark.parametrize("wide", [True, False])
+@pytest.mark.parametrize(("wide", "scheme"), [(True, "light"), (False, "dark")])
 @pytest.mark.parametrize("name", ["page", "audits", "study", "long"])
 def test_pages_fit_and_decode_every_image(chromium, pages, name, wide, scheme):
     width = 1280 if wide else {"page": 360, "audits": 360}.get(name, 390)
@@ -276,6 +275,7 @@ def test_a_sample_enlarges_by_click_and_by_key_and_commands_are_copied(chromium,
         assert page.evaluate("getSelection().toString()").startswith(f"palpate audit {LONG}")
 
 
+@pytest.mark.nightly
 def test_pages_keep_the_limits_of_their_benchmark(chromium, pages, tmp_path):
     """Height, bytes, first screen, phone and print, as ``benchmarks/page.py`` measures them."""
     tool = runpy.run_path(str(Path(__file__).parents[1] / "benchmarks" / "page.py"))

@@ -443,7 +443,7 @@ def test_half_probes_name_train_images_beside_the_real_ones_of_labeled_samples()
     assert (of_real.a, of_real.value, of_real.n) == (HALF_PROBES, 1, 4)
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_a_study_from_its_command_to_its_page(tmp_path, monkeypatch):
     """On the paper's data set: every table, method and control; other people's images as well;
     running again builds nothing."""

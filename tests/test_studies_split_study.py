@@ -83,7 +83,7 @@ def test_a_planted_leak_costs_what_it_is_worth(data, whole, capsys, monkeypatch)
     assert "noleak" in (data / "drop.html").read_text()
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_a_killed_study_ends_as_one_that_was_not(data, whole):
     """Of one of the splits: the weights of each training, and what they score."""
     options = ["probe", "tag", "--splits", "orig.json", *TRAIN, "--work", "killed", "--json"]

@@ -139,7 +139,7 @@ sys.exit(main(sys.argv[1:]))
 """
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_when_a_process_dies_the_others_end_without_a_traceback_and_the_run_can_go_on(place):
     (place / "dying.py").write_text(DYING)
     more = ("--clip", "palpate/mini")

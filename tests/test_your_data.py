@@ -303,12 +303,15 @@ def write_stranger(root, sides, as_table):
 
 
 #: Two-sided videos, a table and one side: the others differ in nothing but their import.
-EVERY_VERB = ("flat videos", "table", "one-sided")
+#: Layouts that go through every verb.
+EVERY_VERB = {
+    "flat videos": pytest.mark.slow,
+    "table": pytest.mark.nightly,
+    "one-sided": pytest.mark.slow,
+}
 
 
-@pytest.mark.parametrize(
-    "name", [pytest.param(n, marks=[pytest.mark.slow] * (n in EVERY_VERB)) for n in STRANGERS]
-)
+@pytest.mark.parametrize("name", [pytest.param(n, marks=EVERY_VERB.get(n, ())) for n in STRANGERS])
 def test_a_strangers_layout_reaches_every_verb_with_one_import(name, tmp_path, monkeypatch, capsys):
     sides, options = STRANGERS[name]
     source = write_stranger(tmp_path / "own", sides, name == "table")
