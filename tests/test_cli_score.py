@@ -49,8 +49,9 @@ def test_options_reach_the_function_and_json_is_its_result(capsys, sets):
     )
     Split.from_ids(train=IDS[24:], test=IDS[:24], rule={}, manifest="m").save(Path("s.json"))
     options = ("--sigma", "10", "median", "--normalize", "yes", "--presets", "paper")
-    files = ("--labels", "labels.csv", "--split", "s.json", "--names", "ours")
-    status, out, err = call(capsys, PAIR, *options, *files, "--json")
+    files = ("--labels", "labels.csv", "--split", "s.json")
+    named = PAIR.replace("near", "ours=near")
+    status, out, err = call(capsys, named, *options, *files, "--json")
     assert status == 0, err
     scores = by_key(Results.from_json(json.loads(out)))
     want = scoring.score(
@@ -66,12 +67,12 @@ def test_options_reach_the_function_and_json_is_its_result(capsys, sets):
         permutations=0,
     )
     assert {k: s.value for k, s in scores.items()} == {k: s.value for k, s in by_key(want).items()}
-    assert json.loads(out)["commands"][0].startswith("palpate score --generated near.npz")
+    assert json.loads(out)["commands"][0].startswith("palpate score --generated ours=near.npz")
 
 
 def test_the_terminal_shows_scores_and_differences(capsys, sets):
-    files = "--generated near.npz far.npz --reference real.npz"
-    status, out, err = call(capsys, files, "--names 'ours [x]' theirs")
+    files = "--generated 'ours [x]=near.npz' theirs=far.npz --reference real.npz"
+    status, out, err = call(capsys, files)
     assert status == 0, err
     head, tail = out.split("Paired differences", 1)
     assert "ours [x]" in head
@@ -118,7 +119,7 @@ def test_scores_of_pixels_need_no_torch(tmp_path):
     ("args", "words"),
     [
         (f"{PAIR} --sigma ten", "--sigma must be NUMBER|median|multi"),
-        (f"{PAIR} --names a b", "--names must name every generator"),
+        ("--generated a=near.npz a=far.npz --reference real.npz", "--generated must differ"),
         (f"{PAIR} --group contact", "--group must be known for every input"),
         (f"{PAIR} --encoder palpate/mini", "--encoder must go with images"),
         (f"{PAIR} --labels absent.csv", "absent.csv"),

@@ -17,6 +17,7 @@ NOPE = ("score", "--generated", "nope.npy", "--reference", "nope.npy")
 AUDIT = ("audit", "train.txt", "test.txt", "--fail-over", "0.01")
 QUICK = ("--companions", "none", "--permutations", "0")
 SCORE = ("score", "--generated", "g.npz", "--reference", "r.npz", *QUICK)
+NAMED = ("score", "--generated", "grün=g.npz", "--reference", "r.npz", *QUICK)
 
 
 @pytest.fixture
@@ -95,11 +96,11 @@ def test_a_full_disk_behind_standard_output_is_an_error_and_the_file_is_written(
 def test_letters_that_a_stream_lacks_are_question_marks_and_json_stays_whole(here):
     pipes = dict.fromkeys(("stdout", "stderr"), subprocess.PIPE)
     ascii_only = {"env": {"PYTHONIOENCODING": "ascii"}, **pipes}
-    done = palpate(*SCORE, "--names", "grün", **ascii_only)
+    done = palpate(*NAMED, **ascii_only)
     assert done.returncode == 0, done.stderr
     row = next(line for line in done.stdout.decode("ascii").splitlines() if line.startswith("TMMD"))
     assert row.split()[:3] == ["TMMD", "?", "gr?n"]
-    done = palpate(*SCORE, "--names", "grün", "--json", **ascii_only)
+    done = palpate(*NAMED, "--json", **ascii_only)
     assert (
         done.returncode,
         {s["a"] for s in json.loads(done.stdout.decode("ascii"))["scores"]},

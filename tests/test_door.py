@@ -32,7 +32,7 @@ SIGNATURES = {
     "score": (
         "generated reference * encoder split names labels group background train presets "
         "sigma normalize companions controls inception clip lpips "
-        "permutations seed allow_seen cache progress"
+        "trust_torchscript permutations seed allow_seen cache progress"
     ),
     "split": ("data * by train val seed folds near noleak cache reading skip_bad progress"),
     "train_encoder": ("data split * preset clip output epochs seed device compute progress"),

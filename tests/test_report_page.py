@@ -218,7 +218,7 @@ def test_missing_and_broken_images_become_placeholders(tmp_path):
     lost = SampleRef("a", vision="absent&.png", tactile="broken.png")
     items = [GalleryItem(lost, good), GalleryItem(SampleRef("b"), good)]
     tree = Tree(page_of(Results("t", gallery=items), tmp_path))
-    for text in ("absent&.png file missing", "broken.png file unreadable"):
+    for text in ("absent&.png no such file", "broken.png not an image"):
         name, problem = text.split(" ", 1)
         assert f"{problem} {name}" in tree.text
     assert tree.text.count("not recorded") == 2

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import threading
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -15,7 +14,7 @@ from PIL import Image
 from palpate.captions.prompts import Description, Prompt
 from palpate.captions.replies import QUALITY, SIDE, Question, RejectedError, Reply, ReplyLog
 from palpate.captions.units import Units
-from palpate.core import PalpateError, Problem, Progress, require
+from palpate.core import PalpateError, Problem, Progress, image_bytes, require
 from palpate.data.images import file_digest, in_threads, read_image
 from palpate.data.manifest import Manifest
 
@@ -75,12 +74,10 @@ def prepared(path: Path) -> bytes:
     Raises:
         PalpateError: if the photo is missing, truncated or none.
     """
-    data = io.BytesIO()
     with _READING:
         photo = read_image(path)
         photo.thumbnail((SIDE, SIDE), Image.Resampling.LANCZOS)
-        photo.save(data, "JPEG", quality=QUALITY, exif=b"", icc_profile=None)
-    return data.getvalue()
+        return image_bytes(photo, "JPEG", quality=QUALITY, exif=b"", icc_profile=None)
 
 
 def pending(photos: Sequence[Photo], log: ReplyLog) -> list[Photo]:

@@ -52,6 +52,8 @@ class Options(Common):
     """Results of `palpate preference score -o`: columns of table 3, and what claims follow from."""
     inception: Path | None = None
     """TorchScript file of Inception: FID as published; without it the column is missing."""
+    trust_torchscript: Switch = False
+    """Run the code in that file: a program, which runs with your rights and can write files."""
     clip: str | None = None
     """Folder or hub id of a CLIP: CMMD as published; without it the column is missing."""
     lpips: Annotated[tuple[Path, Path] | None, tyro.conf.arg(metavar="BACKBONE HEADS")] = None
@@ -84,7 +86,12 @@ def run(options: Options, terminal: Terminal) -> dict[str, Any]:
         people=options.people,
         steps=options.steps,
         vq=options.vq,
-        weights=Weights(inception=options.inception, clip=options.clip, lpips=options.lpips),
+        weights=Weights(
+            inception=options.inception,
+            clip=options.clip,
+            lpips=options.lpips,
+            trust_torchscript=options.trust_torchscript,
+        ),
     )
     if options.dry_run:
         stages = plan_graph(plan.nodes(), output)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -20,10 +21,8 @@ Companion = Literal[
 
 @dataclass(frozen=True, kw_only=True)
 class Samples:
-    """What the samples are called, and what belongs together."""
+    """What belongs together."""
 
-    names: tuple[str, ...] = ()
-    """Names of the generators in the tables, instead of those of their folders and files."""
     labels: str | None = None
     """CSV or Parquet file with the columns id, material, video: instead of the inputs' own; or for
     materials `cluster:8`, eight clusters of the reference's photos (else features)."""
@@ -54,6 +53,8 @@ class Metrics:
     """Further metrics. Default: all whose inputs are there; `none` for none."""
     inception: Path | None = None
     """TorchScript file of Inception: FID and KID of its features, as published."""
+    trust_torchscript: Switch = False
+    """Run the code in that file: a program, which runs with your rights and can write files."""
     clip: str | None = None
     """Folder or hub id of a CLIP: CMMD of its features, as published."""
     lpips: Annotated[tuple[Path, Path] | None, tyro.conf.arg(metavar="BACKBONE HEADS")] = None
@@ -69,9 +70,9 @@ class Options(Common):
     With a split, its test part is scored, next to controls where the reference is a manifest.
     """
 
-    generated: tuple[Path, ...]
+    generated: Annotated[tuple[str, ...], tyro.conf.arg(metavar="[NAME=]PATH ...")]
     """What to score, one entry a generator: folders of images or of `palpate generate`, manifests,
-    or embeddings (.npy, .npz)."""
+    or embeddings (.npy, .npz). In the tables a generator has its NAME, else that of its path."""
     reference: Path
     """The real tactile images, of the same kinds. Ids are relative file names."""
     encoder: str | None = None
@@ -101,8 +102,9 @@ class Options(Common):
 def run(options: Options, terminal: Terminal) -> dict[str, Any]:
     """Score, print the tables, write JSON and a page."""
     files, labels = Files(output=options.output, page=options.page), options.samples.labels
+    generated, names = named_paths(options.generated)
     paths = (options.reference, options.split, options.train, labels and Path(labels))
-    inputs = [path for path in (*paths, *options.generated) if path]
+    inputs = [path for path in (*paths, *generated) if path]
     files.guard(inputs)
     if (cache := options.cache) is not None:
         must, fix = "must not be an input", "Choose a folder outside what is read"
@@ -118,8 +120,9 @@ def run(options: Options, terminal: Terminal) -> dict[str, Any]:
     with working_folder(cache, output if has_images else None) as folder:
         with terminal.progress() as progress:
             results = score(
-                list(options.generated),
+                generated,
                 options.reference,
+                names=names,
                 progress=progress,
                 **options.keywords(
                     *("generated", "reference", "output", "page"),
@@ -129,3 +132,14 @@ def run(options: Options, terminal: Terminal) -> dict[str, Any]:
                 ),
             )
         return terminal.deliver(results, files)
+
+
+def named_paths(values: Sequence[str]) -> tuple[list[Path], list[str] | None]:
+    """``[NAME=]PATH`` of generators: their paths, and their names if any has one.
+
+    A path that exists is one, whatever is in it.
+    """
+    parts = [("", "", v) if Path(v).exists() else v.rpartition("=") for v in values]
+    paths = [Path(path) for *_, path in parts]
+    names = [name or path.stem for (name, *_), path in zip(parts, paths, strict=True)]
+    return paths, names if any(equals for _, equals, _ in parts) else None

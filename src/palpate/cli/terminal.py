@@ -85,6 +85,7 @@ OPTION_NAMES: dict[tuple[str, str], str] = {
     ("presets", "name"): "NAME",
     ("", "side"): "--as",
     ("reproduce", "study"): "STUDY",
+    ("score", "names"): "--generated",
     **{("", name): "PATH" for name in _PATHS},
 }
 #: Arguments whose True and False are words of an option.

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from palpate.cli.terminal import Common, PathArgument, Terminal, option_group
+from palpate.cli.terminal import Common, PathArgument, Switch, Terminal, option_group
 
 
 @option_group
@@ -22,10 +22,13 @@ class Options(Common):
     tolerance: float = 1e-6
     """Relative difference up to which two numbers are the same, if not to the sixth decimal:
     another machine adds in another order. Counts and digests must be equal."""
+    trust_torchscript: Switch = False
+    """Run the code in a TorchScript file (Inception) that the results name: a program, which runs
+    with your rights and can write files."""
 
 
 def run(options: Options, terminal: Terminal) -> Any:
     """Verify, print the counts and all that is not the same."""
     from palpate.studies.verifying import verify
 
-    return terminal.run(verify, options.results, tolerance=options.tolerance)
+    return terminal.run(verify, options.results, **options.keywords("results"))

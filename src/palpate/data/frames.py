@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from palpate.core import atomic_path, require_regular
+from palpate.core import require_regular, save_image
 from palpate.data.contacts import SIZE, thumbnail
 from palpate.data.images import SUFFIXES, VIDEOS, read_image
 from palpate.data.manifest import DIGITS
@@ -91,6 +91,7 @@ class VideoFrames:
 
     def __init__(self, source: Path, cache: Path, size: int | None) -> None:
         self.source, self.cache, self.size = source, cache, size
+        self.turned = False  # whether the video turned the frames that were read
         with reader_of(source) as reader:
             self.numbers: Sequence[int] = range(len(reader))
 
@@ -110,6 +111,7 @@ class VideoFrames:
         """Yield ``(k, (h, w, 3) image)``, decoding rising numbers in one pass."""
         with reader_of(self.source) as reader:
             yield from reader.frames(indices)
+            self.turned |= reader.turned
 
     def stream(self) -> Stream:
         """Thumbnails of all frames, and when each is presented, in seconds."""
@@ -150,5 +152,4 @@ def save_frame(path: Path, image: NDArray[np.uint8], size: int | None) -> None:
         scale = size / min(frame.size)
         width, height = (max(size, round(side * scale)) for side in frame.size)
         frame = frame.resize((width, height), Image.Resampling.BICUBIC)
-    with atomic_path(path) as part:
-        frame.save(part, format="JPEG", quality=95, subsampling=0)
+    save_image(path, frame, "JPEG", quality=95, subsampling=0)

@@ -1,22 +1,18 @@
 """Images: read as 8-bit RGB, whole or rejected, one by one or as arrays.
 
-Everything that Pillow reads becomes 8-bit RGB by fixed rules: EXIF orientation is applied; 16-bit
-gray ``v`` becomes ``(v + 128) // 257``, so that 65535 is 255; transparency is laid over white; of
-an animation the first image counts. A batch for a network is the center square, resized by Pillow's
+:mod:`palpate.core.files` has the one function that opens images, and the rules by which all of them
+become upright 8-bit RGB. A batch for a network is the center square, resized by Pillow's
 antialiased bicubic filter, or what a :class:`Preprocess` says: an image is turned, fitted to the
 encoder's shape (the center of it, the whole of it between black borders, or squashed), and resized;
 for some encoders the sensor's image without contact is subtracted first, and an earlier frame of
 the video follows in three further channels. What results is 8-bit and may be cached; then comes
-``(x / 255 - mean) / std`` per channel. No step depends on the content of other images: the range is
-never stretched.
+``(x / 255 - mean) / std`` per channel. No step depends on the content of other images.
 """
 
 from __future__ import annotations
 
 import math
 import os
-import struct
-import zlib
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import suppress
@@ -30,21 +26,25 @@ from typing import TYPE_CHECKING, Any, BinaryIO, Literal, NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
-from PIL import Image, ImageOps
+from PIL import Image
 
 from palpate.core import (
+    ImageError,
     PalpateError,
     Problem,
     ProblemsError,
     Progress,
     atomic_path,
+    decoded,
     digest_file,
     digest_json,
+    open_image,
     quiet,
     read_record,
     require,
     short,
 )
+from palpate.core.files import ORIENTATION
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -52,15 +52,11 @@ if TYPE_CHECKING:
     from palpate.data.manifest import Manifest
 
 Check = Literal["decode", "header", "none"]
-SUFFIXES = (".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".webp")
+SUFFIXES = (".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".webp", ".ppm", ".pgm", ".gif")
+SUFFIXES += (".avif", ".heic", ".heif")
 VIDEOS = (".mp4", ".mov", ".avi", ".mkv", ".m4v", ".webm")
-_CUT = (struct.error, zlib.error, Image.DecompressionBombError)
-#: What Pillow raises for files that are cut, empty, or no images.
-BROKEN = (OSError, SyntaxError, ValueError, EOFError, IndexError, TypeError, *_CUT)
 #: What to do about unreadable files that are not being imported now.
 REFETCH = "Fetch these files again, or skip the bad ones with: palpate import"
-#: Pixels of the largest image that is decoded: some twenty bytes each while it becomes RGB.
-LARGEST = 50_000_000
 #: What an image processor may have of these.
 CHOICES = {
     "fitting": ("crop", "pad", "squash"),
@@ -78,71 +74,54 @@ T = TypeVar("T")
 R = TypeVar("R")
 
 
-def opened(source: Path | BinaryIO) -> Image.Image:
-    """Open an image whose pixels fit into memory; they are not decoded yet.
+class Checked(NamedTuple):
+    """What a check of an image says."""
 
-    Raises:
-        Image.DecompressionBombError: if there are more than ``LARGEST``.
-        OSError: with most other broken files; see ``BROKEN``.
-    """
-    if isinstance(source, Path) and source.is_fifo():
-        raise OSError("a pipe, which is no file")
-    try:
-        image = Image.open(source)
-    except Image.DecompressionBombError:  # in Pillow's words
-        raise Image.DecompressionBombError(f"more than {LARGEST:,} pixels") from None
-    if image.width * image.height > LARGEST:
-        size = f"{image.width} x {image.height} pixels"
-        raise Image.DecompressionBombError(f"{size}, more than {LARGEST:,}")
-    return image
+    form: str = ""  # Pillow's name of it
+    taken: Sequence[str] = ()  # how it is read where it is not upright 8-bit RGB, in words
+    problem: str | None = None  # why it is unusable
 
 
 def read_image(path: Path, at_least: tuple[int, int] | None = None) -> Image.Image:
-    """Read one image file as 8-bit RGB.
+    """Read one image file as upright 8-bit RGB.
 
     Args:
         path: the file.
         at_least: (width, height) that are enough; a large JPEG is decoded faster at a fraction.
 
     Raises:
-        PalpateError: if the file is missing, empty, truncated, or no image.
+        PalpateError: if the file is missing, empty, truncated, no image, or of unknown range.
     """
-    path = Path(path)
     try:
-        with opened(path) as image:
-            if at_least is not None:
-                image.draft("RGB", at_least)
-            image.load()
-            ImageOps.exif_transpose(image, in_place=True)
-            return rgb(image)
-    except BROKEN as error:
+        with open_image(Path(path)) as image:
+            return decoded(image, at_least)[0]
+    except ImageError as error:
         must = f"The image {path} must be whole and readable"
-        raise PalpateError(must, _reason(path, error), "Fetch the file again") from None
+        raise PalpateError(must, str(error), "Fetch the file again") from None
 
 
-def check_image(path: Path, check: Check = "decode") -> str | None:
-    """Return why an image file is unusable, or None.
-
-    Args:
-        path: the file.
-        check: ``decode`` reads every byte (a JPEG at an eighth of its size, which detects
-            truncation as well), ``header`` reads the first bytes only.
-    """
-    path = Path(path)
-    try:
-        form_of(path, check)
-    except BROKEN as error:
-        return _reason(path, error)
+def image_size(path: Path) -> tuple[int, int] | None:
+    """(width, height) of an image as it is read, by its first bytes; None if it is none."""
+    with suppress(ImageError), open_image(path) as image:
+        turned = image.getexif().get(ORIENTATION) in range(5, 9)
+        return image.size[::-1] if turned else image.size
     return None
 
 
-def form_of(source: Path | BinaryIO, check: Check) -> str:
-    """What Pillow calls the form of an image that is usable; raises one of ``BROKEN`` if not."""
-    with opened(source) as image:
-        if check == "decode":
-            image.draft("L", (max(1, image.width // 8), max(1, image.height // 8)))
-            image.load()
-        return str(image.format)
+def check_image(source: Path | BinaryIO, check: Check = "decode") -> Checked:
+    """Look whether an image is usable.
+
+    Args:
+        source: the file, or its content.
+        check: ``decode`` reads every byte (a JPEG at an eighth of its size, which detects
+            truncation as well), ``header`` reads the first bytes only.
+    """
+    try:
+        with open_image(source) as image:
+            form, small = str(image.format), (image.width // 8 + 1, image.height // 8 + 1)
+            return Checked(form, decoded(image, small)[1] if check == "decode" else ())
+    except ImageError as error:
+        return Checked(problem=str(error))
 
 
 class Frames(NamedTuple):
@@ -541,34 +520,6 @@ def file_digest(path: Path) -> str | None:
         if path.is_file():
             return digest_file(path)
     return None
-
-
-def rgb(image: Image.Image) -> Image.Image:
-    """8-bit RGB by the rules in the head of this file."""
-    if image.mode == "RGB":
-        return image
-    if image.mode.startswith("I"):  # 16-bit gray; "I" is the same in 32-bit cells
-        values = np.clip(np.asarray(image), 0, 65535).astype(np.int32)
-        return Image.fromarray(((values + 128) // 257).astype(np.uint8)).convert("RGB")
-    if image.mode == "F":
-        raise ValueError("floating-point pixels, whose range is not defined")
-    if image.has_transparency_data:
-        image = image.convert("RGBA")
-        return Image.alpha_composite(Image.new("RGBA", image.size, "white"), image).convert("RGB")
-    return image.convert("RGB")
-
-
-def _reason(path: Path, error: BaseException) -> str:
-    """What Pillow raised, in plain words."""
-    if not path.exists():
-        return "no such file"
-    if path.is_dir():
-        return "a folder"
-    if path.stat().st_size == 0:
-        return "an empty file (0 bytes)"
-    if isinstance(error, Image.UnidentifiedImageError):
-        return "not an image"
-    return str(error).replace(str(path), path.name) or type(error).__name__
 
 
 def _minus(image: Image.Image, background: Image.Image | None) -> Image.Image:

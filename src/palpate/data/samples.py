@@ -45,8 +45,8 @@ from palpate.core import (
 )
 from palpate.core.features import is_missing, to_numpy
 from palpate.core.messages import require_rows
-from palpate.data.images import BROKEN, cached_images, load_images, opened, read_image, square
 from palpate.data.images import SUFFIXES as IMAGES
+from palpate.data.images import cached_images, image_size, load_images, read_image, square
 from palpate.data.manifest import SCHEMA, Manifest, is_manifest
 from palpate.data.recordings import LEVELS, name_recordings
 from palpate.data.tables import open_table, table_of
@@ -163,7 +163,8 @@ class Samples:
         """
         if self.rows is not None:
             return min(self.rows.shape[1:3])
-        sizes = {path: _image_size(path) for path in self.manifest.paths("tactile")}
+        paths = self.manifest.paths("tactile")
+        sizes = {path: image_size(path) or read_image(path).size for path in paths}
         first = next(iter(sizes))
         other = next((p for p, size in sizes.items() if size != sizes[first]), None)
         if other is not None:
@@ -211,14 +212,6 @@ class Samples:
 def _file_digest(path: Path, _changed: int) -> str:
     """SHA-256 of a file, read once per run unless its time of change differs."""
     return digest_file(path)
-
-
-def _image_size(path: Path) -> tuple[int, int]:
-    try:
-        with opened(path) as image:  # reads the header alone
-            return image.size
-    except BROKEN:
-        return read_image(path).size  # raises the reason
 
 
 def read_samples(source: Any, name: str) -> Samples:

@@ -109,6 +109,8 @@ class Scan:
     split_name: str = ""  # of the split in the rows' cells ``split``, if they have any
     split_rule: dict[str, Any] = field(default_factory=dict)
     inconclusive: int = 0  # rows skipped because their label marks the material as unclear
+    #: How many images were read as something else than upright 8-bit RGB, by how.
+    taken: Counter[str] = field(default_factory=Counter[str])
     more: tuple[str, ...] = ()  # columns beyond those of every manifest
     #: Whether the paths were met on the disk and not written by somebody: links are followed.
     met: bool = False
@@ -188,6 +190,9 @@ def finished(scan: Scan, check: Check, progress: Progress = quiet) -> list[Row]:
     The cells ``split`` of the rows that remain become the split ``scan.split_name``.
     """
     rows = _unique(scan, _checked_images(scan, _checked_paths(scan), check, progress))
+    if scan.taken:
+        counts = (f"{words} ({count})" for words, count in sorted(scan.taken.items()))
+        scan.facts["images"] = ", ".join(counts)
     scan.problems.sort(key=Problem.sort_key)
     return rows
 
@@ -250,13 +255,14 @@ def _checked_images(scan: Scan, rows: list[Row], check: Check, progress: Progres
             uses[path] += 1
             first.setdefault(path, where)
     bad: set[str] = set()
-    reason_of = lambda path: check_image(scan.base / path, check)
-    for path, reason in in_threads(reason_of, first, "checking images", progress):
-        if reason:
+    looked_at = lambda path: check_image(scan.base / path, check)
+    for path, checked in in_threads(looked_at, first, "checking images", progress):
+        scan.taken.update(checked.taken)
+        if checked.problem:
             bad.add(path)
             users = f" (used by {uses[path]} rows)" if uses[path] > 1 else ""
             name = "" if first[path] == path else f"{path}: "
-            scan.problem(first[path], "bad-image", f"{name}{reason}{users}")
+            scan.problem(first[path], "bad-image", f"{name}{checked.problem}{users}")
     return [row for row in rows if bad.isdisjoint(map(row[1].get, IMAGE_COLUMNS))]
 
 

@@ -44,8 +44,9 @@ class StackReader:
             raise self._broken(f"{frames.dtype} pixels")
         self._frames: NDArray[Any] = frames
 
-    #: Stacks have no timestamps.
+    #: Stacks have no timestamps, and no display matrix.
     seconds = None
+    turned = False
 
     def __len__(self) -> int:
         """Number of frames."""

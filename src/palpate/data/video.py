@@ -6,6 +6,9 @@ the index: ``pts[k]``. To reach frame ``k`` the reader seeks to the last keyfram
 before ``pts[k]`` and decodes until exactly that timestamp; where decoding is already between that
 keyframe and ``k``, it continues from there. Rates and durations are not used, so B-frames, variable
 rates and clips that do not start at zero are exact.
+
+A display matrix (of a phone that was held upright) turns or mirrors the frames: a pixel (x, y) is
+shown at (a x + c y, b x + d y), its first two rows being (a, b) and (c, d).
 """
 
 from __future__ import annotations
@@ -32,10 +35,15 @@ class VideoReader:
     Args:
         path: the file.
 
+    Attributes:
+        turned: whether frames that were read were turned or mirrored by a display matrix.
+
     Raises:
         MissingExtraError: if PyAV is not installed.
         PalpateError: if the file is missing, no video, cut short, or without timestamps.
     """
+
+    turned = False
 
     def __init__(self, path: Path) -> None:
         try:
@@ -104,8 +112,9 @@ class VideoReader:
         try:
             for frame in self._decoded:
                 if (k := position.pop(frame.pts, None)) is not None:
-                    image = resize(frame, *size, "rgb24", interpolation=area)
-                    images[k] = image.to_ndarray()
+                    stored = size[::-1] if self._matrix(frame)[1] else size
+                    image = resize(frame, *stored, "rgb24", interpolation=area)
+                    images[k] = self._upright(frame, image.to_ndarray())
         except self._errors as error:
             raise self._broken(f"a frame that cannot be decoded ({_reason(error)})") from None
         if position:
@@ -187,12 +196,29 @@ class VideoReader:
         try:
             for frame in self._decoded:
                 if frame.pts == target:
-                    return frame.to_ndarray(format="rgb24")
+                    return self._upright(frame, frame.to_ndarray(format="rgb24"))
                 if frame.pts is not None and frame.pts > target:
                     return None
         except self._errors as error:
             raise self._broken(f"a frame that cannot be decoded ({_reason(error)})") from None
         return None
+
+    def _matrix(self, frame: Any) -> tuple[int, int, int, int]:
+        """Signs of a, b, c and d of a frame's display matrix; that of no turn if it has none."""
+        data = frame.side_data.get("DISPLAYMATRIX")
+        if data is None:
+            return 1, 0, 0, 1
+        (a, b, _), (c, d, _), _ = np.sign(np.frombuffer(data, np.int32).reshape(3, 3)).tolist()
+        if not ((a and d and not b and not c) or (b and c and not a and not d)):
+            raise self._broken("a display matrix that is no quarter turn", REWRITE)
+        return a, b, c, d
+
+    def _upright(self, frame: Any, image: NDArray[np.uint8]) -> NDArray[np.uint8]:
+        """The image (h, w, 3) of a frame as its display matrix shows it."""
+        a, b, c, d = self._matrix(frame)
+        self.turned |= (a, d) != (1, 1)
+        image = image.transpose(1, 0, 2) if b else image
+        return np.ascontiguousarray(image[:: b or d, :: c or a])
 
     def _broken(self, got: str, fix: str = "Fetch the file again") -> PalpateError:
         return PalpateError(f"The video {self.path} must be whole and readable", got, fix)

@@ -23,23 +23,25 @@ from numpy.typing import NDArray
 from PIL import Image, PngImagePlugin
 
 from palpate.core import (
+    ImageError,
     Note,
     PalpateError,
     Problem,
     ProblemsError,
     Progress,
     Split,
-    atomic_path,
     digest_file,
     digest_json,
     locked,
+    open_image,
     plain,
     quiet,
     require,
+    save_image,
     write_json,
 )
 from palpate.core.files import canonical_json
-from palpate.data.images import BROKEN, SUFFIXES, check_image, read_image, square
+from palpate.data.images import SUFFIXES, check_image, read_image, square
 from palpate.diffusion.generated import Generated, Index, file_name, old_index
 from palpate.encoders.models import FIX_MODEL, find_model
 
@@ -244,9 +246,9 @@ class _Target:
         if (path := self.path(item.id)) is None:
             return False
         try:
-            with Image.open(path) as image:
+            with open_image(path) as image:
                 text = [image.info.get(f"palpate.{k}") for k in ("id", "settings", "input")]
-        except BROKEN:
+        except ImageError:
             return False
         return text == [item.id, self.digest, stamp]
 
@@ -271,8 +273,7 @@ class _Target:
         for name, value in values.items():  # their order decides the bytes
             if value:
                 text.add_itxt(f"palpate.{name}", value)
-        with atomic_path(path) as part:
-            image.save(part, format="PNG", pnginfo=text)
+        save_image(path, image, pnginfo=text)
         return item
 
     def finish(
@@ -397,7 +398,7 @@ def _is_single(output: Path | None, paths: Sequence[Path]) -> bool:
 def _require_readable(paths: Sequence[Path], argument: str = "photos") -> None:
     if len(paths) > FEW:
         return
-    reasons = ((path, check_image(path)) for path in paths)
+    reasons = ((path, check_image(path).problem) for path in paths)
     if bad := [Problem(str(path), "bad-image", reason) for path, reason in reasons if reason]:
         fix = "Save it anew, smaller if it is large, or pass another"
         fix = fix if paths[0].is_file() else "Check the path"

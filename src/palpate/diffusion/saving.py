@@ -23,10 +23,8 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from PIL import Image
-
 from palpate._version import __version__
-from palpate.core import atomic_folder, write_json
+from palpate.core import atomic_folder, save_image, write_json
 from palpate.training.cards import write_model_cards
 
 if TYPE_CHECKING:
@@ -46,7 +44,7 @@ def write_pipeline(
     with atomic_folder(folder) as part:
         pipeline.denoiser.save(part / "unet", half=half)
         if pipeline.gel is not None:
-            Image.fromarray(pipeline.gel).save(part / "gel.png")
+            save_image(part / "gel.png", pipeline.gel)
         if shared is None:
             pipeline.autoencoder.save(part / "autoencoder", half=half)
             if pipeline.encoders is not None:

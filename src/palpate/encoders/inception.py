@@ -5,8 +5,8 @@ It maps 8-bit images (n, 3, h, w), 0 to 255, to features (n, d). The widely used
 gives the 2048 pool features when called with ``return_features=True``.
 
 **Trust.** A TorchScript file is a program: loading it unpickles no Python object, but running it
-runs any torch operation that its author chose, with the rights of this process. Take such a file
-from its publisher alone.
+runs any torch operation that its author chose, those that write files too, with the rights of this
+process. So it is loaded only where the caller says that it is trusted; no record says so for him.
 """
 
 from __future__ import annotations
@@ -27,6 +27,10 @@ from palpate.encoders.models import first_line
 FILE = "inception-2015-12-05.pt"
 URL = f"https://nvlabs-fi-cdn.nvidia.com/stylegan2-ada-pytorch/pretrained/metrics/{FILE}"
 FIX = f"Fetch {FILE} (about 96 MB) from {URL} and pass its path"
+RUNS = (
+    "If you trust its publisher, say so: a TorchScript file is a program, which runs with your "
+    "rights and can write files"
+)
 
 
 @dataclass(frozen=True)
@@ -74,12 +78,24 @@ class Inception:
         return features.float().numpy()
 
 
-def load_inception(path: str | Path) -> Inception:
-    """Load a TorchScript file; see the head of this module on trust.
+def require_trusted(path: str | Path, trust_torchscript: bool) -> None:
+    """Check that the user trusts a TorchScript file before it is loaded.
 
     Raises:
-        PalpateError: if it is missing or another kind of file, with where to get it.
+        PalpateError: if not, with what it would do.
     """
+    must, example = "must be given for a file of TorchScript", {"trust_torchscript": True}
+    if not trust_torchscript:
+        raise PalpateError(must, str(path), RUNS, argument="trust_torchscript", example=example)
+
+
+def load_inception(path: str | Path, *, trust_torchscript: bool = False) -> Inception:
+    """Load a TorchScript file, whose code then runs; see the head of this module on trust.
+
+    Raises:
+        PalpateError: if it is not trusted, missing or another kind of file, with where to get it.
+    """
+    require_trusted(path, trust_torchscript)
     path = Path(path)
     must = f"The Inception weights {path} must be a file"
     require(path.is_file(), None, must, "no such file", fix=FIX)

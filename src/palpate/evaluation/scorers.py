@@ -61,11 +61,22 @@ REFERENCE = "reference"
 
 @dataclass(frozen=True, kw_only=True)
 class Weights:
-    """Weights that palpate does not ship: Inception (TorchScript), a CLIP, LPIPS (two files)."""
+    """Weights that palpate does not ship: Inception (TorchScript), a CLIP, LPIPS (two files).
+
+    Raises:
+        PalpateError: if the code of Inception's file is not trusted.
+    """
 
     inception: Path | str | None = None
     clip: Path | str | None = None
     lpips: tuple[str | Path, str | Path] | None = None
+    trust_torchscript: bool = False
+
+    def __post_init__(self) -> None:
+        if self.inception is not None:  # said here, not after an hour of other scores
+            from palpate.encoders.inception import require_trusted
+
+            require_trusted(self.inception, self.trust_torchscript)
 
     @property
     def companions(self) -> list[Name]:
@@ -213,7 +224,10 @@ class Bench:
         """Features of everything by Inception."""
         from palpate.encoders.inception import load_inception
 
-        network = load_inception(str(self.weights.inception))
+        weights = self.weights
+        network = load_inception(
+            str(weights.inception), trust_torchscript=weights.trust_torchscript
+        )
         return self._standard("Inception", network.digest, network.embed)
 
     @cached_property

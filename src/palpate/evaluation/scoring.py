@@ -81,6 +81,7 @@ def score(  # noqa: PLR0913
     inception: str | Path | None = None,
     clip: str | Path | None = None,
     lpips: tuple[str | Path, str | Path] | None = None,
+    trust_torchscript: bool = False,
     permutations: int = 999,
     seed: int = 0,
     allow_seen: bool = False,
@@ -124,9 +125,10 @@ def score(  # noqa: PLR0913
         companions: further scores (:mod:`palpate.evaluation.scorers`); an empty list is none.
             Default: all whose inputs are there.
         controls: whether a split scores its controls.
-        inception: TorchScript file of Inception, for FID and KID as published.
+        inception: TorchScript file of Inception, for FID and KID as published. It is a program.
         clip: folder or hub id of a CLIP, for CMMD as published.
         lpips: the two files of LPIPS: AlexNet's weights and the heads.
+        trust_torchscript: run the code in the file of Inception, with the rights of this process.
         permutations: relabelings of the permutation test of TMMD; 0 for none.
         seed: of random halves, permutations and the choice of control images.
         allow_seen: score with an encoder that was trained on some of the reference's images; every
@@ -155,8 +157,8 @@ def score(  # noqa: PLR0913
     reserved = (REFERENCE,) if split is None else (REFERENCE, BACKGROUND, SAME_MATERIAL, REAL)
     sources = named_sources(generated, names, reserved)
     real = read_samples(reference, REFERENCE)
-    images, weights = not real.embedded, Weights(inception=inception, clip=clip, lpips=lpips)
-    of_images = {"encoder": encoder, "cache": cache, "background": background, **vars(weights)}
+    images, files = not real.embedded, {"inception": inception, "clip": clip, "lpips": lpips}
+    of_images = {"encoder": encoder, "cache": cache, "background": background, **files}
     for name, value in of_images.items():
         usable = images or value is None
         require(usable, name, "must go with images", "embeddings", fix="Drop it")
@@ -164,7 +166,9 @@ def score(  # noqa: PLR0913
         generators={name: read_samples(source, name) for name, source in sources.items()},
         reference=real if background is None else replace(real, gel=one_image(background)),
         seen=None if train is None else read_samples(train, "train"),
-        weights=weights,
+        weights=Weights(
+            inception=inception, clip=clip, lpips=lpips, trust_torchscript=trust_torchscript
+        ),
         presets=tuple(dict.fromkeys(presets or ())),
         sigmas=tuple(dict.fromkeys(sigmas)),
         normalize=normalize,

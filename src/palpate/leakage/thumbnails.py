@@ -17,10 +17,10 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from PIL import Image, ImageOps
+from PIL import Image
 
 from palpate.core import PalpateError, Progress, atomic_path, digest_json, quiet, short
-from palpate.data.images import BROKEN, check_image, file_stamp, in_threads, opened, read_image
+from palpate.data.images import file_stamp, in_threads, read_image
 
 VERSION = 5
 SIDE = 32
@@ -31,8 +31,6 @@ AT_ONCE = 32
 #: A JPEG is decoded at no less than this: libjpeg's reduction aliases, and faint contacts drown in
 #: that where a copy is edited.
 DRAFT = 128
-#: Modes that need no rule of :func:`palpate.data.images.read_image`.
-PLAIN = ("RGB", "L")
 
 #: Thumbnails of some files, and which of the files cannot be read, with the reason.
 Decoded = tuple[NDArray[np.uint8], dict[int, str]]
@@ -51,18 +49,10 @@ class Thumbnails:
 def thumbnail(path: Path) -> NDArray[np.uint8] | str:
     """One image, (32, 32, 3); or why it cannot be read."""
     try:
-        with opened(path) as image:
-            image.draft("RGB", (DRAFT, DRAFT))
-            image.load()
-            if image.mode in PLAIN and not image.has_transparency_data:
-                upright = ImageOps.exif_transpose(image) if image.info.get("exif") else image
-                small = upright.resize((SIDE, SIDE), Image.Resampling.BOX)
-                return np.asarray(small.convert("RGB"))
-        return np.asarray(read_image(path).resize((SIDE, SIDE), Image.Resampling.BOX))
+        image = read_image(path, (DRAFT, DRAFT))
     except PalpateError as error:
         return error.got
-    except BROKEN as error:
-        return check_image(path) or str(error) or type(error).__name__
+    return np.asarray(image.resize((SIDE, SIDE), Image.Resampling.BOX))
 
 
 def thumbnails(

@@ -16,9 +16,8 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
-from PIL import Image
 
-from palpate.core import Progress, Score, require, track
+from palpate.core import Progress, Score, open_image, require, track
 from palpate.metrics.images import per_image
 from palpate.preference.arrays import FEWER, VoteArrays
 from palpate.preference.plan import REFERENCE, Plan
@@ -54,7 +53,8 @@ def shown_metrics(plan: Plan, progress: Progress) -> list[Metric]:
 
     def pixels(item: str, slot: str) -> Any:
         data = base64.b64decode(plan.images[plan.name(item, slot)].partition(",")[2])
-        return np.asarray(Image.open(io.BytesIO(data)))
+        with open_image(io.BytesIO(data)) as image:
+            return np.asarray(image)
 
     keys = sorted({(t.item, m) for t in plan.trials if t.kind == "pair" for m in (t.left, t.right)})
     images: dict[Literal["SSIM", "PSNR"], dict[tuple[str, str], float]] = {"SSIM": {}, "PSNR": {}}

@@ -7,7 +7,6 @@ JPEG without metadata.
 from __future__ import annotations
 
 import base64
-import io
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageFilter
 
-from palpate.core import Note, Progress, require, track
+from palpate.core import Note, Progress, image_bytes, require, track
 from palpate.data.images import read_image, square
 from palpate.data.recordings import recordings_note
 from palpate.data.samples import (
@@ -137,9 +136,8 @@ def load_square(path: Path, size: int) -> NDArray[np.uint8]:
 
 def data_uri(image: NDArray[np.uint8], quality: int = QUALITY) -> str:
     """Encode an image (h, w, 3) as JPEG without metadata, as a data URI."""
-    file = io.BytesIO()
-    Image.fromarray(image).save(file, "JPEG", quality=quality, subsampling=0)
-    return "data:image/jpeg;base64," + base64.b64encode(file.getvalue()).decode()
+    data = image_bytes(image, "JPEG", quality=quality, subsampling=0)
+    return "data:image/jpeg;base64," + base64.b64encode(data).decode()
 
 
 def estimated_gel(images: NDArray[np.uint8]) -> NDArray[np.uint8]:

@@ -15,7 +15,7 @@ from typing import Any
 from markupsafe import Markup, escape
 from PIL import Image, ImageDraw, ImageFont, ImageOps
 
-from palpate.core import Score, atomic_path, write_text
+from palpate.core import ImageError, Score, save_image, write_text
 from palpate.report import audits
 from palpate.report.first_screen import COLUMNS, TELLING, telling_columns
 from palpate.report.labels import digits_of, file_names, with_interval
@@ -81,8 +81,7 @@ def save_figures(results: Results, folder: Path, *, base: Path) -> list[Path]:
         write_text(path := folder / f"{name}.svg", str(drawing))
         files.append(path)
     for name, picture in _pictures(results).items():
-        with atomic_path(path := folder / f"{name}.png") as part:
-            _grid(picture, base).save(part, "png")
+        save_image(path := folder / f"{name}.png", _grid(picture, base))
         files.append(path)
     return files
 
@@ -179,9 +178,9 @@ def _field(wanted: Wanted, base: Path, crop: bool) -> Image.Image:
     """An image in a square: its center, or all of it on white."""
     try:
         if wanted.path is None:
-            raise FileNotFoundError
+            raise ImageError
         image, tiny = read_image(base, wanted.path, 4 * SIDE, less=wanted.less, like=wanted.like)
-    except Exception:  # as for thumbnails
+    except ImageError:
         field = Image.new("RGB", (SIDE, SIDE), COLORS["paper"])
         ImageDraw.Draw(field).rectangle((0, 0, SIDE - 1, SIDE - 1), outline=COLORS["line"], width=3)
         return field

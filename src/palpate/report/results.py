@@ -73,8 +73,8 @@ FILES = (
     ),
     *("study", "votes", "metrics", "splits"),
 )
-#: Arguments that change no number.
-SILENT = ("progress", "cache", "threads")
+#: Arguments that change no number, or that nobody may say for the user.
+SILENT = ("progress", "cache", "threads", "trust_torchscript")
 #: What is read of a manifest's folder, next to images.
 TABLE = "manifest.parquet"
 

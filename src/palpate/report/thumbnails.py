@@ -9,7 +9,6 @@ name.
 from __future__ import annotations
 
 import base64
-import io
 from collections.abc import Hashable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
@@ -18,17 +17,15 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from PIL import Image, ImageFilter, ImageOps
+from PIL import Image, ImageFilter
 
-from palpate.core import Progress, quiet, track
+from palpate.core import ImageError, Progress, decoded, image_bytes, open_image, quiet, track
 
 TINY = 96
 #: (longest side in pixels, quality), best first.
 SIZES = ((256, 88), (192, 86), (160, 84), (128, 82), (96, 78), (64, 72), (48, 64), (32, 60))
 #: Below this side, rows that are folded anyway are skipped before images shrink further.
 KEEP_ALL = 128
-#: Pixels of the largest image that is decoded, and the problem of a larger one.
-LARGEST, TOO_LARGE = 50_000_000, "image too large"
 #: Bytes of markup around the images of one row, roughly.
 ROW_MARKUP = 1_500
 
@@ -127,17 +124,12 @@ def thumbnail(
         return Thumbnail(problem="not recorded")
     try:
         image, tiny = read_image(base, name, side, less=less, like=like)
-        data = io.BytesIO()
-        exact = tiny and side == SIZES[0][0] and less is None
-        kind = "webp" if exact else "jpeg"
-        image.save(
-            data, kind, lossless=exact, quality=quality, subsampling=0 if quality >= 86 else 2
-        )
-    except FileNotFoundError:
-        return Thumbnail(problem="file missing")
-    except Exception as error:  # a damaged file makes PIL raise almost anything
-        return Thumbnail(problem=TOO_LARGE if TOO_LARGE in error.args else "file unreadable")
-    uri = f"data:image/{kind};base64,{base64.b64encode(data.getvalue()).decode()}"
+    except ImageError as error:
+        return Thumbnail(problem=str(error))
+    exact = tiny and side == SIZES[0][0] and less is None
+    kind, subsampling = "webp" if exact else "jpeg", 0 if quality >= 86 else 2
+    data = image_bytes(image, kind, lossless=exact, quality=quality, subsampling=subsampling)
+    uri = f"data:image/{kind};base64,{base64.b64encode(data).decode()}"
     return Thumbnail(uri, image.width, image.height, tiny)
 
 
@@ -154,17 +146,11 @@ def read_image(
         like: as in :class:`Wanted`.
 
     Raises:
-        OSError: if the file is missing, a pipe, or of too many pixels; PIL raises almost anything
-            for a damaged one.
+        ImageError: if a file cannot be read, with the reason.
     """
-    if (base / name).is_fifo():  # it would be waited for
-        raise OSError("a pipe")
-    with Image.open(base / name) as file:
-        if file.width * file.height > LARGEST:
-            raise OSError(TOO_LARGE)
+    with open_image(base / name) as file:
         tiny = max(file.size) <= TINY
-        file.draft("RGB", (2 * side, 2 * side))
-        image = to_rgb(file)
+        image, _ = decoded(file, (2 * side, 2 * side))
     image.thumbnail((side, side), Image.Resampling.LANCZOS)
     if less is None:
         return image, tiny
@@ -186,28 +172,11 @@ def amplified(image: Image.Image, background: Path | None, pattern: Image.Image)
         if background is None:
             ground = image.filter(ImageFilter.GaussianBlur(max(image.size) / 12))
         else:
-            with Image.open(background) as file:
-                ground = to_rgb(file).resize(image.size)
+            with open_image(background) as file:
+                ground = decoded(file)[0].resize(image.size)
         contact = np.asarray(image, np.float32) - np.asarray(ground, np.float32)
         return contact - np.median(contact, axis=(0, 1)).astype(np.float32)
 
     gain = 110 / max(float(np.quantile(np.abs(contact_of(pattern)), 0.99)), 2.0)
     gray = np.clip(128 + gain * contact_of(image), 0, 255)
     return Image.fromarray(gray.round().astype(np.uint8))
-
-
-def to_rgb(image: Image.Image) -> Image.Image:
-    """Return an upright 8-bit RGB copy.
-
-    16-bit and float grays are stretched from their own range, transparency becomes white.
-    """
-    image = ImageOps.exif_transpose(image)
-    if image.mode.startswith("I") or image.mode == "F":
-        values = np.asarray(image, dtype=np.float64)
-        low, high = float(np.nanmin(values)), float(np.nanmax(values))
-        unit = np.nan_to_num((values - low) / (high - low)) if high > low else np.zeros_like(values)
-        image = Image.fromarray((255 * unit).round().astype(np.uint8))
-    if "A" in image.getbands() or "transparency" in image.info:
-        image = image.convert("RGBA")
-        image = Image.alpha_composite(Image.new("RGBA", image.size, "white"), image)
-    return image.convert("RGB")

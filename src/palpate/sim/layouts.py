@@ -12,14 +12,13 @@ additional ``objects.csv`` and ``captions.csv``.
 
 from __future__ import annotations
 
-import io
 from collections.abc import Iterable, Mapping, Sequence
 from fractions import Fraction
 from pathlib import Path
 
 import numpy as np
-from PIL import Image
 
+from palpate.core import image_bytes
 from palpate.data.tables import csv_text
 from palpate.sim.materials import MATERIALS
 from palpate.sim.options import BACKGROUND_OFFSET, WorldOptions
@@ -54,9 +53,8 @@ def write_video_files(video: Video, folder: Path) -> None:
             continue
         (folder / f"{name}_frame").mkdir()
         for frame in frames:
-            file = io.BytesIO()  # written at once: PIL does not notice a disk that is full
-            Image.fromarray(render(frame)).save(file, "JPEG", quality=95, subsampling=0)
-            (folder / f"{name}_frame" / f"{frame:010d}.jpg").write_bytes(file.getvalue())
+            data = image_bytes(render(frame), "JPEG", quality=95, subsampling=0)
+            (folder / f"{name}_frame" / f"{frame:010d}.jpg").write_bytes(data)
 
 
 def _write_mp4(path: Path, images: Iterable[np.ndarray], size: int) -> None:

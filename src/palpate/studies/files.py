@@ -13,7 +13,6 @@ from typing import Any
 import numpy as np
 import polars as pl
 from numpy.typing import NDArray
-from PIL import Image
 
 from palpate.core import (
     Score,
@@ -25,6 +24,7 @@ from palpate.core import (
     read_json,
     require,
     rng_for,
+    save_image,
     write_json,
 )
 from palpate.data.manifest import Manifest
@@ -61,7 +61,7 @@ def write_images(folder: Path, ids: Sequence[str], images: NDArray[np.uint8]) ->
     folder.mkdir(exist_ok=True)
     rows = [{"id": i, "tactile": f"{k}.png"} for k, i in enumerate(ids)]
     for row, image in zip(rows, images, strict=True):
-        Image.fromarray(np.asarray(image)).save(folder / row["tactile"])
+        save_image(folder / row["tactile"], np.asarray(image))
     Manifest.from_rows(rows, folder).save(folder / "manifest.parquet")
 
 

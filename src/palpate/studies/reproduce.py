@@ -24,7 +24,7 @@ from palpate.core import Progress, digest_file, quiet, require, require_choice
 from palpate.data.samples import read_samples
 from palpate.evaluation.scorers import Weights
 from palpate.preference.scoring import PREFERENCE
-from palpate.report.results import Results
+from palpate.report.results import SILENT, Results
 from palpate.sim.options import WorldOptions
 from palpate.sim.presets import MINI_SEEDS
 from palpate.studies import making
@@ -182,7 +182,11 @@ class Plan:
                 "people": self.people and str(self.people),
                 "steps of a method": self.size.steps,
                 "vq": self.size.vq if isinstance(self.size.vq, str) else None,
-                "weights": {n: _absolute(path) for n, path in vars(self.weights).items() if path},
+                "weights": {
+                    n: _absolute(path)
+                    for n, path in vars(self.weights).items()
+                    if path and n not in SILENT
+                },
                 "device": self.device,
                 "jobs": jobs,
             },
@@ -428,7 +432,7 @@ def run_study(
     return results
 
 
-def plan_again(settings: Mapping[str, Any], folder: Path) -> Plan:
+def plan_again(settings: Mapping[str, Any], folder: Path, trust_torchscript: bool) -> Plan:
     """The plan of a run by its record; what was given to it lies in the run folder.
 
     Raises:
@@ -448,5 +452,8 @@ def plan_again(settings: Mapping[str, Any], folder: Path) -> Plan:
         people=options["people"] and folder / "results" / "people.json",
         steps=options["steps of a method"],
         vq=options["vq"],
-        weights=Weights(**options["weights"]),
+        weights=Weights(
+            **{n: files for n, files in options["weights"].items() if n not in SILENT},
+            trust_torchscript=trust_torchscript,
+        ),
     )

@@ -30,6 +30,7 @@ from palpate.report.results import (
     PATH,
     RESULTS_FORMAT,
     ROWS,
+    SILENT,
     Audit,
     Call,
     Results,
@@ -111,7 +112,11 @@ class Verification:
 
 
 def verify(
-    path: str | Path, *, tolerance: float = TOLERANCE, progress: Progress = quiet
+    path: str | Path,
+    *,
+    tolerance: float = TOLERANCE,
+    trust_torchscript: bool = False,
+    progress: Progress = quiet,
 ) -> Verification:
     """Make the results of a file again and compare every number.
 
@@ -121,6 +126,7 @@ def verify(
             results in a run folder.
         tolerance: relative difference up to which two numbers are the same, in [0, 1); the default
             is for sums whose order may change. Digests and counts must be equal.
+        trust_torchscript: run the code in a TorchScript file that the results name.
         progress: called with what is done.
 
     Raises:
@@ -134,7 +140,8 @@ def verify(
     else:
         results = Results.load(file)
     staged = isinstance(results.settings.get("stages"), Mapping)
-    after, reasons = (_run_again if staged else _calls_again)(results, file, progress)
+    again = _run_again if staged else _calls_again
+    after, reasons = again(results, file, trust_torchscript, progress)
     checks = list[Check]()
     before = _items(results)
     for name in dict.fromkeys([*before, *after]):
@@ -178,7 +185,7 @@ def _name(part: str, item: Any) -> str:
 
 
 def _calls_again(
-    results: Results, file: Path, progress: Progress
+    results: Results, file: Path, trust_torchscript: bool, progress: Progress
 ) -> tuple[dict[str, Any], list[str]]:
     """The items that the calls of a file make now, and why some calls cannot be made."""
     calls = [*results.calls, *(a.call for a in results.audits if a.call is not None)]
@@ -187,13 +194,13 @@ def _calls_again(
     for call in calls:
         try:
             with reading_entry(file, f"The call of palpate {call.verb}"):
-                again.append(_call_again(call, progress))
+                again.append(_call_again(call, trust_torchscript, progress))
         except (PalpateError, OSError) as error:
             reasons.append(" ".join(str(error).split()))
     return _items(*again), reasons
 
 
-def _call_again(call: Call, progress: Progress) -> Results:
+def _call_again(call: Call, trust_torchscript: bool, progress: Progress) -> Results:
     """What a call makes now.
 
     Raises:
@@ -203,7 +210,10 @@ def _call_again(call: Call, progress: Progress) -> Results:
     require(call.verb in FUNCTIONS, None, must, repr(call.verb), fix="Run it again yourself")
     module, name = FUNCTIONS[call.verb]
     function = partial(getattr(import_module(module), name), progress=progress)
-    results = function(**{name: _decoded(value) for name, value in call.arguments.items()})
+    arguments = {n: _decoded(value) for n, value in call.arguments.items() if n not in SILENT}
+    if "inception" in arguments:
+        arguments["trust_torchscript"] = trust_torchscript
+    results = function(**arguments)
     return results if isinstance(results, Results) else Results(title="", audits=[results])
 
 
@@ -231,7 +241,7 @@ def _decoded(value: Any) -> Any:
 
 
 def _run_again(
-    results: Results, file: Path, progress: Progress
+    results: Results, file: Path, trust_torchscript: bool, progress: Progress
 ) -> tuple[dict[str, Any], list[str]]:
     """What the stages next to a file hold and make now, and why some cannot be made."""
     from palpate.studies.demo import Demo
@@ -246,7 +256,11 @@ def _run_again(
         try:
             with reading_entry(file, "The settings"):
                 demo = settings["study"] == Demo.name
-                plan = Demo.again(settings) if demo else plan_again(settings, folder)
+                plan = (
+                    Demo.again(settings)
+                    if demo
+                    else plan_again(settings, folder, trust_torchscript)
+                )
                 stages, nodes = dict[str, Stage](), plan.nodes()
                 for done, node in enumerate(nodes):
                     progress("stages", done, len(nodes), node.name)

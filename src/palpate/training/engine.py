@@ -26,7 +26,6 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from PIL import Image
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import load_file, save_file
 from torch import Tensor, nn
@@ -41,6 +40,7 @@ from palpate.core import (
     quiet,
     require,
     rng_for,
+    save_image,
     short,
 )
 from palpate.training.options import Compute, LoopOptions, RowOrder, Tracker, learning_rate
@@ -398,8 +398,7 @@ class _Run:
             return
         with self.evaluating():
             image = self.task.samples(self.module)
-        with atomic_path(self.folder / SAMPLES / f"{self.step:07}.png") as part:
-            Image.fromarray(image).save(part)
+        save_image(self.folder / SAMPLES / f"{self.step:07}.png", image)
         for tracker in self.trackers:
             log = tracker.log_images
             if tracker.name == "tensorboard":

@@ -32,7 +32,6 @@ from __future__ import annotations
 import re
 from collections import Counter, defaultdict
 from collections.abc import Collection, Iterable, Sequence
-from contextlib import suppress
 from functools import cache
 from pathlib import Path, PurePosixPath
 from typing import Literal
@@ -40,7 +39,7 @@ from typing import Literal
 from palpate.core import Progress, Split, quiet, require, require_choice
 from palpate.data.formats import tvl
 from palpate.data.formats.layout import report_missing_folders, subfolders, suspect_rows
-from palpate.data.images import BROKEN, in_threads, opened
+from palpate.data.images import image_size, in_threads
 from palpate.data.manifest import CLIMBS, Manifest
 from palpate.data.recordings import TRAJECTORY, contact_names, in_time, sessions_of
 from palpate.data.scanning import WORLD, Cells, Facts, Format, Row, Scan, world_facts
@@ -207,7 +206,7 @@ def _swap(result: Scan, swap: Swap, progress: Progress) -> set[str]:
     of_video = {row["video"]: row for _, row in reversed(result.rows)}
 
     def sizes(video: str) -> list[tuple[int, int] | None]:
-        return [_size(result.base / of_video[video][side]) for side in ("vision", "tactile")]
+        return [image_size(result.base / of_video[video][side]) for side in ("vision", "tactile")]
 
     seen = dict(in_threads(sizes, of_video, "looking for swapped folders", progress))
     done = (
@@ -227,13 +226,6 @@ def _swap(result: Scan, swap: Swap, progress: Progress) -> set[str]:
         if row["video"] in fixed:
             row["vision"], row["tactile"] = row["tactile"], row["vision"]
     return fixed
-
-
-def _size(path: Path) -> tuple[int, int] | None:
-    """(width, height) of an image, or None if it cannot be read."""
-    with suppress(*BROKEN), opened(path) as image:
-        return image.size
-    return None
 
 
 def _choose_backgrounds(result: Scan, fixed: Collection[str]) -> None:

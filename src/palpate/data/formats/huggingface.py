@@ -22,11 +22,10 @@ from pathlib import Path
 from typing import Any
 
 import polars as pl
-from PIL import Image
 
 from palpate.core import PalpateError, Progress, atomic_path, inside, quiet, require
 from palpate.data.formats.huggingface_source import Source, first_line, open_source
-from palpate.data.images import BROKEN, Check, form_of
+from palpate.data.images import Check, Checked, check_image
 from palpate.data.manifest import IMAGE_COLUMNS, PART_NAMES, SCHEMA
 from palpate.data.mapping import ColumnMaps, compile_maps, text_of
 from palpate.data.rows import manifest_rows, odd_groups, read_classes
@@ -97,7 +96,7 @@ class _Store:
     folder: Path | None
     created: list[Path]
     check: Check
-    checked: dict[bytes, tuple[str, str | None]] = field(default_factory=dict)
+    checked: dict[bytes, Checked] = field(default_factory=dict)
     paths: dict[bytes, str] = field(default_factory=dict)
 
     def put(self, data: bytes, default: str) -> str | tuple[str, str]:
@@ -108,11 +107,11 @@ class _Store:
         """
         digest = hashlib.blake2b(data, digest_size=16).digest()
         if digest not in self.checked:
-            self.checked[digest] = _checked(data, self.check)
-        kind, reason = self.checked[digest]
-        if reason:
-            return "bad-image", reason
-        suffix = SUFFIXES.get(kind, f".{kind.lower()}")
+            self.checked[digest] = check_image(io.BytesIO(data), self.check)
+        checked = self.checked[digest]
+        if checked.problem:
+            return "bad-image", checked.problem
+        suffix = SUFFIXES.get(checked.form, f".{checked.form.lower()}")
         if digest not in self.paths and self.folder is not None:
             self._write(self.folder / f"{default}{suffix}", data)
         return self.paths.setdefault(digest, default + suffix)
@@ -125,16 +124,6 @@ class _Store:
         else:
             must, fix = "Images of an earlier import must be the same", "Choose another folder"
             require(path.read_bytes() == data, None, must, f"another one at {path}", fix=fix)
-
-
-def _checked(data: bytes, check: Check) -> tuple[str, str | None]:
-    """(format of an image, why it is unusable or None)."""
-    try:
-        return form_of(io.BytesIO(data), check), None
-    except Image.UnidentifiedImageError:
-        return "", "not an image" if data else "an empty file (0 bytes)"
-    except BROKEN as error:
-        return "", str(error) or type(error).__name__
 
 
 def _scan(

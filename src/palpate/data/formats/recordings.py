@@ -202,11 +202,12 @@ class Recordings:
             return rows
         first = {path: row for row in reversed(rows) for path in self._folder_images(row)}
         bad: set[Path] = set()
-        checked = in_threads(lambda p: check_image(p, check), first, "checking images", progress)
-        for path, reason in checked:
-            if reason:
+        checks = in_threads(lambda p: check_image(p, check), first, "checking images", progress)
+        for path, checked in checks:
+            self.scan.taken.update(checked.taken)
+            if checked.problem:
                 bad.add(path)
-                self.scan.problem(first[path].where, "bad-image", f"{path}: {reason}")
+                self.scan.problem(first[path].where, "bad-image", f"{path}: {checked.problem}")
         # A bad background costs no row.
         self.backgrounds = {c: path for c, path in self.backgrounds.items() if path not in bad}
         return [row for row in rows if bad.isdisjoint(self._folder_images(row))]
@@ -343,9 +344,11 @@ class Recordings:
                 return f"{self.frames[job[0]][job[1]].source}: {error.got}"
             return None
 
-        for (video, _, _), text in in_threads(attempt, jobs, task, progress, stop=stop):
+        for (video, side, _), text in in_threads(attempt, jobs, task, progress, stop=stop):
             if text:
                 self.scan.problem(first[video].where, "bad-video", text)
+            if getattr(self.frames[video][side], "turned", False):
+                self.scan.taken["videos turned upright by their tag"] += 1
 
     def _require_same_settings(self, jobs: Sequence[_Job], into: Into) -> None:
         """Record the settings of extracted frames; reject a folder with others."""
