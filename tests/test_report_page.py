@@ -218,9 +218,8 @@ def test_missing_and_broken_images_become_placeholders(tmp_path):
     lost = SampleRef("a", vision="absent&.png", tactile="broken.png")
     items = [GalleryItem(lost, good), GalleryItem(SampleRef("b"), good)]
     tree = Tree(page_of(Results("t", gallery=items), tmp_path))
-    for text in ("absent&.png no such file", "broken.png not an image"):
-        name, problem = text.split(" ", 1)
-        assert f"{problem} {name}" in tree.text
+    assert "no such file absent&.png" in tree.text
+    assert re.search(r"not an image that can be read \(.*\) broken\.png", tree.text)
     assert tree.text.count("not recorded") == 2
     assert "2 images could not be read" in tree.text
     assert len(tree.all("img")) == 2
@@ -236,7 +235,7 @@ def test_small_images_stay_lossless_and_others_become_8_bit_on_white(tmp_path):
     exact, deep, clear = shown_images(html)
     assert np.array_equal(exact, np.asarray(Image.open(tmp_path / small)))
     assert Tree(html).all("img")[0]["class"] == "px"
-    assert (deep.min(), deep.max()) == (0, 255)
+    assert (deep.min(), deep.max()) == (0, round(60000 / 257))
     assert (clear == 255).all()
 
 

@@ -100,7 +100,7 @@ def write_probed(work: Work, probed: Probed) -> None:
 def read_probed(folder: Path) -> Probed:
     """What :func:`write_probed` wrote."""
     scores = read_scores(folder)
-    with np.load(folder / "means.npz") as arrays:
+    with np.load(folder / "means.npz", allow_pickle=False) as arrays:
         parts = [[arrays[f"{name}{k}"] for name in _MEAN] for k in range(len(scores))]
     return Probed([Mean(s, *part) for s, part in zip(scores, parts, strict=True)])
 
