@@ -55,7 +55,7 @@ def same_again(file, monkeypatch):
     """A study that is run again has the results of today's file."""
     results = Results.load(file)
     plan = SimpleNamespace(nodes=list, results=lambda stages: results)
-    monkeypatch.setattr(reproduce, "plan_again", lambda settings, folder: plan)
+    monkeypatch.setattr(reproduce, "plan_again", lambda settings, folder, trusted: plan)
 
 
 def differing(file):
