@@ -23,8 +23,8 @@ from palpate.encoders.models import shipped_folder
 from palpate.report.results import Results
 from palpate.sim import MINI_SEEDS, write_world
 from palpate.studies.demo import PRESETS, Demo
-from palpate.studies.files import require_unseen
 from palpate.studies.graph import digests_of
+from palpate.studies.making import require_unseen
 from palpate.studies.reproduce import run_study
 from palpate.studies.running import plan_graph
 from palpate.studies.verifying import verify

@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from palpate.core import PalpateError, locked
-from palpate.studies.graph import Named, Node, Nodes
+from palpate.studies.graph import Node, Nodes, Stamped
 from palpate.studies.running import plan_graph, run_graph
 
 
@@ -77,7 +77,7 @@ def test_what_reads_a_stage_is_built_again_where_that_has_other_files(tmp_path, 
     """As of a training on a GPU, whose weights are not the same twice."""
     run_graph(DIAMOND, tmp_path)
     shutil.rmtree(tmp_path / "a")
-    other = Node("a", write, {"text": Named(text, "a")})
+    other = Node("a", write, {"text": Stamped(text, "a")})
     nodes = [other if n.name == "a" else n for n in DIAMOND]
     lines = []
     run_graph(nodes, tmp_path, jobs=jobs, print_line=lines.append)
@@ -117,7 +117,7 @@ def fail(work, *, error):
     "error", [PalpateError("must", "got", "fix", argument="seed"), ZeroDivisionError("bug")]
 )
 def test_an_error_stops_the_run_and_finished_nodes_stay(tmp_path, jobs, error):
-    nodes = [node("a"), Node("b", fail, {"error": Named(error, "")}, ("a",)), node("c", "b")]
+    nodes = [node("a"), Node("b", fail, {"error": Stamped(error, "")}, ("a",)), node("c", "b")]
     lines = []
     with pytest.raises(type(error)) as raised:
         run_graph(nodes, tmp_path, jobs=jobs, print_line=lines.append)

@@ -161,7 +161,7 @@ def test_the_size_of_the_paper_takes_its_autoencoder(tmp_path):
     for preset in ("paper", "mini"):
         plan = Plan(tag, preset=preset, root=tmp_path, vq=file, steps=400)
         made[preset] = {n.name: n for n in plan.nodes()}
-        assert made[preset]["autoencoder-vq-NoLeak"].options["options"].name == digest_file(file)
+        assert made[preset]["autoencoder-vq-NoLeak"].options["options"].stamp == digest_file(file)
         assert made[preset]["ours-vq-NoLeak-0"].options["training"].diffusion.loop.steps == 400
     assert made["paper"].keys() == made["mini"].keys()
     assert "world" not in made["mini"]

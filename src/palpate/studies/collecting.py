@@ -23,7 +23,7 @@ from palpate.studies.files import (
     read_probed,
     read_scores,
     splits_of,
-    stamped,
+    with_stage,
 )
 from palpate.studies.graph import Work
 from palpate.studies.names import (
@@ -101,7 +101,7 @@ def collect(
         },
         notes=notes,
         tables=[replace(t, rows=_staged_rows(t.rows, stage)) for t in tables],
-        claims=[replace(c, evidence=[stamped(s, stage) for s in c.evidence]) for c in claims],
+        claims=[replace(c, evidence=[with_stage(s, stage) for s in c.evidence]) for c in claims],
     )
     results.save(work.folder / "results.json")
     if people is not None:  # ``palpate verify`` reads it again
@@ -138,7 +138,7 @@ def _tasks_of_generators(
 
 
 def _staged_rows(rows: Sequence[Sequence[Any]], stage: str) -> list[list[Any]]:
-    return [[stamped(c, stage) if isinstance(c, Score) else c for c in row] for row in rows]
+    return [[with_stage(c, stage) if isinstance(c, Score) else c for c in row] for row in rows]
 
 
 def _leak(audits: Sequence[Audit]) -> str:

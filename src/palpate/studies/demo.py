@@ -39,19 +39,18 @@ from palpate.sim.presets import PRESETS as WORLDS
 from palpate.studies.controls import nearest_rows
 from palpate.studies.files import (
     data_of,
-    data_stamp,
     fresh,
     gallery,
-    model_stamp,
     read_audits,
     read_scores,
     write_images,
     write_scores,
 )
-from palpate.studies.graph import Named, Node, Nodes, Work
+from palpate.studies.graph import Node, Nodes, Stamped, Work
 from palpate.studies.making import Training, make_generator, make_images, make_world, read_data
 from palpate.studies.names import NEAREST, SHIPPED
 from palpate.studies.stages import Facts, Stage, record_of
+from palpate.studies.stamps import data_stamp, model_stamp
 from palpate.studies.study import WORLD
 from palpate.studies.study_tables import FAMILY, NAMED, Scores
 from palpate.training.run import TrainingRun
@@ -144,19 +143,19 @@ class Demo:
         require_choice("preset", self.preset, PRESETS)
         preset, size, root = PRESETS[self.preset], None, None
         clip, tactile, autoencoder, start = (
-            Named(SHIPPED, model_stamp(part, SHIPPED))
+            Stamped(SHIPPED, model_stamp(part, SHIPPED))
             for part in ("clip", "encoders", "autoencoder", "generator")
         )
         if data is None:
             nodes.add("world", make_world, options=preset.world)
         else:
-            root = Named(data, [str(data.resolve()), data_stamp(data)])
+            root = Stamped(data, [str(data.resolve()), data_stamp(data)])
             size = 4 * preset.diffusion.size
         nodes.add(
             "data",
             read_data,
             *(node.name for node in nodes),
-            read=Named(partial(import_sized, size=size), size),
+            read=Stamped(partial(import_sized, size=size), size),
             root=root,
             name="world" if data is None else data.name,
             unseen=True,

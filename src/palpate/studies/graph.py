@@ -44,14 +44,14 @@ class Work:
 
 
 @dataclass(frozen=True)
-class Named:
-    """An option whose value is no JSON, or not all that matters: a digest takes ``name`` for it.
+class Stamped:
+    """An option whose value is no JSON, or not all that matters: a digest takes the stamp for it.
 
-    Of a function that is its source, of a model its weights, of a file its bytes.
+    Stamps are made by :mod:`palpate.studies.stamps`.
     """
 
     value: Any
-    name: Any
+    stamp: Any
 
 
 @dataclass(frozen=True)
@@ -62,7 +62,7 @@ class Node:
         name: folder of the stage in the run folder.
         call: called with a :class:`Work` and the options; fills the folder and returns facts
             (JSON). For several processes a function of a module.
-        options: of the call; all of them enter the digest, those that are :class:`Named` by name.
+        options: of the call; all of them enter the digest, a :class:`Stamped` one by its stamp.
         after: names of the earlier nodes that it reads; their digests enter its own.
         version: raised by hand when the stage comes to write other bytes.
         measures: it trains nothing: ``palpate verify`` builds it again, to compare.
@@ -77,12 +77,12 @@ class Node:
 
     def build(self, work: Work) -> Mapping[str, Any] | None:
         """Fill the folder of ``work``."""
-        values = ((k, v.value if isinstance(v, Named) else v) for k, v in self.options.items())
+        values = ((k, v.value if isinstance(v, Stamped) else v) for k, v in self.options.items())
         return self.call(work, **dict(values))
 
     def inputs(self, digests: Mapping[str, str]) -> dict[str, Any]:
         """What the stage reads, of the ``digests`` of earlier nodes."""
-        names = {k: v.name if isinstance(v, Named) else v for k, v in self.options.items()}
+        names = {k: v.stamp if isinstance(v, Stamped) else v for k, v in self.options.items()}
         return {**names, "after": {name: digests[name] for name in self.after}}
 
 

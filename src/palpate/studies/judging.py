@@ -33,7 +33,7 @@ from palpate.studies.files import (
     data_of,
     probing_plan,
     splits_of,
-    stamped,
+    with_stage,
     write_probed,
     write_scores,
 )
@@ -140,7 +140,7 @@ def judge_images(
             one = metric(Judged(subject, x, real, embedded[subject], features, seed))
             details = {**one.details, "extra": True}  # a column of the tables
             scores.append(replace(one, a=subject, split=parts.digest, details=details))
-    write_scores(work.folder, [stamped(s, work.stage) for s in scores])
+    write_scores(work.folder, [with_stage(s, work.stage) for s in scores])
     return {"scores": len(scores), "judge": judge.digest("tactile")}
 
 

@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from palpate.core import Split, require, write_json
+from palpate.core import Split, read_json, require, write_json
 from palpate.data.manifest import Manifest
 from palpate.data.samples import read_samples
 from palpate.diffusion.autoencoder import BackgroundAutoencoder, load_autoencoder
@@ -33,8 +33,9 @@ from palpate.encoders.models import pick_device
 from palpate.leakage.auditing import audit
 from palpate.leakage.splitting import split as leak_free_split
 from palpate.sim.options import WorldOptions
+from palpate.sim.presets import MINI_SEEDS
 from palpate.sim.writer import write_world
-from palpate.studies.files import data_of, fresh, require_unseen, write_images
+from palpate.studies.files import data_of, fresh, write_images
 from palpate.studies.graph import Work
 from palpate.studies.methods import Images, Make, Setting
 from palpate.studies.names import NOLEAK, ORIG, slug
@@ -67,6 +68,26 @@ def read_data(
     dataset = str(manifest.facts.get("dataset", name))
     counts = {"samples": len(manifest), "videos": videos}
     return {"digest": manifest.digest, "dataset": dataset, **counts}
+
+
+def require_unseen(source: Path, facts: Mapping[str, str] | None = None) -> None:
+    """Raise for data that the shipped models were trained on: it cannot judge them.
+
+    Args:
+        source: a world, or any file or folder of one; the nearest ``world.json`` there or above
+            decides.
+        facts: of the manifest made of it; they hold the world's seed where ``world.json`` is out of
+            sight.
+    """
+    path = Path(source).resolve()
+    marks = (folder / "world.json" for folder in (path, *path.parents))
+    mark = next((m for m in marks if m.is_file()), None)
+    record = read_json(mark, "world record") if mark is not None else {}
+    seen = isinstance(record, dict) and bool(record.get("seen_by_shipped_models"))
+    seed = (facts or {}).get("world_seed", "")
+    seen |= seed.isdecimal() and int(seed) in MINI_SEEDS
+    must = "The shipped models must not have been trained on the data that they are judged on"
+    require(not seen, None, must, f"{source}", fix="Write a world of another seed")
 
 
 def make_splits(work: Work, *, noleak: str | None) -> Facts:

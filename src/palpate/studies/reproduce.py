@@ -29,14 +29,14 @@ from palpate.sim.options import WorldOptions
 from palpate.sim.presets import MINI_SEEDS
 from palpate.studies import making
 from palpate.studies.collecting import collect
-from palpate.studies.files import data_stamp, function_stamp, model_stamp, require_unseen
-from palpate.studies.graph import Named, Node, Nodes
+from palpate.studies.graph import Node, Nodes, Stamped
 from palpate.studies.judging import judge_images, probe_encoders
-from palpate.studies.making import Training
+from palpate.studies.making import Training, require_unseen
 from palpate.studies.methods import Method, shipped
 from palpate.studies.names import NOLEAK, SHIPPED, SPLITS, images_node, scores_node, slug
 from palpate.studies.running import run_graph
 from palpate.studies.stages import PrintLine, Stage, record_of
+from palpate.studies.stamps import data_stamp, function_stamp, model_stamp
 from palpate.studies.study import STUDIES, Preset, Study
 from palpate.studies.utility import USEFUL, Draws, measure_utility
 
@@ -150,7 +150,7 @@ class Plan:
                 making.take_images,
                 *DATA,
                 split=NOLEAK,
-                folder=Named(folder, read_samples(folder, str(folder)).image_digest()),
+                folder=Stamped(folder, read_samples(folder, str(folder)).image_digest()),
                 size=self.size.diffusion.size,
             )
         for seed, split, judge in product(self.seeds, SPLITS, SPLITS):
@@ -224,20 +224,20 @@ class _Graph(Nodes):
         super().__init__()
         self.plan, self.study, self.size = plan, plan.study, plan.size
         # Other weights under the same name make other stages.
-        self.clip = Named(self.size.clip, model_stamp("clip", self.size.clip))
-        self.weights = Named(plan.weights, _stamps(plan.weights))
+        self.clip = Stamped(self.size.clip, model_stamp("clip", self.size.clip))
+        self.weights = Stamped(plan.weights, _stamps(plan.weights))
 
     def add_data(self) -> None:
         """World, data and splits."""
         study, root = self.study, self.plan.root
         if (world := self.plan.world) is not None:
-            self.add("world", making.make_world, options=Named(world, [world, world.digest]))
+            self.add("world", making.make_world, options=Stamped(world, [world, world.digest]))
         self.add(
             "data",
             making.read_data,
             *(node.name for node in self),
-            read=Named(study.read, function_stamp(study.read)),
-            root=root and Named(Path(root), [_absolute(root), data_stamp(Path(root))]),
+            read=Stamped(study.read, function_stamp(study.read)),
+            root=root and Stamped(Path(root), [_absolute(root), data_stamp(Path(root))]),
             name=study.name,
             unseen=self.size.clip == SHIPPED,
         )
@@ -251,7 +251,7 @@ class _Graph(Nodes):
             kinds[f"autoencoder-vq-{split}"] = self.size.vq
         for name, options in kinds.items():
             if isinstance(options, str):
-                options = Named(options, model_stamp("autoencoder", options))
+                options = Stamped(options, model_stamp("autoencoder", options))
             self.add(name, making.make_autoencoder, *DATA, split=split, options=options, size=size)
         self.add(
             f"controls-{split}",
@@ -259,7 +259,7 @@ class _Graph(Nodes):
             *DATA,
             f"autoencoder-{split}",
             split=split,
-            controls=Named(controls, {n: function_stamp(make) for n, make in controls.items()}),
+            controls=Stamped(controls, {n: function_stamp(make) for n, make in controls.items()}),
             size=size,
             clip=self.clip,
         )
@@ -289,7 +289,7 @@ class _Graph(Nodes):
                 split=split,
                 seed=seed,
                 name=method.name,
-                make=Named(make, stamp),
+                make=Stamped(make, stamp),
                 size=size.diffusion.size,
                 steps=size.steps,
                 clip=self.clip,
@@ -328,7 +328,7 @@ class _Graph(Nodes):
         if split == judge == NOLEAK:
             methods |= {name: images_node(name, NOLEAK) for name in self.plan.systems}
         metrics = [function_stamp(metric) for metric in study.metrics]
-        sizes = [size.diffusion.size, size.permutations, self.clip.name]
+        sizes = [size.diffusion.size, size.permutations, self.clip.stamp]
         self.add(
             scores_node(split, judge, seed),
             judge_images,
@@ -336,8 +336,8 @@ class _Graph(Nodes):
             encoder,
             f"controls-{split}",
             *methods.values(),
-            study=Named(study, {"controls": list(study.controls), "metrics": metrics}),
-            preset=Named(size, sizes),
+            study=Stamped(study, {"controls": list(study.controls), "metrics": metrics}),
+            preset=Stamped(size, sizes),
             split=split,
             encoders=encoder,
             methods=methods,
@@ -380,12 +380,12 @@ class _Graph(Nodes):
             *DATA,
             images_node(study.on_both[0], NOLEAK, plan.seeds[0]),
             *(node.name for node in self if node.name.startswith(read)),
-            study=Named(
+            study=Stamped(
                 study, [study.name, study.title, study.tables, study.paper, *study.controls]
             ),
             methods=[*(m.name for m in study.methods), *plan.systems],
             seeds=plan.seeds,
-            people=plan.people and Named(Path(plan.people), digest_file(Path(plan.people))),
+            people=plan.people and Stamped(Path(plan.people), digest_file(Path(plan.people))),
             measures=True,
         )
 

@@ -18,11 +18,11 @@ from palpate.data.reading import load
 from palpate.encoders import EncoderSet
 from palpate.evaluation.probing import Plan, Probed, measure, named, plan_of, results_of
 from palpate.report.results import Results
-from palpate.studies.files import model_stamp
-from palpate.studies.graph import Named, Nodes
+from palpate.studies.graph import Nodes, Stamped
 from palpate.studies.making import make_encoders
 from palpate.studies.running import run_graph
 from palpate.studies.stages import PrintLine
+from palpate.studies.stamps import model_stamp
 from palpate.training.options import Compute
 
 
@@ -80,10 +80,10 @@ def compare_splits(  # noqa: PLR0913 - those of training
             split=name,
             seed=seed,
             preset=preset,
-            clip=Named(clip, weights),
-            data=Named((manifest, split), [manifest.digest, split.digest]),
+            clip=Stamped(clip, weights),
+            data=Stamped((manifest, split), [manifest.digest, split.digest]),
             epochs=epochs,
-            compute=Named(compute, ""),
+            compute=Stamped(compute, ""),
         )
     stages = run_graph(nodes, folder, device=device, print_line=print_line, progress=progress)
     runs: dict[str, list[Probed]] = {}
