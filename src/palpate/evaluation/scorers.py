@@ -48,7 +48,6 @@ if TYPE_CHECKING:
 
 Images = NDArray[np.uint8]
 Name = Literal["fid", "kid", "prdc", "cmmd", "ssim", "psnr", "ms-ssim", "contact", "lpips"]
-Preset = Literal["grouped", "paper", "paper-tables", "cmmd"]
 #: With more rows, what forms all pairs must be requested by name.
 MANY = 50_000
 #: Bandwidth of the paper; scores name any other one as their kernel where several are requested.

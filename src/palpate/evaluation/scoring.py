@@ -44,7 +44,6 @@ from palpate.evaluation.scorers import (
     REFERENCE,
     Bench,
     Name,
-    Preset,
     Weights,
     bandwidths,
     choose,
@@ -53,6 +52,7 @@ from palpate.evaluation.scorers import (
 )
 from palpate.metrics.inputs import require_same_ids
 from palpate.metrics.intervals import without_interval
+from palpate.metrics.mmd import Preset
 from palpate.report.labels import measured
 from palpate.report.records import GalleryItem
 from palpate.report.results import OBJECT, PATH, Call, Results

@@ -72,6 +72,7 @@ from palpate.metrics.inputs import (
 from palpate.metrics.intervals import PairSums, Totals, mean_of_pairs
 from palpate.metrics.kernels import Backend, Kernel, Sigma, centered_squares, gaussian, kernel_sums
 
+Preset = Literal["grouped", "paper", "paper-tables", "cmmd"]
 Estimator = Literal["unbiased", "biased", "grouped"]
 Halves = Literal["group", "random", "ordered"]
 Denominator = Literal["sum", "mean", "mean_off_diagonal"]
@@ -171,7 +172,7 @@ class Options:
 class Settings(TypedDict, total=False):
     """What a call may set of :class:`Options`."""
 
-    preset: Literal["paper", "paper-tables", "cmmd", "grouped"] | None
+    preset: Preset | None
     estimator: Estimator
     halves: Halves
     denominator: Denominator
