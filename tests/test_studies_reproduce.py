@@ -20,7 +20,7 @@ from palpate.preference.scoring import PREFERENCE, STRENGTH
 from palpate.report.results import Results
 from palpate.sim import WorldOptions
 from palpate.sim.presets import MINI_SEEDS
-from palpate.studies import collecting, controls, files, judging, reproduce, utility
+from palpate.studies import collecting, controls, judging, reproduce, stamps, utility
 from palpate.studies.controls import CONTROLS
 from palpate.studies.graph import Work, digests_of
 from palpate.studies.methods import METHODS, Method, Setting
@@ -84,7 +84,7 @@ def test_nodes_train_once_for_each_split_and_seed():
     assert "ours-NoLeak-0" in nodes["images-ours-by-text-NoLeak-0"].after
     judged = nodes["scores-NoLeak-by-NoLeak-1"]
     assert {*judged.options["methods"]} == {*METHODS}
-    assert judged.options["study"].name["controls"] == [*CONTROLS]
+    assert judged.options["study"].stamp["controls"] == [*CONTROLS]
 
 
 def test_another_seed_leaves_the_nodes_of_the_first():
@@ -132,7 +132,7 @@ def test_other_shipped_weights_build_what_reads_them(monkeypatch):
 def test_the_words_of_a_card_build_nothing_again(monkeypatch, tmp_path, part):
     before = reproduce.model_stamp(part, "palpate/mini")
     record = json.loads((shipped_folder("palpate/mini", part) / "palpate.json").read_text())
-    monkeypatch.setattr(files, "shipped_folder", lambda *_: tmp_path)
+    monkeypatch.setattr(stamps, "shipped_folder", lambda *_: tmp_path)
 
     def stamp(record):
         (tmp_path / "palpate.json").write_text(json.dumps(record))

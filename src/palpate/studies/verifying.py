@@ -21,21 +21,10 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any, Literal
 
-from palpate.core import PalpateError, Progress, few, plain, quiet, read_record, require
+from palpate.core import PalpateError, Progress, few, plain, quiet, require
 from palpate.core.files import reading_entry
 from palpate.report.labels import label_of, subject_of
-from palpate.report.results import (
-    AUDIT_FORMAT,
-    OBJECT,
-    PATH,
-    RESULTS_FORMAT,
-    ROWS,
-    SILENT,
-    Audit,
-    Call,
-    Results,
-    is_there,
-)
+from palpate.report.results import OBJECT, PATH, ROWS, SILENT, Audit, Call, Results, is_there
 from palpate.studies.graph import Work
 from palpate.studies.stages import Stage, stage_outputs, stored_stage
 
@@ -134,11 +123,7 @@ def verify(
     """
     require(0 <= tolerance < 1, "tolerance", "must lie in [0, 1)", tolerance, TOLERANCE)
     file = Path(path)
-    data = read_record(file, "results file", form=(RESULTS_FORMAT, AUDIT_FORMAT))
-    if data["format"] == AUDIT_FORMAT:
-        results = Results(title="", audits=[Audit.load(file)])
-    else:
-        results = Results.load(file)
+    results = Results.load(file)
     staged = isinstance(results.settings.get("stages"), Mapping)
     again = _run_again if staged else _calls_again
     after, reasons = again(results, file, trust_torchscript, progress)
@@ -214,7 +199,7 @@ def _call_again(call: Call, trust_torchscript: bool, progress: Progress) -> Resu
     if "inception" in arguments:
         arguments["trust_torchscript"] = trust_torchscript
     results = function(**arguments)
-    return results if isinstance(results, Results) else Results(title="", audits=[results])
+    return results.to_results() if isinstance(results, Audit) else results
 
 
 def _decoded(value: Any) -> Any:
@@ -230,10 +215,12 @@ def _decoded(value: Any) -> Any:
         path = Path(value[PATH])
         got, fix = f"nothing at {path}", "Put it there again"
         require(is_there(path), None, "An input must exist", got, fix=fix)
-        if ROWS in value:
+        if ROWS in value:  # of a manifest in memory: as its folder has it, or as it is read
+            from palpate.data.manifest import Manifest
             from palpate.data.reading import load
 
-            return load(path)
+            manifest = Manifest.load(path)
+            return manifest if manifest.digest == value[ROWS] else load(path)
         return path
     if isinstance(value, Mapping):
         return {key: _decoded(item) for key, item in value.items()}
