@@ -195,10 +195,11 @@ def _call_again(call: Call, trust_torchscript: bool, progress: Progress) -> Resu
     require(call.verb in FUNCTIONS, None, must, repr(call.verb), fix="Run it again yourself")
     module, name = FUNCTIONS[call.verb]
     function = partial(getattr(import_module(module), name), progress=progress)
-    arguments = {n: _decoded(value) for n, value in call.arguments.items() if n not in SILENT}
-    if "inception" in arguments:
-        arguments["trust_torchscript"] = trust_torchscript
-    results = function(**arguments)
+    if "inception" in call.arguments:
+        function = partial(function, trust_torchscript=trust_torchscript)
+    results = function(
+        **{n: _decoded(value) for n, value in call.arguments.items() if n not in SILENT}
+    )
     return results.to_results() if isinstance(results, Audit) else results
 
 
