@@ -342,8 +342,9 @@ def test_the_worst_pairs_come_from_different_videos_first():
     scores = np.array([0.9, 0.8, 1.0, 0.7], np.float32)
     flags = signals.Flags.of("x", scores, np.ones(4, bool), np.zeros(4, np.int64))
     none = Gaps(np.full(4, -1), np.full(4, -1))
-    worst = flags.summary(train, test, none, 3).worst
-    assert [p.test.id for p in worst] == ["t2", "t3", "t0"]
+    worst = flags.summary(train, test, none).worst
+    assert [p.test.id for p in worst] == ["t2", "t3", "t0", "t1"]
+    assert signals.varied(np.arange(4), scores, test, 3) == [2, 3, 0]
 
 
 def test_frames_whose_images_are_not_at_hand_are_audited_by_names_with_a_note(small_manifest):

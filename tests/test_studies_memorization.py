@@ -9,7 +9,7 @@ from PIL import Image
 
 from forge import commands
 from palpate.core import FeatureSet, PalpateError
-from palpate.evaluation.memorization import contact_rows, memorization, nearest
+from palpate.evaluation.memorization import contact_rows, memorization, nearest_train
 from palpate.metrics.intervals import jackknife_error
 
 RNG = np.random.default_rng(0)
@@ -35,7 +35,7 @@ def planted(share):
 
 
 def test_distances_are_those_of_a_loop():
-    distance, at = nearest(TEST.features, TRAIN.features)
+    distance, at = nearest_train(TEST.features, TRAIN.features)
     for k, row in enumerate(TEST.features):
         each = [float(np.linalg.norm(row - other)) for other in TRAIN.features]
         assert distance[k] == pytest.approx(min(each), abs=1e-6)
@@ -63,7 +63,10 @@ def test_real_images_score_their_floors_and_the_area_is_that_of_all_pairs():
     assert share.value == pytest.approx(share.floor, abs=1 / len(TEST.ids))
     assert area.value == 0.5
     made = planted(0.3)
-    d, r = nearest(made.features, TRAIN.features)[0], nearest(TEST.features, TRAIN.features)[0]
+    d, r = (
+        nearest_train(made.features, TRAIN.features)[0],
+        nearest_train(TEST.features, TRAIN.features)[0],
+    )
 
     def statistic(d, r):
         return float(((d[:, None] < r) + 0.5 * (d[:, None] == r)).mean())

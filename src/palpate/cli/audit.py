@@ -163,7 +163,8 @@ def _next_commands(options: Options, audit: Audit) -> list[str]:
         return []
     if audit.groups_in_all and (audit.groups_in_all < 2 or audit.largest_group > MOST):
         return []  # no split can keep these groups whole
-    source = shlex.join([*map(str, paths), *options.reading.arguments()])
+    skip = ["--skip-bad"] * options.skip_bad
+    source = shlex.join([*map(str, paths), *options.reading.arguments(), *skip])
     checked = {s.kind: s for s in audit.signals if s.checked and s.kind.startswith("near-dup")}
     sides = [kind.split()[-1] for kind, s in checked.items() if s.flagged or audit.group == "none"]
     near = f" --near {'both' if len(sides) == 2 else sides[0]}" if sides else ""
@@ -176,7 +177,7 @@ def _next_commands(options: Options, audit: Audit) -> list[str]:
         commands.append(f"palpate audit {source}{by} --split noleak.json")
         if not options.comparison.impact and checked and len(audit.materials) > 1:
             split = f" --split {shlex.quote(str(options.split))}" if options.split else ""
-            commands.append(f"palpate audit {source}{split} --impact")
+            commands.append(f"palpate audit {source}{by}{split} --impact")
     return commands
 
 

@@ -31,6 +31,7 @@ import tempfile
 from collections.abc import Generator, Iterable, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from functools import cache
+from itertools import islice
 from pathlib import Path, PurePath
 from typing import TYPE_CHECKING, Any, BinaryIO
 
@@ -119,9 +120,9 @@ def digest_json(value: Any) -> str:
 
 def digest_lines(lines: Iterable[str]) -> str:
     """Return the SHA-256 of the lines, each ended by a newline, in the order given."""
-    state = hashlib.sha256()
-    for line in lines:
-        state.update(f"{line}\n".encode())
+    state, rest = hashlib.sha256(), iter(lines)
+    while block := list(islice(rest, 1 << 14)):  # line by line takes thrice as long
+        state.update("\n".join([*block, ""]).encode())
     return state.hexdigest()
 
 

@@ -85,7 +85,15 @@ class Split:
     @cached_property
     def digest(self) -> str:
         """SHA-256 of the assignment."""
-        return digest_lines(f"{i}\t{self.parts[i]}" for i in sorted(self.parts))
+        return digest_lines([f"{i}\t{self.parts[i]}" for i in sorted(self.parts)])
+
+    def changed(self, **fields: Any) -> Split:
+        """The same assignment with another rule, manifest or notes; its digest is not computed
+        again.
+        """
+        other = replace(self, **fields)
+        vars(other).update({k: v for k, v in vars(self).items() if k == "digest"})
+        return other
 
     def ids(self, *parts: str) -> list[str]:
         """Return the ids in the given parts, in the order of the split."""

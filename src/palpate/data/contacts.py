@@ -28,7 +28,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
-from scipy import ndimage, signal
+from scipy import ndimage
 
 Floats = NDArray[np.float32]
 Pixels = NDArray[np.uint8]
@@ -147,9 +147,11 @@ def _contacts(
     smooth: Floats, height: float, reference: int
 ) -> tuple[list[tuple[int, int]], list[int]]:
     """First and last frame of each contact, and its background, by the smooth energy."""
+    from scipy.signal import find_peaks  # seconds, which no other verb has to wait
+
     # The gel is taken as untouched before the video and after it.
     peaks: list[int] = []
-    for peak in (signal.find_peaks(np.pad(smooth, 1), prominence=height)[0] - 1).tolist():
+    for peak in (find_peaks(np.pad(smooth, 1), prominence=height)[0] - 1).tolist():
         # Equal peaks have no trough between them for scipy.
         if not peaks or smooth[peaks[-1] : peak].min() <= smooth[peak] - height:
             peaks.append(peak)

@@ -91,7 +91,7 @@ def described(manifest: Manifest, split: Split) -> Split:
     """
     train, test = (manifest.part(split, part).table for part in ("train", "test"))
     facts = {"recordings": groups_of(manifest), "shared": shared_groups(train, test)}
-    return replace(split, rule={**split.rule, **facts})
+    return split.changed(rule={**split.rule, **facts})
 
 
 def rule_notes(rule: Mapping[str, Any]) -> list[Note]:
@@ -138,7 +138,7 @@ def resampled_by(
     require(requested in ("auto", "frame", *levels), "group", must, got, fix=fix)
     enough = [level for level, own in units.items() if min(map(len, own)) >= LEAST]
     # What the data ask for, coarse to fine.
-    levels = [n for k, n in enumerate(levels) if not any(_cuts(t, levels[k:]) for t in tables)]
+    levels = [n for k, n in enumerate(levels) if not any(cuts(t, levels[k:]) for t in tables)]
     apart = [n for n in levels if not paired and any(own != units[n][0] for own in units[n])]
     inner = levels[levels.index(kept) :] if paired and kept in levels else levels
     right = [*apart, *(level for level in inner if level in enough), *inner, "frame"][0]
@@ -154,7 +154,7 @@ def resampled_by(
     return group, doubt, notes
 
 
-def _cuts(table: pl.DataFrame, levels: Sequence[str]) -> bool:
+def cuts(table: pl.DataFrame, levels: Sequence[str]) -> bool:
     """Whether a unit of a finer level is of several of the first: a video of two objects."""
     level, *finer = levels
     return any(len(table.select(level, n).unique()) > table[n].n_unique() for n in finer)
@@ -307,6 +307,8 @@ def _read(
         found = {p: next((m for own in patterns if (m := own.fullmatch(p))), None) for p in paths}
         rows = {path: match.groupdict() for path, match in found.items() if match}
         return rows, ("video", "frame"), f"file names of {', '.join(chosen)}"
+    if template is None and all(posixpath.splitext(path)[0].isdecimal() for path in usual):
+        return {}, (), ""  # bare numbers name no recording
     text = template or _suggested(usual, inputs)
     parsed = Template.parse(text)
     rows = {path: fields for path in paths if (fields := parsed.match(path)) is not None}

@@ -4,18 +4,14 @@ from __future__ import annotations
 
 import inspect
 from dataclasses import replace
-from functools import lru_cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from palpate.core import FeatureSet, Note, Progress, Split, quiet, require
 from palpate.data.manifest import MODALITIES, Manifest
 from palpate.leakage.auditing import audit as audit_leakage
 from palpate.report.records import Impact
 from palpate.report.results import Audit, Call
-
-if TYPE_CHECKING:
-    from palpate.encoders.encoder_set import EncoderSet
 
 
 def audit(
@@ -59,17 +55,6 @@ def audit(
     call = Call.of("audit", audit, arguments)
     folder = None if cache is None else Path(cache)
 
-    @lru_cache
-    def encoders() -> EncoderSet:
-        from palpate.encoders.guard import load_encoders
-
-        return load_encoders(encoder, progress)
-
-    def embed(samples: Manifest, modality: Any) -> FeatureSet:
-        from palpate.encoders.embed import embed as embed_samples
-
-        return embed_samples(samples, encoders(), modality, cache=folder, progress=progress)
-
     def measure(samples: Manifest, split: Split, group: str, name: str) -> Impact:
         from palpate.evaluation.impact import impact as measure_impact
 
@@ -77,19 +62,21 @@ def audit(
         notes: list[Note] = []
         seen: list[str] = []
         if encoder is not None:
-            from palpate.encoders.guard import guard
+            from palpate.encoders.embed import embed
+            from palpate.encoders.guard import guard, load_encoders
 
+            encoders, features = load_encoders(encoder, progress), dict[str, FeatureSet]()
             # every sample is in the test part of some leak-free split
-            judged = samples.take([i for part in ("train", "test") for i in split.ids(part)])
-            features = {}
-            for m in encoders().modalities:
-                if m not in MODALITIES or judged.table[m].null_count() == len(judged):
+            judged = samples.part(split, "train", "test")
+            for m in encoders.modalities:
+                if m not in MODALITIES or not judged.table[m].count():
                     continue
-                new = guard(encoders(), m, judged, allow_seen=allow_seen, progress=progress)
+                new = guard(encoders, m, judged, allow_seen=allow_seen, progress=progress)
                 notes += new
                 if any(note.code in ("seen-images", "seen-dataset") for note in new):
                     seen.append(f"{m} encoder")
-                features[f"{m} encoder"] = embed(samples, m)
+                rows = embed(samples, encoders, m, cache=folder, progress=progress)
+                features[f"{m} encoder"] = rows
         result = measure_impact(
             samples,
             split,

@@ -39,10 +39,13 @@ import hashlib
 from collections import Counter
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
+from itertools import product
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
+import polars as pl
 from numpy.typing import NDArray
 
 from palpate.core import FeatureSet, Note, PalpateError, Progress, Split, quiet, require, rng_for
@@ -59,6 +62,8 @@ PROBE_ROWS = 10_000
 #: Columns kept by the PCA; features of no more columns are not reduced.
 COMPONENTS = 128
 CLASSIFIERS = ("1-NN", "linear probe")
+#: Parts of a split whose samples are compared.
+COMPARED = ("train", "test")
 #: Entries of a block of distances (float32: 64 MB), of some test rows by all train rows.
 CELLS = 1 << 24
 #: Rounding of a float32 distance, relative to the squared lengths.
@@ -84,22 +89,34 @@ class _Design:
     """What is compared.
 
     Attributes:
-        ids: the samples.
-        material, group: (n,) of each sample.
-        splits: numbers of the train and of the test samples, of the given split, then of the
-            leak-free ones.
+        table: (n) samples with ``id``, ``material``, ``owner`` (the group) and a column for each
+            split: the part of the given one (``split 0``) and of the leak-free ones.
         clean: digests of the latter.
         notes: what was excluded, and what qualifies the result.
         settings: sizes and baselines.
     """
 
-    ids: list[str]
-    material: Names
-    group: Names
-    splits: list[tuple[Rows, Rows]]
+    table: pl.DataFrame
     clean: list[str]
     notes: list[Note]
     settings: dict[str, Any]
+
+    @cached_property
+    def material(self) -> Names:
+        """(n,) materials."""
+        return np.array(self.table["material"].to_list(), dtype=str)
+
+    @cached_property
+    def group(self) -> Names:
+        """(n,) groups."""
+        return np.array(self.table["owner"].to_list(), dtype=str)
+
+    @property
+    def splits(self) -> list[tuple[Rows, Rows]]:
+        """Numbers of the train and of the test samples, by split."""
+        parts = self.table.select(pl.col("^split .*$"))
+        train, test = ([(c == part).arg_true().to_numpy() for c in parts] for part in COMPARED)
+        return list(zip(train, test, strict=True))
 
 
 def impact(
@@ -141,10 +158,11 @@ def impact(
     """
     require(len(features) > 0, "features", "must hold features to classify by", features)
     design = _design(manifest, split, group, seeds)
+    ids = design.table["id"].to_list()
     if isinstance(features, str):
-        sources = pixel_sources(manifest.take(design.ids), cache=cache, progress=progress)
+        sources = pixel_sources(manifest.take(ids), cache=cache, progress=progress)
     else:
-        sources = given_sources(features, design.ids)
+        sources = [_given(name, rows.take(ids)) for name, rows in features.items()]
     rows = _measure(design, sources, seen, progress)
     settings = {
         **design.settings,
@@ -178,87 +196,73 @@ def _measure(
 
 def _design(manifest: Manifest, split: Split, group: str, seeds: Sequence[int]) -> _Design:
     """Choose the samples and materials that can be compared, and make leak-free splits."""
-    manifest.take(split.ids("train", "test"))  # names ids that are missing
-    for part in ("train", "test"):
+    for part in COMPARED:
         must = f"The {part} part must hold samples"
         require(len(split.ids(part)) > 0, None, must, "none", fix="Check the split")
-    ids, part_of = manifest.ids, [split.parts.get(i) for i in manifest.ids]
-    labels = manifest.column("material")
-    inside = [k for k, part in enumerate(part_of) if part in ("train", "test")]
-    rows = sorted((k for k in inside if labels[k]), key=lambda k: ids[k])  # in any manifest's order
+    require(group in GROUPS, "group", f"must be one of {', '.join(GROUPS)}", repr(group), "video")
+    inside = manifest.part(split, *COMPARED)
+    ids = inside.table.drop_nulls("material")["id"].sort().to_list()  # in any manifest's order
     must, fix = "The impact of a leak needs materials", "Fill the manifest's column material"
-    require(len(rows) > 0, None, must, "none in train and test", fix=fix)
-    pool = manifest.take([ids[k] for k in rows])
-    notes: list[Note] = []
-    if len(rows) < len(inside):
-        notes.append(Note("no-material", {"count": len(inside) - len(rows)}))
+    require(len(ids) > 0, None, must, "none in train and test", fix=fix)
+    pool = inside.take(ids)
+    notes = [Note("no-material", {"count": n})] if (n := len(inside) - len(pool)) else []
     videos = pool.table["video"].drop_nulls().n_unique()
     if group == "contact" and videos not in (0, pool.table["contact"].n_unique()):
         notes.append(Note("shared-videos"))
-    owners = _owners(pool, group)
-    here, leaking = [labels[k] for k in rows], [str(part_of[k]) for k in rows]
-    excluded = _incomparable(here, owners, [leaking], group)
-    rows, here, owners, leaking = _without(excluded, here, rows, here, owners, leaking)
-    share = leaking.count("train") / len(leaking)
-    kept = manifest.take([ids[k] for k in rows])
-    plans = [leak_free_split(kept, train=share, by=group, seed=s) for s in seeds]
-    parts = [leaking, *([p.parts[i] for i in kept.ids] for p in plans)]
-    late = _incomparable(here, owners, parts, group)
-    rows, here, owners, *parts = _without(late, here, rows, here, owners, *parts)
-    excluded |= late
-    splits = [
-        (np.flatnonzero(np.array(p) == "train"), np.flatnonzero(np.array(p) == "test"))
-        for p in parts
-    ]
-    material, owner = np.array(here, dtype=str), np.array(owners, dtype=str)
-    test_groups = [len(np.unique(owner[test])) for _, test in splits]
-    settings = {
-        "given_split": split.digest,
-        "group": group,
-        "seeds": list(seeds),
-        "materials": sorted({*here}),
-        "left_out": excluded,
-        "train_samples": min(len(train) for train, _ in splits),
-        "test_samples": [len(test) for _, test in splits],
-        "test_groups": test_groups,
-        "shared_groups": len(np.intersect1d(owner[splits[0][0]], owner[splits[0][1]])),
-    }
-    if excluded:
-        total = len(excluded) + len({*here})
-        notes.append(Note("materials-excluded", {"materials": excluded, "total": total}))
-    if min(test_groups) < 5:
-        notes.append(Note("few-test-groups", {"count": min(test_groups), "group": group}))
-    clean = [p.digest for p in plans]
-    return _Design([ids[k] for k in rows], material, owner, splits, clean, notes, settings)
-
-
-def _owners(pool: Manifest, column: str) -> list[str]:
-    """The group of each sample."""
-    require(column in GROUPS, "group", f"must be one of {', '.join(GROUPS)}", repr(column), "video")
-    if nulls := pool.table[column].null_count():
-        must = f"Every sample that is compared needs a {column}"
+    if nulls := pool.table[group].null_count():
+        must = f"Every sample that is compared needs a {group}"
         fix, example = "Fill the column, or choose another group", {"group": "contact"}
         raise PalpateError(must, f"{nulls} without", fix, example=example)
-    return pool.column(column)
+    parts = pl.Series("split 0", [split.parts[i] for i in ids])
+    table = pool.table.select("id", "material", parts, owner=group)
+    excluded = _incomparable(table, group)
+    table = _without(excluded, table)
+    kept = pool.take(table["id"].to_list())
+    share = float((table["split 0"] == "train").mean())  # type: ignore[arg-type]
+    plans = [leak_free_split(kept, train=share, by=group, seed=s) for s in seeds]
+    clean = {f"split {k}": [p.parts[i] for i in kept.ids] for k, p in enumerate(plans, 1)}
+    table = table.with_columns(pl.Series(name, part) for name, part in clean.items())
+    late = _incomparable(table, group)
+    excluded |= late
+    design = _Design(_without(late, table), [p.digest for p in plans], notes, {})
+    splits, materials = design.splits, sorted({*design.table["material"]})
+    owners = [[np.unique(design.group[rows]) for rows in parts] for parts in splits]
+    test_groups = [len(test) for _, test in owners]
+    design.settings.update(
+        {
+            "given_split": split.digest,
+            "group": group,
+            "seeds": list(seeds),
+            "materials": materials,
+            "left_out": excluded,
+            "train_samples": min(len(train) for train, _ in splits),
+            "test_samples": [len(test) for _, test in splits],
+            "test_groups": test_groups,
+            "shared_groups": len(np.intersect1d(*owners[0])),
+        }
+    )
+    if excluded:
+        params = {"materials": excluded, "total": len(excluded) + len(materials)}
+        notes.append(Note("materials-excluded", params))
+    if min(test_groups) < 5:
+        notes.append(Note("few-test-groups", {"count": min(test_groups), "group": group}))
+    return design
 
 
-def _incomparable(
-    labels: Sequence[str], owners: Sequence[str], splits: Sequence[Sequence[str]], column: str
-) -> dict[str, str]:
+def _incomparable(table: pl.DataFrame, column: str) -> dict[str, str]:
     """Materials that cannot be compared, with the reason.
 
     Raises:
         PalpateError: if fewer than two remain.
     """
-    groups = Counter(label for label, _ in set(zip(labels, owners, strict=True)))
+    groups = table.group_by("material").agg(pl.col("owner").n_unique()).sort("material").iter_rows()
+    groups = dict(groups)
     reasons = {label: f"one {column}" for label, count in groups.items() if count < 2}
-    for at, parts in enumerate(splits):
-        present = set(zip(labels, parts, strict=True))
-        name = "the given" if at == 0 else "a leak-free"
-        for label in groups:
-            for part in ("train", "test"):
-                if (label, part) not in present:
-                    reasons.setdefault(label, f"not in {part} of {name} split")
+    for name, part in product(table.select(pl.col("^split .*$")).columns, COMPARED):
+        present = {*table.filter(pl.col(name) == part)["material"]}
+        which = "the given" if name == "split 0" else "a leak-free"
+        for label in groups.keys() - present:
+            reasons.setdefault(label, f"not in {part} of {which} split")
     if len(groups) - len(reasons) < 2:
         counts = ", ".join(f"{n} {why}" for why, n in Counter(reasons.values()).most_common())
         got = f"{len(groups) - len(reasons)} of {len(groups)} ({counts})"
@@ -268,15 +272,11 @@ def _incomparable(
         fix = "Add recordings, or choose a finer group (of contacts train and test share videos)"
         got = got if reasons else f"{len(groups)} material"
         raise PalpateError(must, got, fix, example={"group": "contact"})
-    return {label: reasons[label] for label in groups if label in reasons}
+    return reasons
 
 
-def _without(
-    excluded: Mapping[str, str], labels: Sequence[str], *columns: Sequence[Any]
-) -> list[Any]:
-    """Columns without the samples of some materials."""
-    keep = [k for k, label in enumerate(labels) if label not in excluded]
-    return [[column[k] for k in keep] for column in columns]
+def _without(excluded: Collection[str], table: pl.DataFrame) -> pl.DataFrame:
+    return table.filter(~pl.col("material").is_in(list(excluded)))
 
 
 def _classify(source: Source, train: Rows, test: Rows, design: _Design) -> dict[str, Mean]:
@@ -287,7 +287,7 @@ def _classify(source: Source, train: Rows, test: Rows, design: _Design) -> dict[
     x, z = reduction.apply(source, train), reduction.apply(source, test)
     owners, material = design.group[train], design.material[train]
     few = thin(np.arange(len(train)), owners, material, min(size, PROBE_ROWS), seed)
-    ids, truth = [design.ids[k] for k in train[few]], design.material[test]
+    ids, truth = design.table["id"].gather(train[few]).to_list(), design.material[test]
     fitted = FeatureSet(ids, x[few], material[few].tolist(), owners[few].tolist())
     right = np.array(fit_probe(fitted, seed=seed).predict(z)) == truth
     hits = {"1-NN": nearest_hits(z, x, truth, material), "linear probe": right}
@@ -443,15 +443,6 @@ def pixel_sources(
             background = cached_images(manifest, "background", SIZE, cache, progress)
             sources.append(_pixels("tactile minus background", images, background))
     return sources
-
-
-def given_sources(features: Mapping[str, FeatureSet], ids: Sequence[str]) -> list[Source]:
-    """The features of the samples ``ids``, by name.
-
-    Raises:
-        PalpateError: if some have none.
-    """
-    return [_given(name, rows.take(ids)) for name, rows in features.items()]
 
 
 def _given(name: str, rows: FeatureSet) -> Source:

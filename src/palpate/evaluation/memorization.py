@@ -28,6 +28,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from palpate.core import FeatureSet, Score, require
+from palpate.leakage.neighbors import nearest
 from palpate.metrics.inputs import Array, require_one_encoder
 from palpate.metrics.intervals import Spread, jackknife_error
 
@@ -39,8 +40,6 @@ if TYPE_CHECKING:
 SIDE = 32
 #: Quantile of real distances under which a generated image counts as memorized.
 QUANTILE = 0.05
-#: Distances in memory at a time.
-CELLS = 1 << 22
 PIXELS, FEATURES = "contact pixels", "tactile features"
 SHARE, NEARNESS = "memorized share", "nearness to train"
 
@@ -100,16 +99,10 @@ def contact_rows(images: NDArray[np.uint8], ground: NDArray[Any]) -> NDArray[np.
     return rows / np.float32(np.sqrt(rows.shape[1]))
 
 
-def nearest(queries: NDArray[Any], train: NDArray[Any]) -> tuple[Array, NDArray[np.intp]]:
+def nearest_train(queries: NDArray[Any], train: NDArray[Any]) -> tuple[Array, NDArray[np.intp]]:
     """Distance (n,) of each query (n, d) to its nearest train row (m, d), and which that is."""
-    base = np.asarray(train, np.float32)
-    squares = (base**2).sum(axis=1)
-    at = np.empty(len(queries), np.intp)
-    step = max(1, CELLS // max(1, len(base)))
-    for start in range(0, len(queries), step):
-        part = np.asarray(queries[start : start + step], np.float32)
-        at[start : start + step] = (squares - 2 * part @ base.T).argmin(axis=1)
-    change = np.asarray(queries, np.float64) - base[at]
+    at = nearest(*(np.ascontiguousarray(x, np.float32) for x in (queries, train)))[:, 0]
+    change = np.asarray(queries, np.float64) - np.asarray(train, np.float32)[at]
     return np.sqrt((change**2).sum(axis=1)), at
 
 
@@ -149,8 +142,8 @@ def memorization(
         widths = other.features.shape[1], train.features.shape[1]
         must, got = f"{pair} images must have rows of one width", f"{widths[0]} and {widths[1]}"
         require(widths[0] == widths[1], None, must, got, fix="Describe both in one way")
-    drawn, at = nearest(generated.features, train.features)
-    test, _ = nearest(real.features, train.features)
+    drawn, at = nearest_train(generated.features, train.features)
+    test, _ = nearest_train(real.features, train.features)
     groups = _units(generated), _units(real)
     threshold = float(np.quantile(test, QUANTILE))
     first = [int(k) for k in np.argsort(drawn, kind="stable")[:10]]

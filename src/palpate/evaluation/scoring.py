@@ -258,8 +258,8 @@ def aligned(bench: Bench, labels: Any, split: Split | None, group: str) -> Bench
     if real.numbered:  # row k of a generator is not row k of the reference
         real = real.with_columns(pl.Series("id", [f"{REFERENCE} {i}" for i in real.ids]))
     generators = {name: labeled_as(samples, real) for name, samples in generators.items()}
-    real, *made = with_recordings([real, *generators.values()])
-    generators, train = dict(zip(generators, made, strict=True)), None
+    real, *named = with_recordings([real, *generators.values()])
+    generators, train = dict(zip(generators, named, strict=True)), None
     if split is not None:
         everything, (real, train) = real, _parts(real, split)
         for name, samples in generators.items():

@@ -33,6 +33,7 @@ from palpate.leakage.groups import GROUPS
 from palpate.leakage.inputs import Data, Source, read_all, rename_unrelated
 from palpate.leakage.questions import LARGEST, NO_GROUP, questions
 from palpate.leakage.signals import (
+    WORST,
     Flags,
     Gaps,
     by_contact,
@@ -43,6 +44,7 @@ from palpate.leakage.signals import (
     shared_group,
     signal_table,
     time_gap,
+    varied,
 )
 from palpate.report.records import Impact, LeakPair
 from palpate.report.results import MATRIX_ROWS, Audit
@@ -64,7 +66,6 @@ class _Options:
     images: bool
     modalities: Sequence[str]
     false_positives: float
-    worst: int
     cache: Path | None
     progress: Progress
     skipped: bool = False  # whether many rows of the inputs were
@@ -84,7 +85,6 @@ def audit(  # noqa: PLR0913
     false_positives: float = 0.001,
     impact: MeasureImpact | None = None,
     name: str | None = None,
-    worst: int = 12,
     cache: str | Path | None = None,
     root: str | Path | None = None,
     reading: Mapping[str, Any] | None = None,
@@ -112,7 +112,6 @@ def audit(  # noqa: PLR0913
         false_positives: rate at which unrelated images may pass for near-duplicates, in (0, 0.1].
         impact: function (samples, split, group, name) -> :class:`Impact`; needs ``split``.
         name: heading; default: the names of the inputs, or of the split.
-        worst: how many of the strongest pairs to keep for each signal.
         cache: folder that keeps decoded images.
         root: where the paths of tables start; default: the folder of the table.
         reading: how sources are read, as in :func:`palpate.load`: ``columns``, ``names``,
@@ -134,7 +133,6 @@ def audit(  # noqa: PLR0913
     require(test is None or split is None, None, must, "both", fix="Pass one of them")
     require(by in (*GROUPS, "auto"), "by", f"must be auto or one of {', '.join(GROUPS)}", repr(by))
     require(near_frames >= 0, "near_frames", "must be at least 0", near_frames, 30)
-    require(worst >= 0, "worst", "must be at least 0", worst, 12)
     require_choice("identity", identity, ("auto", "names", "images"))
     accepted, must = set(modalities) <= set(MODALITIES), "must be among vision, tactile"
     require(accepted, "modalities", must, list(modalities), ["vision"])
@@ -147,7 +145,6 @@ def audit(  # noqa: PLR0913
         images,
         modalities,
         false_positives,
-        worst,
         None if cache is None else Path(cache),
         progress,
     )
@@ -242,9 +239,10 @@ def _known(manifest: Manifest, column: str) -> bool:
     return manifest.table[column].null_count() < len(manifest)
 
 
-def _with_images(train: Manifest, test: Manifest) -> bool:
-    """Whether some images can be compared."""
-    return any(_known(train, c) and _known(test, c) for c in MODALITIES)
+def _compared(train: Manifest, test: Manifest, options: _Options) -> list[str]:
+    """The images that are compared: those that both parts have."""
+    asked = options.modalities if options.images else ()
+    return [m for m in asked if _known(train, m) and _known(test, m)]
 
 
 def _group(train: Manifest, test: Manifest, options: _Options) -> str:
@@ -299,8 +297,8 @@ def _compare(
     last = int(timed.max()) if timed.size else 0
     middle = float(np.median(timed)) if timed.size else None
     edges = [e for e in GAP_EDGES if e <= last] + [last + 1] if timed.size else []
-    pairs = _worst_pairs(train, test, group, gaps, options.worst)
-    signals = [f.summary(train, test, gaps, options.worst) for f in flags]
+    pairs = _worst_pairs(train, test, group, gaps)
+    signals = [f.summary(train, test, gaps) for f in flags]
     return Audit(
         name=name,
         group=group,
@@ -354,7 +352,7 @@ def _notes(
         notes += [Note("numbers-next", {"count": count, "of": len(test)})] if count else []
     if equal:
         params = {"equal": dict(equal), "roots": [str(train.root), str(test.root)]}
-        images = options.images and _with_images(train, test)
+        images = bool(_compared(train, test, options))
         notes.append(Note("equal-names", params | {"images": images}))
     for modality in options.modalities if options.images else ():
         if _known(train, modality) != _known(test, modality):
@@ -379,16 +377,15 @@ def _signals(
         columns = dict.fromkeys([group, "video", "object", "session"])
         flags += [shared_group(train, test, c, counts=c == group) for c in columns]
     flags.append(time_gap(gaps, options.near_frames))
-    for modality in options.modalities if options.images else ():
-        if _known(train, modality) and _known(test, modality):
-            from palpate.leakage.near import near_duplicates
+    for modality in _compared(train, test, options):
+        from palpate.leakage.near import near_duplicates
 
-            rate, cache, progress = options.false_positives, options.cache, options.progress
-            flags.append(
-                near_duplicates(
-                    train, test, modality, false_positives=rate, cache=cache, progress=progress
-                )
+        rate, cache, progress = options.false_positives, options.cache, options.progress
+        flags.append(
+            near_duplicates(
+                train, test, modality, false_positives=rate, cache=cache, progress=progress
             )
+        )
     return [f for f in flags if f is not None]
 
 
@@ -420,17 +417,9 @@ def _matrix(
     return list(rows.select("group", *parts, "leaking").iter_rows(named=True))
 
 
-def _worst_pairs(
-    train: Manifest, test: Manifest, group: str, gaps: Gaps, count: int
-) -> list[LeakPair]:
+def _worst_pairs(train: Manifest, test: Manifest, group: str, gaps: Gaps) -> list[LeakPair]:
     """The test samples nearest to train: the nearest of each video first, then others, by gap."""
-    timed = np.flatnonzero(gaps.frames >= 0)
-    order = timed[np.argsort(gaps.frames[timed], kind="stable")].tolist()
-    videos = test.table["video"].to_list()
-    first: dict[str, int] = {}
-    for k in order:
-        first.setdefault(videos[k], k)
-    chosen = list(dict.fromkeys([*first.values(), *order]))[:count]
+    chosen = varied(np.flatnonzero(gaps.frames >= 0), -gaps.frames, test)
     pairs = [(k, int(gaps.row[k]), int(gaps.frames[k])) for k in chosen]
     if not pairs and group != NO_GROUP:  # no frames: a shared group is still a pair worth showing
         first_of = [
@@ -438,7 +427,7 @@ def _worst_pairs(
             for m in (test, train)
         ]
         shared = sorted((first_of[0].keys() & first_of[1].keys()) - {None})
-        pairs = [(first_of[0][g], first_of[1][g], None) for g in shared[:count]]
+        pairs = [(first_of[0][g], first_of[1][g], None) for g in shared[:WORST]]
     row = lambda m, k: m.ref(m.table.row(k, named=True))
     return [LeakPair(row(test, k), row(train, j), gap) for k, j, gap in pairs]
 

@@ -72,14 +72,6 @@ class Index(Protocol):
         ...
 
 
-class Descriptors:
-    """Ways in which a pool of images is compared, by row."""
-
-    shares: Sequence[float]  # of the rate of false positives, for each question
-    #: The question that each answers, and what makes an index of train images.
-    ways: Sequence[tuple[int, Callable[[Ints], Index]]]
-
-
 class VectorIndex:
     """Vectors that are compared as they are.
 
@@ -139,8 +131,8 @@ class Whitener:
         return (x - self.mean) @ self.matrix
 
 
-class Whitened(Descriptors):
-    """Thumbnails of a pool.
+class Whitened:
+    """Thumbnails of a pool, and the ways in which they are compared, by row.
 
     Args:
         pixels: (u, side, side, 3) thumbnails.
@@ -148,6 +140,10 @@ class Whitened(Descriptors):
         backgrounds: (n,) rows of their backgrounds, or None to use none.
         gray: compare luma alone, as copies without color need.
         fit: (f,) the images to fit on, those that show something.
+
+    Attributes:
+        ways: the question that each answers, and what makes an index of train images.
+        shares: of the rate of false positives, for each question.
     """
 
     def __init__(
@@ -204,7 +200,7 @@ class Whitened(Descriptors):
         self._moved = [[_sampler(s, *GEOMETRIES[0], move) for s in GRIDS] for move in MOVES]
         self.edits = _edits(8 if gray else 16, 1 if gray else 3)
         self._turns = _edits(8, 1 if gray else 2)[0]
-        self.ways = [
+        self.ways: list[tuple[int, Callable[[Ints], Index]]] = [
             (0, lambda rows: VectorIndex(self.slopes, rows)),
             (1, lambda rows: MoveIndex(self, rows)),
             (2, lambda rows: EditIndex(self, rows)),

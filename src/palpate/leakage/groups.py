@@ -17,9 +17,12 @@ from scipy.sparse.csgraph import connected_components
 
 from palpate.core import Note, PalpateError, require
 from palpate.data.manifest import MODALITIES, Manifest
+from palpate.data.recordings import cuts
 
 #: Columns that a split can keep whole, and by which a split can be audited.
 GROUPS = ("video", "contact", "object", "session", "domain", "sensor")
+#: Those above the video.
+COARSE = ("object", "session")
 Ints = NDArray[np.int64]
 
 
@@ -58,15 +61,11 @@ def nested_groups(manifest: Manifest) -> list[str]:
     """
     complete = _known(manifest, ["object", "session", "video", "contact"])
     size = {c: manifest.table[c].n_unique() for c in complete}
+    coarse, fine = ([c for c in complete if (c in COARSE) == yes] for yes in (True, False))
     if "video" in complete:
-        pairs = {
-            c: manifest.table.select("video", c).n_unique()
-            for c in ("object", "session")
-            if c in complete
-        }
-        complete = [c for c in complete if c not in pairs or size[c] < size["video"] == pairs[c]]
-    coarse = [c for c in complete if c in ("object", "session")]
-    return sorted(coarse, key=size.__getitem__) + [c for c in complete if c not in coarse]
+        cut = [c for c in coarse if cuts(manifest.table, [c, "video"])]
+        coarse = [c for c in coarse if c not in cut and size[c] < size["video"]]
+    return sorted(coarse, key=size.__getitem__) + fine
 
 
 def _known(manifest: Manifest, columns: Sequence[str]) -> list[str]:
@@ -105,6 +104,8 @@ def components(manifest: Manifest, by: Sequence[str], links: Sequence[Ints] = ()
         must = f"Every sample needs a {column} to be split by it"
         got = f"{empty} of {n} samples without"
         require(not empty, None, must, got, fix="Fill the column, or choose another one")
+    if len(by) == 1 and not links:  # its values are the groups already
+        return table[by[0]].to_list()
     labels = [table[c].rank("dense").cast(pl.Int64).fill_null(0).to_numpy() - 1 for c in by]
     return _names(manifest, by, _joined([*labels, *links], n))
 

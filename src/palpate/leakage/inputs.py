@@ -113,7 +113,7 @@ def read_all(
     return [
         Source(
             manifest,
-            {name: replace(s, manifest=manifest.digest) for name, s in part.splits.items()}
+            {name: s.changed(manifest=manifest.digest) for name, s in part.splits.items()}
             if manifest is not part.manifest
             else part.splits,
             [*part.notes, *(notes if k == 0 else [])],

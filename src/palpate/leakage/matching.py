@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from palpate.core import Progress, quiet, rng_for
-from palpate.leakage.descriptors import Descriptors, Whitened
+from palpate.leakage.descriptors import Whitened
 from palpate.leakage.neighbors import Apart, Floats, Ints
 from palpate.leakage.pool import Pool
 
@@ -23,7 +23,7 @@ NULL_IMAGES = 2000
 class View:
     """One way to compare images."""
 
-    descriptors: Descriptors  # of all images
+    descriptors: Whitened  # of all images
     usable: NDArray[np.bool_]  # (items,) those that can be compared so
     queries: NDArray[np.bool_]  # (items,) those whose matches are of interest
     shares: Sequence[float]  # of the rate of false positives of these, for each question

@@ -46,6 +46,7 @@ NODES, DRAW_NODES = 600_000, 6000
 INFEASIBLE = 2
 #: Groups x parts up to which an optimum is solved without presolve, which now and then cuts off the
 #: optimum of a small program (in 2 of 691 drawn ones; without it in none) and takes no less time.
+#: Of 193 drawn programs of 200 to 2,000 it cut off none, and proved more in less time.
 SMALL = 100
 #: How far from the best objective a draw may stop.
 DRAW_GAP = 0.15

@@ -31,8 +31,8 @@ from palpate.data.manifest import MODALITIES, Manifest
 from palpate.report.records import CANNOT_TELL, CAUSES, LeakPair, Signal
 
 Ints = NDArray[np.int64]
-#: Pairs kept for each cause that is no leak.
-HARMLESS_PAIRS = 3
+#: The strongest pairs of a signal that are kept, and those of each cause that is no leak.
+WORST, HARMLESS_PAIRS = 12, 3
 
 
 @dataclass(frozen=True)
@@ -116,23 +116,23 @@ class Flags(Signal):
             columns[f"{key}_cause"] = causes.replace("", None)
         return columns
 
-    def summary(self, train: Manifest, test: Manifest, gaps: Gaps, worst: int) -> Signal:
+    def summary(self, train: Manifest, test: Manifest, gaps: Gaps) -> Signal:
         """The signal as a result, with its strongest pairs."""
         signal = Signal(*(getattr(self, f.name) for f in fields(Signal)))
         if self.cause is not None:
             counts = {name: int((self.cause == name).sum()) for name in CAUSES}
             signal = replace(signal, causes={name: n for name, n in counts.items() if n})
-        return replace(signal, worst=self._worst(train, test, gaps, worst))
+        return replace(signal, worst=self._worst(train, test, gaps))
 
-    def _worst(self, train: Manifest, test: Manifest, gaps: Gaps, worst: int) -> list[LeakPair]:
+    def _worst(self, train: Manifest, test: Manifest, gaps: Gaps) -> list[LeakPair]:
         """The strongest pairs, one a video first; then a few of each cause that is no leak."""
         paired = self.nearest >= 0
         ranked = self.flag | (self.verdict == CANNOT_TELL)
-        chosen = _varied(np.flatnonzero(ranked & paired), self.score, test, worst)
+        chosen = varied(np.flatnonzero(ranked & paired), self.score, test)
         if self.cause is not None:
             for name in CAUSES[1:]:
                 rows = np.flatnonzero((self.cause == name) & paired)
-                chosen += _varied(rows, self.score, test, min(HARMLESS_PAIRS, worst))
+                chosen += varied(rows, self.score, test, HARMLESS_PAIRS)
         return [self._pair(train, test, gaps, k) for k in chosen]
 
     def _pair(self, train: Manifest, test: Manifest, gaps: Gaps, k: int) -> LeakPair:
@@ -253,10 +253,10 @@ def leaking(flags: Sequence[Flags], count: int) -> NDArray[np.bool_]:
     return np.any(counted, axis=0) if counted else np.zeros(count, bool)
 
 
-def _varied(rows: Ints, score: NDArray[np.float32], test: Manifest, most: int) -> list[int]:
+def varied(rows: Ints, score: NDArray[Any], test: Manifest, most: int = WORST) -> list[int]:
     """Up to ``most`` rows by falling score, the best of each video first."""
     order = rows[np.argsort(-score[rows], kind="stable")].tolist()
-    videos = test.table["video"]
+    videos = test.table["video"].to_list()
     best: dict[str | None, int] = {}
     for k in order:
         if len(best) >= most:

@@ -9,7 +9,6 @@ there are parts are named and go along.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import Any, overload
 
@@ -130,9 +129,9 @@ def split(  # noqa: PLR0913  # pyright: ignore[reportInconsistentOverload]
         where = {g: parts[k] for g, k in zip(names, assignment.tolist(), strict=True)}
         part_of = {i: where[g] for i, g in zip(manifest.ids, groups, strict=True)}
         more = [*notes, *_notes(manifest, facts)]
-        made = _audited(manifest, Split(part_of, dict(facts), manifest.digest, more), cache)
-        fold_name = f"{made.rule['name']}, fold {fold} of {folds}" if folds else made.rule["name"]
-        splits.append(replace(made, rule={**made.rule, "name": fold_name}))
+        fresh = _audited(manifest, Split(part_of, dict(facts), manifest.digest, more), cache)
+        fold_name = f"{fresh.rule['name']}, fold {fold} of {folds}" if folds else fresh.rule["name"]
+        splits.append(fresh.changed(rule={**fresh.rule, "name": fold_name}))
     return splits[0] if folds is None else splits
 
 
@@ -230,26 +229,26 @@ def _achieved(
     }
 
 
-def _audited(manifest: Manifest, made: Split, cache: str | Path | None) -> Split:
+def _audited(manifest: Manifest, fresh: Split, cache: str | Path | None) -> Split:
     """The split with the verdict of its own audit, and a name that says what train and test share.
 
     The audit is by all that is known of the samples, and by the images that were kept together.
     """
-    near = made.rule["near"]
+    near = fresh.rule["near"]
     own = audit(
         manifest,
-        split=made,
+        split=fresh,
         images=near is not None,
         cache=cache,
         modalities=near["modalities"] if near else [*MODALITIES],
     )
-    facts = {**made.rule, "audit": own.verdict}
-    notes = [*made.notes, *_question(manifest, own.shared)]
+    facts = {**fresh.rule, "audit": own.verdict}
+    notes = [*fresh.notes, *_question(manifest, own.shared)]
     if own.verdict != NO_LEAK:
         what = f"{own.group}s shared" if own.groups_shared else own.verdict
         facts["name"] = f"by {' and '.join(facts['by']) or LINKED}: {what}"
         notes.append(Note("not-noleak", {"name": facts["name"], "verdict": own.verdict}))
-    return replace(made, rule=facts, notes=notes)
+    return fresh.changed(rule=facts, notes=notes)
 
 
 def _question(manifest: Manifest, shared: Mapping[str, Sequence[int]]) -> list[Note]:
