@@ -95,7 +95,7 @@ def place(video: str) -> int:
 
 
 def named(problems):
-    return {place(p.where) for p in problems if p.kind == "swapped-folders"}
+    return {place(p.where) for p in problems if p.kind == "exchanged-sides"}
 
 
 @pytest.mark.parametrize("swapped", [set(), {2, 5, 11}])

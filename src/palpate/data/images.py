@@ -63,6 +63,8 @@ CHOICES = {
     "turn": ("none", "left", "portrait"),
     "resample": (3, 0, 1, 2, 4, 5),
 }
+#: (width, height) of what a check keeps of an image.
+SMALL = (16, 12)
 CLIP_MEAN = (0.48145466, 0.4578275, 0.40821073)
 CLIP_STD = (0.26862954, 0.26130258, 0.27577711)
 #: A square before the crop is at most so many times what the encoder sees.
@@ -80,6 +82,8 @@ class Checked(NamedTuple):
     form: str = ""  # Pillow's name of it
     taken: Sequence[str] = ()  # how it is read where it is not upright 8-bit RGB, in words
     problem: str | None = None  # why it is unusable
+    size: tuple[int, int] = (0, 0)  # width and height, in pixels
+    small: NDArray[np.uint8] = np.zeros((*SMALL[::-1], 3), np.uint8)  # (12, 16, 3) if decoded
 
 
 def read_image(path: Path, at_least: tuple[int, int] | None = None) -> Image.Image:
@@ -118,8 +122,16 @@ def check_image(source: Path | BinaryIO, check: Check = "decode") -> Checked:
     """
     try:
         with open_image(source) as image:
-            form, small = str(image.format), (image.width // 8 + 1, image.height // 8 + 1)
-            return Checked(form, decoded(image, small)[1] if check == "decode" else ())
+            form, size, least = (
+                str(image.format),
+                image.size,
+                (image.width // 8 + 1, image.height // 8 + 1),
+            )
+            if check != "decode":
+                return Checked(form, size=size)
+            rgb, taken = decoded(image, least)
+            small = np.asarray(rgb.resize(SMALL, Image.Resampling.BOX))
+            return Checked(form, taken, size=size, small=small)
     except ImageError as error:
         return Checked(problem=str(error))
 

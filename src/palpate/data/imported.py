@@ -16,6 +16,7 @@ from palpate.data.manifest import IMAGE_COLUMNS, Manifest
 
 if TYPE_CHECKING:
     from palpate.data.formats import Facts
+    from palpate.data.suspicions import Look
 
 #: Rows that an import shows of a folder.
 EXAMPLES = 3
@@ -100,6 +101,7 @@ class Validation:
         invalid: there but unusable.
         suspicious: usable, but a person should look.
         templates: those of a folder, with three rows of what they give.
+        looks: what suspicious recordings look like.
     """
 
     format: str
@@ -109,6 +111,7 @@ class Validation:
     invalid: Sequence[Problem]
     suspicious: Sequence[Problem]
     templates: Mapping[str, str] = field(default_factory=dict)
+    looks: Mapping[str, Look] = field(default_factory=dict)
 
     @property
     def ok(self) -> bool:

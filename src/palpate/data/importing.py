@@ -126,7 +126,9 @@ def validate(
     invalid = [p for p in scan.problems if not p.kind.startswith(MISSING)]
     templated = any(fact.startswith("template_") for fact in scan.facts)
     templates = templates_of(manifest_of(scan, rows, scan.facts)) if templated else {}
-    return Validation(name, facts, len(rows), missing, invalid, scan.suspicious, templates)
+    odd = {problem.where for problem in scan.suspicious}
+    looks = {recording: look for recording, look in scan.looks.items() if recording in odd}
+    return Validation(name, facts, len(rows), missing, invalid, scan.suspicious, templates, looks)
 
 
 def write_lists(manifest: Manifest, split: Split, output: Path) -> list[Path]:

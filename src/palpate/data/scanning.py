@@ -29,8 +29,9 @@ from palpate.core import (
     read_json,
     require,
 )
-from palpate.data.images import Check, check_image, in_threads
+from palpate.data.images import Check, Checked, check_image, in_threads
 from palpate.data.manifest import CLIMBS, FOLLOWED, IMAGE_COLUMNS, Manifest
+from palpate.data.suspicions import SIDES, Look, evenly, suspicions
 
 #: Manifest column -> cell; ``split`` may hold the part of the data set's own split.
 Cells = dict[str, Any]
@@ -111,6 +112,7 @@ class Scan:
     inconclusive: int = 0  # rows skipped because their label marks the material as unclear
     #: How many images were read as something else than upright 8-bit RGB, by how.
     taken: Counter[str] = field(default_factory=Counter[str])
+    looks: dict[str, Look] = field(default_factory=dict)  # recording -> what it looks like
     more: tuple[str, ...] = ()  # columns beyond those of every manifest
     #: Whether the paths were met on the disk and not written by somebody: links are followed.
     met: bool = False
@@ -190,6 +192,7 @@ def finished(scan: Scan, check: Check, progress: Progress = quiet) -> list[Row]:
     The cells ``split`` of the rows that remain become the split ``scan.split_name``.
     """
     rows = _unique(scan, _checked_images(scan, _checked_paths(scan), check, progress))
+    scan.suspicious += suspicions(scan.looks)
     if scan.taken:
         counts = (f"{words} ({count})" for words, count in sorted(scan.taken.items()))
         scan.facts["images"] = ", ".join(counts)
@@ -255,6 +258,9 @@ def _checked_images(scan: Scan, rows: list[Row], check: Check, progress: Progres
             uses[path] += 1
             first.setdefault(path, where)
     bad: set[str] = set()
+    recordings = evenly(row for _, row in rows)
+    some = {row.get(side) for own in recordings.values() for row in own for side in SIDES}
+    usable: dict[str, Checked] = {}
     looked_at = lambda path: check_image(scan.base / path, check)
     for path, checked in in_threads(looked_at, first, "checking images", progress):
         scan.taken.update(checked.taken)
@@ -263,6 +269,10 @@ def _checked_images(scan: Scan, rows: list[Row], check: Check, progress: Progres
             users = f" (used by {uses[path]} rows)" if uses[path] > 1 else ""
             name = "" if first[path] == path else f"{path}: "
             scan.problem(first[path], "bad-image", f"{name}{checked.problem}{users}")
+        elif path in some and check == "decode":
+            usable[path] = checked
+    looks = {name: Look.of_rows(own, scan.base, usable) for name, own in recordings.items()}
+    scan.looks |= {name: look for name, look in looks.items() if look.frames}
     return [row for row in rows if bad.isdisjoint(map(row[1].get, IMAGE_COLUMNS))]
 
 

@@ -3,7 +3,9 @@
 All checks see thumbnails (:mod:`palpate.data.contacts`), so a difference is in gray levels.
 
 * ``frozen-stream``: at least 15 frames in a row that differ by at most 0.05 each, while most of the
-  stream differs by more. Sensors and cameras have noise; only a stalled one repeats itself.
+  stream differs by more; or all frames, within 0.2 of their median image (a codec that begins anew
+  at a key frame changes it a little), while the other stream moves. Sensors and cameras have noise;
+  only a stalled one repeats itself.
 * ``dropped-frames``: places where the timestamps leap by over 1.5 times their median step. Streams
   of a variable rate (the middle half of the steps differs by over a quarter) are not judged.
 * ``unequal-streams``: photo and tactile videos whose lengths differ by over 2 %, at least 3 frames,
@@ -13,42 +15,56 @@ All checks see thumbnails (:mod:`palpate.data.contacts`), so a difference is in 
   reported where its correlation is at least 0.6, and 0.25 above that of every shift more than 5
   frames away, 0 included. Where photos do not show the press (the camera looks elsewhere, or is
   shaken by hand), no shift is distinct and nothing is reported.
+* ``contact-rate``: the share of pairs (frame in contact, frame not) of which the first differs more
+  from the untouched gel is at most 0.7 for the contacts as they are numbered, and at least 0.9 and
+  0.25 more if all numbers are multiplied by the ratio of two usual rates: they were counted at
+  another rate than the frames.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import ndimage
+from scipy import ndimage, stats
 
-from palpate.data.contacts import Pixels
+from palpate.data.contacts import Pixels, contact_energy, find_reference
 
 #: (kind, text) of what looks wrong.
 Finding = tuple[str, str]
-FROZEN, STILL = 15, 0.05
+FROZEN, STILL, STILL_STREAM = 15, 0.05, 0.2
 LEAP, VARIABLE = 1.5, 0.25
 SHORTER, FEWEST = 0.02, 3
 LONGEST_LAG, LEAST_LAG, CORRELATION, MARGIN, NEAR = 60, 3, 0.6, 0.25, 5
+#: Usual rates over each other.
+RATES = (1.0, 0.5, 2.0, 1 / 3, 3.0, 25 / 30, 30 / 25, 24 / 30, 30 / 24, 0.25, 4.0)
+AS_NUMBERED, RESCALED, GAIN, FEWEST_CONTACTS = 0.7, 0.9, 0.25, 10
 #: Shorter recordings are not correlated.
 LEAST_FRAMES = 60
 
 
 def findings(
-    thumbnails: Mapping[str, Pixels], seconds: Mapping[str, NDArray[np.float64]]
+    thumbnails: Mapping[str, Pixels],
+    seconds: Mapping[str, NDArray[np.float64]],
+    in_contact: Collection[int] = (),
 ) -> list[Finding]:
     """What looks wrong with one recording.
 
     Args:
         thumbnails: ``vision``, ``tactile`` or both -> (n, 48, 64, 3) frames in order.
         seconds: of those that are videos -> (n,) when each frame is presented.
+        in_contact: frames that a list says are in contact.
     """
     changes = {name: changes_of(images) for name, images in thumbnails.items()}
-    problems = [p for name, change in changes.items() for p in _frozen(name, change)]
+    still = [name for name, images in thumbnails.items() if _is_still(images)]
+    still = still if len(still) == 1 < len(thumbnails) else []
+    problems = [p for n, change in changes.items() for p in _frozen(n, change, n in still)]
     problems += [p for name, times in seconds.items() for p in _dropped(name, times)]
     if len(changes) == 2:
         problems += _unequal(thumbnails, seconds) or lag_of(changes["tactile"], changes["vision"])
+    if "tactile" in thumbnails and in_contact:
+        problems += _rate(thumbnails["tactile"], in_contact)
     return problems
 
 
@@ -60,8 +76,15 @@ def changes_of(images: Pixels) -> NDArray[np.float64]:
     )
 
 
-def _frozen(name: str, changes: NDArray[np.float64]) -> list[Finding]:
-    still = np.pad(changes <= STILL, 1)
+def _is_still(images: Pixels) -> bool:
+    """Whether (n, 48, 64, 3) frames are one image."""
+    median = np.median(images, axis=0)
+    away = (np.square(np.subtract(x, median, dtype=np.float32)).mean() for x in images)
+    return all(square <= STILL_STREAM**2 for square in away)
+
+
+def _frozen(name: str, changes: NDArray[np.float64], throughout: bool) -> list[Finding]:
+    still = np.pad((changes <= STILL) | throughout, 1)
     edges = np.flatnonzero(still[1:] != still[:-1]).reshape(-1, 2)
     longest = edges[np.diff(edges)[:, 0].argmax()] if len(edges) else [0, 0]
     count = int(longest[1] - longest[0]) + 1
@@ -98,6 +121,28 @@ def _unequal(
         text = " and ".join(f"{rate:.3g} frames a second in {name}" for name, rate in rates.items())
         return [("unequal-streams", f"{text}: frame k is not one instant in both")]
     return []
+
+
+def _rate(touch: Pixels, in_contact: Collection[int]) -> list[Finding]:
+    ranks = stats.rankdata(contact_energy(touch, touch[find_reference(touch)]))
+    frames, numbers = np.arange(len(touch)), np.array(sorted(in_contact))
+
+    def agreement(factor: float) -> float:
+        """The share of pairs by ranks (Mann and Whitney); NaN where too few frames are compared."""
+        inside = np.isin((frames / factor).round(), numbers)
+        count, others = int(inside.sum()), int((~inside).sum())
+        if min(count, others) < FEWEST_CONTACTS:
+            return np.nan
+        return float(ranks[inside].sum() - count * (count + 1) / 2) / (count * others)
+
+    last = np.quantile(numbers, RESCALED)
+    values = {rate: agreement(rate) for rate in RATES if last * rate < len(touch)}
+    as_is, best = agreement(1.0), max(values, key=lambda r: np.nan_to_num(values[r]), default=1.0)
+    if not as_is <= AS_NUMBERED or values.get(best, 0) < max(RESCALED, as_is + GAIN):
+        return []
+    text = f"the listed contacts fit the gel at {best:.3g} times their frame numbers "
+    text += f"({values[best]:.2f} of pairs; {as_is:.2f} as they are): another frame rate"
+    return [("contact-rate", text)]
 
 
 def lag_of(tactile: NDArray[np.float64], vision: NDArray[np.float64]) -> list[Finding]:

@@ -22,8 +22,8 @@ are relative to its ``dataN/``, or start at ``dataN/`` or ``hct/``.
   minute after each other: they may show the same object. No column ``object`` is made of captions,
   since frames of one folder are worded differently.
 - **background** is the image that the list names, else ``digit_background.png``.
-- **Swapped folders**: in some trajectories ``vision/`` holds the tactile images and ``tactile/``
-  the photos. They are recognized by their size, which is that of the sensor in ``vision/`` alone.
+- **Exchanged sides**: in some trajectories ``vision/`` holds the tactile images and ``tactile/``
+  the photos (:mod:`palpate.data.suspicions`).
 - Photos of ``data3`` show the touched spot lower: TVL crops them 200 pixels further down.
 """
 
@@ -39,10 +39,10 @@ from typing import Literal
 from palpate.core import Progress, Split, quiet, require, require_choice
 from palpate.data.formats import tvl
 from palpate.data.formats.layout import report_missing_folders, subfolders, suspect_rows
-from palpate.data.images import image_size, in_threads
 from palpate.data.manifest import CLIMBS, Manifest
 from palpate.data.recordings import TRAJECTORY, contact_names, in_time, sessions_of
 from palpate.data.scanning import WORLD, Cells, Facts, Format, Row, Scan, world_facts
+from palpate.data.suspicions import exchanged_sides, looked_at
 
 FACTS = Facts(
     name="HCT (Touch-Vision-Language)",
@@ -83,8 +83,8 @@ def scan(source: Path, *, swap: Swap = "report", progress: Progress = quiet) -> 
     """Read the lists and look at the trajectories.
 
     Options:
-        swap: trajectories whose vision and tactile folders are swapped are reported, or ``fix``
-            also swaps their paths back.
+        swap: ``report`` leaves trajectories whose vision and tactile folders are exchanged as they
+            are, with the other suspicions; ``fix`` puts their paths back.
     """
     require_choice("swap", swap, ("report", "fix"))
     root, rigs = find(Path(source))
@@ -97,7 +97,7 @@ def scan(source: Path, *, swap: Swap = "report", progress: Progress = quiet) -> 
     contacts = dict(zip(keys, names, strict=True))
     sessions = sessions_of(row["video"] for _, row in result.rows)
     report_missing_folders(result)
-    fixed = _swap(result, swap, progress)
+    fixed = _put_back(result, progress) if swap == "fix" else set[str]()
     _choose_backgrounds(result, fixed)
     sensor = WORLD.sensor if "synthetic" in result.facts else FACTS.sensor
     for _, row in result.rows:
@@ -201,31 +201,15 @@ def _located(cell: str, rig: str) -> str:
     return path if first == rig or RIG.fullmatch(first) else f"{rig}/{path}"
 
 
-def _swap(result: Scan, swap: Swap, progress: Progress) -> set[str]:
-    """Report swapped trajectories; with ``fix`` swap their paths back and return their names."""
-    of_video = {row["video"]: row for _, row in reversed(result.rows)}
-
-    def sizes(video: str) -> list[tuple[int, int] | None]:
-        return [image_size(result.base / of_video[video][side]) for side in ("vision", "tactile")]
-
-    seen = dict(in_threads(sizes, of_video, "looking for swapped folders", progress))
-    done = (
-        "their paths were swapped back"
-        if swap == "fix"
-        else "the option swap, if fix, swaps them back"
-    )
-    swapped = {v for v in of_video if seen[v][0] == tvl.IMAGE_SIZE != seen[v][1] is not None}
-    for video in (v for v in of_video if v in swapped):
-        vision, tactile = (f"{size[0]}x{size[1]}" for size in seen[video] if size)
-        text = f"frames of vision are {vision} pixels as the sensor's should be, tactile {tactile}"
-        result.suspect(video, "swapped-folders", f"{text}; {done}")
-    fixed = swapped if swap == "fix" else set[str]()
-    state = "fixed" if fixed else "as they are"
-    result.facts["swapped_folders"] = f"{len(swapped)}, {state}" if swapped else "none"
+def _put_back(result: Scan, progress: Progress) -> set[str]:
+    """Put the paths of trajectories with exchanged sides back; return their names."""
+    looks = looked_at((row for _, row in result.rows), result.base, progress)
+    exchanged = {problem.where for problem in exchanged_sides(looks)}
     for _, row in result.rows:
-        if row["video"] in fixed:
+        if row["video"] in exchanged:
             row["vision"], row["tactile"] = row["tactile"], row["vision"]
-    return fixed
+    result.facts["exchanged_sides"] = f"put back in {len(exchanged)} trajectories"
+    return exchanged
 
 
 def _choose_backgrounds(result: Scan, fixed: Collection[str]) -> None:

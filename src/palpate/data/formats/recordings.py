@@ -23,6 +23,7 @@ from palpate.data.frames import FolderFrames, Frames, VideoFrames, streams_of
 from palpate.data.images import Check, check_image, in_threads
 from palpate.data.scanning import Into, Scan, raise_if, require_some
 from palpate.data.streams import Finding, findings
+from palpate.data.suspicions import Look
 
 if TYPE_CHECKING:
     from palpate.data.listing import FrameList, FrameTable
@@ -267,9 +268,11 @@ class Recordings:
 
         def check(video: str) -> list[Finding]:
             try:
-                return findings(*streams_of(self.frames[video]))
+                images, seconds = streams_of(self.frames[video])
             except PalpateError:
                 return []  # reported where its frames are read
+            self.scan.looks[video] = Look.of_video(images)
+            return findings(images, seconds, self.in_contact.get(video, ()))
 
         results = in_threads(check, sorted(self.frames), "checking streams", progress)
         for video, problems in sorted(results):

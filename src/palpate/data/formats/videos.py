@@ -29,6 +29,8 @@ from itertools import islice
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from palpate.core import PalpateError, ProblemsError, Progress, few, quiet, require
 from palpate.data.contacts import Contacts, find_contacts, thumbnail
 from palpate.data.detection import (
@@ -48,6 +50,7 @@ from palpate.data.images import SUFFIXES, Check, in_threads, read_image
 from palpate.data.manifest import PART_NAMES
 from palpate.data.scanning import Cells, Facts, Format, Into, Scan
 from palpate.data.streams import Finding, findings
+from palpate.data.suspicions import Look, startup_frames
 from palpate.data.templates import FIX, Fields, Template, assign, walk
 
 FACTS = Facts(
@@ -243,8 +246,13 @@ def _contacts(
             images, seconds = streams_of(work.frames[video])
         except PalpateError as error:
             return error.got
-        contacts = find_contacts(images["tactile"], gel=gel) if "tactile" in images else None
-        return contacts, findings(images, seconds)
+        work.scan.looks[video] = Look.of_video(images)
+        problems = findings(images, seconds)
+        if (touch := images.get("tactile")) is None:
+            return None, problems
+        if count := startup_frames(touch):  # they are no contact
+            touch = np.concatenate([touch[count : count + 1].repeat(count, axis=0), touch[count:]])
+        return find_contacts(touch, gel=gel), problems
 
     contacts: dict[str, Contacts | None] = {}
     for video, outcome in in_threads(find, sorted(work.frames), "finding contacts", progress):
