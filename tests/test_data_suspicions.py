@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from palpate.cli import main
 from palpate.data.importing import import_dataset, validate
 from palpate.data.streams import findings
 from palpate.data.suspicions import exchanged_sides, looked_at, startup_frames
@@ -205,3 +206,31 @@ def test_videos_are_read_upright(tmp_path, degrees):
 @pytest.mark.skipif(not CLIPS.is_dir(), reason="no real clips")
 def test_real_clips_raise_no_suspicion():
     assert validate(CLIPS).suspicious == []
+
+
+def test_a_page_shows_what_is_suspicious(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    for r in range(5):
+        pairs = [exchanged(r, k if k < 30 else 60 - k) for k in range(60)]
+        Path(f"set/video_{r}").mkdir(parents=True)
+        for side, images in zip(("camera", "gelsight"), zip(*pairs, strict=True), strict=True):
+            np.save(f"set/video_{r}/{side}.npy", np.stack(images))
+    assert main(["validate", "set", "--page", "check.html"]) == 0
+    assert "its sides are exchanged" in capsys.readouterr().out
+    page = Path("check.html").read_text(encoding="utf-8")
+    assert "exchanged-sides" in page
+    assert page.count("data:image/") == 2
+    with Image.open("check/4-vision.png") as shown:
+        assert abs(np.asarray(shown).astype(int) - gel(4, 0)).mean() < 3
+
+
+def test_a_summary_says_how_images_were_read(tmp_path):
+    for side in ("photo", "touch"):
+        for k in range(3):
+            path = tmp_path / "set" / "cup" / side / f"{k}.png"
+            path.parent.mkdir(parents=True, exist_ok=True)
+            deep = (gel(0, k)[..., 0].astype(np.uint16) * 257) if side == "touch" else photo(0, k)
+            Image.fromarray(deep).save(path)
+    words = "16-bit gray with 65535 as white (3)"
+    assert words in str(validate(tmp_path / "set"))
+    assert words in str(import_dataset(tmp_path / "set", tmp_path / "out"))

@@ -133,14 +133,14 @@ class Validation:
 
 
 def templates_of(manifest: Manifest) -> dict[str, str]:
-    """The templates of a folder, with three rows of what they gave."""
+    """The templates of a folder, with three rows of what they gave, and how images were read."""
     table, facts = manifest.filled(), manifest.facts
     rows = {c: facts[f"template_{c}"] for c in IMAGE_COLUMNS if f"template_{c}" in facts}
     step = max(1, (len(table) - 1) // (EXAMPLES - 1))
     for k, row in enumerate(table.gather_every(step).head(EXAMPLES).iter_rows(named=True), 1):
         cells = (f"{name}={cell}" for name, cell in row.items() if name not in IMAGE_COLUMNS)
         rows |= {f"example {k}": ", ".join(cells)} if rows else {}
-    return rows
+    return rows | ({"images read as": facts["images"]} if "images" in facts else {})
 
 
 def words_of(table: pl.DataFrame) -> str:

@@ -124,7 +124,7 @@ def validate(
         scan.problem(source, "empty", "no sample is usable")
     missing = [p for p in scan.problems if p.kind.startswith(MISSING)]
     invalid = [p for p in scan.problems if not p.kind.startswith(MISSING)]
-    templated = any(fact.startswith("template_") for fact in scan.facts)
+    templated = any(fact.startswith(("template_", "images")) for fact in scan.facts)
     templates = templates_of(manifest_of(scan, rows, scan.facts)) if templated else {}
     odd = {problem.where for problem in scan.suspicious}
     looks = {recording: look for recording, look in scan.looks.items() if recording in odd}

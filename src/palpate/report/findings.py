@@ -203,8 +203,10 @@ def purpose(results: Results) -> str:
         parts.append(
             "what do an encoder's embeddings know of a sample: its class, its text, its image"
         )
-    elif results.gallery or results.scores:
+    elif results.scores or any(item.generated for item in results.gallery):
         parts.append("how close do generated tactile images come to real ones")
+    elif results.gallery:
+        parts.append("which recordings should a person look at")
     if results.audits:
         parts.append("does the split leak")
     if results.claims:
