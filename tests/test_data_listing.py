@@ -82,7 +82,7 @@ def test_every_bad_line_is_reported_or_skipped_with_its_place(tmp_path):
 
 @pytest.mark.parametrize(
     ("content", "place", "kind"),
-    [("\n \n", "", "empty-list"), (b"v/1.jpg,3\nv\xe9/2.jpg,3\n", ":2", "bad-encoding")],
+    [("\n \n", "", "empty-list"), (b"v\xc3\xa9/1.jpg,3\nv\xe9/2.jpg,3\n", ":2", "bad-encoding")],
 )
 def test_empty_lists_and_foreign_bytes(tmp_path, content, place, kind):
     path = write(tmp_path / "l.txt", content)

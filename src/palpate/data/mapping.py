@@ -7,6 +7,7 @@ use other mapped columns; columns of the table go first. See ``docs/concepts/dat
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -17,6 +18,12 @@ from palpate.core import PalpateError
 
 #: What polars raises for expressions that it cannot parse or compute.
 ERRORS = (pl.exceptions.PolarsError, pl.exceptions.PanicException, ValueError, TypeError)
+#: Bytes of the longest text that an expression may make of a row, and signs that it may pad to.
+LONGEST, LONGEST_PAD = 1 << 16, 255
+PADS = re.compile(r"(?i)\b[lr]pad\s*\(.*?,\s*([0-9]+)")
+#: A cast to an integer; what rounding may change; the column of lines, which is none of a table's.
+INTEGER = re.compile(r"(?i)(\bas|::)\s*(?:tiny|small|big)?int(?:eger)?[0-9]*\b")
+SLACK, LINES = 100, "^palpate_line$"
 FIX = "Use SQL functions on columns: substr, split_part, replace, regexp_replace, left, right, ||"
 
 
@@ -52,10 +59,7 @@ class ColumnMaps:
         """
         computed: dict[str, list[str | None]] = {}
         for target, expression in self.expressions.items():
-            try:
-                values = table.with_columns(expression.cast(pl.String).alias(target))[target]
-            except ERRORS as error:
-                raise _unusable(target, self.texts[target], error) from None
+            values = _values(target, self.texts[target], expression, table)
             computed[target] = values.str.strip_chars().to_list()
             if target not in table.columns:
                 table = table.with_columns(values)
@@ -96,6 +100,49 @@ def compile_maps(
         ordered |= ready
         pending = {t: e for t, e in pending.items() if t not in ready}
     return ColumnMaps(ordered, _columns(ordered, columns), texts)
+
+
+def _values(target: str, text: str, expression: pl.Expr, table: pl.DataFrame) -> pl.Series:
+    """(n,) texts: of cells as texts, else of numbers where all cells of a column are some."""
+    failed: BaseException | None = None
+    if any(int(width) > LONGEST_PAD for width in PADS.findall(text)):
+        raise _unusable(target, text, f"it pads to more than {LONGEST_PAD} signs")
+    for cells in (table, None):
+        if cells is None:
+            cells = table.with_columns(map(_as_numbers, table))
+        try:
+            first = cells.head(1).with_columns(expression.alias(target))[target]
+            if (first.cast(pl.String).str.len_bytes().max() or 0) > LONGEST:
+                raise _unusable(target, text, f"it makes texts of more than {LONGEST:,} bytes")
+            values = cells.with_columns(expression.alias(target))[target]
+        except ERRORS as error:
+            failed = failed or error
+            continue
+        if values.dtype.is_integer() and _overflows(text, cells, values):
+            raise _unusable(target, text, "a number is too large for its type; cast to bigint")
+        return values.cast(pl.String)
+    raise _unusable(target, text, failed or "") from None
+
+
+def _as_numbers(column: pl.Series) -> pl.Series:
+    """A column of integers or decimals as such; others as they are."""
+    for pattern, kind in ((r"^[+-]?[0-9]{1,18}$", pl.Int64), (r"^[+-]?[0-9.]{1,18}$", pl.Float64)):
+        if column.dtype == pl.String and column.count() and column.str.contains(pattern).all():
+            return column.cast(kind, strict=False)
+    return column
+
+
+def _overflows(text: str, cells: pl.DataFrame, values: pl.Series) -> bool:
+    """Whether integers differ from what the expression gives in floating point."""
+    try:
+        exact = pl.sql_expr(INTEGER.sub(r"\1 double", text)).cast(pl.Float64)
+        floats = cells.select(pl.all().exclude(LINES)).with_columns(
+            pl.col(pl.Int64).cast(pl.Float64)
+        )
+        difference = (floats.select(exact).to_series() - values).abs()
+    except ERRORS:
+        return False
+    return bool((difference > SLACK + 1e-6 * values.cast(pl.Float64).abs()).any())
 
 
 def text_of(value: Any) -> str | None:

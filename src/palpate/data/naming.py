@@ -25,17 +25,26 @@ from typing import Any
 
 import polars as pl
 
-from palpate.core import PalpateError, Problem, Split
+from palpate.core import PalpateError, Problem, Split, require
 from palpate.data.detection import ROLES
 from palpate.data.foreign import require_native
 from palpate.data.formats.intervals import NEEDED, ORDER
 from palpate.data.images import SUFFIXES
 from palpate.data.manifest import PART_NAMES, SCHEMA, Manifest
 from palpate.data.mapping import compile_maps
-from palpate.data.recordings import LOOKED_AT, PATH, USUAL
-from palpate.data.rows import manifest_rows, read_classes
+from palpate.data.recordings import PATH, USUAL
+from palpate.data.rows import manifest_rows, read_classes, relocated, without_repeats
 from palpate.data.scanning import require_some
-from palpate.data.tables import TABLES, Table, decoded, header_of, lines_of, open_table, table_of
+from palpate.data.tables import (
+    TABLES,
+    Table,
+    content_of,
+    decoded,
+    header_of,
+    lines_of,
+    open_table,
+    table_of,
+)
 from palpate.data.templates import Template
 
 #: ``video start end [label]``, separated by spaces, tabs, commas or semicolons.
@@ -44,11 +53,11 @@ INTERVAL = re.compile(r"\s*([^\s,;]+)[\s,;]+(\d{1,9})[\s,;]+(\d{1,9})(?:[\s,;]+(
 MOST_FRAMES = 20_000_000
 
 
-def read_names(path: Path, **options: Any) -> tuple[Manifest, list[Problem], Split | None] | None:
+def read_names(source: Any, **options: Any) -> tuple[Manifest, list[Problem], Split | None] | None:
     """Read a list of samples whose images are not at hand.
 
     Args:
-        path: a file.
+        source: a file, a polars or pandas frame, or dictionaries.
         options: ``columns`` (manifest column -> map expression), ``names`` of the columns of a
             table without a header, ``classes``, ``root``, and the templates ``vision`` or
             ``tactile`` of its paths.
@@ -57,6 +66,12 @@ def read_names(path: Path, **options: Any) -> tuple[Manifest, list[Problem], Spl
         The samples, without images unless they are there; what is wrong with the list; and the
         split that it states. None if it is no such list.
     """
+    for name in sorted(set(options) - {"columns", "names", "classes", "root", *ROLES}):
+        must, got = "must be left out for a list or table", repr(options[name])
+        raise PalpateError(must, got, "", argument=name)
+    if not isinstance(source, (str, Path)):
+        return _paths(Path("row"), table_of(source), False, options)
+    path = Path(source)
     require_native(path)
     names = options["names"].split(",") if options.get("names") else []
     if not names and _is_interval(path):
@@ -71,6 +86,7 @@ def read_names(path: Path, **options: Any) -> tuple[Manifest, list[Problem], Spl
     if set(NEEDED) <= set(header):
         return _intervals(path) if not any(path.parent.glob("*/*")) else None
     table = records or open_table(path, [name.strip() for name in names])
+    require(not (records and names), "names", "must be left out for JSON", path.name)
     return _paths(path, table, records is not None, options)
 
 
@@ -89,7 +105,7 @@ def _is_interval(path: Path) -> bool:
 
 def _intervals(path: Path) -> tuple[Manifest, list[Problem], None]:
     """Every frame of every interval."""
-    lines, header = lines_of(decoded(path.read_bytes())), header_of(path)
+    lines, header = lines_of(decoded(content_of(path))), header_of(path)
     order = list(range(4))
     if header and not _is_interval(path):
         lines[0] = ""
@@ -123,7 +139,7 @@ def _records(path: Path) -> Table | None:
     """The objects of a JSON file that nests them, or sorts them by part; None for other files."""
     if path.suffix.lower() not in (".json", ".jsonl"):
         return None
-    text = decoded(path.read_bytes())
+    text = decoded(content_of(path))
     try:
         lines = path.suffix.lower() == ".jsonl"
         data = [json.loads(s) for s in text.split("\n") if s.strip()] if lines else json.loads(text)
@@ -197,8 +213,12 @@ def _paths(
     frame = table.read(columns)
     cells = compiled.apply(frame)
     side, paths = _named_images(frame, cells, options)
+    distinct = {f"of {name}": frame[name].to_list() for name in columns} | cells
+    kept = without_repeats({**distinct, PATH: paths} if paths else distinct, table)
+    paths, cells = kept.get(PATH), {name: kept[name] for name in cells}
     root = Path(options.get("root") or path.parent)
-    there = {p for p in paths or () if p and (root / p).is_file()} if paths else set[str]()
+    images = [p for p in paths or () if p]
+    there = any((root / p).is_file() for p in images) or bool(relocated(images, root))
     stated = {"id", "video", "object"} & cells.keys()
     mapped = there and {"vision", "tactile"} & cells.keys()
     plain = mapped or (not paths and "split" not in cells)
@@ -267,8 +287,8 @@ def _named_images(
     columns |= {n: frame[n].to_list() for n in _path_columns(frame.columns) if n not in columns}
     for name in _path_columns([*columns], side) if side else columns:
         values = columns[name]
-        some = [value for value in values[:LOOKED_AT] if value is not None]
-        if some and sum(map(_is_image, some)) >= USUAL * len(some):
+        some = [value for value in values if value is not None]
+        if 2 * sum(map(_is_image, some)) > len(some):
             return side, values
     return side, None
 

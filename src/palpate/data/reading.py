@@ -13,6 +13,7 @@ from palpate.data.formats import Format, recognized, require_options
 from palpate.data.listing import LINE, read_list
 from palpate.data.manifest import IMAGE_COLUMNS, SCHEMA, Manifest, is_manifest
 from palpate.data.mapping import compile_maps
+from palpate.data.naming import read_names
 from palpate.data.recordings import name_recordings
 from palpate.data.rows import manifest_rows, read_classes
 from palpate.data.scanning import Scan, finished, manifest_of, raise_if, require_some
@@ -81,7 +82,12 @@ def read_samples(
     if isinstance(source, Manifest):
         return source, []
     if not isinstance(source, (str, Path)):
-        return _of_table(table_of(source), Path(), skip_bad, options)
+        # Rows whose images are not at hand are those of a list on disk.
+        named = None if "root" in options else read_names(source, **options)
+        if named is None:
+            return _of_table(table_of(source), Path(), skip_bad, options)
+        raise_if(named[1], skip_bad)
+        return named[:2]
     path = Path(source)
     require_regular(path)
     if format == "auto" and path.exists():
@@ -89,6 +95,9 @@ def read_samples(
         if is_manifest(path):
             return Manifest.load(path, options.get("root")), []
         if path.is_file() and (path.suffix.lower() not in TABLES or is_list(path)):
+            if named := read_names(path, **options) if set(options) - {"root"} else None:
+                raise_if(named[1], skip_bad)
+                return named[:2]
             listed = read_list(path, skip_bad=skip_bad)
             return listed.manifest, listed.skipped
     chosen = "pairs" if "side" in options else format

@@ -2,22 +2,28 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+import re
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import polars as pl
+
 from palpate.core import PARTS, Problem, require
 from palpate.data.manifest import PART_NAMES
-from palpate.data.tables import INCONCLUSIVE, read_categories, whole
+from palpate.data.tables import INCONCLUSIVE, Table, read_categories, whole
 
 #: Columns that a split keeps whole; where only some rows have a value, a person should look.
 GROUPS = ("video", "object", "session")
 INTEGERS = ("frame", "start", "end")
+#: Paths that are looked for, to see where those of another machine start.
+TRIED = 100
 Row = dict[str, Any]
+Cells = Mapping[str, Sequence[str | None]]
 
 
 def manifest_rows(
-    cells: Mapping[str, Sequence[str | None]],
+    cells: Cells,
     count: int,
     where: Callable[[int], str],
     classes: Mapping[int, str] | None,
@@ -84,6 +90,66 @@ def read_classes(path: Path) -> dict[int, str]:
     must, got = "must be a table of classes", f"no file {path}"
     require(path.is_file(), "classes", must, got, fix="Check the path")
     return read_categories(path)
+
+
+def without_repeats(cells: Cells, table: Table) -> Cells:
+    """The cells without the rows that are equal to an earlier one; those become problems.
+
+    Rows of ``table`` that go leave its lines, too.
+    """
+    frame = pl.DataFrame(cells).with_row_index("row")
+    first = frame.group_by(list(cells)).agg(first=pl.col("row").min()) if cells else frame
+    if not cells or len(first) == len(frame):
+        return cells
+    pairs = frame.join(first, on=list(cells), how="left", nulls_equal=True, maintain_order="left")
+    for row, before in pairs.select("row", "first").filter(pl.col("row") != pl.col("first")).rows():
+        text = f"repeats the row {table.where(before)}: all cells that are read are equal"
+        table.problems.append(Problem(table.where(row), "duplicate-row", text))
+    keep = pairs["row"] == pairs["first"]
+    table.lines = pl.Series(table.lines).filter(keep).to_list()
+    return {name: pl.Series(texts).filter(keep).to_list() for name, texts in cells.items()}
+
+
+def relocated(written: Iterable[str], root: Path) -> dict[str, str]:
+    """Paths of another machine -> where their files are below the root.
+
+    The longest end that all paths of one beginning (``/home``, ``C:``) have below the root, or
+    below a folder in it; backslashes separate folders where nothing has such a name. Two paths
+    never become one. Paths that are right as they are written, or found nowhere, are left out.
+    """
+    distinct = list(dict.fromkeys(written))
+    if all((root / path).is_file() for path in _some(distinct)):
+        return {}
+    by_head: dict[str, dict[str, Sequence[str]]] = {}
+    for path in distinct:
+        parts = [part for part in re.split(r"[/\\]+", path) if part not in ("", ".")]
+        absolute = re.match(r"[/\\]|[A-Za-z]:", path)
+        if parts and ".." not in parts:
+            by_head.setdefault(parts[0] if absolute else "", {})[path] = parts
+    places: dict[str, str] = {}
+    for paths in by_head.values():
+        places |= _found(paths, root)
+    return {path: place for path, place in places.items() if path != place}
+
+
+def _found(paths: Mapping[str, Sequence[str]], root: Path) -> dict[str, str]:
+    """Path -> its end that is a file below the root, by one rule for all; empty without one."""
+    some = _some(list(paths))
+    folders = sorted(entry.name for entry in root.iterdir() if entry.is_dir())
+    best, rule = len(some) // 2, (0, "")
+    for start in ("", *(f"{name}/" for name in folders[:TRIED])):
+        for k in range(min(map(len, paths.values()))):
+            count = sum((root / (start + "/".join(paths[p][k:]))).is_file() for p in some)
+            apart = len({tuple(parts[k:]) for parts in paths.values()}) == len(paths)
+            if count > best and apart:
+                best, rule = count, (k, start)
+        if best > len(some) // 2:
+            return {p: rule[1] + "/".join(parts[rule[0] :]) for p, parts in paths.items()}
+    return {}
+
+
+def _some(items: Sequence[str]) -> Sequence[str]:
+    return items[:: max(1, len(items) // TRIED)]
 
 
 def odd_groups(source: Path, rows: Sequence[tuple[str, Row]]) -> list[Problem]:

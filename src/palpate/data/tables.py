@@ -2,7 +2,8 @@
 
 Cells are read as texts; each row keeps its place for messages. CSV and TSV are UTF-8 (or UTF-16
 with a byte-order mark), with any line ends; a ``.csv`` whose header has semicolons but no commas is
-split at those. A quoted cell may span lines; its row counts by its first. Rows of another width,
+split at those. A file without any character of UTF-8 beyond ASCII, but with other bytes, is one of
+Windows (cp1252). A quoted cell may span lines; its row counts by its first. Rows of another width,
 lines that are not JSON, bytes that are not UTF-8 and quotation marks that stay open are problems of
 their line; blank lines are ignored. Items of a JSON array, rows of Parquet and of data frames are
 counted from 1. Only the requested columns are kept.
@@ -16,6 +17,7 @@ import io
 import json
 import re
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -34,6 +36,11 @@ INCONCLUSIVE = -1
 SPELLING = {"Ruber": "Rubber"}
 #: A column of every table that was read: the line of each row.
 LINE = "palpate_line"
+#: Bytes of a text that is read at once.
+LARGEST = 1 << 28
+#: The encoding of texts that Excel saves as plain CSV.
+WINDOWS = "cp1252"
+CONTROL = re.compile("[\x00-\x08\x0b\x0c\x0e-\x1f]")
 #: Signs that no cell can hold: bytes that were not UTF-8, the zero character, halves of characters.
 UNFIT = re.compile("[\ufffd\x00\ud800-\udfff]")
 #: Where a row was read, and its cells by number of the requested column.
@@ -50,6 +57,7 @@ class Table:
     problems: list[Problem]  # what is wrong with its rows; complete after :meth:`read`
     records: _Records  # from the requested columns to (line, cells)
     lines: list[int] = field(default_factory=list)  # (rows,) line of each row that was read
+    suspicious: list[Problem] = field(default_factory=list)  # read, but a person should look
 
     def read(self, columns: Sequence[str]) -> pl.DataFrame:
         """Read the rows.
@@ -147,10 +155,35 @@ def delimiter_of(path: Path, text: str) -> str:
 
 
 def decoded(data: bytes) -> str:
-    """Decode UTF-8, or UTF-16 with a byte-order mark; other bytes become U+FFFD."""
+    """Decode UTF-8, UTF-16 with a byte-order mark, or cp1252; other bytes become U+FFFD."""
     if data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
         return data.decode("utf-16", errors="replace")
-    return data.decode("utf-8-sig", errors="replace")
+    text = data.decode("utf-8-sig", errors="replace")
+    if "\ufffd" in text and is_windows(data):
+        return data.decode(WINDOWS)
+    return text
+
+
+def is_windows(data: bytes) -> bool:
+    """Whether bytes are a text of Windows: no characters of UTF-8 and no control characters."""
+    bare = data.decode("utf-8", errors="ignore")
+    if not bare.isascii() or CONTROL.search(bare):
+        return False
+    with suppress(UnicodeDecodeError):
+        return data.decode(WINDOWS) != bare
+    return False
+
+
+def content_of(path: Path) -> bytes:
+    """The bytes of a table or list.
+
+    Raises:
+        PalpateError: if it is larger than any that can be read at once.
+    """
+    size, must = Path(path).stat().st_size, f"A table or list must have at most {LARGEST >> 20} MiB"
+    got, fix = f"{path} of {size >> 20:,} MiB", "Write it in parts, or as Parquet"
+    require(size <= LARGEST, None, must, got, fix=fix)
+    return Path(path).read_bytes()
 
 
 def lines_of(text: str) -> list[str]:
@@ -171,7 +204,8 @@ def _unfit(cells: Sequence[Any], columns: Sequence[str]) -> tuple[str, str] | No
     """What is wrong with a row as (kind, text)."""
     for name, cell in zip(columns, cells, strict=True):
         if isinstance(cell, str) and UNFIT.search(cell):
-            return "bad-encoding", "the row holds bytes that are not UTF-8, or a zero character"
+            text = "the row holds bytes that are not UTF-8, or a zero character: save the file as"
+            return "bad-encoding", f"{text} UTF-8"
         if isinstance(cell, (list, dict, bytes)):
             return "bad-row", f"{name} holds a {type(cell).__name__} instead of a text or number"
     return None
@@ -179,7 +213,9 @@ def _unfit(cells: Sequence[Any], columns: Sequence[str]) -> tuple[str, str] | No
 
 def _csv(path: Path, names: Sequence[str] | None) -> Table:
     problems: list[Problem] = []
-    rows = _csv_rows(path, decoded(path.read_bytes()), problems)
+    data = content_of(path)
+    text = decoded(data)
+    rows = _csv_rows(path, text, problems)
     header = list(names or [cell.strip() for cell in next(rows, (0, []))[1]])
 
     def records(columns: Sequence[str]) -> Iterator[Record]:
@@ -191,7 +227,12 @@ def _csv(path: Path, names: Sequence[str] | None) -> Table:
                 text = f"{len(cells)} cells under {len(header)} columns"
                 problems.append(Problem(f"{path}:{line}", "bad-row", text))
 
-    return Table(str(path), header, problems, records)
+    table = Table(str(path), header, problems, records)
+    if not text.isascii() and is_windows(data):
+        first = next(line for line in text.splitlines() if not line.isascii())
+        words = f"not UTF-8, and read as {WINDOWS}, the encoding of Windows: {first[:80]!r}"
+        table.suspicious.append(Problem(str(path), "encoding", words))
+    return table
 
 
 def _csv_rows(path: Path, text: str, problems: list[Problem]) -> Iterator[tuple[int, list[str]]]:
@@ -222,7 +263,7 @@ def _rows_inside(lines: Sequence[str], dialect: Any, width: int) -> bool:
 
 def _json(path: Path) -> Table:
     """JSON lines, or a JSON array of objects, by the suffix."""
-    text, problems = decoded(path.read_bytes()), list[Problem]()
+    text, problems = decoded(content_of(path)), list[Problem]()
     rows: list[tuple[int, Any]] = []
     array = path.suffix.lower() == ".json"
     for number, line in enumerate([text] if array else text.split("\n"), 1):
@@ -342,4 +383,4 @@ def text_in(path: Path) -> str:
     path = Path(path)
     got = f"the folder {path}" if path.is_dir() else f"no file {path}"
     require(path.is_file(), None, "The list must be a file", got, fix="Check the path")
-    return decoded(path.read_bytes())
+    return decoded(content_of(path))

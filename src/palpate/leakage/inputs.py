@@ -54,8 +54,13 @@ def read(
     source = paths[0] if len(paths) == len(several) == 1 else data
     path = Path(source) if isinstance(source, (str, Path)) else None
     # A table may name images that are not at hand; everything else is read as `palpate.load` does.
-    table = path if path and path.is_file() and not (is_manifest(path) or is_list(path)) else None
-    named = None if table is None else read_names(table, **_options(reading), root=root)
+    options = _options(reading)
+    if path is None:
+        table = None if isinstance(source, Manifest) or root else source
+    else:
+        listed = path.is_file() and not is_manifest(path) and (options or not is_list(path))
+        table = path if listed else None
+    named = None if table is None else read_names(table, **options, root=root)
     if named is not None:
         manifest, skipped, split = named
         if skipped and not skip_bad:
@@ -154,7 +159,7 @@ def _join(
         must, listed = "Several paths must all be lists", path.is_file() and not is_manifest(path)
         got = f"{path}, which is none" if path.exists() else f"no file {path}"
         require(listed, None, must, got, fix="Name one manifest, or lists alone")
-    if not all(map(is_list, paths)):
+    if _options(reading) or not all(map(is_list, paths)):
         parts = read_all(paths, skip_bad, quiet, root, reading)
         return Manifest.join(*(part.manifest for part in parts)), []
     root = paths[0].parent

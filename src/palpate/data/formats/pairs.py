@@ -45,7 +45,7 @@ from palpate.data.formats.layout import require_folder
 from palpate.data.frames import VIDEOS
 from palpate.data.images import SUFFIXES
 from palpate.data.mapping import compile_maps
-from palpate.data.rows import manifest_rows, odd_groups, read_classes
+from palpate.data.rows import manifest_rows, odd_groups, read_classes, relocated, without_repeats
 from palpate.data.scanning import Facts, Format, Scan
 from palpate.data.tables import TABLES, header_of, open_table
 from palpate.data.templates import FIX, Fields, Matches, assign
@@ -159,12 +159,21 @@ def _read_table(
         got = f"no tactile among {columns}, and no vision" if columns else "an empty file"
         must = f"{path} must have the columns vision and tactile, or one of them"
         raise PalpateError(must, got, "Map your columns to them", example=MAP)
-    cells = compiled.apply(table.read(compiled.columns))
+    cells = without_repeats(compiled.apply(table.read(compiled.columns)), table)
     result.problems += table.problems
+    result.suspicious += table.suspicious
     sides = [side for side in sides if any(cells[side])] or sides  # a column may be empty
     rows, result.inconclusive = manifest_rows(
         cells, len(table.lines), table.where, classes, result.problems
     )
+    images = [(row, c) for _, row in rows for c in (*SIDES, "background") if c in row]
+    places = relocated((row[column] for row, column in images), result.base)
+    for row, column in images:
+        row[column] = places.get(row[column], row[column])
+    if places:
+        written, place = next(iter(places.items()))
+        text = f"{len(places)} paths are read by their end: {written!r} is {place!r}"
+        result.suspect(path, "other-paths", text)
     for k, row in rows:
         lacking = " and no ".join(side for side in sides if side not in row)
         names_in_paths = "/".join(row.get(side, "") for side in sides).split("/")

@@ -1,0 +1,149 @@
+"""Lists and tables as people have them: other machines, encodings, repeated rows, flags."""
+
+import polars as pl
+import pytest
+
+from forge.errors import fails
+from forge.pictures import write_images
+from palpate.data import tables
+from palpate.data.importing import import_dataset
+from palpate.data.listing import read_list
+from palpate.data.mapping import compile_maps
+from palpate.data.naming import read_names
+from palpate.data.reading import load
+from palpate.leakage import audit
+
+IMAGES = [f"img/{o}/{k}_{side}.png" for o in ("cup", "mug") for k in (1, 2) for side in ("v", "t")]
+
+
+def listed(path, paths, end="\n", encoding="utf-8", material="Wood", sign=","):
+    """A table of the images of :data:`IMAGES`, each path as ``paths`` writes it."""
+    rows = [sign.join(("vision", "tactile", "material"))]
+    for k in range(0, len(IMAGES), 2):
+        rows.append(sign.join((paths(IMAGES[k]), paths(IMAGES[k + 1]), material)))
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_bytes(end.join(rows).encode(encoding))
+    return path
+
+
+WRITTEN = {
+    "absolute": lambda p: f"/home/ann/set/{p}",
+    "windows": lambda p: "D:\\data\\" + p.replace("/", "\\"),
+    "backslashes": lambda p: p.replace("/", "\\"),
+    "a folder above": lambda p: f"set/{p}",
+    "without the folder": lambda p: p.removeprefix("img/"),
+    "two machines": lambda p: f"{'/mnt/bob' if 'cup' in p else '/home/ann/data'}/{p}",
+    "a dot": lambda p: f"./{p}",
+}
+
+
+@pytest.mark.parametrize("form", WRITTEN)
+def test_paths_of_another_machine_are_read_by_their_end(tmp_path, form):
+    write_images(tmp_path, IMAGES)
+    result = import_dataset(listed(tmp_path / "t.csv", WRITTEN[form]), tmp_path / "out")
+    table = result.manifest.require_valid().table
+    assert [*table["vision"], *table["tactile"]] == IMAGES[::2] + IMAGES[1::2]
+    said = [p.text for p in result.suspicious if p.kind == "other-paths"]
+    assert len(said) == (form != "a dot")
+
+
+def test_two_paths_never_become_one_file(tmp_path):
+    write_images(tmp_path, ["1_v.png", "1_t.png", "2_v.png", "2_t.png"])
+    fails("missing-file", import_dataset, listed(tmp_path / "t.csv", str), tmp_path / "out")
+
+
+def test_paths_that_climb_name_the_root(tmp_path):
+    write_images(tmp_path, IMAGES)
+    table = listed(tmp_path / "lists" / "t.csv", lambda p: f"../{p}")
+    error = fails("leaves the root", import_dataset, table, tmp_path / "out")
+    assert error.example == {"root": "FOLDER"}
+
+
+@pytest.mark.parametrize("sign", [",", ";"])
+@pytest.mark.parametrize("material", ["Béton", "Straße"])
+def test_a_table_of_windows_is_read_and_said(tmp_path, sign, material):
+    write_images(tmp_path, IMAGES)
+    table = listed(tmp_path / "t.csv", str, "\r\n", "cp1252", material, sign)
+    result = import_dataset(table, tmp_path / "out")
+    assert set(result.manifest.table["material"]) == {material}
+    (said,) = (p for p in result.suspicious if p.kind == "encoding")
+    assert "cp1252" in said.text
+
+
+def test_a_text_of_two_encodings_is_refused_by_its_lines(tmp_path):
+    rows = "vision,tactile,material\na,b,Béton\n".encode() + "c,d,Béton\n".encode("cp1252")
+    (tmp_path / "t.csv").write_bytes(rows)
+    error = fails("UTF-8", import_dataset, tmp_path / "t.csv", tmp_path / "out")
+    assert "t.csv:3" in str(error)
+    assert not tables.is_windows(b"\x89PNG\x00\xff")
+
+
+def test_a_repeated_row_is_one_sample(tmp_path):
+    write_images(tmp_path, IMAGES)
+    table = listed(tmp_path / "t.csv", str)
+    table.write_text(table.read_text() + "\n" + table.read_text().splitlines()[2] + "\n")
+    error = fails("duplicate-row", import_dataset, table, tmp_path / "out")
+    assert "t.csv:6" in str(error)
+    assert "repeats the row" in str(error)
+    assert len(import_dataset(table, tmp_path / "out", skip_bad=True).manifest) == 4
+
+
+PATHS = [f"v{v}/{k:04d}.jpg" for v in range(3) for k in range(0, 60, 10)]
+
+
+@pytest.mark.parametrize("sign", ["\n", "\r\n"])
+def test_a_flag_makes_the_parts_of_a_list_without_a_header(tmp_path, sign):
+    rows = [f"{path},1,{k},{int(k % 6 > 2)}" for k, path in enumerate(PATHS)]
+    (tmp_path / "all.csv").write_text(sign.join(rows))
+    columns = {"split": "case when flag = 1 then 'test' else 'train' end"}
+    reading = {"names": "tactile,label,index,flag", "columns": columns}
+    result = audit(tmp_path / "all.csv", reading=reading)
+    assert result.test_samples_in_shared_groups == 9
+
+
+def test_a_frame_list_takes_the_options_of_a_table(tmp_path):
+    path = tmp_path / "train.txt"
+    path.write_text("".join(f"{p},3\n" for p in PATHS))
+    assert load(path).table["material"].unique().to_list() == ["3"]
+    named = load(path, columns={"material": "'class ' || label"})
+    assert named.table["material"].unique().to_list() == ["class 3"]
+    fails("must be left out", load, path, side="vision")
+
+
+def test_a_frame_and_a_table_of_the_same_rows_say_the_same(tmp_path):
+    frame = pl.DataFrame({"tactile": PATHS, "split": ["train"] * 9 + ["test"] * 9})
+    frame.write_csv(tmp_path / "t.csv")
+    ours, theirs = (read_names(source) for source in (frame, tmp_path / "t.csv"))
+    assert ours[0].table.equals(theirs[0].table)
+    assert ours[2].parts == theirs[2].parts
+    answers = [audit(source) for source in (frame, tmp_path / "t.csv")]
+    assert [a.test_samples_in_shared_groups for a in answers] == [3, 3]
+
+
+def test_large_metadata_are_refused_before_they_are_read(tmp_path):
+    for name in ("list.txt", "table.csv", "table.json"):
+        with open(tmp_path / name, "wb") as file:
+            file.write(b"v/1.jpg,3\n")
+            file.truncate(tables.LARGEST + 1)
+        fails("at most 256 MiB", load, tmp_path / name)
+    fails("at most 256 MiB", read_list, tmp_path / "list.txt")
+
+
+@pytest.mark.parametrize(
+    ("expression", "words"),
+    [
+        ("lpad(a, 2000000000, 'x')", "pads to more"),
+        (f"replace(a, 'x', '{'y' * 70000}')", "more than"),
+        ("cast(n as int) * 3000000000 * 4000000000", "too large"),
+    ],
+)
+def test_expressions_cannot_grow(expression, words):
+    table = pl.DataFrame({"a": ["x", "x"], "n": ["7", "8"]})
+    fails(words, compile_maps({"frame": expression}, ["a", "n"], ["frame"]).apply, table)
+
+
+def test_numbers_compare_as_numbers():
+    table = pl.DataFrame({"n": ["07", "8"]})
+    for expression, values in (("n > 7", ["false", "true"]), ("n", ["07", "8"])):
+        cells = compile_maps({"text": expression}, ["n"], ["text"]).apply(table)
+        assert cells["text"] == values
