@@ -270,3 +270,45 @@ def test_other_stacks_are_errors(tmp_path, images):
 def test_files_that_are_no_stacks_are_errors(tmp_path, data):
     (tmp_path / "x.npy").write_bytes(data)
     fails("The stack", StackReader, tmp_path / "x.npy")
+
+
+#: When the frames of a camera are presented, in ticks of the 70 frames of the gel.
+CAMERAS = {
+    "half the rate": [2 * k for k in range(35)],
+    "three quarters": [round(4 * k / 3) for k in range(53)],
+    "a gap": [k for k in range(70) if not 30 <= k < 42],
+    "in step": list(range(70)),
+    "shorter": list(range(60)),
+}
+
+
+@pytest.mark.parametrize("camera", CAMERAS)
+def test_frames_of_two_rates_are_paired_by_time(tmp_path, camera):
+    times = CAMERAS[camera]
+    save(tmp_path / "own" / "cup" / "gel.mov", gel())
+    save(tmp_path / "own" / "cup" / "rgb.mov", photos(70, PRESSES)[times], times)
+    result = import_dataset(tmp_path / "own", tmp_path / "m", every=1)
+    by_number = camera in ("in step", "shorter")
+    said = [p for p in result.suspicious if p.kind == "paired-by-time"]
+    assert len(said) == (not by_number)
+    paths = result.manifest.table["vision"].str.extract(r"(\d+)\.jpg$").cast(int).to_list()
+    expected = {}
+    for k in range(70):
+        nearest = min(range(len(times)), key=lambda j: (abs(times[j] - k), j))
+        step = sorted(np.diff(times))[len(times) // 2]
+        if abs(times[nearest] - k) <= step / 2 + 0.01:
+            expected[k] = nearest
+    assert dict(zip(result.manifest.column("frame"), paths, strict=True)) == expected
+    numbers = import_dataset(tmp_path / "own", tmp_path / "n", every=1, pairing="number")
+    table = numbers.manifest.table
+    assert table["vision"].str.extract(r"(\d+)\.jpg$").cast(int).to_list() == [*range(len(times))]
+
+
+def test_stacks_of_two_lengths_are_refused_in_one_line(tmp_path):
+    save(tmp_path / "own" / "cup" / "gel.npy", gel())
+    save(tmp_path / "own" / "cup" / "rgb.npy", photos(70, PRESSES)[::2])
+    error = fails("", import_dataset, tmp_path / "own", tmp_path / "m", every=1)
+    assert [p.kind for p in error.problems] == ["unequal-streams"]
+    assert "35 frames of vision and 70 of tactile" in str(error)
+    result = import_dataset(tmp_path / "own", tmp_path / "m", every=1, pairing="number")
+    assert len(result.manifest) == 35

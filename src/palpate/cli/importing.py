@@ -73,6 +73,9 @@ class TableOptions(Reading):
     """
     sensor: str | None = None
     """Name of the tactile sensor, for videos."""
+    pairing: Literal["time", "number"] | None = None
+    """Whether frames of a photo and a tactile video belong together by their time stamps, where
+    these show other rates or gaps (default), or by number."""
     config: str | None = None
     """Configuration of a Hugging Face data set."""
     revision: str | None = None

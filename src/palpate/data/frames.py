@@ -94,6 +94,7 @@ class VideoFrames:
         self.turned = False  # whether the video turned the frames that were read
         with reader_of(source) as reader:
             self.numbers: Sequence[int] = range(len(reader))
+            self.seconds: NDArray[np.float64] | None = reader.seconds
 
     def __len__(self) -> int:
         """Number of frames."""
@@ -124,12 +125,76 @@ class VideoFrames:
         Raises:
             PalpateError: if the video breaks off; earlier frames stay.
         """
-        missing = [k for k in sorted(frames) if not self.path(k).is_file()]
+        needed = {self.path(k): k for k in sorted(frames)}
+        missing = [k for path, k in needed.items() if not path.is_file()]
         for k, image in self.read(missing) if missing else ():
             if stop.is_set():
                 return
             created.append(self.path(k))
             save_frame(self.path(k), image, self.size)
+
+
+class TimedFrames(VideoFrames):
+    """Frames of a video by the numbers of another, each the one that is nearest in time.
+
+    Args:
+        own: the video.
+        nearest: (n,) its frame for each frame of the other; -1 where none is near.
+    """
+
+    def __init__(self, own: VideoFrames, nearest: NDArray[np.int64]) -> None:
+        self.source, self.cache, self.size, self.nearest = own.source, own.cache, own.size, nearest
+        self.numbers: Sequence[int] = np.flatnonzero(nearest >= 0).tolist()
+        self.seconds = None
+
+    def __len__(self) -> int:
+        """Number of frames of the other."""
+        return len(self.nearest)
+
+    def has(self, k: int) -> bool:
+        """Whether a frame is near frame ``k`` of the other."""
+        return 0 <= k < len(self.nearest) and self.nearest[k] >= 0
+
+    def path(self, k: int) -> Path:
+        """Where the frame near frame ``k`` is cached."""
+        return super().path(int(self.nearest[k]))
+
+    def read(self, indices: Iterable[int]) -> Iterator[tuple[int, NDArray[np.uint8]]]:
+        """Yield ``(k, (h, w, 3) image near it)`` of rising numbers."""
+        pairs = [(k, int(self.nearest[k])) for k in indices]
+        images = super().read(dict.fromkeys(own for _, own in pairs))
+        number, image = next(images, (-1, None))
+        for k, own in pairs:
+            while number != own:
+                number, image = next(images)
+            assert image is not None
+            yield k, image
+
+    def stream(self) -> Stream:
+        """Thumbnails of all frames that are near one; their seconds are no steps."""
+        images, _ = super().stream()
+        return images[np.maximum.accumulate(np.maximum(self.nearest, 0))], None
+
+
+def nearest_in_time(
+    times: NDArray[np.float64], others: NDArray[np.float64]
+) -> tuple[NDArray[np.int64], float] | None:
+    """For each of (n,) seconds the nearest of (m,) others, where equal numbers are other instants.
+
+    Returns:
+        (n,) the nearest, -1 where none is within half a step of the slower stream, and that half in
+        seconds; None where rates and gaps are alike, so that frame k of both is one instant.
+    """
+    if min(len(times), len(others)) < 2:
+        return None
+    near = 0.505 * max(float(np.median(np.diff(t))) for t in (times, others))
+    count = min(len(times), len(others))
+    if np.abs(times[:count] - others[:count]).max() <= near:
+        return None
+    after = np.searchsorted(others, times).clip(1, len(others) - 1)
+    before = times - others[after - 1] <= others[after] - times + 1e-6  # of two, the earlier
+    nearest = after - before
+    return np.where(np.abs(others[nearest] - times) <= near, nearest, -1), near
 
 
 Frames = FolderFrames | VideoFrames

@@ -27,7 +27,7 @@ from pathlib import Path
 
 from palpate.core import PalpateError, Problem, Progress, quiet, require
 from palpate.data.formats.layout import require_videos
-from palpate.data.formats.recordings import Recordings, Row
+from palpate.data.formats.recordings import Pairing, Recordings, Row
 from palpate.data.images import Check
 from palpate.data.listing import FrameTable
 from palpate.data.mapping import compile_maps
@@ -77,6 +77,8 @@ class Options:
         every: take every n-th frame of a contact, from its first.
         sensor: the tactile sensor.
         size: their shorter side is reduced to so many pixels.
+        pairing: whether frames of both sides belong together by their time stamps, where these
+            show other rates or gaps, or by number.
     """
 
     root: Path | None = None
@@ -85,6 +87,7 @@ class Options:
     every: int = 1
     sensor: str | None = None
     size: int | None = None
+    pairing: Pairing = "time"
 
 
 def scan(
@@ -103,7 +106,7 @@ def scan(
     must = "must be the folder of the recordings"
     require(base.is_dir(), "root", must, f"no folder {base}", fix="Check the path")
     result = Scan(base, {"dataset": source.stem})
-    work = Recordings(result, into, require_videos(base), {}, options.size)
+    work = Recordings(result, into, require_videos(base), {}, options.size, pairing=options.pairing)
     listed = _read(result, source, columns, options.classes)
     result.inconclusive = sum(i.inconclusive for i in listed)
     contacts = _contacts(work, listed, progress)

@@ -12,17 +12,25 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cache
+from operator import itemgetter
 from pathlib import Path
 from threading import Event
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import polars as pl
 
 from palpate.core import PalpateError, Problem, Progress, read_json, require, write_json
-from palpate.data.frames import FolderFrames, Frames, VideoFrames, streams_of
+from palpate.data.frames import (
+    FolderFrames,
+    Frames,
+    TimedFrames,
+    VideoFrames,
+    nearest_in_time,
+    streams_of,
+)
 from palpate.data.images import Check, check_image, in_threads
 from palpate.data.scanning import Into, Scan, raise_if, require_some
-from palpate.data.streams import Finding, findings
+from palpate.data.streams import FEWEST, SHORTER, Finding, findings
 from palpate.data.suspicions import Look
 
 if TYPE_CHECKING:
@@ -33,6 +41,7 @@ BACKGROUND_BEFORE = 4
 MODALITIES = ("vision", "tactile")
 
 
+Pairing = Literal["time", "number"]
 #: One recording: modality -> a folder of frames, a video file, or None.
 VideoFiles = Mapping[str, Path | None]
 
@@ -96,6 +105,8 @@ class Recordings:
     background_frames: dict[str, int] = field(default_factory=dict)
     extracted: bool = False  # whether frames of videos are files by now
     modalities: tuple[str, ...] = MODALITIES  # those that every recording has
+    #: How frames of both sides belong together; None where a data set says that it is by number.
+    pairing: Pairing | None = None
 
     def __post_init__(self) -> None:
         self.home = self.scan.base  # before extracted frames move the root
@@ -112,7 +123,7 @@ class Recordings:
         first = {row.video: row for row in reversed(rows)}
         count = Counter(row.video for row in rows)
         results = in_threads(self._open_one, sorted(first), "reading recordings", progress)
-        for name, opened in results:
+        for name, opened in sorted(results, key=itemgetter(0)):
             if isinstance(opened, tuple):
                 kind, text = opened
                 lost = f"{text} ({count[name]} row{'s' * (count[name] != 1)} of this recording)"
@@ -142,7 +153,33 @@ class Recordings:
                 opened[modality] = VideoFrames(source, cache, self.size)
             except PalpateError as error:
                 return "bad-video", f"{source}: {error.got}"
-        return opened
+        return opened if self.pairing is None else self._in_time(name, opened)
+
+    def _in_time(self, name: str, opened: dict[str, Frames]) -> dict[str, Frames] | tuple[str, str]:
+        """The frames by the numbers of the tactile ones, where equal numbers are other instants."""
+        tactile, vision = opened.get("tactile"), opened.get("vision")
+        if not isinstance(tactile, VideoFrames) or not isinstance(vision, VideoFrames):
+            return opened
+        counts = f"{len(vision)} frames of vision and {len(tactile)} of tactile"
+        if tactile.seconds is None or vision.seconds is None:
+            differ = abs(len(vision) - len(tactile)) >= max(
+                FEWEST, SHORTER * max(len(vision), len(tactile))
+            )
+            if differ and self.pairing == "time":
+                text = f"{counts} without time stamps, so frame k may not be one instant in both; "
+                return "unequal-streams", f"{text}the option pairing, if number, takes them so"
+            return opened
+        if self.pairing == "number":
+            return opened
+        if (found := nearest_in_time(tactile.seconds, vision.seconds)) is None:
+            return opened
+        nearest, near = found
+        alone = int((nearest < 0).sum())
+        text = f"{counts}, of other rates or with gaps: each tactile frame has the photo that is "
+        text += f"nearest in time, within {near:.3f} s; {alone} without one are left out"
+        self.scan.suspect(name, "paired-by-time", text)
+        self.scan.facts["pairing"] = "nearest in time"
+        return {**opened, "vision": TimedFrames(vision, nearest)}
 
     def has(self, row: Row) -> bool:
         """Whether both modalities have the frame; if not, it is a problem."""

@@ -14,9 +14,10 @@ files. Fields become columns, and equal fields join the sides. A video is named 
 ``video`` (and the object around it), else by all fields. An image may serve a whole video: a photo
 as ``vision``, the untouched gel as ``background``.
 
-A frame is its position in both files, so it is valid up to the shorter one. The samples are the
-frames in contact (:mod:`palpate.data.contacts`), or every n-th frame of the whole video, in contact
-or not. A contact is ``video#000k``; its background is the gel before it.
+A frame is its position in the tactile file. The photo is that of the same number, or, where the
+time stamps of two videos show other rates or gaps, the one that is nearest in time. The samples are
+the frames in contact (:mod:`palpate.data.contacts`), or every n-th frame of the whole video, in
+contact or not. A contact is ``video#000k``; its background is the gel before it.
 """
 
 from __future__ import annotations
@@ -44,7 +45,7 @@ from palpate.data.detection import (
     walked,
 )
 from palpate.data.formats.layout import has_listed_videos, require_folder
-from palpate.data.formats.recordings import Recordings, Row, thin
+from palpate.data.formats.recordings import Pairing, Recordings, Row, thin
 from palpate.data.frames import MOVING, streams_of
 from palpate.data.images import SUFFIXES, Check, in_threads, read_image
 from palpate.data.manifest import PART_NAMES
@@ -108,6 +109,8 @@ class Options:
         max_per_contact: keep that many evenly spaced frames of a contact.
         sensor: the tactile sensor.
         size: their shorter side is reduced to so many pixels.
+        pairing: whether frames of both sides belong together by their time stamps, where these
+            show other rates or gaps, or by number.
     """
 
     vision: str | None = None
@@ -118,6 +121,7 @@ class Options:
     max_per_contact: int | None = None
     sensor: str | None = None
     size: int | None = None
+    pairing: Pairing = "time"
 
 
 def scan(
@@ -133,7 +137,7 @@ def scan(
     videos, result = _videos(require_folder(source, FACTS.name), options)
     decoded = check == "decode" or into is not None
     _require_amounts(videos, every if decoded else 1, options.max_per_contact)
-    work = _opened(result, into, videos, progress, options.size)
+    work = _opened(result, into, videos, progress, options)
     contacts = _contacts(work, videos, progress) if decoded else {}
     rows = _rows(work, videos, contacts, every if decoded else 1)
     rows = thin(rows, options.max_per_contact)
@@ -221,7 +225,11 @@ def _require_amounts(
 
 
 def _opened(
-    result: Scan, into: Into | None, videos: Mapping[str, _Video], progress: Progress, *frames: Any
+    result: Scan,
+    into: Into | None,
+    videos: Mapping[str, _Video],
+    progress: Progress,
+    options: Options,
 ) -> Recordings:
     """The recordings with their files open."""
     files = {
@@ -229,7 +237,9 @@ def _opened(
         for name, v in videos.items()
     }
     sides = tuple(c for c in SIDES if any(c in v.moving for v in videos.values()))
-    work = Recordings(result, into, files, {}, *frames, modalities=sides)
+    work = Recordings(
+        result, into, files, {}, options.size, modalities=sides, pairing=options.pairing
+    )
     work.open([Row(v.where, name, name, 0, name, "") for name, v in videos.items()], progress)
     return work
 
@@ -287,7 +297,9 @@ def _rows(
         if name not in work.frames or (contacts and name not in contacts):
             continue
         analysis = contacts.get(name)
-        contact_of = dict.fromkeys(range(min(map(len, work.frames[name].values()))), name)
+        opened = work.frames[name].values()
+        numbers = range(min(map(len, opened)))
+        contact_of = {k: name for k in numbers if all(frames.has(k) for frames in opened)}
         chosen = {} if analysis is None else {name: analysis.reference}
         for k, (first, last) in enumerate(analysis.runs if analysis else (), 1):
             contact = video.fields.get("contact", f"{name}#{k:04d}")
