@@ -104,7 +104,8 @@ def test_validation_shows_facts_and_fails_on_what_is_requested(capsys, tag, tabl
 
 
 def test_problems_of_one_kind_are_one_line_and_all_are_in_json(capsys, table):
-    table.write_text("vision,tactile\n" + "x.jpg,y.jpg\n" * 30)
+    rows = "".join(f"x.jpg,y.jpg,{k}\n" for k in range(30))
+    table.write_text(f"vision,tactile,frame\n{rows}")
     status, out, _ = call(capsys, "validate", table)
     assert (status, out.count("no file"), out.count("  30 like ")) == (1, 2, 2)
     assert len(json.loads(call(capsys, "validate", table, "--json")[1])["missing"]) == 60

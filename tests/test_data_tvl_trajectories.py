@@ -150,7 +150,7 @@ def test_every_bad_row_of_hct_is_reported(tree, tmp_path):
         ),  # in another list of this rig
         (f"{video}/vision/99-0.1.jpg,{video}/tactile/99-0.1.jpg,,a", ["missing-file"] * 2),
         (f"{rig}/vision/1-0.1.jpg,{rig}/tactile/1-0.1.jpg,,a", ["missing-folder"]),
-        (f"{good},{good},,\xff", ["bad-encoding"]),
+        (f"{good},{good},,\0", ["bad-encoding"]),
     ]
     path = tree / "data1" / "val.csv"
     text = "\n".join([",".join(COLUMNS), *(line for line, _ in lines)])

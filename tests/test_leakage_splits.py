@@ -328,7 +328,7 @@ def test_what_cannot_be_split_says_why():
         ({"folds": 10, "by": "video"}, "at least as many groups"),
         ({"near": "smell"}, "`near` must be vision, tactile or both"),
         ({"near": "tactile"}, "need tactile images"),
-        ({"noleak": "visgel"}, "`noleak` must be touch-and-go or hct"),
+        ({"noleak": "tarf"}, "`noleak` must be touch-and-go or hct"),
         ({"noleak": "touch-and-go", "seed": 99}, "`seed` must be one of 0, 1, 2, 3, 4"),
     ):
         with pytest.raises(PalpateError, match=words):
@@ -471,7 +471,7 @@ def test_the_published_split_by_command(capsys, tmp_path, real_data):
         (["LISTS", "-o", "x", "--near", "tactile"], "need tactile images"),
         (["LISTS", "nowhere", "-o", "x"], "no file nowhere"),
         (["--noleak", "touch-and-go", "-o", "x", "--train", "0.9"], "train 0.8 and val 0.0"),
-        (["--noleak", "visgel", "-o", "x"], "--noleak must be one of"),
+        (["--noleak", "tarf", "-o", "x"], "--noleak must be one of"),
         (["LISTS", "--noleak", "touch-and-go", "-o", "x"], "8 of 8 that are not"),
         (["--noleak", "hct", "-o", "x"], "no path"),
         (["LISTS", "--noleak", "touch-and-go", "-o", "x", "--by", "video"], "has its rule"),

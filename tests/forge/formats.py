@@ -12,7 +12,7 @@ import shutil
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from itertools import count, product
+from itertools import product
 from pathlib import Path
 
 import numpy as np
@@ -79,7 +79,7 @@ def make_tarf(folder: Path) -> Tree:
     pairs = [(scene, k) for scene, numbers in frames.items() for k in numbers]
     for start, place in ((1, "touch/{}_40_30"), (33, "vision/{}_40_30"), (65, "vision/{}_80_60")):
         write_images(root, [f"{place.format(scene)}/{k}.jpg" for scene, k in pairs], start)
-    backgrounds = ["bench_outdoor_1_colmap_40_50", "office_1_40_30"]
+    backgrounds = ["bench_40_30", "office_1_40_30"]
     write_images(root, [f"touch_bg/{name}/bg.jpg" for name in backgrounds], 97)
     (root / "depth" / "bench_40_30").mkdir(parents=True)
     (root / "depth" / "bench_40_30" / "0.npy").write_bytes(b"never read")
@@ -88,39 +88,6 @@ def make_tarf(folder: Path) -> Tree:
     lists["test"] = [["office_1_40_30", str(k)] for k in frames["office_1"]]
     (root / "split_interval.json").write_text(json.dumps(lists))
     return Tree(root, 10)
-
-
-def visgel_line(place: str, recording: str, k: int, way: str) -> str:
-    """One line of a list; a neighbor before the first frame is the first."""
-    source, other = ("vision", "touch") if way == "vision2touch" else ("touch", "vision")
-    path = lambda side, k: f"{place}/{side}/{recording}/frame{k:04d}.jpg"
-    near = [path(source, max(1, k + step)) for step in (-1, -2, 1, 2)]
-    return " ".join([path(source, 0), path(other, 0), path(source, k), path(other, k), *near])
-
-
-def make_visgel(folder: Path) -> Tree:
-    """Two recordings of seen and one of unseen objects, six frames each, three of them listed."""
-    root = folder / "visgel"
-    seen = [("data/data_seen", "1/rec_a"), ("data/data_seen", "10/rec_a")]
-    unseen = [("data/data_unseen", "2/rec_b")]
-    numbers = count(1)
-    for (place, recording), side in product(seen + unseen, ("touch", "vision")):
-        for k in range(7):
-            write_image(root / place / side / recording / f"frame{k:04d}.jpg", next(numbers))
-    (root / "data_lst").mkdir()
-    parts = (("train", seen), ("eval", unseen))
-    for way, (part, those) in product(("vision2touch", "touch2vision"), parts):
-        lines = [visgel_line(*recording, k, way) for recording in those for k in (2, 3, 4)]
-        (root / "data_lst" / f"{part}_{way}.txt").write_text("\n".join(lines))
-    return Tree(root, 9)
-
-
-def make_visgel_recordings(folder: Path) -> Tree:
-    """The tree that T3 reads: touch alone, two recordings of four frames with the reference."""
-    root = folder / "data_seen"
-    names = [f"{rec}/frame{k:04d}.jpg" for rec in ("2/rec", "10/rec") for k in range(4)]
-    write_images(root, names)
-    return Tree(root, 6)
 
 
 def make_objectfolder(folder: Path) -> Tree:
@@ -344,7 +311,6 @@ TREES: dict[str, Callable[[Path], Tree]] = {
     "objectfolder-generation": make_objectfolder_generation,
     "objectfolder": make_objectfolder,
     "ycb-slide": make_ycb_slide,
-    "visgel": make_visgel,
     "intervals": make_intervals,
     "hf": make_hf,
     "videos": make_videos,

@@ -33,7 +33,6 @@ COMMANDS: dict[str, int] = {
     "import IN/objectfolder-generation -o OUT/m": 2,
     "import IN/objectfolder -o OUT/m": 2,
     "import IN/ycb-slide -o OUT/m": 2,
-    "import IN/visgel -o OUT/m": 2,
     "import IN/intervals/contacts.csv -o OUT/m": 3,
     "import IN/pairs -o OUT/m": 2,
     "import IN/hf --format hf --map vision=rgb tactile=gel material=kind -o OUT/m": 3,

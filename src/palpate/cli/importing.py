@@ -94,8 +94,6 @@ class FormatOptions:
     """Frame lists (Touch and Go; default: label.txt, else train.txt and test.txt)."""
     swap: Literal["report", "fix"] | None = None
     """Report or fix trajectories whose vision and tactile folders are swapped (HCT)."""
-    part: Literal["real", "sim"] | None = None
-    """Real or simulated recordings (YCB-Slide)."""
     size: int | None = None
     """Shorter side of frames that are extracted from videos (default: as they are)."""
     max_per_contact: int | None = None

@@ -58,6 +58,8 @@ SCHEMA: dict[str, type[pl.DataType]] = {
     **dict.fromkeys(("id", *_WORDS, *IMAGE_COLUMNS, "sensor", "domain"), pl.String),
     "frame": pl.Int64,
 }
+#: The column of the paths that a list names, whose images are not at hand.
+PATH = "path"
 #: Modality -> its image column.
 MODALITIES = {"vision": "vision", "tactile": "tactile"}
 FORMAT = "palpate-manifest/1"

@@ -16,10 +16,9 @@ What the paths say more is read from those of all lists together (:mod:`palpate.
 
 from __future__ import annotations
 
-import json
 import posixpath
 import re
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -30,10 +29,10 @@ from palpate.data.detection import ROLES
 from palpate.data.foreign import require_native
 from palpate.data.formats.intervals import NEEDED, ORDER
 from palpate.data.images import SUFFIXES
-from palpate.data.manifest import PART_NAMES, SCHEMA, Manifest
+from palpate.data.manifest import PATH, SCHEMA, Manifest
 from palpate.data.mapping import compile_maps
-from palpate.data.recordings import PATH, USUAL
-from palpate.data.rows import manifest_rows, read_classes, relocated, without_repeats
+from palpate.data.recordings import USUAL
+from palpate.data.rows import is_there, manifest_rows, read_classes, relocated, without_repeats
 from palpate.data.scanning import require_some
 from palpate.data.tables import (
     TABLES,
@@ -81,13 +80,17 @@ def read_names(source: Any, **options: Any) -> tuple[Manifest, list[Problem], Sp
         if not _is_image(cells[0]) or len(cells) > 2:
             return None
         names = [PATH, "label"][: len(cells)]
-    records = _records(path)
-    header = header_of(path) if records is None else list(records.names)
+    nested = path.suffix.lower() in (".json", ".jsonl")
+    require(not (nested and names), "names", "must be left out for JSON", path.name)
+    header = header_of(path)
     if set(NEEDED) <= set(header):
         return _intervals(path) if not any(path.parent.glob("*/*")) else None
-    table = records or open_table(path, [name.strip() for name in names])
-    require(not (records and names), "names", "must be left out for JSON", path.name)
-    return _paths(path, table, records is not None, options)
+    table = open_table(path, [name.strip() for name in names])
+    return _paths(path, table, nested and bool(table.names), options)
+
+
+def _is_image(item: Any) -> bool:
+    return str(item).lower().endswith(SUFFIXES)
 
 
 def _first_line(path: Path) -> str:
@@ -135,74 +138,6 @@ def _intervals(path: Path) -> tuple[Manifest, list[Problem], None]:
     return _manifest(path, frames, path.parent, declared=True), problems, None
 
 
-def _records(path: Path) -> Table | None:
-    """The objects of a JSON file that nests them, or sorts them by part; None for other files."""
-    if path.suffix.lower() not in (".json", ".jsonl"):
-        return None
-    text = decoded(content_of(path))
-    try:
-        lines = path.suffix.lower() == ".jsonl"
-        data = [json.loads(s) for s in text.split("\n") if s.strip()] if lines else json.loads(text)
-    except (ValueError, RecursionError):
-        return None
-    rows = [dict(_flat(item)) for item in _items(data)]
-    return table_of(rows, str(path)) if rows else None
-
-
-def _items(data: Any, split: str | None = None, *, row: bool = False) -> Iterator[dict[str, Any]]:
-    """The objects, pairs or paths in nested lists, with the part whose key they are under.
-
-    An object of a list is a ``row``, also without a value of its own besides what it nests; so is
-    the sibling of an object with one.
-    """
-    if isinstance(data, Mapping):
-        lists = {key: value for key, value in data.items() if isinstance(value, (list, Mapping))}
-        below = [item for value in lists.values() for item in value if isinstance(value, list)]
-        is_list = split is None and not row and lists and len(lists) == len(data)
-        if is_list and not _scalars(below):
-            rows = _any_value_beside(data.values(), (list, Mapping))
-            for key, value in lists.items():
-                yield from _items(value, PART_NAMES.get(str(key).lower()), row=rows)
-        elif set(map(str.lower, map(str, data))) <= PART_NAMES.keys():
-            for key, value in data.items():
-                yield from _items(value, PART_NAMES[str(key).lower()])
-        else:
-            yield dict(data) | ({"split": split} if split else {})
-    elif isinstance(data, list) and _scalars(data) and len(data) >= 2 and not _is_image(data[0]):
-        group = "object" if str(data[0]).isdecimal() else "video"
-        pair = {group: data[0], "id": "/".join(map(str, data)), "split": split}
-        yield pair | ({"frame": data[1]} if group == "video" else {})
-    elif isinstance(data, list):
-        rows = _any_value_beside(data, list)
-        for item in data:
-            yield from _items(item, split, row=rows)
-    elif isinstance(data, str):
-        yield {PATH: data, "split": split}
-
-
-def _any_value_beside(items: Iterable[Any], kinds: Any) -> bool:
-    """Whether an object of some items has a value of none of these kinds."""
-    values = (value for item in items if isinstance(item, Mapping) for value in item.values())
-    return not all(isinstance(value, kinds) for value in values)
-
-
-def _is_image(item: Any) -> bool:
-    return str(item).lower().endswith(SUFFIXES)
-
-
-def _scalars(items: Sequence[Any]) -> bool:
-    return bool(items) and all(isinstance(item, (str, int)) for item in items)
-
-
-def _flat(item: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
-    """Cells of nested objects under names like ``image.path``; lists are skipped."""
-    for key, value in item.items():
-        if isinstance(value, Mapping):
-            yield from _flat(value, f"{prefix}{key}.")
-        elif not isinstance(value, list):
-            yield f"{prefix}{key}", value
-
-
 def _paths(
     path: Path, table: Table, nested: bool, options: Mapping[str, Any]
 ) -> tuple[Manifest, list[Problem], Split | None] | None:
@@ -210,6 +145,7 @@ def _paths(
     maps = dict(options.get("columns", {}))
     compiled = compile_maps(maps, table.names, [*SCHEMA, "split"])
     columns = list(dict.fromkeys([*compiled.columns, *_path_columns(table.names)]))
+    columns = [name for name in columns if name not in table.nested]
     frame = table.read(columns)
     cells = compiled.apply(frame)
     side, paths = _named_images(frame, cells, options)
@@ -218,7 +154,7 @@ def _paths(
     paths, cells = kept.get(PATH), {name: kept[name] for name in cells}
     root = Path(options.get("root") or path.parent)
     images = [p for p in paths or () if p]
-    there = any((root / p).is_file() for p in images) or bool(relocated(images, root))
+    there = any(is_there(root, p) for p in images) or bool(relocated(images, root))
     stated = {"id", "video", "object"} & cells.keys()
     mapped = there and {"vision", "tactile"} & cells.keys()
     plain = mapped or (not paths and "split" not in cells)

@@ -31,14 +31,12 @@ from typing import Any, Literal
 import polars as pl
 
 from palpate.core import NO_LEAK, Note, Split, few, require
-from palpate.data.manifest import IMAGE_COLUMNS, PART_NAMES, SCHEMA, Manifest
+from palpate.data.manifest import IMAGE_COLUMNS, PART_NAMES, PATH, SCHEMA, Manifest
 from palpate.data.templates import Fields, Template
 
 LEVELS = ("object", "session", "video", "contact", "frame")
 #: Columns of names: those that inputs may have in common.
 NAMES = ("id", "video", "contact", "object", "session")
-#: The column of the paths that a list names, whose images are not at hand.
-PATH = "path"
 #: Formats of anyone's data: what they name is not published.
 OWN = (None, "pairs", "intervals", "hf", "videos")
 #: Published lists: name -> pattern of a path, whose groups are columns.

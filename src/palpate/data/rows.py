@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -118,7 +119,7 @@ def relocated(written: Iterable[str], root: Path) -> dict[str, str]:
     never become one. Paths that are right as they are written, or found nowhere, are left out.
     """
     distinct = list(dict.fromkeys(written))
-    if all((root / path).is_file() for path in _some(distinct)):
+    if all(is_there(root, path) for path in _some(distinct)):
         return {}
     by_head: dict[str, dict[str, Sequence[str]]] = {}
     for path in distinct:
@@ -135,17 +136,26 @@ def relocated(written: Iterable[str], root: Path) -> dict[str, str]:
 def _found(paths: Mapping[str, Sequence[str]], root: Path) -> dict[str, str]:
     """Path -> its end that is a file below the root, by one rule for all; empty without one."""
     some = _some(list(paths))
-    folders = sorted(entry.name for entry in root.iterdir() if entry.is_dir())
+    folders = (
+        sorted(entry.name for entry in root.iterdir() if entry.is_dir()) if root.is_dir() else []
+    )
     best, rule = len(some) // 2, (0, "")
     for start in ("", *(f"{name}/" for name in folders[:TRIED])):
         for k in range(min(map(len, paths.values()))):
-            count = sum((root / (start + "/".join(paths[p][k:]))).is_file() for p in some)
+            count = sum(is_there(root, start + "/".join(paths[p][k:])) for p in some)
             apart = len({tuple(parts[k:]) for parts in paths.values()}) == len(paths)
             if count > best and apart:
                 best, rule = count, (k, start)
         if best > len(some) // 2:
             return {p: rule[1] + "/".join(parts[rule[0] :]) for p, parts in paths.items()}
     return {}
+
+
+def is_there(root: Path, path: str) -> bool:
+    """Whether a path below a root is a file; one that no disk can hold is none."""
+    with suppress(OSError, ValueError):
+        return (root / path).is_file()
+    return False
 
 
 def _some(items: Sequence[str]) -> Sequence[str]:

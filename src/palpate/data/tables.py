@@ -25,7 +25,8 @@ from typing import Any
 import polars as pl
 
 from palpate.core import PalpateError, Problem, ProblemsError, require
-from palpate.data.manifest import reading_parquet
+from palpate.data.images import SUFFIXES
+from palpate.data.manifest import PART_NAMES, PATH, reading_parquet
 from palpate.data.mapping import text_of
 
 csv.field_size_limit(1 << 30)  # by default a long text is an error, for the whole process
@@ -58,6 +59,7 @@ class Table:
     records: _Records  # from the requested columns to (line, cells)
     lines: list[int] = field(default_factory=list)  # (rows,) line of each row that was read
     suspicious: list[Problem] = field(default_factory=list)  # read, but a person should look
+    nested: set[str] = field(default_factory=set)  # columns that hold lists
 
     def read(self, columns: Sequence[str]) -> pl.DataFrame:
         """Read the rows.
@@ -275,23 +277,86 @@ def _json(path: Path) -> Table:
                 reason = f"not JSON: {getattr(error, 'msg', 'nested too deep')}"
                 problems.append(Problem(f"{path}:{at}", "bad-row", reason))
     if array and rows:
-        if not isinstance(rows[0][1], list):
+        data = rows[0][1]
+        flat = isinstance(data, list) and not _all_nested(data)
+        rows = list(enumerate(data if flat else _items(data), 1))
+        if not flat and (not rows or rows[0][1] is data):
             must, got = f"{path} must hold a JSON list of objects", repr(text.strip()[:20])
             raise PalpateError(must, got, "Write [{...}, {...}], or JSON lines")
-        rows = list(enumerate(rows[0][1], 1))
     return _of_objects(str(path), rows, problems)
+
+
+def _items(data: Any, split: str | None = None, *, row: bool = False) -> Iterator[dict[str, Any]]:
+    """The objects, pairs or paths in nested lists, with the part whose key they are under.
+
+    An object of a list is a ``row``, also without a value of its own besides what it nests; so is
+    the sibling of an object with one.
+    """
+    if isinstance(data, Mapping):
+        lists = {key: value for key, value in data.items() if isinstance(value, (list, Mapping))}
+        below = [item for value in lists.values() for item in value if isinstance(value, list)]
+        is_list = split is None and not row and lists and len(lists) == len(data)
+        if is_list and not _scalars(below):
+            rows = _any_value_beside(data.values(), (list, Mapping))
+            for key, value in lists.items():
+                yield from _items(value, PART_NAMES.get(str(key).lower()), row=rows)
+        elif set(map(str.lower, map(str, data))) <= PART_NAMES.keys():
+            for key, value in data.items():
+                yield from _items(value, PART_NAMES[str(key).lower()])
+        else:
+            yield dict(data) | ({"split": split} if split else {})
+    elif (
+        isinstance(data, list)
+        and _scalars(data)
+        and len(data) >= 2
+        and not str(data[0]).lower().endswith(SUFFIXES)
+    ):
+        group = "object" if str(data[0]).isdecimal() else "video"
+        pair = {group: data[0], "id": "/".join(map(str, data)), "split": split}
+        yield pair | ({"frame": data[1]} if group == "video" else {})
+    elif isinstance(data, list):
+        rows = _any_value_beside(data, list)
+        for item in data:
+            yield from _items(item, split, row=rows)
+    elif isinstance(data, str):
+        yield {PATH: data, "split": split}
+
+
+def _all_nested(data: list[Any]) -> bool:
+    """Whether a list has no object with a value of its own."""
+    return not _any_value_beside(data, (list, Mapping))
+
+
+def _any_value_beside(items: Iterable[Any], kinds: Any) -> bool:
+    """Whether an object of some items has a value of none of these kinds."""
+    values = (value for item in items if isinstance(item, Mapping) for value in item.values())
+    return not all(isinstance(value, kinds) for value in values)
+
+
+def _scalars(items: Sequence[Any]) -> bool:
+    return bool(items) and all(isinstance(item, (str, int)) for item in items)
+
+
+def _flat(item: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
+    """Cells of nested objects under names like ``image.path``."""
+    for key, value in item.items():
+        if isinstance(value, Mapping):
+            yield from _flat(value, f"{prefix}{key}.")
+        else:
+            yield f"{prefix}{key}", value
 
 
 def _of_objects(name: str, rows: Sequence[tuple[int, Any]], problems: list[Problem]) -> Table:
     wrong = [line for line, row in rows if not isinstance(row, Mapping)]
     problems += [Problem(f"{name}:{line}", "bad-row", "not a JSON object") for line in wrong]
-    objects = [(line, row) for line, row in rows if isinstance(row, Mapping)]
+    objects = [(line, dict(_flat(row))) for line, row in rows if isinstance(row, Mapping)]
     names = list(dict.fromkeys(str(key) for _, row in objects for key in row))
+    lists = {str(k) for _, row in objects for k, cell in row.items() if isinstance(cell, list)}
 
     def records(columns: Sequence[str]) -> Iterator[Record]:
         return ((line, [row.get(c) for c in columns]) for line, row in objects)
 
-    return Table(name, names, problems, records)
+    return Table(name, names, problems, records, nested=lists)
 
 
 def _schema(path: Path) -> dict[str, pl.DataType]:

@@ -16,7 +16,7 @@ import polars as pl
 from palpate.core import Note, PalpateError, Problem, ProblemsError, Progress, Split, quiet, require
 from palpate.data.imported import splits_of
 from palpate.data.listing import categories_in, read_lists
-from palpate.data.manifest import Manifest, is_manifest
+from palpate.data.manifest import PATH, Manifest, is_manifest
 from palpate.data.naming import read_names
 from palpate.data.reading import is_list, read_samples
 from palpate.data.recordings import NAMES, name_recordings, recordings_note
@@ -66,7 +66,10 @@ def read(
         if skipped and not skip_bad:
             raise ProblemsError(skipped, FIX, example={"skip_bad": True})
         splits = {} if split is None else {str(split.rule["name"]): split}
-        return Source(manifest, splits, _notes(skipped))
+        notes = _notes(skipped)
+        if path is None and PATH in manifest.table.columns:
+            notes.append(Note("images-not-found", {"root": str(manifest.root)}))
+        return Source(manifest, splits, notes)
     manifest, skipped = read_samples(
         source, skip_bad=skip_bad, root=root, progress=progress, **_options(reading)
     )

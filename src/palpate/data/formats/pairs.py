@@ -31,6 +31,7 @@ from pathlib import Path
 import polars as pl
 
 from palpate.core import PalpateError, Progress, few, quiet, require
+from palpate.data.beside import join_tables, tables_of_pairs
 from palpate.data.detection import (
     SIDES,
     TARGETS,
@@ -44,6 +45,7 @@ from palpate.data.detection import (
 from palpate.data.formats.layout import require_folder
 from palpate.data.frames import VIDEOS
 from palpate.data.images import SUFFIXES
+from palpate.data.manifest import PART_NAMES
 from palpate.data.mapping import compile_maps
 from palpate.data.rows import manifest_rows, odd_groups, read_classes, relocated, without_repeats
 from palpate.data.scanning import Facts, Format, Scan
@@ -123,7 +125,16 @@ def scan(source: Path, options: Options, *, progress: Progress = quiet) -> Scan:
         _read_table(result, source, maps, options.names, labels)
     else:
         templates = {column: text for column, text in texts.items() if text is not None}
-        _read_folder(result, templates, options.side, maps, labels)
+        tables = [] if templates or options.side or maps else tables_of_pairs(source)
+        for path in tables:
+            first = len(result.rows)
+            _read_table(result, path, maps, None, labels)
+            result.suspect(path, "table-first", "the images are those of this table")
+            for _, row in result.rows[first:]:
+                if part := PART_NAMES.get(path.stem.lower()):
+                    row.setdefault("split", part)
+        if not tables:
+            read_folder(result, templates, options.side, maps, labels)
     progress("reading rows", 1, 1)
     result.suspicious += odd_groups(source, result.rows)
     absent = [name for name in SIDES if result.rows and name not in result.rows[0][1]]
@@ -133,7 +144,7 @@ def scan(source: Path, options: Options, *, progress: Progress = quiet) -> Scan:
     worded = any("text" in row for _, row in result.rows)
     result.facts["text_source"] = f"column {maps.get('text', 'text')}" if worded else "none"
     result.facts["dataset"] = source.resolve().stem
-    if any("split" in row for _, row in result.rows):
+    if any("split" in row for _, row in result.rows) and not result.splits:
         result.split_name = "Orig"
         result.split_rule = {"method": "official", "column": maps.get("split", "split")}
     return result
@@ -186,14 +197,19 @@ def _read_table(
             result.rows.append((table.where(k), row))
 
 
-def _read_folder(
+def read_folder(
     result: Scan,
     texts: Mapping[str, str],
     side: Side | None,
     maps: Mapping[str, str],
     classes: Mapping[int, str] | None,
+    *,
+    published: bool = False,
 ) -> None:
-    """Add the images of a folder, by its templates; map expressions go first."""
+    """Add the images of a folder, by its templates; map expressions go first.
+
+    Of a ``published`` layout a side may be lacking.
+    """
     files = walked(result, (*SUFFIXES, *VIDEOS))
     videos = [path for path in files if path.lower().endswith(VIDEOS)]
     text = "videos, which are read with a template of their own"
@@ -202,6 +218,8 @@ def _read_folder(
     result.facts |= {"templates": "stated"} if texts else {}
     templates = parsed(texts or templates_of(files, result.base, side))
     matches = {s: _distinct(result, found) for s, found in assign(files, templates).items()}
+    if published:
+        templates = {side: t for side, t in templates.items() if matches[side] or side == "tactile"}
     for side_, template in templates.items():
         got = f"{template.text}, which matches none of {few(files)}"
         require(bool(matches[side_]), side_, "must match images", got, fix=FIX)
@@ -226,6 +244,7 @@ def _read_folder(
         cells, len(places), places.__getitem__, classes, result.problems
     )
     result.rows += [(places[k], row) for k, row in numbered]
+    join_tables(result, result.rows)
 
 
 def _distinct(result: Scan, matches: Matches) -> Matches:

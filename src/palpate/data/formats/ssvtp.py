@@ -96,7 +96,7 @@ def scan(source: Path, *, progress: Progress = quiet) -> Scan:
 FORMAT = Format(FACTS, detect, LOOKS_FOR, scan)
 
 
-def _images(result: Scan, side: str) -> Images[str]:
+def _images(result: Scan, side: str) -> Images:
     """Id -> file of the images of one side."""
     folder = f"images_{side}"
     names = file_names(result.base / folder)
@@ -110,7 +110,7 @@ def _read_list(
     result: Scan,
     path: Path,
     part: str,
-    sides: tuple[Images[str], Images[str]],
+    sides: tuple[Images, Images],
     captions: dict[str, str | None],
 ) -> None:
     """Add the rows of one list; ``captions`` gets the caption of each listed id."""
