@@ -7,7 +7,7 @@ import pytest
 from forge.errors import fails
 from forge.formats import make_objectfolder, make_objectfolder_generation, make_tarf, make_ycb_slide
 from forge.pictures import write_image, write_images
-from palpate.data.importing import import_dataset
+from palpate.data.importing import import_dataset, validate
 
 
 def imported(make, folder, **options):
@@ -119,6 +119,17 @@ def test_a_table_of_pairs_beside_the_images_goes_first(tmp_path, absolute):
     result = import_dataset(tmp_path / "own", tmp_path / "out")
     assert sorted(result.manifest.column("material")) == ["cup", "cup", "mug", "mug"]
     assert result.splits["Orig"].counts() == {"train": 3, "test": 1}
+
+
+def test_an_import_is_validated_again(tmp_path):
+    write_images(tmp_path / "own", NAMES)
+    import_dataset(tmp_path / "own", tmp_path / "out")
+    assert validate(tmp_path / "out").ok
+    (tmp_path / "own" / NAMES[0]).unlink()
+    (tmp_path / "own" / NAMES[1]).write_bytes(b"")
+    result = validate(tmp_path / "out")
+    assert (result.format, result.samples) == ("manifest", 2)
+    assert (kinds(result.missing), kinds(result.invalid)) == (["missing-file"], ["bad-image"])
 
 
 def test_a_published_layout_of_another_tree_is_refused(tmp_path):

@@ -147,3 +147,35 @@ def test_numbers_compare_as_numbers():
     for expression, values in (("n > 7", ["false", "true"]), ("n", ["07", "8"])):
         cells = compile_maps({"text": expression}, ["n"], ["text"]).apply(table)
         assert cells["text"] == values
+
+
+@pytest.mark.parametrize("sign", ["", " ", "   ", "\t", ";", ", "])
+@pytest.mark.parametrize("suffix", [".txt", ".lst", ".csv"])
+def test_lines_of_paths_with_or_without_a_label(tmp_path, sign, suffix):
+    files = []
+    for part, rows in (("train", PATHS[:9]), ("test", PATHS[9:])):
+        lines = [f"/home/ann/set/{path}{sign}{3 if sign else ''}\n" for path in rows]
+        files.append(tmp_path / f"{part}{suffix}")
+        files[-1].write_text("".join(lines))
+    assert audit(*files).test_samples_in_shared_groups == 3
+
+
+def test_lines_of_two_paths(tmp_path):
+    write_images(tmp_path, IMAGES)
+    rows = [
+        f"{v.replace('_v', '_v')} {t}\n" for v, t in zip(IMAGES[::2], IMAGES[1::2], strict=True)
+    ]
+    text = "".join(rows).replace("_v", "_rgb").replace("_t", "_tac")
+    write_images(tmp_path, [p.replace("_v", "_rgb").replace("_t", "_tac") for p in IMAGES])
+    (tmp_path / "pairs.csv").write_text(text)
+    table = import_dataset(tmp_path / "pairs.csv", tmp_path / "out").manifest.table
+    assert table["vision"].str.contains("rgb").all()
+    assert table["tactile"].str.contains("tac").all()
+
+
+def test_utf16_without_a_mark(tmp_path):
+    write_images(tmp_path, IMAGES)
+    for encoding in ("utf-16-le", "utf-16-be", "utf-16"):
+        table = listed(tmp_path / "t.csv", str, encoding=encoding, material="Béton")
+        result = import_dataset(table, tmp_path / "out", overwrite=True)
+        assert set(result.manifest.table["material"]) == {"Béton"}

@@ -27,7 +27,7 @@ from typing import Literal
 from palpate.core import PalpateError, few, require
 from palpate.data.captions import ADJECTIVES
 from palpate.data.foreign import counted
-from palpate.data.manifest import DIGITS, PART_NAMES, SCHEMA
+from palpate.data.manifest import DIGITS, PART_NAMES, ROLE_OF, ROLES, SCHEMA
 from palpate.data.scanning import Cells, Scan
 from palpate.data.templates import Fields, Matches, Template, assign, join, walk
 
@@ -37,14 +37,8 @@ SIDES = ("vision", "tactile")
 ORDER = ("tactile", "vision", "background")
 #: What may be mapped.
 TARGETS = (*SCHEMA, "split")
-#: Column -> words that say that an image belongs there; those of ``_WEAK`` say so if no other does.
-ROLES = {
-    "vision": ("vision", "visual", "rgb", "photo", "photos", "camera", "cam", "color", "webcam"),
-    "tactile": ("tactile", "touch", "touches", "tac", "gelsight", "gel", "digit", "gelslim"),
-    "background": ("background", "backgrounds", "bg", "nocontact"),
-}
+#: Words that say what an image shows if no other does.
 _WEAK = {"image": "vision", "images": "vision", "img": "vision", "pictures": "vision"}
-ROLE_OF = {word: role for role, words in ROLES.items() for word in words}
 MEANING = {
     "video": ("video", "clip", "seq", "sequence", "recording", "rec", "run", "take", "trial"),
     "contact": ("contact", "press", "touch", "grasp", "tap", "poke", "interaction"),

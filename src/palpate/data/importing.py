@@ -11,10 +11,11 @@ from palpate.data.formats import FORMATS, recognized, require_options
 from palpate.data.images import Check
 from palpate.data.imported import Imported, Validation, removing_on_error, templates_of
 from palpate.data.listing import write_table
-from palpate.data.manifest import Manifest, is_manifest
+from palpate.data.manifest import FOLLOWED, SCHEMA, Manifest, is_manifest
 from palpate.data.scanning import (
     MISSING,
     WORLD,
+    Facts,
     Into,
     Scan,
     finished,
@@ -101,7 +102,8 @@ def validate(
     """Check a data set without writing anything: what is missing, invalid or suspicious.
 
     Args:
-        source: folder or table, or a name on the hub with ``format="hf"``.
+        source: folder or table, or a name on the hub with ``format="hf"``; an import is checked
+            again.
         format: as in :func:`import_dataset`.
         check: how images are checked.
         progress: progress callback.
@@ -114,11 +116,14 @@ def validate(
         must, fix = "must be a folder or a table on disk", "Write it, or see palpate.load"
         raise PalpateError(must, type(source).__name__, fix, argument="source")
     source, world = Path(source), world_facts(Path(source))
-    name, form = recognized(source, format, options)
-    options = options | {"check": check, "progress": progress}
-    scan = form.read(source, require_options(name, form, options))
-    # palpate's own world has the layouts of real sets and must not be shown as one of them.
-    facts = WORLD if world else form.facts
+    if format == "auto" and is_manifest(source):
+        name, facts, scan = _scan_of(Manifest.load(source, options.get("root")))
+    else:
+        name, form = recognized(source, format, options)
+        options = options | {"check": check, "progress": progress}
+        scan = form.read(source, require_options(name, form, options))
+        # palpate's own world has the layouts of real sets and must not be shown as one of them.
+        facts = WORLD if world else form.facts
     rows = finished(scan, check, progress)
     if not rows and not scan.problems:
         scan.problem(source, "empty", "no sample is usable")
@@ -129,6 +134,22 @@ def validate(
     odd = {problem.where for problem in scan.suspicious}
     looks = {recording: look for recording, look in scan.looks.items() if recording in odd}
     return Validation(name, facts, len(rows), missing, invalid, scan.suspicious, templates, looks)
+
+
+def _scan_of(manifest: Manifest) -> tuple[str, Facts, Scan]:
+    """The rows of an import, to be checked again."""
+    named = {name: manifest.facts.get(name, "unknown") for name in ("license", "citation", "url")}
+    dataset, group = (
+        manifest.facts.get("dataset", "an import"),
+        manifest.facts.get("group", "video"),
+    )
+    facts = Facts(name=dataset, samples="as many as it has rows", group=group, **named)
+    scan = Scan(manifest.root, dict(manifest.facts), met=manifest.facts.get("links") == FOLLOWED)
+    for k, row in enumerate(manifest.table.iter_rows(named=True), 1):
+        cells = {name: cell for name, cell in row.items() if cell is not None}
+        scan.rows.append((f"row {k}", cells))
+    scan.more = tuple(manifest.table.columns[len(SCHEMA) :])
+    return "manifest", facts, scan
 
 
 def write_lists(manifest: Manifest, split: Split, output: Path) -> list[Path]:

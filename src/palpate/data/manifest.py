@@ -60,6 +60,13 @@ SCHEMA: dict[str, type[pl.DataType]] = {
 }
 #: The column of the paths that a list names, whose images are not at hand.
 PATH = "path"
+#: Column -> words that say that an image belongs there.
+ROLES = {
+    "vision": ("vision", "visual", "rgb", "photo", "photos", "camera", "cam", "color", "webcam"),
+    "tactile": ("tactile", "touch", "touches", "tac", "gelsight", "gel", "digit", "gelslim"),
+    "background": ("background", "backgrounds", "bg", "nocontact"),
+}
+ROLE_OF = {word: role for role, words in ROLES.items() for word in words}
 #: Modality -> its image column.
 MODALITIES = {"vision": "vision", "tactile": "tactile"}
 FORMAT = "palpate-manifest/1"

@@ -25,11 +25,9 @@ from typing import Any
 import polars as pl
 
 from palpate.core import PalpateError, Problem, Split, require
-from palpate.data.detection import ROLES
 from palpate.data.foreign import require_native
 from palpate.data.formats.intervals import NEEDED, ORDER
-from palpate.data.images import SUFFIXES
-from palpate.data.manifest import PATH, SCHEMA, Manifest
+from palpate.data.manifest import PATH, ROLES, SCHEMA, Manifest
 from palpate.data.mapping import compile_maps
 from palpate.data.recordings import USUAL
 from palpate.data.rows import is_there, manifest_rows, read_classes, relocated, without_repeats
@@ -40,6 +38,8 @@ from palpate.data.tables import (
     content_of,
     decoded,
     header_of,
+    headless_names,
+    is_image,
     lines_of,
     open_table,
     table_of,
@@ -74,12 +74,12 @@ def read_names(source: Any, **options: Any) -> tuple[Manifest, list[Problem], Sp
     require_native(path)
     names = options["names"].split(",") if options.get("names") else []
     if not names and _is_interval(path):
+        for name in sorted(set(options) - {"root"}):
+            must, got = "must be left out for lines of video, start and end", repr(options[name])
+            require(not options[name], name, must, got)
         return _intervals(path)
-    if path.suffix.lower() not in TABLES and not names:
-        cells = re.split(r"\s*,\s*", _first_line(path))
-        if not _is_image(cells[0]) or len(cells) > 2:
-            return None
-        names = [PATH, "label"][: len(cells)]
+    if path.suffix.lower() not in TABLES and not names and not headless_names(path):
+        return None
     nested = path.suffix.lower() in (".json", ".jsonl")
     require(not (nested and names), "names", "must be left out for JSON", path.name)
     header = header_of(path)
@@ -87,10 +87,6 @@ def read_names(source: Any, **options: Any) -> tuple[Manifest, list[Problem], Sp
         return _intervals(path) if not any(path.parent.glob("*/*")) else None
     table = open_table(path, [name.strip() for name in names])
     return _paths(path, table, nested and bool(table.names), options)
-
-
-def _is_image(item: Any) -> bool:
-    return str(item).lower().endswith(SUFFIXES)
 
 
 def _first_line(path: Path) -> str:
@@ -103,7 +99,7 @@ def _first_line(path: Path) -> str:
 def _is_interval(path: Path) -> bool:
     """Whether the first line that is not empty is an interval."""
     match = INTERVAL.fullmatch(_first_line(path))
-    return match is not None and not _is_image(match[1])
+    return match is not None and not is_image(match[1])
 
 
 def _intervals(path: Path) -> tuple[Manifest, list[Problem], None]:
@@ -224,7 +220,7 @@ def _named_images(
     for name in _path_columns([*columns], side) if side else columns:
         values = columns[name]
         some = [value for value in values if value is not None]
-        if 2 * sum(map(_is_image, some)) > len(some):
+        if 2 * sum(map(is_image, some)) > len(some):
             return side, values
     return side, None
 

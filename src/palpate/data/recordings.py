@@ -31,7 +31,7 @@ from typing import Any, Literal
 import polars as pl
 
 from palpate.core import NO_LEAK, Note, Split, few, require
-from palpate.data.manifest import IMAGE_COLUMNS, PART_NAMES, PATH, SCHEMA, Manifest
+from palpate.data.manifest import IMAGE_COLUMNS, PART_NAMES, PATH, ROLE_OF, SCHEMA, Manifest
 from palpate.data.templates import Fields, Template
 
 LEVELS = ("object", "session", "video", "contact", "frame")
@@ -334,7 +334,7 @@ def _suggested(paths: Sequence[str], inputs: Sequence[Sequence[str]]) -> str:
     Folders and endings that say what images show are ``*`` in it, as are folders of which every
     input has another one: they say where an input is.
     """
-    from palpate.data.detection import ROLE_OF, template_of
+    from palpate.data.detection import template_of
 
     roles = "|".join(ROLE_OF)
     folder = re.compile(rf"(?i)(?:(?:{roles}|images?|frames?)[_\-. ]?)+")

@@ -26,7 +26,7 @@ import polars as pl
 
 from palpate.core import PalpateError, Problem, ProblemsError, require
 from palpate.data.images import SUFFIXES
-from palpate.data.manifest import PART_NAMES, PATH, reading_parquet
+from palpate.data.manifest import PART_NAMES, PATH, ROLE_OF, reading_parquet
 from palpate.data.mapping import text_of
 
 csv.field_size_limit(1 << 30)  # by default a long text is an error, for the whole process
@@ -108,6 +108,7 @@ def open_table(path: Path, names: Sequence[str] | None = None) -> Table:
         return _parquet(path)
     if suffix in (".jsonl", ".json"):
         return _json(path)
+    names = names or headless_names(path)
     must = f"A table must be one of {', '.join(TABLES)}"
     require(bool(names) or suffix in TABLES, None, must, path.name, fix="Convert it, or rename it")
     return _csv(path, names)
@@ -153,13 +154,42 @@ def delimiter_of(path: Path, text: str) -> str:
     """What separates the cells of a CSV file."""
     head = re.split("[\r\n]", text.lstrip("\r\n"), maxsplit=1)[0]
     signs = "\t" if path.suffix.lower() == ".tsv" else ",;\t"
-    return next((sign for sign in signs if sign in head), signs[0])
+    spaced = is_image(head.split(" ")[0]) and " " in head.strip()
+    return next((sign for sign in signs if sign in head), " " if spaced else signs[0])
+
+
+def headless_names(path: Path) -> list[str]:
+    """Columns of a list without a header, whose first line names images; empty for others.
+
+    An image is ``vision`` or ``tactile`` where there are several and a word of its path says so,
+    else a ``path``; what is no image is a ``label``.
+    """
+    if path.suffix.lower() in TABLES[2:]:
+        return []
+    with open(path, "rb") as file:
+        head = decoded(file.read(1 << 16)).lstrip("\r\n")
+    cells = [cell.strip() for cell in next(_cells(path, head.splitlines()), [])]
+    images = [cell for cell in cells if is_image(cell)]
+    names: list[str] = []
+    for cell in cells if images else ():
+        words = re.findall("[a-z]+", cell.lower())
+        side = next((ROLE_OF[word] for word in words if word in ROLE_OF), PATH)
+        name = (side if len(images) > 1 else PATH) if cell in images else "label"
+        names.append(name if name not in names else f"{name}_{len(names) + 1}")
+    return names
+
+
+def is_image(name: object) -> bool:
+    """Whether a name has the suffix of an image."""
+    return str(name).strip().lower().endswith(SUFFIXES)
 
 
 def decoded(data: bytes) -> str:
     """Decode UTF-8, UTF-16 with a byte-order mark, or cp1252; other bytes become U+FFFD."""
     if data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
         return data.decode("utf-16", errors="replace")
+    if b"\0" in data[:2] and data[:2] != b"\0\0":  # UTF-16 without a mark
+        return data.decode("utf-16-be" if data[:1] == b"\0" else "utf-16-le", errors="replace")
     text = data.decode("utf-8-sig", errors="replace")
     if "\ufffd" in text and is_windows(data):
         return data.decode(WINDOWS)
@@ -240,7 +270,7 @@ def _csv(path: Path, names: Sequence[str] | None) -> Table:
 def _csv_rows(path: Path, text: str, problems: list[Problem]) -> Iterator[tuple[int, list[str]]]:
     """(first line, cells) of each row that is not blank."""
     lines = list(io.StringIO(text, newline=""))
-    reader = csv.reader(lines, delimiter=delimiter_of(path, text))
+    reader = _cells(path, lines)
     first = 1
     try:
         for cells in reader:
@@ -256,6 +286,12 @@ def _csv_rows(path: Path, text: str, problems: list[Problem]) -> Iterator[tuple[
     except csv.Error as error:
         broken = f"{error}; is a quotation mark open? No row after it was read"
         problems.append(Problem(f"{path}:{first}", "bad-row", broken))
+
+
+def _cells(path: Path, lines: Sequence[str]) -> Any:
+    """A reader of the cells of some lines."""
+    sign = delimiter_of(path, "\n".join(lines[:9]))
+    return csv.reader(lines, delimiter=sign, skipinitialspace=sign == " ")
 
 
 def _rows_inside(lines: Sequence[str], dialect: Any, width: int) -> bool:
@@ -305,12 +341,7 @@ def _items(data: Any, split: str | None = None, *, row: bool = False) -> Iterato
                 yield from _items(value, PART_NAMES[str(key).lower()])
         else:
             yield dict(data) | ({"split": split} if split else {})
-    elif (
-        isinstance(data, list)
-        and _scalars(data)
-        and len(data) >= 2
-        and not str(data[0]).lower().endswith(SUFFIXES)
-    ):
+    elif isinstance(data, list) and _scalars(data) and len(data) >= 2 and not is_image(data[0]):
         group = "object" if str(data[0]).isdecimal() else "video"
         pair = {group: data[0], "id": "/".join(map(str, data)), "split": split}
         yield pair | ({"frame": data[1]} if group == "video" else {})
