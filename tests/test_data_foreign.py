@@ -136,3 +136,32 @@ def test_one_background_is_not_that_of_another_object():
         *(f"{o}/{k}_{s}.png" for o in BOTH for k in (1, 2) for s in ("rgb", "tac")),
     ]
     assert detect_layout(files, "own")["background"] == "{video}/bg.png"
+
+
+@pytest.mark.parametrize("stamp", ["{:.3f}", "{:.0f}000000"])
+@pytest.mark.parametrize("side", ["{o}/rgb/{t}.png", "rgb/{o}/cam_{t}.png"])
+def test_images_with_time_stamps_are_paired_by_the_nearest(tmp_path, stamp, side):
+    start = 1.7e12 if stamp.endswith("0") else 1.7e9
+    step = 40 if stamp.endswith("0") else 0.04
+    times = {"rgb": [start + 1.7 * step * k for k in range(12)]}  # the slower camera
+    times["gelsight"] = [start + step * (k + 0.25) for k in range(20)]
+    paths = {
+        word: [
+            side.replace("rgb", word)
+            .replace("cam", "gel" * (word != "rgb") or "cam")
+            .format(o=o, t=stamp.format(t))
+            for o in BOTH
+            for t in some
+        ]
+        for word, some in times.items()
+    }
+    write_images(tmp_path / "own", [*paths["rgb"], *paths["gelsight"]])
+    result = import_dataset(tmp_path / "own", tmp_path / "out", skip_bad=True)
+    assert "paired-by-time" in {p.kind for p in result.suspicious}
+    near = {}
+    for n, t in enumerate(times["gelsight"]):
+        k = min(range(12), key=lambda k: abs(times["rgb"][k] - t))
+        if abs(times["rgb"][k] - t) <= 0.85 * step:
+            near |= {paths["gelsight"][n + 20 * i]: paths["rgb"][k + 12 * i] for i in range(2)}
+    table = result.manifest.table
+    assert dict(zip(table["tactile"], table["vision"], strict=True)) == near

@@ -29,7 +29,7 @@ from palpate.data.captions import ADJECTIVES
 from palpate.data.foreign import counted
 from palpate.data.manifest import DIGITS, PART_NAMES, ROLE_OF, ROLES, SCHEMA
 from palpate.data.scanning import Cells, Scan
-from palpate.data.templates import Fields, Matches, Template, assign, join, walk
+from palpate.data.templates import TIME, Fields, Matches, Template, assign, join, walk
 
 Side = Literal["vision", "tactile"]
 SIDES = ("vision", "tactile")
@@ -60,20 +60,42 @@ def detect_layout(files: Sequence[str], folder: str) -> dict[str, str]:
         files: paths below it, at least one.
         folder: its name, which may say what its only side shows.
     """
+    return _detected_and_fit(files, folder)[0]
+
+
+def _detected_and_fit(files: Sequence[str], folder: str) -> tuple[dict[str, str], bool]:
+    """The templates, and whether they fit."""
+    templates, fit = _detected(files, folder)
+    fit = fit or bool(templates and _fit(files, templates))
+    if not {"vision", "tactile"} <= templates.keys() or fit:
+        return templates, fit
+    timed, _ = _detected([_TIMED.sub(_TIME, path) for path in files], folder)
+    timed = {
+        side: text.replace(_TIME, f"{{{TIME}}}").replace("{sample}", "{video}")
+        for side, text in timed.items()
+    }
+    both = all(f"{{{TIME}}}" in timed.get(side, "") for side in ("vision", "tactile"))
+    return (timed, True) if both and _fit(files, timed) else (templates, False)
+
+
+def _detected(files: Sequence[str], folder: str) -> tuple[dict[str, str], bool]:
+    """The templates of files without time stamps, and whether they are known to fit."""
     sides = _by_role({path: posixpath.splitext(path)[0] for path in files})
     if not sides and (roles := {ROLE_OF[w] for w in _words(folder) if w in ROLE_OF}):
         sides = {min(roles): list(files)} if len(roles) == 1 else {}
     if set(sides) <= {"background"}:
-        return {}
+        return {}, False
     several = any(map(_several, sides.values()))
     sides = {side: sides[side] for side in ROLES if side in sides}
     together = _together(sides, several)
     if together and _fit(files, together):
-        return together
+        return together, True
     apart = _faced(_alike({side: template_of(sides[side], several) for side in sides}, sides))
-    return together if together and _contradict([*apart.values()]) else apart
+    return together if together and _contradict([*apart.values()]) else apart, False
 
 
+#: A time stamp at the end of a name, and what stands in its place.
+_TIMED, _TIME = re.compile(r"(?:[0-9]{9,}(?:\.[0-9]+)?|[0-9]+\.[0-9]+)(?=\.\w+$)"), "\ue001"
 #: In place of the word that says what an image shows.
 _ROLE = "\ue000"
 
@@ -444,6 +466,11 @@ def joined(
     result.suspect(result.base, "unmatched", f"{kind} of no template", unmatched)
     result.facts |= {f"template_{column}": template.text for column, template in templates.items()}
     fields = tuple(dict.fromkeys(name for t in templates.values() for name in t.fields))
+    if TIME in fields and len(templates) > 1:
+        pairs = {path for row in rows for path in row.values()} | {p.where for p in problems}
+        text = "within half a step of the slower side; files that are nearest to none"
+        text = f"images are paired by time, {text}: {len(used - pairs)}"
+        result.suspect(result.base, "paired-by-time", text)
     result.more = tuple(name for name in fields if name not in TARGETS)
     return rows, fields
 
@@ -462,8 +489,8 @@ def templates_of(
     require(bool(files), None, f"{folder} must hold {kind}", "none", fix="Check the path")
     if side is not None:
         return renamed({side: template_of(files)})
-    templates = detect_layout(files, folder.resolve().name)
-    if templates and _fit(files, templates):
+    templates, fit = _detected_and_fit(files, folder.resolve().name)
+    if fit:
         return renamed(templates)
     if templates:
         choices = [templates, *({side: text} for side, text in templates.items())]

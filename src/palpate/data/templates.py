@@ -6,6 +6,7 @@ in a template   matches
 ``{name}``      one or more characters of one name; the earlier field takes as many as it can
 ``{name:d}``    all digits of a number (``0007`` is 7); the field ``frame`` is always one
 ``{name:**}``   any number of folders, also none
+``{time}``      the same as the first: a time stamp, by which sides are joined to the nearest
 ``*``  ``**``   the same as the first and the last, but not kept
 ==============  ====================================================================================
 
@@ -17,10 +18,13 @@ from __future__ import annotations
 
 import os
 import re
+from bisect import bisect_left
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
+from statistics import median
 
 from palpate.core import PalpateError, Problem, require
 from palpate.data.manifest import CLIMBS, DIGITS, IMAGE_COLUMNS
@@ -29,6 +33,8 @@ _TOKEN = re.compile(
     r"(?<![^/])(?:\*\*|\{(?P<deep>\w+):\*\*\})(?P<end>/|$)"
     r"|\{(?P<field>\w+)(?::(?P<spec>[^{}]*))?\}|(?P<star>\*+)|(?P<literal>[^{}*]+)|(?P<wrong>.)"
 )
+#: The field of a time stamp.
+TIME = "time"
 FIX = "Write fields as {object}, {frame:d} or {video:**}, and * for what does not matter"
 #: Field -> value, in the order of the template.
 Fields = dict[str, str]
@@ -72,7 +78,8 @@ class Template:
         for token in _TOKEN.finditer(path):
             name, spec = token["deep"] or token["field"], "**" if token["deep"] else token["spec"]
             spec = "d" if name == "frame" and not spec else spec or ""
-            readable = spec in ("", "d", "**") and (not name or name.isidentifier())
+            spec = "t" if name == TIME and not spec else spec
+            readable = spec in ("", "d", "t", "**") and (not name or name.isidentifier())
             if token["wrong"] or not readable:
                 raise wrong("must have fields that can be read", f"{token[0]!r} in {text!r}")
             if name in IMAGE_COLUMNS:
@@ -115,6 +122,8 @@ def _piece(token: re.Match[str], name: str | None, spec: str, *, loose: bool) ->
     if token["star"]:
         return "[^/]*"
     group = f"(?P<{name}>" if name else "(?:"
+    if spec == "t":
+        return f"{group}[0-9]+(?:\\.[0-9]+)?)"
     if spec == "d":
         return f"{'(?<![0-9])' * loose}{group}[0-9]{{1,{DIGITS}}})(?![0-9])"
     if token["end"] is None:
@@ -167,7 +176,8 @@ def join(
     """Join the files of several templates by their equal fields.
 
     Several files of one side may share one of the other (a photo of an object, a background of a
-    video); where both sides have several for the same fields, no row is made.
+    video); where both sides have several for the same fields, no row is made. Files with the field
+    ``time`` are joined to the nearest, within half a step of the slower side.
 
     Args:
         sides: column -> its files; the first decides the order of the rows.
@@ -181,20 +191,24 @@ def join(
     problems: list[Problem] = []
     for side, matches in further:
         shared = {name for row in rows for name in row} - set(sides)
-        keys = tuple(sorted(shared & {name for _, fields in matches for name in fields}))
+        shared &= {name for _, fields in matches for name in fields}
+        keys = tuple(sorted(shared - {TIME}))
         must = "Templates must share a field, which says what belongs together"
         got = f"none for {len(rows)} files of {first} and {len(matches)} of {side}"
         fix = "Give one part of both paths the same field"
-        require(bool(keys) or len(rows) <= 1 or len(matches) <= 1, None, must, got, fix=fix)
+        require(bool(shared) or len(rows) <= 1 or len(matches) <= 1, None, must, got, fix=fix)
         partners = _by_key([(fields, path) for path, fields in matches], keys)
         alone = _by_key([(row, row[first]) for row in rows], keys)
         for key in partners.keys() - alone.keys() if side not in optional else ():
             text = f"no {first} image {_named(keys, key)}"
             problems += [Problem(path, "unpaired", text) for _, path in partners[key]]
+        near: dict[str, list[tuple[Fields, str]]] = {}
+        for key in alone if TIME in shared else ():
+            near |= _nearest(alone[key], partners.get(key, []))
         joined: list[Fields] = []
         for row in rows:
             key = tuple(map(row.get, keys))
-            files = partners.get(key, [])
+            files = near.get(row[first], []) if TIME in shared else partners.get(key, [])
             if len(files) > 1 and len(alone[key]) > 1:
                 text = f"{len(alone[key])} {first} and {len(files)} {side} images"
                 text += f" {_named(keys, key)}; a further field must distinguish them"
@@ -207,6 +221,24 @@ def join(
                 joined += [fields | row | {side: path} for fields, path in files] or [row]
         rows = joined
     return rows, sorted(problems, key=lambda problem: problem.where)
+
+
+def _nearest(
+    rows: Sequence[tuple[Fields, str]], files: Sequence[tuple[Fields, str]]
+) -> dict[str, list[tuple[Fields, str]]]:
+    """Path of a row -> the file nearest in time, if there is one within half a step."""
+    mine, theirs = ([float(fields[TIME]) for fields, _ in some] for some in (rows, files))
+    steps = [median(b - a for a, b in pairwise(sorted(t))) for t in (mine, theirs) if len(t) > 1]
+    order = sorted(range(len(files)), key=theirs.__getitem__)
+    times = [theirs[k] for k in order]
+    found: dict[str, list[tuple[Fields, str]]] = {}
+    for (_, path), time in zip(rows, mine, strict=True):
+        k = bisect_left(times, time)
+        ends = [j for j in (k - 1, k) if 0 <= j < len(times)]
+        best = min(ends, key=lambda j: abs(times[j] - time), default=None)
+        if best is not None and abs(times[best] - time) <= 0.505 * max(steps, default=0):
+            found[path] = [files[order[best]]]
+    return found
 
 
 def _by_key(
