@@ -69,7 +69,7 @@ def test_options_of_the_format_pass_through(capsys, tag, tmp_path):
     ("args", "word"),
     [
         (["--size", "three"], "size"),
-        (["--part", "sim"], "must be left out for the format touch-and-go"),
+        (["--swap", "fix"], "must be left out for the format touch-and-go"),
         (["--map", "video=a", "--map", "video=b"], "each column once"),
         (["--map", "video="], "as COLUMN=EXPRESSION"),
         (["--format", "zip"], "one of auto, touch-and-go"),

@@ -19,7 +19,8 @@ from palpate.data.scanning import finished
 #: Takes what no other format recognized, so it may recognize trees of others too; it must be last.
 CATCH_ALL = "pairs"
 #: Formats whose files are met on the disk; paths that are written in lists may not leave the root.
-FOLLOWED = ("touch-and-go", "tarf", "objectfolder-generation", "ycb-slide", "intervals", "pairs")
+FOLLOWED = {"touch-and-go", "tarf", "ycb-slide", "objectfolder", "objectfolder-generation"}
+FOLLOWED |= {"intervals", "pairs"}
 FACTS = ("name", "citation", "license", "url", "sensor", "samples", "group")
 
 
@@ -139,6 +140,8 @@ def test_a_bad_image_is_reported_and_skipped_alone(name, folder, made, whole, tm
     row = whole.manifest.table.row(-1, named=True)
     if how == "link" and made.remove is not None:
         pytest.skip("its samples are not files of their own")
+    if how == "remove" and name == "objectfolder":
+        pytest.skip("an image without partners leaves no trace")
     if (spoil := getattr(made, how, None)) is not None:
         spoil(copy.source)
     else:

@@ -206,6 +206,7 @@ def test_validation_tells_lag_and_dropped_frames(tmp_path):
     assert {(p.where, p.kind) for p in report.suspicious} == {
         ("late", "lag"),
         ("gaps", "dropped-frames"),
+        ("gaps", "paired-by-time"),
     }
     texts = {p.kind: p.text for p in report.suspicious}
     assert "12 frames before" in texts["lag"]

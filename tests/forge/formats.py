@@ -99,8 +99,7 @@ def make_objectfolder(folder: Path) -> Tree:
     write_images(root, names)
     write_image(root / "2/tactile_data/1/0/gelsight/3.jpg", 99)  # T3's copy
     (root / "objectfolder_real_metadata.csv").write_text(METADATA)
-    last = "17/tactile_data/3/0/gelsight"  # one missing image leaves no trace; a missing trial does
-    return Tree(root, 9, remove=lambda source: shutil.rmtree(source / last))
+    return Tree(root, 10)
 
 
 def make_objectfolder_generation(folder: Path) -> Tree:

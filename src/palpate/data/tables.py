@@ -316,7 +316,7 @@ def _json(path: Path) -> Table:
         data = rows[0][1]
         flat = isinstance(data, list) and not _all_nested(data)
         rows = list(enumerate(data if flat else _items(data), 1))
-        if not flat and (not rows or rows[0][1] is data):
+        if not flat and (not rows or rows[0][1] == data):
             must, got = f"{path} must hold a JSON list of objects", repr(text.strip()[:20])
             raise PalpateError(must, got, "Write [{...}, {...}], or JSON lines")
     return _of_objects(str(path), rows, problems)

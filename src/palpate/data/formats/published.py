@@ -41,12 +41,8 @@ def detect(source: Path, templates: Mapping[str, str]) -> bool:
     return any(tactile.match(path.relative_to(source).as_posix()) for path in paths)
 
 
-def scan(
-    source: Path,
-    templates: Mapping[str, str],
-    columns: Mapping[str, str],
-    *,
-    progress: Progress = quiet,
+def _scan(
+    source: Path, templates: Mapping[str, str], columns: Mapping[str, str], progress: Progress
 ) -> Scan:
     """Read a folder by the templates of a row."""
     result = Scan(require_folder(source, "a published data set"))
@@ -61,12 +57,13 @@ def scan(
 
 
 def _row(facts: Facts, templates: Mapping[str, str], **columns: str) -> Format:
-    return Format(
-        facts,
-        partial(detect, templates=templates),
-        " and ".join(templates.values()),
-        partial(scan, templates=templates, columns=columns),
-    )
+    """The format of a row."""
+
+    def scan(source: Path, *, progress: Progress = quiet) -> Scan:
+        return _scan(source, templates, columns, progress)
+
+    looks_for = " and ".join(templates.values())
+    return Format(facts, partial(detect, templates=templates), looks_for, scan)
 
 
 TARF = _row(
