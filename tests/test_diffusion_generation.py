@@ -122,6 +122,9 @@ def test_broken_photos_are_reported_at_once_or_skipped(pipeline, tmp_path):
     names = sorted(Path(p.where).name for p in caught.problems)
     assert names == ["1.png", "3.png", "gone.png"]
     assert not (tmp_path / "out").exists()
+    bad = {i: p for i, p in table.items() if i in ("v/1", "v/gone")}
+    caught = fails("No photo is left", generate, bad, model=pipeline, skip_bad=True)
+    assert len(caught.problems) == 2
     made = generate(table, model=pipeline, output=tmp_path / "out", skip_bad=True)
     assert made.ids == ["v/0", "v/2", "v/4"]
     assert len(Generated.load(tmp_path / "out").skipped) == 3

@@ -174,7 +174,9 @@ def test_file_names_say_which_images_are_of_one_video(tmp_path):
         ({"task": "rank"}, "pair, sort"),
         ({"design": "ours"}, "paper"),
         ({"until": "tomorrow"}, "date"),
+        ({"until": "2020-01-31"}, "must be today or later. Got 2020-01-31"),
         ({"task": "sort", "labels": None}, "two materials"),
+        ({"labels": {"elsewhere/1": "wood"}}, "labels must hold ids .* 'elsewhere/1' instead of"),
         ({"output": None, "dry_run": False}, "folder"),
     ],
 )

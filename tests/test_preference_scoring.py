@@ -406,7 +406,7 @@ def test_different_answers_under_one_code_are_said(plan, tmp_path):
 
 
 def test_votes_after_the_last_day_do_not_count(rated, tmp_path):
-    plan = rated.make(items=4, raters=1, until="2026-10-01")
+    plan = replace(rated.make(items=4, raters=1), until="2026-10-01")
     early = changed(plan)
     with pytest.raises(PalpateError, match=f"{len(plan.trials)} after 2026-10-01"):
         read(plan, tmp_path, early)

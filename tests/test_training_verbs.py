@@ -172,10 +172,12 @@ def test_the_split_that_lies_with_the_data_is_the_default(tag, tmp_path, capsys)
     split.save(tmp_path / "tag" / "splits" / "Orig.json")
     assert main([*common, "--dry-run"]) == 0
     assert main([*common, "--epochs", "0.1"]) == 0
+    assert main([*common, "--epochs", "0.2"]) == 2  # no advice to remove what took days
     card = EncoderSet.load(tmp_path / "e").card
     assert card["split"] == split.digest
     # What the split shares is said, and stays with the model.
     words = " ".join(capsys.readouterr().err.split())
+    assert "a training that is finished: it cannot go on. Train longer" in words
     assert "Videos: from the column video; contacts: from the column contact" in words
     assert "The split 'Orig' is not NoLeak: 6 of 6 videos of its test part are in train" in words
     assert card["split_rule"]["shared"] == {"video": [6, 6]}

@@ -38,6 +38,7 @@ from palpate.core import (
     rng_for,
     track,
 )
+from palpate.core.messages import require_joined
 from palpate.data.manifest import Manifest
 from palpate.data.reading import load
 from palpate.data.texts import TABLE, joined, read_texts
@@ -94,7 +95,9 @@ def check_captions(
     arguments = {"captions": captions, "data": data, "split": split, "seed": seed} | options
     call = Call.of("caption check", check_captions, arguments)
     manifest, flags = _read(captions, data, options)
-    split = None if split is None else Split.load(split)
+    if split is not None:
+        split = Split.load(split)
+        require_joined(manifest.ids, split.parts, "The split")
     rows = _rows(manifest, flags, split)
     vocabulary = Vocabulary(sorted({*rows["label"]} - {""}))
     scores, notes = _faults(rows, vocabulary), list[Note]()

@@ -22,8 +22,9 @@ class Options(Common):
     """A .png for one photo; else a folder for images/ and index.json."""
     text: str | None = None
     """What is felt, e.g. "rough, porous stone"; alone, or next to photos for all of them."""
-    weight: float = 0.5
-    """With photos and a text: how much the photo counts, in [0, 1]; the text has the rest."""
+    weight: float | None = None
+    """With photos and a text: how much the photo counts, in [0, 1]; the text has the rest (default:
+    0.5)."""
     gel: Path | None = None
     """Picture of your sensor's gel without contact; the images are made on it (default: the
     no-contact image of each sample, else the model's stock gel, a typical one)."""

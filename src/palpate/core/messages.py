@@ -155,6 +155,21 @@ def require_rows(ids: Iterable[str], wanted: Sequence[str], must: str, fix: str)
     return [row[i] for i in wanted]
 
 
+def require_joined(ids: Iterable[str], others: Iterable[str], source: str) -> list[str]:
+    """Check a join by id; return the ids of which ``source``, with the ids ``others``, has none.
+
+    Raises:
+        PalpateError: if that is all of them: the ids are another set's.
+    """
+    own, theirs = [*ids], {*others}
+    lacking = [i for i in own if i not in theirs]
+    got = f"ids as {min(theirs, default='')!r} instead of {next(iter(own), '')!r}"
+    fix = "Use what was made for these samples, or write their ids there"
+    holds = not own or len(lacking) < len(own)
+    require(holds, None, f"{source} must hold ids of these samples", got, fix=fix)
+    return lacking
+
+
 class PalpateWarning(UserWarning):
     """A result that needs a second look; results carry the same fact as a :class:`Note`."""
 

@@ -13,6 +13,7 @@ from pathlib import Path
 import polars as pl
 
 from palpate.core import PalpateError, Problem, ProblemsError, digest_lines, require, short
+from palpate.core.messages import require_joined
 from palpate.data.images import file_digest
 from palpate.data.imported import Imported, splits_of
 from palpate.data.manifest import Manifest, write_parquet
@@ -104,9 +105,7 @@ def joined(manifest: Manifest, texts: Texts, where: Path, *, keep: bool = True) 
             their names.
     """
     ids, must, fix = manifest.ids, "The texts must be of these samples", "Use those made for them"
-    if texts.ids.isdisjoint(ids):
-        got = f"{where}, with ids as {min(texts.ids, default='')!r} instead of {ids[0]!r}"
-        raise PalpateError(must, got, fix)
+    require_joined(ids, texts.ids, f"The texts in {where}")
     for name, digest in image_digests(manifest, texts.images).items():
         got = f"{where}, made for another image of {name!r}"
         by_id = f"{fix}; a table of only id and text joins by id alone"

@@ -56,6 +56,7 @@ T = TypeVar("T")
 R = TypeVar("R")
 Photos = str | Path | Sequence[str | Path] | Mapping[str, Path]
 FIX_PHOTOS = "Fix, remove or skip these photos"
+WHOLE = "must go with a manifest, of which it names the parts"
 #: Photos that are decoded before the model is loaded, so that a broken one is reported at once.
 FEW = 64
 #: Threads that read photos while others are sampled.
@@ -85,7 +86,7 @@ def generate(  # noqa: PLR0913 - a public verb, step by step
     photos: Manifest | Photos | None = None,
     *,
     text: str | None = None,
-    weight: float = 0.5,
+    weight: float | None = None,
     gel: str | Path | None = None,
     model: TactilePipeline | str | Path = "palpate/mini",
     output: str | Path | None = None,
@@ -108,7 +109,8 @@ def generate(  # noqa: PLR0913 - a public verb, step by step
             The ids, which with ``seed`` decide the noise, are paths below a folder, file names, or
             those of the manifest. None: one image of ``text`` alone, whose id is the text.
         text: what is felt, e.g. ``"rough, porous stone"``; next to photos, for all of them.
-        weight: with photos and a text, the share of the photo where both take one place.
+        weight: with photos and a text, the share of the photo where both take one place; default:
+            0.5.
         gel: an image of the gel without contact, on which the images are made; default: the
             manifest's column ``background``, else the model's stock gel.
         model: a pipeline, a folder of ``palpate train generator``, a hub id, or the shipped
@@ -133,9 +135,7 @@ def generate(  # noqa: PLR0913 - a public verb, step by step
         ProblemsError: naming every unreadable photo, unless ``skip_bad``; of up to 32 photos before
             any image is made.
     """
-    must, fix = "There must be at least one photo, or a text", "Pass one of them"
-    require(photos is not None or text is not None, None, must, "none", fix=fix)
-    require(0 <= weight <= 1, "weight", "must lie in [0, 1]", f"{weight:g}", fix="1 is the photo")
+    weight = _share(weight, photos is not None, text is not None)
     output = None if output is None else Path(output)
     rank, size, gathered = 0, 1, dict
     if int(os.environ.get("WORLD_SIZE", "1")) > 1:
@@ -143,6 +143,7 @@ def generate(  # noqa: PLR0913 - a public verb, step by step
 
         device = processes.connect(device)
         (rank, size), gathered = processes.place(), processes.merged
+    require(split is None or photos is not None, "split", WHOLE, "a text alone", fix="Leave it out")
     items = [_Item(str(text), None)] if photos is None else _items(photos, split, part)
     paths = [item.vision or Path(item.id) for item in items]
     single = _is_single(output, paths)
@@ -192,6 +193,8 @@ def generate(  # noqa: PLR0913 - a public verb, step by step
     ready = iter(reader)
     first = [*islice(ready, 1)]  # few photos are all read before anything is written
     bad = reader.checked(gathered(reader.bad))
+    if len(bad) == len(items):
+        raise ProblemsError([*bad.values()], "No photo is left: fix some, or pass others")
     new: dict[str, bool] = {}
     with target.writing():
         rows = drawn(chain(first, ready))
@@ -332,6 +335,8 @@ def _items(photos: Any, split: Split | str | Path | None, part: str) -> list[_It
     elif not isinstance(photos, Sequence | Mapping):
         manifest = photos
     if manifest is None:
+        fix = "Leave it out, or import the data set"
+        require(split is None, "split", WHOLE, "photos", fix=fix)
         items = [_Item(i, path) for i, path in photo_ids(photos).items()]
     else:
         manifest = manifest if split is None else manifest.part(Split.load(split), part)
@@ -341,6 +346,17 @@ def _items(photos: Any, split: Split | str | Path | None, part: str) -> list[_It
     must, fix = "There must be at least one photo", "Check the folder, the split or the names"
     require(bool(items), None, must, "none", fix=fix)
     return items
+
+
+def _share(weight: float | None, photos: bool, text: bool) -> float:
+    """The share of the photo; checks what drives the images."""
+    must, fix = "There must be at least one photo, or a text", "Pass one of them"
+    require(photos or text, None, must, "none", fix=fix)
+    must, got = "must go with photos and a text", "no photo" if text else "no text"
+    require(weight is None or (photos and text), "weight", must, got, fix="Leave it out")
+    share = 0.5 if weight is None else weight
+    require(0 <= share <= 1, "weight", "must lie in [0, 1]", f"{share:g}", fix="1 is the photo")
+    return share
 
 
 def _on_gels(

@@ -33,6 +33,7 @@ import re
 from collections.abc import Generator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from itertools import compress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 from zipfile import is_zipfile
@@ -394,14 +395,15 @@ def pick_device(device: str | torch.device) -> torch.device:
     """
     import torch
 
+    there = torch.cuda.is_available(), torch.backends.mps.is_available(), True
+    devices = [*compress(("cuda", "mps", "cpu"), there)]
     if device == "auto":
-        mps = torch.backends.mps.is_available()
-        device = "cuda" if torch.cuda.is_available() else "mps" if mps else "cpu"
+        device = devices[0]
     try:
         torch.empty(0, device=device)
     except (RuntimeError, AssertionError, NotImplementedError) as error:
         must = "must be auto, cpu, or a device of this machine"
-        fix = "Choose auto, cpu, cuda or mps"
+        fix = f"This machine has: auto, {', '.join(devices)}"
         got = f"{str(device)!r}: {first_line(error)}"
         raise PalpateError(must, got, fix, argument="device") from None
     return torch.device(device)

@@ -22,7 +22,7 @@ from typing import Any, Literal
 import polars as pl
 
 from palpate.core import Note, Progress, Score, Split, quiet, require, rng_for
-from palpate.core.messages import require_rows
+from palpate.core.messages import require_joined, require_rows
 from palpate.data.recordings import resampled_by, source_of
 from palpate.data.samples import (
     SUFFIX,
@@ -252,9 +252,9 @@ def aligned(bench: Bench, labels: Any, split: Split | None, group: str) -> Bench
     listed = [] if table is None else table["id"].to_list()
     real, full = labeled(real, table), [*real.ids, *listed]
     generators = {n: labeled(with_full_ids(s, full), table) for n, s in bench.generators.items()}
-    of_samples = any({*listed} & {*s.ids} for s in (real, *generators.values()))
-    must = "The labels must hold ids of the samples"
-    require(not listed or of_samples, "labels", must, "other ids")
+    if listed:
+        every = [i for samples in (real, *generators.values()) for i in samples.ids]
+        require_joined(every, listed, "The labels")
     if real.numbered:  # row k of a generator is not row k of the reference
         real = real.with_columns(pl.Series("id", [f"{REFERENCE} {i}" for i in real.ids]))
     generators = {name: labeled_as(samples, real) for name, samples in generators.items()}
@@ -313,6 +313,7 @@ def _parts(real: Samples, split: Split) -> tuple[Samples, Samples | None]:
     """The test part of the reference, and its train part if it has all of it."""
     must = "must go with a reference that has ids"
     require(not real.numbered, "split", must, real.source, fix="Save it with ids")
+    require_joined(real.ids, split.parts, "The split")
     ids = {*real.ids}
     real.take([i for i in split.ids("test") if i not in ids])  # raises for missing ids
     test, train = ([i for i in real.ids if split.parts.get(i) == p] for p in ("test", "train"))

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from PIL import Image, ImageFilter
 
 from palpate.core import Note, Progress, image_bytes, require, track
+from palpate.core.messages import require_joined
 from palpate.data.images import read_image, square
 from palpate.data.recordings import recordings_note
 from palpate.data.samples import (
@@ -55,7 +56,10 @@ def read_sources(
     Raises:
         PalpateError: if one has no image files, or no id is common.
     """
-    real = labeled(_files(read_samples(reference, REFERENCE)), read_labels(labels))
+    real, table = _files(read_samples(reference, REFERENCE)), read_labels(labels)
+    if table is not None:
+        require_joined(real.ids, table["id"], "The labels")
+    real = labeled(real, table)
     reserved = (REFERENCE, GEL, COPY, EXAMPLE, SAME)
     sources = named_sources(generated, names, reserved).items()
     methods = {name: with_full_ids(_files(read_samples(s, name)), real.ids) for name, s in sources}

@@ -6,6 +6,7 @@ in turn. Order and sides of a rater depend on the plan's secret, which no page h
 
 from __future__ import annotations
 
+import datetime
 import re
 import secrets
 from collections.abc import Sequence
@@ -118,7 +119,8 @@ def make(  # noqa: PLR0913
     require(1 <= raters <= 999, "raters", "must lie in 1 .. 999", raters, 10)
     require(32 <= size <= 1024, "size", "must lie in 32 .. 1024", size, 256)
     require(abs(seed) < LARGEST, "seed", "must lie between -2^63 and 2^63", seed, 0)
-    until = last_day(until)
+    until, today = last_day(until), datetime.datetime.now(datetime.UTC).date().isoformat()
+    require(until is None or until >= today, "until", "must be today or later", until, "2030-12-31")
     folder = None if output is None or dry_run else Path(output)
     must = "must be a new folder for the study"
     require(dry_run or folder is not None, "output", must, "none", "study/")

@@ -14,7 +14,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from palpate.core import PalpateError, Progress, locked, quiet, require_new_folder
+from palpate.core import PalpateError, Progress, locked, quiet, require, require_new_folder
 from palpate.training.options import Compute, LoopOptions
 from palpate.training.processes import barrier, connect, merged, place
 
@@ -87,6 +87,12 @@ def work_folder(output: Path | None) -> Generator[Path]:
             yield Path(merged({str(rank): name})["0"])
             barrier()  # the first one is removed when nobody needs it
         return
+    must, fix = (
+        f"{output} must be absent or empty",
+        "Train longer from the start, in another folder",
+    )
+    finished = (output / "palpate.json").is_file()
+    require(not finished, None, must, "a training that is finished: it cannot go on", fix=fix)
     require_new_folder(output)
     work = output.absolute().parent / f".{output.name}.work"
     barrier()  # all have looked at the output before it is written
