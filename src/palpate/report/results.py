@@ -167,7 +167,7 @@ def digest_of(path: Path, name: str) -> str | None:
     return digest_folder(path, "**/*.safetensors") if weights else None
 
 
-class Shown:
+class Document:
     """What audits and results share: they print themselves, and are JSON of a format."""
 
     form: ClassVar[str]
@@ -227,7 +227,7 @@ class Shown:
 
 
 @dataclass(frozen=True)
-class Audit(Shown):
+class Audit(Document):
     """The leaks of one split. Counts are samples; gaps are frames; fractions lie in [0, 1].
 
     Attributes:
@@ -338,7 +338,7 @@ class Audit(Shown):
 
 
 @dataclass(frozen=True)
-class Results(Shown):
+class Results(Document):
     """Scores, audits and images of a run: a table of scores that can also be drawn as a page.
 
     Iterates over its scores; ``results["TMMD"]`` lists those of a column, by its printed name (as

@@ -354,12 +354,12 @@ class Page:
         return with_interval(score, digits)
 
     def _distance(self) -> str:
-        given_gels = self.stages["generator"].facts["background"]
-        source = "photos and no-contact images" if given_gels else "photos alone"
-        background, made = (self.named.get(FAMILY[0], n) for n in (BACKGROUND, "generated"))
+        with_gels = self.stages["generator"].facts["background"]
+        source = "photos and no-contact images" if with_gels else "photos alone"
+        background, ours = (self.named.get(FAMILY[0], n) for n in (BACKGROUND, "generated"))
         versus = f", the no-contact image {self._with_interval(background)}" if background else ""
         start = f"Distance: {len(self.generated.ids)} tactile images generated from {source}"
-        value = self._with_interval(made)
+        value = self._with_interval(ours)
         return f"{start} have TMMD (grouped) {value} to the real ones{versus} (lower is better)."
 
     def _material(self) -> str:
