@@ -57,6 +57,8 @@ Images = NDArray[np.uint8]
 Options = AutoencoderOptions | BackgroundOptions
 #: Of the latents of a VQ model in stage 1, as a share of their spread.
 NOISE = 0.02
+#: Of the k-means that makes the codebook: assignments and means.
+ITERATIONS = 12
 #: Of an autoencoder that is given the gel: largest random change of each color's gain, so that
 #: other gels are no surprise; largest noise on the latents as a share of their spread; weight of
 #: what a 2 x 2 average of the latents loses.
@@ -355,23 +357,20 @@ def _set_codebook(
     model.net.quantize.embedding.weight.data.copy_(torch.from_numpy(centers))
 
 
-def k_means(
-    points: NDArray[np.float64], k: int, rng: np.random.Generator, iterations: int = 12
-) -> NDArray[np.float64]:
+def k_means(points: NDArray[np.float64], k: int, rng: np.random.Generator) -> NDArray[np.float64]:
     """Lloyd's k-means in few dimensions.
 
     Args:
         points: (n, d).
         k: centers; more than n gives points twice, with a little noise.
         rng: draws the first centers.
-        iterations: of assignment and mean.
 
     Returns:
         (k, d).
     """
     centers = points[rng.choice(len(points), size=k, replace=len(points) < k)].copy()
     centers += 1e-4 * points.std() * rng.standard_normal(centers.shape)
-    for _ in range(iterations):
+    for _ in range(ITERATIONS):
         distance, nearest = KDTree(centers).query(points)
         counts = np.bincount(nearest, minlength=k)
         sums = [np.bincount(nearest, weights=column, minlength=k) for column in points.T]

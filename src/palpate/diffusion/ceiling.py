@@ -33,6 +33,8 @@ from palpate.training.processes import place
 
 #: Samples that are scored, and samples of train that a probe is fitted to, at most.
 SCORED, FITTED = 1000, 4000
+#: Images that are reconstructed at a time.
+BATCH = 64
 
 
 @dataclass(frozen=True)
@@ -56,20 +58,19 @@ def measure_reconstruction(
     autoencoder: AnyAutoencoder,
     images: NDArray[np.uint8],
     background: NDArray[np.uint8] | None = None,
-    batch: int = 64,
 ) -> Reconstruction:
     """Score reconstructions of bytes (n, h, w, 3), a batch at a time.
 
     ``background`` holds the gel of each image, for an autoencoder that is given them.
     """
     rows: list[NDArray[np.float64]] = []
-    for start in range(0, len(images), batch):
-        part = slice(start, start + batch)
+    for start in range(0, len(images), BATCH):
+        part = slice(start, start + BATCH)
         pixels = np.asarray(images[part])
         gels = None if background is None else background[part]
-        z = autoencoder.encode(pixels, gels, batch=batch)
+        z = autoencoder.encode(pixels, gels, batch=BATCH)
         # Rounded to bytes first: what is scored is the image that a user gets.
-        decoded = autoencoder.decode(z, gels, batch=batch)
+        decoded = autoencoder.decode(z, gels, batch=BATCH)
         scored = [per_image(name, decoded, pixels) for name in ("PSNR", "SSIM")]
         rows.append(np.stack([score.values for score in scored]))
     psnr, ssim = map(float, np.concatenate(rows, axis=1).mean(axis=1))

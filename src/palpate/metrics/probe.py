@@ -84,7 +84,6 @@ def material_accuracy(
     *,
     probe: Probe | None = None,
     l2: float | None = None,
-    seed: int = 0,
     subject: str = "real",
     split: str | None = None,
 ) -> Score:
@@ -95,7 +94,6 @@ def material_accuracy(
         test: features of the same encoder with labels, and groups for the interval.
         probe: a probe fitted to ``train`` before; None fits one.
         l2: see :func:`fit_probe`.
-        seed: see :func:`fit_probe`.
         subject: what is scored, kept in the score.
         split: digest of the split, kept in the score.
 
@@ -107,8 +105,8 @@ def material_accuracy(
         PalpateError: without labels in both sets, or on features of two encoders.
     """
     require_one_encoder(train, test, "Train and test")
-    probe = probe or fit_probe(train, l2=l2, seed=seed)
-    return _linear(probe, train, test, "material", seed=seed, subject=subject, split=split)[0].score
+    probe = probe or fit_probe(train, l2=l2)
+    return _linear(probe, train, test, "material", seed=0, subject=subject, split=split)[0].score
 
 
 def class_accuracies(

@@ -129,9 +129,9 @@ def score_text(value: float) -> str:
     return f"{value:.{3 if value >= 1 else digits}f}"
 
 
-def plural(n: int, singular: str, many: str | None = None) -> str:
-    """Return ``"1 video"``, ``"1,234 videos"``; ``many`` where the plural is irregular."""
-    return f"{n:,} {singular if n == 1 else many or singular + 's'}"
+def plural(n: int, singular: str) -> str:
+    """Return ``"1 video"``, ``"1,234 videos"``."""
+    return f"{n:,} {singular}{'s' * (n != 1)}"
 
 
 def where(sample: SampleRef) -> str:

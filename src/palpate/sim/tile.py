@@ -122,9 +122,9 @@ class Tile:
         z = -np.abs(self.noise(*spectrum))
         return (z - float(z.mean())) * (1.0 / float(z.std()))
 
-    def warp(self, field: Array, amount: float, low: float = 4.0, high: float = 20.0) -> Array:
+    def warp(self, field: Array, amount: float) -> Array:
         """Look ``field`` up at places displaced by smooth noise of deviation ``amount`` mm."""
-        dy, dx = (self.noise(low, high) * (amount / self.px) for _ in range(2))
+        dy, dx = (self.noise(4.0, 20.0) * (amount / self.px) for _ in range(2))
         return sample_periodic(field, self.y * (1.0 / self.px) + dy, self.x * (1.0 / self.px) + dx)
 
     def cells(self, size: float, jitter: float = 0.9) -> Cells:
