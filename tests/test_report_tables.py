@@ -40,7 +40,6 @@ from palpate.report.terminal import rankings
         *((decimals, ([v],), d) for v, d in ((1234.0, 0), (12.0, 2), (0.5, 3), (0.0123, 4))),
         (decimals, ([],), 1),
         (plural, (1, "video"), "1 video"),
-        (plural, (1200, "match", "matches"), "1,200 matches"),
     ],
 )
 def test_numbers_are_written_for_people(function, args, text):
