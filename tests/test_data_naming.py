@@ -152,7 +152,7 @@ def test_a_template_of_the_photos_is_held_against_the_photos(columns, tmp_path):
         ("vision", "rig/{video}/photo/{frame}.png", "video", ["cup0", "cup0", "cup1", "cup1"]),
         ("tactile", "gel/{frame}.png", "frame", [8, 9, 10, 11]),
     ):
-        manifest, problems, _ = read_names(table, **{side: template})
+        manifest, problems, _ = read_names(table, {side: template})
         (named,) = name_recordings([manifest], template)
         assert (named.column(column), problems) == (values, [])
 
@@ -195,7 +195,7 @@ def test_bad_lines_and_wrong_options_are_named(tmp_path, capsys):
     fails("at most 20,000,000 frames", read_names, path)
     table = tmp_path / "t.csv"
     table.write_text(rows_of("own", range(3)) + "\nelse/where.png,else/where.png")
-    _, problems, _ = read_names(table, tactile="rig/{video}/touch/{frame}.png")
+    _, problems, _ = read_names(table, {"tactile": "rig/{video}/touch/{frame}.png"})
     assert [p.kind for p in problems] == ["no-match"]
     table.write_text("id,tactile\n1,a/1.png\n1,a/2.png\n")
     _, problems, _ = read_names(table)

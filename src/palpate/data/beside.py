@@ -11,15 +11,17 @@ from __future__ import annotations
 from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path, PurePosixPath
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import polars as pl
 
 from palpate.core import PalpateError, Split, few
 from palpate.data.manifest import PART_NAMES
 from palpate.data.rows import relocated
-from palpate.data.scanning import Cells, Scan
 from palpate.data.tables import LINE, TABLES, Table, header_of, open_table
+
+if TYPE_CHECKING:
+    from palpate.data.scanning import Cells, Scan
 
 #: Other names of the columns that a table may fill.
 SYNONYMS = {"label": "material", "class": "material", "category": "material"}

@@ -122,7 +122,7 @@ def _together(sides: Mapping[str, Sequence[str]], several: bool) -> dict[str, st
     count = len(next(iter(written.values())))
     text = template_of(bare, several)
     template = Template.parse(text)
-    plain = all(map(template.match, bare)) and text.count(_ROLE) == count
+    plain = all(map(template.match, set(bare))) and text.count(_ROLE) == count
     if len(sides) < 2 or not plain or any(len(words) != count for words in written.values()):
         return {}
     templates: dict[str, str] = {}

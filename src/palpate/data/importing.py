@@ -138,12 +138,15 @@ def validate(
 
 def _scan_of(manifest: Manifest) -> tuple[str, Facts, Scan]:
     """The rows of an import, to be checked again."""
-    named = {name: manifest.facts.get(name, "unknown") for name in ("license", "citation", "url")}
-    dataset, group = (
-        manifest.facts.get("dataset", "an import"),
-        manifest.facts.get("group", "video"),
+    fact = manifest.facts.get
+    facts = Facts(
+        name=fact("dataset", "an import"),
+        license=fact("license", "unfact"),
+        citation=fact("citation", "unfact"),
+        url=fact("url", "unfact"),
+        samples="as many as it has rows",
+        group=fact("group", "video"),
     )
-    facts = Facts(name=dataset, samples="as many as it has rows", group=group, **named)
     scan = Scan(manifest.root, dict(manifest.facts), met=manifest.facts.get("links") == FOLLOWED)
     for k, row in enumerate(manifest.table.iter_rows(named=True), 1):
         cells = {name: cell for name, cell in row.items() if cell is not None}

@@ -20,6 +20,7 @@ import posixpath
 import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import polars as pl
@@ -52,7 +53,9 @@ INTERVAL = re.compile(r"\s*([^\s,;]+)[\s,;]+(\d{1,9})[\s,;]+(\d{1,9})(?:[\s,;]+(
 MOST_FRAMES = 20_000_000
 
 
-def read_names(source: Any, **options: Any) -> tuple[Manifest, list[Problem], Split | None] | None:
+def read_names(
+    source: Any, options: Mapping[str, Any] = MappingProxyType({})
+) -> tuple[Manifest, list[Problem], Split | None] | None:
     """Read a list of samples whose images are not at hand.
 
     Args:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -83,7 +83,7 @@ def read_samples(
         return source, []
     if not isinstance(source, (str, Path)):
         # Rows whose images are not at hand are those of a list on disk.
-        named = None if "root" in options else read_names(source, **options)
+        named = None if "root" in options else read_names(source, options)
         if named is None:
             return _of_table(table_of(source), Path(), skip_bad, options)
         raise_if(named[1], skip_bad)
@@ -95,7 +95,7 @@ def read_samples(
         if is_manifest(path):
             return Manifest.load(path, options.get("root")), []
         if path.is_file() and (path.suffix.lower() not in TABLES or is_list(path)):
-            if named := read_names(path, **options) if set(options) - {"root"} else None:
+            if named := read_names(path, options) if set(options) - {"root"} else None:
                 raise_if(named[1], skip_bad)
                 return named[:2]
             listed = read_list(path, skip_bad=skip_bad)
@@ -154,18 +154,9 @@ def _of_table(
     rows, _ = manifest_rows(cells, len(table.lines), table.where, classes, table.problems)
     facts = {"dataset": Path(table.name).stem}
     base = Path(options.get("root", root))
-    if "root" not in options and _without_files(rows, base):
-        rows = [(k, {c: v for c, v in row.items() if c not in IMAGE_COLUMNS}) for k, row in rows]
-        facts["images_not_below"] = str(base)
     places = [(table.where(k), row) for k, row in rows]
     scan = Scan(base, rows=places, problems=table.problems)
     return _of_scan(scan, table.name, facts, skip_bad, quiet)
-
-
-def _without_files(rows: Sequence[tuple[int, dict[str, Any]]], root: Path) -> bool:
-    """Whether rows name images, and none of these is a file: their root is not known."""
-    paths = [row[c] for _, row in rows for c in IMAGE_COLUMNS if row.get(c)]
-    return bool(paths) and not any((root / path).is_file() for path in paths)
 
 
 def _of_scan(

@@ -60,7 +60,7 @@ def read(
     else:
         listed = path.is_file() and not is_manifest(path) and (options or not is_list(path))
         table = path if listed else None
-    named = None if table is None else read_names(table, **options, root=root)
+    named = None if table is None else read_names(table, {**options, "root": root})
     if named is not None:
         manifest, skipped, split = named
         if skipped and not skip_bad:
@@ -76,8 +76,6 @@ def read(
     notes = _notes(skipped)
     if "side_assumed" in manifest.facts:
         notes.append(Note("photos-assumed", {"name": manifest.facts.get("dataset", "")}))
-    if lost := manifest.facts.get("images_not_below"):
-        notes.append(Note("images-not-found", {"root": lost}))
     return Source(manifest, splits_of(path) if path is not None else {}, notes)
 
 

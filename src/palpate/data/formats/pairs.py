@@ -27,6 +27,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import polars as pl
 
@@ -50,7 +51,10 @@ from palpate.data.mapping import compile_maps
 from palpate.data.rows import manifest_rows, odd_groups, read_classes, relocated, without_repeats
 from palpate.data.scanning import Facts, Format, Scan
 from palpate.data.tables import TABLES, header_of, open_table
-from palpate.data.templates import FIX, Fields, Matches, assign
+from palpate.data.templates import FIX, Fields, Matches, Template, assign
+
+if TYPE_CHECKING:
+    from palpate.data.formats.published import Layout
 
 LOOKS_FOR = (
     f"a table ({', '.join(TABLES)}) with the columns vision and tactile, or a folder of images"
@@ -60,6 +64,8 @@ FACTS = Facts(
     samples="as many as the table has rows",
     group="the column video, if there is one",
 )
+#: Folders that are looked into for a published layout.
+PEEKS = 60
 #: No file system has names of more bytes.
 LONGEST_NAME = 255
 MAP = {"columns": {"vision": "YOUR_COLUMN"}}
@@ -134,7 +140,7 @@ def scan(source: Path, options: Options, *, progress: Progress = quiet) -> Scan:
                 if part := PART_NAMES.get(path.stem.lower()):
                     row.setdefault("split", part)
         if not tables:
-            read_folder(result, templates, options.side, maps, labels)
+            _read_folder(result, templates, options.side, maps, labels)
     progress("reading rows", 1, 1)
     result.suspicious += odd_groups(source, result.rows)
     absent = [name for name in SIDES if result.rows and name not in result.rows[0][1]]
@@ -151,6 +157,36 @@ def scan(source: Path, options: Options, *, progress: Progress = quiet) -> Scan:
 
 
 FORMAT = Format(FACTS, detect, LOOKS_FOR, scan, record=Options)
+
+
+def format_of(layout: Layout) -> Format:
+    """The format of a published layout."""
+    templates = layout.templates
+
+    def detect(source: Path) -> bool:
+        """Whether the tactile template matches one of the first files, and constants are there."""
+        constant = (text for text in templates.values() if "{" not in text)
+        if not all((source / text).is_file() for text in constant):
+            return False
+        tactile = Template.parse(templates["tactile"])
+        folders = islice(os.walk(source, followlinks=True), PEEKS)
+        paths = (Path(folder, name) for folder, _, names in folders for name in names)
+        return any(tactile.match(path.relative_to(source).as_posix()) for path in paths)
+
+    def scan(source: Path, *, progress: Progress = quiet) -> Scan:
+        result = Scan(require_folder(source, layout.facts.name))
+        progress("reading rows", 0, 1)
+        _read_folder(result, dict(templates), None, layout.columns, None, published=True)
+        result.facts.pop("templates", None)
+        worded = any("text" in row for _, row in result.rows)
+        result.facts |= {"text_source": "table" if worded else "none"}
+        result.facts |= {"layout": templates["tactile"]}
+        if "template_vision" not in result.facts:
+            result.facts["vision"] = "none in this layout"
+        progress("reading rows", 1, 1)
+        return result
+
+    return Format(layout.facts, detect, " and ".join(templates.values()), scan)
 
 
 def _read_table(
@@ -197,7 +233,7 @@ def _read_table(
             result.rows.append((table.where(k), row))
 
 
-def read_folder(
+def _read_folder(
     result: Scan,
     texts: Mapping[str, str],
     side: Side | None,

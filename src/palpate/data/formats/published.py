@@ -8,65 +8,28 @@ inferred.
 
 from __future__ import annotations
 
-import os
 from collections.abc import Mapping
-from functools import partial
-from itertools import islice
-from pathlib import Path
+from dataclasses import dataclass
 
-from palpate.core import Progress, quiet
-from palpate.data.formats import pairs
-from palpate.data.formats.layout import require_folder
-from palpate.data.scanning import Facts, Format, Scan
-from palpate.data.templates import Template
+from palpate.data.scanning import Facts
 
-#: Folders that ``detect`` opens.
-PEEKS = 60
+
+@dataclass(frozen=True)
+class Layout:
+    """A published layout."""
+
+    facts: Facts
+    templates: Mapping[str, str]  # column of images -> template
+    columns: Mapping[str, str]  # manifest column -> map expression over the fields
+
+
 OBJECTFOLDER = (
     "R. Gao et al.: The ObjectFolder Benchmark: Multisensory Learning with Neural and Real "
     "Objects. CVPR, 2023"
 )
 OBJECTFOLDER_LICENSE = "unknown for ObjectFolder-Real (CC BY 4.0 is stated for ObjectFolder 2.0)"
 OBJECTFOLDER_SENSOR = "GelSight (T3 says black, Sparsh says Mini, AnyTouch files it with GelSlim)"
-
-
-def detect(source: Path, templates: Mapping[str, str]) -> bool:
-    """Whether the tactile template matches one of the first files, and constants are there."""
-    constant = (text for text in templates.values() if "{" not in text)
-    if not all((source / text).is_file() for text in constant):
-        return False
-    tactile = Template.parse(templates["tactile"])
-    folders = islice(os.walk(source, followlinks=True), PEEKS)
-    paths = (Path(folder, name) for folder, _, names in folders for name in names)
-    return any(tactile.match(path.relative_to(source).as_posix()) for path in paths)
-
-
-def _scan(
-    source: Path, templates: Mapping[str, str], columns: Mapping[str, str], progress: Progress
-) -> Scan:
-    """Read a folder by the templates of a row."""
-    result = Scan(require_folder(source, "a published data set"))
-    progress("reading rows", 0, 1)
-    pairs.read_folder(result, dict(templates), None, columns, None, published=True)
-    result.facts.pop("templates", None)
-    worded = any("text" in row for _, row in result.rows)
-    result.facts |= {"layout": templates["tactile"], "text_source": "table" if worded else "none"}
-    result.facts |= {} if "template_vision" in result.facts else {"vision": "none in this layout"}
-    progress("reading rows", 1, 1)
-    return result
-
-
-def _row(facts: Facts, templates: Mapping[str, str], **columns: str) -> Format:
-    """The format of a row."""
-
-    def scan(source: Path, *, progress: Progress = quiet) -> Scan:
-        return _scan(source, templates, columns, progress)
-
-    looks_for = " and ".join(templates.values())
-    return Format(facts, partial(detect, templates=templates), looks_for, scan)
-
-
-TARF = _row(
+TARF = Layout(
     Facts(
         name="TaRF",
         citation="Y. Dou, F. Yang, Y. Liu, A. Loquercio, A. Owens: Tactile-Augmented Radiance "
@@ -83,10 +46,10 @@ TARF = _row(
         "tactile": "touch/{video}_40_30/{frame}.jpg",
         "background": "touch_bg/{video}_40_30/bg.jpg",
     },
-    id="video || '_40_30/' || frame",  # as split_interval.json names it
-    sensor="'DIGIT'",
+    # The id is as split_interval.json names it.
+    {"id": "video || '_40_30/' || frame", "sensor": "'DIGIT'"},
 )
-OBJECTFOLDER_REAL = _row(
+OBJECTFOLDER_REAL = Layout(
     Facts(
         name="ObjectFolder-Real",
         citation=OBJECTFOLDER,
@@ -101,9 +64,9 @@ OBJECTFOLDER_REAL = _row(
         "tactile": "{object:d}/tactile_data/{video}/0/gelsight/{frame}.png",
         "background": "{object:d}/tactile_data/{video}/0/gelsight/0.png",
     },
-    sensor="'GelSight'",
+    {"sensor": "'GelSight'"},
 )
-OBJECTFOLDER_GENERATION = _row(
+OBJECTFOLDER_GENERATION = Layout(
     Facts(
         name="ObjectFolder-Real, visuo-tactile cross-generation",
         citation=OBJECTFOLDER,
@@ -119,9 +82,9 @@ OBJECTFOLDER_GENERATION = _row(
         "tactile": "touch/{object:d}/{contact:d}.png",
         "background": "touch_ref/touch_ref.png",
     },
-    sensor="'GelSight'",
+    {"sensor": "'GelSight'"},
 )
-YCB_SLIDE = _row(
+YCB_SLIDE = Layout(
     Facts(
         name="YCB-Slide",
         citation="S. Suresh, Z. Si, S. Anderson, M. Kaess, M. Mukadam: MidasTouch: Monte-Carlo "
@@ -138,5 +101,12 @@ YCB_SLIDE = _row(
         "vision": "real/{object}/{video}/webcam_frames/frame_{frame}.jpg",
         "tactile": "real/{object}/{video}/frames/frame_{frame}.jpg",
     },
-    sensor="'DIGIT'",
+    {"sensor": "'DIGIT'"},
 )
+#: Name of the format -> its layout, in the order in which they are tried.
+LAYOUTS = {
+    "tarf": TARF,
+    "objectfolder-generation": OBJECTFOLDER_GENERATION,
+    "objectfolder": OBJECTFOLDER_REAL,
+    "ycb-slide": YCB_SLIDE,
+}
