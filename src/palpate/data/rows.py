@@ -130,7 +130,7 @@ def relocated(written: Iterable[str], root: Path) -> dict[str, str]:
     places: dict[str, str] = {}
     for paths in by_head.values():
         places |= _found(paths, root)
-    return {path: place for path, place in places.items() if path != place}
+    return {path: below for path, below in places.items() if path != below}
 
 
 def _found(paths: Mapping[str, Sequence[str]], root: Path) -> dict[str, str]:

@@ -32,7 +32,7 @@ from typing import TYPE_CHECKING
 import polars as pl
 
 from palpate.core import PalpateError, Progress, few, quiet, require
-from palpate.data.beside import join_tables, tables_of_pairs
+from palpate.data.adjacent import join_tables, tables_of_pairs
 from palpate.data.detection import (
     SIDES,
     TARGETS,
@@ -218,8 +218,8 @@ def _read_table(
     for row, column in images:
         row[column] = places.get(row[column], row[column])
     if places:
-        written, place = next(iter(places.items()))
-        text = f"{len(places)} paths are read by their end: {written!r} is {place!r}"
+        written, below = next(iter(places.items()))
+        text = f"{len(places)} paths are read by their end: {written!r} is {below!r}"
         result.suspect(path, "other-paths", text)
     for k, row in rows:
         lacking = " and no ".join(side for side in sides if side not in row)

@@ -31,7 +31,7 @@ FILLED = ("object", "session", "material", "text", "sensor", "domain", "video", 
 FIELDS, SHARE = ("object", "video", "session", "contact"), 0.5
 
 
-def tables_beside(folder: Path) -> list[Path]:
+def adjacent_tables(folder: Path) -> list[Path]:
     """The tables in a folder, and the one next to it that has its name."""
     own = sorted(p for p in folder.iterdir() if p.suffix.lower() in TABLES and p.is_file())
     named = folder.resolve()
@@ -39,9 +39,9 @@ def tables_beside(folder: Path) -> list[Path]:
 
 
 def tables_of_pairs(folder: Path) -> list[Path]:
-    """The tables beside the images of a folder that name photos and tactile images of it."""
+    """The tables next to the images of a folder that name photos and tactile images of it."""
     pairs: list[Path] = []
-    for path in tables_beside(folder):
+    for path in adjacent_tables(folder):
         with suppress(PalpateError):
             if {"vision", "tactile"} <= set(header_of(path)):
                 cells = open_table(path).read(["vision", "tactile"])["tactile"].drop_nulls()
@@ -51,8 +51,8 @@ def tables_of_pairs(folder: Path) -> list[Path]:
 
 
 def join_tables(result: Scan, rows: Sequence[tuple[str, Cells]]) -> None:
-    """Fill the rows of a folder from the tables beside it; the parts of lists become splits."""
-    for path in tables_beside(result.base):
+    """Fill the rows of a folder from the tables next to them; the parts of lists become splits."""
+    for path in adjacent_tables(result.base):
         try:
             table = open_table(path)
             names = list(dict.fromkeys(n for n in table.names if n and n not in table.nested))
