@@ -48,10 +48,10 @@ def text_of(node):
 
 
 def texts(node):
-    """Texts below a node, but for parts of others, docstrings and what an extra is for."""
+    """Texts below a node, but for parts of others and docstrings."""
     if text := text_of(node):
         yield text
-    elif getattr(getattr(node, "func", None), "id", "") != "require_extra":
+    else:
         doc = isinstance(node, DOCUMENTED) and ast.get_docstring(node) is not None
         for child in ast.iter_child_nodes(node):
             if not (doc and child is node.body[0]):

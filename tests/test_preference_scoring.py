@@ -444,6 +444,7 @@ def write_database(path, plan, rows):
         disk.execute("INSERT INTO study VALUES (?)", (plan.study,))
         disk.execute("CREATE TABLE votes (rater, trial, choice, ms, at, undone, received)")
         disk.executemany("INSERT INTO votes VALUES (?, ?, ?, ?, ?, ?, ?)", rows)
+        disk.execute(f"PRAGMA user_version = {len(rows)}")  # the end mark
 
 
 def test_no_vote_is_nothing_to_score(study):

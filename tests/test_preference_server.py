@@ -2,21 +2,28 @@
 
 import json
 import resource
+import select
+import shutil
+import signal
 import socket
 import sqlite3
+import time
+from contextlib import ExitStack, closing, suppress
 from types import SimpleNamespace
 
 import pytest
 
-from forge.people import pair_study
-from forge.servers import Serving
-from palpate.core import PalpateError
+from forge.people import Crowd, pair_study
+from forge.servers import AT, Serving
+from palpate import preference
+from palpate.core import Note, PalpateError
 
 pytest.importorskip("uvicorn", reason="uvicorn is not installed")
 
 from preference_load import measure
 
 from palpate.preference import server as served
+from palpate.preference.plan import Plan
 from palpate.preference.store import VoteStore
 
 
@@ -217,6 +224,114 @@ def test_a_killed_server_goes_on_with_its_votes_and_invitations(study, tmp_path)
         assert sorted(server.tokens) == ["r01", "r02", "r03"]
         assert server.send("r01", 0) == (200, {"stored": "already"})
         assert server.send("r03", 0) == (200, {"stored": True})
+
+
+@pytest.fixture(scope="module")
+def planned(rated, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("planned") / "study"
+    rated.make(folder, items=4, raters=2, count=2, size=32)
+    return folder
+
+
+def voted(planned, folder, number):
+    """A folder with all votes of a served study, whose process a signal ended; its exit status."""
+    shutil.copytree(planned, folder)
+    plan = Plan.load(folder)
+    with Serving(folder, plan.public(), verb=True) as server:
+        for rater in server.tokens:
+            for vote in Crowd({"ours": 1.0, "gvst": 0.0}).download(plan, rater)["votes"]:
+                vote |= {"study": plan.study, "rater": rater, "at": AT}
+                assert server.json("POST", "/vote", rater, vote)[0] == 200
+        assert {p.stat().st_mode & 0o77 for p in folder.glob("*.db*")} == {0}
+        assert (folder / "plan.json").stat().st_mode & 0o77 == 0
+        server.kill(number)
+    return 2 * len(plan.trials), server.process.returncode
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
+def test_a_server_that_is_stopped_leaves_all_votes_in_one_file(planned, tmp_path, number):
+    count, status = voted(planned, tmp_path / "study", number)
+    assert status in (0, 130)
+    log = tmp_path / "study" / "study.db-wal"
+    assert not log.exists() or not log.stat().st_size
+    log.unlink(missing_ok=True)
+    results = preference.score(tmp_path / "study")
+    assert sum(r["votes"] for r in results.settings["preference"]["raters"]) == count
+    assert not any(note.code == "votes-so-far" for note in results.notes)
+
+
+def test_votes_in_a_log_that_was_not_copied_are_missed(planned, tmp_path):
+    folder = tmp_path / "study"
+    count, _ = voted(planned, folder, signal.SIGKILL)
+    assert Note("votes-so-far", {"count": count}) in preference.score(folder).notes
+    shutil.copytree(planned, tmp_path / "copy")
+    shutil.copy(folder / "study.db", tmp_path / "copy")
+    for _ in "twice":  # to read the file must not make a log
+        with pytest.raises(PalpateError, match=r"also those in study\.db-wal\. Got 0"):
+            preference.score(tmp_path / "copy")
+    VoteStore(folder / "study.db", Plan.load(folder).study).close()
+    with closing(sqlite3.connect(folder / "study.db")) as disk, disk:
+        disk.execute("DELETE FROM votes WHERE rater = 'r02'")
+    with pytest.raises(
+        PalpateError, match=rf"the {count} that its server counted\. Got {count // 2}"
+    ):
+        preference.score(folder)
+    VoteStore(folder / "study.db", Plan.load(folder).study).close()  # it counts anew
+    assert not any(note.code == "votes-so-far" for note in preference.score(folder).notes)
+
+
+def half_open(server, address, count):
+    """Connections from an address of this machine that never end the head of their request."""
+    sockets = []
+    for _ in range(count):
+        peer = ("127.0.0.1", server.port)
+        sockets.append(socket.create_connection(peer, source_address=(address, 0)))
+        sockets[-1].sendall(b"GET / HTTP/1.1\r\nHost: study\r\n")
+    return sockets
+
+
+def open_ones(sockets):
+    """How many of some connections the server has not closed."""
+    closed, _, _ = select.select(sockets, [], [], 0)
+    return len(sockets) - len(closed)
+
+
+def test_raters_are_served_while_others_hold_connections_open(study, tmp_path):
+    with Serving(tmp_path, study, wait=3.0) as server, ExitStack() as stack:
+        for addresses, most in (("3", served.MOST_OF_ADDRESS), ("456789", served.MOST_WAITING)):
+            sockets = [
+                stack.enter_context(each)
+                for address in addresses
+                for each in half_open(server, f"127.0.0.{address}", 300 // len(addresses))
+            ]
+            start = time.monotonic()
+            for k in range(10):
+                assert server.send("r01", k)[0] == 200
+                assert server.request("GET", "/study.json", "r02")[0] == 200
+            assert time.monotonic() - start < 10  # 20 requests
+            assert 0 < open_ones(sockets) <= most
+        body = server.json("GET", "/votes", "r01")[1]
+        assert len(body["votes"]) == 10
+        time.sleep(max(0, start + 4 - time.monotonic()))
+        assert open_ones(sockets) == 0
+
+
+def test_a_body_that_does_not_come_is_not_waited_for(study, tmp_path):
+    with Serving(tmp_path, study, wait=0.5) as server:
+        head = "POST /vote HTTP/1.1\r\nHost: study\r\nAuthorization: Bearer {}\r\n"
+        for token, status in ((server.tokens["r01"], b" 408 "), ("guessed", b" 403 ")):
+            with socket.create_connection(("127.0.0.1", server.port), timeout=5) as slow:
+                slow.sendall(head.format(token).encode() + b"Content-Length: 4000\r\n\r\n{")
+                assert status in slow.recv(4096)
+                closed = False
+                for _ in range(30):  # a drop now and then keeps no connection
+                    with suppress(OSError):
+                        slow.sendall(b" ")
+                    time.sleep(0.1)
+                    if closed := bool(select.select([slow], [], [], 0)[0]):
+                        break
+                assert closed
+        assert server.send("r01")[0] == 200
 
 
 def test_no_vote_is_lost_or_double_when_the_server_is_killed(tmp_path):

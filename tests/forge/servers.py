@@ -185,6 +185,7 @@ def load(study):
     return types.SimpleNamespace(public=lambda: public)
 
 server.Plan.load = load
+server.LONGEST_WAIT = float(sys.argv[3])
 server.serve(sys.argv[1], ready=ready, **json.loads(sys.argv[2]))
 """
 #: A time as a browser writes it.
@@ -197,20 +198,33 @@ class Serving:
     Args:
         folder: where the study and the votes lie.
         public: the public form of a plan.
+        verb: serve the plan that lies in the folder, by the command line.
+        wait: the longest wait for a request, in seconds.
         **options: of :func:`palpate.preference.server.serve`.
     """
 
-    def __init__(self, folder, public, **options):
+    def __init__(self, folder, public, *, verb=False, wait=10.0, **options):
         self.folder, self.public, self.tokens = folder, public, {}
+        self.verb, self.wait = verb, wait
         (folder / "public.json").write_text(json.dumps(public))
         self.database = folder / "study.db"
         self.start(**{"port": 0, "invite": len(public["raters"])} | options)
 
     def start(self, **options):
-        command = [sys.executable, "-c", _PROGRAM, self.folder, json.dumps(options)]
-        self.process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
-        ready = json.loads(self.process.stdout.readline())
-        self.url, self.tokens = ready["url"], self.tokens | ready["tokens"]
+        command = ["-c", _PROGRAM, self.folder, json.dumps(options), str(self.wait)]
+        if self.verb:
+            words = [word for name, value in options.items() for word in (f"--{name}", str(value))]
+            command = ["-m", "palpate", "preference", "serve", self.folder, *words]
+        self.process = subprocess.Popen(
+            [sys.executable, *command], stdout=subprocess.PIPE, text=True
+        )
+        if self.verb:
+            self.url = self.process.stdout.readline().split()[-1]
+            lines = [self.process.stdout.readline().split() for _ in range(options["invite"])]
+            self.tokens |= {rater: link.partition("token=")[2] for rater, link in lines}
+        else:
+            ready = json.loads(self.process.stdout.readline())
+            self.url, self.tokens = ready["url"], self.tokens | ready["tokens"]
         self.port = int(self.url.rsplit(":", 1)[1].strip("/"))
 
     def kill(self, number=signal.SIGKILL):

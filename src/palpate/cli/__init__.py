@@ -10,9 +10,10 @@ a full disk behind ``>`` is an error.
 from __future__ import annotations
 
 import os
+import signal
 import sys
 from collections.abc import Generator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from typing import Any, TextIO
 
 from palpate.cli.verbs import INTERRUPTED, OK, USER_ERROR, VERBS
@@ -42,8 +43,13 @@ def main(argv: list[str] | None = None) -> int:
 
     Returns:
         0 done, or no leak found; 1 a check failed, or a split leaks; 2 a user's mistake, explained
-        in one line; 3 an audit cannot tell; 70 a bug in palpate; 130 stopped by Ctrl-C.
+        in one line; 3 an audit cannot tell; 70 a bug in palpate; 130 stopped by Ctrl-C, SIGTERM or
+        a terminal that closes.
     """
+    for number in (signal.SIGTERM, signal.SIGHUP):
+        if signal.getsignal(number) is signal.SIG_DFL:  # nohup ignores one of them
+            with suppress(ValueError):  # not in the main thread
+                signal.signal(number, signal.default_int_handler)
     try:
         with resilient_streams():
             try:

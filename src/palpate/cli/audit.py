@@ -18,7 +18,6 @@ from palpate.cli.terminal import (
     Switch,
     Terminal,
     guard_output,
-    require_extra,
     working_folder,
 )
 from palpate.cli.verbs import FAILED_CHECK, OK, UNKNOWN
@@ -134,8 +133,6 @@ def _check(options: Options) -> None:
         fix="E.g. palpate audit train.txt test.txt",
     )
     require(0 <= outputs.fail_over <= 1, "fail_over", "must lie in [0, 1]", outputs.fail_over)
-    if options.comparison.encoder is not None:
-        require_extra("palpate audit --encoder")
     inputs = [*options.paths, *(p for p in (options.split, options.pretrain) if p)]
     if outputs.output is not None and is_table(outputs.output):
         formats = (TABLE_FORMAT.encode(), b"id,video,frame,material,leaking")

@@ -8,7 +8,7 @@ from typing import Annotated, Any, Literal
 
 import tyro
 
-from palpate.cli.terminal import Common, Files, OptionalOutPath, Switch, Terminal, require_extra
+from palpate.cli.terminal import Common, Files, OptionalOutPath, Switch, Terminal
 from palpate.core import require
 from palpate.training.options import Compute
 
@@ -107,7 +107,6 @@ class Options(Common):
 
 def run(options: Options, terminal: Terminal) -> dict[str, Any]:
     """Probe, print the scores, write JSON or a page."""
-    require_extra("palpate probe")
     training, output = options.training, options.output
     got, fix = "both" if training.train else "neither", "E.g. --encoder palpate/mini"
     must = "Either an encoder or training must be chosen"

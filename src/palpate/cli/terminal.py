@@ -90,6 +90,8 @@ OPTION_NAMES: dict[tuple[str, str], str] = {
 }
 #: Arguments whose True and False are words of an option.
 WORDED = ("normalize",)
+#: Options that need the extra ``all`` in verbs that do without.
+NEEDING_EXTRA = ("encoder", "inception", "lpips")
 #: What would break a line of the terminal, or color it.
 _CONTROL = re.compile("[\x00-\x1f\x7f-\x9f\u2028\u2029]")
 #: The default of an option in its help, unless it says nothing.
@@ -296,15 +298,31 @@ class _LogProgress:
             self.printed = self.printed - {task} if ended else self.printed | {task}
 
 
-def require_extra(purpose: str) -> None:
-    """Check that the packages of the extra ``all`` are installed, before any work.
+def _require_variables() -> None:
+    """Check variables of the environment that break libraries while they load.
 
     Raises:
-        MissingExtraError: if torch, diffusers, transformers or av is absent.
+        PalpateError: naming one.
     """
-    for package in ("torch", "diffusers", "transformers", "safetensors", "av"):
-        if importlib.util.find_spec(package) is None:
-            raise MissingExtraError(package, "all", purpose)
+    must, fix = "The variable {} must be {}, as libraries need it", "Unset it"
+    epoch = os.environ.get("SOURCE_DATE_EPOCH", "0")
+    require(epoch.isdecimal(), None, must.format("SOURCE_DATE_EPOCH", "a number"), epoch, fix=fix)
+    documented, got = sys.flags.optimize < 2, "2, which removes docstrings"
+    require(documented, None, must.format("PYTHONOPTIMIZE", "0 or 1"), got, fix=fix)
+
+
+def _require_extra(verb: str, options: Any) -> None:
+    """Check before any work that the packages are there that a verb or its options need.
+
+    Raises:
+        MissingExtraError: if one of the extra ``all`` is absent.
+    """
+    values = _keywords(options)
+    needing = [f" {option_name(verb, name)}" for name in NEEDING_EXTRA if values.get(name)]
+    if VERBS[verb].extra or needing:
+        for package in ("torch", "diffusers", "transformers", "safetensors", "av"):
+            if importlib.util.find_spec(package) is None:
+                raise MissingExtraError(package, "all", f"palpate {verb}{''.join(needing[:1])}")
 
 
 def guard_output(
@@ -495,7 +513,10 @@ def _set_threads() -> None:
     os.environ.setdefault("OMP_WAIT_POLICY", "passive")
 
 
-def _file_error(error: OSError) -> PalpateError:
+def _explained(verb: str, error: OSError | ModuleNotFoundError) -> PalpateError:
+    """What cannot be read, written or imported, as must, got, fix."""
+    if isinstance(error, ModuleNotFoundError):
+        return MissingExtraError((error.name or "").partition(".")[0], "all", f"palpate {verb}")
     file = error.filename or "the files of this command"
     got = error.strerror or str(error)
     if error.errno in NO_ROOM:
@@ -527,8 +548,8 @@ def run_verb(name: str, args: Sequence[str]) -> int:
         if as_json and FIRST:
             _write_json(result)
         return status
-    except (PalpateError, OSError) as caught:
-        error = caught if isinstance(caught, PalpateError) else _file_error(caught)
+    except (PalpateError, OSError, ModuleNotFoundError) as caught:
+        error = caught if isinstance(caught, PalpateError) else _explained(name, caught)
         if error.shared and not FIRST:
             return USER_ERROR
         _print_error(f"palpate {name}: {error_line(name, error)}")
@@ -554,6 +575,7 @@ def run_verb(name: str, args: Sequence[str]) -> int:
 
 
 def _call(name: str, args: Sequence[str]) -> tuple[Any, int]:
+    _require_variables()
     for arg in args:  # an empty variable of the shell, a path that is not UTF-8
         fit = arg and not re.search("[\ud800-\udfff]", arg)
         must, fix = "must be UTF-8 and not empty", "Rename the path, or check the shell's variables"
@@ -567,8 +589,7 @@ def _call(name: str, args: Sequence[str]) -> tuple[Any, int]:
     verb = VERBS[name]
     module = importlib.import_module(f"palpate.cli.{verb.module}")
     options = parse(name, module.Options, args)
-    if verb.extra:
-        require_extra(f"palpate {name}")
+    _require_extra(name, options)
     terminal = Terminal(options, shlex.join(["palpate", *name.split(), *args]))
     answer = module.run(options, terminal)
     if hasattr(answer, "to_json"):

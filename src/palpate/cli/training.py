@@ -101,12 +101,12 @@ class Training(Common):
         """The preset of a verb with what ``--set`` changes.
 
         Raises:
-            PalpateError: if there is none, or the data are not there: before torch is imported,
-                which takes seconds.
+            PalpateError: if there is none, the data are not there, or a tracker is not: before
+                torch is imported, which takes seconds.
         """
         from palpate.data.formats import require_source
 
-        preset = PRESETS[verb].preset(self.preset, self.settings)
+        preset, _ = PRESETS[verb].preset(self.preset, self.settings), self.machine.compute
         require_source(self.data)
         return preset
 

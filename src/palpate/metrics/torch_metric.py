@@ -23,7 +23,7 @@ from typing import Any, Self
 
 import numpy as np
 
-from palpate.core import MissingExtraError, Score, require
+from palpate.core import PalpateError, Score, require
 from palpate.metrics import streaming
 from palpate.metrics.streaming import Batch
 
@@ -31,7 +31,8 @@ try:
     torch: Any = importlib.import_module("torch")
     Metric: Any = importlib.import_module("torchmetrics").Metric
 except ImportError as error:
-    raise MissingExtraError(str(error.name), "train", "palpate.metrics.torch_metric") from None
+    must, fix = "palpate.metrics.torch_metric needs torch and torchmetrics", "pip install both"
+    raise PalpateError(must, f"no package {error.name}", fix) from None
 
 #: Arguments of ``torchmetrics.Metric``.
 THEIRS = (

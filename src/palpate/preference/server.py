@@ -10,6 +10,10 @@ The last three take the token as ``Authorization: Bearer``. A vote is answered a
 (write-ahead log, ``synchronous=FULL``); votes that arrive together share one transaction. Its key
 is (rater, trial), so that a vote sent again counts once, and only a later ``undone`` replaces it.
 Nothing but the routes above exists, and no request names a file.
+
+A connection has ``LONGEST_WAIT`` seconds for a request with an invitation; of too many that wait,
+of one address or of all, the oldest is closed for the newest. So raters are served while others
+hold connections open.
 """
 
 from __future__ import annotations
@@ -25,7 +29,7 @@ from collections.abc import AsyncGenerator, Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import asynccontextmanager, closing, suppress
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 from palpate.core import MissingExtraError, PalpateError
 from palpate.preference.page import policy, study_page
@@ -40,12 +44,15 @@ try:
     from starlette.requests import ClientDisconnect, Request
     from starlette.responses import HTMLResponse, JSONResponse, Response
     from starlette.routing import Route
+    from uvicorn.protocols.http.h11_impl import H11Protocol
 except ImportError as error:
     name = str(error.name).partition(".")[0]
     raise MissingExtraError(name, "preference", "The server of a study") from None
 
 #: Longest body of a request, in bytes, and the longest wait for it, in seconds.
 LARGEST_BODY, LONGEST_WAIT = 4096, 10.0
+#: Connections that wait for a request with an invitation: of all addresses, and of one.
+MOST_WAITING, MOST_OF_ADDRESS = 256, 64
 #: Requests a second of one rater; a page that was offline may send all its votes at once.
 RATE = 5.0
 #: Seconds after which a page tries again when the disk is full or it came too often.
@@ -60,6 +67,59 @@ FIELDS = dict.fromkeys(("study", "rater", "trial", "choice", "at"), str) | {
     "ms": int,
     "undone": int,
 }
+
+
+class _Connection(H11Protocol):
+    """A connection that is closed at its ``deadline``, unless a rater's request is being answered.
+
+    Attributes:
+        deadline: while it waits for a request with an invitation.
+    """
+
+    deadline: asyncio.TimerHandle | None = None
+
+    def connection_made(self, transport: Any) -> None:
+        """Wait for a request, and end the oldest others that do so where they are too many."""
+        super().connection_made(transport)
+        self.app_state = {**self.app_state, "connection": self}
+        self.wait()
+        for address, most in (
+            (self.client and self.client[0], MOST_OF_ADDRESS),
+            (None, MOST_WAITING),
+        ):
+            waiting = {
+                each.deadline.when(): each
+                for each in cast("set[_Connection]", self.connections)
+                if each.deadline and address in (None, each.client and each.client[0])
+            }
+            if len(waiting) > most:
+                waiting[min(waiting)].end()
+
+    def wait(self) -> None:
+        """Give it time for its next request."""
+        self.admit()
+        self.deadline = self.loop.call_later(LONGEST_WAIT, self.end)
+
+    def admit(self) -> None:
+        """Give its request the time that it takes."""
+        if self.deadline:
+            self.deadline.cancel()
+        self.deadline = None
+
+    def end(self) -> None:
+        """Close it when what is under way has been sent."""
+        self.admit()
+        self.transport.close()
+
+    def on_response_complete(self) -> None:
+        """Wait for the next request."""
+        super().on_response_complete()
+        self.wait()
+
+    def connection_lost(self, exc: Exception | None) -> None:
+        """Forget the deadline."""
+        self.admit()
+        super().connection_lost(exc)
 
 
 class _Study:
@@ -100,6 +160,7 @@ class _Study:
         yield
         writer.cancel()
         self.disk.shutdown()
+        self.store.close()  # before the server hands on the signal that ended it
 
     async def _write(self) -> None:
         """Store what arrived meanwhile in one transaction, then answer: one wait for the disk."""
@@ -120,8 +181,8 @@ class _Study:
     async def _on_disk(self, function: Callable[..., Any], argument: Any) -> Any:
         return await asyncio.get_running_loop().run_in_executor(self.disk, function, argument)
 
-    def rater(self, token: str | None) -> str:
-        """Return whose token it is.
+    def rater(self, request: Request, token: str | None) -> str:
+        """Return whose token a request has, and let its connection live.
 
         Raises:
             HTTPException: 403 for no invitation, 429 for too many requests.
@@ -129,6 +190,7 @@ class _Study:
         rater = self.raters.get(hashed(token)) if token else None
         if rater is None:
             raise HTTPException(403, "no such invitation")
+        request.state.connection.admit()
         left, since = self.budget[rater]
         now = time.monotonic()
         left = min(self.burst(rater), left + RATE * (now - since)) if since else left
@@ -139,11 +201,11 @@ class _Study:
 
     def _bearer(self, request: Request) -> str:
         scheme, _, token = request.headers.get("authorization", "").partition(" ")
-        return self.rater(token if scheme == "Bearer" else None)
+        return self.rater(request, token if scheme == "Bearer" else None)
 
     async def show(self, request: Request) -> Response:
         """Answer ``GET /``."""
-        self.rater(request.query_params.get("token"))
+        self.rater(request, request.query_params.get("token"))
         return HTMLResponse(self.page, headers=PAGE_HEADERS)
 
     async def study(self, request: Request) -> Response:
@@ -270,6 +332,8 @@ def serve(
         ready(f"http://{address}:{listener.getsockname()[1]}/", tokens)
         config = uvicorn.Config(
             app,
+            http=_Connection,
+            ws="none",
             access_log=False,  # it would hold the tokens
             log_level="warning",
             server_header=False,

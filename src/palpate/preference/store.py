@@ -2,6 +2,10 @@
 
 Its key is (rater, trial), so that a vote sent again counts once, and only a later ``undone``
 replaces it. Of an invitation a hash is kept.
+
+The header's ``user_version`` is the end mark: ``OPEN`` while a server has the file, then the number
+of votes. Votes of a server that has not ended may lie in ``study.db-wal`` alone, and a copy without
+that file has the mark ``OPEN``.
 """
 
 from __future__ import annotations
@@ -10,13 +14,14 @@ import hashlib
 import secrets
 import sqlite3
 from collections.abc import Generator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
 from palpate.core import PalpateError, require
 
 Vote = Mapping[str, Any]
+OPEN = -1
 #: What a vote is, next to its rater.
 CELLS = ("trial", "choice", "ms", "at", "undone")
 _TABLES = """
@@ -50,11 +55,14 @@ class VoteStore:
 
     def __init__(self, path: Path, study: str, mode: str = "rwc") -> None:
         self._path, uri = path, f"{path.absolute().as_uri()}?mode={mode}"
+        self._writes = mode != "ro"
         with _usable(path):
+            if self._writes:
+                path.touch(0o600)  # SQLite gives the files next to it the same rights
             self._disk = sqlite3.connect(
                 uri, uri=True, isolation_level=None, check_same_thread=False
             )
-            if mode != "ro":
+            if self._writes:
                 self._disk.executescript(_TABLES)
                 self._disk.execute("PRAGMA synchronous=FULL")
                 self._disk.execute("INSERT OR IGNORE INTO study VALUES (?)", (study,))
@@ -62,12 +70,47 @@ class VoteStore:
         try:
             require_study(path, study, *names)
         except PalpateError:
-            self.close()
+            self._disk.close()
             raise
+        if self._writes:
+            with _usable(path):
+                self._mark(OPEN)
+                self._disk.execute(f"PRAGMA user_version = {OPEN}")  # now the log is not empty
 
     def close(self) -> None:
-        """Close the file."""
+        """Close the file, whose end mark then counts the votes."""
+        if self._writes:
+            self._writes = False
+            with suppress(sqlite3.Error):  # a full disk: the file stays open, as a killed server's
+                self._mark(self._count())
         self._disk.close()
+
+    def _mark(self, mark: int) -> None:
+        """Write the end mark into the file itself."""
+        self._disk.execute(f"PRAGMA user_version = {mark}")
+        self._disk.execute("PRAGMA wal_checkpoint(TRUNCATE)")
+
+    def _count(self) -> int:
+        return self._disk.execute("SELECT count(*) FROM votes").fetchone()[0]
+
+    def ended(self) -> bool:
+        """Whether the server has ended, and the file thus has its last vote.
+
+        Raises:
+            PalpateError: if the log was not copied, or the end mark counts other votes.
+        """
+        with _usable(self._path):
+            count, (mark,) = self._count(), self._disk.execute("PRAGMA user_version").fetchone()
+        log = self._path.with_name(f"{self._path.name}-wal")
+        holds = log.is_file() and log.stat().st_size > 0 if mark == OPEN else mark == count
+        wanted = f"those in {log.name}" if mark == OPEN else f"the {mark:,} that its server counted"
+        must = f"{self._path} must hold all votes, also {wanted}"
+        fix = (
+            f"Copy it with {log.name} next to it, or after the server has ended. To go on without "
+        )
+        fix += "them, serve the study and stop it: it counts anew"
+        require(holds, None, must, f"{count:,}", fix=fix)
+        return mark != OPEN
 
     def invite(
         self, raters: Sequence[str], count: int, again: Sequence[str] = ()
@@ -135,7 +178,7 @@ def _usable(path: Path) -> Generator[None]:
     """Raise what SQLite raises inside as an error of the file."""
     try:
         yield
-    except sqlite3.Error as error:
+    except (sqlite3.Error, OSError) as error:
         must = f"{path} must be a file of votes that the server can read and write"
         fix = "Name the one that it wrote, with the files next to it"
         raise PalpateError(must, str(error), fix) from None

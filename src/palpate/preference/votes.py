@@ -74,7 +74,7 @@ def read_votes(plan: Plan, paths: Iterable[str | Path]) -> Votes:
         paths: downloads, folders of them (every ``.json`` but the plan), or the server's file.
 
     Raises:
-        PalpateError: if a file is torn, edited, or of another study, or all votes are late.
+        PalpateError: if a file is incomplete, edited, or of another study, or all votes are late.
     """
     files = _files(paths)
     downloaded = [v for path in files if path.suffix != ".db" for v in _of_download(plan, path)]
@@ -82,7 +82,13 @@ def read_votes(plan: Plan, paths: Iterable[str | Path]) -> Votes:
     # By the clocks of raters, with a day for time zones; the server refused late votes by its own.
     in_time = [v for v in downloaded if last is None or (v.at.date() - last).days <= 1]
     late = len(downloaded) - len(in_time)
-    in_time += [v for path in files if path.suffix == ".db" for v in _of_server(plan, path)]
+    running = 0
+    for path in files:
+        if path.suffix == ".db":
+            with closing(VoteStore(path, plan.study, "ro")) as store:
+                running += not store.ended()
+                for rater in store.voters():
+                    in_time += _checked(plan, rater, store.votes(rater), path)
     got = f"{late:,} after {plan.until}, the last day, by the clocks of the raters"
     fix = "Pass votes that were given in time"
     require(bool(in_time) or not late, None, "There must be votes to score", got, fix=fix)
@@ -94,7 +100,9 @@ def read_votes(plan: Plan, paths: Iterable[str | Path]) -> Votes:
         differing += earlier not in (None, vote) and earlier.undone == vote.undone  # type: ignore[union-attr]
         kept[vote.rater][vote.trial.id] = vote
     facts = {"votes-twice": twice, "votes-differ": differing, "votes-late": late}
-    return Votes(kept, [Note(code, {"count": n}) for code, n in facts.items() if n])
+    notes = [Note(code, {"count": n}) for code, n in facts.items() if n]
+    so_far = Note("votes-so-far", {"count": sum(map(len, kept.values()))})
+    return Votes(kept, [*notes, *[so_far] * (running > 0)])
 
 
 def _files(paths: Iterable[str | Path]) -> list[Path]:
@@ -116,12 +124,6 @@ def _of_download(plan: Plan, path: Path) -> list[Vote]:
     require(record.get("digest") == digest_json(rest), None, must, got, fix=AGAIN)
     rows = record["votes"] if isinstance(record["votes"], list) else [None]
     return _checked(plan, record["rater"], rows, path)
-
-
-def _of_server(plan: Plan, path: Path) -> list[Vote]:
-    with closing(VoteStore(path, plan.study, "ro")) as store:
-        rows = {rater: store.votes(rater) for rater in store.voters()}
-    return [vote for rater, votes in rows.items() for vote in _checked(plan, rater, votes, path)]
 
 
 def _checked(plan: Plan, rater: str, rows: Sequence[Any], path: Path) -> list[Vote]:

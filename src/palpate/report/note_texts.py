@@ -552,6 +552,7 @@ PREFERENCE: dict[str, Sentence] = {
         "later one counts. Did two people use one code?"
     ),
     "votes-late": ("{count:vote} after the end of the study are skipped"),
+    "votes-so-far": ("{count:vote} so far: the server of the study has not ended, or was killed"),
     "items-left-out": (
         "{name}: {missing:item} of the reference without an image, and "
         "{unknown:image} without an item, are left out"

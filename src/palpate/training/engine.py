@@ -528,13 +528,9 @@ def _tracker(name: Tracker, folder: Path) -> Any:
     from accelerate.tracking import TensorBoardTracker, WandBTracker
 
     PartialState()  # which their logging needs, also in one process
-    try:
-        board = name == "tensorboard"
-        tracker = TensorBoardTracker(name, folder) if board else WandBTracker("palpate")
-        tracker.start()
-    except ImportError:
-        must, got = f"The tracker {name} must be installed", "no such package"
-        raise PalpateError(must, got, f"pip install {name}") from None
+    board = name == "tensorboard"
+    tracker = TensorBoardTracker(name, folder) if board else WandBTracker("palpate")
+    tracker.start()
     return tracker
 
 

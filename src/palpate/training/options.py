@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from importlib.util import find_spec
 from typing import Literal
 
 import numpy as np
@@ -118,6 +119,10 @@ class Compute:
         require(fits, "chunk", "must be at least 1", self.chunk, fix=fix)
         minutes = self.checkpoint_minutes
         require(minutes >= 0, "checkpoint_minutes", "must be at least 0", minutes)
+        for name in self.trackers:
+            installed = find_spec(name) or find_spec(name + "X")  # tensorboardX writes the same
+            fix = f"pip install {name}"
+            require(installed is not None, "trackers", "must be installed", name, fix=fix)
 
 
 def learning_rate(step: int, options: LoopOptions) -> float:
