@@ -116,11 +116,6 @@ class _Connection(H11Protocol):
         super().on_response_complete()
         self.wait()
 
-    def connection_lost(self, exc: Exception | None) -> None:
-        """Forget the deadline."""
-        self.admit()
-        super().connection_lost(exc)
-
 
 class _Study:
     """One study being served: routes, and the thread that alone uses the file."""
