@@ -163,10 +163,12 @@ def require_joined(ids: Iterable[str], others: Iterable[str], source: str) -> li
     """
     own, theirs = [*ids], {*others}
     lacking = [i for i in own if i not in theirs]
-    got = f"ids as {min(theirs, default='')!r} instead of {next(iter(own), '')!r}"
-    fix = "Use what was made for these samples, or write their ids there"
-    holds = not own or len(lacking) < len(own)
-    require(holds, None, f"{source} must hold ids of these samples", got, fix=fix)
+    if own and len(lacking) == len(own):
+        wrong, right = (", ".join(map(repr, names[:2])) for names in (sorted(theirs), own))
+        got, must = f"ids as {wrong} instead of {right}", f"{source} must hold ids of these samples"
+        raise PalpateError(
+            must, got, "Use what was made for these samples, or write their ids there"
+        )
     return lacking
 
 
