@@ -106,6 +106,17 @@ def test_the_blocks_of_a_page_run(page, examples, tmp_path, monkeypatch):
     run_page(page)
 
 
+def test_each_claim_on_security_names_its_tests():
+    text = (TOP / "SECURITY.md").read_text()
+    rows = [line for line in text.splitlines() if line.startswith("| ")][1:]
+    assert len(rows) > 5
+    for row in rows:
+        tests = re.findall(r"`(\w+\.py)::(\w+)`", row.split(" | ")[1])
+        assert tests, row
+        for file, name in tests:
+            assert f"\ndef {name}(" in (TOP / "tests" / file).read_text(), name
+
+
 def test_links_resolve():
     pages = [TOP / "README.md", TOP / "CONTRIBUTING.md", *(TOP / "docs").rglob("*.md")]
     broken = []

@@ -248,3 +248,31 @@ def test_ctrl_c_while_libraries_load_is_no_traceback(monkeypatch, capsys):
     monkeypatch.setitem(sys.modules, "palpate.cli.terminal", Loading())
     assert main(["audit", "a", "b"]) == 130
     assert capsys.readouterr().err.strip().startswith("palpate: stopped")
+
+
+@pytest.mark.parametrize(
+    ("variable", "words"),
+    [
+        ("SOURCE_DATE_EPOCH=x", "SOURCE_DATE_EPOCH must be a number, as libraries need it. Got x."),
+        ("PYTHONOPTIMIZE=2", "PYTHONOPTIMIZE must be 0 or 1, as libraries need it. Got 2."),
+    ],
+)
+def test_a_variable_that_breaks_libraries_is_one_line(variable, words):
+    name, value = variable.split("=")
+    command = [sys.executable, "-m", "palpate", "validate", "nothing"]
+    done = subprocess.run(
+        command, env=os.environ | {name: value}, capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 2
+    assert words in done.stderr
+    assert done.stderr.count("\n") == 1
+
+
+@pytest.mark.parametrize("verb", ["train encoder", "train autoencoder", "train generator"])
+def test_a_tracker_that_is_not_installed_is_answered_before_anything_is_read(
+    verb, monkeypatch, capsys
+):
+    monkeypatch.setattr("palpate.training.options.find_spec", lambda name: None)
+    assert main([*verb.split(), "no-data", "-o", "o", "--trackers", "tensorboard"]) == 2
+    error = capsys.readouterr().err
+    assert "--trackers must be installed. Got tensorboard. pip install tensorboard" in error

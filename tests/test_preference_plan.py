@@ -14,8 +14,9 @@ from PIL import Image, ImageFilter
 from forge.people import write_folder
 from palpate import preference
 from palpate.core import PalpateError
+from palpate.data.images import read_image, square
 from palpate.preference import Plan
-from palpate.preference.images import QUALITY, data_uri, load_square
+from palpate.preference.images import QUALITY, data_uri
 
 
 @pytest.fixture(scope="module")
@@ -224,7 +225,7 @@ def test_a_manifest_gives_materials_videos_and_the_gel_of_catches(small_manifest
     assert len({item.video for item in plan.items}) == 6
     catch = next(trial for trial in plan.trials if trial.kind == "catch")
     row = small_manifest.take([catch.item])
-    gel = load_square(folder / row.column("background")[0], 256)
+    gel = square(read_image(folder / row.column("background")[0]), 256)
     assert plan.images[plan.name(catch.item, "gel")] == data_uri(gel, QUALITY - 1)
 
 
@@ -243,7 +244,7 @@ def test_an_image_looks_the_same_whatever_file_it_came_in(tmp_path):
     image = Image.fromarray(noise).filter(ImageFilter.GaussianBlur(1))
     image.save(tmp_path / "a.png")
     image.save(tmp_path / "a.jpg", quality=98, subsampling=0)
-    png, jpg = (load_square(tmp_path / f"a.{s}", 64).astype(float) for s in ("png", "jpg"))
+    png, jpg = (square(read_image(tmp_path / f"a.{s}"), 64).astype(float) for s in ("png", "jpg"))
     assert np.abs(png - jpg).mean() < 0.5
 
 

@@ -385,7 +385,7 @@ def test_votes_of_another_plan_or_of_no_page_are_said(plan, tmp_path, change, wo
 def test_the_same_votes_twice_count_once(plan, downloads):
     first = sorted(downloads.iterdir())[0]
     votes = read_votes(plan, [first, first])
-    assert len(votes) == len(plan.trials)
+    assert len(votes.by_rater["r01"]) == len(plan.trials)
     assert {n.code for n in votes.notes} == {"votes-twice"}
 
 
@@ -412,7 +412,7 @@ def test_votes_after_the_last_day_do_not_count(rated, tmp_path):
         read(plan, tmp_path, early)
     early["votes"][0]["at"] = "2026-09-30T10:00:00Z"
     votes = read(plan, tmp_path, signed(early))
-    assert len(votes) == 1
+    assert len(votes.by_rater["r01"]) == 1
     assert votes.notes == [Note("votes-late", {"count": len(plan.trials) - 1})]
 
 

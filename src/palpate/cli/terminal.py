@@ -304,11 +304,13 @@ def _require_variables() -> None:
     Raises:
         PalpateError: naming one.
     """
-    must, fix = "The variable {} must be {}, as libraries need it", "Unset it"
     epoch = os.environ.get("SOURCE_DATE_EPOCH", "0")
-    require(epoch.isdecimal(), None, must.format("SOURCE_DATE_EPOCH", "a number"), epoch, fix=fix)
-    documented, got = sys.flags.optimize < 2, "2, which removes docstrings"
-    require(documented, None, must.format("PYTHONOPTIMIZE", "0 or 1"), got, fix=fix)
+    for name, holds, form in (
+        ("SOURCE_DATE_EPOCH", epoch.isdecimal(), "a number"),
+        ("PYTHONOPTIMIZE", sys.flags.optimize < 2, "0 or 1"),  # 2 removes docstrings
+    ):
+        must = f"The variable {name} must be {form}, as libraries need it"
+        require(holds, None, must, os.environ.get(name, "-OO"), fix="Unset it")
 
 
 def _require_extra(verb: str, options: Any) -> None:

@@ -106,13 +106,6 @@ class VoteArrays:
         """(B, C, 3) wins, ties and losses of every replicate."""
         return outcome_counts(self.values, self.resampled)
 
-    @property
-    def method(self) -> str:
-        """How intervals are made, in words."""
-        if len(self.raters) <= FEW_RATERS:
-            return "items resampled, for these raters alone"
-        return "items and raters resampled"
-
     @cached_property
     def strength(self) -> Array:
         """(methods + 1,) of :func:`davidson`."""
@@ -141,7 +134,11 @@ class VoteArrays:
         if items == 1:
             return None, "", (Note("one-item"),)
         if interval := percentiles(replicates):
-            return interval, self.method, ()
+            few = len(self.raters) <= FEW_RATERS
+            drawn = (
+                "items resampled, for these raters alone" if few else "items and raters resampled"
+            )
+            return interval, drawn, ()
         if not items:
             return None, "", ()
         method = f"Clopper-Pearson, items as the sample, n = {items}"

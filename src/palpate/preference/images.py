@@ -83,7 +83,10 @@ def read_sources(
     rows = zip(real.ids, *columns, strict=True)
     items = [Item(i, label or None, group or None) for i, label, group in rows if i in common]
     notes += [Note("videos-unknown")] * (not any(item.video for item in items))
-    paths = {name: _paths(samples) for name, samples in [(REFERENCE, real), *methods.items()]}
+    paths = {
+        name: dict(zip(samples.ids, samples.manifest.paths("tactile"), strict=True))
+        for name, samples in [(REFERENCE, real), *methods.items()]
+    }
     if real.has_background:
         paths[GEL] = dict(zip(real.ids, real.manifest.paths("background"), strict=True))
     return Sources(items, paths, notes)
@@ -101,10 +104,6 @@ def _files(samples: Samples) -> Samples:
     return samples
 
 
-def _paths(samples: Samples) -> dict[str, Path]:
-    return dict(zip(samples.ids, samples.manifest.paths("tactile"), strict=True))
-
-
 def encoded(plan: Plan, sources: Sources, progress: Progress) -> dict[str, str]:
     """Name -> data URI of every image that a trial or strip shows.
 
@@ -117,9 +116,10 @@ def encoded(plan: Plan, sources: Sources, progress: Progress) -> dict[str, str]:
     wanted |= {(item.id, EXAMPLE) for item in plan.examples}
     files = {key: path for key in sorted(wanted) if (path := sources.path(*key)) is not None}
     read_files = track(list(files.items()), "reading images", progress)
-    images = {key: load_square(path, plan.size) for key, path in read_files}
+    images = {key: square(read_image(path), plan.size) for key, path in read_files}
     if missing := wanted - set(images):  # no background is known
-        reference = [load_square(sources.paths[REFERENCE][i.id], plan.size) for i in plan.items]
+        paths = (sources.paths[REFERENCE][item.id] for item in plan.items)
+        reference = [square(read_image(path), plan.size) for path in paths]
         gel = estimated_gel(np.stack(reference))
         images |= dict.fromkeys(missing, gel)
     # The copy in a catch is another file than the reference above it.
@@ -127,15 +127,6 @@ def encoded(plan: Plan, sources: Sources, progress: Progress) -> dict[str, str]:
         plan.name(*key): data_uri(image, QUALITY - (key[1] in (COPY, GEL)))
         for key, image in images.items()
     }
-
-
-def load_square(path: Path, size: int) -> NDArray[np.uint8]:
-    """Read the center square of an image file: (size, size, 3), 0 to 255.
-
-    Raises:
-        PalpateError: if the file is missing or broken.
-    """
-    return square(read_image(path), size)
 
 
 def data_uri(image: NDArray[np.uint8], quality: int = QUALITY) -> str:

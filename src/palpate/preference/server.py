@@ -83,17 +83,13 @@ class _Connection(H11Protocol):
         super().connection_made(transport)
         self.app_state = {**self.app_state, "connection": self}
         self.wait()
-        for address, most in (
-            (self.client and self.client[0], MOST_OF_ADDRESS),
-            (None, MOST_WAITING),
-        ):
-            waiting = {
-                each.deadline.when(): each
-                for each in cast("set[_Connection]", self.connections)
-                if each.deadline and address in (None, each.client and each.client[0])
-            }
-            if len(waiting) > most:
-                waiting[min(waiting)].end()
+        connections = cast("set[_Connection]", self.connections)
+        waiting = {c.deadline.when(): c for c in connections if c.deadline}
+        host = lambda connection: connection.client and connection.client[0]
+        own = {when: c for when, c in waiting.items() if host(c) == host(self)}
+        for crowd, most in ((own, MOST_OF_ADDRESS), (waiting, MOST_WAITING)):
+            if len(crowd) > most:
+                crowd[min(crowd)].end()
 
     def wait(self) -> None:
         """Give it time for its next request."""

@@ -62,9 +62,6 @@ class Votes:
     by_rater: Mapping[str, Mapping[str, Vote]]
     notes: list[Note] = field(default_factory=list)
 
-    def __len__(self) -> int:
-        return sum(map(len, self.by_rater.values()))
-
 
 def read_votes(plan: Plan, paths: Iterable[str | Path]) -> Votes:
     """Read votes of a study.
