@@ -103,7 +103,7 @@ def test_help_is_wrapped_by_the_terminal_and_says_no_empty_default(capsys):
     [
         (
             "score --generated a b --reference r --sigma 10 median --group frame",
-            {"generated": ("a", "b"), "sigma": (10.0, "median"), "group": "frame", "names": None},
+            {"generated": ("a", "b"), "sigma": (10.0, "median"), "group": "frame"},
         ),
         (
             "import d -o m --map vision=rgb 'video=substr(rgb, 1, 2)' --map id=n --every 0",
