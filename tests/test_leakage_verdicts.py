@@ -157,6 +157,20 @@ def test_a_split_whose_own_audit_leaks_is_not_called_noleak(run):
     assert (status, data["commands"]) == (1, [])  # nothing can keep the only video whole
 
 
+def test_the_next_command_reads_what_the_audit_read(run):
+    for part, first in (("train", 0), ("test", 5)):
+        frames = [(v, first + 10 * k) for v in range(4) for k in range(10)]
+        lines = [f"v{v}/{k}.jpg,{v % 2}\n" for v, k in frames]
+        Path(f"{part}.txt").write_text("".join([*lines, "no line\n"]))
+    status, data = run("audit train.txt test.txt --skip-bad")
+    assert (status, data["commands"]) == (
+        1,
+        ["palpate split train.txt test.txt --skip-bad --by video -o noleak.json"],
+    )
+    status, data = run(data["commands"][0].removeprefix("palpate "))
+    assert (status, data["audit"]) == (0, "no leak found")
+
+
 NAMES = ("{k:04d}.png", "cup_{k}.png", "rec{v}/{k:04d}.png", "v{v}_{k:05d}.png", "a{v}/b_{k}.jpg")
 
 

@@ -38,7 +38,7 @@ from palpate.metrics.contact import contact_per_image
 from palpate.metrics.distributions import compare_fid, prdc_rows
 from palpate.metrics.images import PerImage, per_image
 from palpate.metrics.kernels import Polynomial
-from palpate.metrics.paired import compare, compare_tmmd, mean_differences
+from palpate.metrics.paired import Comparison, compare, compare_tmmd, mean_differences
 from palpate.metrics.tactile import tmmd
 from palpate.report.labels import measured
 
@@ -451,43 +451,37 @@ def companion(bench: Bench, name: str, *, default: bool) -> list[Score]:
         return []
 
 
+def _compared(
+    bench: Bench, sets: Sets, metric: str, compared: Callable[..., Comparison]
+) -> list[Score]:
+    """Scores of a metric and differences of every batch, named by where the features come from."""
+    results = [compared(some, sets.reference, **bench.common) for some in sets.batches()]
+    return [_named(s, metric, sets) for r in results for s in (*r.scores, *r.differences)]
+
+
 def _fid(bench: Bench, sets: Sets) -> list[Score]:
-    results = [compare_fid(some, sets.reference, **bench.common) for some in sets.batches()]
-    return [_named(s, "FID", sets) for r in results for s in (*r.scores, *r.differences)]
+    return _compared(bench, sets, "FID", compare_fid)
 
 
 def _cmmd(bench: Bench, sets: Sets) -> list[Score]:
-    results = [
-        compare_tmmd(
-            some,
-            sets.reference,
-            preset="cmmd",
-            permutations=bench.permutations,
-            normalize=bench.normalize,
-            **bench.common,
-        )
-        for some in sets.batches()
-    ]
-    return [_named(s, "CMMD", sets) for r in results for s in (*r.scores, *r.differences)]
+    cmmd = partial(
+        compare_tmmd, preset="cmmd", permutations=bench.permutations, normalize=bench.normalize
+    )
+    return _compared(bench, sets, "CMMD", cmmd)
 
 
 def _kid(bench: Bench, sets: Sets) -> list[Score]:
-    scores: list[Score] = []
-    for some in sets.batches():
-        result = compare_tmmd(
-            some,
-            sets.reference,
-            kernel=Polynomial(),
-            preset="paper",
-            normalize=False,
-            permutations=0,
-            **bench.common,
+    kid = partial(
+        compare_tmmd, kernel=Polynomial(), preset="paper", normalize=False, permutations=0
+    )
+    return [
+        replace(
+            s,
+            settings={key: value for key, value in s.settings.items() if key != "preset"},
+            notes=[*[Note("kid-interval")] * (s.b is None), *s.notes],
         )
-        for s in (*result.scores, *result.differences):
-            settings = {key: value for key, value in s.settings.items() if key != "preset"}
-            notes = [*[Note("kid-interval")] * (s.b is None), *s.notes]
-            scores.append(_named(replace(s, settings=settings, notes=notes), "KID", sets))
-    return scores
+        for s in _compared(bench, sets, "KID", kid)
+    ]
 
 
 def _prdc(bench: Bench, sets: Sets) -> list[Score]:

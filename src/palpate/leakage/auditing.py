@@ -297,6 +297,10 @@ def _compare(
     last = int(timed.max()) if timed.size else 0
     middle = float(np.median(timed)) if timed.size else None
     edges = [e for e in GAP_EDGES if e <= last] + [last + 1] if timed.size else []
+    parts = {"train": a, "val": b.clear() if val is None else val.table, "test": b}
+    rows = _rows(parts, group, leaks)
+    compared = rows.filter(~pl.col("val"))
+    sizes = compared["group"].drop_nulls().value_counts()["count"]
     pairs = _worst_pairs(train, test, group, gaps)
     signals = [f.summary(train, test, gaps) for f in flags]
     return Audit(
@@ -316,29 +320,18 @@ def _compare(
         gap_edges=edges,
         gap_counts=np.histogram(timed, edges)[0].tolist() if edges else [],
         worst=pairs,
-        materials=_materials(a, b, group),
+        materials=_materials(compared),
         notes=_notes(train, test, group, equal, options),
         against=against,
         signals=[replace(s, worst=pairs) if s.kind == "time gap" else s for s in signals],
         leaking_samples=int(leaks.sum()),
-        matrix=_matrix(
-            {"train": a, "val": b.clear() if val is None else val.table, "test": b}, group, leaks
-        ),
+        matrix=_matrix(rows),
         groups_in_all=len(groups[0] | groups[1]),
         shared={c: n for c, n in shared_groups(a, b).items() if c not in equal},
         questions=answers,
-        largest_group=_largest(a, b, group),
+        largest_group=round(int(sizes.max() or 0) / len(compared), 5),  # type: ignore[arg-type]
         table=signal_table(test, train, flags, gaps),
     )
-
-
-def _largest(train: pl.DataFrame, test: pl.DataFrame, group: str) -> float:
-    """The share of all samples that are in one group."""
-    if group == NO_GROUP:
-        return 0.0
-    every = pl.concat([train[group], test[group]])
-    sizes = every.drop_nulls().value_counts()["count"]
-    return round(int(sizes.max() or 0) / len(every), 5)  # pyright: ignore[reportArgumentType]
 
 
 def _notes(
@@ -389,32 +382,46 @@ def _signals(
     return [f for f in flags if f is not None]
 
 
-def _matrix(
-    parts: Mapping[str, pl.DataFrame], group: str, leaks: NDArray[np.bool_]
-) -> list[dict[str, Any]]:
-    """Samples of each group by part, shared groups with most test samples first."""
-    if group == NO_GROUP:
-        return []
+def _rows(parts: Mapping[str, pl.DataFrame], group: str, leaks: NDArray[np.bool_]) -> pl.DataFrame:
+    """A row for each sample of all parts: its group, material and part, and whether it leaks."""
+    column = pl.lit(None, pl.String) if group == NO_GROUP else pl.col(group)
     flagged = {"test": pl.Series(leaks)}
-    long = pl.concat(
+    return pl.concat(
         t.select(
-            group=pl.col(group),
+            "material",
+            group=column,
             leaking=flagged.get(part, pl.lit(False)),
-            **{p: pl.lit(int(p == part)) for p in parts},
+            **{p: pl.lit(p == part) for p in parts},
         )
         for part, t in parts.items()
-    ).drop_nulls("group")
-    rows = (
-        long.group_by("group")
-        .agg(pl.col("train", "val", "test", "leaking").sum())
+    )
+
+
+def _matrix(rows: pl.DataFrame) -> list[dict[str, Any]]:
+    """Samples of each group by part, shared groups with most test samples first."""
+    parts = ("train", "val", "test")
+    matrix = (
+        rows.drop_nulls("group")
+        .group_by("group")
+        .agg(pl.col(*parts, "leaking").sum())
         .with_columns(
-            shared=(pl.col("train") > 0) & (pl.col("test") > 0),
-            size=pl.sum_horizontal("train", "val", "test"),
+            shared=(pl.col("train") > 0) & (pl.col("test") > 0), size=pl.sum_horizontal(*parts)
         )
         .sort("shared", "test", "size", "group", descending=[True, True, True, False])
         .head(MATRIX_ROWS)
     )
-    return list(rows.select("group", *parts, "leaking").iter_rows(named=True))
+    return list(matrix.select("group", *parts, "leaking").iter_rows(named=True))
+
+
+def _materials(rows: pl.DataFrame) -> list[dict[str, Any]]:
+    """Samples and groups of each material in both parts."""
+    groups = {
+        f"groups_{part}": pl.col("group").filter(part).drop_nulls().n_unique()
+        for part in ("train", "test")
+    }
+    materials = rows.drop_nulls("material").group_by("material")
+    both = materials.agg(pl.col("train", "test").sum(), **groups).sort("material")
+    return list(both.iter_rows(named=True))
 
 
 def _worst_pairs(train: Manifest, test: Manifest, group: str, gaps: Gaps) -> list[LeakPair]:
@@ -430,17 +437,3 @@ def _worst_pairs(train: Manifest, test: Manifest, group: str, gaps: Gaps) -> lis
         pairs = [(first_of[0][g], first_of[1][g], None) for g in shared[:WORST]]
     row = lambda m, k: m.ref(m.table.row(k, named=True))
     return [LeakPair(row(test, k), row(train, j), gap) for k, j, gap in pairs]
-
-
-def _materials(train: pl.DataFrame, test: pl.DataFrame, group: str) -> list[dict[str, Any]]:
-    """Samples and groups of each material in both parts."""
-    groups = pl.col(group).drop_nulls().n_unique() if group != NO_GROUP else pl.lit(0)
-    train, test = (
-        t.drop_nulls("material")
-        .group_by("material")
-        .agg(pl.len().alias(part), groups.cast(pl.Int64).alias(f"groups_{part}"))
-        for part, t in (("train", train), ("test", test))
-    )
-    both = train.join(test, on="material", how="full", coalesce=True).fill_null(0).sort("material")
-    columns = ("material", "train", "test", "groups_train", "groups_test")
-    return list(both.select(columns).iter_rows(named=True))
