@@ -261,6 +261,7 @@ def test_chains_of_imports_are_short_and_none_runs_back_to_the_door():
     ("words", "files"),
     [
         ("score --generated a --reference b --encoder palpate/mini", 32),
+        ("audit a.txt b.txt", 26),
         ("generate b/0.png -o t.png", 12),  # of them core/messages, by its checks in one line
     ],
 )
@@ -271,6 +272,9 @@ def test_the_main_paths_stay_short(tmp_path, words, files):
         (tmp_path / name).mkdir()
         for k, image in enumerate(folder):
             Image.fromarray(image).save(tmp_path / name / f"{k}.png")
+    for name in "ab":
+        lines = [f"{name}{v}/{k}.jpg,{v % 3}\n" for v in range(6) for k in range(9)]
+        (tmp_path / f"{name}.txt").write_text("".join(lines))
     script = [sys.executable, TOP / "benchmarks" / "walk.py", "--json", "walk.json", "--"]
     subprocess.run([*script, "palpate", *words.split()], cwd=tmp_path, check=True, timeout=300)
     walked = json.loads((tmp_path / "walk.json").read_text(encoding="utf-8"))

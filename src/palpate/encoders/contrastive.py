@@ -30,6 +30,7 @@ from palpate._version import __version__
 from palpate.core import Progress, Split, digest_json, digest_lines, fields_of, quiet, require
 from palpate.data.images import CLIP_MEAN, CLIP_STD, Preprocess, cached_images, image_stamp
 from palpate.data.manifest import Manifest
+from palpate.data.recordings import resampled_by
 from palpate.encoders.embed import embed, texts_of
 from palpate.encoders.encoder_set import (
     EncoderSet,
@@ -126,13 +127,17 @@ def train_encoder(
             for part in ("train", "test")
         ]
         if len(parts[1]) and len(set(parts[0].column("material"))) > 1:
+            tables, kept = [p.table for p in parts], str(split.rule.get("group"))
+            level, doubt, _ = resampled_by(tables, "auto", kept, paired=True)
+            groups = "id" if level == "frame" else level
             with first_alone():
-                features = [embed(p, encoders, cache=run.cache, progress=progress) for p in parts]
+                embedded = partial(embed, groups=groups, cache=run.cache, progress=progress)
+                features = [embedded(part, encoders) for part in parts]
             score = material_accuracy(features[0], features[1], split=split.digest)
             row = {
                 "score": "linear probe of material, tactile",
                 "value": score.value,
-                "interval": score.interval,
+                "interval": None if doubt else score.interval,
                 "chance": score.details.get("chance"),
                 "n": score.n,
             }

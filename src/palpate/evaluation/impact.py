@@ -111,7 +111,7 @@ class _Design:
         """(n,) groups."""
         return np.array(self.table["owner"].to_list(), dtype=str)
 
-    @property
+    @cached_property
     def splits(self) -> list[tuple[Rows, Rows]]:
         """Numbers of the train and of the test samples, by split."""
         parts = self.table.select(pl.col("^split .*$"))
@@ -180,16 +180,15 @@ def _measure(
     """Rows for each kind of features and classifier."""
     rows: list[ImpactRow] = []
     column, total = design.settings["group"], len(sources) * len(design.splits)
+    chance = 1 / len(design.settings["materials"])
     for number, source in enumerate(sources):
-        means: dict[str, list[Mean]] = {c: [] for c in CLASSIFIERS}
-        for k, parts in enumerate(design.splits):
-            done = number * len(design.splits) + k
-            progress(f"classifying materials by {column}", done, total, source.name)
-            for c, mean in _classify(source, *parts, design).items():
-                means[c].append(mean)
-        chance = 1 / len(design.settings["materials"])
-        of_source = [_row(source.name, c, means[c], chance, column) for c in CLASSIFIERS]
-        rows += [replace(row, seen=source.name in seen) for row in of_source]
+        of_splits: list[dict[str, Mean]] = []
+        for k, parts in enumerate(design.splits, number * len(design.splits)):
+            progress(f"classifying materials by {column}", k, total, source.name)
+            of_splits.append(_classify(source, *parts, design))
+        for c in CLASSIFIERS:
+            row = _row(source.name, c, [means[c] for means in of_splits], chance, column)
+            rows.append(replace(row, seen=source.name in seen))
     progress(f"classifying materials by {column}", total, total)
     return rows
 
