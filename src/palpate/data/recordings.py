@@ -292,8 +292,6 @@ def _read(
     inputs: Sequence[Sequence[str]], template: str | None
 ) -> tuple[dict[str, Fields], Sequence[str], str]:
     """What the paths of some inputs say: path -> fields, their levels, and how they were read."""
-    from palpate.data.detection import name_apart
-
     paths = [path for own in inputs for path in own]
     if not paths:
         return {}, (), ""
@@ -307,6 +305,8 @@ def _read(
         return rows, ("video", "frame"), f"file names of {', '.join(chosen)}"
     if template is None and all(posixpath.splitext(path)[0].isdecimal() for path in usual):
         return {}, (), ""  # bare numbers name no recording
+    from palpate.data.detection import name_apart
+
     text = template or _suggested(usual, inputs)
     parsed = Template.parse(text)
     rows = {path: fields for path in paths if (fields := parsed.match(path)) is not None}
