@@ -217,7 +217,7 @@ def _design(manifest: Manifest, split: Split, group: str, seeds: Sequence[int]) 
     excluded = _incomparable(table, group)
     table = _without(excluded, table)
     kept = pool.take(table["id"].to_list())
-    share = float((table["split 0"] == "train").mean())  # type: ignore[arg-type]
+    share = float((table["split 0"] == "train").mean())  # pyright: ignore[reportArgumentType]
     plans = [leak_free_split(kept, train=share, by=group, seed=s) for s in seeds]
     clean = {f"split {k}": [p.parts[i] for i in kept.ids] for k, p in enumerate(plans, 1)}
     table = table.with_columns(pl.Series(name, part) for name, part in clean.items())
@@ -237,7 +237,7 @@ def _design(manifest: Manifest, split: Split, group: str, seeds: Sequence[int]) 
             "train_samples": min(len(train) for train, _ in splits),
             "test_samples": [len(test) for _, test in splits],
             "test_groups": test_groups,
-            "shared_groups": len(np.intersect1d(*owners[0])),
+            "shared_groups": len({*owners[0][0]} & {*owners[0][1]}),
         }
     )
     if excluded:

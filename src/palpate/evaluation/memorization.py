@@ -101,8 +101,9 @@ def contact_rows(images: NDArray[np.uint8], ground: NDArray[Any]) -> NDArray[np.
 
 def nearest_train(queries: NDArray[Any], train: NDArray[Any]) -> tuple[Array, NDArray[np.intp]]:
     """Distance (n,) of each query (n, d) to its nearest train row (m, d), and which that is."""
-    at = nearest(*(np.ascontiguousarray(x, np.float32) for x in (queries, train)))[:, 0]
-    change = np.asarray(queries, np.float64) - np.asarray(train, np.float32)[at]
+    base = np.ascontiguousarray(train, np.float32)
+    at = nearest(np.ascontiguousarray(queries, np.float32), base)[:, 0]
+    change = np.asarray(queries, np.float64) - base[at]
     return np.sqrt((change**2).sum(axis=1)), at
 
 

@@ -38,6 +38,7 @@ from palpate.metrics.contact import contact_per_image
 from palpate.metrics.distributions import compare_fid, prdc_rows
 from palpate.metrics.images import PerImage, per_image
 from palpate.metrics.kernels import Polynomial
+from palpate.metrics.mmd import Preset
 from palpate.metrics.paired import Comparison, compare, compare_tmmd, mean_differences
 from palpate.metrics.tactile import tmmd
 from palpate.report.labels import measured
@@ -143,7 +144,7 @@ class Bench:
     seen: Samples | None = None
     encoders: EncoderSet | None = None
     weights: Weights = field(default_factory=Weights)
-    presets: Sequence[str] = ()
+    presets: Sequence[Preset] = ()
     sigmas: Sequence[float | str] = ()
     normalize: Literal["check"] | bool = "check"
     permutations: int = 999
@@ -406,12 +407,14 @@ def tmmd_family(bench: Bench) -> list[Score]:
     return scores
 
 
-def bandwidths(bench: Bench, *, grouped: bool, rows: int) -> list[tuple[str | None, float | str]]:
+def bandwidths(
+    bench: Bench, *, grouped: bool, rows: int
+) -> list[tuple[Preset | None, float | str]]:
     """(preset, bandwidth) of each column; None is the preset that fits the ids of a metric.
 
     Of bandwidths that nobody requested, ``multi`` is for TMMD alone, of the first preset.
     """
-    fitting: Sequence[str | None] = ("grouped", "paper") if grouped else (None,)
+    fitting: Sequence[Preset | None] = ("grouped", "paper") if grouped else (None,)
     presets = bench.presets or fitting
     columns = [(p, s) for p in presets for s in bench.sigmas or (SIGMA,)]
     return columns + [(presets[0], "multi")] * (not bench.sigmas and rows <= MANY)

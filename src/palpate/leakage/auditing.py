@@ -329,7 +329,7 @@ def _compare(
         groups_in_all=len(groups[0] | groups[1]),
         shared={c: n for c, n in shared_groups(a, b).items() if c not in equal},
         questions=answers,
-        largest_group=round(int(sizes.max() or 0) / len(compared), 5),  # type: ignore[arg-type]
+        largest_group=round(int(sizes.max() or 0) / len(compared), 5),  # pyright: ignore[reportArgumentType]
         table=signal_table(test, train, flags, gaps),
     )
 
