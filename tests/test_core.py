@@ -120,6 +120,32 @@ def test_records_that_cannot_be_read(tmp_path, text, words):
         int("x")
 
 
+@pytest.mark.parametrize(
+    ("given", "wanted", "words"),
+    [
+        ("palpate-split/1", "palpate-results/1", "r.json, a split. .* for palpate audit --split"),
+        ("palpate/preference@1", "palpate-split/1", "a study. .* for palpate preference score"),
+        ("palpate-results/9", "palpate-results/1", "'palpate-results/9'.* install the release"),
+        ("elsewhere/1", "palpate-results/1", "'elsewhere/1'.* install the release"),
+    ],
+)
+def test_a_file_of_another_kind_is_said_to_be_one(tmp_path, given, wanted, words):
+    path = tmp_path / "r.json"
+    path.write_text(json.dumps({"format": given}))
+    with pytest.raises(PalpateError, match=words):
+        read_record(path, "file", form=wanted)
+
+
+def test_a_folder_of_another_kind_is_said_to_be_one(tmp_path):
+    (tmp_path / "manifest.parquet").write_bytes(b"PAR1\x81")
+    for path in (tmp_path, tmp_path / "palpate.json", tmp_path / "manifest.parquet"):
+        with pytest.raises(PalpateError, match=r"a manifest\. Name another one: .* palpate audit"):
+            read_record(path, "card", form="palpate-pipeline/1")
+    (tmp_path / "palpate.json").write_text('{"format": "palpate-pipeline/1"}')
+    with pytest.raises(PalpateError, match=r"a generator\. .* for palpate generate --model"):
+        read_record(tmp_path / "index.json", "index")
+
+
 def test_a_path_may_not_climb_out(tmp_path):
     (tmp_path / "root").mkdir()
     (tmp_path / "root" / "link").symlink_to(tmp_path)

@@ -18,6 +18,7 @@ import pytest
 from forge.pictures import write_image
 from forge.results import full_audit
 from palpate.cli import main
+from palpate.cli.terminal import working_folder
 from palpate.core import PalpateError, atomic_folder, atomic_path, locked
 from palpate.data.manifest import Manifest
 
@@ -203,6 +204,22 @@ def test_two_runs_do_not_share_a_folder_and_a_killed_one_does_not_block(tmp_path
         other.wait()
     with locked(folder):
         pass
+
+
+def test_two_commands_do_not_resume_from_one_folder(tmp_path):
+    output = tmp_path / "scores.json"
+    with working_folder(None, output) as folder:
+        (folder / "half").touch()
+        with pytest.raises(PalpateError, match=r"scores\.json must be written by one run"):
+            working_folder(None, output).__enter__()
+        with working_folder(tmp_path / "cache", output) as cache:  # of its own, by content
+            assert cache == tmp_path / "cache"
+    assert list(tmp_path.iterdir()) == []
+    stopped = working_folder(None, output)
+    (stopped.__enter__() / "half").touch()
+    assert not stopped.__exit__(KeyboardInterrupt, KeyboardInterrupt(), None)
+    with working_folder(None, output) as folder:
+        assert [p.name for p in folder.iterdir()] == ["half"]
 
 
 def test_what_a_killed_run_left_is_replaced(tmp_path):

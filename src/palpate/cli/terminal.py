@@ -55,6 +55,7 @@ from palpate.core import (
     ProblemsError,
     Progress,
     fact_lines,
+    locked,
     problem_lines,
     quiet,
     require,
@@ -374,13 +375,17 @@ def guard_output(
 def working_folder(cache: Path | None, output: Path | None) -> Generator[Path | None]:
     """Yield the cache; without one a folder next to the output, from which an interrupted run
     resumes and which one that has ended removes.
+
+    Raises:
+        PalpateError: if another run writes that output.
     """
     if cache is not None or output is None or is_stream(output):
         yield cache
         return
     folder = output.absolute().parent / f".{output.name}.work"
-    yield folder
-    shutil.rmtree(folder, ignore_errors=True)
+    with locked(folder, output):
+        yield folder
+        shutil.rmtree(folder, ignore_errors=True)
 
 
 def parse(name: str, options: type[Any], args: Sequence[str]) -> Any:

@@ -26,6 +26,7 @@ import io
 import json
 import math
 import os
+import re
 import shutil
 import tempfile
 from collections.abc import Generator, Iterable, Mapping, Sequence
@@ -53,6 +54,24 @@ MOST_PIXELS = 50_000_000
 WHITE_16, BRIGHT_16 = 65535, 4096
 #: Tags of EXIF and TIFF.
 ORIENTATION, BITS, PHOTOMETRIC = 0x0112, 258, 262
+
+#: Format without its version -> what it is, and what reads it.
+READERS = {
+    "palpate-manifest": ("a manifest", "palpate audit"),
+    "palpate-split": ("a split", "palpate audit --split"),
+    "palpate-audit": ("an audit", "palpate report"),
+    "palpate-results": ("results", "palpate report"),
+    "palpate-generated": ("generated images", "palpate score --generated"),
+    "palpate-clip": ("a vision and a text encoder", "palpate train encoder --clip"),
+    "palpate-encoders": ("encoders", "palpate probe --encoder"),
+    "palpate-autoencoder": ("an autoencoder", "palpate train generator --autoencoder"),
+    "palpate-pipeline": ("a generator", "palpate generate --model"),
+    "palpate/preference": ("a study", "palpate preference score"),
+    "palpate/preference-votes": ("votes", "palpate preference score"),
+}
+#: The files that tell of a folder what it is.
+MARKS, MANIFEST = ("palpate.json", "index.json", "plan.json"), "manifest.parquet"
+_VERSION = re.compile(r"[/@]\d+$")
 
 
 def plain(value: Any) -> Any:
@@ -313,13 +332,14 @@ def read_json(path: Path, role: str) -> Any:
         json.dumps(value, ensure_ascii=False, allow_nan=False).encode()
         return value
     except FileNotFoundError:
-        raise PalpateError(f"The {role} must exist", f"no file {path}", "Check the path") from None
+        got, fix = instead(Path(path).parent, f"no file {path}", "Check the path")
+        raise PalpateError(f"The {role} must exist", got, fix) from None
     except IsADirectoryError:
-        fix = "Name the file itself"
-        raise PalpateError(f"The {role} must be a file", f"the folder {path}", fix) from None
+        got, fix = instead(Path(path), f"the folder {path}", "Name the file itself")
+        raise PalpateError(f"The {role} must be a file", got, fix) from None
     except (ValueError, RecursionError) as error:  # no JSON, no UTF-8, nested too deep
-        fix = "Write it again with palpate"
-        raise PalpateError(f"The {role} {path} must be JSON", str(error), fix) from None
+        got, fix = instead(Path(path), str(error), "Write it again with palpate")
+        raise PalpateError(f"The {role} {path} must be JSON", got, fix) from None
 
 
 def read_record(
@@ -345,11 +365,32 @@ def read_record(
     if forms is not None and record.get("format") not in forms:
         got = repr(record.get("format"))
         fix = "Name another one, or install the release of palpate that wrote it"
+        if _VERSION.sub("", str(record.get("format"))) != _VERSION.sub("", forms[0]):
+            got, fix = instead(Path(path), got, fix)
         raise PalpateError(f"The {role} {path} must have the format {forms[0]}", got, fix)
     if missing := [name for name in keys if name not in record]:
         must = f"The {role} {path} must have the keys {', '.join(keys)}"
         raise PalpateError(must, f"no {', no '.join(missing)}", fix)
     return record
+
+
+def kind_of(path: Path) -> tuple[str, str] | None:
+    """What a file or folder that palpate wrote is, and what reads it; None for all else."""
+    for file in [path / name for name in MARKS] if path.is_dir() else [path]:
+        with suppress(OSError, ValueError, RecursionError, AttributeError):
+            form = str(json.loads(file.read_bytes()).get("format"))
+            if kind := READERS.get(_VERSION.sub("", form)):
+                return kind
+    manifest = path / MANIFEST if path.is_dir() else path
+    there = manifest.name == MANIFEST and manifest.is_file()
+    return READERS["palpate-manifest"] if there else None
+
+
+def instead(path: Path, got: str, fix: str) -> tuple[str, str]:
+    """What an error says was given, and to do: of what palpate wrote, what it is and is for."""
+    if (kind := kind_of(path)) is None:
+        return got, fix
+    return f"{path}, {kind[0]}", f"Name another one: this is for {kind[1]}"
 
 
 @contextmanager

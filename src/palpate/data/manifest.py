@@ -48,6 +48,7 @@ from palpate.core import (
     digest_lines,
     fact_lines,
     inside,
+    instead,
     require,
 )
 from palpate.core.messages import require_rows
@@ -298,7 +299,10 @@ class Manifest:
         path = Path(path)
         path = path / "manifest.parquet" if path.is_dir() else path
         fix = "Write one with: palpate import"
-        require(path.is_file(), None, "The manifest must exist", f"no file {path}", fix=fix)
+        if not path.is_file():
+            raise PalpateError(
+                "The manifest must exist", *instead(path.parent, f"no file {path}", fix)
+            )
         try:
             meta = _metadata(path)
             with reading_parquet():
