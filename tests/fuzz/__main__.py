@@ -16,11 +16,14 @@ def main() -> int:
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--case", type=int, help="run this one alone")
     parser.add_argument("--workers", type=int, default=2)
+    parser.add_argument("--bare", action="store_true", help="in an environment without extras")
     options = parser.parse_args()
     one = options.case
     numbers = range(options.cases) if one is None else range(one, one + 1)
     start, kinds = time.monotonic(), dict[str, list[int]]()
-    for number, args, failures in run(numbers, options.seed, min(options.workers, len(numbers))):
+    for number, args, failures in run(
+        numbers, options.seed, min(options.workers, len(numbers)), bare=options.bare
+    ):
         for failure in failures:
             kinds.setdefault(failure, []).append(number)
             if len(kinds[failure]) == 1:

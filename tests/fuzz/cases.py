@@ -22,11 +22,14 @@ import polars as pl
 from PIL import Image
 
 from fuzz import mutations
+from fuzz.bare import EXTRAS
 from fuzz.seeds import COMMANDS
 from palpate.cli import main
 
 #: What one case may take.
 SECONDS, BYTES = 60, 2 << 30
+#: Addresses that the process has asked for.
+NETWORK: list[str] = []
 
 
 def random_case(seed: int, number: int, base: Path, folder: Path) -> list[str]:
@@ -35,7 +38,9 @@ def random_case(seed: int, number: int, base: Path, folder: Path) -> list[str]:
     weights = np.array(list(COMMANDS.values()), float)
     command = list(COMMANDS)[rng.choice(len(COMMANDS), p=weights / weights.sum())]
     args = prepare(command, base, folder)
-    files = sorted(p for p in (folder / "in").rglob("*") if p.is_file())
+    files, own = (
+        sorted(p for p in (folder / name).rglob("*") if p.is_file()) for name in ("in", "out")
+    )
     places = [str(p) for p in (*files[:3], *files[-2:], folder / "in", folder / "out" / "none")]
     long = "OUT/" + "x" * 300
     outputs = ["", ".", "..", "/", "OUT/a/b/c", "OUT/x.json", "OUT/\udcff", long, *places]
@@ -44,7 +49,9 @@ def random_case(seed: int, number: int, base: Path, folder: Path) -> list[str]:
     with contextlib.suppress(PermissionError):  # a /dev/null of the case's own
         os.mknod(folder / "in" / "null", 0o666 | stat.S_IFCHR, os.makedev(1, 3))
     for _ in range(int(rng.integers(1, 4))):
-        if rng.random() < 0.25 or not files:
+        if own and rng.random() < 0.7:
+            mutations.change_content(rng, own)
+        elif rng.random() < 0.25 or not files:
             mutations.change_arguments(rng, args, places, outputs)
         else:
             change = mutations.change_content if rng.random() < 0.8 else mutations.change_place
@@ -54,20 +61,38 @@ def random_case(seed: int, number: int, base: Path, folder: Path) -> list[str]:
 
 
 def prepare(command: str, base: Path, folder: Path) -> list[str]:
-    """Link the inputs that a command names; return its arguments."""
+    """Link the inputs that a command names, copy what it goes on from; return its arguments."""
     for name in sorted(set(re.findall(r"\bIN/([\w-]+)", command))):
         shutil.copytree(base / name, folder / "in" / name, copy_function=os.link)
+    for name in sorted(set(re.findall(r"\bKEPT/([\w-]+)", command))):
+        shutil.copytree(base / "kept" / name, folder / "out" / name)
     for name in ("in", "out", "cwd", "tmp"):
         (folder / name).mkdir(parents=True, exist_ok=True)
-    places = {"IN": folder / "in", "OUT": folder / "out"}
-    return [re.sub(r"\b(IN|OUT)\b", lambda m: str(places[m[1]]), a) for a in shlex.split(command)]
+    places = {"IN": folder / "in", "OUT": folder / "out", "KEPT": folder / "out"}
+    return [
+        re.sub(r"\b(IN|OUT|KEPT)\b", lambda m: str(places[m[1]]), a) for a in shlex.split(command)
+    ]
 
 
-def failures(args: Sequence[str], folder: Path) -> list[str]:
-    """Run a command in this process; return what is wrong with how it ended."""
-    before = snapshot(folder / "in")
+def failures(args: Sequence[str], folder: Path, ending: tuple[int, ...] = ()) -> list[str]:
+    """Run a command in this process; return what is wrong with how it ended.
+
+    Args:
+        args: of the command.
+        folder: of the case.
+        ending: the exit statuses that are right, if not all that the fuzzer allows; 2 is then only
+            for a package that is not installed.
+    """
+    NETWORK.clear()
+    before = snapshot(folder / "in") | snapshot(folder / "out")
     status, out, err = run(args, folder)
-    return [*_ending(status, out, err, "--json" in args), *_traces(folder, before)]
+    wrong = [*_ending(status, out, err, "--json" in args), *_traces(folder, before)]
+    if ending and NETWORK:
+        wrong.append(f"a connection to {NETWORK}")
+    lacking = status == 2 and re.search(r"pip install -e '\.\[(\w+)\]'", err)
+    if ending and status not in ending and not (lacking and lacking[1] in EXTRAS):
+        wrong.append(f"status {status}: {err[-300:]}")
+    return wrong
 
 
 def run(args: Sequence[str], folder: Path) -> tuple[int | str, str, str]:
@@ -133,7 +158,8 @@ def snapshot(folder: Path) -> dict[str, tuple[int, ...]]:
 def _traces(folder: Path, before: dict[str, tuple[int, ...]]) -> Iterator[str]:
     """What was changed, left behind or half written."""
     after = snapshot(folder / "in")
-    if changed := [path for path in before if after.get(path) != before[path]]:
+    inside = [path for path in before if Path(path).is_relative_to(folder / "in")]
+    if changed := [path for path in inside if after.get(path) != before[path]]:
         yield f"an input was changed: {Path(changed[0]).name!r}"
     for name in ("in", "out", "cwd", "tmp", ""):
         parts = ("in", "out", "cwd", "tmp")
@@ -142,8 +168,10 @@ def _traces(folder: Path, before: dict[str, tuple[int, ...]]) -> Iterator[str]:
         strange = [n for n in left if n.startswith(".") and not n.endswith(resumed)]
         if strange or (name in ("tmp", "") and left):
             yield f"left behind in {name or 'the folder above'}: {(strange or left)[0]!r}"
+    own = snapshot(folder / "out")
     for file in (folder / "out").rglob("*"):
-        if file.is_file() and (reason := broken(file)):
+        changed = before.get(os.fsdecode(file)) != own[os.fsdecode(file)]
+        if file.is_file() and changed and (reason := broken(file)):
             yield f"a broken {file.suffix}: {reason}"
 
 
@@ -163,11 +191,19 @@ def broken(file: Path) -> str:
     return ""
 
 
-def check(seed: int, number: int, base: Path, work: Path) -> tuple[list[str], list[str]]:
-    """Run one random case below ``work``; return its arguments and failures."""
-    folder = work / f"{seed}-{number}"
+def check(seed: int, job: int | str, base: Path, work: Path) -> tuple[list[str], list[str]]:
+    """Run a random case below ``work``, or a command on whole inputs.
+
+    Returns:
+        Its arguments and failures.
+    """
+    folder = work / f"{seed}-{job if isinstance(job, int) else os.getpid()}"
     try:
-        args = random_case(seed, number, base, folder)
-        return args, failures(args, folder)
+        if isinstance(job, int):
+            args = random_case(seed, job, base, folder)
+            return args, failures(args, folder)
+        args = prepare(job, base, folder)
+        # The demo is given data without images: it stops before its minutes of training.
+        return args, failures(args, folder, (2,) if job.startswith("demo") else (0, 1, 3))
     finally:
         shutil.rmtree(folder, ignore_errors=True)

@@ -22,6 +22,8 @@ from palpate.cli import VERBS
 
 Rng = np.random.Generator
 LONG = "x" * 140_000
+#: Bytes of a file that is almost all a hole.
+SPARSE = 3 << 30
 WORDS = [
     *("", " ", "0", "-1", "1.5", "nan", "inf", "1e400", "9" * 30, "9" * 5000, "null", "True"),
     *("\0", "a\0b", "\udcff", "a\nb", "\r", "\t", "\ud800", "\ufeff", "\u202e", "é", "e\u0301"),
@@ -211,6 +213,22 @@ def safetensors(rng: Rng, data: bytes) -> bytes:
 
 # --- images
 
+#: What Pillow knows under any name, or hands to another program, and what no image is.
+FOREIGN = [
+    b"%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 24 24\n%%EndComments\nshowpage\n%%EOF\n",
+    b"%PDF-1.4\n1 0 obj <<>> endobj\ntrailer <<>>\n%%EOF\n",
+    b"<svg xmlns='http://www.w3.org/2000/svg' width='24' height='24'><script/></svg>",
+    b"\xd7\xcd\xc6\x9a" + b"\0" * 40,  # a metafile
+    b"SIMPLE  =                    T".ljust(2880),  # FITS
+    b"GRIB" + b"\0" * 40,
+    b"8BPS\0\1" + b"\0" * 40,
+    b"icns\0\0\0\x08",
+    b"\x7fELF" + b"\0" * 60,
+    b"#!/bin/sh\nexit\n",
+    b"\0\0\0\x18ftypmp42" + b"\0" * 40,
+    b"\x93NUMPY\1\0",
+]
+
 
 def image(rng: Rng, data: bytes) -> bytes:
     """Other modes, sizes, formats, animations, headers that promise too much."""
@@ -223,8 +241,8 @@ def image(rng: Rng, data: bytes) -> bytes:
     bombs = [bomb(*side) for side in ((9000, 9000), (13000, 13000), (60000, 60000), (1, 2**31 - 1))]
     stream = io.BytesIO()
     picture = pick(rng, images)
-    if rng.random() < 0.2:
-        return pick(rng, bombs)
+    if rng.random() < 0.3:
+        return pick(rng, bombs) if rng.random() < 0.5 else pick(rng, FOREIGN)
     try:
         exif = Image.Exif()
         exif[0x0112] = int(rng.integers(0, 12))
@@ -276,10 +294,18 @@ def change_content(rng: Rng, files: list[Path]) -> None:
 
 
 def change_place(rng: Rng, files: list[Path]) -> None:
-    """A file is lost, swapped, renamed, or something else than a file."""
+    """A file is lost, swapped, renamed, huge, or something else than a file; or all next to it."""
     file, another = pick(rng, files), pick(rng, files)
-    kind = int(rng.integers(9))
-    if kind == 0:
+    kind = int(rng.integers(11))
+    if kind == 9:  # a whole side of the samples
+        for each in filter(Path.is_file, file.parent.iterdir()):
+            each.unlink()
+    elif kind == 10:
+        data = file.read_bytes()
+        file.unlink()  # the copy may be a hard link
+        file.write_bytes(data)
+        os.truncate(file, SPARSE)
+    elif kind == 0:
         file.rename(file.with_name("swap"))
         shutil.copy(another if another.exists() else file.with_name("swap"), file)
     elif kind in (1, 2):

@@ -1,11 +1,13 @@
 """Valid inputs of every verb and reader, as small as they can be, and the commands that read them.
 
-A command is a line; ``IN`` is the folder of inputs, ``OUT`` an empty one. Only the folders of
-inputs that the line names are copied for it.
+A command is a line; ``IN`` is the folder of inputs, ``OUT`` an empty one, ``KEPT`` one with what
+the same command has written before, which it goes on from. Only the folders that the line names are
+copied for it.
 """
 
 import json
 import shutil
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 from unittest.mock import patch
@@ -20,8 +22,15 @@ from forge.pictures import gel, photo, put, write_csv, write_video
 from palpate import preference
 from palpate.cli import main
 from palpate.data.manifest import Manifest
+from palpate.preference.store import VoteStore
 
 MINI = Path(palpate.__file__).parent / "mini"
+SCORE = "score --generated IN/manifest --reference IN/manifest --split IN/split/split.json "
+SCORE += "--encoder IN/models/encoders --permutations 9"
+TRAIN = "train encoder IN/manifest --split IN/split/split.json --clip IN/models/encoders/clip "
+TRAIN += "--epochs 1 --preset tiny --checkpoint-minutes 0"
+GENERATE = "generate IN/manifest --model IN/models/generator --steps 1"
+CAPTION = "caption IN/manifest --template {material} --per frame"
 #: Command -> how often it is drawn next to the others; those that load models are slow. ``demo``
 #: gets no further than its data, since its other stages are the other verbs.
 COMMANDS: dict[str, int] = {
@@ -72,8 +81,7 @@ COMMANDS: dict[str, int] = {
     "--labels IN/vectors/labels.csv --page OUT/t.html --permutations 0": 4,
     "score --generated IN/generated --reference IN/manifest -o OUT/s.json "
     "--companions ssim psnr --permutations 0": 4,
-    "score --generated IN/manifest --reference IN/manifest --split IN/split/split.json "
-    "--encoder IN/models/encoders --permutations 9": 1,
+    f"{SCORE} --cache KEPT/scored": 1,
     "verify IN/results/audit.json --tolerance 1e-3": 4,
     "verify IN/results/scores.json --json": 4,
     "report IN/results/audit.json IN/results/scores.json -o OUT/page.html": 8,
@@ -82,11 +90,18 @@ COMMANDS: dict[str, int] = {
     "generate IN/pairs/vision/rec0/0.jpg -o OUT/t.png --model IN/models/generator --steps 1": 1,
     "generate IN/manifest -o OUT/g --model IN/models/generator --steps 1 "
     "--split IN/split/split.json": 1,
-    "train encoder IN/manifest --split IN/split/split.json --clip IN/models/encoders/clip "
-    "--epochs 0.1 --preset tiny -o OUT/e": 1,
+    f"{TRAIN} -o KEPT/stopped": 1,
+    "train autoencoder IN/manifest --split IN/split/split.json --preset tiny --set loop.steps=1 "
+    "-o OUT/a": 1,
     "train generator IN/manifest --split IN/split/split.json --clip IN/models/encoders "
     "--autoencoder IN/models/autoencoder --steps 1 --preset tiny -o OUT/g": 1,
-    "caption IN/manifest --template {material} --per frame -o OUT/c": 2,
+    f"{GENERATE} -o KEPT/generated": 1,
+    f"{CAPTION} -o OUT/c": 2,
+    f"{CAPTION} -o KEPT/captions": 1,
+    "presets mini": 1,
+    **{f"{verb} -o OUT/x": 1 for verb in ("audit IN/photos IN/photos", "split IN/touches")},
+    "score --generated IN/touches --reference IN/touches -o OUT/x --permutations 0": 1,
+    "validate IN/photos": 1,
     "caption IN/manifest --server http://127.0.0.1:9/v1 --model x "
     "--per frame --dry-run -o OUT/c": 1,
     "preference make --reference IN/manifest --generated IN/manifest IN/generated --names a b "
@@ -96,14 +111,22 @@ COMMANDS: dict[str, int] = {
 }
 
 
+#: Further commands for an environment without extras: with them they take long, or do not end.
+BARE = ("reproduce world-gelsight -o OUT/r", "preference serve IN/study")
+
+
 def build(folder: Path) -> None:
     """Write all inputs below ``folder``, the same bytes every time."""
     for name, make in TREES.items():
         source = make(folder / f".{name}").source
         (source if source.is_dir() else source.parent).rename(folder / name)
         shutil.rmtree(folder / f".{name}")
-    for make in (_videos, _tables, _vectors, _results):
+    for make in (_videos, _tables, _vectors, _results, _kept):
         make(folder)
+    program = folder / "bin" / "gs"  # what no image may start
+    program.parent.mkdir()
+    program.write_text('#!/bin/sh\ntouch "$TMPDIR/a program that an image started"\n')
+    program.chmod(0o755)
 
 
 def _videos(folder: Path) -> None:
@@ -133,6 +156,11 @@ def _tables(folder: Path) -> None:
         rows.append(row)
     shutil.copytree(table, folder / "manifest")
     Manifest.from_rows(rows, folder / "manifest").save(folder / "manifest" / "manifest.parquet")
+    for name, side in (("photos", "tactile"), ("touches", "vision")):
+        shutil.copytree(table, folder / name)
+        shutil.rmtree(folder / name / side)
+        part = [{k: v for k, v in row.items() if k != side} for row in rows]
+        Manifest.from_rows(part, folder / name).save(folder / name / "manifest.parquet")
     cells = [list(map(str, row.values())) for row in rows]
     write_csv(table / "rows.csv", list(rows[0]), cells)
     lines = ["\t".join(line) for line in (list(rows[0]), *cells)]
@@ -182,11 +210,28 @@ def _results(folder: Path) -> None:
         reference, methods = folder / "manifest", {"a": folder / "manifest", "b": results}
         plan = preference.make(reference, methods, folder / "study", raters=2, size=32)
     Crowd({"a": 1.0, "b": 0.0}).write(plan, folder / "study" / "votes")
+    with closing(VoteStore(folder / "study" / "study.db", plan.study)) as store:
+        votes = Crowd({"a": 0.0, "b": 1.0}).download(plan, "r01")["votes"]
+        store.store([vote | {"rater": "r01", "received": ""} for vote in votes])
     options = ("--preset", "tiny", "--size", "16", "--materials", "2", "--workers", "1")
     call("world", "-o", folder / "made", *options)
     (folder / "world").mkdir()
     (folder / "made" / "world.json").rename(folder / "world" / "world.json")
     shutil.rmtree(folder / "made")
+
+
+def _kept(folder: Path) -> None:
+    """What commands go on from: caches, a stopped training, images and captions."""
+    kept = folder / "kept"
+
+    def words(line: str) -> list[str]:
+        return [word.replace("IN/", f"{folder}/") for word in line.split()]
+
+    call(*words(SCORE), "--cache", kept / "scored")
+    call(*words(GENERATE), "-o", kept / "generated")
+    call(*words(CAPTION), "-o", kept / "captions")
+    with patch("palpate.training.engine._Run.draw", side_effect=KeyboardInterrupt):
+        main([*words(TRAIN), "-o", str(kept / "stopped"), "-q"])
 
 
 def call(*args: str | Path) -> None:

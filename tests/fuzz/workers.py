@@ -6,32 +6,46 @@ import multiprocessing
 import os
 import re
 import resource
+import sys
 import tempfile
 import traceback
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from multiprocessing.connection import Connection
 from pathlib import Path
 from queue import SimpleQueue
+from typing import TypeVar
 
 from fuzz import cases, seeds
+from fuzz.bare import hide
+
+Job = TypeVar("Job", int, str)
 
 
-def serve(pipe: Connection, seed: int, base: Path, work: Path) -> None:
-    """Run the cases whose numbers arrive, within the limit of memory."""
-    import torch  # noqa: F401  (its own size does not count)
+def serve(pipe: Connection, seed: int, base: Path, work: Path, bare: bool) -> None:
+    """Run the cases whose numbers arrive, or commands, within the limit of memory."""
+    if bare:
+        hide()
+    else:
+        import torch  # noqa: F401  (its own size does not count)
+    os.environ["PATH"] = f"{base / 'bin'}{os.pathsep}{os.environ['PATH']}"
 
+    def watch(event: str, args: tuple[object, ...]) -> None:
+        if event in ("socket.connect", "socket.getaddrinfo"):
+            cases.NETWORK.append(repr(args))
+
+    sys.addaudithook(watch)
     sink = os.open(os.devnull, os.O_WRONLY)
     os.dup2(sink, 1)  # what C libraries print
     os.dup2(sink, 2)
     while True:
-        number = pipe.recv()
+        job = pipe.recv()
         used = re.search(r"VmData:\s+(\d+) kB", Path("/proc/self/status").read_text())
         assert used is not None
         limit = int(used[1]) * 1024 + cases.BYTES  # what earlier cases left does not count
         resource.setrlimit(resource.RLIMIT_DATA, (limit, resource.RLIM_INFINITY))
         try:
-            pipe.send(cases.check(seed, number, base, work))
+            pipe.send(cases.check(seed, job, base, work))
         except Exception:
             pipe.send(([], [f"the fuzzer itself: {traceback.format_exc()[-900:]}"]))
 
@@ -43,7 +57,7 @@ class Worker:
         self.settings = settings
         self.process: multiprocessing.process.BaseProcess | None = None
 
-    def check(self, number: int) -> tuple[list[str], list[str]]:
+    def check(self, job: int | str) -> tuple[list[str], list[str]]:
         if self.process is None:
             context = multiprocessing.get_context("spawn")
             self.pipe, end = context.Pipe()
@@ -53,7 +67,7 @@ class Worker:
             limit = 3 * cases.SECONDS  # with the start
         else:
             limit = cases.SECONDS
-        self.pipe.send(number)
+        self.pipe.send(job)
         try:
             if self.pipe.poll(limit):
                 return self.pipe.recv()
@@ -72,29 +86,37 @@ class Worker:
 
 
 def run(
-    numbers: range, seed: int, workers: int = 2, base: Path | None = None
-) -> Iterator[tuple[int, list[str], list[str]]]:
-    """Yield (number, arguments, failures) of each case; ``base`` holds the inputs already."""
+    jobs: Iterable[Job],
+    seed: int,
+    workers: int = 2,
+    base: Path | None = None,
+    *,
+    bare: bool = False,
+) -> Iterator[tuple[Job, list[str], list[str]]]:
+    """Yield (job, arguments, failures) of each number of a case or command on whole inputs.
+
+    ``base`` holds the inputs already; ``bare`` is an environment without extras.
+    """
     with tempfile.TemporaryDirectory(prefix="palpate-fuzz-") as place:
         if base is None:
             base = Path(place) / "base"
             with contextlib.redirect_stdout(io.StringIO()):
                 seeds.build(base)
         idle: SimpleQueue[Worker] = SimpleQueue()
-        every = [Worker(seed, base, Path(place) / "work") for _ in range(workers)]
+        every = [Worker(seed, base, Path(place) / "work", bare) for _ in range(workers)]
         for worker in every:
             idle.put(worker)
 
-        def check(number: int) -> tuple[int, list[str], list[str]]:
+        def check(job: Job) -> tuple[Job, list[str], list[str]]:
             worker = idle.get()
             try:
-                return number, *worker.check(number)
+                return job, *worker.check(job)
             finally:
                 idle.put(worker)
 
         pool = ThreadPoolExecutor(workers)
         try:
-            yield from pool.map(check, numbers)
+            yield from pool.map(check, jobs)
         finally:
             pool.shutdown(cancel_futures=True)
             for worker in every:
