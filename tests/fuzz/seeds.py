@@ -99,8 +99,10 @@ COMMANDS: dict[str, int] = {
     f"{CAPTION} -o OUT/c": 2,
     f"{CAPTION} -o KEPT/captions": 1,
     "presets mini": 1,
-    **{f"{verb} -o OUT/x": 1 for verb in ("audit IN/photos IN/photos", "split IN/touches")},
-    "score --generated IN/touches --reference IN/touches -o OUT/x --permutations 0": 1,
+    "audit IN/photos IN/photos -o OUT/x": 1,
+    "split IN/touches -o OUT/x --train 0.5": 1,
+    "score --generated IN/touches --reference IN/touches -o OUT/x --permutations 0 "
+    "--companions ssim": 1,
     "validate IN/photos": 1,
     "caption IN/manifest --server http://127.0.0.1:9/v1 --model x "
     "--per frame --dry-run -o OUT/c": 1,
