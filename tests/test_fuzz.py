@@ -9,8 +9,7 @@ from fuzz.workers import run
 from palpate.cli import VERBS
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(3600)]
-MODELS = [command for command in seeds.COMMANDS if "models" in command or "train " in command]
-LIGHT = [command for command in seeds.COMMANDS if command not in MODELS]
+nightly = pytest.mark.nightly
 
 
 @pytest.fixture(scope="module")
@@ -20,9 +19,9 @@ def base(tmp_path_factory):
     return folder
 
 
-@pytest.mark.parametrize("commands", [LIGHT, pytest.param(MODELS, marks=pytest.mark.nightly)])
-def test_every_command_of_the_fuzzer_works_on_whole_inputs(base, commands):
-    wrong = [result for result in run(commands, seed=0, base=base) if result[-1]]
+@nightly
+def test_every_command_of_the_fuzzer_works_on_whole_inputs(base):
+    wrong = [result for result in run([*seeds.COMMANDS], seed=0, base=base) if result[-1]]
     assert not wrong, wrong[:5]
 
 
@@ -37,15 +36,14 @@ def test_without_extras_every_verb_works_or_says_which_it_lacks(base):
 
 
 @pytest.mark.parametrize(
-    ("first", "end"), [(0, 30), pytest.param(30, 2000, marks=pytest.mark.nightly)]
+    ("first", "end", "bare"),
+    [
+        (0, 30, True),
+        pytest.param(30, 500, True, marks=nightly),
+        pytest.param(0, 2000, False, marks=nightly),
+    ],
 )
-def test_broken_inputs_end_in_one_line(first, end, base):
-    results = run(range(first, end), seed=0, base=base)
+def test_broken_inputs_end_in_one_line(first, end, bare, base):
+    results = run(range(first, end), seed=0, base=base, bare=bare)
     wrong = [(number, *rest) for number, *rest in results if rest[-1]]
-    assert not wrong, wrong[:5]
-
-
-@pytest.mark.nightly
-def test_broken_inputs_end_in_one_line_without_extras(base):
-    wrong = [result for result in run(range(500), seed=1, base=base, bare=True) if result[-1]]
     assert not wrong, wrong[:5]

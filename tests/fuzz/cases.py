@@ -89,7 +89,7 @@ def failures(args: Sequence[str], folder: Path, ending: tuple[int, ...] = ()) ->
     wrong = [*_ending(status, out, err, "--json" in args), *_traces(folder, before)]
     if ending and NETWORK:
         wrong.append(f"a connection to {NETWORK}")
-    lacking = status == 2 and re.search(r"pip install -e '\.\[(\w+)\]'", err)
+    lacking = status == 2 and re.search(r"the extra (\w+) brings it", err)
     if ending and status not in ending and not (lacking and lacking[1] in EXTRAS):
         wrong.append(f"status {status}: {err[-300:]}")
     return wrong

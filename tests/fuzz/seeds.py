@@ -90,7 +90,7 @@ COMMANDS: dict[str, int] = {
     "generate IN/pairs/vision/rec0/0.jpg -o OUT/t.png --model IN/models/generator --steps 1": 1,
     "generate IN/manifest -o OUT/g --model IN/models/generator --steps 1 "
     "--split IN/split/split.json": 1,
-    f"{TRAIN} -o KEPT/stopped": 1,
+    f"{TRAIN} -o KEPT/stopped/model": 1,
     "train autoencoder IN/manifest --split IN/split/split.json --preset tiny --set loop.steps=1 "
     "-o OUT/a": 1,
     "train generator IN/manifest --split IN/split/split.json --clip IN/models/encoders "
@@ -233,7 +233,7 @@ def _kept(folder: Path) -> None:
     call(*words(GENERATE), "-o", kept / "generated")
     call(*words(CAPTION), "-o", kept / "captions")
     with patch("palpate.training.engine._Run.draw", side_effect=KeyboardInterrupt):
-        main([*words(TRAIN), "-o", str(kept / "stopped"), "-q"])
+        main([*words(TRAIN), "-o", str(kept / "stopped" / "model"), "-q"])
 
 
 def call(*args: str | Path) -> None:

@@ -253,7 +253,8 @@ class MissingExtraError(PalpateError):
     """An optional dependency is not installed; names the ``pip install`` that adds it."""
 
     def __init__(self, package: str, extra: str, purpose: str) -> None:
-        must, got = f"{purpose} needs the package {package}", "no such package in this environment"
+        must = f"{purpose} needs the package {package}"
+        got = f"no such package in this environment; the extra {extra} brings it"
         super().__init__(must, got, f"In palpate's checkout run: pip install -e '.[{extra}]'")
 
 
