@@ -5,6 +5,7 @@ whole files in the output folder. Everything else is a failure.
 """
 
 import contextlib
+import getpass
 import io
 import json
 import os
@@ -162,7 +163,7 @@ def _traces(folder: Path, before: dict[str, tuple[int, ...]]) -> Iterator[str]:
     if changed := [path for path in inside if after.get(path) != before[path]]:
         yield f"an input was changed: {Path(changed[0]).name!r}"
     for name in ("in", "out", "cwd", "tmp", ""):
-        parts = ("in", "out", "cwd", "tmp")
+        parts = ("in", "out", "cwd", "tmp", f"torchinductor_{getpass.getuser()}")
         left = [p.name for p in (folder / name).iterdir() if p.name not in parts]
         resumed = (".work", ".part")  # the same command goes on from these
         strange = [n for n in left if n.startswith(".") and not n.endswith(resumed)]
