@@ -91,8 +91,8 @@ COMMANDS: dict[str, int] = {
     "generate IN/manifest -o OUT/g --model IN/models/generator --steps 1 "
     "--split IN/split/split.json": 1,
     f"{TRAIN} -o KEPT/stopped/model": 1,
-    "train autoencoder IN/manifest --split IN/split/split.json --preset tiny --set autoencoder.steps_free=1 "
-    "-o OUT/a": 1,
+    "train autoencoder IN/manifest --split IN/split/split.json --preset tiny "
+    "--set autoencoder.steps_free=1 -o OUT/a": 1,
     "train generator IN/manifest --split IN/split/split.json --clip IN/models/encoders "
     "--autoencoder IN/models/autoencoder --steps 1 --preset tiny -o OUT/g": 1,
     f"{GENERATE} -o KEPT/generated": 1,
