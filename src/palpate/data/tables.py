@@ -25,7 +25,6 @@ from typing import Any
 import polars as pl
 
 from palpate.core import PalpateError, Problem, ProblemsError, require
-from palpate.data.images import SUFFIXES
 from palpate.data.manifest import PART_NAMES, PATH, ROLE_OF, reading_parquet
 from palpate.data.mapping import text_of
 
@@ -181,6 +180,8 @@ def headless_names(path: Path) -> list[str]:
 
 def is_image(name: object) -> bool:
     """Whether a name has the suffix of an image."""
+    from palpate.data.images import SUFFIXES  # lists are read without Pillow
+
     return str(name).strip().lower().endswith(SUFFIXES)
 
 
