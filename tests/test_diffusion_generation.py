@@ -13,7 +13,7 @@ from PIL import Image
 from forge.errors import fails
 from forge.models import make_pipeline
 from forge.pictures import write_photos
-from palpate.core import PalpateError, Split, inside
+from palpate.core import PalpateError, Split, inside, read_json, sealed, write_json
 from palpate.data.manifest import Manifest
 from palpate.diffusion.generated import Generated, file_name
 from palpate.diffusion.generation import generate, photo_ids
@@ -214,9 +214,9 @@ def test_wrong_inputs_and_outputs_are_explained(pipeline, tmp_path):
 
 def test_an_index_that_points_outside_is_rejected(pipeline, tmp_path):
     made = generate(write_photos(tmp_path / "in", 1), model=pipeline, output=tmp_path / "out")
-    index = json.loads((tmp_path / "out" / "index.json").read_text())
+    index = read_json(tmp_path / "out" / "index.json", "index")
     index["images"][made.ids[0]] = "../../in/0.png"
-    (tmp_path / "out" / "index.json").write_text(json.dumps(index))
+    write_json(tmp_path / "out" / "index.json", sealed(index))
     fails("must lie in images/", Generated.load, tmp_path / "out")
 
 

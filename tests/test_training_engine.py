@@ -3,6 +3,7 @@
 import json
 import math
 import os
+import shutil
 import signal
 import time
 import warnings
@@ -15,6 +16,7 @@ from safetensors import safe_open
 from tensorboardX.proto.event_pb2 import Event
 from torch import nn
 
+from forge.damage import flip
 from forge.errors import fails
 from palpate.core import PalpateError, PalpateWarning, quiet
 from palpate.training import engine
@@ -180,7 +182,9 @@ def test_interrupted_twice_and_while_saving(tmp_path, whole):
     net = Net()
     fit(net, loss, N, options(), tmp_path)
     assert same(weights(net), whole[0])
-    assert sorted(p.name for p in tmp_path.iterdir()) == ["checkpoint.safetensors", "log.jsonl"]
+    checkpoint = "checkpoint.safetensors"
+    files = [checkpoint, f"{checkpoint}.sha256", "log.jsonl"]
+    assert sorted(p.name for p in tmp_path.iterdir()) == files
 
 
 def test_finished_run_is_only_read(tmp_path, whole):
@@ -367,11 +371,16 @@ def test_no_rows_no_parameters_no_steps_bad_options(tmp_path):
         fails(f"`{next(iter(change))}` must", options, **change)
 
 
-def test_broken_checkpoint_is_reported(tmp_path):
-    fit(Net(), loss, N, options(), tmp_path)
-    file = tmp_path / "checkpoint.safetensors"
-    file.write_bytes(file.read_bytes()[:50])
-    fails(r"checkpoint\.safetensors", fit, Net(), loss, N, options(), tmp_path)
+@pytest.mark.parametrize("name", ["checkpoint", "best"])
+def test_a_damaged_checkpoint_is_refused_with_the_way_back(tmp_path, name):
+    held_out = {"held_out": (4, load)}
+    fit(Net(), loss, N, options(keep="best"), tmp_path, **held_out)
+    (file,) = tmp_path.glob(f"{name}*.safetensors")
+    flip(file)
+    words = f"{file} must be whole. Got damaged: its digest is another. Remove {tmp_path} to start"
+    fails(words, fit, Net(), loss, N, options(keep="best"), tmp_path, **held_out)
+    shutil.rmtree(tmp_path)
+    fit(Net(), loss, N, options(keep="best"), tmp_path, **held_out)
 
 
 @pytest.mark.parametrize("batch", [1, 4, 11, 12, 17, 22, 23])

@@ -4,13 +4,15 @@ The log is ``replies.jsonl``: one JSON object a line for every finished request,
 arrives and never changed::
 
     {"key": "<sha256>", "id": "video/frame", "prompt": "touch-adjectives/1", "model": "...",
-     "raw": "{...}", "refused": false, "finish": "stop", "tokens": [812, 31], "unused": null}
+     "raw": "{...}", "refused": false, "finish": "stop", "tokens": [812, 31], "unused": null,
+     "sealed": "<sha256>"}
 
 ``key`` is SHA-256 over the model, the digest of the prompt, the bytes of the image file and the
 parameters. The same request finds its answer there; a killed run loses what was in flight. A reply
 after which the request was repeated says why under ``unused`` (``invalid``, ``truncated``), and so
 does the error of a request that the server does not take (``rejected``): these are no answers, but
-their tokens count. A last line without its end was cut by a kill or a full disk and is dropped.
+their tokens count. A last line without its end was cut by a kill or a full disk and is dropped; a
+line whose digest under ``sealed`` is of another content is refused.
 """
 
 from __future__ import annotations
@@ -24,7 +26,7 @@ from pathlib import Path
 from typing import Any, BinaryIO
 
 from palpate.captions.prompts import Description, Prompt
-from palpate.core import PalpateError, digest_json
+from palpate.core import PalpateError, digest_json, sealed, unsealed
 
 #: Photos are sent at most so many pixels a side, as JPEG of this quality.
 SIDE, QUALITY = 768, 90
@@ -119,7 +121,7 @@ class ReplyLog:
 
     def _read(self, line: bytes, number: int) -> None:
         try:
-            row = json.loads(line)
+            row = unsealed(json.loads(line))
             self._add(row["key"], Reply(*(row[each.name] for each in fields(Reply))))
         except (ValueError, TypeError, LookupError):
             must, got = f"{self._path} must hold replies only", f"another line {number}"
@@ -135,7 +137,8 @@ class ReplyLog:
     def append(self, key: str, sample: str, prompt: str, reply: Reply) -> None:
         """Keep a reply, on disk before anything else happens; does nothing once closed."""
         row = {"key": key, "id": sample, "prompt": prompt, **asdict(reply)}
-        line = json.dumps(row, ensure_ascii=False).encode("utf-8", "replace") + b"\n"
+        row = json.loads(json.dumps(row, ensure_ascii=False).encode("utf-8", "replace"))
+        line = json.dumps(sealed(row), ensure_ascii=False).encode() + b"\n"
         with self._lock:
             if not self._open:
                 return

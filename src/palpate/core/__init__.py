@@ -24,8 +24,10 @@ from palpate.core.files import (
     require_regular,
     rng_for,
     save_image,
+    sealed,
     seed_for,
     short,
+    unsealed,
     write_json,
     write_text,
 )
@@ -48,6 +50,7 @@ from palpate.core.messages import (
 )
 from palpate.core.score import Measure, Score, require_comparable
 from palpate.core.split import NO_LEAK, PARTS, Split
+from palpate.core.whole import cached, is_whole, sealed_path
 
 __all__ = [
     "NO_LEAK",
@@ -67,6 +70,7 @@ __all__ = [
     "Split",
     "atomic_folder",
     "atomic_path",
+    "cached",
     "decoded",
     "digest_file",
     "digest_folder",
@@ -78,6 +82,7 @@ __all__ = [
     "image_bytes",
     "inside",
     "instead",
+    "is_whole",
     "locked",
     "open_image",
     "plain",
@@ -93,9 +98,12 @@ __all__ = [
     "require_regular",
     "rng_for",
     "save_image",
+    "sealed",
+    "sealed_path",
     "seed_for",
     "short",
     "track",
+    "unsealed",
     "write_json",
     "write_text",
 ]

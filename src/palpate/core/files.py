@@ -1,7 +1,11 @@
 """Files that are either whole or absent, images, values as JSON, digests and seeds.
 
-Files are written to a temporary sibling, then renamed. Digests are SHA-256 over canonical forms:
-equal content has one name, and a random draw depends on (seed, purpose, sample), never on order.
+Files are written to a temporary sibling, flushed to the disk, then renamed. Digests are SHA-256
+over canonical forms: equal content has one name, and a random draw depends on (seed, purpose,
+sample), never on order.
+
+What palpate reads back is checked before it is believed: an object in JSON holds its own digest,
+see :func:`sealed`; for other files see :mod:`palpate.core.whole`.
 
 **Images** are decoded by Pillow, by the decoders in ``IMAGE_FORMATS`` alone, none of which starts a
 program, and become upright 8-bit RGB by fixed rules:
@@ -30,7 +34,7 @@ import re
 import shutil
 import tempfile
 from collections.abc import Generator, Iterable, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager, nullcontext, suppress
 from functools import cache
 from itertools import islice
 from pathlib import Path, PurePath
@@ -54,6 +58,8 @@ MOST_PIXELS = 50_000_000
 WHITE_16, BRIGHT_16 = 65535, 4096
 #: Tags of EXIF and TIFF.
 ORIENTATION, BITS, PHOTOMETRIC = 0x0112, 258, 262
+#: The key of an object's own digest.
+SEAL = "sealed"
 
 #: Format without its version -> what it is, and what reads it.
 READERS = {
@@ -194,11 +200,36 @@ def _starting(path: Path) -> Generator[None]:
         raise PalpateError(f"{path} must be writable", reason, fix) from None
 
 
+def _move(part: Path, final: Path, flush: bool) -> None:
+    """Rename a file or folder, by default after all of it has reached the disk."""
+    if flush:
+        for path in (part, *part.rglob("*")):
+            _flush(path)
+    part.replace(final)
+    if flush:
+        _flush(final.parent)
+
+
+def _flush(path: Path) -> None:
+    if os.name != "posix" or not path.exists():  # Windows flushes only what is open to write
+        return
+    handle = os.open(path, os.O_RDONLY)
+    try:
+        with suppress(OSError) if path.is_dir() else nullcontext():  # not on every network disk
+            os.fsync(handle)
+    finally:
+        os.close(handle)
+
+
 @contextmanager
-def atomic_path(path: Path) -> Generator[Path]:
+def atomic_path(path: Path, *, flush: bool = True) -> Generator[Path]:
     """Yield a temporary file to write to; rename it to ``path`` on success, else remove it.
 
     A device or a pipe is written to and never replaced; a link stays, and its target is replaced.
+
+    Args:
+        path: the file.
+        flush: wait until it is on the disk, some milliseconds.
 
     Raises:
         OSError: if the disk is full.
@@ -222,14 +253,18 @@ def atomic_path(path: Path) -> Generator[Path]:
             with open(part, "rb") as source, open(final, "wb") as target:
                 shutil.copyfileobj(source, target)
         else:
-            part.replace(final)
+            _move(part, final, flush)
     finally:
         part.unlink(missing_ok=True)
 
 
 @contextmanager
-def atomic_folder(folder: Path) -> Generator[Path]:
+def atomic_folder(folder: Path, *, flush: bool = True) -> Generator[Path]:
     """Yield a temporary folder to fill; rename it to ``folder`` on success, else remove it.
+
+    Args:
+        folder: absent or empty.
+        flush: wait until all files are on the disk, some milliseconds each.
 
     Raises:
         PalpateError: if ``folder`` is not empty, is the current folder, or is written by another
@@ -245,7 +280,7 @@ def atomic_folder(folder: Path) -> Generator[Path]:
             yield part
             if folder.exists():
                 folder.rmdir()
-            part.replace(folder)
+            _move(part, folder, flush)
         finally:
             shutil.rmtree(part, ignore_errors=True)
 
@@ -315,22 +350,44 @@ def write_json(path: Path, value: Any) -> None:
     write_text(path, json.dumps(value, indent=1, ensure_ascii=False, allow_nan=False) + "\n")
 
 
+def sealed(record: Mapping[str, Any]) -> dict[str, Any]:
+    """Return an object for JSON with its own digest, which :func:`unsealed` checks.
+
+    Raises:
+        ValueError: for NaN or infinity, which JSON has not.
+    """
+    record = json.loads(json.dumps(record, default=plain, allow_nan=False))
+    return {**record, SEAL: digest_json(record)}
+
+
+def unsealed(record: Any) -> Any:
+    """Return a value from JSON, an object without the digest that it may hold.
+
+    Raises:
+        ValueError: if that is of another object.
+    """
+    digest = record.pop(SEAL, None) if isinstance(record, dict) else None
+    if digest is not None and digest != digest_json(record):
+        raise ValueError("damaged: its digest is of another content")
+    return record
+
+
 def read_json(path: Path, role: str) -> Any:
-    """Read a JSON file.
+    """Read a JSON file, and check its digest if it is :func:`sealed`.
 
     Args:
         path: the file.
         role: its role, for the error (``"split file"``).
 
     Raises:
-        PalpateError: if the file is missing or is not JSON.
+        PalpateError: if the file is missing, is not JSON, or is damaged.
     """
     require_regular(Path(path))
     try:
         value = json.loads(Path(path).read_text(encoding="utf-8"))
         # No NaN and no infinity, which JSON has not, and no halves of characters.
         json.dumps(value, ensure_ascii=False, allow_nan=False).encode()
-        return value
+        return unsealed(value)
     except FileNotFoundError:
         got, fix = instead(Path(path).parent, f"no file {path}", "Check the path")
         raise PalpateError(f"The {role} must exist", got, fix) from None
@@ -573,5 +630,5 @@ def save_image(
         PalpateError: if nothing can be written there.
     """
     data = image_bytes(image, form, **options)
-    with atomic_path(path) as part:
+    with atomic_path(path, flush=False) as part:
         part.write_bytes(data)

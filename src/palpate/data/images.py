@@ -34,7 +34,7 @@ from palpate.core import (
     Problem,
     ProblemsError,
     Progress,
-    atomic_path,
+    cached,
     decoded,
     digest_file,
     digest_json,
@@ -423,26 +423,19 @@ def cached_images(
     stamps = [] if preprocess.plain else frames.stamps(manifest.root)
     key = short(digest_json([geometry, image_stamp(manifest, column), stamps]))
 
-    def fill(images: NDArray[np.uint8]) -> None:
+    shape = (len(manifest), *preprocess.shape)
+
+    def decode(part: Path) -> None:
+        images = np.lib.format.open_memmap(part, mode="w+", dtype=np.uint8, shape=shape)
         load_images(frames.files, preprocess, progress=progress, into=images)
+        images.flush()
 
     file = Path(cache) / f"{column}-{preprocess.resize}-{key}.npy"
-    return mapped_images(file, (len(manifest), *preprocess.shape), fill)
+    return cached(file, decode, mapped, progress)
 
 
-def mapped_images(
-    file: Path, shape: tuple[int, ...], fill: Callable[[NDArray[np.uint8]], object]
-) -> NDArray[np.uint8]:
-    """Map an array of bytes read-only from its file; ``fill`` computes one that is not there."""
-    with suppress(Exception):  # a damaged header is parsed as Python, and fails in many ways
-        mapped = np.load(file, mmap_mode="r", allow_pickle=False)
-        if mapped.shape == shape and mapped.dtype == np.uint8:
-            return mapped
-    with atomic_path(file) as part:
-        images = np.lib.format.open_memmap(part, mode="w+", dtype=np.uint8, shape=shape)
-        fill(images)
-        images.flush()
-        del images
+def mapped(file: Path) -> NDArray[Any]:
+    """An array in a file, mapped read-only."""
     return np.load(file, mmap_mode="r", allow_pickle=False)
 
 

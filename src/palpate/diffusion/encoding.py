@@ -4,7 +4,7 @@ images, and what conditions on its photos and texts.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -12,8 +12,8 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from palpate.core import Progress, atomic_path, digest_json, quiet, read_json, short, write_json
-from palpate.data.images import cached_images, image_stamp
+from palpate.core import Progress, cached, digest_json, quiet, short
+from palpate.data.images import cached_images, image_stamp, mapped
 from palpate.data.manifest import Manifest
 from palpate.diffusion.autoencoder import AnyAutoencoder, BackgroundAutoencoder
 from palpate.diffusion.denoiser import inputs_of
@@ -65,7 +65,6 @@ def encode_part(
     if own and gels is not None:  # the stock gel is that of train
         stamps.append(digest_tensors({"gel": torch.from_numpy(np.array(gels[0]))}))
     key = digest_json([part.digest, *stamps, size])
-    store = folder / f"latents-{short(digest_json([key, autoencoder.digest]))}"
     conditions: dict[str, NDArray[Any]] = {}
     if encoders is not None:
         for s in policy.modalities:
@@ -78,18 +77,16 @@ def encode_part(
         conditions["photos"] = cached_images(part, "vision", policy.photo_size, cache, progress)
 
     def code(pixels: NDArray[np.uint8], ground: NDArray[np.uint8] | None, name: str) -> Any:
-        target = store / name
-        return encode_latents(
-            autoencoder, pixels, ground, ids=part.ids, folder=target, key=key, progress=progress
-        )
+        file = folder / f"{name}-{short(digest_json([CACHE_FORMAT, key, autoencoder.digest]))}.npy"
+        return encode_latents(autoencoder, pixels, ground, file=file, progress=progress)
 
-    latents, seen = code(images, gels if own else None, ""), None
+    latents, seen = code(images, gels if own else None, "latents"), None
     if background:
         assert gels is not None
         if isinstance(autoencoder, BackgroundAutoencoder):
             seen = lambda rows, _: autoencoder.gel(gels[rows])
         else:
-            coded = code(gels, None, "background")
+            coded = code(gels, None, "gel-latents")
             seen = lambda rows, stats: stats.normalize(torch.as_tensor(coded[rows]))
     return Rows(latents, conditions, seen, part.ids, gels=gels)
 
@@ -99,21 +96,17 @@ def encode_latents(
     images: NDArray[np.uint8],
     background: NDArray[np.uint8] | None,
     *,
-    ids: Sequence[str],
-    folder: Path,
-    key: str = "",
+    file: Path,
     batch: int = 32,
     progress: Progress = quiet,
 ) -> NDArray[np.float32]:
     """Latents of all images, before quantization, as a read-only memory map; encoded once.
 
     Args:
-        autoencoder: frozen; its digest is part of the cache's key.
-        images: (n, h, w, 3) bytes, in the order of ``ids``; an array or a memory map.
+        autoencoder: frozen.
+        images: (n, h, w, 3) bytes, an array or a memory map.
         background: of the same gels, for an autoencoder that is given them.
-        ids: sample ids.
-        folder: holds ``latents.npy`` and ``latents.json``, the ids in order and a key.
-        key: digest of what the images are (manifest, column, size).
+        file: ``.npy`` whose name says of which images, and of which autoencoder.
         batch: images at once.
         progress: called after each batch.
 
@@ -125,9 +118,8 @@ def encode_latents(
         gels = None if background is None else background[rows]
         return autoencoder.encode(images[rows], gels, batch=batch).numpy()
 
-    about = {"key": digest_json([key, autoencoder.digest]), "ids": list(ids)}
     task = "encoding tactile images"
-    return _mapped(folder / "latents", about, code, batch=batch, progress=progress, task=task)
+    return _mapped(file, len(images), code, batch=batch, progress=progress, task=task)
 
 
 def encode_patches(
@@ -146,34 +138,30 @@ def encode_patches(
             pixels = preprocess(to_unit(images[rows], encoders.device))
             return encoders.patches(pixels, count).half().cpu().numpy()
 
-    key = [encoders.digest("vision"), image_stamp(part, "vision"), count]
-    about = {"key": digest_json(key), "ids": part.ids}
-    file = folder / f"vision-states-{short(digest_json(about))}"
-    return _mapped(file, about, code, progress=progress, task="encoding vision")
+    key = [CACHE_FORMAT, encoders.digest("vision"), image_stamp(part, "vision"), count, part.ids]
+    file = folder / f"vision-states-{short(digest_json(key))}.npy"
+    return _mapped(file, len(part), code, progress=progress, task="encoding vision")
 
 
 def _mapped(
     file: Path,
-    about: Mapping[str, Any],
+    n: int,
     code: Callable[[slice], NDArray[Any]],
     *,
     batch: int = 32,
     progress: Progress,
     task: str,
 ) -> NDArray[Any]:
-    """What ``code`` gives for all rows, as a memory map; computed once, while ``about`` is so."""
-    data, note, n = file.with_suffix(".npy"), file.with_suffix(".json"), len(about["ids"])
-    about = {"format": CACHE_FORMAT, **about}
-    if not (data.is_file() and note.is_file() and read_json(note, "latent cache") == about):
-        note.unlink(missing_ok=True)
-        with atomic_path(data) as part:
-            first = code(slice(0, min(batch, n)))
-            shape = (n, *first.shape[1:])
-            store = np.lib.format.open_memmap(part, mode="w+", dtype=first.dtype, shape=shape)
-            for start in range(0, n, batch):
-                rows = slice(start, min(start + batch, n))
-                store[rows] = code(rows) if start else first
-                progress(task, rows.stop, n)
-            store.flush()
-        write_json(note, about)
-    return np.load(data, mmap_mode="r", allow_pickle=False)
+    """What ``code`` gives for ``n`` rows, as a memory map; computed once."""
+
+    def fill(part: Path) -> None:
+        first = code(slice(0, min(batch, n)))
+        shape = (n, *first.shape[1:])
+        store = np.lib.format.open_memmap(part, mode="w+", dtype=first.dtype, shape=shape)
+        for start in range(0, n, batch):
+            rows = slice(start, min(start + batch, n))
+            store[rows] = code(rows) if start else first
+            progress(task, rows.stop, n)
+        store.flush()
+
+    return cached(file, fill, mapped, progress)

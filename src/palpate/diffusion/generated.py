@@ -4,7 +4,7 @@
 
     OUT/images/<name>.png   one image per id; the name is made from the id
     OUT/index.json          {"format", "complete", "settings", "digest", "notice",
-                             "images": {id: name}, "skipped": [...]}
+                             "images": {id: name}, "skipped": [...], "sealed"}
 
 ``settings`` holds the pipeline's digest, seed, sampler and image size; a folder made with others is
 rejected.

@@ -38,6 +38,7 @@ from palpate.core import (
     quiet,
     require,
     save_image,
+    sealed,
     write_json,
 )
 from palpate.core.files import canonical_json
@@ -61,6 +62,7 @@ WHOLE = "must go with a manifest, of which it names the parts"
 FEW = 64
 #: Threads that read photos while others are sampled.
 THREADS = max(2, min(16, os.cpu_count() or 1))
+PNG_END = b"\0\0\0\0IEND\xaeB`\x82"
 #: Gels kept in memory.
 GELS = 64
 
@@ -245,15 +247,17 @@ class _Target:
         return self.folder / "images" / file_name(sample_id) if self.folder else self.file
 
     def has(self, item: _Item, stamp: str) -> bool:
-        """Whether the image of this id, photo and settings is there."""
+        """Whether the image of this id, photo and settings is there, undamaged."""
         if (path := self.path(item.id)) is None:
             return False
         try:
             with open_image(path) as image:
                 text = [image.info.get(f"palpate.{k}") for k in ("id", "settings", "input")]
+                image.verify()  # the checksum of each chunk but the last
         except ImageError:
             return False
-        return text == [item.id, self.digest, stamp]
+        whole = path.read_bytes().endswith(PNG_END)
+        return whole and text == [item.id, self.digest, stamp]
 
     @contextmanager
     def writing(self) -> Generator[None]:
@@ -261,7 +265,7 @@ class _Target:
         folder = self.folder if self.first else None
         with nullcontext() if folder is None else locked(folder):
             if folder is not None:
-                write_json(folder / "index.json", plain(self.index))
+                write_json(folder / "index.json", sealed(plain(self.index)))
             yield
 
     def keep(self, item: _Item, array: NDArray[np.uint8]) -> _Item:
@@ -288,7 +292,7 @@ class _Target:
             files = {**self.index.images, **{i: file_name(i) for i in ids}}
             index = replace(self.index, complete=True, images=files, skipped=skipped)
             if self.first:
-                write_json(self.folder / "index.json", plain(index))
+                write_json(self.folder / "index.json", sealed(plain(index)))
         common = (self.settings, skipped, new, self.notice, notes, self.memory)
         return Generated(self.folder, files, *common)
 

@@ -23,6 +23,7 @@ from palpate.core import (
     Problem,
     ProblemsError,
     Progress,
+    cached,
     digest_json,
     quiet,
     require,
@@ -100,16 +101,18 @@ def embed(
     label, group = words_of(manifest, "material"), words_of(manifest, groups)
     key = digest_json(["palpate-embedding/1", digest, manifest.ids, inputs, label, group])
     file = Path(cache) / f"{modality}-{short(key)}.npz" if cache else None
-    if file is not None and (cached := _cached(file)) is not None:
-        progress(f"embedding {modality}", len(manifest), len(manifest), "cached")
-        return cached
-    if frames is None:
-        features = embed_texts(texts, encoders, batch=batch, progress=progress)
-    else:
-        features = embed_frames(frames, encoders, modality, batch, progress)
-    result = FeatureSet(manifest.ids, features, label, group, digest)
-    if file is not None:
-        result.save(file)
+
+    def compute() -> FeatureSet:
+        if frames is None:
+            features = embed_texts(texts, encoders, batch=batch, progress=progress)
+        else:
+            features = embed_frames(frames, encoders, modality, batch, progress)
+        return FeatureSet(manifest.ids, features, label, group, digest)
+
+    if file is None:
+        return compute()
+    result = cached(file, lambda part: compute().save(part), FeatureSet.load, progress)
+    progress(f"embedding {modality}", len(manifest), len(manifest))
     return result
 
 
@@ -226,14 +229,6 @@ def words_of(manifest: Manifest, name: str) -> list[str] | None:
     """A column as texts, '' for none; None where all are."""
     values = manifest.column(name)
     return None if all(v is None for v in values) else ["" if v is None else str(v) for v in values]
-
-
-def _cached(file: Path) -> FeatureSet | None:
-    """The cached features, if the file is whole; its name says whose they are."""
-    try:
-        return FeatureSet.load(file)
-    except Exception:  # of a damaged file NumPy, zipfile and zlib raise many kinds
-        return None
 
 
 def list_images(inputs: Any) -> list[Path | Image.Image]:

@@ -10,7 +10,6 @@ pieces of 1,024 files, so that a run that was stopped goes on where it was.
 
 from __future__ import annotations
 
-import zipfile
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from palpate.core import PalpateError, Progress, atomic_path, digest_json, quiet, short
+from palpate.core import PalpateError, Progress, cached, digest_json, quiet, short
 from palpate.data.images import file_stamp, in_threads, read_image
 
 VERSION = 5
@@ -75,7 +74,7 @@ def thumbnails(
     for start in range(0, len(files), PIECE):
         progress("decoding images", start, len(files))
         piece = files[start : start + PIECE]
-        pixels, reasons = _piece(piece, cache)
+        pixels, reasons = _piece(piece, cache, progress)
         unreadable.update({str(piece[k]): reason for k, reason in sorted(reasons.items())})
         for k, name in enumerate(map(str, piece)):
             if k in reasons:
@@ -90,23 +89,25 @@ def thumbnails(
     return Thumbnails(row, np.stack(different) if different else empty, unreadable)
 
 
-def _piece(files: Sequence[Path], cache: Path | None) -> Decoded:
+def _piece(files: Sequence[Path], cache: Path | None, progress: Progress) -> Decoded:
     """Thumbnails of some files, from the cache if they are there."""
     if cache is None:
         return _decode(files)
     key = digest_json([VERSION, [[str(path), *file_stamp(path)] for path in files]])
-    stored = cache / f"thumbnails-{short(key)}.npz"
-    try:
-        with np.load(stored, allow_pickle=False) as piece:
-            reasons = zip(piece["bad"].tolist(), piece["why"].tolist(), strict=True)
-            return piece["pixels"], dict(reasons)
-    except (OSError, ValueError, EOFError, KeyError, zipfile.BadZipFile):
-        pixels, bad = _decode(files)  # absent or damaged
-    with atomic_path(stored) as part, open(part, "wb") as file:
-        np.savez(
-            file, pixels=pixels, bad=np.array(list(bad), int), why=np.array([*bad.values()], str)
-        )
-    return pixels, bad
+
+    def decode(part: Path) -> None:
+        pixels, bad = _decode(files)
+        why = np.array([*bad.values()], str)
+        with open(part, "wb") as file:
+            np.savez(file, pixels=pixels, bad=np.array(list(bad), int), why=why)
+
+    return cached(cache / f"thumbnails-{short(key)}.npz", decode, _stored, progress)
+
+
+def _stored(file: Path) -> Decoded:
+    with np.load(file, allow_pickle=False) as piece:
+        reasons = zip(piece["bad"].tolist(), piece["why"].tolist(), strict=True)
+        return piece["pixels"], dict(reasons)
 
 
 def _decode(files: Sequence[Path]) -> Decoded:

@@ -18,7 +18,7 @@ from __future__ import annotations
 import dataclasses
 import importlib.util
 import shutil
-from contextlib import nullcontext
+from contextlib import nullcontext, suppress
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -26,8 +26,10 @@ from typing import Any
 
 from palpate.core import (
     MissingExtraError,
+    PalpateError,
     Progress,
     atomic_folder,
+    digest_folder,
     digest_json,
     digest_lines,
     locked,
@@ -35,6 +37,7 @@ from palpate.core import (
     read_json,
     require,
     require_new_folder,
+    sealed,
     write_json,
     write_text,
 )
@@ -53,7 +56,7 @@ NOTE = (
     "Synthetic: procedural surfaces and a simulated sensor. Shows mechanisms; never compare its "
     "numbers with those of real data sets."
 )
-#: Folder within an unfinished world: its lock, and the captions of each finished video.
+#: Folder within an unfinished world: captions of each finished video, and the digest of its files.
 WORK = ".work"
 
 
@@ -134,7 +137,11 @@ def _finished(output: Path, options: WorldOptions) -> WorldRecord:
 def _render(unfinished: Path, world: World, workers: int, progress: Progress) -> None:
     """Render the videos that are missing; materials that a user added go to the workers too."""
     plans = world.plans
-    todo = [plan for plan in plans if not (unfinished / "dataset" / plan.name).is_dir()]
+    todo = [plan for plan in plans if not _is_whole(unfinished, plan)]
+    for folder in (unfinished / "dataset" / plan.name for plan in todo):
+        if folder.is_dir():
+            progress(f"{folder} is damaged: making it again", 0, 0)
+            shutil.rmtree(folder)
     finished = len(plans) - len(todo)
     progress("rendering videos", finished, len(plans))
     job = partial(_write_video, world.options, unfinished)
@@ -147,6 +154,15 @@ def _render(unfinished: Path, world: World, workers: int, progress: Progress) ->
             progress("rendering videos", count, len(plans), name)
 
 
+def _is_whole(unfinished: Path, plan: VideoPlan) -> bool:
+    """Whether a video is there as it was written."""
+    folder, record = unfinished / "dataset" / plan.name, unfinished / WORK / f"{plan.name}.json"
+    with suppress(PalpateError, LookupError, TypeError):
+        files = read_json(record, "record of a video")["files"]
+        return folder.is_dir() and digest_folder(folder) == files
+    return False
+
+
 def _set_materials(materials: dict[str, Material]) -> None:
     MATERIALS.clear()
     MATERIALS.update(materials)
@@ -156,9 +172,10 @@ def _write_video(options: WorldOptions, unfinished: Path, plan: VideoPlan) -> st
     """Render a video into ``unfinished``, whole or not at all; return its name."""
     video = Video(options, plan)
     captions = [video.text(contact) for contact in range(options.contacts_per_video)]
-    write_json(unfinished / WORK / f"{plan.name}.json", captions)
-    with atomic_folder(unfinished / "dataset" / plan.name) as folder:
+    with atomic_folder(unfinished / "dataset" / plan.name, flush=False) as folder:
         write_video_files(video, folder)
+        record = {"captions": captions, "files": digest_folder(folder)}
+        write_json(unfinished / WORK / f"{plan.name}.json", sealed(record))
     return plan.name
 
 
@@ -168,7 +185,9 @@ def _finish(unfinished: Path, world: World) -> None:
         shutil.rmtree(stray, ignore_errors=True)
     options, leak = world.options, leak_table(world.parts)
     captions = {
-        plan.name: read_json(unfinished / WORK / f"{plan.name}.json", "captions of a video")
+        plan.name: read_json(unfinished / WORK / f"{plan.name}.json", "record of a video")[
+            "captions"
+        ]
         for plan in world.plans
     }
     manifest = world.manifest(captions, unfinished)

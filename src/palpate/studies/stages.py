@@ -4,10 +4,11 @@
 earlier stages that it read, its facts, the digest of its own files, time, date and
 versions. A stage is built in ``run/NAME.partial``, with what it reads in ``run/NAME.partial.json``,
 and renamed when complete. Running again with the same inputs and the same files of earlier stages
-reuses it; with others the stage, and so every stage that read it, is built again. A killed
-stage finds its partial folder again if the inputs are the same, and may resume from there. The
-digest holds an integer version of each stage, raised by hand where the stage comes to write other
-bytes, and not the version of palpate: a release does not build everything again.
+reuses it; with others, or where its own files are no longer those that it wrote, the stage, and so
+every stage that read it, is built again. A killed stage finds its partial folder again if the
+inputs are the same, and may resume from there. The digest holds an integer version of each stage,
+raised by hand where the stage comes to write other bytes, and not the version of palpate: a release
+does not build everything again.
 """
 
 from __future__ import annotations
@@ -26,7 +27,14 @@ from pathlib import Path
 from typing import Any
 
 from palpate._version import __version__
-from palpate.core.files import canonical_json, digest_folder, digest_json, read_json, write_json
+from palpate.core.files import (
+    canonical_json,
+    digest_folder,
+    digest_json,
+    read_json,
+    sealed,
+    write_json,
+)
 from palpate.core.messages import PalpateError
 
 FORMAT = "palpate-stage/1"
@@ -95,6 +103,8 @@ def run_stage(
     if (stage := finished_stage(folder, digest, read)) is not None:
         print_line(f"{name}: already done ({stage.seconds:.0f} s then)")
         return stage
+    if folder.exists():
+        print_line(f"{name}: it or what it reads has changed since it was done")
     print_line(f"{name}: ...")
     record = {"digest": digest, "version": version, "inputs": inputs, "read": read}
     stage = _build(folder, json.loads(canonical_json(record)), build)
@@ -108,13 +118,15 @@ def stage_digest(name: str, inputs: Mapping[str, Any], version: int = 1) -> str:
 
 
 def finished_stage(folder: Path, digest: str, read: Mapping[str, str]) -> Stage | None:
-    """Return the stage in ``folder`` if it is finished and read what ``digest`` and ``read`` name.
+    """Return the stage in ``folder`` if it is finished, undamaged and read what ``digest`` and
+    ``read`` name.
 
     The digest does not say which files earlier stages had: one that was made again may have others.
     """
     record = _record(folder / "stage.json")
     same = record.get("digest") == digest and record.get("read") == read
-    return Stage(folder, record) if same else None
+    whole = same and stage_outputs(folder) == record["outputs"]
+    return Stage(folder, record) if whole else None
 
 
 def stored_stage(folder: Path) -> Stage:
@@ -176,7 +188,7 @@ def _build(
         with suppress(metadata.PackageNotFoundError):
             record["versions"][package] = metadata.version(package)
     record["machine"] = f"{platform.machine()}, {os.cpu_count()} cores"
-    write_json(partial / "stage.json", record)
+    write_json(partial / "stage.json", sealed(record))
     shutil.rmtree(final, ignore_errors=True)
     partial.replace(final)
     partial_record.unlink()
@@ -184,4 +196,6 @@ def _build(
 
 
 def _record(path: Path) -> dict[str, Any]:
-    return read_json(path, "stage record") if path.is_file() else {}
+    with suppress(PalpateError):  # absent or damaged: the stage is built again
+        return read_json(path, "stage record")
+    return {}

@@ -3,7 +3,8 @@
 The rows and the noise of step k depend on (seed, k) alone, so a run that is stopped and started
 again takes the same steps as one that was not, on any number of processes. A checkpoint is one
 safetensors file (weights, moving average, both Adam moments) with the step and the log in its
-metadata: one rename replaces all of it, and no pickle is involved. It is written in the background.
+metadata: one rename replaces all of it, and no pickle is involved. It is written in the background,
+and sealed: one that was damaged since is refused.
 
 The moving average of the weights is ``a <- d a + (1 - d) w`` with ``d = min(ema, (1 + k) / (10 +
 k))``, the warm-up of latent diffusion (Rombach et al., CVPR 2022, public code).
@@ -37,14 +38,16 @@ from palpate.core import (
     atomic_path,
     digest_json,
     few,
+    is_whole,
     quiet,
     require,
     rng_for,
     save_image,
+    sealed_path,
     short,
 )
 from palpate.training.options import Compute, LoopOptions, RowOrder, Tracker, learning_rate
-from palpate.training.processes import average, barrier, merged, place, shared
+from palpate.training.processes import agreed, average, barrier, merged, place, shared
 from palpate.training.steps import Step
 
 Batch = dict[str, Tensor]
@@ -376,6 +379,11 @@ class _Run:
         return low, len(losses) - 1 - losses.index(low) if losses else 0
 
     @property
+    def keeps_best(self) -> bool:
+        """Whether weights of an evaluation are the result."""
+        return self.options.keep == "best" and self.best[0] < math.inf
+
+    @property
     def stopped(self) -> bool:
         """Whether the held-out loss has not become better for long enough."""
         patience = self.options.patience
@@ -413,7 +421,7 @@ class _Run:
 
     def finish(self) -> None:
         """Leave the weights that are the result in the module, in evaluation mode."""
-        if self.options.keep == "best" and self.best[0] < math.inf:
+        if self.keeps_best:
             barrier()  # the first process writes it
             best = load_file(self.best_file, device=str(self.device))
             self.module.load_state_dict(best)
@@ -472,10 +480,17 @@ class _Run:
             tracker.finish()
 
     def restore(self) -> int:
-        """Load a checkpoint of this run, if there is one; returns the step to go on from."""
+        """Load a checkpoint of this run, if there is one; returns the step to go on from.
+
+        Raises:
+            PalpateError: if it is damaged.
+        """
         path = self.folder / CHECKPOINT
         if path.is_file():
+            self._require_whole(path)
             self._read(path)
+        if self.keeps_best:  # what the log calls the best must be there at the end
+            self._require_whole(self.best_file)
         if self.part[1] > 1:
             steps = torch.tensor([float(self.step)] * 2, device=self.device)
             average([steps[:1]])
@@ -484,16 +499,17 @@ class _Run:
             require(bool(steps[0] == steps[1]), None, must, got, fix=fix)
         return self.step
 
+    def _require_whole(self, path: Path) -> None:
+        must, fix = f"The checkpoint {path} must be whole", f"Remove {self.folder} to start again"
+        with agreed():
+            require(is_whole(path), None, must, "damaged: its digest is another", fix=fix)
+
     def _read(self, path: Path) -> None:
-        try:
-            with safe_open(path, framework="pt") as file:
-                meta = file.metadata() or {}
-                if meta.get("key") != self.key:
-                    return
-                tensors = {k: file.get_tensor(k) for k in file.keys()}  # noqa: SIM118 - no iterator
-        except SafetensorError as error:
-            must = f"The checkpoint {path} must be a whole safetensors file"
-            raise PalpateError(must, str(error), "Delete it to start anew") from None
+        with safe_open(path, framework="pt") as file:
+            meta = file.metadata() or {}
+            if meta.get("key") != self.key:
+                return
+            tensors = {k: file.get_tensor(k) for k in file.keys()}  # noqa: SIM118 - no iterator
         model = {k.removeprefix("model."): v for k, v in tensors.items() if k.startswith("model.")}
         self.module.load_state_dict(model)
         for name, value in self.average.items():
@@ -515,7 +531,7 @@ def _copies(tensors: dict[str, Tensor]) -> dict[str, Tensor]:
 
 def _save(tensors: dict[str, Tensor], path: Path, metadata: dict[str, str] | None = None) -> None:
     try:
-        with atomic_path(path) as part:
+        with sealed_path(path) as part:
             save_file(tensors, part, metadata=metadata)
     except SafetensorError as error:  # of a full disk, too
         must, fix = f"{path} must be writable", "Free some space and run the same command again"

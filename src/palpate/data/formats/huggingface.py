@@ -119,7 +119,7 @@ class _Store:
     def _write(self, path: Path, data: bytes) -> None:
         if not path.is_file():
             self.created.append(path)
-            with atomic_path(path) as part:
+            with atomic_path(path, flush=False) as part:
                 part.write_bytes(data)
         else:
             must, fix = "Images of an earlier import must be the same", "Choose another folder"
