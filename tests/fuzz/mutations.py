@@ -231,13 +231,14 @@ FOREIGN = [
 
 
 def image(rng: Rng, data: bytes) -> bytes:
-    """Other modes, sizes, formats, animations, headers that promise too much."""
+    """Other modes, depths, sizes, formats, animations, headers that promise too much."""
     x = rng.integers(0, 256, (24, 24, 3)).astype(np.uint8)
     modes = ["L", "1", "P", "RGBA", "LA", "CMYK", "YCbCr", "HSV", "F", "I"]
     images = [Image.fromarray(x).convert(mode) for mode in modes]
     images += [Image.fromarray(x[:1, :1]), Image.fromarray(x[:1]), Image.new("RGB", (3000, 1))]
-    images += [Image.fromarray(rng.integers(0, 65536, (24, 24)).astype(np.uint16))]
-    kinds = ["PNG", "JPEG", "GIF", "BMP", "TIFF", "WEBP", "ICO", "PPM"]
+    depths = (65536, 4096, 256, 2)
+    images += [Image.fromarray(rng.integers(0, n, (24, 24)).astype(np.uint16)) for n in depths]
+    kinds = ["PNG", "JPEG", "GIF", "BMP", "TIFF", "WEBP", "ICO", "PPM", "AVIF", "EPS", "TGA", "PDF"]
     bombs = [bomb(*side) for side in ((9000, 9000), (13000, 13000), (60000, 60000), (1, 2**31 - 1))]
     stream = io.BytesIO()
     picture = pick(rng, images)
@@ -247,7 +248,7 @@ def image(rng: Rng, data: bytes) -> bytes:
         exif = Image.Exif()
         exif[0x0112] = int(rng.integers(0, 12))
         picture.save(stream, pick(rng, kinds), exif=exif)
-    except (OSError, ValueError):  # a format without this mode
+    except (OSError, ValueError, KeyError):  # a format without this mode
         picture.convert("RGB").save(stream, "PNG")
     return stream.getvalue()
 

@@ -525,8 +525,10 @@ def _why_unreadable(source: Path | BinaryIO, error: Exception) -> str:
     """What Pillow raised, in plain words."""
     from PIL import Image
 
-    if isinstance(source, Path) and not source.is_file():
-        return "a folder" if source.is_dir() else "no such file"
+    if isinstance(error, FileNotFoundError | IsADirectoryError):
+        return "a folder" if isinstance(error, IsADirectoryError) else "no such file"
+    if isinstance(error, OSError) and error.strerror:
+        return error.strerror
     if isinstance(error, Image.DecompressionBombError):
         return f"more than {MOST_PIXELS:,} pixels"
     if not isinstance(error, Image.UnidentifiedImageError):
@@ -559,7 +561,7 @@ def decoded(
     """
     from PIL import Image, ImageOps
 
-    deep, tags = ";16" in str([tile.args for tile in image.tile]), getattr(image, "tag_v2", {})
+    layout, tags = str(getattr(image, "tile", "")), getattr(image, "tag_v2", {})
     several = image.format != "MPO" and getattr(image, "is_animated", False)  # MPO: of a phone
     taken = ["the first of several images"] if several else []
     if at_least is not None:
@@ -571,12 +573,13 @@ def decoded(
     if image.mode == "F":
         raise ImageError("floating-point pixels, whose range is not defined")
     if image.mode.startswith("I"):
-        bits = min(16, *tags.get(BITS, (16,)), 16)
+        bits = min(16, *tags.get(BITS, (16,)))
         image = Image.fromarray(_gray(np.asarray(image), 2**bits - 1, tags.get(PHOTOMETRIC) == 0))
         taken.append(f"{bits}-bit gray with {2**bits - 1} as white")
-    elif deep:  # Pillow has the upper eight bits alone
-        colors = zip(image.getbands(), image.getextrema(), strict=True)
-        _require_bright(256 * max(range_[1] for band, range_ in colors if band != "A") + 255)
+    elif ";16" in layout:  # Pillow has the upper eight bits alone
+        colors = np.asarray(image).reshape(-1, len(image.getbands()))
+        colors = colors[:, :-1] if "A" in image.getbands() else colors
+        _require_bright(256 * int(colors.max()) + 255)
         taken.append(f"16-bit color with {WHITE_16} as white")
     if image.has_transparency_data:
         image = image.convert("RGBA")

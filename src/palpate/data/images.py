@@ -52,8 +52,10 @@ if TYPE_CHECKING:
     from palpate.data.manifest import Manifest
 
 Check = Literal["decode", "header", "none"]
-SUFFIXES = (".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".webp", ".ppm", ".pgm", ".gif")
-SUFFIXES += (".avif", ".heic", ".heif")
+SUFFIXES = (
+    *(".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".webp"),
+    *(".ppm", ".pgm", ".gif", ".avif", ".heic", ".heif"),
+)
 VIDEOS = (".mp4", ".mov", ".avi", ".mkv", ".m4v", ".webm")
 #: What to do about unreadable files that are not being imported now.
 REFETCH = "Fetch these files again, or skip the bad ones with: palpate import"
@@ -108,7 +110,7 @@ def image_size(path: Path) -> tuple[int, int] | None:
     """(width, height) of an image as it is read, by its first bytes; None if it is none."""
     with suppress(ImageError), open_image(path) as image:
         turned = image.getexif().get(ORIENTATION) in range(5, 9)
-        return image.size[::-1] if turned else image.size
+        return (image.height, image.width) if turned else image.size
     return None
 
 
@@ -452,11 +454,7 @@ def image_stamp(manifest: Manifest, column: str) -> str:
 
 def square(image: Image.Image, size: int) -> NDArray[np.uint8]:
     """The center square of an RGB image, resized: (size, size, 3), 0 to 255."""
-    width, height = image.size
-    side = min(width, height)
-    left, top = (width - side) // 2, (height - side) // 2
-    image = image.crop((left, top, left + side, top + side))
-    return np.asarray(image.resize((size, size), Image.Resampling.BICUBIC))
+    return Preprocess(size, size).prepare(image)
 
 
 def in_threads(

@@ -31,7 +31,7 @@ from palpate.core import (
 )
 from palpate.data.images import Check, Checked, check_image, in_threads
 from palpate.data.manifest import CLIMBS, FOLLOWED, IMAGE_COLUMNS, Manifest
-from palpate.data.suspicions import SIDES, Look, evenly, suspicions
+from palpate.data.suspicions import SIDES, Look, evenly, looks_of, suspicions
 
 #: Manifest column -> cell; ``split`` may hold the part of the data set's own split.
 Cells = dict[str, Any]
@@ -271,8 +271,7 @@ def _checked_images(scan: Scan, rows: list[Row], check: Check, progress: Progres
             scan.problem(first[path], "bad-image", f"{name}{checked.problem}{users}")
         elif path in some and check == "decode":
             usable[path] = checked
-    looks = {name: Look.of_rows(own, scan.base, usable) for name, own in recordings.items()}
-    scan.looks |= {name: look for name, look in looks.items() if look.frames}
+    scan.looks |= looks_of(recordings, scan.base, usable)
     return [row for row in rows if bad.isdisjoint(map(row[1].get, IMAGE_COLUMNS))]
 
 

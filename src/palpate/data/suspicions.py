@@ -12,7 +12,8 @@ distance to a side is that to the nearest quarter of the other recordings.
 * ``channel-order``: with its colors in another order one side is less than half as far away, and
   not farther than twice what is usual.
 * ``another-gel``: within a session where one is known, else a rig, the tactile images are over six
-  times as far away as is usual, and by over 15 gray levels; at most a fifth of the recordings.
+  times as far away as is usual, and by over 15 gray levels, over 10 in most pixels, as no contact
+  is; at most a fifth of the recordings.
 * ``startup-frames``: the mean color of up to a twentieth of the frames, the first ones, is by over
   25 gray levels another one, and the step after them is four times every later one.
 * ``frozen-stream``: all photos, of at least 15 files, are one image, while the gel moves.
@@ -74,21 +75,6 @@ class Look:
         means = {side: x.mean(axis=(2, 4)).round().astype(np.uint8) for side, x in cells.items()}
         return cls(means, {side: x[0] for side, x in images.items()})
 
-    @classmethod
-    def of_rows(cls, rows: Sequence[Row], root: Path, checked: Mapping[str, Checked]) -> Look:
-        """Of rows of one recording, of whose images below ``root`` some were looked at."""
-        frames: dict[str, Pixels] = {}
-        first: dict[str, Path | Pixels] = {}
-        sizes: dict[str, tuple[int, int]] = {}
-        for side in SIDES:
-            paths = dict.fromkeys(row[side] for row in rows if row.get(side) in checked)
-            if paths:
-                frames[side] = np.stack([checked[path].small for path in paths])
-                one = next(iter(paths))
-                first[side], sizes[side] = root / one, checked[one].size
-        rig = tuple(rows[0].get(column) for column in RIG)
-        return cls(frames, first, sizes, rig, rows[0].get("session"))
-
 
 def evenly(rows: Iterable[Row]) -> dict[str, list[Row]]:
     """Recording -> some of its rows; a row that names none is a recording of its own."""
@@ -97,11 +83,33 @@ def evenly(rows: Iterable[Row]) -> dict[str, list[Row]]:
         path = row.get("tactile") or row.get("vision") or ""
         name = next((row[level] for level in LEVELS if row.get(level) is not None), path)
         recordings.setdefault(name, []).append(row)
-    some = lambda count: np.unique(np.linspace(0, count - 1, min(count, FRAMES)).astype(int))
-    return {
-        name: [sorted(own, key=_frame)[k] for k in some(len(own))]
-        for name, own in recordings.items()
-    }
+    for name, own in recordings.items():
+        own.sort(key=lambda row: row.get("frame") or 0)
+        recordings[name] = [own[k] for k in _spread(len(own), FRAMES)]
+    return recordings
+
+
+def looks_of(
+    recordings: Mapping[str, Sequence[Row]], root: Path | None, checked: Mapping[str, Checked]
+) -> dict[str, Look]:
+    """Recording -> what it looks like, of those with images among the checked ones.
+
+    Without ``root``, the folder of the images, they are no files.
+    """
+    looks: dict[str, Look] = {}
+    for name, rows in recordings.items():
+        paths = {side: dict.fromkeys(str(row.get(side)) for row in rows) for side in SIDES}
+        usable = {side: [path for path in paths[side] if path in checked] for side in SIDES}
+        there = {side: [checked[path] for path in own] for side, own in usable.items() if own}
+        if there:
+            looks[name] = Look(
+                {side: np.stack([one.small for one in own]) for side, own in there.items()},
+                {s: root / usable[s][0] if root else own[0].small for s, own in there.items()},
+                {side: own[0].size for side, own in there.items()},
+                tuple(rows[0].get(column) for column in RIG),
+                rows[0].get("session"),
+            )
+    return looks
 
 
 def looked_at(rows: Iterable[Row], root: Path, progress: Progress) -> dict[str, Look]:
@@ -110,13 +118,12 @@ def looked_at(rows: Iterable[Row], root: Path, progress: Progress) -> dict[str, 
     paths = {row[side] for own in recordings.values() for row in own for side in SIDES}
     check = lambda path: check_image(root / path)
     checks = in_threads(check, paths, "looking at recordings", progress)
-    usable = {path: checked for path, checked in checks if not checked.problem}
-    looks = {name: Look.of_rows(own, root, usable) for name, own in recordings.items()}
-    return {name: look for name, look in looks.items() if look.frames}
+    return looks_of(recordings, root, {p: checked for p, checked in checks if not checked.problem})
 
 
-def _frame(row: Row) -> int:
-    return row.get("frame") or 0
+def _spread(count: int, most: int) -> NDArray[np.int64]:
+    """At most so many places in ``count``, evenly chosen, the first and the last among them."""
+    return np.unique(np.linspace(0, count - 1, min(count, most)).astype(np.int64))
 
 
 def suspicions(looks: Mapping[str, Look]) -> list[Problem]:
@@ -154,14 +161,16 @@ def exchanged_sides(looks: Mapping[str, Look]) -> list[Problem]:
     for (names, scenes), (_, touches) in zip(photos, gels, strict=True):
         sizes = [tuple(both[name].sizes.get(side) for side in SIDES) for name in names]
         usual = Counter(sizes).most_common(1)[0][0]
+        like_gel, like_photos = (_distances(scenes, medians) for medians in (touches, scenes))
+        own = _distances(touches, touches)
         for k, name in enumerate(names):
-            like_gel, like_photos = (_distance(scenes[k], x, k) for x in (touches, scenes))
-            own = _distance(touches[k], touches, k)
             if usual[0] != usual[1] and sizes[k] == usual[::-1]:
                 text = "its vision has the size of tactile images, and its tactile that of vision"
-            elif like_photos > LEAST and like_gel < min(NEARER * like_photos, own / FARTHER):
-                text = f"its vision is like the tactile images of the others ({like_gel:.0f} gray "
-                text += f"levels away), its tactile is not ({own:.0f})"
+            elif like_photos[k] > LEAST and (
+                like_gel[k] < min(NEARER * like_photos[k], own[k] / FARTHER)
+            ):
+                text = f"its vision is like the tactile images of the others ({like_gel[k]:.0f} "
+                text += f"gray levels away), its tactile is not ({own[k]:.0f})"
             else:
                 continue
             problems.append(Problem(name, EXCHANGED, f"{text}: its sides are exchanged"))
@@ -208,37 +217,36 @@ def _groups(
 
 def _other_gels(names: Sequence[str], medians: Medians) -> list[Problem]:
     """Recordings whose gel differs from that of the others."""
-    far = np.array([_distance(image, medians, k) for k, image in enumerate(medians)])
+    far = _distances(medians, medians)
     usual = float(np.median(far))
-    strange = np.flatnonzero(far > max(GEL_LEAST, GEL_TIMES * usual))
+    most = np.median(np.abs(medians - np.median(medians, axis=0)), axis=1)
+    strange = np.flatnonzero((far > max(GEL_LEAST, GEL_TIMES * usual)) & (most > LEAST))
     if len(strange) > GEL_SHARE * len(far):
         return []
     text = "its tactile images differ by {:.0f} gray levels from those of the others, which do by "
     text += f"{usual:.0f}: another gel or sensor"
-    return [Problem(names[k], "another-gel", text.format(far[k])) for k in strange]
+    return [Problem(names[k], "another-gel", text.format(far[k])) for k in strange.tolist()]
 
 
 def _orders(medians: Medians) -> list[tuple[int, str]]:
     """Rows that are like the others with their channels in another order, and that order."""
-    as_is = np.array([_distance(image, medians, k) for k, image in enumerate(medians)])
+    if len(medians) < 3:
+        return []
+    as_is = _distances(medians, medians)
     limits = np.minimum(NEARER * as_is, max(LEAST, FARTHER * float(np.median(as_is))))
-    orders: list[tuple[int, str]] = []
-    for k in np.flatnonzero(as_is > LEAST).tolist() if len(medians) > 2 else ():
-        pixels = medians[k].reshape(-1, 3)
-        turned = {
-            "".join("RGB"[c] for c in order): _distance(pixels[:, order].ravel(), medians, k)
-            for order in permutations(range(3))
-        }
-        best = min(turned, key=lambda order: turned[order])
-        orders += [(k, best)] if turned[best] < limits[k] else []
-    return orders
+    pixels, orders = medians.reshape(len(medians), -1, 3), list(permutations(range(3)))
+    turned = [_distances(pixels[..., o].reshape(medians.shape), medians) for o in orders]
+    best = np.argmin(turned, axis=0)
+    rows = np.flatnonzero((as_is > LEAST) & (np.min(turned, axis=0) < limits)).tolist()
+    return [(k, "".join("RGB"[c] for c in orders[best[k]])) for k in rows]
 
 
-def _distance(image: Medians, medians: Medians, without: int) -> float:
-    """From an image to the nearest quarter of the rows but one; infinite without others."""
-    rows = np.unique(np.linspace(0, len(medians) - 1, min(len(medians), COMPARED)).astype(int))
-    rows = rows[rows != without]
-    if not len(rows):
-        return np.inf
-    differences = np.sqrt(np.square(medians[rows] - image).mean(axis=1))
-    return float(np.quantile(differences, 0.25, method="lower"))
+def _distances(images: Medians, medians: Medians) -> NDArray[np.float64]:
+    """(n,) from image k to the nearest quarter of the rows but k; infinite without others."""
+    rows = _spread(len(medians), COMPARED)
+    compared = medians[rows]
+    products = np.square(images).sum(axis=1)[:, None] - 2 * images @ compared.T
+    squares = (products + np.square(compared).sum(axis=1)).clip(0) / images.shape[1]
+    squares[rows, np.arange(len(rows))] = np.inf
+    nearest = max(0, (len(rows) - 2) // 4)
+    return np.sqrt(np.partition(squares, nearest, axis=1)[:, nearest])

@@ -112,8 +112,8 @@ class VideoReader:
         try:
             for frame in self._decoded:
                 if (k := position.pop(frame.pts, None)) is not None:
-                    stored = size[::-1] if self._matrix(frame)[1] else size
-                    image = resize(frame, *stored, "rgb24", interpolation=area)
+                    width, height = size[::-1] if self._matrix(frame)[1] else size
+                    image = resize(frame, width, height, "rgb24", interpolation=area)
                     images[k] = self._upright(frame, image.to_ndarray())
         except self._errors as error:
             raise self._broken(f"a frame that cannot be decoded ({_reason(error)})") from None

@@ -30,6 +30,7 @@ from palpate.data.manifest import IMAGE_COLUMNS, PART_NAMES, SCHEMA
 from palpate.data.mapping import ColumnMaps, compile_maps, text_of
 from palpate.data.rows import manifest_rows, odd_groups, read_classes
 from palpate.data.scanning import Cells, Facts, Format, Into, Scan
+from palpate.data.suspicions import evenly, looks_of
 from palpate.data.tables import LINE
 
 LOOKS_FOR = (
@@ -78,7 +79,11 @@ def scan(
     """
     opened = open_source(source, config, revision)
     folder, created = (into.out / "images", into.created) if into else (None, list[Path]())
-    result = _scan(opened, columns or {}, classes, _Store(folder, created, check), progress)
+    store = _Store(folder, created, check)
+    result = _scan(opened, columns or {}, classes, store, progress)
+    if check == "decode":
+        usable = {path: store.checked[digest] for digest, path in store.paths.items()}
+        result.looks = looks_of(evenly(row for _, row in result.rows), folder, usable)
     if folder is not None:
         folder.mkdir(parents=True, exist_ok=True)
     for _, row in result.rows if folder is None else ():

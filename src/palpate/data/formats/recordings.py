@@ -309,7 +309,8 @@ class Recordings:
             except PalpateError:
                 return []  # reported where its frames are read
             self.scan.looks[video] = Look.of_video(images)
-            return findings(images, seconds, self.in_contact.get(video, ()))
+            counted = "tactile" in images and self.frames[video]["tactile"].numbers[0] == 0
+            return findings(images, seconds, self.in_contact.get(video, ()) if counted else ())
 
         results = in_threads(check, sorted(self.frames), "checking streams", progress)
         for video, problems in sorted(results):
