@@ -123,7 +123,7 @@ def test_no_absolute_paths_no_forbidden_packages():
 
 #: What decodes images or could run code from a file -> the only modules that call it, and how.
 OPENERS = {
-    "Image.open": (["core/files.py"], "formats=_installed_formats()"),
+    "Image.open": (["core/images.py"], "formats=_installed_formats()"),
     "torch.load": (["encoders/models.py"], "weights_only=True"),
     "torch.jit.load": (["encoders/inception.py"], ""),
     "np.load": (None, "allow_pickle=False"),

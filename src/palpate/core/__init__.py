@@ -2,20 +2,16 @@
 
 from palpate.core.features import FeatureSet
 from palpate.core.files import (
-    ImageError,
     atomic_folder,
     atomic_path,
-    decoded,
     digest_file,
     digest_folder,
     digest_json,
     digest_lines,
     fact_lines,
-    image_bytes,
     inside,
     instead,
     locked,
-    open_image,
     plain,
     read_json,
     read_record,
@@ -23,7 +19,6 @@ from palpate.core.files import (
     require_new_folder,
     require_regular,
     rng_for,
-    save_image,
     sealed,
     seed_for,
     short,
@@ -31,6 +26,7 @@ from palpate.core.files import (
     write_json,
     write_text,
 )
+from palpate.core.images import ImageError, decoded, image_bytes, open_image, save_image
 from palpate.core.messages import (
     MissingExtraError,
     Note,

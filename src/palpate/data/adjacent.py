@@ -24,8 +24,11 @@ if TYPE_CHECKING:
     from palpate.data.scanning import Cells, Scan
 
 #: Other names of the columns that a table may fill.
-SYNONYMS = {"label": "material", "class": "material", "category": "material"}
-SYNONYMS |= {"caption": "text", "description": "text", "prompt": "text", "part": "split"}
+SYNONYMS = {
+    **dict.fromkeys(("label", "class", "category"), "material"),
+    **dict.fromkeys(("caption", "description", "prompt"), "text"),
+    "part": "split",
+}
 FILLED = ("object", "session", "material", "text", "sensor", "domain", "video", "contact", "split")
 #: Fields that a column may name, and the share of rows that a column must name images in.
 FIELDS, SHARE = ("object", "video", "session", "contact"), 0.5

@@ -15,8 +15,10 @@ from palpate.core import PalpateError, few
 
 _UNPACK = "Unpack it first: {} {name}; then name the folder"
 _FILES = "Write its images as files, or as stacks with numpy.save, next to a table that names them"
-_PLAIN = "It may run code when it is opened. Where you trust it, save what it holds as JSON, such "
-_PLAIN += 'as {{"train": [..], "test": [..]}}, as CSV, or its images as files'
+_PLAIN = (
+    "It may run code when it is opened. Where you trust it, save what it holds as JSON, such "
+    'as {{"train": [..], "test": [..]}}, as CSV, or its images as files'
+)
 #: (what it is, suffixes, bytes that it may begin with, the way in).
 KINDS: tuple[tuple[str, tuple[str, ...], tuple[bytes, ...], str], ...] = (
     ("a spreadsheet", (".xlsx", ".xls", ".ods"), (), "Save it as CSV (UTF-8)"),
@@ -40,8 +42,10 @@ KINDS: tuple[tuple[str, tuple[str, ...], tuple[bytes, ...], str], ...] = (
     ("a TFRecord file", (".tfrecord", ".tfrecords"), (), _FILES),
     ("a database", (".sqlite", ".mdb", ".lmdb"), (b"SQLite format 3",), _FILES),
 )
-_EPISODES = "Cut each episode into a folder of its own, such as episode_0/camera.mp4 and "
-_EPISODES += "episode_0/touch.mp4, and import the folder that holds them"
+_EPISODES = (
+    "Cut each episode into a folder of its own, such as episode_0/camera.mp4 and "
+    "episode_0/touch.mp4, and import the folder that holds them"
+)
 #: A link that a copy turned into a file holds at most so many bytes.
 LONGEST_LINK = 255
 #: (what a folder is, the file that says so, the way in).

@@ -1,7 +1,7 @@
 """Images: read as 8-bit RGB, whole or rejected, one by one or as arrays.
 
-:mod:`palpate.core.files` has the one function that opens images, and the rules by which all of them
-become upright 8-bit RGB. A batch for a network is the center square, resized by Pillow's
+:mod:`palpate.core.images` has the one function that opens images, and the rules by which all of
+them become upright 8-bit RGB. A batch for a network is the center square, resized by Pillow's
 antialiased bicubic filter, or what a :class:`Preprocess` says: an image is turned, fitted to the
 encoder's shape (the center of it, the whole of it between black borders, or squashed), and resized;
 for some encoders the sensor's image without contact is subtracted first, and an earlier frame of
@@ -44,7 +44,7 @@ from palpate.core import (
     require,
     short,
 )
-from palpate.core.files import ORIENTATION
+from palpate.core.images import ORIENTATION
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -425,10 +425,10 @@ def cached_images(
     stamps = [] if preprocess.plain else frames.stamps(manifest.root)
     key = short(digest_json([geometry, image_stamp(manifest, column), stamps]))
 
-    shape = (len(manifest), *preprocess.shape)
+    rows = (len(manifest), *preprocess.shape)
 
     def decode(part: Path) -> None:
-        images = np.lib.format.open_memmap(part, mode="w+", dtype=np.uint8, shape=shape)
+        images = np.lib.format.open_memmap(part, mode="w+", dtype=np.uint8, shape=rows)
         load_images(frames.files, preprocess, progress=progress, into=images)
         images.flush()
 

@@ -112,7 +112,7 @@ def _values(target: str, text: str, expression: pl.Expr, table: pl.DataFrame) ->
             cells = table.with_columns(map(_as_numbers, table))
         try:
             first = cells.head(1).with_columns(expression.alias(target))[target]
-            if (first.cast(pl.String).str.len_bytes().max() or 0) > LONGEST:
+            if (first.cast(pl.String).str.len_bytes() > LONGEST).any():
                 raise _unusable(target, text, f"it makes texts of more than {LONGEST:,} bytes")
             values = cells.with_columns(expression.alias(target))[target]
         except ERRORS as error:

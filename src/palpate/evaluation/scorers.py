@@ -416,7 +416,9 @@ def bandwidths(
     """
     fitting: Sequence[Preset | None] = ("grouped", "paper") if grouped else (None,)
     presets = bench.presets or fitting
-    columns = [(p, s) for p in presets for s in bench.sigmas or (SIGMA,)]
+    columns: list[tuple[Preset | None, float | str]] = [
+        (p, s) for p in presets for s in bench.sigmas or (SIGMA,)
+    ]
     return columns + [(presets[0], "multi")] * (not bench.sigmas and rows <= MANY)
 
 
