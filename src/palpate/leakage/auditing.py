@@ -415,12 +415,12 @@ def _matrix(rows: pl.DataFrame) -> list[dict[str, Any]]:
 
 def _materials(rows: pl.DataFrame) -> list[dict[str, Any]]:
     """Samples and groups of each material in both parts."""
-    groups = {
-        f"groups_{part}": pl.col("group").filter(part).drop_nulls().n_unique()
+    groups = [
+        pl.col("group").filter(part).drop_nulls().n_unique().alias(f"groups_{part}")
         for part in ("train", "test")
-    }
+    ]
     materials = rows.drop_nulls("material").group_by("material")
-    both = materials.agg(pl.col("train", "test").sum(), **groups).sort("material")
+    both = materials.agg(pl.col("train", "test").sum(), *groups).sort("material")
     return list(both.iter_rows(named=True))
 
 
