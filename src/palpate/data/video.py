@@ -114,7 +114,7 @@ class VideoReader:
                 if (k := position.pop(frame.pts, None)) is not None:
                     width, height = size[::-1] if self._matrix(frame)[1] else size
                     image = resize(frame, width, height, "rgb24", interpolation=area)
-                    images[k] = self._upright(frame, np.asarray(image.to_ndarray()))
+                    images[k] = self._upright(frame, np.asarray(image.to_ndarray(), np.uint8))
         except self._errors as error:
             raise self._broken(f"a frame that cannot be decoded ({_reason(error)})") from None
         if position:

@@ -419,7 +419,9 @@ def bandwidths(
     columns: list[tuple[Preset | None, float | str]] = [
         (p, s) for p in presets for s in bench.sigmas or (SIGMA,)
     ]
-    return columns + [(presets[0], "multi")] * (not bench.sigmas and rows <= MANY)
+    if not bench.sigmas and rows <= MANY:
+        columns.append((presets[0], "multi"))
+    return columns
 
 
 def _with_kernel(bench: Bench, score: Score, sigma: float | str) -> Score:
