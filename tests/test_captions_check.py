@@ -135,7 +135,7 @@ def test_texts_that_train_and_test_share(samples):
     assert (score.value, score.n) == (1.0, 10)
     with pytest.raises(PalpateError, match="captions in train and test"):
         check_captions(manifest, split=Split.from_ids(train=manifest.ids))
-    with pytest.raises(PalpateError, match=r"split must hold ids .* 'x' instead of 'v0/00'"):
+    with pytest.raises(PalpateError, match=r"split must hold ids .* 'x', 'y' instead of 'v0/00'"):
         check_captions(manifest, split=Split.from_ids(train=["x"], test=["y"]))
 
 

@@ -371,7 +371,9 @@ def read_json(path: Path, role: str) -> Any:
         got, fix = instead(Path(path), f"the folder {path}", "Name the file itself")
         raise PalpateError(f"The {role} must be a file", got, fix) from None
     except (ValueError, RecursionError) as error:  # no JSON, no UTF-8, nested too deep
-        got, fix = instead(Path(path), str(error), "Write it again with palpate")
+        got, fix = str(error), "Write it again with palpate"
+        if isinstance(error, UnicodeDecodeError):  # no text at all: it may be a manifest
+            got, fix = instead(Path(path), got, fix)
         raise PalpateError(f"The {role} {path} must be JSON", got, fix) from None
 
 
