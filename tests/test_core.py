@@ -123,7 +123,7 @@ def test_records_that_cannot_be_read(tmp_path, text, words):
 @pytest.mark.parametrize(
     ("given", "wanted", "words"),
     [
-        ("palpate-split/1", "palpate-results/1", "r.json, a split. .* for palpate audit --split"),
+        ("palpate-split/1", "palpate-results/1", "r.json, a split. .* for palpate audit DATA --split"),
         ("palpate/preference@1", "palpate-split/1", "a study. .* for palpate preference score"),
         ("palpate-results/9", "palpate-results/1", "'palpate-results/9'.* install the release"),
         ("elsewhere/1", "palpate-results/1", "'elsewhere/1'.* install the release"),
@@ -142,7 +142,7 @@ def test_a_folder_of_another_kind_is_said_to_be_one(tmp_path):
         with pytest.raises(PalpateError, match=r"a manifest\. Name another one: .* palpate audit"):
             read_record(path, "card", form="palpate-pipeline/1")
     (tmp_path / "palpate.json").write_text('{"format": "palpate-pipeline/1"}')
-    with pytest.raises(PalpateError, match=r"a generator\. .* for palpate generate --model"):
+    with pytest.raises(PalpateError, match=r"a generator\. .* for palpate generate PHOTO --model"):
         read_record(tmp_path / "index.json", "index")
 
 

@@ -13,7 +13,7 @@ TOP = Path(__file__).resolve().parents[1]
 SIGNATURES = {
     "audit": (
         "train_or_data test * split pretrain by near_frames identity images modalities "
-        "false_positives impact name worst cache root reading "
+        "false_positives impact name cache root reading "
         "skip_bad progress encoder allow_seen"
     ),
     "caption": (

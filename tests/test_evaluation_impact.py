@@ -242,7 +242,7 @@ def test_each_kind_of_pixels_has_a_row(small_manifest: Manifest, tmp_path: Path)
     assert [r.features for r in found.rows[::2]] == kinds
     assert [found.rows[k].clean for k in (0, 4)] == [1.0, 1.0]  # brightness is the material there
     assert found.headline.startswith("1-NN on tactile pixels: ")
-    assert len(list((tmp_path / "cache").iterdir())) == 3
+    assert len(list((tmp_path / "cache").glob("*.npy"))) == 3
     table = small_manifest.table.with_columns(background=None, vision=None)
     bare = Manifest(table.cast(small_manifest.table.schema), small_manifest.root)
     again = impact(bare, split, seeds=(0,))

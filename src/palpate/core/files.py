@@ -40,14 +40,14 @@ SEAL = "sealed"
 #: Format without its version -> what it is, and what reads it.
 READERS = {
     "palpate-manifest": ("a manifest", "palpate audit"),
-    "palpate-split": ("a split", "palpate audit --split"),
+    "palpate-split": ("a split", "palpate audit DATA --split SPLIT"),
     "palpate-audit": ("an audit", "palpate report"),
     "palpate-results": ("results", "palpate report"),
     "palpate-generated": ("generated images", "palpate score --generated"),
-    "palpate-clip": ("a vision and a text encoder", "palpate train encoder --clip"),
+    "palpate-clip": ("a vision and a text encoder", "palpate train encoder DATA --clip CLIP"),
     "palpate-encoders": ("encoders", "palpate probe --encoder"),
-    "palpate-autoencoder": ("an autoencoder", "palpate train generator --autoencoder"),
-    "palpate-pipeline": ("a generator", "palpate generate --model"),
+    "palpate-autoencoder": ("an autoencoder", "palpate train generator DATA --autoencoder DIR"),
+    "palpate-pipeline": ("a generator", "palpate generate PHOTO --model DIR"),
     "palpate/preference": ("a study", "palpate preference score"),
     "palpate/preference-votes": ("votes", "palpate preference score"),
 }
@@ -365,7 +365,9 @@ def read_json(path: Path, role: str) -> Any:
         json.dumps(value, ensure_ascii=False, allow_nan=False).encode()
         return unsealed(value)
     except FileNotFoundError:
-        got, fix = instead(Path(path).parent, f"no file {path}", "Check the path")
+        got, fix = f"no file {path}", "Check the path"
+        if Path(path).name in MARKS:
+            got, fix = instead(Path(path).parent, got, fix)
         raise PalpateError(f"The {role} must exist", got, fix) from None
     except IsADirectoryError:
         got, fix = instead(Path(path), f"the folder {path}", "Name the file itself")
