@@ -250,6 +250,8 @@ def voted(planned, folder, number):
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
 def test_a_server_that_is_stopped_leaves_all_votes_in_one_file(planned, tmp_path, number):
+    if signal.getsignal(number) is signal.SIG_IGN:
+        pytest.skip("these tests run under nohup, and so would the server")
     count, status = voted(planned, tmp_path / "study", number)
     assert status in (0, 130)
     log = tmp_path / "study" / "study.db-wal"
