@@ -78,7 +78,7 @@ def test_encoders_and_a_generator_from_the_command_line(tag, tmp_path, capsys):
     capsys.readouterr()
     # The same again does not overwrite.
     assert main(["train", "encoder", *common, "-o", "encoders"]) == 2
-    assert "must be absent or an empty folder" in capsys.readouterr().err
+    assert "a training that is finished" in capsys.readouterr().err
 
 
 def test_a_loss_that_is_no_number_ends_a_generator_in_one_line(tag, tmp_path, capsys):
