@@ -94,7 +94,7 @@ VERBS = {
         scores,
     ),
     "train autoencoder": Verb(
-        ("train", "autoencoder", *TRAIN, "--set", "autoencoder.steps=4"),
+        ("train", "autoencoder", *TRAIN, "--set", "autoencoder.steps_free=4"),
         ("autoencoder", 2),
         weights,
     ),
