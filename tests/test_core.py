@@ -123,7 +123,11 @@ def test_records_that_cannot_be_read(tmp_path, text, words):
 @pytest.mark.parametrize(
     ("given", "wanted", "words"),
     [
-        ("palpate-split/1", "palpate-results/1", "r.json, a split. .* for palpate audit DATA --split"),
+        (
+            "palpate-split/1",
+            "palpate-results/1",
+            "r.json, a split. .* for palpate audit DATA --split",
+        ),
         ("palpate/preference@1", "palpate-split/1", "a study. .* for palpate preference score"),
         ("palpate-results/9", "palpate-results/1", "'palpate-results/9'.* install the release"),
         ("elsewhere/1", "palpate-results/1", "'elsewhere/1'.* install the release"),
