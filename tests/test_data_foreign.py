@@ -69,9 +69,10 @@ def test_links_are_followed_and_circles_cut(tmp_path):
     for k in range(2):
         (root / f"s{k}").symlink_to(tmp_path / "store" / f"s{k}")
     (root / "s0" / "again").symlink_to(root)
+    (root / "s2").symlink_to(tmp_path / "unmounted")
     result = import_dataset(root, tmp_path / "out")
     assert len(Manifest.load(tmp_path / "out").require_valid()) == 4
-    assert [p.kind for p in result.suspicious] == ["linked-twice"]
+    assert [p.kind for p in result.suspicious] == ["linked-twice", "dead-link"]
 
 
 def test_links_that_a_copy_turned_into_files_are_named(tmp_path):

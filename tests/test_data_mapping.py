@@ -152,3 +152,11 @@ def test_the_paths_of_a_real_published_list_follow_from_one_another(real_data):
         cells = compile_maps({"tactile": maps[kind]}, rows.columns, ["tactile"]).apply(rows)
         assert cells["tactile"] == rows["tactile_fp"].to_list()
         assert len(rows) == count
+
+
+def test_an_aggregate_of_all_rows_is_no_value_of_a_row():
+    table = pl.DataFrame({"video": ["a", "b", "c"]})
+    with pytest.raises(PalpateError, match="one value of all rows"):
+        compile_maps({"object": "max(video)"}, ["video"], ["object"]).apply(table)
+    constant = compile_maps({"object": "'cup'"}, ["video"], ["object"]).apply(table)
+    assert constant["object"] == ["cup"] * 3

@@ -437,6 +437,9 @@ def walked(result: Scan, suffixes: tuple[str, ...]) -> list[str]:
     files = [name for name in files if name not in odd] if odd else files
     text = "links to folders that are read already"
     result.suspect(result.base, "linked-twice", text, again)
+    rest = (name for name in every if not name.lower().endswith(suffixes))
+    dead = [name for name in rest if not (result.base / name).exists()]
+    result.suspect(result.base, "dead-link", "links that lead nowhere", dead)
     text = "files that are not read"
     result.suspect(result.base, "unread", text, counted(every))
     result.met = True

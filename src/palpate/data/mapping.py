@@ -111,6 +111,9 @@ def _values(target: str, text: str, expression: pl.Expr, table: pl.DataFrame) ->
         if cells is None:
             cells = table.with_columns(map(_as_numbers, table))
         try:
+            two = cells.head(2)
+            if expression.meta.root_names() and two.select(expression).height < two.height:
+                raise _unusable(target, text, "it makes one value of all rows")
             first = cells.head(1).with_columns(expression.alias(target))[target]
             if (first.cast(pl.String).str.len_bytes() > LONGEST).any():
                 raise _unusable(target, text, f"it makes texts of more than {LONGEST:,} bytes")
