@@ -256,16 +256,11 @@ class Terminal:
         elif not self.err.is_terminal:
             yield _LogProgress(self.print_line)
         else:
-            from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeRemainingColumn
+            from rich.progress import MofNCompleteColumn, TextColumn
             from rich.progress import Progress as Bars
 
-            columns = (
-                TextColumn("{task.description}"),
-                BarColumn(),
-                MofNCompleteColumn(),
-                TimeRemainingColumn(),
-                TextColumn("{task.fields[remark]}"),
-            )
+            remark_column = TextColumn("{task.fields[remark]}")
+            columns = (*Bars.get_default_columns(), MofNCompleteColumn(), remark_column)
             with Bars(*columns, console=self.err) as bars:
                 tasks: dict[str, Any] = {}
 
