@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from forge.errors import fails
-from palpate.data.listing import read_frame_table, read_list, read_lists, write_list
-from palpate.data.reading import is_list
+from palpate.data.listing import is_list, read_frame_table, read_list, read_lists, write_list
 from palpate.data.recordings import contact_names
 from palpate.data.tables import read_categories
 

@@ -116,7 +116,7 @@ def test_bad_rows_are_raised_together_or_skipped(images):
     bad = ({"video": "x", "frame": "one"}, {"video": "x", "frame": 0}, {"vision": "../x.jpg"})
     rows = [*ROWS, *bad]
     error = fails("", data.load, rows, root=images)
-    kinds = enumerate(("bad-frame", "duplicate-id", "outside-root"), 4)
+    kinds = enumerate(("bad-frame", "empty-cell", "outside-root"), 4)
     assert [(p.where, p.kind) for p in error.problems] == [(f"row:{k}", v) for k, v in kinds]
     assert len(data.load(rows, root=images, skip_bad=True)) == 3
 

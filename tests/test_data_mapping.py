@@ -25,7 +25,7 @@ ROW = {"path": PATH, "left image": "l.png", "rgb-path": "r", "end": "7", "none":
 
 def mapped(maps, row=ROW, targets=("video", "id", "frame", "tactile", "vision")):
     table = pl.DataFrame({k: [v] for k, v in row.items()}, schema=dict.fromkeys(row, pl.String))
-    return {k: v[0] for k, v in compile_maps(maps, list(row), targets).apply(table).items()}
+    return compile_maps(maps, list(row), targets).apply(table).row(0, named=True)
 
 
 def value(text):
@@ -150,7 +150,7 @@ def test_the_paths_of_a_real_published_list_follow_from_one_another(real_data):
     for kind, count in (("hct", 356), ("ssvtp", 46)):
         rows = table.filter(pl.col("image_fp").str.starts_with(kind))
         cells = compile_maps({"tactile": maps[kind]}, rows.columns, ["tactile"]).apply(rows)
-        assert cells["tactile"] == rows["tactile_fp"].to_list()
+        assert cells["tactile"].to_list() == rows["tactile_fp"].to_list()
         assert len(rows) == count
 
 
@@ -159,4 +159,4 @@ def test_an_aggregate_of_all_rows_is_no_value_of_a_row():
     with pytest.raises(PalpateError, match="one value of all rows"):
         compile_maps({"object": "max(video)"}, ["video"], ["object"]).apply(table)
     constant = compile_maps({"object": "'cup'"}, ["video"], ["object"]).apply(table)
-    assert constant["object"] == ["cup"] * 3
+    assert constant["object"].to_list() == ["cup"] * 3

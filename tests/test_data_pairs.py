@@ -58,7 +58,7 @@ def test_tables_of_every_kind_give_the_same_manifest(images, tmp_path, suffix):
     else:
         text = frame.write_csv(separator="\t" if suffix == ".tsv" else ",")
         table.write_bytes(b"\xef\xbb\xbf" + text.replace("\n", "\r\n").encode())
-    result = import_dataset(table, tmp_path / "out", columns=MAPS, size=64)
+    result = import_dataset(table, tmp_path / "out", columns=MAPS)
     assert rows_of(result, "id", "frame", "material", "tactile", "text") == [
         ("x/0", 0, None, "t/0.jpg", None),
         ("x/1", 1, "wood", "t/1.jpg", None),

@@ -5,7 +5,7 @@ from forge.pictures import tree, write_image
 from palpate.core import Split
 from palpate.data.importing import import_dataset, validate, write_lists
 from palpate.data.manifest import Manifest
-from palpate.data.reading import read_samples
+from palpate.data.reading import read
 from test_data_touch_and_go import make_recordings, shown
 
 
@@ -29,7 +29,7 @@ def test_validation_decodes_raw_videos_as_an_import_does(tmp_path):
     imported = import_dataset(root, tmp_path / "out", skip_bad=True, format="touch-and-go")
     assert validation.samples == len(imported.manifest) < 18
     assert validate(root, check="header").ok
-    assert len(read_samples(root)[0]) == 18  # who only wants the samples waits for no decoding
+    assert len(read(root).manifest) == 18  # who only wants the samples waits for no decoding
     assert tree(root) == before
 
 

@@ -17,8 +17,9 @@ import polars as pl
 
 from palpate.core import PalpateError, Split, few
 from palpate.data.manifest import PART_NAMES
+from palpate.data.mapping import LINE
 from palpate.data.rows import relocated
-from palpate.data.tables import LINE, TABLES, Table, header_of, open_table
+from palpate.data.tables import TABLES, Table, header_of, open_table
 
 if TYPE_CHECKING:
     from palpate.data.scanning import Cells, Scan

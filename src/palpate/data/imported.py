@@ -6,17 +6,16 @@ from collections.abc import Generator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import polars as pl
 
-from palpate.core import Problem, Split, fact_lines, plain, problem_lines
+from palpate.core import Problem, Progress, Split, fact_lines, plain, problem_lines, quiet
 from palpate.data.captions import NAMED
+from palpate.data.images import Check
 from palpate.data.manifest import IMAGE_COLUMNS, Manifest
-
-if TYPE_CHECKING:
-    from palpate.data.formats import Facts
-    from palpate.data.suspicions import Look
+from palpate.data.scanning import Facts, Scan, finished, manifest_of, raise_if, require_some
+from palpate.data.suspicions import Look
 
 #: Rows that an import shows of a folder.
 EXAMPLES = 3
@@ -87,6 +86,33 @@ class Imported:
         words = words_of(self.manifest.table)
         rows = self.summary() | templates_of(self.manifest) | ({"captions": words} if words else {})
         return _text(f"Imported {self.facts.get('dataset', '')}", rows, lists)
+
+
+def imported_of(
+    scan: Scan,
+    source: object,
+    facts: Mapping[str, str],
+    *,
+    skip_bad: bool,
+    check: Check,
+    progress: Progress = quiet,
+) -> Imported:
+    """A scan as an import that is not written yet.
+
+    Raises:
+        ProblemsError: with every bad row and file, unless ``skip_bad``.
+        PalpateError: if no usable row is left.
+    """
+    rows = finished(scan, check, progress)
+    raise_if(scan.problems, skip_bad)
+    require_some(len(rows), source, scan.problems)
+    manifest = manifest_of(scan, rows, {**facts, **scan.facts})
+    ids = set(manifest.ids)
+    splits: dict[str, Split] = {}
+    for name, split in scan.splits.items():
+        if parts := {i: part for i, part in split.parts.items() if i in ids}:
+            splits[name] = Split(parts, split.rule, manifest.digest)
+    return Imported(manifest, scan.problems, splits, scan.inconclusive, scan.suspicious)
 
 
 @dataclass(frozen=True)

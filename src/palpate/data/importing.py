@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 from palpate.core import PalpateError, Progress, Split, locked, quiet
 from palpate.data.formats import FORMATS, recognized, require_options
 from palpate.data.images import Check
-from palpate.data.imported import Imported, Validation, removing_on_error, templates_of
+from palpate.data.imported import Imported, Validation, imported_of, removing_on_error, templates_of
 from palpate.data.listing import write_table
 from palpate.data.manifest import FOLLOWED, SCHEMA, Manifest, is_manifest
 from palpate.data.scanning import (
@@ -20,8 +19,6 @@ from palpate.data.scanning import (
     Scan,
     finished,
     manifest_of,
-    raise_if,
-    require_some,
     world_facts,
 )
 from palpate.data.texts import read_texts, reimported, with_texts
@@ -171,30 +168,3 @@ def write_lists(manifest: Manifest, split: Split, output: Path) -> list[Path]:
         return form.write_lists(manifest, split, Path(output))
     parts = {part: manifest.part(split, part) for part in split.counts()}
     return [write_table(Path(output) / f"{part}.csv", rows) for part, rows in parts.items()]
-
-
-def imported_of(
-    scan: Scan,
-    source: Path,
-    facts: Mapping[str, str],
-    *,
-    skip_bad: bool,
-    check: Check,
-    progress: Progress = quiet,
-) -> Imported:
-    """A scan as an import that is not written yet.
-
-    Raises:
-        ProblemsError: with every bad row and file, unless ``skip_bad``.
-        PalpateError: if no usable row is left.
-    """
-    rows = finished(scan, check, progress)
-    raise_if(scan.problems, skip_bad)
-    require_some(len(rows), source, scan.problems)
-    manifest = manifest_of(scan, rows, {**facts, **scan.facts})
-    ids = set(manifest.ids)
-    splits: dict[str, Split] = {}
-    for name, split in scan.splits.items():
-        if parts := {i: part for i, part in split.parts.items() if i in ids}:
-            splits[name] = Split(parts, split.rule, manifest.digest)
-    return Imported(manifest, scan.problems, splits, scan.inconclusive, scan.suspicious)

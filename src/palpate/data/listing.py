@@ -20,9 +20,9 @@ from pathlib import Path
 import polars as pl
 
 from palpate.core import Problem, ProblemsError, write_text
-from palpate.data.manifest import CLIMBS, SCHEMA, Manifest
+from palpate.data.manifest import CLIMBS, Manifest
 from palpate.data.recordings import contact_names
-from palpate.data.tables import INCONCLUSIVE, lines_of, read_categories, text_in
+from palpate.data.tables import INCONCLUSIVE, decoded, lines_of, read_categories, text_in
 
 PATH = r"^(?P<video>[^/\\]+)/(?P<stem>[^/\\]+)\.(?P<suffix>[A-Za-z0-9]+)$"
 #: A good line; the video takes all commas before the slash.
@@ -47,6 +47,13 @@ class FrameList:
     #: Table ``video, frame`` of every readable row, inconclusive ones included: all frames in
     #: contact.
     contact: pl.DataFrame
+
+
+def is_list(path: Path) -> bool:
+    """Whether the first line that is not empty is a row of a frame list."""
+    with open(path, "rb") as file:
+        lines = lines_of(decoded(file.read(1 << 16)))
+    return re.match(LINE, next((line.strip() for line in lines if line.strip()), "")) is not None
 
 
 def read_list(
@@ -93,10 +100,9 @@ def read_lists(
     table = rows.select("id", "video", "frame", material=label).with_columns(
         contact=pl.Series(names, dtype=pl.String)
     )
-    empty = (pl.lit(None, kind).alias(c) for c, kind in SCHEMA.items() if c not in table.columns)
-    table = table.with_columns(empty).select(list(SCHEMA))
     facts = {"source": ", ".join(Path(path).name for path in paths)}
-    manifest, contact = Manifest(table, Path(root), facts), every.select("video", "frame")
+    manifest = Manifest.of_table(table, Path(root), facts)
+    contact = every.select("video", "frame")
     return FrameList(manifest, problems, every.height - conclusive.height, rows, contact)
 
 

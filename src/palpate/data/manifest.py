@@ -119,6 +119,16 @@ class Manifest:
         table = pl.DataFrame({c: [row.get(c) for row in rows] for c in schema}, schema=schema)
         return cls(table, Path(root), facts or {})
 
+    @classmethod
+    def of_table(
+        cls, table: pl.DataFrame, root: Path, facts: Mapping[str, str] | None = None
+    ) -> Manifest:
+        """Make a manifest of a table; absent columns become null, further ones go last."""
+        absent = (pl.lit(None).alias(c) for c in SCHEMA if c not in table.columns)
+        more = (c for c in table.columns if c not in SCHEMA)
+        typed = (pl.col(c).cast(kind) for c, kind in SCHEMA.items())
+        return cls(table.with_columns(*absent).select(*typed, *more), root, facts or {})
+
     def __len__(self) -> int:
         return self.table.height
 

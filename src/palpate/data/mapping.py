@@ -21,9 +21,11 @@ ERRORS = (pl.exceptions.PolarsError, pl.exceptions.PanicException, ValueError, T
 #: Bytes of the longest text that an expression may make of a row, and signs that it may pad to.
 LONGEST, LONGEST_PAD = 1 << 16, 255
 PADS = re.compile(r"(?i)\b[lr]pad\s*\(.*?,\s*([0-9]+)")
-#: A cast to an integer; what rounding may change; the column of lines, which is none of a table's.
+#: A cast to an integer; what rounding may change.
 INTEGER = re.compile(r"(?i)(\bas|::)\s*(?:tiny|small|big)?int(?:eger)?[0-9]*\b")
-SLACK, LINES = 100, "^palpate_line$"
+SLACK = 100
+#: A column beside those of every table: the line of each row.
+LINE = "palpate_line"
 FIX = "Use SQL functions on columns: substr, split_part, replace, regexp_replace, left, right, ||"
 
 
@@ -48,22 +50,23 @@ class ColumnMaps:
         left = {t: e for t, e in self.expressions.items() if t not in targets}
         return ColumnMaps(left, _columns(left, self.columns), self.texts)
 
-    def apply(self, table: pl.DataFrame) -> dict[str, list[str | None]]:
+    def apply(self, table: pl.DataFrame) -> pl.DataFrame:
         """Compute the targets.
 
         Args:
             table: (n rows); it must have ``columns``, as texts.
 
         Returns:
-            Target -> (n,) texts: None where the expression is null, ``""`` where it is empty.
+            (n rows) the targets as texts: null where the expression is null, ``""`` where it is
+            empty; and the column ``LINE``, if the table has it.
         """
-        computed: dict[str, list[str | None]] = {}
+        computed = [table[LINE]] if LINE in table.columns else []
         for target, expression in self.expressions.items():
             values = _values(target, self.texts[target], expression, table)
-            computed[target] = values.str.strip_chars().to_list()
+            computed.append(values.str.strip_chars())
             if target not in table.columns:
                 table = table.with_columns(values)
-        return computed
+        return pl.DataFrame(computed)
 
 
 def compile_maps(
@@ -139,9 +142,7 @@ def _overflows(text: str, cells: pl.DataFrame, values: pl.Series) -> bool:
     """Whether integers differ from what the expression gives in floating point."""
     try:
         exact = pl.sql_expr(INTEGER.sub(r"\1 double", text)).cast(pl.Float64)
-        floats = cells.select(pl.all().exclude(LINES)).with_columns(
-            pl.col(pl.Int64).cast(pl.Float64)
-        )
+        floats = cells.drop(LINE, strict=False).with_columns(pl.col(pl.Int64).cast(pl.Float64))
         difference = (floats.select(exact).to_series() - values).abs()
     except ERRORS:
         return False

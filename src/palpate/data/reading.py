@@ -2,25 +2,20 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from palpate.core import PalpateError, Problem, Progress, quiet, require, require_regular
+from palpate.core import PalpateError, Progress, quiet, require, require_regular
 from palpate.data.foreign import require_native
-from palpate.data.formats import Format, recognized, require_options
-from palpate.data.listing import LINE, read_list
-from palpate.data.manifest import IMAGE_COLUMNS, SCHEMA, Manifest, is_manifest
-from palpate.data.mapping import compile_maps
-from palpate.data.naming import read_names
+from palpate.data.formats import Format, intervals, pairs, recognized, require_options
+from palpate.data.imported import Imported, imported_of, splits_of
+from palpate.data.listed import SIDES, read_table
+from palpate.data.listing import is_list, read_list
+from palpate.data.manifest import Manifest, is_manifest
 from palpate.data.recordings import name_recordings
-from palpate.data.rows import manifest_rows, read_classes
-from palpate.data.scanning import Scan, finished, manifest_of, raise_if, require_some
-from palpate.data.tables import TABLES, Table, decoded, header_of, lines_of, open_table, table_of
-
-#: Columns of which a table needs at least one.
-NAMING = ("id", "video", *IMAGE_COLUMNS[:2])
+from palpate.data.scanning import Scan, raise_if
+from palpate.data.tables import TABLES, headless_names
 
 
 def load(
@@ -40,8 +35,9 @@ def load(
             manifest columns; or the folder of a data set of any known format, or of images of one
             modality (``side``: ``vision`` or ``tactile``).
         format: name of the format, or ``auto``.
-        images: raise if samples have no image files because their frames are inside videos or
-            tables. Frame lists and tables without image columns never have images.
+        images: raise if samples have no image files because their frames are inside videos, or the
+            files that a table names are not there. Frame lists and tables without image columns
+            never have images.
         skip_bad: skip bad rows instead of raising.
         progress: progress callback.
         options: options of the format, e.g. ``root`` and ``columns`` of a table.
@@ -51,12 +47,9 @@ def load(
             imported first.
         ProblemsError: with every bad row, unless ``skip_bad``.
     """
-    imported = isinstance(source, str | Path) and is_manifest(Path(source))
-    if imported:
-        _require_left_out(options, {"root"}, "a manifest")
-    manifest, _ = read_samples(
-        source, format=format, skip_bad=skip_bad, progress=progress, **options
-    )
+    manifest = read(
+        source, format=format, images=images, skip_bad=skip_bad, progress=progress, **options
+    ).manifest
     without = not manifest.table["vision"].count() and not manifest.table["tactile"].count()
     if images and without and "format" in manifest.facts:  # lists and tables have no format
         got = f"{source}, whose images are inside videos or tables"
@@ -65,66 +58,93 @@ def load(
     return name_recordings([manifest])[0]
 
 
-def read_samples(
+def read(
     source: Any,
     *,
     format: str = "auto",  # noqa: A002
+    images: bool = False,
     skip_bad: bool = False,
     progress: Progress = quiet,
     **options: Any,
-) -> tuple[Manifest, list[Problem]]:
-    """Load samples as :func:`load` does; frames inside videos or tables have no images.
+) -> Imported:
+    """Read samples as :func:`load` does, with what is wrong with them and the splits they state.
 
-    Returns:
-        The samples, and what was skipped.
+    Args:
+        source: as in :func:`load`.
+        format: likewise.
+        images: whether the images of tables must be there; else samples of a table of whose images
+            none is there are named by its cells alone. Frames inside videos have no images.
+        skip_bad: skip bad rows instead of raising.
+        progress: progress callback.
+        options: likewise.
+
+    Raises:
+        PalpateError: as :func:`load`.
+        ProblemsError: likewise.
     """
     options = {name: value for name, value in options.items() if value is not None}
     if isinstance(source, Manifest):
-        return source, []
-    if not isinstance(source, (str, Path)):
-        # Rows whose images are not at hand are those of a list on disk.
-        named = None if "root" in options else read_names(source, options)
-        if named is None:
-            return _of_table(table_of(source), Path(), skip_bad, options)
-        raise_if(named[1], skip_bad)
-        return named[:2]
+        return Imported(source)
+    if not isinstance(source, str | Path):
+        return _of_table(source, options, images=images, skip_bad=skip_bad)
     path = Path(source)
     require_regular(path)
     if format == "auto" and path.exists():
         require_native(path)
         if is_manifest(path):
-            return Manifest.load(path, options.get("root")), []
-        if path.is_file() and (path.suffix.lower() not in TABLES or is_list(path)):
-            if named := read_names(path, options) if set(options) - {"root"} else None:
-                raise_if(named[1], skip_bad)
-                return named[:2]
-            listed = read_list(path, skip_bad=skip_bad)
-            return listed.manifest, listed.skipped
-    chosen = "pairs" if "side" in options else format
-    name, form = recognized(path, chosen, options)
-    columns = {*header_of(path), *options.get("columns", {})} if path.is_file() else set[str]()
-    if name == "pairs" and path.is_file() and columns.isdisjoint(("vision", "tactile")):
-        names = options.pop("names", None)
-        return _of_table(open_table(path, names), path.parent, skip_bad, options)
+            _require_only({"root"}, options, "a manifest")
+            return Imported(Manifest.load(path, options.get("root")), splits=splits_of(path))
+        if path.is_file() and (named := _of_file(path, options, images, skip_bad)):
+            return named
+    name, form = recognized(path, "pairs" if "side" in options else format, options)
     # Images are not decoded here: broken ones are reported when they are read.
-    more = {"check": "none", "progress": progress}
-    scan = _scanned(form, path, require_options(name, form, options | more))
-    facts = {**form.facts.of_manifest(), "format": name, **scan.facts}
-    return _of_scan(scan, path, facts, skip_bad, progress)
+    options |= {"check": "none", "progress": progress}
+    scan = _scanned(form, path, require_options(name, form, options))
+    facts = {**form.facts.of_manifest(), "format": name}
+    return imported_of(scan, path, facts, skip_bad=skip_bad, check="none", progress=progress)
 
 
-def is_list(path: Path) -> bool:
-    """Whether the first line that is not empty is a row of a frame list."""
-    with open(path, "rb") as file:
-        head = decoded(file.read(1 << 16))
-    line = next((line.strip() for line in lines_of(head) if line.strip()), "")
-    return re.match(LINE, line) is not None
+def _of_file(
+    path: Path, options: Mapping[str, Any], images: bool, skip_bad: bool
+) -> Imported | None:
+    """The samples of a list or table; None if it is next to the recordings that it lists."""
+    is_interval = "names" not in options and intervals.detect(path)
+    is_table = path.suffix.lower() in TABLES or "names" in options or headless_names(path)
+    if (set(options) <= {"root"} and is_list(path)) or not (is_interval or is_table):
+        listed = read_list(path, skip_bad=skip_bad)
+        return Imported(listed.manifest, listed.skipped, inconclusive=listed.inconclusive)
+    if not is_interval:
+        return _of_table(path, options, images=images, skip_bad=skip_bad)
+    if intervals.has_recordings(path, options.get("root")):
+        return None
+    _require_only({"root", "columns", "classes"}, options, "a list of intervals alone")
+    imported = intervals.by_name(path, options.get("columns"), options.get("classes"))
+    raise_if(imported.skipped, skip_bad)
+    return imported
 
 
-def _require_left_out(options: Mapping[str, Any], accepted: set[str], kind: str) -> None:
+def _of_table(source: Any, options: Mapping[str, Any], *, images: bool, skip_bad: bool) -> Imported:
+    """The samples of a table or list, with its images if one of these is there, or all must."""
+    _require_only({"columns", "names", "classes", "root", *SIDES}, options, "a list or table")
+    side = next((side for side in ("tactile", "vision") if side in options), "")
+    own = {name: value for name, value in options.items() if name not in SIDES}
+    listed = read_table(source, side=side, **own)
+    if listed.sides and (images or listed.at_hand):
+        must = "must come with a folder, or a list whose images are not at hand"
+        require(not side, side, must, listed.table.name, fix="Leave it out")
+        facts = {**pairs.FACTS.of_manifest(), "format": "pairs"}
+        scan = pairs.scan_of(listed)
+        return imported_of(scan, listed.table.name, facts, skip_bad=skip_bad, check="none")
+    imported = listed.by_name(options.get(side))
+    raise_if(imported.skipped, skip_bad)
+    return imported
+
+
+def _require_only(accepted: set[str], options: Mapping[str, Any], kind: str) -> None:
     """Raise for an option that a kind of source does not take."""
     for name in sorted(set(options) - accepted):
-        raise PalpateError(f"must be left out for {kind}", repr(options[name]), "", argument=name)
+        fix = f"It takes {', '.join(sorted(accepted))}"
+        require(False, name, f"must be left out for {kind}", repr(options[name]), fix=fix)
 
 
 def _scanned(form: Format, path: Path, options: dict[str, Any]) -> Scan:
@@ -137,32 +157,3 @@ def _scanned(form: Format, path: Path, options: dict[str, Any]) -> Scan:
         scan = form.read(path, options | {"side": "vision"})
         scan.facts["side_assumed"] = "vision"
         return scan
-
-
-def _of_table(
-    table: Table, root: Path, skip_bad: bool, options: dict[str, Any]
-) -> tuple[Manifest, list[Problem]]:
-    """Samples of a data frame, or of a table without images."""
-    _require_left_out(options, {"columns", "root", "classes"}, "a table")
-    maps = compile_maps(options.get("columns", {}), table.names, [*SCHEMA, "split"])
-    must = f"must have at least one of the columns {', '.join(NAMING)}"
-    got = ", ".join(table.names) or "no columns"
-    fix = "Map a column to one of them"
-    require(any(name in maps.expressions for name in NAMING), "source", must, got, fix=fix)
-    classes = None if "classes" not in options else read_classes(Path(options["classes"]))
-    cells = maps.apply(table.read(maps.columns))
-    rows, _ = manifest_rows(cells, len(table.lines), table.where, classes, table.problems)
-    facts = {"dataset": Path(table.name).stem}
-    base = Path(options.get("root", root))
-    places = [(table.where(k), row) for k, row in rows]
-    scan = Scan(base, rows=places, problems=table.problems)
-    return _of_scan(scan, table.name, facts, skip_bad, quiet)
-
-
-def _of_scan(
-    scan: Scan, source: object, facts: dict[str, str], skip_bad: bool, progress: Progress
-) -> tuple[Manifest, list[Problem]]:
-    rows = finished(scan, "none", progress)
-    raise_if(scan.problems, skip_bad)
-    require_some(len(rows), source, scan.problems)
-    return manifest_of(scan, rows, facts), scan.problems

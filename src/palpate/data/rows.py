@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -12,24 +12,24 @@ import polars as pl
 
 from palpate.core import PARTS, Problem, require
 from palpate.data.manifest import PART_NAMES
-from palpate.data.tables import INCONCLUSIVE, Table, read_categories, whole
+from palpate.data.mapping import LINE
+from palpate.data.tables import INCONCLUSIVE, read_categories
 
 #: Columns that a split keeps whole; where only some rows have a value, a person should look.
 GROUPS = ("video", "object", "session")
 INTEGERS = ("frame", "start", "end")
+#: A text that is a whole number (``7``, ``007``, ``7.0``).
+WHOLE = r"^\+?(-?[0-9]{1,18})(?:\.0+)?$"
 #: Paths that are looked for, to see where those of another machine start.
 TRIED = 100
 Row = dict[str, Any]
-Cells = Mapping[str, Sequence[str | None]]
+#: The line of a row -> its place in words (``file:line``).
+Place = Callable[[int], str]
 
 
 def manifest_rows(
-    cells: Cells,
-    count: int,
-    where: Callable[[int], str],
-    classes: Mapping[int, str] | None,
-    problems: list[Problem],
-) -> tuple[list[tuple[int, Row]], int]:
+    rows: pl.DataFrame, place: Place, classes: Mapping[int, str] | None, problems: list[Problem]
+) -> tuple[pl.DataFrame, int]:
     """Rows of a manifest from mapped cells.
 
     ``frame``, ``start`` and ``end`` become integers; with ``classes`` the number of a material
@@ -37,53 +37,53 @@ def manifest_rows(
     of a part.
 
     Args:
-        cells: manifest column -> (count,) texts, as :meth:`ColumnMaps.apply` gives them.
-        count: number of rows.
-        where: row -> its place.
+        rows: manifest columns as texts and the column ``LINE``, as :meth:`ColumnMaps.apply` gives
+            them.
+        place: line -> its place.
         classes: number -> name, or None to take materials as they are.
         problems: what is wrong is added here.
 
     Returns:
-        (row number, its cells that are not null) of the good rows, and how many were inconclusive.
+        The good rows, and how many were inconclusive.
     """
-    names = set(classes.values()) if classes is not None else set[str]()
-    rows: list[tuple[int, Row]] = []
-    inconclusive = 0
-    for k in range(count):
-        row: Row = {name: texts[k] for name, texts in cells.items() if texts[k] is not None}
-        empty = [name for name, cell in row.items() if not cell]
-        wrong = [("bad-map", f"the expression for {name} is empty here") for name in empty]
-        wrong += _make_integers(row)
-        material = row.get("material")
-        if classes is not None and material is not None and material not in names:
-            number = whole(material)
-            if number == INCONCLUSIVE:
-                inconclusive += 1
-                continue
-            if number not in classes:
-                text = f"the class {material!r} is not in the table of classes"
-                wrong.append(("unknown-label", text))
-            row["material"] = classes.get(-1 if number is None else number)
-        if "split" in row:
-            part = PART_NAMES.get(row["split"].lower())
-            if part is None:
-                text = f"the split {row['split']!r} is none of {', '.join(PARTS)}"
-                wrong.append(("unknown-part", text))
-            row["split"] = part
-        problems += [Problem(where(k), *problem) for problem in wrong]
-        if not wrong:
-            rows.append((k, row))
-    return rows, inconclusive
+    columns = [name for name in rows.columns if name != LINE]
+    count, failed = len(rows), set[int]()
+
+    def report(name: str, kind: str, wrong: pl.Expr, words: str) -> None:
+        for line, cell in rows.filter(wrong).select(LINE, name).iter_rows():
+            problems.append(Problem(place(line), kind, f"the {name} {cell!r} is {words}"))
+            failed.add(line)
+
+    if classes is not None and "material" in columns:
+        number = pl.col("material").str.extract(WHOLE).cast(pl.Int64)
+        named = pl.col("material").is_in(list(classes.values()))
+        rows = rows.filter((named | number.ne_missing(INCONCLUSIVE)).fill_null(True))
+        listed = named | number.is_in(list(classes)).fill_null(False)
+        report("material", "unknown-label", ~listed, "not in the table of classes")
+        name = number.replace_strict(classes, default=None, return_dtype=pl.String)
+        rows = rows.with_columns(material=pl.when(named).then("material").otherwise(name))
+    inconclusive = count - len(rows)
+    for name in columns:
+        report(name, "bad-map", pl.col(name) == "", "empty: its expression gives nothing here")
+    for name in (name for name in INTEGERS if name in columns):
+        number = pl.col(name).str.extract(WHOLE).cast(pl.Int64)
+        wrong = (pl.col(name) != "") & (number < 0).fill_null(True)
+        report(name, "bad-frame", wrong, "not a whole number from 0")
+        rows = rows.with_columns(number)
+    if "split" in columns:
+        part = pl.col("split").str.to_lowercase()
+        wrong = ~part.is_in(list(PART_NAMES))
+        report("split", "unknown-part", wrong, f"none of {', '.join(PARTS)}")
+        rows = rows.with_columns(part.replace_strict(PART_NAMES, default=None))
+    return rows.filter(~pl.col(LINE).is_in(list(failed))) if failed else rows, inconclusive
 
 
-def _make_integers(row: Row) -> Iterator[tuple[str, str]]:
-    """Make integers of the cells that must be some; yield what is wrong as (kind, text)."""
-    for name in INTEGERS:
-        if row.get(name):
-            number = whole(row[name])
-            if number is None or number < 0:
-                yield "bad-frame", f"the {name} {row[name]!r} is not a whole number from 0"
-            row[name] = number
+def records(rows: pl.DataFrame, place: Place) -> list[tuple[str, Row]]:
+    """(place, cells that are not null) of each row."""
+    return [
+        (place(row.pop(LINE)), {name: cell for name, cell in row.items() if cell is not None})
+        for row in rows.iter_rows(named=True)
+    ]
 
 
 def read_classes(path: Path) -> dict[int, str]:
@@ -93,22 +93,17 @@ def read_classes(path: Path) -> dict[int, str]:
     return read_categories(path)
 
 
-def without_repeats(cells: Cells, table: Table) -> Cells:
-    """The cells without the rows that are equal to an earlier one; those become problems.
-
-    Rows of ``table`` that go leave its lines, too.
-    """
-    frame = pl.DataFrame(cells).with_row_index("row")
-    first = frame.group_by(list(cells)).agg(first=pl.col("row").min()) if cells else frame
-    if not cells or len(first) == len(frame):
-        return cells
-    pairs = frame.join(first, on=list(cells), how="left", nulls_equal=True, maintain_order="left")
-    for row, before in pairs.select("row", "first").filter(pl.col("row") != pl.col("first")).rows():
-        text = f"repeats the row {table.where(before)}: all cells that are read are equal"
-        table.problems.append(Problem(table.where(row), "duplicate-row", text))
-    keep = pairs["row"] == pairs["first"]
-    table.lines = pl.Series(table.lines).filter(keep).to_list()
-    return {name: pl.Series(texts).filter(keep).to_list() for name, texts in cells.items()}
+def without_repeats(rows: pl.DataFrame, place: Place, problems: list[Problem]) -> pl.DataFrame:
+    """The rows without those that are equal to an earlier one but for their line."""
+    columns = [name for name in rows.columns if name != LINE]
+    if not columns or rows.n_unique(columns) == len(rows):
+        return rows
+    first = pl.col(LINE).first().over(columns)
+    again = rows.select(LINE, first=first).filter(pl.col(LINE) != pl.col("first"))
+    for line, before in again.iter_rows():
+        text = f"repeats the row {place(before)}: all cells that are read are equal"
+        problems.append(Problem(place(line), "duplicate-row", text))
+    return rows.filter(~pl.col(LINE).is_in(again[LINE].implode()))
 
 
 def relocated(written: Iterable[str], root: Path) -> dict[str, str]:
@@ -119,36 +114,42 @@ def relocated(written: Iterable[str], root: Path) -> dict[str, str]:
     never become one. Paths that are right as they are written, or found nowhere, are left out.
     """
     distinct = list(dict.fromkeys(written))
-    if all(is_there(root, path) for path in _some(distinct)):
+    if all(is_there(root, path) for path in some(distinct)):
         return {}
-    by_head: dict[str, dict[str, Sequence[str]]] = {}
+    by_head: dict[str, list[str]] = {}
     for path in distinct:
-        parts = [part for part in re.split(r"[/\\]+", path) if part not in ("", ".")]
-        absolute = re.match(r"[/\\]|[A-Za-z]:", path)
-        if parts and ".." not in parts:
-            by_head.setdefault(parts[0] if absolute else "", {})[path] = parts
+        if ".." in path and ".." in _parts(path):
+            continue
+        absolute = re.match(r"[/\\]+[^/\\]*|[A-Za-z]:", path)
+        by_head.setdefault(absolute[0] if absolute else "", []).append(path)
     places: dict[str, str] = {}
     for paths in by_head.values():
-        places |= _found(paths, root)
+        places |= _ends(paths, root)
     return {path: below for path, below in places.items() if path != below}
 
 
-def _found(paths: Mapping[str, Sequence[str]], root: Path) -> dict[str, str]:
+def _ends(paths: Sequence[str], root: Path) -> dict[str, str]:
     """Path -> its end that is a file below the root, by one rule for all; empty without one."""
-    some = _some(list(paths))
+    tried = [_parts(path) for path in some(paths)]
     folders = (
         sorted(entry.name for entry in root.iterdir() if entry.is_dir()) if root.is_dir() else []
     )
-    best, rule = len(some) // 2, (0, "")
+    best, rule = len(tried) // 2, (0, "")
     for start in ("", *(f"{name}/" for name in folders[:TRIED])):
-        for k in range(min(map(len, paths.values()))):
-            count = sum(is_there(root, start + "/".join(paths[p][k:])) for p in some)
-            apart = len({tuple(parts[k:]) for parts in paths.values()}) == len(paths)
-            if count > best and apart:
-                best, rule = count, (k, start)
-        if best > len(some) // 2:
-            return {p: rule[1] + "/".join(parts[rule[0] :]) for p, parts in paths.items()}
-    return {}
+        for k in range(min(map(len, tried), default=0)):
+            ends = ["/".join(parts[k:]) for parts in tried]
+            count = sum(is_there(root, start + end) for end in ends)
+            if count > best:
+                every = {"/".join(_parts(path)[k:]) for path in paths}
+                apart = len(every) == len(paths) and "" not in every
+                best, rule = (count, (k, start)) if apart else (best, rule)
+    if best == len(tried) // 2:
+        return {}
+    return {path: rule[1] + "/".join(_parts(path)[rule[0] :]) for path in paths}
+
+
+def _parts(path: str) -> list[str]:
+    return [part for part in re.split(r"[/\\]+", path) if part not in ("", ".")]
 
 
 def is_there(root: Path, path: str) -> bool:
@@ -158,7 +159,8 @@ def is_there(root: Path, path: str) -> bool:
     return False
 
 
-def _some(items: Sequence[str]) -> Sequence[str]:
+def some(items: Sequence[str]) -> Sequence[str]:
+    """As many items, evenly, as are looked for on the disk."""
     return items[:: max(1, len(items) // TRIED)]
 
 

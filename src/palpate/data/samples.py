@@ -47,7 +47,7 @@ from palpate.core.features import is_missing, to_numpy
 from palpate.core.messages import require_rows
 from palpate.data.images import SUFFIXES as IMAGES
 from palpate.data.images import cached_images, image_size, load_images, read_image, square
-from palpate.data.manifest import SCHEMA, Manifest, is_manifest
+from palpate.data.manifest import Manifest, is_manifest
 from palpate.data.recordings import LEVELS, name_recordings
 from palpate.data.tables import open_table, table_of
 
@@ -252,17 +252,9 @@ def one_image(source: Any) -> NDArray[np.uint8]:
 
 def _manifest(root: Path, **columns: Sequence[str]) -> Manifest:
     """Columns of text as a manifest; those left out, and '', are null."""
-    table = pl.DataFrame(
-        {name: [v or None for v in values] for name, values in columns.items()},
-        schema=dict.fromkeys(columns, pl.String),
-    )
-    absent = (pl.lit(None, kind).alias(name) for name, kind in SCHEMA.items())
-    return Manifest(
-        table.with_columns(c for c in absent if c.meta.output_name() not in columns).select(
-            *SCHEMA
-        ),
-        root,
-    )
+    cells = {name: [v or None for v in values] for name, values in columns.items()}
+    table = pl.DataFrame(cells, schema=dict.fromkeys(columns, pl.String))
+    return Manifest.of_table(table, root)
 
 
 # Image files

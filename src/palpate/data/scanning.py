@@ -280,7 +280,7 @@ def _unique(scan: Scan, rows: list[Row]) -> list[Row]:
 
     A missing id is made of video and frame, else of the path of the tactile or vision image.
     """
-    seen: dict[str, tuple[str, str | None]] = {}
+    seen: dict[str, tuple[str, str | None, Cells]] = {}
     in_two: set[str] = set()
     good: list[Row] = []
     for where, row in rows:
@@ -290,20 +290,31 @@ def _unique(scan: Scan, rows: list[Row]) -> list[Row]:
             hint = f", made of {made_of} since there is none: map a column to id"
         i = row["id"]
         if i not in seen:
-            seen[i] = where, part
+            seen[i] = where, part, row
             good.append((where, row))
             continue
-        before, other = seen[i]
+        before, other, first = seen[i]
         if part and other and part != other:
             in_two.add(i)
             text = f"{i} is in {part} here and in {other} at {before}, so in no part"
             scan.problem(where, "two-parts", text)
         else:
+            hint = _difference(first, row) or hint
             scan.problem(where, "duplicate-id", f"the id {i!r} is at {before} already{hint}")
-    parts = {i: part for i, (_, part) in seen.items() if part and i not in in_two}
+    parts = {i: part for i, (_, part, _) in seen.items() if part and i not in in_two}
     if scan.split_name and parts:
         scan.splits[scan.split_name] = Split(parts, scan.split_rule)
     return good
+
+
+def _difference(first: Cells, row: Cells) -> str:
+    """In what rows of the same images differ, in words; empty for those of others."""
+    if any(first.get(column) != row.get(column) for column in SIDES):
+        return ""
+    differing = [name for name in {**first, **row} if first.get(name) != row.get(name)]
+    cells = (f"{name} ({row.get(name)!r} here, {first.get(name)!r} there)" for name in differing)
+    other = f" and another {few(cells)}" if differing else ""
+    return f", with the same images{other}: keep the row that is right"
 
 
 def _default_id(where: str, row: Cells) -> tuple[str, str]:

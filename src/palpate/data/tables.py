@@ -26,7 +26,7 @@ import polars as pl
 
 from palpate.core import PalpateError, Problem, ProblemsError, require
 from palpate.data.manifest import PART_NAMES, PATH, ROLE_OF, reading_parquet
-from palpate.data.mapping import text_of
+from palpate.data.mapping import LINE, text_of
 
 csv.field_size_limit(1 << 30)  # by default a long text is an error, for the whole process
 TABLES = (".csv", ".tsv", ".jsonl", ".json", ".parquet")
@@ -34,8 +34,6 @@ TABLES = (".csv", ".tsv", ".jsonl", ".json", ".parquet")
 INCONCLUSIVE = -1
 #: Names that the published category table misspells.
 SPELLING = {"Ruber": "Rubber"}
-#: A column of every table that was read: the line of each row.
-LINE = "palpate_line"
 #: Bytes of a text that is read at once.
 LARGEST = 1 << 28
 #: The encoding of texts that Excel saves as plain CSV.
@@ -56,7 +54,6 @@ class Table:
     names: list[str]  # its columns
     problems: list[Problem]  # what is wrong with its rows; complete after :meth:`read`
     records: _Records  # from the requested columns to (line, cells)
-    lines: list[int] = field(default_factory=list)  # (rows,) line of each row that was read
     suspicious: list[Problem] = field(default_factory=list)  # read, but a person should look
     nested: set[str] = field(default_factory=set)  # columns that hold lists
 
@@ -70,20 +67,18 @@ class Table:
         if double := [name for name in columns if self.names.count(name) > 1]:
             must = f"Columns of {self.name} must have different names"
             raise PalpateError(must, f"{double[0]} twice or more", "Rename one of them")
-        self.lines = []
-        rows: list[list[str | None]] = []
+        rows: list[list[Any]] = []
         for line, cells in self.records(columns):
             if problem := _unfit(cells, columns):
-                self.problems.append(Problem(f"{self.name}:{line}", *problem))
+                self.problems.append(Problem(self.place(line), *problem))
             else:
-                self.lines.append(line)
-                rows.append([text_of(cell) for cell in cells])
-        table = pl.DataFrame(rows, dict.fromkeys(columns, pl.String), orient="row")
-        return table.insert_column(0, pl.Series(LINE, self.lines, pl.Int64))
+                rows.append([line, *map(text_of, cells)])
+        schema = {LINE: pl.Int64} | dict.fromkeys(columns, pl.String)
+        return pl.DataFrame(rows, schema, orient="row")
 
-    def where(self, k: int) -> str:
-        """``file:line`` of row ``k``."""
-        return f"{self.name}:{self.lines[k]}"
+    def place(self, line: int) -> str:
+        """``file:line``."""
+        return f"{self.name}:{line}"
 
 
 def open_table(path: Path, names: Sequence[str] | None = None) -> Table:
@@ -152,7 +147,7 @@ def header_of(path: Path) -> list[str]:
 def delimiter_of(path: Path, text: str) -> str:
     """What separates the cells of a CSV file."""
     head = re.split("[\r\n]", text.lstrip("\r\n"), maxsplit=1)[0]
-    signs = "\t" if path.suffix.lower() == ".tsv" else ",;\t"
+    signs = "\t" if path.suffix.lower() == ".tsv" else ",;\t|"
     spaced = is_image(head.split(" ")[0]) and " " in head.strip()
     return next((sign for sign in signs if sign in head), " " if spaced else signs[0])
 
@@ -183,6 +178,14 @@ def is_image(name: object) -> bool:
     from palpate.data.images import SUFFIXES  # lists are read without Pillow
 
     return str(name).strip().lower().endswith(SUFFIXES)
+
+
+def names_images(cells: pl.Series) -> bool:
+    """Whether most of some texts have the suffix of an image."""
+    from palpate.data.images import SUFFIXES
+
+    ends = "|".join(map(re.escape, SUFFIXES))
+    return 2 * (cells.str.contains(rf"(?i)(?:{ends})$").sum() or 0) > cells.count()
 
 
 def decoded(data: bytes) -> str:

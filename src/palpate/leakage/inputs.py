@@ -14,11 +14,9 @@ from typing import Any
 import polars as pl
 
 from palpate.core import Note, PalpateError, Problem, ProblemsError, Progress, Split, quiet, require
-from palpate.data.imported import splits_of
-from palpate.data.listing import categories_in, read_lists
-from palpate.data.manifest import PATH, Manifest, is_manifest
-from palpate.data.naming import read_names
-from palpate.data.reading import is_list, read_samples
+from palpate.data.listing import categories_in, is_list, read_lists
+from palpate.data.manifest import Manifest, is_manifest
+from palpate.data.reading import read as read_samples
 from palpate.data.recordings import NAMES, name_recordings, recordings_note
 
 #: A manifest, a path, several frame lists that are joined, or a polars or pandas frame.
@@ -52,31 +50,17 @@ def read(
         manifest, skipped = _join([Path(path) for path in paths], skip_bad, root, reading)
         return Source(manifest, {}, _notes(skipped))
     source = paths[0] if len(paths) == len(several) == 1 else data
-    path = Path(source) if isinstance(source, (str, Path)) else None
-    # A table may name images that are not at hand; everything else is read as `palpate.load` does.
-    options = _options(reading)
-    if path is None:
-        table = None if isinstance(source, Manifest) or root else source
-    else:
-        listed = path.is_file() and not is_manifest(path) and (options or not is_list(path))
-        table = path if listed else None
-    named = None if table is None else read_names(table, {**options, "root": root})
-    if named is not None:
-        manifest, skipped, split = named
-        if skipped and not skip_bad:
-            raise ProblemsError(skipped, FIX, example={"skip_bad": True})
-        splits = {} if split is None else {str(split.rule["name"]): split}
-        notes = _notes(skipped)
-        if path is None and PATH in manifest.table.columns:
-            notes.append(Note("images-not-found", {"root": str(manifest.root)}))
-        return Source(manifest, splits, notes)
-    manifest, skipped = read_samples(
+    samples = read_samples(
         source, skip_bad=skip_bad, root=root, progress=progress, **_options(reading)
     )
-    notes = _notes(skipped)
+    manifest, notes = samples.manifest, _notes(samples.skipped)
     if "side_assumed" in manifest.facts:
         notes.append(Note("photos-assumed", {"name": manifest.facts.get("dataset", "")}))
-    return Source(manifest, splits_of(path) if path is not None else {}, notes)
+    if column := manifest.facts.get("path_column"):
+        notes.append(Note("path-column", {"column": column}))
+    if "images_absent" in manifest.facts:
+        notes.append(Note("images-not-found", {"root": str(manifest.root)}))
+    return Source(manifest, samples.splits, notes)
 
 
 def _options(reading: Mapping[str, Any] | None) -> dict[str, Any]:

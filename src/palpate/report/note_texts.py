@@ -285,6 +285,7 @@ LEAKAGE: dict[str, Sentence] = {
         "No image that the table names is a file below {root}, so images were not read; pass the "
         "folder that its paths start from as {arg:root=FOLDER}"
     ),
+    "path-column": "The paths are those of the column {column}, most of whose cells name images",
     "question": _question,
     "rare-materials": "In fewer than {parts} groups, so not in every part: {materials}",
     "recordings": _recordings,

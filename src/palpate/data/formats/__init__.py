@@ -77,14 +77,13 @@ def recognized(
 
 
 def require_options(name: str, form: Format, options: dict[str, Any]) -> dict[str, Any]:
-    """The options of a format that are not None; some matter to an import alone.
+    """The options of a format that are not None.
 
     Raises:
         PalpateError: if an option does not belong to the format.
     """
     values = {key: value for key, value in options.items() if value is not None}
-    accepted = {*form.options, "size", "into"}  # the last two may be without use
-    if unknown := sorted(set(values) - accepted):
+    if unknown := sorted(set(values) - {*form.options, "into"}):
         takes = ", ".join(k for k in form.options if k not in ("skip_bad", "check", "progress"))
         must, got = f"must be left out for the format {name}", repr(values[unknown[0]])
         fix = f"This format takes {takes or 'no options'}"

@@ -27,11 +27,10 @@ from palpate.core import PalpateError, Progress, atomic_path, inside, quiet, req
 from palpate.data.formats.huggingface_source import Source, first_line, open_source
 from palpate.data.images import Check, Checked, check_image
 from palpate.data.manifest import IMAGE_COLUMNS, PART_NAMES, SCHEMA
-from palpate.data.mapping import ColumnMaps, compile_maps, text_of
-from palpate.data.rows import manifest_rows, odd_groups, read_classes
+from palpate.data.mapping import LINE, ColumnMaps, compile_maps, text_of
+from palpate.data.rows import manifest_rows, odd_groups, read_classes, records
 from palpate.data.scanning import Cells, Facts, Format, Into, Scan
 from palpate.data.suspicions import evenly, looks_of
-from palpate.data.tables import LINE
 
 LOOKS_FOR = (
     "a folder written by save_to_disk of the library datasets, or of Parquet shards; for a name on "
@@ -199,10 +198,9 @@ class _BatchReader:
         plain = self.maps.without(list(stored))
         texts = [pl.Series(n, self._texts(n), dtype=pl.String) for n in plain.columns]
         cells = plain.apply(pl.DataFrame({LINE: range(count)}).with_columns(texts))
-        problems = self.result.problems
-        usable, inconclusive = manifest_rows(cells, count, self.where, classes, problems)
+        usable, inconclusive = manifest_rows(cells, self.where, classes, self.result.problems)
         self.result.inconclusive += inconclusive
-        for k, row in usable:
+        for k, (_, row) in zip(usable[LINE], records(usable, self.where), strict=True):
             if not {"video", "frame"} <= set(row):
                 row.setdefault("id", self._place(k, ""))
             good = True

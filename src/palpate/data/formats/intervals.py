@@ -1,9 +1,10 @@
-"""Interval lists: contacts as ``video,start,end,label`` lines, next to folders of recordings.
+"""Interval lists: contacts as ``video,start,end,label`` lines, with or without recordings.
 
 ::
 
     root/
-      contacts.csv                     any table (:mod:`palpate.data.tables`)
+      contacts.csv                     any table (:mod:`palpate.data.tables`), or lines of
+                                       ``video start end [label]``
       <video>/video.mp4  gelsight.mp4, or video_frame/ gelsight_frame/, as in Touch and Go, also
                                        under dataset/ or final_dataset/
 
@@ -15,25 +16,41 @@ material: no samples, but no background is taken from there either.
 
 Each interval is a contact ``video#000k`` in the order of frames; each of its frames is a sample
 (``every`` thins). Backgrounds follow the rule of Touch and Go. Intervals that overlap are all
-skipped: which is true is unknown.
+skipped: which is true is unknown. Without recordings every frame of an interval is a sample by its
+name alone.
 """
 
 from __future__ import annotations
 
+import re
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+import polars as pl
+
 from palpate.core import PalpateError, Problem, Progress, quiet, require
-from palpate.data.formats.layout import require_videos
+from palpate.data.formats.layout import find_videos, require_videos
 from palpate.data.formats.recordings import Pairing, Recordings, Row
 from palpate.data.images import Check
+from palpate.data.imported import Imported
 from palpate.data.listing import FrameTable
+from palpate.data.manifest import Manifest
 from palpate.data.mapping import compile_maps
-from palpate.data.rows import manifest_rows, read_classes
-from palpate.data.scanning import Facts, Format, Into, Scan
-from palpate.data.tables import header_of, open_table
+from palpate.data.rows import manifest_rows, read_classes, records
+from palpate.data.scanning import Facts, Format, Into, Scan, require_some
+from palpate.data.tables import (
+    TABLES,
+    Record,
+    Table,
+    decoded,
+    header_of,
+    is_image,
+    lines_of,
+    open_table,
+    text_in,
+)
 
 FACTS = Facts(
     name="your own recordings with an interval list",
@@ -43,6 +60,10 @@ FACTS = Facts(
 NEEDED = ("video", "start", "end")
 ORDER = ("video", "start", "end", "label")
 WORDS = ("material", "object", "text", "session")
+#: Between the cells of a line.
+SEPARATORS = re.compile(r"[\s,;]+")
+#: Frames that the intervals of one list may have together, where there are no recordings.
+MOST_FRAMES = 20_000_000
 LOOKS_FOR = f"a table with the columns {', '.join(ORDER)}, next to folders of recordings"
 
 
@@ -60,10 +81,43 @@ class Interval:
 
 def detect(source: Path) -> bool:
     """Whether this is a table with video, start and end and without images, or bare lines."""
-    header = header_of(source) if source.is_file() else []
-    if {"vision", "tactile"} & set(header):
+    first = _first_row(source) if source.is_file() else []
+    if {"vision", "tactile"} & set(first):
         return False
-    return _is_bare(header) or set(NEEDED) <= set(header)
+    return _is_bare(first) or set(NEEDED) <= set(first)
+
+
+def has_recordings(source: Path, root: Path | None = None) -> bool:
+    """Whether there are recordings next to a list."""
+    return bool(find_videos(source.parent if root is None else Path(root)))
+
+
+def by_name(
+    source: Path, columns: Mapping[str, str] | None = None, classes: Path | None = None
+) -> Imported:
+    """Every frame of every interval, by its name; a frame of several intervals is of the first.
+
+    Raises:
+        PalpateError: if there are more than ``MOST_FRAMES``, or none.
+    """
+    result = Scan(source.parent)
+    listed = [i for i in _read(result, source, columns, classes) if not i.inconclusive]
+    count = sum(i.last - i.first + 1 for i in listed)
+    must, fix = f"{source} must have at most {MOST_FRAMES:,} frames", "Check their ends"
+    require(count <= MOST_FRAMES, None, must, f"{count:,}", fix=fix)
+    require_some(count, source, result.problems)
+    rows = [(i.video, i.first, i.last, *map(i.words.get, WORDS)) for i in listed]
+    schema = {"video": pl.String, "first": pl.Int64, "last": pl.Int64}
+    table = pl.DataFrame(rows, schema | dict.fromkeys(WORDS, pl.String), orient="row")
+    frames = table.with_columns(
+        contact=pl.format("{}#{}-{}", "video", "first", "last"),
+        frame=pl.int_ranges("first", pl.col("last") + 1),
+    ).explode("frame")
+    frames = frames.unique(["video", "frame"], keep="first", maintain_order=True)
+    frames = frames.drop("first", "last").with_columns(id=pl.format("{}/{}", "video", "frame"))
+    manifest = Manifest.of_table(frames, source.parent, {"dataset": source.stem})
+    result.problems.sort(key=Problem.sort_key)
+    return Imported(manifest, result.problems, inconclusive=result.inconclusive)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -108,7 +162,6 @@ def scan(
     result = Scan(base, {"dataset": source.stem})
     work = Recordings(result, into, require_videos(base), {}, options.size, pairing=options.pairing)
     listed = _read(result, source, columns, options.classes)
-    result.inconclusive = sum(i.inconclusive for i in listed)
     contacts = _contacts(work, listed, progress)
     rows = [row for name in contacts for row in _frames(work, name, contacts[name], every)]
     starts, videos = {c: i.first for c, i in contacts.items()}, {i.video for i in contacts.values()}
@@ -126,18 +179,48 @@ def scan(
 FORMAT = Format(FACTS, detect, LOOKS_FOR, scan, record=Options)
 
 
-def _is_bare(header: list[str]) -> bool:
-    """Whether the first line of a table is an interval already, and no header."""
-    numbers = all(cell.isdecimal() for cell in header[1:3])
-    return len(header) in (3, 4) and header[0] != "" and numbers
+def _first_row(path: Path) -> list[str]:
+    """The cells of the first line that is not empty."""
+    if path.suffix.lower() in TABLES:
+        return header_of(path)
+    with open(path, "rb") as file:
+        lines = lines_of(decoded(file.read(1 << 12)))
+    return SEPARATORS.split(next((line.strip() for line in lines if line.strip()), ""))
+
+
+def _is_bare(cells: list[str]) -> bool:
+    """Whether the cells of a first line are an interval already, and no header."""
+    numbers = all(cell.isdecimal() for cell in cells[1:3])
+    return len(cells) in (3, 4) and cells[0] != "" and numbers and not is_image(cells[0])
+
+
+def _of_lines(path: Path, names: Sequence[str] | None) -> Table:
+    """The table of a text whose cells spaces, tabs, commas or semicolons separate."""
+    lines = ((k, line.strip()) for k, line in enumerate(lines_of(text_in(path)), 1))
+    rows = [(k, SEPARATORS.split(line)) for k, line in lines if line]
+    header = list(ORDER if names else rows.pop(0)[1])
+    text = f"is not {' '.join(header)}, or without the last"
+    good = [(k, cells) for k, cells in rows if 0 <= len(header) - len(cells) <= 1]
+    problems = [
+        Problem(f"{path}:{k}", "bad-row", f"{' '.join(cells)!r} {text}")
+        for k, cells in rows
+        if not 0 <= len(header) - len(cells) <= 1
+    ]
+
+    def records(columns: Sequence[str]) -> Iterator[Record]:
+        places = [header.index(name) for name in columns]
+        return ((k, [[*cells, None][place] for place in places]) for k, cells in good)
+
+    return Table(str(path), header, problems, records)
 
 
 def _read(
     result: Scan, path: Path, columns: Mapping[str, str] | None, classes: Path | None
 ) -> list[Interval]:
     """The well-formed intervals of the list, in its order."""
-    header = header_of(path)
-    table = open_table(path, ORDER[: len(header)] if _is_bare(header) else None)
+    first = _first_row(path)
+    names = ORDER[: len(first)] if _is_bare(first) else None
+    table = open_table(path, names) if path.suffix.lower() in TABLES else _of_lines(path, names)
     maps = dict(columns or {})
     if "label" in table.names and "material" not in table.names:
         maps.setdefault("material", "label")
@@ -150,15 +233,16 @@ def _read(
     cells = compiled.apply(table.read(compiled.columns))
     result.problems += table.problems
     # Without classes, as an inconclusive contact (-1) is contact all the same.
-    rows, _ = manifest_rows(cells, len(table.lines), table.where, None, result.problems)
+    rows, _ = manifest_rows(cells, table.place, None, result.problems)
     labels = None if classes is None else read_classes(Path(classes))
     intervals: list[Interval] = []
-    for k, row in rows:
-        interval = _interval(table.where(k), row, labels)
+    for where, row in records(rows, table.place):
+        interval = _interval(where, row, labels)
         if isinstance(interval, Interval):
             intervals.append(interval)
         else:
-            result.problem(table.where(k), *interval)
+            result.problem(where, *interval)
+    result.inconclusive = sum(i.inconclusive for i in intervals)
     return intervals
 
 

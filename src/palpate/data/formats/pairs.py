@@ -31,7 +31,7 @@ from typing import TYPE_CHECKING
 
 import polars as pl
 
-from palpate.core import PalpateError, Progress, few, quiet, require
+from palpate.core import Progress, few, quiet, require
 from palpate.data.adjacent import join_tables, tables_of_pairs
 from palpate.data.detection import (
     SIDES,
@@ -46,11 +46,12 @@ from palpate.data.detection import (
 from palpate.data.formats.layout import require_folder
 from palpate.data.frames import VIDEOS
 from palpate.data.images import SUFFIXES
-from palpate.data.manifest import PART_NAMES
-from palpate.data.mapping import compile_maps
-from palpate.data.rows import manifest_rows, odd_groups, read_classes, relocated, without_repeats
+from palpate.data.listed import Listed, read_table
+from palpate.data.manifest import IMAGE_COLUMNS, PART_NAMES
+from palpate.data.mapping import LINE, compile_maps
+from palpate.data.rows import manifest_rows, odd_groups, read_classes, records
 from palpate.data.scanning import Facts, Format, Scan
-from palpate.data.tables import TABLES, header_of, open_table
+from palpate.data.tables import TABLES, header_of, headless_names
 from palpate.data.templates import FIX, Fields, Matches, Template, assign
 
 if TYPE_CHECKING:
@@ -66,16 +67,14 @@ FACTS = Facts(
 )
 #: Folders that are looked into for a published layout.
 PEEKS = 60
-#: No file system has names of more bytes.
-LONGEST_NAME = 255
-MAP = {"columns": {"vision": "YOUR_COLUMN"}}
 
 
 def detect(source: Path) -> bool:
     """Whether this is a table file, or a folder with images below it."""
     if source.is_file():
         suffix = source.suffix.lower()
-        return suffix in TABLES and (suffix != ".json" or bool(header_of(source)))
+        tabular = suffix in TABLES and (suffix != ".json" or bool(header_of(source)))
+        return tabular or bool(headless_names(source))
     files = (
         name for _, _, names in islice(os.walk(source, followlinks=True), 500) for name in names
     )
@@ -112,48 +111,64 @@ class Options:
 def scan(source: Path, options: Options, *, progress: Progress = quiet) -> Scan:
     """Read the rows of a table, or the images of a folder."""
     source = Path(source)
-    maps = dict(options.columns or {})
-    labels = None if options.classes is None else read_classes(Path(options.classes))
     is_table = source.is_file()
     if not is_table:
         require_folder(source, FACTS.name)
-    texts = {column: getattr(options, column) for column in (*SIDES, "background")}
-    foreign = {"side": options.side, **texts}
-    foreign = foreign if is_table else {"root": options.root, "names": options.names}
-    if wrong := [name for name, value in foreign.items() if value is not None]:
+    templates = {c: text for c in IMAGE_COLUMNS if (text := getattr(options, c)) is not None}
+    foreign = {"root": options.root, "names": options.names}
+    foreign = {"side": options.side, **templates} if is_table else foreign
+    for name, value in foreign.items():
         must = f"must come with a {'folder' if is_table else 'table'}"
-        raise PalpateError(must, str(source), "Leave it out", argument=wrong[0])
-    base = source.parent if is_table else source
-    result = Scan(base if options.root is None else Path(options.root))
+        require(value is None, name, must, str(source), fix="Leave it out")
     progress("reading rows", 0, 1)
     if is_table:
-        result.facts["layout"] = f"table {source.suffix.lower()[1:] or 'csv'}"
-        _read_table(result, source, maps, options.names, labels)
+        more = {c: getattr(options, c) for c in ("columns", "names", "classes", "root")}
+        result = scan_of(read_table(source, **more))
     else:
-        templates = {column: text for column, text in texts.items() if text is not None}
-        tables = [] if templates or options.side or maps else tables_of_pairs(source)
-        for path in tables:
-            first = len(result.rows)
-            _read_table(result, path, maps, None, labels)
-            result.suspect(path, "table-first", "the images are those of this table")
-            for _, row in result.rows[first:]:
-                if part := PART_NAMES.get(path.stem.lower()):
-                    row.setdefault("split", part)
-        if not tables:
-            _read_folder(result, templates, options.side, maps, labels)
+        result = _of_folder(source, options, templates)
     progress("reading rows", 1, 1)
-    result.suspicious += odd_groups(source, result.rows)
-    absent = [name for name in SIDES if result.rows and name not in result.rows[0][1]]
-    if absent and is_table:
+    return result
+
+
+def scan_of(listed: Listed) -> Scan:
+    """The scan of a table whose images must be files."""
+    result, path = listed.scan, Path(listed.table.name)
+    listed.add_images()
+    result.facts["layout"] = f"table {path.suffix.lower()[1:] or 'csv'}"
+    _describe(result, path, listed.mapped)
+    sides = {side for _, row in result.rows for side in SIDES if side in row}
+    if absent := [side for side in SIDES if sides and side not in sides]:
         text = f"no column {absent[0]}, so the samples have one image each; map one if there is one"
-        result.suspect(source, "one-sided", text)
+        result.suspect(path, "one-sided", text)
+    return result
+
+
+def _of_folder(source: Path, options: Options, templates: Mapping[str, str]) -> Scan:
+    """The images of a folder, by the tables in it that pair them, else by their names."""
+    result, maps = Scan(source), options.columns or {}
+    for path in () if templates or options.side or maps else tables_of_pairs(source):
+        first = len(result.rows)
+        read_table(path, classes=options.classes, scan=result).add_images()
+        result.suspect(path, "table-first", "the images are those of this table")
+        part = PART_NAMES.get(path.stem.lower())
+        for _, row in result.rows[first:] if part else ():
+            row.setdefault("split", part)
+    if not result.rows and not result.problems:
+        labels = None if options.classes is None else read_classes(Path(options.classes))
+        _read_folder(result, templates, options.side, maps, labels)
+    _describe(result, source, maps)
+    return result
+
+
+def _describe(result: Scan, source: Path, maps: Mapping[str, str]) -> None:
+    """Add what is odd of the rows of a scan, and facts about them."""
+    result.suspicious += odd_groups(source, result.rows)
     worded = any("text" in row for _, row in result.rows)
     result.facts["text_source"] = f"column {maps.get('text', 'text')}" if worded else "none"
     result.facts["dataset"] = source.resolve().stem
     if any("split" in row for _, row in result.rows) and not result.splits:
         result.split_name = "Orig"
         result.split_rule = {"method": "official", "column": maps.get("split", "split")}
-    return result
 
 
 FORMAT = Format(FACTS, detect, LOOKS_FOR, scan, record=Options)
@@ -176,7 +191,7 @@ def format_of(layout: Layout) -> Format:
     def scan(source: Path, *, progress: Progress = quiet) -> Scan:
         result = Scan(require_folder(source, layout.facts.name))
         progress("reading rows", 0, 1)
-        _read_folder(result, dict(templates), None, layout.columns, None, published=True)
+        _read_folder(result, templates, None, layout.columns, None, published=True)
         result.facts.pop("templates", None)
         worded = any("text" in row for _, row in result.rows)
         result.facts |= {"text_source": "table" if worded else "none"}
@@ -187,50 +202,6 @@ def format_of(layout: Layout) -> Format:
         return result
 
     return Format(layout.facts, detect, " and ".join(templates.values()), scan)
-
-
-def _read_table(
-    result: Scan,
-    path: Path,
-    maps: Mapping[str, str],
-    names: str | None,
-    classes: Mapping[int, str] | None,
-) -> None:
-    """Add the rows of a table."""
-    table = open_table(path, None if names is None else [name.strip() for name in names.split(",")])
-    broken = bool(table.problems) and not table.names
-    compiled = compile_maps({} if broken else maps, table.names, TARGETS)
-    sides = [side for side in SIDES if side in compiled.expressions]
-    if not sides and not table.problems:
-        columns = ", ".join(table.names)
-        got = f"no tactile among {columns}, and no vision" if columns else "an empty file"
-        must = f"{path} must have the columns vision and tactile, or one of them"
-        raise PalpateError(must, got, "Map your columns to them", example=MAP)
-    cells = without_repeats(compiled.apply(table.read(compiled.columns)), table)
-    result.problems += table.problems
-    result.suspicious += table.suspicious
-    sides = [side for side in sides if any(cells[side])] or sides  # a column may be empty
-    rows, result.inconclusive = manifest_rows(
-        cells, len(table.lines), table.where, classes, result.problems
-    )
-    images = [(row, c) for _, row in rows for c in (*SIDES, "background") if c in row]
-    places = relocated((row[column] for row, column in images), result.base)
-    for row, column in images:
-        row[column] = places.get(row[column], row[column])
-    if places:
-        written, below = next(iter(places.items()))
-        text = f"{len(places)} paths are read by their end: {written!r} is {below!r}"
-        result.suspect(path, "other-paths", text)
-    for k, row in rows:
-        lacking = " and no ".join(side for side in sides if side not in row)
-        names_in_paths = "/".join(row.get(side, "") for side in sides).split("/")
-        if lacking:
-            result.problem(table.where(k), "empty-cell", f"no {lacking} path")
-        elif any(len(name.encode()) > LONGEST_NAME for name in names_in_paths):
-            text = "a name in a path is longer than file systems allow"
-            result.problem(table.where(k), "bad-path", text)
-        else:
-            result.rows.append((table.where(k), row))
 
 
 def _read_folder(
@@ -275,11 +246,9 @@ def _read_folder(
         schema=dict.fromkeys(("path", *names), pl.String),
     )
     compiled = compile_maps(maps, table.columns, (*TARGETS, *result.more))
-    cells = compiled.apply(table)
-    numbered, result.inconclusive = manifest_rows(
-        cells, len(places), places.__getitem__, classes, result.problems
-    )
-    result.rows += [(places[k], row) for k, row in numbered]
+    cells = compiled.apply(table.with_row_index(LINE))
+    good, result.inconclusive = manifest_rows(cells, places.__getitem__, classes, result.problems)
+    result.rows += records(good, places.__getitem__)
     join_tables(result, result.rows)
 
 

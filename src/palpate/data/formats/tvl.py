@@ -11,6 +11,7 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 from palpate.core import PARTS, write_text
+from palpate.data.mapping import LINE
 from palpate.data.scanning import Row, Scan
 from palpate.data.tables import csv_text, header_of, open_table
 
@@ -47,7 +48,7 @@ def read_list(scan: Scan, path: Path, columns: Sequence[str] = COLUMNS) -> list[
     table = open_table(path, names)
     rows = table.read([name for name in columns if name in names]).rows(named=True)
     scan.problems += table.problems
-    return [(table.where(k), row) for k, row in enumerate(rows) if k]  # the first is the header
+    return [(table.place(row[LINE]), row) for row in rows[1:]]  # the first is the header
 
 
 def write_list(path: Path, columns: Sequence[str], rows: Iterable[Sequence[str | None]]) -> Path:

@@ -7,7 +7,7 @@ import pytest
 
 from forge.errors import fails
 from palpate.cli import main
-from palpate.data.naming import read_names
+from palpate.data.reading import read
 from palpate.data.recordings import groups_of, name_recordings
 
 
@@ -58,7 +58,7 @@ def test_a_list_without_images_is_audited_and_answered(kind, tmp_path, capsys, m
     data = json.loads(capsys.readouterr().out)
     assert (data["leaking_samples"], data["test_samples"]) == (leaking, of)
     assert data["identical_samples"] == 0
-    samples = name_recordings([read_names(tmp_path / f"test{suffix}")[0]])[0].table
+    samples = name_recordings([read(tmp_path / f"test{suffix}").manifest])[0].table
     if kind != "own":
         assert (samples["video"][0], samples["frame"][0]) == (video, frame)
     assert bool(data["commands"]) == (kind != "ssvtp")  # nothing says what belongs together
@@ -100,24 +100,23 @@ def test_rows_of_one_file_have_the_same_columns(tmp_path, keyed):
     rows[1] |= {"text": "x"}
     path = tmp_path / "a.json"
     path.write_text(json.dumps({f"s{k}": row for k, row in enumerate(rows)} if keyed else rows))
-    manifest, problems, _ = read_names(path)
-    assert (manifest.table["path"].null_count(), len(manifest), problems) == (0, 4, [])
+    manifest = read(path).manifest
+    assert (manifest.table["path"].null_count(), len(manifest)) == (0, 4)
 
 
 def test_rows_that_begin_with_an_image_are_no_videos_and_frames(tmp_path):
     path = tmp_path / "a.json"
     path.write_text(json.dumps([["cup/1.jpg", "7"], ["pan/2.jpg", "8"]]))
-    assert read_names(path) is None
+    fails("at least one of the columns", read, path)
     path.write_text(json.dumps([["cup", "7"], ["pan", "8"]]))
-    manifest, _, _ = read_names(path)
-    assert manifest.table["video"].to_list() == ["cup", "pan"]
+    assert read(path).manifest.table["video"].to_list() == ["cup", "pan"]
 
 
 def test_what_one_list_hides_the_other_shows(tmp_path):
     """All test paths are of one recording, which only the train paths show to be one."""
     for part, numbers in (("train", range(35)), ("test", range(35, 38))):
         (tmp_path / f"{part}.csv").write_text(rows_of("own", numbers))
-    lists = [read_names(tmp_path / f"{part}.csv")[0] for part in ("train", "test")]
+    lists = [read(tmp_path / f"{part}.csv").manifest for part in ("train", "test")]
     named = name_recordings(lists)
     source = "file names `rig/{video}/touch/{frame:d}.png`"
     assert groups_of(named[1]) == [("video", source), ("frame", source)]
@@ -133,7 +132,7 @@ def test_a_list_of_two_published_data_sets_is_read_row_by_row(tmp_path, capsys):
         rows += [{"gel": ssvtp.format(k)} for k in numbers]
         (tmp_path / f"{part}.json").write_text(json.dumps(rows))
     paths = [tmp_path / f"{part}.json" for part in ("train", "test")]
-    named = name_recordings([read_names(path)[0] for path in paths])
+    named = name_recordings([read(path).manifest for path in paths])
     rows = named[1].table.select("video", "frame", "session").rows()
     assert named[0].facts["video_from"] == "file names of HCT, SSVTP"
     assert rows[0] == ("data1/3-17003.70", 35, "data1/0-17000.70")
@@ -152,9 +151,8 @@ def test_a_template_of_the_photos_is_held_against_the_photos(columns, tmp_path):
         ("vision", "rig/{video}/photo/{frame}.png", "video", ["cup0", "cup0", "cup1", "cup1"]),
         ("tactile", "gel/{frame}.png", "frame", [8, 9, 10, 11]),
     ):
-        manifest, problems, _ = read_names(table, {side: template})
-        (named,) = name_recordings([manifest], template)
-        assert (named.column(column), problems) == (values, [])
+        (named,) = name_recordings([read(table, **{side: template}).manifest], template)
+        assert named.column(column) == values
 
 
 def test_frames_that_begin_anew_in_every_contact_make_no_sample_of_two(tmp_path, capsys):
@@ -189,19 +187,17 @@ def test_frames_that_begin_anew_in_every_contact_make_no_sample_of_two(tmp_path,
 def test_bad_lines_and_wrong_options_are_named(tmp_path, capsys):
     path = tmp_path / "l.txt"
     path.write_text("v 1 5\nv 9 7\nv one 3\n\nv 20 22 wood\n")
-    manifest, problems, _ = read_names(path)
-    assert (len(manifest), [p.where[-2:] for p in problems]) == (8, [":2", ":3"])
+    result = read(path, skip_bad=True)
+    assert (len(result.manifest), [p.where[-2:] for p in result.skipped]) == (8, [":2", ":3"])
     path.write_text("v 0 999999999\n")
-    fails("at most 20,000,000 frames", read_names, path)
+    fails("at most 20,000,000 frames", read, path)
     table = tmp_path / "t.csv"
     table.write_text(rows_of("own", range(3)) + "\nelse/where.png,else/where.png")
-    _, problems, _ = read_names(table, {"tactile": "rig/{video}/touch/{frame}.png"})
-    assert [p.kind for p in problems] == ["no-match"]
+    fails("no-match", read, table, tactile="rig/{video}/touch/{frame}.png")
     table.write_text("id,tactile\n1,a/1.png\n1,a/2.png\n")
-    _, problems, _ = read_names(table)
-    assert [p.kind for p in problems] == ["duplicate-id"]
+    fails("duplicate-id", read, table)
     (tmp_path / "a").mkdir()
     (tmp_path / "a" / "1.png").write_bytes(b"")
-    assert read_names(table) is None  # its images are there
+    fails("missing-file", read, table)  # one of its images is there
     assert main(["audit", str(table), str(table), "--map", "nothing"]) == 2
     assert "COLUMN=EXPRESSION" in capsys.readouterr().err

@@ -1,0 +1,234 @@
+"""Tables and lists of images: one reader for every verb, whether the images are at hand or not.
+
+=====================================================  =============================================
+source                                                 samples
+=====================================================  =============================================
+lines of one path or two, with or without labels       one a line
+a table (:mod:`palpate.data.tables`), a data frame     one a row; nested keys are columns like
+                                                       ``image.path``
+JSON ``{"train": [[object, contact], ...], ...}``      one an item; a name instead of a number is a
+                                                       video, and the second its frame
+=====================================================  =============================================
+
+Columns of manifests, and ``split``, are mapped or have their names. Images are those of ``vision``
+and ``tactile``. Where neither is a column, the paths are those of the column most of whose cells
+name images, one of tactile images by its name before one of photos: they name the samples, and what
+they say more is read from those of all lists together (:mod:`palpate.data.recordings`). Paths of
+another machine are read by their end.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import polars as pl
+
+from palpate.core import PalpateError, Problem, Split, require
+from palpate.data.imported import Imported
+from palpate.data.manifest import IMAGE_COLUMNS, PATH, ROLES, SCHEMA, Manifest
+from palpate.data.mapping import LINE, compile_maps
+from palpate.data.recordings import USUAL
+from palpate.data.rows import (
+    is_there,
+    manifest_rows,
+    read_classes,
+    records,
+    relocated,
+    some,
+    without_repeats,
+)
+from palpate.data.scanning import Scan, require_some
+from palpate.data.tables import Table, names_images, open_table, table_of
+from palpate.data.templates import Template
+
+SIDES = ("vision", "tactile")
+#: Columns of which a table needs at least one, if none names images.
+NAMING = ("id", "video", "object", *SIDES)
+#: No file system has names of more bytes.
+LONGEST_NAME = 255
+
+
+@dataclass
+class Listed:
+    """The rows of a table or list, whether their images are at hand or not."""
+
+    table: Table
+    scan: Scan  # what is wrong with them; it has no rows yet
+    rows: pl.DataFrame  # LINE, columns of a manifest, ``split``, and PATH, of those that there are
+    paths: str  # the column of the paths, where it is neither vision nor tactile
+    mapped: Mapping[str, str]  # column -> its map expression
+
+    @property
+    def sides(self) -> list[str]:
+        """The sides that have a column of images."""
+        return [side for side in SIDES if side in self.rows.columns]
+
+    @property
+    def at_hand(self) -> bool:
+        """Whether one of the images, of as many as are looked for, is a file."""
+        columns = (name for name in (*self.sides, PATH) if name in self.rows.columns)
+        cells = (path for name in columns for path in some(self.rows[name].drop_nulls()))
+        return any(is_there(self.scan.base, path) for path in cells)
+
+    def add_images(self) -> None:
+        """Add the rows whose images must be files to the scan.
+
+        Raises:
+            PalpateError: if there is no column of images.
+        """
+        scan, name = self.scan, self.table.name
+        if not self.sides and not scan.problems:
+            columns = ", ".join(self.table.names)
+            got = f"no tactile among {columns}, and no vision" if columns else "an empty file"
+            must = f"{name} must have the columns vision and tactile, or one of them"
+            example = {"columns": {"vision": self.paths or "YOUR_COLUMN"}}
+            raise PalpateError(must, got, "Map your columns to them", example=example)
+        # A column may be empty.
+        sides = [side for side in self.sides if self.rows[side].count()] or self.sides
+        for where, row in records(self.rows.drop(PATH, strict=False), self.table.place):
+            lacking = " and no ".join(side for side in sides if side not in row)
+            names = "/".join(row.get(side, "") for side in sides).split("/")
+            if lacking:
+                scan.problem(where, "empty-cell", f"no {lacking} path")
+            elif any(len(name.encode()) > LONGEST_NAME for name in names):
+                text = "a name in a path is longer than file systems allow"
+                scan.problem(where, "bad-path", text)
+            else:
+                scan.rows.append((where, row))
+
+    def by_name(self, template: str | None = None) -> Imported:
+        """The samples without their images, each named by its columns or the path of its image.
+
+        Args:
+            template: of the paths; that it does not match some is a problem if they are many.
+
+        Raises:
+            PalpateError: if no column names samples.
+        """
+        problems = self.scan.problems
+        stated = not {"id", "video", "object"}.isdisjoint(self.rows.columns)
+        usable = stated or PATH in self.rows.columns or bool(problems)
+        must = f"must have at least one of the columns {', '.join(NAMING)}"
+        got = ", ".join(self.table.names) or "no columns"
+        require(usable, "source", must, got, fix="Map a column to one of them")
+        require_some(len(self.rows), self.table.name, problems)
+        rows = self.rows.drop(IMAGE_COLUMNS, strict=False)
+        if template and PATH in rows.columns:
+            problems += self._unlike(Template.parse(template), template)
+        names = {
+            "id": pl.col("id"),
+            "frame": pl.concat_str("video", "frame", separator="/"),
+            PATH: pl.col(PATH).str.replace(r"([^/])\.[^./]*$", "$1"),
+            LINE: pl.concat_str(pl.lit(f"{self.table.name}:"), LINE),
+        }
+        if "video" not in rows.columns:
+            del names["frame"]
+        rows = rows.with_columns(id=pl.coalesce(names[c] for c in names if c in rows.columns))
+        again = rows.filter(~pl.col("id").is_first_distinct())
+        for line, name in again.select(LINE, "id").iter_rows():
+            text = f"the id {name!r} is in an earlier row already"
+            problems.append(Problem(self.table.place(line), "duplicate-id", text))
+        rows = rows.filter(pl.col("id").is_first_distinct()) if len(again) else rows
+        problems.sort(key=Problem.sort_key)
+        path = Path(self.table.name)
+        listed = not stated or path.suffix.lower() in (".json", ".jsonl")
+        facts = {"source": path.name} if listed else {"dataset": path.stem}
+        facts |= {"path_column": self.paths} if self.paths not in ("", PATH) else {}
+        facts |= {"images_absent": "yes"} if PATH in rows.columns and not self.at_hand else {}
+        table = rows.drop(LINE, "split", strict=False)
+        manifest = Manifest.of_table(table, self.scan.base, facts)
+        splits: dict[str, Split] = {}
+        if "split" in rows.columns:
+            parts = rows.drop_nulls("split")
+            stated_parts = dict(zip(parts["id"], parts["split"], strict=True))
+            rule = {"method": "official", "column": self.mapped.get("split", "split")}
+            splits["Orig"] = Split(stated_parts, rule, manifest.digest)
+        scan = self.scan
+        return Imported(manifest, problems, splits, scan.inconclusive, scan.suspicious)
+
+    def _unlike(self, template: Template, text: str) -> list[Problem]:
+        """Problems of the paths that a template does not match, if they are many."""
+        rows = self.rows.select(LINE, PATH).drop_nulls()
+        odd = [(line, path) for line, path in rows.iter_rows() if template.match(path) is None]
+        return [
+            Problem(self.table.place(line), "no-match", f"{path!r} is not like the template {text}")
+            for line, path in odd
+            if len(odd) > (1 - USUAL) * len(self.rows)
+        ]
+
+
+def read_table(
+    source: Any,
+    *,
+    columns: Mapping[str, str] | None = None,
+    names: str | None = None,
+    classes: Path | None = None,
+    root: Path | None = None,
+    side: str = "",
+    scan: Scan | None = None,
+) -> Listed:
+    """Read a table or list.
+
+    Args:
+        source: a file, a polars or pandas frame, or dictionaries.
+        columns: manifest column (or ``split``) -> map expression over the columns of the table.
+        names: columns of a table without a header line, separated by commas.
+        classes: table of classes, whose numbers are the materials.
+        root: folder that paths are relative to; default: that of the table.
+        side: the side whose paths name the samples; default: tactile, if there are any.
+        scan: takes what is wrong, below its own root; default: a new one.
+
+    Raises:
+        PalpateError: if it is none, or a map is wrong.
+    """
+    if isinstance(source, str | Path):
+        own = [name.strip() for name in names.split(",")] if names else None
+        table, base = open_table(Path(source), own), Path(source).parent
+    else:
+        require(names is None, "names", "must be left out for rows in memory", names)
+        table, base = table_of(source), Path()
+    scan = Scan(base if root is None else Path(root)) if scan is None else scan
+    labels = None if classes is None else read_classes(Path(classes))
+    broken = bool(table.problems) and not table.names
+    maps = compile_maps({} if broken else columns or {}, table.names, (*SCHEMA, "split"))
+    wanted = (side,) if side else ("tactile", "vision")
+    paths = next((name for name in wanted if name in maps.expressions), "")
+    others = [] if paths else [n for n in _by_role(table.names, side) if n not in table.nested]
+    cells = table.read(list(dict.fromkeys([*maps.columns, *others])))
+    rows = maps.apply(cells)
+    column = next((name for name in others if names_images(cells[name])), "")
+    if paths or column:
+        rows = rows.with_columns((rows[paths] if paths else cells[column]).alias(PATH))
+    scan.problems += table.problems
+    if not {*NAMING, PATH}.isdisjoint(rows.columns):
+        rows = without_repeats(rows, table.place, scan.problems)
+    rows, inconclusive = manifest_rows(rows, table.place, labels, scan.problems)
+    scan.inconclusive += inconclusive
+    scan.suspicious += table.suspicious
+    images = [name for name in IMAGE_COLUMNS if name in rows.columns]
+    written = pl.concat([pl.Series(dtype=pl.String), *(rows[name].drop_nulls() for name in images)])
+    if places := relocated(written.unique(maintain_order=True), scan.base):
+        rows = rows.with_columns(pl.col(images).replace(places))
+        before, below = next(iter(places.items()))
+        text = f"{len(places)} paths are read by their end: {before!r} is {below!r}"
+        scan.suspect(table.name, "other-paths", text)
+    return Listed(table, scan, rows, column, columns or {})
+
+
+def _by_role(names: Sequence[str], side: str) -> list[str]:
+    """Columns that may hold paths: tactile by their name first, then photos, then others.
+
+    With a side, those of the side first, then those that may be of it, then those of the other.
+    """
+
+    def place(name: str) -> int:
+        words = set(re.findall("[a-z]+", name.lower()))
+        role = next((r for r in ("tactile", "vision") if words & set(ROLES[r])), "")
+        order = (side, "", *ROLES) if side else ("tactile", "vision", "")
+        return order.index(role)
+
+    return sorted(names, key=place)
