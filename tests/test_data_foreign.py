@@ -2,6 +2,8 @@
 
 import io
 import pickle
+import re
+import shlex
 import zipfile
 
 import numpy as np
@@ -9,6 +11,7 @@ import pytest
 
 from forge.errors import fails
 from forge.pictures import write_images
+from palpate.cli import main
 from palpate.data.detection import detect_layout
 from palpate.data.importing import import_dataset
 from palpate.data.manifest import Manifest
@@ -98,6 +101,7 @@ SIDES = [
     ("{o}_{k}.png", "{o}_{k}_touch.png"),  # one side without a word
     ("day_1/{o}/rgb/{k}.png", "day_1/{o}/gelsight/{k}.png"),
     ("{o}/run_1/rgb/{k}.png", "{o}/run_1/gelsight/{k}.png"),
+    ("{o}_rgb/{k}.png", "{o}_tac/{k}.png"),
 ]
 
 
@@ -121,14 +125,49 @@ def test_an_object_without_partners_gets_none_of_another(tmp_path, photo, alone)
 @pytest.mark.parametrize(
     ("photo", "touch"),
     [
-        (["cup/photo/1.jpg", "cup/photo/2.jpg"], ["mug/touch/1.png", "mug/touch/2.png"]),
+        *(
+            ([a.format(o="cup", k=k) for k in (1, 2)], [b.format(o="mug", k=k) for k in (1, 2)])
+            for a, b in SIDES
+        ),
         (["photo/1.jpg", "photo/2.jpg"], [f"touch/{o}/{k}.png" for o in BOTH for k in (1, 2)]),
+        (["photo_1.jpg", "photo_2.jpg"], [f"{o}_touch_{k}.png" for o in BOTH for k in (1, 2)]),
     ],
 )
-def test_photos_that_nothing_ties_to_touches_are_not_paired(tmp_path, photo, touch):
+def test_photos_that_nothing_ties_to_touches_are_not_paired(tmp_path, photo, touch, capsys):
+    """What is offered then takes one side, and works."""
     write_images(tmp_path / "own", [*photo, *touch])
-    error = fails("must say what they show", import_dataset, tmp_path / "own", tmp_path / "out")
-    assert error.choices
+    command = ["import", str(tmp_path / "own"), "-o", str(tmp_path / "out")]
+    assert main(command) == 2
+    text = capsys.readouterr().err
+    assert "few share their names" in text
+    answers = re.findall("(?m)^  palpate .*$", text)
+    assert len(answers) == 2
+    for answer in answers:
+        assert main([*shlex.split(answer)[1:], "--overwrite"]) == 0
+        assert len(Manifest.load(tmp_path / "out")) in (len(photo), len(touch))
+
+
+@pytest.mark.parametrize(
+    ("photo", "touch"),
+    [
+        ("{o}/photo.jpg", "{o}/touch/{k}.png"),
+        ("photo/{o}.jpg", "touch/{o}/{k}.png"),
+        ("{o}_photo.jpg", "{o}_{k}_touch.png"),
+    ],
+)
+def test_one_photo_of_an_object_is_that_of_its_touches_alone(tmp_path, photo, touch):
+    names = [photo.format(o="cup"), *(touch.format(o=o, k=k) for o in BOTH for k in range(3))]
+    write_images(tmp_path / "own", names)
+    result = import_dataset(tmp_path / "own", tmp_path / "out", skip_bad=True)
+    assert [p.kind for p in result.skipped] == ["unpaired"] * 3
+    assert result.manifest.table["tactile"].str.contains("cup").to_list() == [True] * 3
+
+
+def test_one_side_of_a_folder_of_both_is_taken_by_its_template(tmp_path):
+    write_images(tmp_path / "own", [f"{s}/{k}.png" for s in ("photo", "touch") for k in range(3)])
+    own, out = tmp_path / "own", tmp_path / "out"
+    error = fails("names say both sides", import_dataset, own, out, side="vision")
+    assert [*error.choices] == [{"vision": "photo/{frame:d}.png"}]
 
 
 def test_one_background_is_not_that_of_another_object():

@@ -1,8 +1,9 @@
 """The templates of a folder, found from the names of its files.
 
 Names are cut into words, numbers and signs. A word such as ``photo`` or ``gelsight`` that occurs in
-some paths and not in others gives their side. What the paths of a side have in common is written
-out; what varies becomes a field:
+some paths and not in others gives their side. Without these words the paths of both sides are read
+as one: what they have in common is written out; what varies, on one side or between both, becomes a
+field, so a name that one side has alone is a field with one value there, and no partner of all:
 
 - digits at the end of file names are the ``frame``;
 - a word before what varies names it (``press_3``: ``contact``), else its values do (``train``,
@@ -11,7 +12,9 @@ out; what varies becomes a field:
 - of the other folders the innermost is the ``video`` of the images in it and the one around it the
   ``object``; folders at several depths are one ``video``.
 
-The second half reads a folder by its templates, be they given or found.
+Where the sides are built differently (one photo for many touches), the names of the one are the
+first of the other. The templates hold if they join most files, and no photo of one frame with the
+touches of several. The second half reads a folder by its templates, be they given or found.
 """
 
 from __future__ import annotations
@@ -20,7 +23,8 @@ import contextlib
 import posixpath
 import re
 from collections import defaultdict
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from functools import cache
 from pathlib import Path
 from typing import Literal
 
@@ -37,8 +41,11 @@ SIDES = ("vision", "tactile")
 ORDER = ("tactile", "vision", "background")
 #: What may be mapped.
 TARGETS = (*SCHEMA, "split")
-#: Words that say what an image shows if no other does.
-_WEAK = {"image": "vision", "images": "vision", "img": "vision", "pictures": "vision"}
+#: Words that say what an image shows if no other does, and words of any image.
+_WEAK: dict[str, str] = dict.fromkeys(("image", "images", "img", "pictures"), "vision")
+_SAYING = {*ROLE_OF, *_WEAK, "frame", "frames"}
+#: What names one of several cameras or sensors, next to a word of its side.
+_UNIT = re.compile(r"(?i)(?:[0-9]+|[a-z]|left|right|mini|realsense)(?:[_\-. ]|$)")
 MEANING = {
     "video": ("video", "clip", "seq", "sequence", "recording", "rec", "run", "take", "trial"),
     "contact": ("contact", "press", "touch", "grasp", "tap", "poke", "interaction"),
@@ -51,215 +58,178 @@ MEANING = {
 _MEANING_OF = {word: column for column, words in MEANING.items() for word in words}
 _MATERIALS = {name.lower() for name in ADJECTIVES}
 _TOKEN = re.compile(r"[A-Za-z]+|[0-9]+|[^A-Za-z0-9]")
+#: A time stamp at the end of a name, and what stands in its place.
+_TIMED, _TIME = re.compile(r"(?:[0-9]{9,}(?:\.[0-9]+)?|[0-9]+\.[0-9]+)(?=\.\w+$)"), "\ue001"
+#: In place of a name that says nothing but its side.
+_ROLE = "\ue000"
+#: A field of a template.
+_MARK = re.compile(r"\{(\w+)[^{}]*\}")
 
 
 def detect_layout(files: Sequence[str], folder: str) -> dict[str, str]:
-    """Column -> template of the images below a folder; empty if no name says what they show.
+    """Column -> template of the images below a folder; empty if their names do not say it.
 
     Args:
         files: paths below it, at least one.
         folder: its name, which may say what its only side shows.
     """
-    return _detected_and_fit(files, folder)[0]
+    for timed in (False, True):
+        paths = [_TIMED.sub(_TIME, path) for path in files] if timed else files
+        names = _Names(paths, folder)
+        for texts in names.readings():
+            if timed:
+                texts = {
+                    side: text.replace(_TIME, f"{{{TIME}}}").replace("{sample}", "{video}")
+                    for side, text in texts.items()
+                }
+            both = all(f"{{{TIME}}}" in texts.get(side, "") for side in SIDES)
+            if (both or not timed) and _fit(files, texts):
+                return texts
+    return {}
 
 
-def _detected_and_fit(files: Sequence[str], folder: str) -> tuple[dict[str, str], bool]:
-    """The templates, and whether they fit."""
-    templates, fit = _detected(files, folder)
-    fit = fit or bool(templates and _fit(files, templates))
-    if not {"vision", "tactile"} <= templates.keys() or fit:
-        return templates, fit
-    timed, _ = _detected([_TIMED.sub(_TIME, path) for path in files], folder)
-    timed = {
-        side: text.replace(_TIME, f"{{{TIME}}}").replace("{sample}", "{video}")
-        for side, text in timed.items()
-    }
-    both = all(f"{{{TIME}}}" in timed.get(side, "") for side in ("vision", "tactile"))
-    return (timed, True) if both and _fit(files, timed) else (templates, False)
+class _Names:
+    """The paths of a folder as names, by the side that a word gives them."""
 
-
-def _detected(files: Sequence[str], folder: str) -> tuple[dict[str, str], bool]:
-    """The templates of files without time stamps, and whether they are known to fit."""
-    sides = _by_role({path: posixpath.splitext(path)[0] for path in files})
-    if not sides and (roles := {ROLE_OF[w] for w in _words(folder) if w in ROLE_OF}):
-        sides = {min(roles): list(files)} if len(roles) == 1 else {}
-    if set(sides) <= {"background"}:
-        return {}, False
-    several = any(map(_several, sides.values()))
-    sides = {side: sides[side] for side in ROLES if side in sides}
-    together = _together(sides, several)
-    if together and _fit(files, together):
-        return together, True
-    apart = _faced(_alike({side: template_of(sides[side], several) for side in sides}, sides))
-    return together if together and _contradict([*apart.values()]) else apart, False
-
-
-#: A time stamp at the end of a name, and what stands in its place.
-_TIMED, _TIME = re.compile(r"(?:[0-9]{9,}(?:\.[0-9]+)?|[0-9]+\.[0-9]+)(?=\.\w+$)"), "\ue001"
-#: In place of the word that says what an image shows.
-_ROLE = "\ue000"
-
-
-def _together(sides: Mapping[str, Sequence[str]], several: bool) -> dict[str, str]:
-    """The templates by what the paths of all sides have in common but for the words of their side.
-
-    So a folder that one side lacks, or has alone, is a field of both, with the values that each
-    has. Empty where the sides differ by more than those words.
-    """
-    stems = {side: [posixpath.splitext(path) for path in files] for side, files in sides.items()}
-    own = {s: set.intersection(*(set(_words(stem)) for stem, _ in stems[s])) for s in sides}
-    shared = set.intersection(*own.values())
-    bare: list[str] = []
-    written: dict[str, tuple[str, ...]] = {}
-    for side in sides:
-        roles = {word for word in own[side] - shared if word in ROLE_OF or word in _WEAK}
-        for stem, _ in stems[side]:
-            tokens = _TOKEN.findall(stem)
-            marked = tuple(t for t in tokens if t.lower() in roles)
-            if written.setdefault(side, marked) != marked or not marked:
-                return {}
-            bare.append("".join(_ROLE if t in marked else t for t in tokens) + ".x")
-    count = len(next(iter(written.values())))
-    text = template_of(bare, several)
-    template = Template.parse(text)
-    plain = all(map(template.match, set(bare))) and text.count(_ROLE) == count
-    if len(sides) < 2 or not plain or any(len(words) != count for words in written.values()):
-        return {}
-    templates: dict[str, str] = {}
-    for side, words in written.items():
-        suffixes = {suffix for _, suffix in stems[side]}
-        parts = text.removesuffix(".x").split(_ROLE)
-        path = "".join(map("".join, zip(parts, (*words, ""), strict=True)))
-        templates[side] = path + (min(suffixes) if len(suffixes) == 1 else ".*")
-    return templates
-
-
-def _contradict(texts: Sequence[str]) -> bool:
-    """Whether folders that no word of a side names face each other by two names."""
-    folders = [text.split("/")[:-1] for text in texts]
-    return len(set(map(len, folders))) == 1 and any(
-        len(set(names)) > 1
-        and not any("{" in name or ROLE_OF.keys() & set(_words(name)) for name in names)
-        for names in zip(*folders, strict=True)
-    )
-
-
-def _faced(templates: dict[str, str]) -> dict[str, str]:
-    """The templates, where a constant that faces a field of another side is that field.
-
-    ``cup_{frame:d}.png`` next to ``{object}_{frame:d}_touch.png`` is ``{object}_{frame:d}.png``: it
-    is the photo of one object and not of all.
-    """
-    for side in templates:
-        for facing in (text for other, text in templates.items() if other != side):
-            pieces, others = templates[side].split("/"), facing.split("/")
-            fields = {*Template.parse(templates[side]).fields}
-            if len(pieces) == len(others):
-                pairs = zip(pieces, others, strict=True)
-                templates[side] = "/".join(_facing(a, b, fields) for a, b in pairs)
-    return templates
-
-
-def _facing(piece: str, facing: str, fields: set[str]) -> str:
-    """One piece of a template, with the fields of the piece that it faces."""
-    field = re.compile(r"(\{\w+[^{}]*\})")
-    both = [mark for mark in field.findall(facing) if mark in field.findall(piece)]
-    split = re.compile("(" + "|".join(map(re.escape, both)) + ")") if both else re.compile("(\0)")
-    mine, theirs = split.split(piece), split.split(facing)
-    if len(mine) != len(theirs):
-        return piece
-    for k, (text, other) in enumerate(zip(mine, theirs, strict=True)):
-        names = re.findall(r"\{(\w+)", other)
-        if names and not fields & set(names) and not field.search(text):
-            stems = [re.sub(r"\.[\w*]+$", "", part) for part in (text, other)]
-            pattern = "".join(
-                f"(?P<{part[1:-1].partition(':')[0]}>{'[0-9]+' if ':d' in part else '[^/]+'})"
-                if field.fullmatch(part)
-                else "".join(
-                    "[A-Za-z]+" if t.lower() in ROLE_OF else re.escape(t)
-                    for t in _TOKEN.findall(part)
-                )
-                for part in field.split(stems[1])
-            )
-            if match := re.fullmatch(pattern, stems[0]):
-                spans = sorted(
-                    (match.span(n), m) for n, m in zip(names, field.findall(other), strict=True)
-                )
-                for (first, last), mark in reversed(spans):
-                    mine[k] = mine[k][:first] + mark + mine[k][last:]
-                fields.update(names)
-    return "".join(mine)
-
-
-def _alike(templates: dict[str, str], sides: Mapping[str, Sequence[str]]) -> dict[str, str]:
-    """The templates, with one name for the only field that two sides do not share but equal."""
-    first, *further = templates
-    for side in further:
-        one, two = (Template.parse(templates[s]) for s in (first, side))
-        own = [n for n in one.fields if n not in two.fields]
-        other = [n for n in two.fields if n not in one.fields]
-        if len(own) == len(other) == 1 and (
-            _values(one, own[0], sides[first]) == _values(two, other[0], sides[side])
-        ):
-            field = re.findall(rf"\{{{own[0]}\b[^{{}}]*\}}", one.text)
-            templates[side] = re.sub(rf"\{{{other[0]}\b[^{{}}]*\}}", field[0], two.text)
-    return templates
-
-
-def _values(template: Template, field: str, files: Sequence[str]) -> set[str]:
-    """The values of a field, numbers without leading zeros."""
-    return {(template.match(path) or {}).get(field, "").lstrip("0") for path in files}
-
-
-def _words(text: str) -> list[str]:
-    return [token.lower() for token in _TOKEN.findall(text)]
-
-
-def _by_role(stems: dict[str, str]) -> dict[str, list[str]]:
-    """Side -> its files, by words that some have and others have not; else by a word of all.
-
-    Files without such a word are the other side, if each is the partner of one with a word.
-    """
-    words = {path: _words(stem) for path, stem in stems.items()}
-    shared = set.intersection(*map(set, words.values()))
-    sides: dict[str, list[str]] = defaultdict(list)
-    for path, own in words.items():
-        strong = [ROLE_OF[word] for word in own if word in ROLE_OF and word not in shared]
-        weak = [_WEAK[word] for word in own if word in _WEAK and word not in shared]
-        # The picture of an empty gel may lie in the folder of the tactile images.
-        role = "background" if "background" in strong else (strong or weak or [""])[-1]
-        sides[role].append(path)
-    plain = sides.pop("", [])
-    if not sides:
-        roles = {ROLE_OF[word] for word in shared if word in ROLE_OF} or {
-            _WEAK[word] for word in shared if word in _WEAK
+    def __init__(self, files: Sequence[str], folder: str) -> None:
+        self.names = {path: posixpath.splitext(path)[0].split("/") for path in files}
+        #: (which folder, which token of its name, the word there) that all paths have.
+        self.shared = {
+            (depth, *word)
+            for depth, names in enumerate(zip(*self.names.values(), strict=False))
+            for word in set.intersection(*({*enumerate(_tokens(name))} for name in {*names}))
         }
-        return {min(roles): list(stems)} if len(roles) == 1 else {}
-    if plain and len(named := sides.keys() & {"vision", "tactile"}) == 1:
-        (side,) = named
-        partners = set[object]().union(*(_partners(stems[path], side) for path in sides[side]))
-        places = {key[0] for key in partners if isinstance(key, tuple)}
-        if 2 * sum(_has_partner(stems[path], partners, places) for path in plain) < len(plain):
-            return {}
-        sides["tactile" if side == "vision" else "vision"] = plain
-    return dict(sides)
+        self.silent = ""  # the side whose files no word gives
+        self.sides = self._by_role(folder)
+
+    def _saying(self, depth: int, name: str) -> list[str]:
+        """The tokens of a name in lower case, empty where all paths have it."""
+        return [t * ((depth, k, t) not in self.shared) for k, t in enumerate(_tokens(name))]
+
+    def _by_role(self, folder: str) -> dict[str, list[str]]:
+        """Side -> its files, by words that some have and others have not; else by a word of all.
+
+        Files without such a word are the other side.
+        """
+        sides: dict[str, list[str]] = defaultdict(list)
+        saying = cache(self._saying)
+        for path, names in self.names.items():
+            words = [word for depth, name in enumerate(names) for word in saying(depth, name)]
+            strong = [ROLE_OF[word] for word in words if word in ROLE_OF]
+            weak = [_WEAK[word] for word in words if word in _WEAK]
+            # The picture of an empty gel may lie in the folder of the tactile images.
+            side = "background" if "background" in strong else (strong or weak or [""])[-1]
+            sides[side].append(path)
+        plain = sides.pop("", [])
+        if not sides:
+            every = [word for *_, word in self.shared]
+            for words, by in ((every, ROLE_OF), (every, _WEAK), (_tokens(folder), ROLE_OF)):
+                roles = {by[word] for word in words if word in by}
+                if len(roles) == 1:
+                    return {min(roles): plain}
+        if plain and len(named := sides.keys() & {*SIDES}) == 1:
+            self.silent = "tactile" if "vision" in named else "vision"
+            sides[self.silent] = plain
+        return {side: sides[side] for side in ROLES if side in sides}
+
+    def readings(self) -> Iterator[dict[str, str]]:
+        """Templates of the sides, by the names of both, then by those of either."""
+        main = [side for side in self.sides if side != "background"]
+        several = any(map(_several, self.sides.values()))
+        for units in (False, True)[: len(main)]:
+            bare = {side: self._bare(side, units) for side in self.sides}
+            for basis in (main, *([side] for side in main[::-1]))[: 2 * len(main)]:
+                paths = dict.fromkeys(f"{path}.x" for side in basis for path in bare[side])
+                template = template_of([*paths], several).removesuffix(".x")
+                texts = {side: self._faced(template, side, units) for side in self.sides}
+                if all(texts[side] for side in main):
+                    yield {side: text for side, text in texts.items() if text}
+
+    def _bare(self, side: str, units: bool) -> list[str]:
+        """The paths of a side without what only says their side."""
+
+        @cache
+        def bare(depth: int, name: str, folder: bool) -> str:
+            return "".join(name[c] for c in self._kept(depth, name, units and folder)) or _ROLE
+
+        return [
+            "/".join(bare(depth, name, depth + 1 < len(names)) for depth, name in enumerate(names))
+            for names in map(self.names.__getitem__, self.sides[side])
+        ]
+
+    def _kept(self, depth: int, name: str, units: bool) -> list[int]:
+        """The characters of a name that say more than its side; maybe without those of a unit."""
+        says = [word in _SAYING for word in self._saying(depth, name)]
+        if not any(says):
+            return [*range(len(name))]
+        tokens = [*_TOKEN.finditer(name)]
+        kept: list[re.Match[str]] = []
+        for k, token in enumerate(tokens):
+            if says[k]:
+                kept = kept[:-1] if kept and not kept[-1][0].isalnum() else kept
+            elif kept or token[0].isalnum() or not k or not says[k - 1]:
+                kept.append(token)
+        rest = "".join(token[0] for token in kept).strip("_-. ")
+        kept = [] if not rest or (units and _UNIT.fullmatch(rest)) else kept
+        return [c for token in kept for c in range(*token.span())]
+
+    def _faced(self, template: str, side: str, units: bool) -> str:
+        """The template of a side whose names face those of a bare template, or nothing."""
+        names = max((self.names[path] for path in self.sides[side]), key=len)
+        bare, places, start = list[str](), list[int](), 0
+        for depth, name in enumerate(names):
+            kept = self._kept(depth, name, units and depth + 1 < len(names))
+            bare.append("".join(name[c] for c in kept) or _ROLE)
+            places += [start + c for c in (kept or [0])] + [start + len(name)]
+            start += len(name) + 1
+        text, path = "/".join(bare), "/".join(names)
+        for own in _facing(template.split("/"), bare, side == self.silent):
+            if match := Template.parse(f"{own}.x").pattern.fullmatch(f"{text}.x"):
+                break
+        else:
+            return ""
+        pieces, after = list[str](), 0
+        marks = {mark[1]: mark[0] for mark in _MARK.finditer(own)}
+        for (first, last), name in sorted((match.span(n), n) for n in marks if match[n]):
+            a, b = places[first], places[last - 1] + 1
+            if path[a:b] != text[first:last]:
+                return ""  # a word of the side stands within a field
+            pieces += [_literal(path[after:a]), marks[name]]
+            after = b
+        own_names = "".join([*pieces, _literal(path[after:])]).split("/")
+        columns = [*zip(*(self.names[path] for path in self.sides[side]), strict=False)]
+        for k in (k for k, name in enumerate(bare[: len(columns)]) if name == _ROLE):
+            if len({*columns[k]}) > 1:
+                before, _, end = _affixes(columns[k])
+                own_names[k] = f"{before}{{sensor}}{end}"
+        return "/".join(own_names) + _suffix(self.sides[side])
 
 
-def _partners(stem: str, role: str) -> list[object]:
-    """Paths without a word of a role: with any word in its place, or with none."""
-    tokens, words = _TOKEN.findall(stem), {*ROLES[role], *(w for w in _WEAK if _WEAK[w] == role)}
-    places = [k for k, token in enumerate(tokens) if token.lower() in words]
-    word = rf"(?:{'|'.join(words)})(?![A-Za-z])"
-    bare = re.sub(rf"(?i)[_\-. ]{word}|(?<![A-Za-z]){word}[_\-. ]?", "", stem)
-    return [bare, *((k, *tokens[:k], "", *tokens[k + 1 :]) for k in places)]
+def _facing(template: list[str], names: list[str], silent: bool) -> Iterator[str]:
+    """What of a bare template the names of another side may face, the whole of it first."""
+    yield "/".join(template)
+    if silent and len(names) == len(template):
+        pairs = zip(template, names, strict=True)
+        yield "/".join(_literal(name) if piece == _ROLE else piece for piece, name in pairs)
+    saying = [k for k, name in enumerate(names) if name != _ROLE]
+    pieces = [piece for piece in template if piece != _ROLE]
+    if saying and len(saying) <= len(pieces):
+        own = dict(zip(saying, pieces, strict=False))
+        last = own[saying[-1]]
+        for end in (len(last), *(mark.end() for mark in [*_MARK.finditer(last)][::-1])):
+            own[saying[-1]] = last[:end]
+            yield "/".join(own.get(k, _ROLE) for k in range(len(names)))
+    elif not saying:
+        yield "/".join(names)
 
 
-def _has_partner(stem: str, partners: set[object], places: set[object]) -> bool:
-    tokens = _TOKEN.findall(stem)
-    inside = [k for k in places if isinstance(k, int) and k < len(tokens)]
-    return stem in partners or any(
-        (k, *tokens[:k], "", *tokens[k + 1 :]) in partners for k in inside
-    )
+def _suffix(files: Sequence[str]) -> str:
+    suffixes = {posixpath.splitext(path)[1] for path in files}
+    return min(suffixes) if len(suffixes) == 1 else ".*"
+
+
+def _tokens(text: str) -> list[str]:
+    return [token.lower() for token in _TOKEN.findall(text)]
 
 
 def _several(files: Sequence[str]) -> bool:
@@ -278,7 +248,6 @@ def template_of(files: Sequence[str], several: bool | None = None) -> str:
     places = [path.split("/") for path in files]
     folders = [parts[:-1] for parts in places]
     names = [posixpath.splitext(parts[-1]) for parts in places]
-    suffixes = {suffix for _, suffix in names}
     fields: set[str] = set()
     pieces = _folders(folders, fields)
     free = [k for k, piece in enumerate(pieces) if piece is None]
@@ -286,8 +255,7 @@ def template_of(files: Sequence[str], several: bool | None = None) -> str:
     for k in free if named == ["object"] else reversed(free):
         pieces[k] = f"{{{_new(fields, *named, 'object', f'folder_{k + 1}')}}}"
     stem = _stem([stem for stem, _ in names], fields)
-    suffix = min(suffixes) if len(suffixes) == 1 else ".*"
-    text = "/".join([*map(str, pieces), stem + suffix])
+    text = "/".join([*map(str, pieces), stem + _suffix(files)])
     text = re.sub(r"\**(\{\w+\})\**", r"\1", text)  # a field takes what is next to it
     text = re.sub(r"(?:\{\w+\}){2,}", _one_field, text)
     return _with_contacts(text, files) if {"video", "name", "frame"} <= fields else text
@@ -342,7 +310,7 @@ def _common(folders: Sequence[Sequence[str]], step: int) -> Sequence[str]:
 
 def _column(before: str, middles: Sequence[str]) -> str:
     """What a varying part of a name is: by the word before it, else by its values."""
-    words = [word for word in _words(before) if word.isalpha()]
+    words = [word for word in _tokens(before) if word.isalpha()]
     if words and words[-1] in _MEANING_OF:
         return _MEANING_OF[words[-1]]
     values = {middle.lower() for middle in middles}
@@ -490,19 +458,26 @@ def templates_of(
     ``kind``, what the files are, is for errors; ``renamed`` changes the names of fields.
     """
     require(bool(files), None, f"{folder} must hold {kind}", "none", fix="Check the path")
+    must = f"The names of the {kind} in {folder} must say what they show"
+    names = _Names(files, folder.resolve().name)
     if side is not None:
+        own = names.sides.get(side, [])
+        if names.sides.keys() >= {*SIDES} and not names.silent:
+            must = "must be left out where names say both sides"
+            got = f"{side!r}, which the names of {len(own)} of {len(files)} {kind} say"
+            choices = [renamed({side: template_of(own)})]
+            raise PalpateError(must, got, "Leave it out", argument="side", choices=choices)
         return renamed({side: template_of(files)})
-    templates, fit = _detected_and_fit(files, folder.resolve().name)
-    if fit:
+    if templates := detect_layout(files, folder.resolve().name):
         return renamed(templates)
-    if templates:
-        choices = [templates, *({side: text} for side, text in templates.items())]
+    sides = {s: files for s, files in names.sides.items() if s in SIDES}
+    if sides:
+        choices = [{side: template_of(files)} for side, files in sides.items()]
         got = f"{few(files)}, of which few share their names"
     else:
         every = template_of(files)
         choices = [{"tactile": every}, {"vision": every}]
         got = f"{few(files)}, without a word like {ROLES['vision'][0]} or {ROLES['tactile'][0]}"
-    must = f"The names of the {kind} in {folder} must say what they show"
     raise PalpateError(must, got, "Choose one of these", choices=[*map(renamed, choices)])
 
 
@@ -513,7 +488,8 @@ def _fit(files: Sequence[str], templates: Mapping[str, str]) -> bool:
         rows, _ = join(matches)
         both = [side for side in SIDES if side in matches]
         numbered = len(both) == 2 and all("{frame" in templates[side] for side in both)
-        samples = len({tuple(v for n, v in row.items() if n not in matches) for row in rows})
+        sides = {*matches, "sensor"}  # several sensors may share a photo
+        samples = len({tuple(v for n, v in row.items() if n not in sides) for row in rows})
         shared = numbered and any(len({row[s] for row in rows}) < samples for s in both)
         return not shared and 2 * len(rows) >= min(len(matches[side]) for side in both)
     return False
