@@ -40,57 +40,40 @@ def test_a_true_metric_with_the_same_score():
     assert same(metric.compute(), want)
 
 
-def joined(number, folder):
-    """Join a group of two processes; where to leave what is found."""
-    meet = f"file://{folder}/meet"
-    torch.distributed.init_process_group("gloo", init_method=meet, rank=number, world_size=2)
-    return folder / str(number)
-
-
-def share_of_rows(number, folder):
+def test_two_gloo_processes_give_what_one_gives(on_two_processes):
     """The second of two processes gets a quarter of the rows, and no real ones."""
-    out, (g, r) = joined(number, folder), sets()
-    cut = 3 * len(g.ids) // 4
-    metric = torch_metric.TMMD()
-    mine = np.arange(cut) if number == 0 else np.arange(cut, len(g.ids))
-    feed(metric, g, order=mine, step=5 + number)
-    if number == 0:
-        feed(metric, r, real=True)
-    synced = metric.compute().item(), metric.score().to_json()
-    # unsynchronized again
-    rows = metric.plain.compute().n if number == 0 else None
-    metric.update(g.features[:0])
-    out.write_bytes(pickle.dumps((*synced, rows, metric.compute().item())))
-    torch.distributed.destroy_process_group()
-
-
-@pytest.mark.slow
-def test_two_gloo_processes_give_what_one_gives(tmp_path):
-    torch.multiprocessing.spawn(share_of_rows, (tmp_path,), nprocs=2)
-    found = [pickle.loads((tmp_path / str(k)).read_bytes()) for k in range(2)]
     g, r = sets()
-    want = plain_score(g, r)
-    for value, score, _, later in found:
+    cut = 3 * len(g.ids) // 4
+
+    def share_of_rows():
+        number, metric = torch.distributed.get_rank(), torch_metric.TMMD()
+        mine = np.arange(cut) if number == 0 else np.arange(cut, len(g.ids))
+        feed(metric, g, order=mine, step=5 + number)
+        if number == 0:
+            feed(metric, r, real=True)
+        synced = metric.compute().item(), metric.score().to_json()
+        # unsynchronized again
+        rows = metric.plain.compute().n if number == 0 else None
+        metric.update(g.features[:0])
+        return *synced, rows, metric.compute().item()
+
+    results, want = on_two_processes(share_of_rows), plain_score(g, r)
+    for value, score, _, later in results:
         assert value == pytest.approx(want.value, abs=1e-9)
         assert later == value
         assert close(score, want.to_json())
-    assert found[0][2] == 3 * len(g.ids) // 4
+    assert results[0][2] == cut
 
 
-def other_settings(number, folder):
-    out = joined(number, folder)
-    metric = both(torch_metric.TMMD(encoder=str(number)), *sets())
-    try:
-        out.write_text(str(metric.compute()))
-    except PalpateError as error:
-        out.write_text(str(error))
-    torch.distributed.destroy_process_group()
+def test_processes_of_different_settings_are_refused(on_two_processes):
+    def other_settings():
+        metric = both(torch_metric.TMMD(encoder=str(torch.distributed.get_rank())), *sets())
+        try:
+            return str(metric.compute())
+        except PalpateError as error:
+            return str(error)
 
-
-@pytest.mark.nightly
-def test_processes_of_different_settings_are_refused(tmp_path):
-    torch.multiprocessing.spawn(other_settings, (tmp_path,), nprocs=2)
-    assert any("same settings" in (tmp_path / str(k)).read_text() for k in range(2))
+    assert any("same settings" in text for text in on_two_processes(other_settings))
 
 
 def test_a_collection_may_be_called_and_may_keep_real_samples():

@@ -73,15 +73,14 @@ def scores(folder, out):
 
 TRAIN = ("../tag", "--split", "../split.json", "--preset", "tiny", "-o", "out", "--seed", "3")
 MINI = ("--clip", "palpate/mini")
+WORLD = ("world", "-o", "out", "--preset", "tiny", "--materials", "2", "--workers", "1")
+WORLD += ("--objects-per-material", "1", "--size", "16", "--layout")
 VERBS = {
-    "world": Verb(
-        ("world", "-o", "out", "--preset", "tiny", "--materials", "2", "--workers", "1"),
-        ("rendering videos", 2),
-        everything,
-    ),
+    "world": Verb((*WORLD, "videos"), ("rendering videos", 1), everything),
+    "world of frames": Verb((*WORLD, "frames"), ("rendering videos", 1), everything),
     "generate": Verb(
         ("generate", "../photos", "-o", "out", "--steps", "1", "--batch", "2"),
-        ("generating", 3),
+        ("generating", 2),
         everything,
     ),
     "caption": Verb(("caption", "../tag", "-o", "out"), ("describing", 8), captions),
@@ -89,6 +88,7 @@ VERBS = {
         (
             *("score", "--generated", "../photos", "--reference", "../tag", "--json"),
             *("--encoder", "palpate/mini", "--cache", "cache"),
+            *("--companions", "none", "--permutations", "0"),
         ),
         None,
         scores,
@@ -105,6 +105,10 @@ VERBS = {
         ("train", "generator", *TRAIN, *MINI, "--steps", "4"), ("generator", 2), weights
     ),
 }
+
+
+#: The others take minutes: a file for each frame, or trainings.
+DAILY = ("world", "generate", "caption", "score")
 
 
 class Stopper:
@@ -126,7 +130,7 @@ class Stopper:
 def place(tag, tmp_path, monkeypatch):
     """Data and photos, and a folder beside them where commands run."""
     (tmp_path / "photos").mkdir()
-    for k in range(4):
+    for k in range(3):
         Image.fromarray(picture(k + 1, 32)).save(tmp_path / "photos" / f"{k}.png")
     monkeypatch.setattr(terminal, "_LogProgress", Stopper)
     monkeypatch.setattr(Stopper, "stop", None)
@@ -137,11 +141,7 @@ def place(tag, tmp_path, monkeypatch):
 
 @pytest.mark.parametrize(
     "name",
-    [
-        *(pytest.param(n, marks=pytest.mark.slow) for n in ("world", "generate", "caption")),
-        *(pytest.param(n, marks=pytest.mark.nightly) for n in VERBS if n.startswith("train")),
-        pytest.param("score", marks=pytest.mark.slow),
-    ],
+    [pytest.param(n, marks=pytest.mark.slow if n in DAILY else pytest.mark.nightly) for n in VERBS],
 )
 def test_each_damaged_file_of_a_stopped_run_is_made_again_or_refused(
     place, capsys, monkeypatch, name
