@@ -92,7 +92,7 @@ def test_equal_file_names_of_two_roots_are_no_leak_and_a_copied_file_is(layout, 
     assert data["questions"][0]["reason"] == "names"
     (note,) = [note["params"] for note in data["notes"] if note["code"] == "equal-names"]
     assert note["equal"]["id"] == 12
-    status, data, _ = run(capsys, *sources(), "--identity", "names")
+    status, data, _ = run(capsys, *sources(), "--identity", "names", "--no-images")
     assert (status, data["leaking_samples"], data["identical_samples"]) == (1, 12, 12)
     shutil.copy(a / "video1" / "0001.jpg", b / "video2" / "0011.jpg")
     status, data, _ = run(capsys, *sources())
@@ -132,8 +132,8 @@ def test_a_damaged_picture_is_named_and_the_others_are_compared(folders, capsys)
     (of_b / "b2.png").write_bytes((of_b / "b2.png").read_bytes()[:-40])
     Image.open(of_b / "b4.png").convert("L").resize((200, 50)).save(of_b / "b4.png")
     Image.open(of_a / "a4.png").convert("RGBA").save(of_a / "a4.png")
-    status, data, _ = run(capsys, "a", "b")
-    assert status == 1
+    status, data, _ = run(capsys, of_a, of_b)
+    assert status == 3
     vision = next(s for s in data["signals"] if s["kind"] == "near-duplicate vision")
     assert vision["checked"] == 28
     assert vision["worst"][0]["test"]["id"] == "3"
@@ -142,12 +142,12 @@ def test_a_damaged_picture_is_named_and_the_others_are_compared(folders, capsys)
 
 
 def test_a_page_a_table_and_json_are_written_whole(folders, capsys):
-    status, data, _ = run(capsys, "a b --page p.html -o a.json")
-    assert status == run(capsys, "a b -o t.csv")[0] == 1
+    status, data, _ = run(capsys, "a/vision b/vision --page p.html -o p.json")
+    assert status == run(capsys, "a b --no-images -o t.csv")[0] == 3
     page = Path("p.html").read_text()
     assert "near-duplicate vision" in page
     assert len(page) < 10_000_000
-    assert json.loads(Path("a.json").read_text())["leaking_samples"] == data["leaking_samples"]
+    assert json.loads(Path("p.json").read_text())["leaking_samples"] == data["leaking_samples"]
     assert Path("t.csv").read_text().startswith("id,video,frame,material,leaking")
     assert not list(folders.glob(".*.work"))
     # A page never replaces what lies beside it.
@@ -155,8 +155,6 @@ def test_a_page_a_table_and_json_are_written_whole(folders, capsys):
     for flags in ("-o a/vision/a1.png", "-o q.json", "--page q.html"):
         assert run(capsys, "a", "b", flags)[0] == 2, flags
     assert run(capsys, "a b --page r.html -o r.md")[0] == 2
-    assert run(capsys, "a b --page r.html -o r.json")[0] == 1
-    assert json.loads(Path("r.json").read_text()) == json.loads(Path("a.json").read_text())
     assert Path("q.json").read_text() == '{"a": 1}'
 
 
