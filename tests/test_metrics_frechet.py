@@ -117,7 +117,7 @@ def test_the_interval_covers_what_is_expected_at_this_size():
     """Groups deviate as a whole: intervals over groups hold the mean, those over rows do not."""
     rng = np.random.default_rng(11)
     by_group, by_row, values = [], [], []
-    for _ in range(300):
+    for draw in range(300):
         sets = [
             (s * (rng.normal(size=(30, 1, 3)) + 0.7 * rng.normal(size=(30, 10, 3))) + mu).reshape(
                 -1, 3
@@ -128,7 +128,8 @@ def test_the_interval_covers_what_is_expected_at_this_size():
         score = fid(features(sets[0], names[0]), features(sets[1], names[1]))
         values.append(score.value)
         by_group.append(score.interval)
-        by_row.append(fid(features(sets[0]), features(sets[1])).interval)
+        if draw % 3 == 0:
+            by_row.append(fid(features(sets[0]), features(sets[1])).interval)
     cover = [
         np.mean([low <= np.mean(values) <= high for low, high in found])
         for found in (by_group, by_row)

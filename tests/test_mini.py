@@ -303,7 +303,7 @@ def test_the_cards_of_what_ships_are_whole_and_current(place):
     assert "900" in json.dumps(card["data"])  # seeds that no experiment uses
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_a_fresh_process_with_the_hub_switched_off(tmp_path):
     code = (
         "import socket\n"

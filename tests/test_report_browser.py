@@ -1,6 +1,6 @@
 """The page in a browser, from disk: no request, no message, every image decoded, no overflow.
 
-Screenshots are kept in ``$PALPATE_ARTIFACTS`` (default ``artifacts/``). The browser is Debian's
+Screenshots are kept in ``$PALPATE_ARTIFACTS``, if that is set. The browser is Debian's
 chromium, or ``$PALPATE_CHROMIUM``.
 """
 
@@ -184,9 +184,8 @@ def opened(chromium, file, width=1280, scheme="light"):
 
 
 def screenshot(page, name):
-    folder = Path(os.environ.get("PALPATE_ARTIFACTS", "artifacts"))
-    folder.mkdir(parents=True, exist_ok=True)
-    page.screenshot(path=folder / f"{name}.png", full_page=True)
+    if folder := os.environ.get("PALPATE_ARTIFACTS"):
+        page.screenshot(path=Path(folder) / f"{name}.png", full_page=True)
 
 
 @pytest.mark.parametrize(("wide", "scheme"), [(True, "light"), (False, "dark")])

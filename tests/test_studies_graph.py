@@ -212,6 +212,17 @@ if __name__ == "__main__":
 """
 
 
+@pytest.fixture(scope="module")
+def script(tmp_path_factory):
+    """A study, and beside it the folder ``whole`` of a run that was not stopped."""
+    file = tmp_path_factory.mktemp("study") / "study.py"
+    file.write_text(SCRIPT)
+    with start(file, file.with_name("whole"), 2) as process:
+        process.communicate()
+    assert process.returncode == 0
+    return file
+
+
 def start(script, folder, jobs):
     command = [sys.executable, str(script), str(folder), str(jobs)]
     return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
@@ -219,9 +230,7 @@ def start(script, folder, jobs):
 
 @pytest.mark.parametrize("jobs", [1, 2])
 @pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGINT])
-def test_a_stopped_run_goes_on_to_the_same_files(tmp_path, jobs, number):
-    script = tmp_path / "study.py"
-    script.write_text(SCRIPT)
+def test_a_stopped_run_goes_on_to_the_same_files(tmp_path, script, jobs, number):
     with start(script, tmp_path / "run", jobs) as process:
         begun = tmp_path / "run" / "a.partial" / "lines"
         while not (begun.exists() and len(begun.read_text().splitlines()) >= 3):
@@ -235,12 +244,11 @@ def test_a_stopped_run_goes_on_to_the_same_files(tmp_path, jobs, number):
     kept = begun.read_text().splitlines()
     time.sleep(0.3)
     assert begun.read_text().splitlines() == kept
-    for run in ("run", "whole"):
-        with start(script, tmp_path / run, jobs) as process:
-            process.communicate()
-        assert process.returncode == 0
+    with start(script, tmp_path / "run", jobs) as process:
+        process.communicate()
+    assert process.returncode == 0
     assert int((tmp_path / "run" / "a.resumed").read_text()) == len(kept) >= 3
     for name in "abc":
         lines = (tmp_path / "run" / name / "lines").read_text()
-        assert lines == (tmp_path / "whole" / name / "lines").read_text()
+        assert lines == (script.with_name("whole") / name / "lines").read_text()
         assert len(lines.splitlines()) == 8
