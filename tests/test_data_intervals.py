@@ -59,12 +59,14 @@ FROM_FILE = {"video": "replace(split_part(file, '/', -1), '.mp4', '')", "materia
         ("video;start;end;material\na;10;12;Wood\na;20;20;Rock", {}),
         ("file,start,end,what\nx/a.mp4,10,12,Wood\nx/a.mp4,20,20,Rock", {"columns": FROM_FILE}),
         ("label,end,start,video\nRock,20,20,a\nWood,12.0,10,a", {}),
+        ("a 10 12 Wood\na 20  20\tRock", {}),
     ],
 )
 def test_forms_of_the_same_list(tmp_path, text, options):
     root = recording(tmp_path / "d", "a")
-    (root / "l.csv").write_text(text)
-    result = import_dataset(root / "l.csv", tmp_path / "out", format="intervals", **options)
+    path = root / ("l.csv" if "," in text or ";" in text else "l.txt")
+    path.write_text(text)
+    result = import_dataset(path, tmp_path / "out", **({"format": "intervals"} | options))
     assert result.manifest.ids == [f"a/{k:010d}" for k in (10, 11, 12, 20)]
     assert result.manifest.column("contact") == ["a#0001"] * 3 + ["a#0002"]
     assert result.manifest.column("material") == ["Wood"] * 3 + ["Rock"]

@@ -5,8 +5,9 @@ import pytest
 
 from forge.errors import fails
 from forge.pictures import write_images
+from palpate.cli import main
 from palpate.data import tables
-from palpate.data.importing import import_dataset
+from palpate.data.importing import import_dataset, validate
 from palpate.data.listing import read_list
 from palpate.data.mapping import compile_maps
 from palpate.data.reading import load, read
@@ -58,7 +59,7 @@ def test_paths_that_climb_name_the_root(tmp_path):
     assert error.example == {"root": "FOLDER"}
 
 
-@pytest.mark.parametrize("sign", [",", ";"])
+@pytest.mark.parametrize("sign", [",", ";", "|"])
 @pytest.mark.parametrize("material", ["Béton", "Straße"])
 def test_a_table_of_windows_is_read_and_said(tmp_path, sign, material):
     write_images(tmp_path, IMAGES)
@@ -85,6 +86,30 @@ def test_a_repeated_row_is_one_sample(tmp_path):
     assert "t.csv:6" in str(error)
     assert "repeats the row" in str(error)
     assert len(import_dataset(table, tmp_path / "out", skip_bad=True).manifest) == 4
+
+
+@pytest.mark.parametrize(("column", "other"), [("material", "Rock"), ("video", "x")])
+def test_rows_of_the_same_images_name_the_cell_that_differs(tmp_path, column, other):
+    """A column mapped to ids would count one sample twice."""
+    write_images(tmp_path, IMAGES)
+    row = {"vision": IMAGES[0], "tactile": IMAGES[1], "material": "Wood", "video": "a"}
+    pl.DataFrame([row, row | {column: other}]).write_csv(tmp_path / "t.csv")
+    error = fails("duplicate-id", import_dataset, tmp_path / "t.csv", tmp_path / "out")
+    (problem,) = error.problems
+    assert f"{column} ({other!r} here, {row[column]!r} there)" in problem.text
+    assert "map a column" not in problem.text
+
+
+@pytest.mark.parametrize("options", [{"size": 16}, {"every": 2}, {"sensor": "x"}, {"swap": "fix"}])
+@pytest.mark.parametrize("folder", [False, True])
+def test_options_without_use_are_refused_by_name(tmp_path, folder, options):
+    write_images(tmp_path / "own", [p.replace("_v", "_rgb").replace("_t", "_tac") for p in IMAGES])
+    write_images(tmp_path, IMAGES)
+    source = tmp_path / "own" if folder else listed(tmp_path / "t.csv", str)
+    for verb in (import_dataset, validate, load):
+        into = [tmp_path / "out"] if verb is import_dataset else []
+        error = fails("must be left out", verb, source, *into, **options)
+        assert error.argument == next(iter(options))
 
 
 PATHS = [f"v{v}/{k:04d}.jpg" for v in range(3) for k in range(0, 60, 10)]
@@ -148,7 +173,7 @@ def test_numbers_compare_as_numbers():
         assert cells["text"].to_list() == values
 
 
-@pytest.mark.parametrize("sign", ["", " ", "   ", "\t", ";", ", "])
+@pytest.mark.parametrize("sign", ["", " ", "   ", "\t", ";", ", ", "|"])
 @pytest.mark.parametrize("suffix", [".txt", ".lst", ".csv"])
 def test_lines_of_paths_with_or_without_a_label(tmp_path, sign, suffix):
     files = []
@@ -170,6 +195,65 @@ def test_lines_of_two_paths(tmp_path):
     table = import_dataset(tmp_path / "pairs.csv", tmp_path / "out").manifest.table
     assert table["vision"].str.contains("rgb").all()
     assert table["tactile"].str.contains("tac").all()
+
+
+def test_a_list_that_an_audit_reads_is_imported_with_its_labels(tmp_path):
+    """No header, tabs; what most paths say decides which is the photo."""
+    rows = [f"{p.replace('_t', '_touch')}\t{p.replace('_t', '_photo')}" for p in IMAGES[1::2]]
+    rows[0] = "img/cup/touch_photo.png\timg/cup/1_photo.png"
+    write_images(tmp_path, [path for row in rows for path in row.split("\t")])
+    (tmp_path / "l.txt").write_text("".join(f"{row}\t{k % 2}\n" for k, row in enumerate(rows)))
+    result = import_dataset(tmp_path / "l.txt", tmp_path / "out").manifest
+    assert result.table.select("tactile", "vision").rows() == [tuple(r.split("\t")) for r in rows]
+    assert result.column("material") == ["0", "1"] * 2
+    assert read(tmp_path / "l.txt").manifest.digest == result.digest
+
+
+def test_a_table_with_both_images_states_its_split(tmp_path):
+    write_images(tmp_path, IMAGES)
+    lines = listed(tmp_path / "t.csv", str).read_text().splitlines()
+    parts = ("split", "train", "train", "train", "test")
+    text = "\n".join(f"{line},{part}" for line, part in zip(lines, parts, strict=True))
+    (tmp_path / "t.csv").write_text(text)
+    result = audit(tmp_path / "t.csv")
+    assert (result.train_samples, result.test_samples) == (3, 1)
+    assert {s.kind for s in result.signals} >= {"near-duplicate vision", "near-duplicate tactile"}
+
+
+def test_the_column_of_the_paths_is_said(tmp_path):
+    rows = [f"{path},{path},note.png" for path in PATHS]
+    rows[0] = "none,none,x.png"  # most of a column decides
+    for part, some in (("train", rows[:9]), ("test", rows[9:])):
+        (tmp_path / f"{part}.csv").write_text("\n".join(["shot,gel,remark", *some]))
+    notes = {n.code: n.params for n in audit(tmp_path / "train.csv", tmp_path / "test.csv").notes}
+    assert notes["path-column"] == {"column": "gel"}
+    assert notes["images-not-found"] == {"root": str(tmp_path)}
+
+
+def test_a_side_that_nobody_can_check_lets_no_gate_pass(tmp_path, capsys):
+    """Of both parts half of the photos are cut; then all tactile images are gone."""
+    names = [
+        f"{part}{v}/{k}_{side}.png"
+        for part in "ab"
+        for v in range(3)
+        for k in range(4)
+        for side in "vt"
+    ]
+    write_images(tmp_path, names)
+    for path in names[::4]:
+        (tmp_path / path).write_bytes((tmp_path / path).read_bytes()[:40])
+    for part in "ab":
+        own = [name for name in names if name[0] == part]
+        pairs = zip(own[::2], own[1::2], strict=True)
+        text = "\n".join(["vision,tactile,video", *(f"{v},{t},{v[:2]}" for v, t in pairs)])
+        (tmp_path / f"{part}.csv").write_text(text)
+    command = ["audit", str(tmp_path / "a.csv"), str(tmp_path / "b.csv"), "--fail-over", "1"]
+    assert main(command) == 3
+    assert "cannot be read" in capsys.readouterr().out
+    for path in names[1::2]:
+        (tmp_path / path).unlink()
+    assert main(command) == 2
+    assert "missing-file" in capsys.readouterr().err
 
 
 def test_utf16_without_a_mark(tmp_path):

@@ -193,8 +193,10 @@ def read_table(
         table, base = table_of(source), Path()
     scan = Scan(base if root is None else Path(root)) if scan is None else scan
     labels = None if classes is None else read_classes(Path(classes))
+    texts = {"material": "label"} if table.bare and "label" in table.names else {}
+    texts |= columns or {}
     broken = bool(table.problems) and not table.names
-    maps = compile_maps({} if broken else columns or {}, table.names, (*SCHEMA, "split"))
+    maps = compile_maps({} if broken else texts, table.names, (*SCHEMA, "split"))
     wanted = (side,) if side else ("tactile", "vision")
     paths = next((name for name in wanted if name in maps.expressions), "")
     others = [] if paths else [n for n in _by_role(table.names, side) if n not in table.nested]
@@ -216,7 +218,7 @@ def read_table(
         before, below = next(iter(places.items()))
         text = f"{len(places)} paths are read by their end: {before!r} is {below!r}"
         scan.suspect(table.name, "other-paths", text)
-    return Listed(table, scan, rows, column, columns or {})
+    return Listed(table, scan, rows, column, texts)
 
 
 def _by_role(names: Sequence[str], side: str) -> list[str]:

@@ -16,6 +16,7 @@ import csv
 import io
 import json
 import re
+from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
@@ -56,6 +57,7 @@ class Table:
     records: _Records  # from the requested columns to (line, cells)
     suspicious: list[Problem] = field(default_factory=list)  # read, but a person should look
     nested: set[str] = field(default_factory=set)  # columns that hold lists
+    bare: bool = False  # it has no header: its columns are named by what they hold
 
     def read(self, columns: Sequence[str]) -> pl.DataFrame:
         """Read the rows.
@@ -86,8 +88,7 @@ def open_table(path: Path, names: Sequence[str] | None = None) -> Table:
 
     Args:
         path: the file.
-        names: columns of a CSV or TSV file that has no header line; the file may then have any
-            suffix.
+        names: columns of a text that has no header line, of any suffix.
 
     Raises:
         PalpateError: if the file is missing, or of another form.
@@ -102,10 +103,13 @@ def open_table(path: Path, names: Sequence[str] | None = None) -> Table:
         return _parquet(path)
     if suffix in (".jsonl", ".json"):
         return _json(path)
-    names = names or headless_names(path)
+    bare = [] if names else headless_names(path)
+    names = names or bare
     must = f"A table must be one of {', '.join(TABLES)}"
     require(bool(names) or suffix in TABLES, None, must, path.name, fix="Convert it, or rename it")
-    return _csv(path, names)
+    table = _csv(path, names)
+    table.bare = bool(bare)
+    return table
 
 
 def table_of(data: Any, name: str = "row") -> Table:
@@ -133,15 +137,27 @@ def header_of(path: Path) -> list[str]:
     try:
         if suffix == ".parquet":
             return list(_schema(path))
-        with open(path, "rb") as file:
-            head = decoded(file.read(1 << 16))
         if suffix in (".csv", ".tsv"):
-            lines = csv.reader(io.StringIO(head, newline=""), delimiter=delimiter_of(path, head))
-            return [cell.strip() for cell in next(cells for cells in lines if any(cells))]
-        first = json.JSONDecoder().raw_decode(head, head.index("{"))[0]
+            return _head(path)[0]
+        text = _start_of(path)
+        first = json.JSONDecoder().raw_decode(text, text.index("{"))[0]
         return [str(name) for name in first] if suffix in TABLES else []
     except Exception:  # whatever the file is, it is not a table
         return []
+
+
+def _start_of(path: Path) -> str:
+    with open(path, "rb") as file:
+        return decoded(file.read(1 << 16))
+
+
+def _head(path: Path) -> list[list[str]]:
+    """The cells of the first rows that are not blank, up to one that is no row."""
+    rows: list[list[str]] = []
+    with suppress(csv.Error):
+        for row in _cells(path, list(io.StringIO(_start_of(path), newline=""))):
+            rows += [[cell.strip() for cell in row]] if any(row) else []
+    return rows
 
 
 def delimiter_of(path: Path, text: str) -> str:
@@ -155,20 +171,18 @@ def delimiter_of(path: Path, text: str) -> str:
 def headless_names(path: Path) -> list[str]:
     """Columns of a list without a header, whose first line names images; empty for others.
 
-    An image is ``vision`` or ``tactile`` where there are several and a word of its path says so,
-    else a ``path``; what is no image is a ``label``.
+    An image is ``vision`` or ``tactile`` where there are several and the words of most paths say
+    so, else a ``path``; what is no image is a ``label``.
     """
-    if path.suffix.lower() in TABLES[2:]:
-        return []
-    with open(path, "rb") as file:
-        head = decoded(file.read(1 << 16)).lstrip("\r\n")
-    cells = [cell.strip() for cell in next(_cells(path, head.splitlines()), [])]
-    images = [cell for cell in cells if is_image(cell)]
+    rows = _head(path) if path.suffix.lower() not in TABLES[2:] else []
+    first = rows[0] if rows else []
+    images = list(map(is_image, first))
     names: list[str] = []
-    for cell in cells if images else ():
-        words = re.findall("[a-z]+", cell.lower())
-        side = next((ROLE_OF[word] for word in words if word in ROLE_OF), PATH)
-        name = (side if len(images) > 1 else PATH) if cell in images else "label"
+    for k, image in enumerate(images if any(images) else ()):
+        words = re.findall("[a-z]+", " ".join(row[k] for row in rows if len(row) > k).lower())
+        roles = Counter(ROLE_OF[word] for word in words if word in ROLE_OF)
+        side = max(roles, key=lambda role: roles[role], default=PATH)
+        name = (side if sum(images) > 1 else PATH) if image else "label"
         names.append(name if name not in names else f"{name}_{len(names) + 1}")
     return names
 

@@ -37,10 +37,11 @@ from palpate.data.images import Check
 from palpate.data.imported import Imported
 from palpate.data.listing import FrameTable
 from palpate.data.manifest import Manifest
-from palpate.data.mapping import compile_maps
-from palpate.data.rows import manifest_rows, read_classes, records
+from palpate.data.mapping import LINE, compile_maps
+from palpate.data.rows import manifest_rows, read_classes, without_repeats
 from palpate.data.scanning import Facts, Format, Into, Scan, require_some
 from palpate.data.tables import (
+    INCONCLUSIVE,
     TABLES,
     Record,
     Table,
@@ -60,6 +61,7 @@ FACTS = Facts(
 NEEDED = ("video", "start", "end")
 ORDER = ("video", "start", "end", "label")
 WORDS = ("material", "object", "text", "session")
+END = pl.col("end")
 #: Between the cells of a line.
 SEPARATORS = re.compile(r"[\s,;]+")
 #: Frames that the intervals of one list may have together, where there are no recordings.
@@ -101,20 +103,16 @@ def by_name(
         PalpateError: if there are more than ``MOST_FRAMES``, or none.
     """
     result = Scan(source.parent)
-    listed = [i for i in _read(result, source, columns, classes) if not i.inconclusive]
-    count = sum(i.last - i.first + 1 for i in listed)
+    rows = _read(result, source, columns, classes)
+    rows = rows.filter(~pl.col("unclear"))
+    count = int((rows["end"] - rows["start"] + 1).sum())
     must, fix = f"{source} must have at most {MOST_FRAMES:,} frames", "Check their ends"
     require(count <= MOST_FRAMES, None, must, f"{count:,}", fix=fix)
     require_some(count, source, result.problems)
-    rows = [(i.video, i.first, i.last, *map(i.words.get, WORDS)) for i in listed]
-    schema = {"video": pl.String, "first": pl.Int64, "last": pl.Int64}
-    table = pl.DataFrame(rows, schema | dict.fromkeys(WORDS, pl.String), orient="row")
-    frames = table.with_columns(
-        contact=pl.format("{}#{}-{}", "video", "first", "last"),
-        frame=pl.int_ranges("first", pl.col("last") + 1),
-    ).explode("frame")
-    frames = frames.unique(["video", "frame"], keep="first", maintain_order=True)
-    frames = frames.drop("first", "last").with_columns(id=pl.format("{}/{}", "video", "frame"))
+    contact = pl.format("{}#{}-{}", "video", "start", "end")
+    frames = rows.select("video", *WORDS, contact=contact, frame=pl.int_ranges("start", END + 1))
+    frames = frames.explode("frame").unique(["video", "frame"], keep="first", maintain_order=True)
+    frames = frames.with_columns(id=pl.format("{}/{}", "video", "frame"))
     manifest = Manifest.of_table(frames, source.parent, {"dataset": source.stem})
     result.problems.sort(key=Problem.sort_key)
     return Imported(manifest, result.problems, inconclusive=result.inconclusive)
@@ -161,7 +159,15 @@ def scan(
     require(base.is_dir(), "root", must, f"no folder {base}", fix="Check the path")
     result = Scan(base, {"dataset": source.stem})
     work = Recordings(result, into, require_videos(base), {}, options.size, pairing=options.pairing)
-    listed = _read(result, source, columns, options.classes)
+    listed = [
+        Interval(
+            f"{source}:{row[LINE]}",
+            *(row[name] for name in NEEDED),
+            {name: row[name] for name in WORDS if row[name]},
+            row["unclear"],
+        )
+        for row in _read(result, source, columns, options.classes).iter_rows(named=True)
+    ]
     contacts = _contacts(work, listed, progress)
     rows = [row for name in contacts for row in _frames(work, name, contacts[name], every)]
     starts, videos = {c: i.first for c, i in contacts.items()}, {i.video for i in contacts.values()}
@@ -216,8 +222,12 @@ def _of_lines(path: Path, names: Sequence[str] | None) -> Table:
 
 def _read(
     result: Scan, path: Path, columns: Mapping[str, str] | None, classes: Path | None
-) -> list[Interval]:
-    """The well-formed intervals of the list, in its order."""
+) -> pl.DataFrame:
+    """The well-formed intervals of a list, in its order.
+
+    Returns:
+        ``LINE``, the columns of ``NEEDED`` and ``WORDS``, and ``unclear``: whether the material is.
+    """
     first = _first_row(path)
     names = ORDER[: len(first)] if _is_bare(first) else None
     table = open_table(path, names) if path.suffix.lower() in TABLES else _of_lines(path, names)
@@ -232,40 +242,30 @@ def _read(
         raise PalpateError(must, got, "Map your columns", example={"columns": example})
     cells = compiled.apply(table.read(compiled.columns))
     result.problems += table.problems
-    # Without classes, as an inconclusive contact (-1) is contact all the same.
-    rows, _ = manifest_rows(cells, table.place, None, result.problems)
+    cells = without_repeats(cells, table.place, result.problems)
+    cells = cells.with_columns(
+        pl.lit(None, pl.String).alias(name)
+        for name in (*NEEDED, *WORDS)
+        if name not in cells.columns
+    )
+    unclear = (pl.col("material") == str(INCONCLUSIVE)).fill_null(False)
     labels = None if classes is None else read_classes(Path(classes))
-    intervals: list[Interval] = []
-    for where, row in records(rows, table.place):
-        interval = _interval(where, row, labels)
-        if isinstance(interval, Interval):
-            intervals.append(interval)
-        else:
-            result.problem(where, *interval)
-    result.inconclusive = sum(i.inconclusive for i in intervals)
-    return intervals
-
-
-def _interval(
-    where: str, row: Mapping[str, object], labels: Mapping[int, str] | None
-) -> Interval | tuple[str, str]:
-    """One interval, or what is wrong with it as (kind, text)."""
-    if lacking := [name for name in NEEDED if name not in row]:
-        return "empty-cell", f"no {' and no '.join(lacking)}"
-    video, start, last = (row[name] for name in NEEDED)
-    assert isinstance(start, int)
-    assert isinstance(last, int)
-    label = row.get("material")
-    if last < start:
-        return "bad-interval", f"the contact ends at frame {last} before it starts at {start}"
-    if labels is not None and label not in (None, "-1", *labels.values()):
-        number = int(str(label)) if str(label).isdecimal() else -1
-        if number not in labels:
-            return "unknown-label", f"the class {label!r} is not in the table of classes"
-        label = labels[number]
-    words = {name: str(row[name]) for name in WORDS if row.get(name)}
-    words |= {"material": str(label)} if label else {}
-    return Interval(where, str(video), start, last, words, label == "-1")
+    parts = [
+        manifest_rows(cells.filter(~unclear), table.place, labels, result.problems)[0],
+        manifest_rows(cells.filter(unclear), table.place, None, result.problems)[0],
+    ]
+    rows = pl.concat(parts).with_columns(unclear=unclear).sort(LINE)
+    empty = pl.any_horizontal(pl.col(NEEDED).is_null())
+    for row in rows.filter(empty | (pl.col("start") > END)).iter_rows(named=True):
+        lacking = [name for name in NEEDED if row[name] is None]
+        text = f"the contact ends at frame {row['end']} before it starts at {row['start']}"
+        problem = (
+            ("empty-cell", f"no {' and no '.join(lacking)}") if lacking else ("bad-interval", text)
+        )
+        result.problem(table.place(row[LINE]), *problem)
+    rows = rows.filter(~empty & (pl.col("start") <= END))
+    result.inconclusive = int(rows["unclear"].sum())
+    return rows
 
 
 def _contacts(work: Recordings, listed: list[Interval], progress: Progress) -> dict[str, Interval]:
@@ -298,13 +298,7 @@ def _within(work: Recordings, interval: Interval) -> bool:
 
 def _apart(listed: list[Interval], problems: list[Problem]) -> list[Interval]:
     """The intervals that share no frame with another, sorted by video and frame."""
-    first: dict[object, Interval] = {}
-    for i in listed:
-        key = (i.video, i.first, i.last, *i.words.items())
-        if (before := first.setdefault(key, i)) is not i:
-            text = f"the same interval is at {before.where} already"
-            problems.append(Problem(i.where, "duplicate-row", text))
-    ordered = sorted(first.values(), key=lambda i: (i.video, i.first, i.last))
+    ordered = sorted(listed, key=lambda i: (i.video, i.first, i.last))
     overlaps: dict[str, tuple[Interval, Interval]] = {}
     widest: Interval | None = None  # of those before, the one that reaches furthest
     for i in ordered:
