@@ -40,10 +40,12 @@ LARGEST = 1 << 28
 #: The encoding of texts that Excel saves as plain CSV.
 WINDOWS = "cp1252"
 CONTROL = re.compile("[\x00-\x08\x0b\x0c\x0e-\x1f]")
-#: Signs that no cell can hold: bytes that were not UTF-8, the zero character, halves of characters.
-UNFIT = re.compile("[\ufffd\x00\ud800-\udfff]")
-#: Where a row was read, and its cells by number of the requested column.
-Record = tuple[int, Sequence[Any]]
+#: Signs that no cell can hold: bytes that were not UTF-8, and the zero character.
+UNFIT = "[\ufffd\x00]"
+#: Halves of characters, which JSON can write.
+HALVES = re.compile("[\ud800-\udfff]")
+#: Where a row was read, and the texts in the requested columns.
+Record = tuple[Any, ...]
 _Records = Callable[[Sequence[str]], Iterable[Record]]
 
 
@@ -54,7 +56,7 @@ class Table:
     name: str  # the file, or how an in-memory table is called in messages
     names: list[str]  # its columns
     problems: list[Problem]  # what is wrong with its rows; complete after :meth:`read`
-    records: _Records  # from the requested columns to (line, cells)
+    records: _Records  # from the requested columns to (line, texts)
     suspicious: list[Problem] = field(default_factory=list)  # read, but a person should look
     nested: set[str] = field(default_factory=set)  # columns that hold lists
     bare: bool = False  # it has no header: its columns are named by what they hold
@@ -69,14 +71,15 @@ class Table:
         if double := [name for name in columns if self.names.count(name) > 1]:
             must = f"Columns of {self.name} must have different names"
             raise PalpateError(must, f"{double[0]} twice or more", "Rename one of them")
-        rows: list[list[Any]] = []
-        for line, cells in self.records(columns):
-            if problem := _unfit(cells, columns):
-                self.problems.append(Problem(self.place(line), *problem))
-            else:
-                rows.append([line, *map(text_of, cells)])
         schema = {LINE: pl.Int64} | dict.fromkeys(columns, pl.String)
-        return pl.DataFrame(rows, schema, orient="row")
+        rows = pl.DataFrame(list(self.records(columns)), schema, orient="row")
+        cells = [pl.col(name).str.strip_chars() for name in columns]
+        rows = rows.with_columns(pl.when(cell != "").then(cell) for cell in cells)
+        unfit = pl.any_horizontal(pl.lit(False), pl.col(pl.String).str.contains(UNFIT))
+        for line in rows.filter(unfit)[LINE]:
+            text = "the row holds bytes that are not UTF-8, or a zero character: save the file as"
+            self.problems.append(Problem(self.place(line), "bad-encoding", f"{text} UTF-8"))
+        return rows.filter(~unfit.fill_null(False))
 
     def place(self, line: int) -> str:
         """``file:line``."""
@@ -250,17 +253,6 @@ def csv_text(header: Sequence[str], rows: Iterable[Sequence[object]]) -> str:
     return text.getvalue()
 
 
-def _unfit(cells: Sequence[Any], columns: Sequence[str]) -> tuple[str, str] | None:
-    """What is wrong with a row as (kind, text)."""
-    for name, cell in zip(columns, cells, strict=True):
-        if isinstance(cell, str) and UNFIT.search(cell):
-            text = "the row holds bytes that are not UTF-8, or a zero character: save the file as"
-            return "bad-encoding", f"{text} UTF-8"
-        if isinstance(cell, (list, dict, bytes)):
-            return "bad-row", f"{name} holds a {type(cell).__name__} instead of a text or number"
-    return None
-
-
 def _csv(path: Path, names: Sequence[str] | None) -> Table:
     problems: list[Problem] = []
     data = content_of(path)
@@ -272,7 +264,7 @@ def _csv(path: Path, names: Sequence[str] | None) -> Table:
         places = [header.index(name) for name in columns]
         for line, cells in rows:
             if len(cells) == len(header):
-                yield line, [cells[k] for k in places]
+                yield (line, *[cells[k] for k in places])  # tuples: nothing to collect
             else:
                 text = f"{len(cells)} cells under {len(header)} columns"
                 problems.append(Problem(f"{path}:{line}", "bad-row", text))
@@ -293,12 +285,12 @@ def _csv_rows(path: Path, text: str, problems: list[Problem]) -> Iterator[tuple[
     try:
         for cells in reader:
             last = reader.line_num
-            quotes = sum(line.count('"') for line in lines[first - 1 : last])
             inner = lines[first:last]  # what a quoted cell took in
+            quotes = "".join(lines[first - 1 : last]).count('"') if inner else 0
             if inner and (quotes % 2 or _rows_inside(inner, reader.dialect, len(cells))):
                 swallowed = f"a quotation mark stays open up to line {last}"
                 problems.append(Problem(f"{path}:{first}", "open-quote", swallowed))
-            elif any(cell.strip() for cell in cells):
+            elif "".join(cells).strip():
                 yield first, cells
             first = last + 1
     except csv.Error as error:
@@ -403,7 +395,14 @@ def _of_objects(name: str, rows: Sequence[tuple[int, Any]], problems: list[Probl
     lists = {str(k) for _, row in objects for k, cell in row.items() if isinstance(cell, list)}
 
     def records(columns: Sequence[str]) -> Iterator[Record]:
-        return ((line, [row.get(c) for c in columns]) for line, row in objects)
+        for line, row in objects:
+            cells = [row.get(name) for name in columns]
+            if odd := [k for k, cell in enumerate(cells) if isinstance(cell, list | dict | bytes)]:
+                kind = type(cells[odd[0]]).__name__
+                text = f"{columns[odd[0]]} holds a {kind} instead of a text or number"
+                problems.append(Problem(f"{name}:{line}", "bad-row", text))
+            else:
+                yield (line, *[HALVES.sub("\ufffd", text_of(cell) or "") for cell in cells])
 
     return Table(name, names, problems, records, nested=lists)
 
@@ -443,7 +442,8 @@ def _of_frame(
             must, got = f"Columns of {name} must hold texts or numbers", f"{column} of type {kind}"
             fix = "For images inside the table use the format hf on its folder"
             require(plain, None, must, got, fix=fix)
-        yield from enumerate(read(columns).iter_rows(), 1)
+        for line, cells in enumerate(read(columns).iter_rows(), 1):
+            yield (line, *map(text_of, cells))
 
     return Table(name, list(schema), [], records)
 

@@ -215,7 +215,7 @@ def _of_lines(path: Path, names: Sequence[str] | None) -> Table:
 
     def records(columns: Sequence[str]) -> Iterator[Record]:
         places = [header.index(name) for name in columns]
-        return ((k, [[*cells, None][place] for place in places]) for k, cells in good)
+        return ((k, *[[*cells, None][place] for place in places]) for k, cells in good)
 
     return Table(str(path), header, problems, records)
 
