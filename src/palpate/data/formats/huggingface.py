@@ -16,7 +16,7 @@ from __future__ import annotations
 
 import hashlib
 import io
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -29,7 +29,7 @@ from palpate.data.images import Check, Checked, check_image
 from palpate.data.manifest import IMAGE_COLUMNS, PART_NAMES, SCHEMA
 from palpate.data.mapping import LINE, ColumnMaps, compile_maps, text_of
 from palpate.data.rows import manifest_rows, odd_groups, read_classes, records
-from palpate.data.scanning import Cells, Facts, Format, Into, Scan
+from palpate.data.scanning import Facts, Format, Into, Scan
 from palpate.data.suspicions import evenly, looks_of
 
 LOOKS_FOR = (
@@ -43,9 +43,9 @@ FACTS = Facts(
     group="the column video, if there is one",
 )
 BATCH = 64
+Batch = Mapping[str, list[Any]]
 #: Suffixes that differ from the name of Pillow's format.
 SUFFIXES = {"JPEG": ".jpg", "MPO": ".jpg", "TIFF": ".tif"}
-Batch = Mapping[str, list[Any]]
 
 
 def detect(source: Path) -> bool:
@@ -77,9 +77,27 @@ def scan(
         revision: of a hub data set: branch, tag or commit.
     """
     opened = open_source(source, config, revision)
+    maps = compile_maps(columns or {}, opened.names, list(SCHEMA))
+    if not {"vision", "tactile"} & set(maps.expressions):
+        got = f"no vision and no tactile among {', '.join(opened.names) or 'no columns'}"
+        must, example = f"{opened.name} must have a column for the images", {"vision": "COLUMN"}
+        raise PalpateError(must, got, "Map your columns", example={"columns": example})
+    names = dict(enumerate(opened.labels.get(maps.source("material") or "", ()))) or None
+    names = names if classes is None else read_classes(Path(classes))
     folder, created = (into.out / "images", into.created) if into else (None, list[Path]())
     store = _Store(folder, created, check)
-    result = _scan(opened, columns or {}, classes, store, progress)
+    result = Scan(folder or opened.folder or Path(), dict(opened.facts))
+    total = sum(len(data) for data in opened.splits.values() if hasattr(data, "__len__"))
+    for split, first, batch in _batches(opened):
+        _add(result, opened, maps, store, classes=names, split=split, first=first, batch=batch)
+        progress("reading rows", first + len(next(iter(batch.values()))), total)
+    parts = sorted(split for split in opened.splits if split in PART_NAMES)
+    if len(parts) > 1:
+        result.split_name, result.split_rule = "Orig", {"method": "official", "parts": parts}
+    worded = any("text" in row for _, row in result.rows)
+    column = f"column {maps.texts.get('text', 'text')}"
+    result.facts["text_source"] = column if worded else "none"
+    result.suspicious = odd_groups(Path(opened.name), result.rows)
     if check == "decode":
         usable = {path: store.checked[digest] for digest, path in store.paths.items()}
         result.looks = looks_of(evenly(row for _, row in result.rows), folder, usable)
@@ -130,39 +148,6 @@ class _Store:
             require(path.read_bytes() == data, None, must, f"another one at {path}", fix=fix)
 
 
-def _scan(
-    source: Source,
-    columns: Mapping[str, str],
-    classes: Path | None,
-    store: _Store,
-    progress: Progress,
-) -> Scan:
-    """Read all rows; ``store`` takes their images."""
-    maps = compile_maps(columns, source.names, list(SCHEMA))
-    if not {"vision", "tactile"} & set(maps.expressions):
-        got = f"no vision and no tactile among {', '.join(source.names) or 'no columns'}"
-        must, example = f"{source.name} must have a column for the images", {"vision": "COLUMN"}
-        raise PalpateError(must, got, "Map your columns", example={"columns": example})
-    names = dict(enumerate(source.labels.get(maps.source("material") or "", ()))) or None
-    names = names if classes is None else read_classes(Path(classes))
-    result = Scan(store.folder or source.folder or Path(), dict(source.facts))
-    total = sum(len(data) for data in source.splits.values() if hasattr(data, "__len__"))
-    for split, first, batch in _batches(source):
-        count = len(next(iter(batch.values())))
-        reader = _BatchReader(source, maps, split, first, batch, result, store)
-        for k, row in reader.rows(count, names):
-            row["split"] = PART_NAMES.get(split)
-            result.rows.append((reader.where(k), row))
-        progress("reading rows", first + count, total)
-    parts = sorted(split for split in source.splits if split in PART_NAMES)
-    if len(parts) > 1:
-        result.split_name, result.split_rule = "Orig", {"method": "official", "parts": parts}
-    worded = any("text" in row for _, row in result.rows)
-    result.facts["text_source"] = f"column {columns.get('text', 'text')}" if worded else "none"
-    result.suspicious = odd_groups(Path(source.name), result.rows)
-    return result
-
-
 def _batches(source: Source) -> Iterator[tuple[str, int, Batch]]:
     """(part, number of its first row, cells by column)."""
     for split, data in source.splits.items():
@@ -179,75 +164,68 @@ def _batches(source: Source) -> Iterator[tuple[str, int, Batch]]:
             raise PalpateError(must, got, "Fetch it again") from None
 
 
-@dataclass
-class _BatchReader:
-    """Rows of one batch, of which the first is row ``first`` of the part ``split``."""
+def _add(
+    result: Scan,
+    source: Source,
+    maps: ColumnMaps,
+    store: _Store,
+    *,
+    classes: Mapping[int, str] | None,
+    split: str,
+    first: int,
+    batch: Batch,
+) -> None:
+    """Add the usable rows of a batch from row ``first`` on; ``store`` takes their images."""
 
-    source: Source
-    maps: ColumnMaps
-    split: str
-    first: int
-    batch: Batch
-    result: Scan
-    store: _Store
+    def place(line: int) -> str:
+        return f"{source.name}/{split}:{line}".replace("/:", ":")
 
-    def rows(self, count: int, classes: Mapping[int, str] | None) -> Iterator[tuple[int, Cells]]:
-        """The usable rows by their number in the batch."""
-        sources = {target: self.maps.source(target) for target in IMAGE_COLUMNS}
-        stored = {t: c for t, c in sources.items() if c and c in self.source.images}
-        plain = self.maps.without(list(stored))
-        texts = [pl.Series(n, self._texts(n), dtype=pl.String) for n in plain.columns]
-        cells = plain.apply(pl.DataFrame({LINE: range(count)}).with_columns(texts))
-        usable, inconclusive = manifest_rows(cells, self.where, classes, self.result.problems)
-        self.result.inconclusive += inconclusive
-        for k, (_, row) in zip(usable[LINE], records(usable, self.where), strict=True):
-            if not {"video", "frame"} <= set(row):
-                row.setdefault("id", self._place(k, ""))
-            good = True
-            for target in (t for t in IMAGE_COLUMNS if t in self.maps.expressions):
-                column = stored.get(target)
-                cell = self.batch[column][k] if column else row.get(target)
-                path = self._stored(target, k, cell)
-                if path is None and target != "background":
-                    path = "missing-image", "no image"
-                if isinstance(path, tuple):
-                    self.result.problem(self.where(k), path[0], f"{target}: {path[1]}")
-                    good = False
-                row[target] = path
-            if good:
-                yield k, row
+    images = [target for target in IMAGE_COLUMNS if target in maps.expressions]
+    stored = {t: column for t in images if (column := maps.source(t)) in source.images}
+    plain, material = maps.without(list(stored)), maps.source("material")
+    texts = {
+        name: _texts(source, name, batch[name], keep=name == material) for name in plain.columns
+    }
+    lines = pl.int_range(first, first + len(next(iter(batch.values()))), eager=True).alias(LINE)
+    table = pl.DataFrame([lines, *(pl.Series(n, v, pl.String) for n, v in texts.items())])
+    rows, inconclusive = manifest_rows(plain.apply(table), place, classes, result.problems)
+    result.inconclusive += inconclusive
+    for line, (where, row) in zip(rows[LINE], records(rows, place), strict=True):
+        if not {"video", "frame"} <= set(row):
+            row.setdefault("id", Path(split, f"{line:08d}").as_posix())
+        good = True
+        for target in images:
+            column = stored.get(target)
+            cell = batch[column][line - first] if column else row.get(target)
+            path = _bytes(source, cell)
+            if isinstance(path, bytes):
+                default = Path(split or "all", target, f"{line:08d}")
+                path = store.put(path, default.as_posix())
+            if path is None and target != "background":
+                path = "missing-image", "no image"
+            if isinstance(path, tuple):
+                result.problem(where, path[0], f"{target}: {path[1]}")
+                good = False
+            row[target] = path
+        if good:
+            row["split"] = PART_NAMES.get(split)
+            result.rows.append((where, row))
 
-    def where(self, k: int) -> str:
-        """Data set, part and row."""
-        return f"{self.source.name}/{self.split}:{self.first + k}".replace("/:", ":")
 
-    def _place(self, k: int, folder: str) -> str:
-        return Path(self.split, folder, f"{self.first + k:08d}").as_posix()
+def _texts(source: Source, name: str, values: list[Any], *, keep: bool) -> list[str | None]:
+    """Cells as texts: an image is its file name, a class label its name.
 
-    def _texts(self, name: str) -> Sequence[str | None]:
-        """Cells as texts: an image is its file name, a class label its name.
-
-        Labels of the material that are no class (-1: unclear) stay numbers.
-        """
-        values = self.batch[name]
-        if name in self.source.images:
-            return [None if v is None else text_of(v["path"]) for v in values]
-        if name in self.source.labels:
-            names = dict(enumerate(self.source.labels[name]))
-            is_material = name == self.maps.source("material")
-            return [names.get(v, text_of(v) if is_material else None) for v in values]
-        if any(isinstance(v, (list, dict, bytes)) for v in values):
-            must = f"Columns of {self.source.name} must hold texts, numbers or images"
-            raise PalpateError(must, f"{name} with lists or objects", "Map another column")
-        return [text_of(v) for v in values]
-
-    def _stored(self, target: str, k: int, cell: Any) -> str | tuple[str, str] | None:
-        """Path of an image in the store; else what is wrong, or None where there is no image."""
-        data = _bytes(self.source, cell)
-        if not isinstance(data, bytes):
-            return data
-        default = self._place(k, target) if self.split else f"all/{self._place(k, target)}"
-        return self.store.put(data, default)
+    With ``keep`` labels that are no class (-1: unclear) stay numbers.
+    """
+    if name in source.images:
+        return [None if v is None else text_of(v["path"]) for v in values]
+    if name in source.labels:
+        names = dict(enumerate(source.labels[name]))
+        return [names.get(v, text_of(v) if keep else None) for v in values]
+    if any(isinstance(v, (list, dict, bytes)) for v in values):
+        must = f"Columns of {source.name} must hold texts, numbers or images"
+        raise PalpateError(must, f"{name} with lists or objects", "Map another column")
+    return [text_of(v) for v in values]
 
 
 def _bytes(source: Source, value: Any) -> bytes | tuple[str, str] | None:
