@@ -198,6 +198,7 @@ def test_images_with_time_stamps_are_paired_by_the_nearest(tmp_path, stamp, side
     write_images(tmp_path / "own", [*paths["rgb"], *paths["gelsight"]])
     result = import_dataset(tmp_path / "own", tmp_path / "out", skip_bad=True)
     assert "paired-by-time" in {p.kind for p in result.suspicious}
+    assert all("of its time; the nearest is" in p.text for p in result.skipped)
     near = {}
     for n, t in enumerate(times["gelsight"]):
         k = min(range(12), key=lambda k: abs(times["rgb"][k] - t))

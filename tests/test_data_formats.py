@@ -86,19 +86,33 @@ def test_a_table_beside_the_images_is_joined(tmp_path, form, place):
     assert "material of 4 of 4 samples" in said
 
 
-def test_a_table_by_file_names_alone(tmp_path):
-    write_images(tmp_path / "own", [f"{s}/{n}.png" for s in ("photo", "touch") for n in "abcd"])
-    (tmp_path / "own" / "labels.csv").write_text(
-        "image,label\na.jpg,Wood\nb.jpg,Rock\nx.jpg,Sand\n"
-    )
-    for suffix, count in ((".jpg", 0), ("", 2)):
-        text = (tmp_path / "own" / "labels.csv").read_text().replace(".jpg", suffix)
+@pytest.mark.parametrize("name", ["{}.jpg", "{}", "{}.PNG", ".\\photo\\{}.png"])
+def test_a_table_by_file_names_in_any_case_and_with_any_suffix(tmp_path, name):
+    write_images(tmp_path / "own", [f"{s}/{n}.png" for s in ("photo", "touch") for n in "aBcd"])
+    rows = [f"{name.format(n)},{label}" for n, label in (("A", "Wood"), ("b", "Rock"), ("x", "x"))]
+    (tmp_path / "own" / "labels.csv").write_text("\n".join(["image,label", *rows]))
+    result = import_dataset(tmp_path / "own", tmp_path / "out")
+    assert sorted(result.manifest.table["material"].drop_nulls()) == ["Rock", "Wood"]
+
+
+def test_a_table_by_the_names_of_folders(tmp_path):
+    """The object of OBJ0 is 0."""
+    names = [f"OBJ{o}/{s}/{k}.png" for o in range(3) for s in ("photo", "touch") for k in (1, 2)]
+    write_images(tmp_path / "own", names)
+    rows = [f"obj{o},M{o}" for o in range(3)]
+    (tmp_path / "own" / "labels.csv").write_text("\n".join(["name,material", *rows]))
+    table = import_dataset(tmp_path / "own", tmp_path / "out").manifest.table
+    assert (table["material"] == "M" + table["object"]).all()
+
+
+def test_a_table_that_names_nothing_is_reported(tmp_path):
+    """So is one whose names several images have."""
+    write_images(tmp_path / "own", ["touch/a/1.png", "touch/A/1.png", "touch/b/2.png"])
+    for text in ("a,b\n8,9\n", "file,material\na/1.png,Wood\n1,Wood\n"):
         (tmp_path / "own" / "labels.csv").write_text(text)
         result = import_dataset(tmp_path / "own", tmp_path / "out", overwrite=True)
-        assert result.manifest.table["material"].count() == count
-    (tmp_path / "own" / "labels.csv").write_text("a,b\n1,2\n")
-    result = import_dataset(tmp_path / "own", tmp_path / "out", overwrite=True)
-    assert kinds(result.suspicious) == ["unread-table"]
+        assert kinds(result.suspicious) == ["unread-table"]
+        assert result.manifest.table["material"].null_count() == 3
 
 
 def test_parts_beside_the_images_are_their_split(tmp_path):

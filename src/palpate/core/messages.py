@@ -34,7 +34,8 @@ class PalpateError(Exception):
         must: what has to hold. With ``argument`` a predicate of it that begins with "must"
             (``"must lie in (0, 1)"``), else a whole clause (``"The manifest must exist"``).
         got: what was given (``"1.5"``).
-        fix: what to do next, in words that name no option (``"Choose a smaller share"``).
+        fix: what to do next (``"Choose a smaller share"``); arguments in it are in backquotes, and
+            the command line shows their options.
         argument: name of the Python argument that is at fault; the command line shows its option.
         example: arguments that would work (``{"train": 0.8}``); each front end writes them its way.
         choices: arguments of several calls that would work, for the user to choose from.
@@ -78,7 +79,8 @@ class PalpateError(Exception):
             example: how an argument with a value is written.
         """
         must = f"{name(self.argument)} {self.must}" if self.argument else self.must
-        parts = [p for p in (must, f"Got {self.got}", self.fix) if p]
+        fix = re.sub(r"`(\w+)`", lambda argument: name(argument[1]), self.fix)
+        parts = [p for p in (must, f"Got {self.got}", fix) if p]
         pasted = [p.endswith("...") or _COMMAND.search(p) is not None for p in parts]
         words = [p if c else f"{p.rstrip('.')}." for p, c in zip(parts, pasted, strict=True)]
         examples = [example(k, v) for k, v in self.example.items()]

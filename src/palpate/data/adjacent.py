@@ -1,21 +1,24 @@
 """Tables in a folder of images, or next to it under its name: what they say of its images.
 
-A column names images by their paths below the folder, with or without the suffix, by the names of
-their files alone, or it has the values of a field (``object``, ``video`` ...). The column and the
-form that fit most rows are taken, if they fit half of them; a name that several images have names
-none. The other columns fill what the samples lack. A table that fits nothing is reported.
+A column names images by their paths below the folder, by the names of their files alone, or it has
+the values of a field (``object``, ``video`` ...) or the names of folders. Capitals, the kind of
+slash and the suffix of an image make no difference. The column and the form that fit most rows are
+taken, if they fit half of them; a name that several images have names none. The other columns fill
+what the samples lack. A table that fits nothing is reported.
 """
 
 from __future__ import annotations
 
+import posixpath
 from collections.abc import Sequence
 from contextlib import suppress
-from pathlib import Path, PurePosixPath
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import TYPE_CHECKING
 
 import polars as pl
 
 from palpate.core import PalpateError, Split, few
+from palpate.data.images import SUFFIXES
 from palpate.data.manifest import PART_NAMES
 from palpate.data.mapping import LINE
 from palpate.data.rows import relocated
@@ -73,25 +76,29 @@ def _join(
     result: Scan, rows: Sequence[tuple[str, Cells]], path: Path, table: Table, frame: pl.DataFrame
 ) -> None:
     keys = _keys(rows)
+    targets = {c: SYNONYMS.get(c.lower(), c.lower()) for c in frame.columns if c != LINE}
+    naming = {
+        column: frame[column].drop_nulls().unique().map_elements(_key, pl.String)
+        for column, target in targets.items()
+        if target in FIELDS or target not in FILLED
+    }
     fits = {
-        (column, form): sum(value in index for value in frame[column].drop_nulls().unique())
+        (column, form): sum(map(index.__contains__, names))
         for form, index in keys.items()
-        for column in frame.columns
-        if column != LINE
+        for column, names in naming.items()
     }
     best = max(fits, key=lambda pair: fits[pair], default=("", ""))
     column, form = best
-    if not frame.height or fits.get(best, 0) < SHARE * frame[column].drop_nulls().n_unique():
+    if not fits.get(best) or fits[best] < SHARE * len(naming[column]):
         got = f"not read, as no column of {few(table.names)} names the images of this folder"
         result.suspect(path, "unread-table", got)
         return
     result.suspicious += [*table.suspicious, *table.problems]
-    targets = {c: SYNONYMS.get(c.lower(), c.lower()) for c in frame.columns if c != column}
-    targets = {c: target for c, target in targets.items() if target in FILLED}
+    targets = {c: target for c, target in targets.items() if target in FILLED and c != column}
     filled: set[int] = set()
     parts: dict[str, str] = {}
     for record in frame.iter_rows(named=True):
-        for k in keys[form].get(record[column] or "", ()):
+        for k in keys[form].get(_key(record[column] or ""), ()):
             row = rows[k][1]
             filled.add(k)
             for name, target in targets.items():
@@ -111,23 +118,27 @@ def _keys(rows: Sequence[tuple[str, Cells]]) -> dict[str, dict[str, list[int]]]:
     """Form of a name -> name -> the rows that it names; names of several images are left out."""
     forms: dict[str, dict[str, list[int]]] = {}
 
-    def add(form: str, name: Any, k: int) -> None:
-        places = forms.setdefault(form, {}).setdefault(str(name), [])
+    def add(form: str, name: str, k: int) -> None:
+        places = forms.setdefault(form, {}).setdefault(name, [])
         if k not in places[-1:]:
             places.append(k)
 
     for k, (_, row) in enumerate(rows):
-        paths = [PurePosixPath(row[c]) for c in ("vision", "tactile") if row.get(c)]
-        for path in paths:
+        for path in (_key(row[side]) for side in ("vision", "tactile") if row.get(side)):
+            *folders, name = path.split("/")
             add("path", path, k)
-            add("path without suffix", path.with_suffix(""), k)
-            add("file name", path.name, k)
-            add("file name without suffix", path.stem, k)
-        add("id", row.get("id"), k)
-        for name in FIELDS:
+            add("file name", name, k)
+            for depth, folder in enumerate(folders):
+                add(f"folder {depth}", folder, k)
+        for name in ("id", *FIELDS):
             if row.get(name) is not None:
-                add(name, row[name], k)
-    for form, index in forms.items():
-        if form not in FIELDS:
-            forms[form] = {name: places for name, places in index.items() if len(places) == 1}
+                add(name, _key(row[name]), k)
+    for form in forms.keys() & {"path", "file name", "id"}:
+        forms[form] = {name: places for name, places in forms[form].items() if len(places) == 1}
     return forms
+
+
+def _key(name: str) -> str:
+    """A name or path as another person may have written it."""
+    text = name.strip().replace("\\", "/").casefold().removeprefix("./")
+    return posixpath.splitext(text)[0] if text.endswith(SUFFIXES) else text

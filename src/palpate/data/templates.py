@@ -202,21 +202,23 @@ def join(
         for key in partners.keys() - alone.keys() if side not in optional else ():
             text = f"no {first} image {_named(keys, key)}"
             problems += [Problem(path, "unpaired", text) for _, path in partners[key]]
-        near: dict[str, list[tuple[Fields, str]]] = {}
+        near: dict[str, tuple[tuple[Fields, str], str]] = {}
         for key in alone if TIME in shared else ():
             near |= _nearest(alone[key], partners.get(key, []))
         joined: list[Fields] = []
         for row in rows:
             key = tuple(map(row.get, keys))
-            files = near.get(row[first], []) if TIME in shared else partners.get(key, [])
+            files, far = partners.get(key, []), ""
+            if row[first] in near:
+                nearest, far = near[row[first]]
+                files = [] if far else [nearest]
             if len(files) > 1 and len(alone[key]) > 1:
                 text = f"{len(alone[key])} {first} and {len(files)} {side} images"
                 text += f" {_named(keys, key)}; a further field must distinguish them"
                 problems.append(Problem(row[first], "ambiguous", text))
             elif not files and side not in optional:
-                problems.append(
-                    Problem(row[first], "unpaired", f"no {side} image {_named(keys, key)}")
-                )
+                text = f"no {side} image {_named(keys, key)}{far}"
+                problems.append(Problem(row[first], "unpaired", text))
             else:
                 joined += [fields | row | {side: path} for fields, path in files] or [row]
         rows = joined
@@ -225,20 +227,21 @@ def join(
 
 def _nearest(
     rows: Sequence[tuple[Fields, str]], files: Sequence[tuple[Fields, str]]
-) -> dict[str, list[tuple[Fields, str]]]:
-    """Path of a row -> the file nearest in time, if there is one within half a step."""
+) -> dict[str, tuple[tuple[Fields, str], str]]:
+    """Path of a row -> the file nearest in time, and in words why it is too far, if it is."""
     mine, theirs = ([float(fields[TIME]) for fields, _ in some] for some in (rows, files))
     steps = [median(b - a for a, b in pairwise(sorted(t))) for t in (mine, theirs) if len(t) > 1]
+    most = 0.505 * max(steps, default=0)
     order = sorted(range(len(files)), key=theirs.__getitem__)
     times = [theirs[k] for k in order]
-    found: dict[str, list[tuple[Fields, str]]] = {}
-    for (_, path), time in zip(rows, mine, strict=True):
+    near: dict[str, tuple[tuple[Fields, str], str]] = {}
+    for (_, path), time in zip(rows, mine, strict=True) if files else ():
         k = bisect_left(times, time)
-        ends = [j for j in (k - 1, k) if 0 <= j < len(times)]
-        best = min(ends, key=lambda j: abs(times[j] - time), default=None)
-        if best is not None and abs(times[best] - time) <= 0.505 * max(steps, default=0):
-            found[path] = [files[order[best]]]
-    return found
+        best = min(range(max(0, k - 1), min(k + 1, len(times))), key=lambda j: abs(times[j] - time))
+        away = abs(times[best] - time)
+        far = f" within {most:.3g} of its time; the nearest is {away:.3g} away" * (away > most)
+        near[path] = files[order[best]], far
+    return near
 
 
 def _by_key(

@@ -84,7 +84,8 @@ def require_options(name: str, form: Format, options: dict[str, Any]) -> dict[st
     """
     values = {key: value for key, value in options.items() if value is not None}
     if unknown := sorted(set(values) - {*form.options, "into"}):
-        takes = ", ".join(k for k in form.options if k not in ("skip_bad", "check", "progress"))
+        common = ("skip_bad", "check", "progress")
+        takes = ", ".join(f"`{name}`" for name in form.options if name not in common)
         must, got = f"must be left out for the format {name}", repr(values[unknown[0]])
         fix = f"This format takes {takes or 'no options'}"
         raise PalpateError(must, got, fix, argument=unknown[0])
