@@ -73,7 +73,7 @@ def test_options_of_the_format_pass_through(capsys, tag, tmp_path):
         (["--map", "video=a", "--map", "video=b"], "each column once"),
         (["--map", "video="], "as COLUMN=EXPRESSION"),
         (["--format", "zip"], "one of auto, touch-and-go"),
-        (["--as", "vision"], "takes labels, size"),
+        (["--as", "vision"], "takes --labels, --size"),
     ],
 )
 @pytest.mark.parametrize("verb", ["import", "validate"])

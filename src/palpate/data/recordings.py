@@ -102,7 +102,6 @@ def rule_notes(rule: Mapping[str, Any]) -> list[Note]:
     elif verdict is None and group is not None:
         count, total = rule["shared"][group]
         params = {"name": name, "group": group, "count": count, "of": total}
-        params = {"name": name, "group": group, "count": count, "of": total}
         notes.append(Note("split-shares", params))
     return notes
 
