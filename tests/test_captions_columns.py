@@ -6,6 +6,7 @@ from dataclasses import replace
 import polars as pl
 import pytest
 
+from forge.errors import fails
 from palpate.captions import caption
 from palpate.cli import main
 from palpate.core import PalpateError, ProblemsError, Split
@@ -47,16 +48,14 @@ def test_templates_that_name_no_filled_column(data, tmp_path, template, got):
 
 
 def test_a_template_has_no_dry_run(data, tmp_path):
-    with pytest.raises(PalpateError, match="needs no model"):
-        caption(data, tmp_path / "c", template="", dry_run=True)
+    fails("needs no model", caption, data, tmp_path / "c", template="", dry_run=True)
     assert not (tmp_path / "c").exists()
 
 
 def test_captions_of_a_model_are_not_replaced(data, tmp_path):
     (tmp_path / "c").mkdir()
     (tmp_path / "c" / "replies.jsonl").write_text("{}\n")
-    with pytest.raises(PalpateError, match="no replies of a model"):
-        caption(data, tmp_path / "c", template="")
+    fails("no replies of a model", caption, data, tmp_path / "c", template="")
     assert [p.name for p in (tmp_path / "c").iterdir()] == ["replies.jsonl"]
 
 

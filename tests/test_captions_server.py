@@ -12,6 +12,7 @@ from pathlib import Path
 import polars as pl
 import pytest
 
+from forge.errors import fails
 from forge.servers import FakeServer
 from palpate.captions import StoppedError, caption
 from palpate.captions.server import Server
@@ -80,8 +81,7 @@ def test_units(data, tmp_path, per, count):
         if count:
             describe(data, tmp_path / "c", server, per=per)
         else:
-            with pytest.raises(PalpateError, match="none is known"):
-                describe(data, tmp_path / "c", server, per=per)
+            fails("none is known", describe, data, tmp_path / "c", server, per=per)
     assert server.count == count
 
 
@@ -179,8 +179,7 @@ def test_a_torn_last_line_is_dropped_and_another_line_is_an_error(data, tmp_path
         assert table_of(tmp_path / "c") == whole
         assert all(json.loads(line) for line in log.read_text().splitlines())
         log.write_text('{"format": "mine"}\n')
-        with pytest.raises(PalpateError, match="another line 1"):
-            describe(data, tmp_path / "c", server)
+        fails("another line 1", describe, data, tmp_path / "c", server)
 
 
 RUN = "import sys; from palpate.cli import main; sys.exit(main(sys.argv[1:]))"
@@ -229,8 +228,7 @@ def test_two_runs_on_one_output(data, tmp_path):
         first = start(*command, "--concurrency", "1")
         while not server.count:
             time.sleep(0.01)
-        with pytest.raises(PalpateError, match="another run writes"):
-            describe(data, tmp_path / "c", server)
+        fails("another run writes", describe, data, tmp_path / "c", server)
         first.kill()
         first.communicate()
 
@@ -271,8 +269,7 @@ def test_photos_that_are_rejected_are_no_matter_of_the_server_in_any_order(data,
             again = describe(data, tmp_path / "c", server, per="frame")
             assert (len(again.problems), again.record["counts"]["texts"]) == (15, 33)
         server.count = 0
-        with pytest.raises(PalpateError, match="must take the requests"):
-            describe(data, tmp_path / "d", server, per="frame")
+        fails("must take the requests", describe, data, tmp_path / "d", server, per="frame")
     assert server.count == 16
 
 
@@ -470,8 +467,7 @@ def test_nothing_is_sent_after_a_call_that_failed(data, tmp_path):
     """Threads that wait to try again send nothing more."""
     faults = {1: (401, {"error": {"message": "no"}})}
     with FakeServer(lambda n: faults.get(n, "503")) as server:
-        with pytest.raises(PalpateError, match="accepts the key"):
-            describe(data, tmp_path / "c", server, per="frame", concurrency=4)
+        fails("accepts the key", describe, data, tmp_path / "c", server, per="frame", concurrency=4)
         sent = server.count
         time.sleep(2.5)  # they would try again after one second
         assert server.count <= sent + 3, "those in flight"

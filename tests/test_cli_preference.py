@@ -85,19 +85,12 @@ def test_two_raters_are_told_from_people_before_the_study(capsys, rated, tmp_pat
     assert "For these 2 raters only" in err
 
 
-@pytest.mark.parametrize(
-    ("args", "words"),
-    [
-        (("--items", "1"), "--items must lie in 2 .. 1000"),
-        (("--until", "soon"), "--until must be a date"),
+def test_mistakes_of_make_are_one_line(capsys, rated, tmp_path):
+    for args, words in (
         (("--title", "Is GVST good?"), "--title must not name a method"),
-        (("--question", " "), "--question must not be blank"),
-        (("--names", "a", "b", "image"), "--names must hold no word of the question"),
         (("--names", "a"), "--names must name every generator"),
-    ],
-)
-def test_mistakes_of_make_are_one_line(capsys, rated, tmp_path, args, words):
-    commands.mistake(capsys, words, "preference", *make(rated, tmp_path / "s", *args))
+    ):
+        commands.mistake(capsys, words, "preference", *make(rated, tmp_path / "s", *args))
     assert not (tmp_path / "s").exists()
 
 

@@ -8,6 +8,7 @@ import shutil
 import numpy as np
 import pytest
 
+from forge.errors import fails
 from palpate.core import (
     FeatureSet,
     MissingExtraError,
@@ -113,8 +114,7 @@ def test_records_that_cannot_be_read(tmp_path, text, words):
     path = tmp_path / "r.json"
     if text is not None:
         path.write_text(text)
-    with pytest.raises(PalpateError, match=words):
-        read_record(path, "card", form=("a/2", "a/1"), keys=["k"])
+    fails(words, read_record, path, "card", form=("a/2", "a/1"), keys=["k"])
     words = r"sizes in .* must be as palpate writes it"
     with pytest.raises(PalpateError, match=words), reading_entry(path, "sizes"):
         int("x")
@@ -136,8 +136,7 @@ def test_records_that_cannot_be_read(tmp_path, text, words):
 def test_a_file_of_another_kind_is_said_to_be_one(tmp_path, given, wanted, words):
     path = tmp_path / "r.json"
     path.write_text(json.dumps({"format": given}))
-    with pytest.raises(PalpateError, match=words):
-        read_record(path, "file", form=wanted)
+    fails(words, read_record, path, "file", form=wanted)
 
 
 def test_a_folder_of_another_kind_is_said_to_be_one(tmp_path):
@@ -178,8 +177,7 @@ def test_a_split_comes_back_from_its_file_unless_edited(tmp_path):
         "one part only": lambda: Split.from_ids(train=["a"], test=["a"]),
         "train, val, test": lambda: Split({"a": "holdout"}),
     }.items():
-        with pytest.raises(PalpateError, match=words):
-            attempt()
+        fails(words, attempt)
 
 
 def test_a_score_is_a_number_that_prints_how_it_was_made():
@@ -209,8 +207,7 @@ def test_scores_of_different_settings_share_no_column(change):
     same = Score("TMMD", "theirs", 2.0, bandwidth=10.0, encoder="e1")
     assert [len(c) for c in columns([a, same, Score("SSIM", "ours", 0.5)])] == [2, 1]
     fields = {"bandwidth": 10.0, "encoder": "e1"} | change
-    with pytest.raises(PalpateError, match=next(iter(change))):
-        columns([a, Score("TMMD", "theirs", 2.0, **fields)])
+    fails(next(iter(change)), columns, [a, Score("TMMD", "theirs", 2.0, **fields)])
 
 
 def test_references_must_agree_where_they_are_known():
@@ -218,8 +215,7 @@ def test_references_must_agree_where_they_are_known():
     for fine in ([], [unknown], [unknown, one], [one, unknown, one], [unknown, two, unknown, two]):
         require_comparable(fine)
     for order in itertools.permutations([unknown, unknown, one, two]):
-        with pytest.raises(PalpateError, match=r"agree in reference. Got '(r1|r2)' for 'g' and"):
-            require_comparable(order)
+        fails(r"agree in reference. Got '(r1|r2)' for 'g' and", require_comparable, order)
     with pytest.raises(PalpateError, match="encoder"):  # elsewhere unknown is a value
         require_comparable([Score("TMMD", "g", 1.0, encoder="e"), unknown])
 
@@ -270,8 +266,7 @@ def test_features_come_back_from_their_file_and_from_tensors(tmp_path):
     again = FeatureSet.load(tmp_path / "f.npz").take(["c", "a"])
     assert (again.labels, again.groups, again.encoder) == (["g", "w"], ["u", "v"], "e")
     assert np.array_equal(again.features, x[[2, 0]])
-    with pytest.raises(PalpateError, match="missing, first 'z'"):
-        features.take(["z"])
+    fails("missing, first 'z'", features.take, ["z"])
 
 
 @pytest.mark.parametrize(
@@ -286,8 +281,7 @@ def test_features_come_back_from_their_file_and_from_tensors(tmp_path):
     ],
 )
 def test_features_that_cannot_be(features, words):
-    with pytest.raises(PalpateError, match=words):
-        FeatureSet(["a"], features)
+    fails(words, FeatureSet, ["a"], features)
     with pytest.raises(PalpateError, match="`labels` must have one entry per row"):
         FeatureSet(["a"], np.ones((1, 2)), labels=["x", "y"])
 

@@ -33,6 +33,7 @@ PAGES = [
 ]
 #: What makes a command quick: presets for tests, few replicates.
 QUICK = {
+    "audit": ["--no-images"],
     "train encoder": ["--preset", "tiny", "--epochs", "1"],
     "train generator": ["--preset", "tiny", "--steps", "2"],
     "generate": ["--steps", "2"],

@@ -9,10 +9,10 @@ import pytest
 from PIL import Image
 from safetensors.numpy import save_file
 
+from forge.errors import fails
 from forge.models import make_encoders
 from forge.worlds import by_video
 from palpate import audit, probe, score
-from palpate.core import PalpateError
 from palpate.data.manifest import Manifest
 from palpate.encoders import Encoder, EncoderSet, train_encoder
 from palpate.encoders.contrastive import train_tactile
@@ -77,8 +77,7 @@ def test_seen_test_images_are_refused_in_probe_and_score_unless_allowed(
         }
         for name, run in runs.items():
             if refused:
-                with pytest.raises(PalpateError, match=f"{refused} of {n} that it was trained on"):
-                    run()
+                fails(f"{refused} of {n} that it was trained on", run)
             results = run(allow_seen=bool(refused))
             notes = [[x for x in s.notes if x.code == "seen-images"] for s in results if s.encoder]
             assert notes, name
@@ -119,8 +118,7 @@ def test_a_declared_data_set_is_refused(encoders, small_manifest):
     for dataset, refused in (("Touch and Go", 1), ("HCT + YCB-Slide", 1), ("VisGel", 0), ("", 0)):
         manifest = Manifest(small_manifest.table, small_manifest.root, {"dataset": dataset})
         if refused:
-            with pytest.raises(PalpateError, match="with which its authors trained it"):
-                guard(public, "tactile", manifest)
+            fails("with which its authors trained it", guard, public, "tactile", manifest)
         notes = guard(public, "tactile", manifest, allow_seen=True)
         codes = [n.code for n in notes]
         rest = ["encoder-license"] + ["pretraining-sets"] * (not refused)
@@ -172,8 +170,7 @@ def test_a_lost_record_of_seen_images_is_an_error(trained, tmp_path, damage):
             save_file({"digests": trained[0].seen["tactile"][1:]}, file)
         case _:
             file.write_text("{}")
-    with pytest.raises(PalpateError, match="must hold the digests of the 24 images"):
-        EncoderSet.load(tmp_path / "e")
+    fails("must hold the digests of the 24 images", EncoderSet.load, tmp_path / "e")
 
 
 def test_digests():

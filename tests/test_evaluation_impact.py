@@ -14,7 +14,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from palpate.core import FeatureSet, PalpateError, ProblemsError, Split
+from forge.errors import fails
+from palpate.core import FeatureSet, ProblemsError, Split
 from palpate.core.records import from_plain
 from palpate.data.importing import import_dataset
 from palpate.data.manifest import Manifest
@@ -292,8 +293,7 @@ FEW = FeatureSet(GOOD.ids[:20], np.zeros((20, 2), np.float32))
 def test_bad_input_is_refused_in_words(manifest, split, options, words) -> None:
     features = {"features": {"v": np.eye(len(manifest))}}
     parts = by_frame(manifest) if split is None else Split(split)
-    with pytest.raises(PalpateError, match=words):
-        impact(manifest, parts, **(features | options))
+    fails(words, impact, manifest, parts, **features | options)
 
 
 def test_missing_and_broken_pictures_are_named(small_manifest: Manifest) -> None:
@@ -306,8 +306,7 @@ def test_missing_and_broken_pictures_are_named(small_manifest: Manifest) -> None
     rows = small_manifest.table.to_dicts()
     rows[2]["vision"] = None
     words = r"Every sample must have a vision image here\. Got 1 without"
-    with pytest.raises(PalpateError, match=words):
-        impact(Manifest.from_rows(rows, small_manifest.root), split)
+    fails(words, impact, Manifest.from_rows(rows, small_manifest.root), split)
 
 
 def test_features_without_any_spread_give_chance() -> None:
@@ -343,8 +342,7 @@ def test_the_five_real_clips_can_be_compared_by_contact_only(
     clips = real_data / "touch_and_go" / "clips"
     manifest = import_dataset(clips, tmp_path / "out", size=64, format="touch-and-go").manifest
     split = by_frame(manifest, every=5)
-    with pytest.raises(PalpateError, match=r"Got 0 of 5 .5 one video.*group='contact'"):
-        impact(manifest, split)
+    fails(r"Got 0 of 5 .5 one video.*group='contact'", impact, manifest, split)
     found = impact(manifest, split, group="contact", cache=tmp_path / "cache")
     assert len(found.rows) == 6
     assert len(found.settings["materials"]) == 5

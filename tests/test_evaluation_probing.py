@@ -6,9 +6,10 @@ import numpy as np
 import polars as pl
 import pytest
 
+from forge.errors import fails
 from palpate import probe
 from palpate.cli import main
-from palpate.core import PalpateError, Split
+from palpate.core import Split
 from palpate.data.manifest import SCHEMA
 from palpate.report.results import Results
 
@@ -226,10 +227,8 @@ def test_what_a_split_shares_is_said(manifest, split, encoders):
     ],
 )
 def test_what_cannot_be_probed_is_refused(manifest, split, encoders, options, match):
-    with pytest.raises(PalpateError, match=match):
-        probe(manifest, split, **{"encoder": encoders, **options})
+    fails(match, probe, manifest, split, **{"encoder": encoders, **options})
 
 
 def test_several_splits_and_several_encoders_at_once_are_refused(manifest, split, encoders):
-    with pytest.raises(PalpateError, match="one where several splits"):
-        probe(manifest, [split, split], encoder=[encoders, encoders])
+    fails("one where several splits", probe, manifest, [split, split], encoder=[encoders, encoders])

@@ -10,6 +10,7 @@ import pytest
 from PIL import Image
 from scipy import stats
 
+from forge.errors import fails
 from forge.pictures import paint
 from forge.scores import DIM, FRAMES, GROUPS, IDS, by_key, codes, feature_sets, unit
 from palpate.core import FeatureSet, PalpateError, Score, Split
@@ -259,8 +260,7 @@ PICTURES = np.random.default_rng(0).integers(0, 256, (12, 32, 32, 3), dtype=np.u
 )
 def test_arguments_that_contradict_each_other(generated, options, words):
     reference = PICTURES if isinstance(generated, np.ndarray) else SETS["real"]
-    with pytest.raises(PalpateError, match=words):
-        score(generated, reference, **options)
+    fails(words, score, generated, reference, **options)
 
 
 def test_nan_is_named_by_generator_and_id(tmp_path):
@@ -280,8 +280,7 @@ def test_scores_of_two_references_do_not_share_a_column():
     for key, s in first.items():
         if key[0].startswith(("TMMD", "KID")):
             assert s.reference == SETS["real"].digest
-            with pytest.raises(PalpateError, match="must agree in reference"):
-                require_comparable([s, second[key]])
+            fails("must agree in reference", require_comparable, [s, second[key]])
         else:
             require_comparable([s, second[key]])
 
@@ -346,8 +345,7 @@ def test_unpaired_images_are_an_error_and_disjoint_ones_a_note(tmp_path):
         paint(tmp_path / name, [*ids], seed)
     real = tmp_path / "real"
     words = r"ids of some and .*1 not in some: '3'; 1 not in reference: '4'"
-    with pytest.raises(PalpateError, match=words):
-        score(tmp_path / "some", real, companions=["ssim"])
+    fails(words, score, tmp_path / "some", real, companions=["ssim"])
     options = {"encoder": "palpate/mini", "presets": ["paper"], "permutations": 0}
     results = score(tmp_path / "other", real, **options)
     assert "no-pairs" in codes(results)
@@ -360,16 +358,13 @@ def test_images_of_several_sizes(tmp_path):
     paint(tmp_path / "mixed", ["1"], 0, side=32)
     paint(tmp_path / "mixed", ["2"], 0, side=16)
     real, psnr = tmp_path / "real", {"companions": ["psnr"]}
-    with pytest.raises(PalpateError, match="small 16, same 32"):
-        score([tmp_path / "small", tmp_path / "same"], real, **psnr)
-    with pytest.raises(PalpateError, match=r"1\.png of 32 x 32 and 2\.png of 16 x 16"):
-        score(tmp_path / "mixed", real, **psnr)
+    fails("small 16, same 32", score, [tmp_path / "small", tmp_path / "same"], real, **psnr)
+    fails(r"1\.png of 32 x 32 and 2\.png of 16 x 16", score, tmp_path / "mixed", real, **psnr)
     [_, resized] = score(tmp_path / "small", real, **psnr).notes
     assert (resized.code, resized.params) == ("resized", {"size": 16, "side": 32})
     assert codes(score(tmp_path / "same", real, **psnr)) == ["groups-unknown"]
     (tmp_path / "same" / "2.png").write_bytes(b"\x89PNG broken")
-    with pytest.raises(PalpateError, match=r"2\.png"):
-        score(tmp_path / "same", real, **psnr)
+    fails(r"2\.png", score, tmp_path / "same", real, **psnr)
 
 
 def test_the_digest_of_images_is_that_of_a_copy_and_not_that_of_others(tmp_path):
@@ -491,10 +486,8 @@ def test_one_background_stands_for_all_images_of_a_folder(tmp_path, small_manife
         got = results[label_of(s), "g"]
         assert got.value == pytest.approx(s.value)
         assert got.settings["background"] == s.settings["background"]
-    with pytest.raises(PalpateError, match=r"background='gel\.png'"):
-        score(tmp_path / "g", real, **contact)
-    with pytest.raises(PalpateError, match="`background` must go with images"):
-        score(SETS["far"], SETS["real"], background=gel)
+    fails(r"background='gel\.png'", score, tmp_path / "g", real, **contact)
+    fails("`background` must go with images", score, SETS["far"], SETS["real"], background=gel)
 
 
 def test_clusters_stand_in_for_materials_and_say_so(tmp_path, small_manifest, mini):
@@ -516,8 +509,7 @@ def test_clusters_stand_in_for_materials_and_say_so(tmp_path, small_manifest, mi
         ("cluster:40", bare["far"], "four samples a cluster"),
         ("cluster:3", bare["far"].features, "share no ids"),
     ):
-        with pytest.raises(PalpateError, match=words):
-            score(made, bare["real"], labels=labels, **FAST)
+        fails(words, score, made, bare["real"], labels=labels, **FAST)
 
 
 def test_tactile_images_without_photos_are_scored(tmp_path, small_manifest, mini):

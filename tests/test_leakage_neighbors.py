@@ -29,23 +29,17 @@ def test_the_nearest_rows_are_those_of_brute_force(k, sizes):
     np.testing.assert_array_equal(nearest(x, y, k), expected)
 
 
-def test_related_rows_are_no_neighbors():
-    rng = np.random.default_rng(3)
+@pytest.mark.parametrize("most", [1, 100])
+@pytest.mark.parametrize("videos", [4, 9])
+def test_related_rows_are_no_neighbors(monkeypatch, videos, most):
+    """Few of them or many."""
+    monkeypatch.setattr(neighbors, "MOST", most)
+    rng = np.random.default_rng(videos)
     x, y = unit(rng, 60), unit(rng, 80)
-    of_x, of_y = rng.integers(0, 4, 60), rng.integers(0, 4, 80)
-    index = nearest(x, y, 3, apart=Apart(of_x, of_y))
-    np.testing.assert_array_equal(index, brute(x, y, 3, of_x[:, None] == of_y))
+    of_x, of_y = rng.integers(0, videos, 60), rng.integers(0, videos, 80)
+    index = nearest(x, y, 4, apart=Apart(of_x, of_y))
+    np.testing.assert_array_equal(index, brute(x, y, 4, of_x[:, None] == of_y))
     assert (nearest(x, y, 1, apart=Apart(np.zeros(60, int), np.zeros(80, int))) == -1).all()
     index = nearest(x, x, 3, apart=Apart(np.arange(60), np.arange(60), 5))
     away = np.abs(np.arange(60)[:, None] - np.arange(60))
     np.testing.assert_array_equal(index, brute(x, x, 3, away <= 5))
-
-
-@pytest.mark.parametrize("most", [1, 100])
-def test_few_and_many_related_rows_give_the_same_neighbors(monkeypatch, most):
-    rng = np.random.default_rng(4)
-    x, y = unit(rng, 50), unit(rng, 90)
-    of_x, of_y = rng.integers(0, 9, 50), rng.integers(0, 9, 90)
-    monkeypatch.setattr(neighbors, "MOST", most)
-    index = nearest(x, y, 4, apart=Apart(of_x, of_y))
-    np.testing.assert_array_equal(index, brute(x, y, 4, of_x[:, None] == of_y))

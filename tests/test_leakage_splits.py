@@ -13,6 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from forge.commands import call, mistake
+from forge.errors import fails
 from forge.scores import codes
 from palpate.core import PalpateError, Split
 from palpate.data.listing import read_lists
@@ -140,8 +141,7 @@ def test_no_group_is_in_two_parts_and_the_same_seed_gives_the_same_split(rows, s
     )
     sizes = m.table["video"].value_counts()["count"]
     if len(sizes) < 2 or 1 - sizes.max() / len(m) < 0.05:
-        with pytest.raises(PalpateError, match=r"smaller parts|at least as many groups"):
-            split(m, by="video", seed=seed)
+        fails(r"smaller parts|at least as many groups", split, m, by="video", seed=seed)
         return
     made = split(m, by="video", seed=seed)
     assert audit(m, split=made).groups_shared == 0
@@ -331,11 +331,9 @@ def test_what_cannot_be_split_says_why():
         ({"noleak": "tarf"}, "`noleak` must be touch-and-go or hct"),
         ({"noleak": "touch-and-go", "seed": 99}, "`seed` must be one of 0, 1, 2, 3, 4"),
     ):
-        with pytest.raises(PalpateError, match=words):
-            split(m, **options)
+        fails(words, split, m, **options)
     big = filled({"huge": {"Wood": 990}, "b": {"Wood": 5}, "c": {"Wood": 5}})
-    with pytest.raises(PalpateError, match=r"'huge' with 99\.0% of all samples.*1\.00% at best"):
-        split(big, by="video")
+    fails(r"'huge' with 99\.0% of all samples.*1\.00% at best", split, big, by="video")
     split(big, by="video", train=0.97)
 
 
@@ -366,8 +364,7 @@ def test_the_record_is_whole_small_and_leak_free(published):
 def test_a_changed_record_and_unknown_videos_are_errors():
     record = load_record()
     for change in ({"frames": 1}, {"sha256": "0" * 64}):
-        with pytest.raises(PalpateError, match="match its checksum"):
-            verify_record({**record, **change})
+        fails("match its checksum", verify_record, {**record, **change})
     videos = split(None, noleak="touch-and-go")
     assert videos.digest == record["splits"]["80/20"]["0"]["digest"]
     known = sorted(videos.parts)[:3]

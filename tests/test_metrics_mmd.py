@@ -1,5 +1,6 @@
 """Squared MMD: both back ends, every kernel and input against double loops over pairs."""
 
+import functools
 import itertools
 import math
 
@@ -8,7 +9,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from palpate.core import FeatureSet, Note, PalpateError, PalpateWarning
+from forge.errors import fails
+from palpate.core import FeatureSet, Note, PalpateWarning
 from palpate.metrics import Gaussian, Polynomial, distance, i_tmmd, kernels, tmmd
 from palpate.metrics.kernels import (
     Kernel,
@@ -114,6 +116,14 @@ KERNELS = {
 }
 
 
+@functools.cache
+def slow_sums(name, seed, n, units):
+    """:func:`loop_sums` of a layout, of all and without each unit."""
+    x, (segment, unit), k = unit_rows(seed, n, 4), layout(seed, n, units=units), KERNELS[name][1]
+    parts = [unit == unit, *(unit != u for u in np.unique(unit))]
+    return [loop_sums(x[part], segment[part], unit[part], k) for part in parts]
+
+
 @pytest.mark.parametrize("library", ["numpy", "torch"])
 @pytest.mark.parametrize("name", KERNELS)
 @pytest.mark.parametrize("most_items", [0, 2048])
@@ -125,14 +135,13 @@ def test_sums_by_segment_and_unit_equal_the_double_loop(name, library, most_item
         x, (segment, unit) = unit_rows(seed, n, 4), layout(seed, n, units=units)
         options = {"segments": 3, "kernel": kernel, "block": block}
         swept = blocked_sums(xp.asarray(x), segment, unit, **options)
-        sums, same = loop_sums(x, segment, unit, k)
+        (sums, same), *left_out = slow_sums(name, seed, n, units)
         np.testing.assert_allclose(swept.totals.sums, sums, atol=1e-10)
         np.testing.assert_allclose(swept.totals.same, same, atol=1e-10)
         diagonal = [sum(k(x[i], x[i]) for i in np.flatnonzero(segment == s)) for s in range(3)]
         np.testing.assert_allclose(swept.totals.diagonal, diagonal, atol=1e-10)
-        for u, without in zip(swept.units, swept.leave_one_out(), strict=True):
-            left = unit != u
-            sums, same = loop_sums(x[left], segment[left], unit[left], k)
+        assert (swept.units == np.unique(unit)).all()
+        for (sums, same), without in zip(left_out, swept.leave_one_out(), strict=True):
             np.testing.assert_allclose(without.sums, sums, atol=1e-10)
             np.testing.assert_allclose(without.same, same, atol=1e-10)
         assert (swept.block is None) == (most_items == 0)
@@ -208,7 +217,7 @@ def two_ends(rows, side, spread=0.1, d=64):
 
 
 @pytest.mark.parametrize("library", ["numpy", "torch"])
-@pytest.mark.parametrize("sigma", [1.0, 2.5, 6.9, 10.0, 25.0, (8.0, 10.0, 20.0)])
+@pytest.mark.parametrize("sigma", [1.0, 6.9, 10.0, (8.0, 10.0, 20.0)])
 @pytest.mark.parametrize("case", ["antipodal", "orthogonal", "copies", "near copies", "one source"])
 def test_float32_keeps_1e_minus_4_at_scale_1000(library, sigma, case):
     xp = pytest.importorskip(library)
@@ -315,11 +324,9 @@ def test_a_bound_that_overflows_is_no_bound(small_moments, sigma, scale):
     exact = distance(x[::2], x[1::2], backend="blocked", **options).value
     got = distance(x[::2], x[1::2], **options)
     assert (got.details["backend"], got.value) == ("blocked", exact)
-    with pytest.raises(PalpateError, match="wide against the features"):
-        distance(x[::2], x[1::2], backend="moments", **options)
+    fails("wide against the features", distance, x[::2], x[1::2], backend="moments", **options)
     groups = [f"v{k % 20}" for k in range(400)]
-    with pytest.raises(PalpateError, match="wide against the features"):
-        i_tmmd(x, groups=groups, backend="moments", **options)
+    fails("wide against the features", i_tmmd, x, groups=groups, backend="moments", **options)
 
 
 def test_arrays_on_disk_are_streamed(tmp_path, monkeypatch, small_moments):

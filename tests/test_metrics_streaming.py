@@ -8,7 +8,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from palpate.core import Note, PalpateError, PalpateWarning
+from forge.errors import fails
+from palpate.core import Note, PalpateWarning
 from palpate.metrics import tmmd
 from palpate.metrics.streaming import TMMD, Batch
 from test_metrics_tactile import change, world
@@ -100,8 +101,7 @@ def test_reset_forgets_and_may_keep_real_samples(keeps):
     g, r = sets()
     metric = both(TMMD(reset_real_features=not keeps), world(3, videos=6), r)
     metric.reset()
-    with pytest.raises(PalpateError, match=f"0 generated and {len(r.ids) if keeps else 0} real"):
-        metric.compute()
+    fails(f"0 generated and {len(r.ids) if keeps else 0} real", metric.compute)
     feed(metric, g)
     if not keeps:
         feed(metric, r, real=True)
@@ -125,10 +125,8 @@ def test_bad_batches_are_named_at_once_and_change_nothing():
         (g.features[0], "shape"),
         (g.features[:8], "one entry a row"),
     ]:
-        with pytest.raises(PalpateError, match=match):
-            metric.update(features, **columns)
-    with pytest.raises(PalpateError, match="Give each always, or never"):
-        metric.update(g.features[:9], **columns | {"groups": None})
+        fails(match, metric.update, features, **columns)
+    fails("Give each always, or never", metric.update, g.features[:9], **columns | {"groups": None})
     assert metric.compute() == before
 
 

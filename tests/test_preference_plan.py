@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from PIL import Image, ImageFilter
 
+from forge.errors import fails
 from forge.people import write_folder
 from palpate import preference
 from palpate.core import PalpateError
@@ -182,8 +183,7 @@ def test_file_names_say_which_images_are_of_one_video(tmp_path):
     ],
 )
 def test_what_cannot_be_made_is_said(rated, options, words):
-    with pytest.raises(PalpateError, match=words):
-        rated.make(**options)
+    fails(words, rated.make, **options)
 
 
 def test_no_common_image_is_said(rated, tmp_path):
@@ -251,5 +251,4 @@ def test_an_image_looks_the_same_whatever_file_it_came_in(tmp_path):
 def test_one_video_is_no_study(rated, tmp_path):
     labels = tmp_path / "labels.csv"
     labels.write_text(re.sub(r"v\d\d$", "v00", rated.labels.read_text(), flags=re.MULTILINE))
-    with pytest.raises(PalpateError, match="two items"):
-        rated.make(labels=labels)
+    fails("two items", rated.make, labels=labels)

@@ -2,8 +2,6 @@
 
 import json
 import sqlite3
-import subprocess
-import sys
 from dataclasses import replace
 from itertools import combinations, product
 
@@ -11,6 +9,8 @@ import numpy as np
 import pytest
 from scipy import stats
 
+from forge.commands import python
+from forge.errors import fails
 from forge.people import Crowd, signed, write_folders
 from palpate import preference
 from palpate.core import Note, PalpateError, quiet
@@ -378,8 +378,7 @@ def with_vote(**fields):
     ],
 )
 def test_votes_of_another_plan_or_of_no_page_are_said(plan, tmp_path, change, words):
-    with pytest.raises(PalpateError, match=words):
-        read(plan, tmp_path, signed(change(CROWD.download(plan, "r01"))))
+    fails(words, read, plan, tmp_path, signed(change(CROWD.download(plan, "r01"))))
 
 
 def test_the_same_votes_twice_count_once(plan, downloads):
@@ -408,8 +407,7 @@ def test_different_answers_under_one_code_are_said(plan, tmp_path):
 def test_votes_after_the_last_day_do_not_count(rated, tmp_path):
     plan = replace(rated.make(items=4, raters=1), until="2026-10-01")
     early = changed(plan)
-    with pytest.raises(PalpateError, match=f"{len(plan.trials)} after 2026-10-01"):
-        read(plan, tmp_path, early)
+    fails(f"{len(plan.trials)} after 2026-10-01", read, plan, tmp_path, early)
     early["votes"][0]["at"] = "2026-09-30T10:00:00Z"
     votes = read(plan, tmp_path, signed(early))
     assert len(votes.by_rater["r01"]) == 1
@@ -448,15 +446,13 @@ def write_database(path, plan, rows):
 
 
 def test_no_vote_is_nothing_to_score(study):
-    with pytest.raises(PalpateError, match="votes to score"):
-        preference.score(study)
+    fails("votes to score", preference.score, study)
 
 
 def test_a_plan_that_was_edited_is_another_study(study, downloads, tmp_path):
     text = (study / "plan.json").read_text()
     (tmp_path / "plan.json").write_text(text.replace('"catches": 0.8', '"catches": 0.1'))
-    with pytest.raises(PalpateError, match="of study"):
-        preference.score(tmp_path, downloads)
+    fails("of study", preference.score, tmp_path, downloads)
 
 
 def test_sorting_is_accuracy_by_material_against_chance(rated, tmp_path):
@@ -527,4 +523,4 @@ preference.make({str(rated.reference)!r}, {[str(m) for m in rated.methods]!r}, d
 preference.score({str(study)!r}, {str(downloads)!r}, replicates=100)
 assert not {{"torch", "starlette", "uvicorn", "diffusers"}} & set(sys.modules)
 """
-    subprocess.run([sys.executable, "-c", code], check=True)
+    python(code)

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from forge.errors import fails
 from forge.results import (
     Tree,
     difference,
@@ -260,8 +261,7 @@ def test_a_page_keeps_within_its_size(tmp_path):
     tree = Tree(page_of(Results("t", audits=audits), tmp_path, max_bytes=110_000))
     assert len(tree.all("figure")) > 0
     assert "rows of images were skipped" in tree.text
-    with pytest.raises(PalpateError, match="`max_bytes` must hold at least the text"):
-        page_of(results, tmp_path, max_bytes=2_000)
+    fails("`max_bytes` must hold at least the text", page_of, results, tmp_path, max_bytes=2_000)
 
 
 def test_the_gallery_is_folded_and_every_material_shows(tmp_path):
@@ -280,8 +280,7 @@ def test_the_gallery_is_folded_and_every_material_shows(tmp_path):
 def test_empty_sections_name_the_command_that_fills_them(tmp_path):
     with pytest.raises(PalpateError, match="must agree in bandwidth"):
         page_of(Results("t", scores=[score(), score(subject="b", bandwidth=1.0)]), tmp_path)
-    with pytest.raises(PalpateError, match=r"must end in \.html"):
-        write_report(Results("t"), tmp_path / "page.json")
+    fails(r"must end in \.html", write_report, Results("t"), tmp_path / "page.json")
     assert list(tmp_path.iterdir()) == []  # what cannot be drawn writes nothing
     settings = {"rate": float("nan"), "path": tmp_path, "array": np.arange(3), "x": np.float32(0.5)}
     tree = Tree(page_of(Results("Nothing yet", settings=settings), tmp_path))

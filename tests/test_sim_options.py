@@ -6,7 +6,7 @@ import re
 import numpy as np
 import pytest
 
-from palpate.core import PalpateError
+from forge.errors import fails
 from palpate.sim import DEFAULT, MATERIALS, MINI_SEEDS, PRESETS, WorldOptions, plan_world
 from palpate.sim.options import RANGES
 from palpate.sim.plan import ObjectRef, contact_frames, first_contact, written_frames
@@ -17,8 +17,7 @@ from palpate.sim.video import make_object
 def test_numbers_have_a_range(name):
     low, high = RANGES[name]
     for value in (low - 1, high + 1, "many", None, float("nan")):
-        with pytest.raises(PalpateError, match=f"`{name}` must be a .*number from"):
-            WorldOptions(**{name: value})
+        fails(f"`{name}` must be a .*number from", WorldOptions, **{name: value})
     for value in (low, high):
         assert getattr(WorldOptions(**{name: value}), name) == value
 
@@ -36,8 +35,7 @@ def test_numbers_have_a_range(name):
     ],
 )
 def test_inconsistent_options_are_rejected(settings, message):
-    with pytest.raises(PalpateError, match=message):
-        WorldOptions(**settings)
+    fails(message, WorldOptions, **settings)
 
 
 def test_one_meaning_has_one_digest():

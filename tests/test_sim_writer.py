@@ -11,8 +11,9 @@ from pathlib import Path
 
 import pytest
 
+from forge.errors import fails
 from palpate.cli import main
-from palpate.core import PalpateError, digest_folder
+from palpate.core import digest_folder
 from palpate.sim import MINI_SEEDS, PRESETS, WorldOptions, write_world
 
 TINY = dataclasses.replace(PRESETS["tiny"], size=16, tile=64)
@@ -60,12 +61,10 @@ def test_a_finished_world_is_kept_and_another_rejected(world):
     again = write_world(world.folder, TINY, progress=never)
     assert again.digest == world.digest
     assert before == {p: p.stat().st_mtime_ns for p in world.folder.rglob("*")}
-    with pytest.raises(PalpateError, match="other options"):
-        write_world(world.folder, dataclasses.replace(TINY, seed=1))
+    fails("other options", write_world, world.folder, dataclasses.replace(TINY, seed=1))
     path = world.folder / "world.json"
     path.write_text(path.read_text().replace("palpate-world/1", "palpate-world/0"))
-    with pytest.raises(PalpateError, match="of another version"):
-        write_world(world.folder, TINY)
+    fails("of another version", write_world, world.folder, TINY)
 
 
 def test_folders_that_cannot_become_a_world_are_rejected_before_rendering(tmp_path, monkeypatch):
@@ -75,13 +74,10 @@ def test_folders_that_cannot_become_a_world_are_rejected_before_rendering(tmp_pa
     monkeypatch.chdir(tmp_path / "here")
     here = [(Path(), "current folder"), (Path("../here"), "current folder")]
     for output, message in ((tmp_path / "notes", "absent or an empty"), *here):
-        with pytest.raises(PalpateError, match=message):
-            write_world(output, TINY, progress=never)
+        fails(message, write_world, output, TINY, progress=never)
     single = WorldOptions(materials=1, objects_per_material=1, leak="none", size=16, tile=64)
-    with pytest.raises(PalpateError, match="at least two videos"):
-        write_world(tmp_path / "w", single, progress=never)
-    with pytest.raises(PalpateError, match="`workers` must be at least 1"):
-        write_world(tmp_path / "w", TINY, workers=0)
+    fails("at least two videos", write_world, tmp_path / "w", single, progress=never)
+    fails("`workers` must be at least 1", write_world, tmp_path / "w", TINY, workers=0)
     assert sorted(p.name for p in tmp_path.iterdir()) == ["here", "notes"]
 
 
@@ -89,8 +85,7 @@ def test_a_second_run_of_the_same_world_is_rejected(tmp_path):
     pytest.importorskip("fcntl")
 
     def second(what, done, total, remark=""):
-        with pytest.raises(PalpateError, match="another run writes there"):
-            write_world(tmp_path / "w", TINY)
+        fails("another run writes there", write_world, tmp_path / "w", TINY)
 
     write_world(tmp_path / "w", TINY, progress=second)
     assert [p.name for p in tmp_path.iterdir()] == ["w"]
@@ -167,8 +162,7 @@ def test_a_full_disk_is_one_line_and_the_same_command_continues(
 
 def test_videos_without_pyav_say_how_to_install_it(tmp_path, monkeypatch):
     monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
-    with pytest.raises(PalpateError, match="video"):
-        write_world(tmp_path / "w", dataclasses.replace(TINY, layout="videos"))
+    fails("video", write_world, tmp_path / "w", dataclasses.replace(TINY, layout="videos"))
 
 
 def test_a_world_of_the_shipped_models_says_so(tmp_path, capsys):

@@ -13,6 +13,7 @@ import pytest
 import torch
 from PIL import Image
 
+from forge.errors import fails
 from palpate.cli import main
 from palpate.core import PalpateError, read_json, write_json
 from palpate.data.importing import import_dataset
@@ -222,8 +223,7 @@ def test_a_world_that_the_shipped_models_saw_is_an_error(tmp_path):
     words = "must not have been trained on the data"
     (tmp_path / "link").symlink_to(tmp_path / "seen" / "manifest.parquet")
     for part in ("seen", "seen/manifest.parquet", "seen/dataset", "link"):
-        with pytest.raises(PalpateError, match=words):
-            run_study(replace(DEMO, data=tmp_path / part), tmp_path / "run")
+        fails(words, run_study, replace(DEMO, data=tmp_path / part), tmp_path / "run")
     manifest = import_dataset(tmp_path / "seen", tmp_path / "import").manifest
     (tmp_path / "seen").rename(tmp_path / "gone")
     with pytest.raises(PalpateError, match=words):
@@ -236,6 +236,5 @@ def test_a_world_that_the_shipped_models_saw_is_an_error(tmp_path):
 
 def test_absent_models_are_reported_before_any_work(tmp_path, monkeypatch):
     monkeypatch.setattr(models, "shipped_root", lambda: tmp_path)
-    with pytest.raises(PalpateError, match="installed package"):
-        run_study(DEMO, tmp_path / "run")
+    fails("installed package", run_study, DEMO, tmp_path / "run")
     assert not list((tmp_path / "run").glob("*"))

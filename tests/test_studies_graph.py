@@ -10,6 +10,7 @@ from pathlib import Path
 
 import pytest
 
+from forge.errors import fails
 from palpate.core import PalpateError, locked
 from palpate.studies.graph import Node, Nodes, Stamped
 from palpate.studies.running import plan_graph, run_graph
@@ -103,8 +104,7 @@ def test_a_plan_writes_nothing_and_is_in_order(tmp_path):
 def test_a_node_that_cannot_be_run(name, after, words):
     nodes = Nodes()
     nodes.add("a", write, text="a")
-    with pytest.raises(PalpateError, match=words):
-        nodes.add(name, write, *after, text="b")
+    fails(words, nodes.add, name, write, *after, text="b")
     assert [node.name for node in nodes] == ["a"]
 
 
@@ -149,8 +149,7 @@ def test_an_idle_process_that_dies_is_one_line(tmp_path):
     nodes = [Node("b", rest, {"seconds": 1.0}), Node("a", name_process)]
     nodes += [Node("c", end_first, {}, ("b", "a"))]
     nodes += [Node(n, rest, {"seconds": 0.0}, ("c",)) for n in "de"]
-    with pytest.raises(PalpateError, match=r"must stay alive\. Got one ended with status -9"):
-        run_graph(nodes, tmp_path, jobs=2)
+    fails(r"must stay alive\. Got one ended with status -9", run_graph, nodes, tmp_path, jobs=2)
 
 
 def test_one_run_at_a_time_holds_the_folder(tmp_path):
@@ -160,8 +159,7 @@ def test_one_run_at_a_time_holds_the_folder(tmp_path):
 
 def test_torchrun_is_refused(tmp_path, monkeypatch):
     monkeypatch.setenv("WORLD_SIZE", "2")
-    with pytest.raises(PalpateError, match="must be begun by one process"):
-        run_graph(DIAMOND, tmp_path)
+    fails("must be begun by one process", run_graph, DIAMOND, tmp_path)
 
 
 def settings(work):

@@ -8,7 +8,8 @@ import pytest
 from PIL import Image
 
 from forge import commands
-from palpate.core import FeatureSet, PalpateError
+from forge.errors import fails
+from palpate.core import FeatureSet
 from palpate.evaluation.memorization import contact_rows, memorization, nearest_train
 from palpate.metrics.intervals import jackknife_error
 
@@ -96,10 +97,8 @@ def test_pixels_lose_their_gel_and_are_averaged():
 
 
 def test_mistakes_are_named():
-    with pytest.raises(PalpateError, match="train images"):
-        memorization(TEST, TEST, FeatureSet([], np.zeros((0, 6), np.float32)))
-    with pytest.raises(PalpateError, match="one width"):
-        memorization(TEST, TEST, FeatureSet(["a"], np.zeros((1, 3), np.float32)))
+    fails("train images", memorization, TEST, TEST, FeatureSet([], np.zeros((0, 6), np.float32)))
+    fails("one width", memorization, TEST, TEST, FeatureSet(["a"], np.zeros((1, 3), np.float32)))
 
 
 @pytest.fixture(scope="module")

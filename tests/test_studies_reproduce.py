@@ -11,9 +11,10 @@ import polars as pl
 import pytest
 
 from forge.commands import call, mistake
+from forge.errors import fails
 from forge.studies import TINY, forge_touch_and_go
 from palpate.cli import main
-from palpate.core import FeatureSet, Measure, PalpateError, Score, Split, digest_file
+from palpate.core import FeatureSet, Measure, Score, Split, digest_file
 from palpate.core.files import canonical_json
 from palpate.encoders.models import shipped_folder
 from palpate.preference.scoring import PREFERENCE, STRENGTH
@@ -68,8 +69,7 @@ def test_no_shipped_model_has_seen_the_worlds_and_another_study_has_another_name
     seen = replace(WORLD, name="seen", world={**(WORLD.world or {}), "seed": MINI_SEEDS[0]})
     other = replace(WORLD, methods=WORLD.methods[:1])
     for study, words in ((seen, "one that no shipped model saw"), (other, "a name of its own")):
-        with pytest.raises(PalpateError, match=words):
-            Plan(study)
+        fails(words, Plan, study)
 
 
 def test_nodes_train_once_for_each_split_and_seed():
@@ -184,8 +184,7 @@ def test_a_method_of_your_own_is_a_function_of_a_file_and_trains_nothing(make):
     assert each[0] != each[1]
     assert "mine-NoLeak-0" not in one
     assert "mine" in one["scores-NoLeak-by-NoLeak-0"].options["methods"]
-    with pytest.raises(PalpateError, match="must be a function of a file"):
-        nodes_of(make)
+    fails("must be a function of a file", nodes_of, make)
 
 
 def test_a_dry_run_writes_nothing(tmp_path, capsys):

@@ -13,7 +13,7 @@ from palpate.cli import main
 from palpate.core import PalpateError, Split
 from palpate.data.manifest import Manifest
 from palpate.diffusion import TactilePipeline, train_generator
-from palpate.diffusion.presets import TINY
+from palpate.diffusion.presets import MINI, TINY
 from palpate.encoders import EncoderSet, train_encoder
 from palpate.training.processes import connect, place
 from palpate.training.run import work_folder
@@ -104,8 +104,8 @@ def test_an_interrupted_training_ends_as_an_uninterrupted_one(tag, tmp_path):
     again = train_encoder(manifest, split, output=tmp_path / "e", **common)
     assert again.digest("tactile") == whole.digest("tactile")
     assert again.card["scores"] == whole.card["scores"]
-    options = {"steps": 4, "autoencoder": "palpate/mini", **common}
-    options["preset"] = "mini"
+    small = replace(MINI, size=32, sampler=replace(MINI.sampler, steps=2))
+    options = {"steps": 4, "autoencoder": "palpate/mini", "preset": small, "device": "cpu"}
     whole_pipeline = train_generator(manifest, split, whole, **options)
     with pytest.raises(KeyboardInterrupt):
         train_generator(
