@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import itertools
 import json
-import subprocess
-import sys
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -14,6 +12,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from forge.commands import python
 from forge.errors import fails
 from palpate.core import FeatureSet, ProblemsError, Split
 from palpate.core.records import from_plain
@@ -330,9 +329,7 @@ split = Split({i: "test" if i.endswith("0") else "train" for i in m.ids})
 print(impact(m, split, features={"x": FeatureSet(m.ids, np.eye(24))}).headline)
 sys.exit("torch" in sys.modules)
 """
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stderr
-    assert "under the given split" in done.stdout
+    assert "under the given split" in python(code)
 
 
 @pytest.mark.nightly
