@@ -11,7 +11,7 @@ from safetensors.numpy import save_file
 
 from forge.errors import fails
 from forge.models import make_encoders
-from forge.worlds import by_video
+from forge.worlds import by_video, six_videos
 from palpate import audit, probe, score
 from palpate.data.manifest import Manifest
 from palpate.encoders import Encoder, EncoderSet, train_encoder
@@ -29,11 +29,12 @@ def encoders():
     return make_encoders()
 
 
-@pytest.fixture
-def trained(small_manifest):
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory):
     """Tiny encoders that were trained on the videos v0, v1 and v2, and their split."""
-    split = by_video(small_manifest, "v0", "v1", "v2")
-    return train_encoder(small_manifest, split, preset="tiny", device="cpu"), split
+    manifest = six_videos(tmp_path_factory.mktemp("trained"))
+    split = by_video(manifest, "v0", "v1", "v2")
+    return train_encoder(manifest, split, preset="tiny", device="cpu"), split
 
 
 def test_training_keeps_which_images_it_saw_by_pixels_not_by_names(

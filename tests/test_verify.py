@@ -19,14 +19,22 @@ from palpate.report.results import Audit, Results
 from palpate.studies.verifying import TOLERANCE, difference, verify
 
 
+@pytest.fixture(scope="module")
+def scored(tmp_path_factory):
+    folder, call = tmp_path_factory.mktemp("scored"), {"companions": ["fid"], "permutations": 9}
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(folder)
+        for name, features in feature_sets().items():
+            features.save(Path(f"{name}.npz"))
+        pp.score(["near.npz", "far.npz"], "real.npz", **call).save("out/scores.json")
+    return folder
+
+
 @pytest.fixture
-def vectors(tmp_path, monkeypatch):
+def vectors(scored, tmp_path, monkeypatch):
     """``real.npz``, ``near.npz`` and ``far.npz`` in the working directory, scored."""
+    shutil.copytree(scored, tmp_path, dirs_exist_ok=True)
     monkeypatch.chdir(tmp_path)
-    for name, features in feature_sets().items():
-        features.save(Path(f"{name}.npz"))
-    call = {"companions": ["fid"], "permutations": 9}
-    pp.score(["near.npz", "far.npz"], "real.npz", **call).save("out/scores.json")
     return Path("out/scores.json")
 
 
