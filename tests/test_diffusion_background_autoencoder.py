@@ -203,6 +203,7 @@ def test_all_samples_name_their_gel_or_none(tmp_path, backgrounds):
         size=32,
         autoencoder=replace(SMALL, steps=2),
         loop=replace(MINI.loop, steps=1, batch=2),
+        sampler=replace(MINI.sampler, steps=2),
     )
     train = lambda: train_generator(manifest, split, "palpate/mini", preset=preset)
     if backgrounds == 4:

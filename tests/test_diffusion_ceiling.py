@@ -41,7 +41,7 @@ class Through:
 @pytest.fixture(scope="module")
 def world(tmp_path_factory):
     folder = tmp_path_factory.mktemp("world")
-    shape = {"objects_per_material": 16, "contacts_per_video": 1, "frames_per_contact": 3}
+    shape = {"objects_per_material": 12, "contacts_per_video": 1, "frames_per_contact": 2}
     write_world(folder / "tree", WorldOptions(seed=5, materials=3, **shape))
     return Manifest.load(folder / "tree")
 

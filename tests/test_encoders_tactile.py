@@ -233,7 +233,7 @@ def drawn(*shape):
         ("sparsh", "pos_embed.frequency_bands", drawn(32)),  # one that would be spread
         ("sparsh", "pos_embed.frequency_bands", drawn(2, 10)),
         ("sparsh", "register_tokens", drawn(1, 2, WIDTH)),
-        ("sparsh", "patch_embed.proj.weight", drawn(WIDTH, 6, 500, 500)),
+        ("sparsh", "patch_embed.proj.weight", drawn(WIDTH, 6, 321, 321)),
         ("sparsh", "patch_embed.proj.weight", drawn(WIDTH, 3, 16, 16)),  # of one frame
         ("sparsh", "norm.weight", drawn(200)),
         ("sparsh", "norm.weight", torch.tensor(1.0)),

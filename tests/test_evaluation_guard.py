@@ -24,6 +24,9 @@ from palpate.report.terminal import audit_text
 from palpate.training.run import TrainingRun
 
 
+FAST = {"permutations": 0, "companions": []}
+
+
 @pytest.fixture(scope="module")
 def encoders():
     return make_encoders()
@@ -71,9 +74,9 @@ def test_seen_test_images_are_refused_in_probe_and_score_unless_allowed(
     for split, refused in ((own, 0), (clean, 0), (some, 8), (whole, 24)):
         n = len(split.ids("test"))
         runs = {
-            "probe": lambda s=split, **k: probe(small_manifest, s, encoder=encoders, **k),
+            "probe": lambda s=split, **k: probe(small_manifest, s, encoder=encoders, top=(), **k),
             "score": lambda s=split, **k: score(
-                made, small_manifest, split=s, encoder=encoders, permutations=0, **k
+                made, small_manifest, split=s, encoder=encoders, **FAST, **k
             ),
         }
         for name, run in runs.items():

@@ -44,8 +44,15 @@ def answers(data):
     return [(q["verdict"], q["reason"]) for q in data["questions"]]
 
 
-@pytest.mark.parametrize("images", ["", "--as tactile", "--no-images"])
-@pytest.mark.parametrize("folders", [("train", "test"), ("w/training", "w/testing"), ("a", "b")])
+@pytest.mark.parametrize(
+    ("folders", "images"),
+    [
+        *((("train", "test"), images) for images in ("", "--as tactile", "--no-images")),
+        (("w/training", "w/testing"), "--no-images"),
+        (("a", "b"), "--as tactile"),
+        (("a", "b"), "--no-images"),
+    ],
+)
 def test_sibling_folders_named_as_parts_share_videos_by_names(folders, images, run):
     for k in range(60):
         part = folders[k % 10 in (3, 6) and k > 20]
