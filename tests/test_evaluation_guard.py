@@ -23,7 +23,6 @@ from palpate.report.notes import COMMAND_LINE, sentence
 from palpate.report.terminal import audit_text
 from palpate.training.run import TrainingRun
 
-
 FAST = {"permutations": 0, "companions": []}
 
 
