@@ -180,13 +180,3 @@ def test_dropped_frames_and_unequal_streams_are_found():
     assert "30 frames a second in tactile and 25 frames a second in vision" in rates
     variable = np.cumsum(np.random.default_rng(0).choice([1 / 60, 1 / 30, 1 / 15], 200))
     assert kinds(tactile, tactile=variable) == {}
-
-
-def test_real_clips_raise_no_suspicion(clips):
-    names = sorted(path.name for path in (clips / "dataset").iterdir())
-    videos = {}
-    for name in names:
-        for side, file in (("tactile", "gelsight.mp4"), ("vision", "video.mp4")):
-            with VideoReader(clips / "dataset" / name / file) as reader:
-                videos[name, side] = reader.thumbnails(SIZE)
-        assert kinds(videos[name, "tactile"], videos[name, "vision"]) == {}

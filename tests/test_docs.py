@@ -41,7 +41,7 @@ QUICK = {
     "world": ["--preset", "tiny", "--size", "16", "--materials", "2", "--workers", "1"],
 }
 SLOW = {
-    "docs/start/train.md": pytest.mark.slow,
+    "docs/start/train.md": pytest.mark.nightly,
     "docs/start/generate.md": pytest.mark.nightly,
     "docs/start/reproduce.md": pytest.mark.nightly,
 }

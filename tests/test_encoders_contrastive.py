@@ -515,6 +515,24 @@ def test_losses_and_averaged_weights_are_those_of_the_loop_before_the_engine(wor
         assert torch.allclose(ours, theirs, atol=1e-5)
 
 
+def test_two_processes_take_the_steps_of_one(world, clip, tmp_path, on_two_processes):
+    train, course = world.part(by_video(world), "train"), replace(TINY.tactile_course, batch=6)
+    rows, options = (
+        Rows(train, clip, TINY.preprocess),
+        replace(course, epochs=4).options(18, seed=3),
+    )
+    loss = TactileLoss(rows, TINY.preprocess, "identical-text")
+    task = Task("training", 18, lambda step: rows.load(step, course.augment), loss)
+
+    def losses(folder="two"):
+        model = TactileModel(new_tactile(TINY.tactile_config(8), seed=3))
+        return [line["loss"] for line in fit(model, task, options, tmp_path / folder)]
+
+    one, two = losses("one"), on_two_processes(losses)
+    assert two[0] == two[1] == pytest.approx(one, abs=1e-4)
+    assert len(one) > 1
+
+
 @pytest.mark.filterwarnings("error::FutureWarning")
 def test_gradient_checkpointing_changes_nothing_and_warns_of_nothing(world, clip, tmp_path):
     digests = set()

@@ -69,8 +69,10 @@ def close(one, two):
         assert a == pytest.approx(b, abs=1e-4)
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_two_processes_take_the_steps_of_one(place):
+    """By their launcher; forked, they are in ``test_encoders_contrastive`` every day."""
     keep = ["--set", "tactile_course.evaluations=2", "tactile_course.keep=best"]
     run(place, "encoder", "one", *keep)
     out = run(place, "encoder", "two", *keep, processes=2)
