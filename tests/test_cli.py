@@ -139,20 +139,17 @@ def test_files_that_cannot_be_written_or_read_are_mistakes_too(
 ):
     folder = tmp_path / "m"
     small_manifest.save(folder / "manifest.parquet")
-    half, odd, scores = (tmp_path / name for name in ("half.json", "odd.json", "scores.json"))
+    half, odd = (tmp_path / name for name in ("half.json", "odd.json"))
     half.write_text('{"format": "palpate-split/1", "rule": {}, "digest": "x"}')
     odd.write_text(
         '{"format": "palpate-split/1", "rule": {}, "digest": "x", "parts": {"train": 3}}'
     )
-    row = {"metric": "m", "a": "s", "value": "high"}
-    scores.write_text(json.dumps({"format": "palpate-results/1", "title": "t", "scores": [row]}))
     for args, words in (
         (["audit", *lists, "-o", folder], f"{folder} must be writable"),
         (["audit", *lists, "-o", lists[0] + "/x.json"], "must be"),
         (["split", folder, "-o", folder], "must not replace an input"),
         (["audit", folder, "--split", half], "an incomplete split file"),
         (["audit", folder, "--split", odd], "an incomplete split file"),
-        (["report", scores, "-o", tmp_path / "p.html"], "The results in"),
     ):
         status, _, err = call(capsys, *args)
         assert (status, words in err, "Traceback" in err) == (2, True, False), (args, err)
