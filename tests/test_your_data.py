@@ -237,10 +237,10 @@ def test_a_template_that_is_found_matches_every_file(paths):
     assert [file for file in files if template.match(file) is None] == []
 
 
-def test_a_hundred_thousand_names_are_understood_quickly():
+def test_ten_thousand_names_are_understood():
     files = [
         f"{o}/{c}/{s}/{f}.png"
-        for o, c, s, f in product(range(50), range(10), ("rgb", "tac"), range(100))
+        for o, c, s, f in product(range(50), range(10), ("rgb", "tac"), range(10))
     ]
     assert detect_layout(files, "own") == {
         "vision": "{object}/{video}/rgb/{frame:d}.png",
@@ -302,6 +302,7 @@ def write_stranger(root, sides, as_table):
     return root / "list.csv" if as_table else root
 
 
+QUICK = "--permutations 0 --companions psnr"
 #: Two-sided videos, a table and one side: the others differ in nothing but their import.
 #: Layouts that go through every verb.
 EVERY_VERB = {
@@ -330,11 +331,11 @@ def test_a_strangers_layout_reaches_every_verb_with_one_import(name, tmp_path, m
     run("train encoder m --split s.json --preset tiny --device cpu -o e")
     if len(sides) == 1:
         (generated, *_) = [*source.glob("touch/thing1"), *Path("m/images").glob("thing1/*/*")]
-        run(f"score --generated {generated} --reference m --encoder e --allow-seen")
+        run(f"score --generated {generated} --reference m --encoder e --allow-seen {QUICK}")
         return
     run("train generator m --split s.json --clip e --preset tiny --steps 2 --device cpu -o g")
     run("generate m --model g --split s.json --device cpu -o made")
-    run("score --generated made --reference m --split s.json --encoder e -o score.json")
+    run(f"score --generated made --reference m --split s.json --encoder e -o score.json {QUICK}")
     run("report audit.json score.json -o page.html")
     assert not list(tmp_path.glob(".*.work"))
     results = Results.load(tmp_path / "page.json")
