@@ -302,7 +302,7 @@ def write_stranger(root, sides, as_table):
     return root / "list.csv" if as_table else root
 
 
-QUICK = "--permutations 0 --companions psnr"
+QUICK = "--permutations 0 --companions none"
 #: Two-sided videos, a table and one side: the others differ in nothing but their import.
 #: Layouts that go through every verb.
 EVERY_VERB = {
