@@ -245,7 +245,7 @@ def test_a_card_says_what_it_must(mini):
         "data": {"seeds": "1-2"},
         "limits": ["Not real."],
         "recipe": "python recipes/r.py",
-        "digest of split": "ab",
+        "digest of split": "äb",
         "loss": [{"loss": 1.0}] * 50,
     }
     about = {"format": "palpate-clip/1", "digests": {"vision": "00ff"}, "name": "palpate/mini"}
@@ -258,7 +258,7 @@ def test_a_card_says_what_it_must(mini):
     )
     lines = ["# T", "S.", "| score | value | interval | n |", "| PSNR | 31.23 | [30, 32.5] |  |"]
     lines += ["| a\\|b |  |  | 3 |", "| seeds |", "- Not real.", "python recipes/r.py"]
-    lines += ["- vision: `00ff`", ' "digest of split": "ab",', 'clip = load_clip("palpate/mini")']
+    lines += ["- vision: `00ff`", ' "digest of split": "äb",', 'clip = load_clip("palpate/mini")']
     for line in lines:
         assert f"\n{line}\n" in body, line
     assert len(text) < 2500

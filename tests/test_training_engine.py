@@ -7,6 +7,7 @@ import shutil
 import signal
 import time
 import warnings
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -514,8 +515,25 @@ def test_a_held_out_loss_that_is_not_finite_is_reported(tmp_path):
     def only_held_out(module, batch):
         return (loss if module.training else breaks)(module, batch)
 
-    with pytest.raises(PalpateError, match="held-out loss of training must be finite"):
-        fit(Net(), only_held_out, N, options(), tmp_path, held_out=(9, load))
+    words = rf"held-out loss of training must be finite. Got nan after step {STEPS - 1}\."
+    with pytest.raises(PalpateError, match=words):
+        fit(Net(), only_held_out, N, options(evaluations=1), tmp_path, held_out=(9, load))
+
+
+def test_the_loss_that_is_shown_is_smoothed_and_seconds_are_those_of_a_step(tmp_path, monkeypatch):
+    steps, remarks = [], []
+
+    def constant(module, batch):
+        steps.append(1)
+        return loss(module, batch)._replace(total=0 * module.b.weight.sum() + 2)
+
+    clock = SimpleNamespace(monotonic=lambda: 3.0 * len(steps))  # of three seconds a step
+    monkeypatch.setattr(engine, "time", clock)
+    report = lambda task, done, total, remark="": remarks.append(remark)
+    log = fit(Net(), constant, N, options(), tmp_path, progress=report)
+    assert [line["seconds"] for line in log] == [3.0] * len(log)
+    assert {*remarks} >= {"loss 2.0000"}
+    assert all(remark in ("", "loss 2.0000") for remark in remarks)
 
 
 def test_a_full_disk_ends_in_one_line_and_keeps_the_last_checkpoint(tmp_path, whole):
