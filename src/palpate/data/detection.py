@@ -92,39 +92,44 @@ class _Names:
     """The paths of a folder as names, by the side that a word gives them."""
 
     def __init__(self, files: Sequence[str], folder: str) -> None:
-        self.names = {path: posixpath.splitext(path)[0].split("/") for path in files}
         #: (which folder, which token of its name, the word there) that all paths have.
         self.shared = {
             (depth, *word)
-            for depth, names in enumerate(zip(*self.names.values(), strict=False))
+            for depth, names in enumerate(zip(*map(_names, files), strict=False))
             for word in set.intersection(*({*enumerate(_tokens(name))} for name in {*names}))
         }
         self.silent = ""  # the side whose files no word gives
-        self.sides = self._by_role(folder)
+        self.sides = self._by_role(files, folder)
 
     def _saying(self, depth: int, name: str) -> list[str]:
         """The tokens of a name in lower case, empty where all paths have it."""
         return [t * ((depth, k, t) not in self.shared) for k, t in enumerate(_tokens(name))]
 
-    def _by_role(self, folder: str) -> dict[str, list[str]]:
+    def _by_role(self, files: Sequence[str], folder: str) -> dict[str, list[str]]:
         """Side -> its files, by words that some have and others have not; else by a word of all.
 
         Files without such a word are the other side.
         """
         sides: dict[str, list[str]] = defaultdict(list)
-        saying = cache(self._saying)
-        for path, names in self.names.items():
-            words = [word for depth, name in enumerate(names) for word in saying(depth, name)]
-            strong = [ROLE_OF[word] for word in words if word in ROLE_OF]
-            weak = [_WEAK[word] for word in words if word in _WEAK]
+
+        @cache
+        def words(depth: int, name: str) -> list[str]:
+            return [word for word in self._saying(depth, name) if word in ROLE_OF or word in _WEAK]
+
+        for path in files:
+            saying = [
+                word for depth, name in enumerate(_names(path)) for word in words(depth, name)
+            ]
+            strong = [ROLE_OF[word] for word in saying if word in ROLE_OF]
+            weak = [_WEAK[word] for word in saying if word in _WEAK]
             # The picture of an empty gel may lie in the folder of the tactile images.
             side = "background" if "background" in strong else (strong or weak or [""])[-1]
             sides[side].append(path)
         plain = sides.pop("", [])
         if not sides:
             every = [word for *_, word in self.shared]
-            for words, by in ((every, ROLE_OF), (every, _WEAK), (_tokens(folder), ROLE_OF)):
-                roles = {by[word] for word in words if word in by}
+            for some, by in ((every, ROLE_OF), (every, _WEAK), (_tokens(folder), ROLE_OF)):
+                roles = {by[word] for word in some if word in by}
                 if len(roles) == 1:
                     return {min(roles): plain}
         if plain and len(named := sides.keys() & {*SIDES}) == 1:
@@ -154,7 +159,7 @@ class _Names:
 
         return [
             "/".join(bare(depth, name, depth + 1 < len(names)) for depth, name in enumerate(names))
-            for names in map(self.names.__getitem__, self.sides[side])
+            for names in map(_names, self.sides[side])
         ]
 
     def _kept(self, depth: int, name: str, units: bool) -> list[int]:
@@ -175,7 +180,8 @@ class _Names:
 
     def _faced(self, template: str, side: str, units: bool) -> str:
         """The template of a side whose names face those of a bare template, or nothing."""
-        names = max((self.names[path] for path in self.sides[side]), key=len)
+        files = self.sides[side]
+        names = _names(max(files, key=lambda path: path.count("/")))
         bare, places, start = list[str](), list[int](), 0
         for depth, name in enumerate(names):
             kept = self._kept(depth, name, units and depth + 1 < len(names))
@@ -197,12 +203,12 @@ class _Names:
             pieces += [_literal(path[after:a]), marks[name]]
             after = b
         own_names = "".join([*pieces, _literal(path[after:])]).split("/")
-        columns = [*zip(*(self.names[path] for path in self.sides[side]), strict=False)]
-        for k in (k for k, name in enumerate(bare[: len(columns)]) if name == _ROLE):
-            if len({*columns[k]}) > 1:
-                before, _, end = _affixes(columns[k])
+        for k in (k for k, name in enumerate(bare) if name == _ROLE):
+            same = {own[k] for own in map(_names, files) if len(own) == len(names)}
+            if len(same) > 1:
+                before, _, end = _affixes(sorted(same))
                 own_names[k] = f"{before}{{sensor}}{end}"
-        return "/".join(own_names) + _suffix(self.sides[side])
+        return "/".join(own_names) + _suffix(files)
 
 
 def _facing(template: list[str], names: list[str], silent: bool) -> Iterator[str]:
@@ -226,6 +232,11 @@ def _facing(template: list[str], names: list[str], silent: bool) -> Iterator[str
 def _suffix(files: Sequence[str]) -> str:
     suffixes = {posixpath.splitext(path)[1] for path in files}
     return min(suffixes) if len(suffixes) == 1 else ".*"
+
+
+def _names(path: str) -> list[str]:
+    """The folders of a path, and the name of its file without the suffix."""
+    return posixpath.splitext(path)[0].split("/")
 
 
 def _tokens(text: str) -> list[str]:
@@ -399,17 +410,18 @@ def walked(result: Scan, suffixes: tuple[str, ...]) -> list[str]:
     Names that are not UTF-8, which no table can hold, are reported.
     """
     every, again = walk(result.base)
-    files = [name for name in every if name.lower().endswith(suffixes)]
-    for name in (odd := [f for f in files if any("\ud800" <= c <= "\udfff" for c in f)]):
+    files, rest = list[str](), list[str]()
+    for name in every:
+        (files if name.lower().endswith(suffixes) else rest).append(name)
+    for name in (odd := [f for f in files if re.search("[\ud800-\udfff]", f)]):
         result.problem(ascii(name), "bad-encoding", "the name of the file is not UTF-8")
     files = [name for name in files if name not in odd] if odd else files
     text = "links to folders that are read already"
     result.suspect(result.base, "linked-twice", text, again)
-    rest = (name for name in every if not name.lower().endswith(suffixes))
     dead = [name for name in rest if not (result.base / name).exists()]
     result.suspect(result.base, "dead-link", "links that lead nowhere", dead)
     text = "files that are not read"
-    result.suspect(result.base, "unread", text, counted(every))
+    result.suspect(result.base, "unread", text, counted(rest))
     result.met = True
     return files
 
@@ -459,6 +471,8 @@ def templates_of(
     """
     require(bool(files), None, f"{folder} must hold {kind}", "none", fix="Check the path")
     must = f"The names of the {kind} in {folder} must say what they show"
+    if side is None and (templates := detect_layout(files, folder.resolve().name)):
+        return renamed(templates)
     names = _Names(files, folder.resolve().name)
     if side is not None:
         own = names.sides.get(side, [])
@@ -468,8 +482,6 @@ def templates_of(
             choices = [renamed({side: template_of(own)})]
             raise PalpateError(must, got, "Leave it out", argument="side", choices=choices)
         return renamed({side: template_of(files)})
-    if templates := detect_layout(files, folder.resolve().name):
-        return renamed(templates)
     sides = {s: files for s, files in names.sides.items() if s in SIDES}
     if sides:
         choices = [{side: template_of(files)} for side, files in sides.items()]

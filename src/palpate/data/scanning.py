@@ -9,10 +9,12 @@ the same problems. A format whose frames must be decoded or written first takes 
 from __future__ import annotations
 
 import inspect
+import os
 import posixpath
 import re
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, fields
 from functools import cache
 from pathlib import Path
@@ -209,15 +211,22 @@ def _checked_paths(scan: Scan) -> list[Row]:
         return inside(root, folder) is None
 
     @cache
+    def files(folder: str) -> set[str]:
+        """The files of a folder that are no links; none if it is not there."""
+        with suppress(OSError), os.scandir(root / folder) as entries:
+            return {entry.name for entry in entries if entry.is_file(follow_symlinks=False)}
+        return set()
+
+    @cache
     def checked(written: str) -> tuple[str, str]:
         """(path relative to the root, ""), or (kind of problem, its text)."""
         folder, _, name = written.rpartition("/")
+        usual = posixpath.normpath(written) == written and "\\" not in name
+        if usual and not written.startswith("/") and not leaves(folder) and name in files(folder):
+            return written, ""
         path = root / written
-        # Resolving is slow, so only unusual paths and links are resolved one by one.
-        unusual = (
-            posixpath.normpath(written) != written or Path(written).is_absolute() or "\\" in name
-        )
-        resolved = inside(root, written) if unusual or path.is_symlink() else path
+        # Paths are slow, so only unusual ones and links are resolved one by one.
+        resolved = inside(root, written)
         if resolved is None or leaves(folder):
             if not scan.met or re.search(CLIMBS, written):
                 return "outside-root", f"the path {written!r} leaves the root {scan.base}"
@@ -228,7 +237,7 @@ def _checked_paths(scan: Scan) -> list[Row]:
                 return "missing-file", f"no file {written!r} in {scan.base}"
         except OSError as error:  # e.g. a name that is too long for the disk
             return "missing-file", f"{written!r} cannot be a file: {error.strerror}"
-        return resolved.relative_to(root).as_posix() if unusual else written, ""
+        return written if usual else resolved.relative_to(root).as_posix(), ""
 
     good: list[Row] = []
     for where, row in scan.rows:

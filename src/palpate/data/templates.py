@@ -112,7 +112,9 @@ class Template:
         if match is None:
             return None
         values = {name: value for name, value in match.groupdict().items() if value is not None}
-        return values | {n: str(int(values[n])) for n in self.digits}
+        for name in self.digits:
+            values[name] = str(int(values[name]))
+        return values
 
 
 def _piece(token: re.Match[str], name: str | None, spec: str, *, loose: bool) -> str:
