@@ -35,7 +35,6 @@ from palpate.data.formats.layout import find_videos, require_videos
 from palpate.data.formats.recordings import Pairing, Recordings, Row
 from palpate.data.images import Check
 from palpate.data.imported import Imported
-from palpate.data.listing import FrameTable
 from palpate.data.manifest import Manifest
 from palpate.data.mapping import LINE, compile_maps
 from palpate.data.rows import manifest_rows, read_classes, without_repeats
@@ -77,7 +76,7 @@ class Interval:
     video: str
     first: int
     last: int
-    words: Mapping[str, str]
+    words: Mapping[str, str | None]  # further cells of the manifest
     inconclusive: bool
 
 
@@ -163,22 +162,18 @@ def scan(
         Interval(
             f"{source}:{row[LINE]}",
             *(row[name] for name in NEEDED),
-            {name: row[name] for name in WORDS if row[name]},
+            {"sensor": options.sensor} | {name: row[name] for name in WORDS if row[name]},
             row["unclear"],
         )
         for row in _read(result, source, columns, options.classes).iter_rows(named=True)
     ]
     contacts = _contacts(work, listed, progress)
     rows = [row for name in contacts for row in _frames(work, name, contacts[name], every)]
-    starts, videos = {c: i.first for c, i in contacts.items()}, {i.video for i in contacts.values()}
-    rows = work.usable(rows, starts, videos, check=check, progress=progress)
-    words: dict[str, FrameTable] = {name: FrameTable({}, []) for name in WORDS}
-    for row in rows:
-        for name, word in contacts[row.contact].words.items():
-            words[name].values[row.video, row.frame] = word
+    starts = {contact: (i.video, i.first) for contact, i in contacts.items()}
+    work.add(rows, starts, check=check, progress=progress)
     column = f"column {(columns or {}).get('text', 'text')}"
-    result.facts["text_source"] = column if words["text"].values else "none"
-    work.add(rows, check=check, progress=progress, sensor=options.sensor, words=words)
+    worded = any(row.get("text") for _, row in result.rows)
+    result.facts["text_source"] = column if worded else "none"
     return result
 
 
@@ -270,7 +265,7 @@ def _read(
 
 def _contacts(work: Recordings, listed: list[Interval], progress: Progress) -> dict[str, Interval]:
     """The usable contacts by name; opens their recordings."""
-    rows = [Row(i.where, i.video, i.video, i.first, i.where, "") for i in listed]
+    rows = [Row(i.where, i.video, i.video, i.first, i.where) for i in listed]
     opened = {row.where for row in work.open(rows, progress)}
     listed = [i for i in listed if i.where in opened and _within(work, i)]
     in_contact: dict[str, set[int]] = {i.video: set() for i in listed}
@@ -326,4 +321,4 @@ def _frames(work: Recordings, contact: str, interval: Interval, every: int) -> l
             work.scan.problem(where, "missing-file", text)
             missing.update(lacking)
     frames = (k for k in numbers if k not in missing)
-    return [Row(where, f"{video}/{k:010d}", video, k, contact, "") for k in frames]
+    return [Row(where, f"{video}/{k:010d}", video, k, contact, interval.words) for k in frames]

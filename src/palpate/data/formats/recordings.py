@@ -15,9 +15,7 @@ from functools import cache
 from operator import itemgetter
 from pathlib import Path
 from threading import Event
-from typing import TYPE_CHECKING, Any, Literal
-
-import polars as pl
+from typing import Any, Literal
 
 from palpate.core import PalpateError, Problem, Progress, read_json, require, write_json
 from palpate.data.frames import (
@@ -33,9 +31,6 @@ from palpate.data.scanning import Into, Scan, raise_if, require_some
 from palpate.data.streams import FEWEST, SHORTER, Finding, findings
 from palpate.data.suspicions import Look
 
-if TYPE_CHECKING:
-    from palpate.data.listing import FrameList, FrameTable
-
 #: The background is this many frames before the contact.
 BACKGROUND_BEFORE = 4
 MODALITIES = ("vision", "tactile")
@@ -48,32 +43,18 @@ VideoFiles = Mapping[str, Path | None]
 
 @dataclass(frozen=True)
 class Row:
-    """A labeled frame; ``where`` is ``list:line``."""
+    """A labeled frame."""
 
-    where: str
+    where: str  # ``list:line``
     id: str
     video: str
     frame: int
     contact: str
-    material: str
+    more: Mapping[str, Any] = field(default_factory=dict)  # further cells of the manifest
 
 
 #: The needed frames of one modality of a recording.
 _Job = tuple[str, str, set[int]]
-
-
-def rows_of(listed: FrameList) -> list[Row]:
-    """The rows of a list, sorted by video and frame."""
-    cells = listed.manifest.table.select("contact", "material")
-    table = pl.concat([listed.rows, cells], how="horizontal").sort("video", "frame")
-    where = pl.format("{}:{}", "source", "line")
-    columns = (where, "id", "video", "frame", "contact", "material")
-    return [Row(*row) for row in table.select(columns).iter_rows()]
-
-
-def first_frames(rows: Iterable[Row]) -> dict[str, int]:
-    """Contact -> its first frame."""
-    return {row.contact: row.frame for row in sorted(rows, key=lambda row: -row.frame)}
 
 
 def thin(rows: list[Row], max_per_contact: int | None) -> list[Row]:
@@ -195,39 +176,53 @@ class Recordings:
             self.scan.problem(row.where, "missing-file", text)
         return not missing
 
-    def usable(
+    def add(
         self,
         rows: list[Row],
-        starts: Mapping[str, int],
-        listed: set[str],
+        starts: Mapping[str, tuple[str, int]],
         *,
         check: Check,
         progress: Progress,
-    ) -> list[Row]:
-        """The rows whose images are whole, with a background chosen for each contact.
+    ) -> None:
+        """Add the rows whose images are whole to the scan, with a background for each contact.
 
-        ``starts`` has the first frame of each contact. Recordings that are not ``listed`` are
-        reported.
+        Frames of videos are extracted, or only decoded; if nothing is written, rows have paths only
+        if they are still to be checked and are files. ``starts`` has the video and the first frame
+        of each contact; recordings without one are reported.
         """
         self.choose_backgrounds(rows, starts)
         rows = self._whole(rows, check, progress)
-        for video in sorted(set(self.videos) - listed):
+        for video in sorted(set(self.videos) - {video for video, _ in starts.values()}):
             text = f"no usable contact of the recording {video!r} is listed"
             self.scan.suspect(self.scan.base, "unlisted-video", text)
         for contact in sorted({row.contact for row in rows} - self.background_frames.keys()):
             text = "no frame before it shows the untouched gel"
             self.scan.suspect(contact, "no-background", text)
-        return rows
+        hidden: dict[str, Any] = {}
+        if self.into is not None:
+            rows = self.extract(rows, progress)
+            self.scan.facts |= self._facts(rows)
+            self.scan.base = self._base(rows)
+        else:
+            if check == "decode":
+                rows = self._decode(rows, progress)
+                self._check_streams(progress)
+            hidden = {} if check == "none" else dict.fromkeys((*MODALITIES, "background"))
+        cells = self.cells(rows, self.scan.base.resolve())
+        self.scan.rows = [(r.where, cell | hidden) for r, cell in zip(rows, cells, strict=True)]
 
-    def choose_backgrounds(self, rows: Sequence[Row], starts: Mapping[str, int]) -> None:
+    def choose_backgrounds(
+        self, rows: Sequence[Row], starts: Mapping[str, tuple[str, int]]
+    ) -> None:
         """Choose the background of every contact.
 
         It is the frame 4 before the contact, else the nearest earlier one without contact.
         """
-        for contact, video in {row.contact: row.video for row in rows}.items():
+        for contact in dict.fromkeys(row.contact for row in rows):
+            video, first = starts[contact]
             frames = self.frames[video]["tactile"]
             numbers, in_contact = frames.numbers, self.in_contact.get(video, set())
-            before = bisect_right(numbers, starts[contact] - BACKGROUND_BEFORE)
+            before = bisect_right(numbers, first - BACKGROUND_BEFORE)
             earlier = (numbers[i] for i in range(before - 1, -1, -1))
             k = next((k for k in earlier if k not in in_contact), None)
             if k is not None:
@@ -257,32 +252,6 @@ class Recordings:
         images = [frames[m].path(row.frame) for m in folders]
         with_background = "tactile" in folders and row.contact in self.backgrounds
         return images + ([self.backgrounds[row.contact]] if with_background else [])
-
-    def add(
-        self,
-        rows: list[Row],
-        *,
-        check: Check,
-        progress: Progress,
-        sensor: str | None = None,
-        words: Mapping[str, FrameTable | None] | None = None,
-    ) -> None:
-        """Add usable rows to the scan, after extracting their frames, or only decoding them.
-
-        If nothing is written they have paths only if they are still to be checked and are files.
-        """
-        hidden: dict[str, Any] = {}
-        if self.into is not None:
-            rows = self.extract(rows, progress)
-            self.scan.facts |= self._facts(rows)
-            self.scan.base = self._base(rows)
-        else:
-            if check == "decode":
-                rows = self._decode(rows, progress)
-                self._check_streams(progress)
-            hidden = {} if check == "none" else dict.fromkeys((*MODALITIES, "background"))
-        cells = self.cells(rows, self.scan.base.resolve(), sensor, words)
-        self.scan.rows = [(r.where, cell | hidden) for r, cell in zip(rows, cells, strict=True)]
 
     def _decode(self, rows: list[Row], progress: Progress) -> list[Row]:
         """Decode what ``extract`` would; keep the rows whose images are whole."""
@@ -414,14 +383,8 @@ class Recordings:
             into.created.append(path)
         write_json(path, {**settings, "videos": sizes})
 
-    def cells(
-        self,
-        rows: Sequence[Row],
-        root: Path,
-        sensor: str | None = None,
-        words: Mapping[str, FrameTable | None] | None = None,
-    ) -> list[dict[str, Any]]:
-        """Manifest cells of the rows, with paths relative to ``root``, and further ``words``.
+    def cells(self, rows: Sequence[Row], root: Path) -> list[dict[str, Any]]:
+        """Manifest cells of the rows, with paths relative to ``root``.
 
         Frames inside videos have no path before ``extract``.
         """
@@ -438,18 +401,15 @@ class Recordings:
                 return None
             return f"{folder(path.parent)}/{path.name}".removeprefix("./")
 
-        tables = {name: table.values for name, table in (words or {}).items() if table is not None}
         cells: list[dict[str, Any]] = []
         for row in rows:
             opened = self.frames[row.video]
-            values = {**vars(row), "sensor": sensor}
-            del values["where"]
+            values = {name: getattr(row, name) for name in ("id", "video", "frame", "contact")}
             values |= {m: relative(f, f.path(row.frame)) for m, f in opened.items()}
             background = self.backgrounds.get(row.contact)
             if background is not None:
                 values["background"] = relative(opened["tactile"], background)
-            values |= {name: table.get((row.video, row.frame)) for name, table in tables.items()}
-            cells.append(values)
+            cells.append(values | row.more)
         return cells
 
     def _facts(self, rows: Sequence[Row]) -> dict[str, str]:

@@ -19,12 +19,14 @@ is not; else null.
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+
+import polars as pl
 
 from palpate.core import PalpateError, Progress, Split, quiet, write_text
 from palpate.data.formats.layout import has_listed_videos, require_folder, require_videos
-from palpate.data.formats.recordings import Recordings, first_frames, rows_of, thin
+from palpate.data.formats.recordings import Recordings, Row, thin
 from palpate.data.images import Check
 from palpate.data.listing import (
     FrameList,
@@ -88,12 +90,11 @@ def scan(
     sensor = WORLD.sensor if "synthetic" in result.facts else FACTS.sensor
     listed, official, words, in_contact = _read_lists(result, labels)
     work = Recordings(result, into, videos, in_contact, size)
-    every = rows_of(listed)
+    every = _rows(listed, words, sensor)
     rows = work.open(thin(every, max_per_contact) if into else every, progress)
     rows = [row for row in rows if work.has(row)]
-    names, starts = set(listed.contact["video"]), first_frames(every)
-    rows = work.usable(rows, starts, names, check=check, progress=progress)
-    work.add(rows, check=check, progress=progress, sensor=sensor, words=words)
+    starts = {row.contact: (row.video, row.frame) for row in reversed(every)}
+    work.add(rows, starts, check=check, progress=progress)
     if official is not None:
         part_of = {name: part for part, name in OFFICIAL.items()}
         cells = official.rows.select("video", "frame", "source").iter_rows()
@@ -140,6 +141,20 @@ def write_lists(manifest: Manifest, split: Split, folder: Path) -> list[Path]:
 
 
 FORMAT = Format(FACTS, has_listed_videos, LOOKS_FOR, scan, write_lists)
+
+
+def _rows(listed: FrameList, words: Mapping[str, FrameTable | None], sensor: str) -> list[Row]:
+    """The rows of a list, sorted by video and frame."""
+    columns = ("contact", "material")
+    table = pl.concat([listed.rows, listed.manifest.table.select(columns)], how="horizontal")
+    where = pl.format("{}:{}", "source", "line")
+    table = table.sort("video", "frame").select(where, "id", "video", "frame", *columns)
+    rows: list[Row] = []
+    for *place, video, frame, contact, material in table.iter_rows():
+        more = {name: t.values.get((video, frame)) for name, t in words.items() if t is not None}
+        more |= {"material": material, "sensor": sensor}
+        rows.append(Row(*place, video, frame, contact, more))
+    return rows
 
 
 def _read_lists(

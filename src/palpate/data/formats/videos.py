@@ -28,7 +28,6 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -139,7 +138,7 @@ def scan(
     _require_amounts(videos, every if decoded else 1, options.max_per_contact)
     work = _opened(result, into, videos, progress, options)
     contacts = _contacts(work, videos, progress) if decoded else {}
-    rows = _rows(work, videos, contacts, every if decoded else 1)
+    rows = _rows(work, videos, contacts, every if decoded else 1, options.sensor)
     rows = thin(rows, options.max_per_contact)
     hidden: Cells = dict.fromkeys(ORDER)
     if into is not None:
@@ -148,11 +147,10 @@ def scan(
         _copy_images(result.base, into, rows, videos)
         result.base, hidden = work.out, {}
         result.facts["frames"] = "in contact" if every is None else f"every {every} of whole videos"
-    for row, cell in zip(rows, _cells(work, rows, videos, options.sensor), strict=True):
-        if "split" in cell:
-            cell["split"] = PART_NAMES[cell["split"]]
-            result.split_name, result.split_rule = "Orig", {"method": "official", "column": "split"}
-        result.rows.append((row.where, cell | hidden))
+    cells = work.cells(rows, work.out.resolve())
+    result.rows = [(row.where, cell | hidden) for row, cell in zip(rows, cells, strict=True)]
+    if any("split" in cell for cell in cells):
+        result.split_name, result.split_rule = "Orig", {"method": "official", "column": "split"}
     return result
 
 
@@ -240,7 +238,7 @@ def _opened(
     work = Recordings(
         result, into, files, {}, options.size, modalities=sides, pairing=options.pairing
     )
-    work.open([Row(v.where, name, name, 0, name, "") for name, v in videos.items()], progress)
+    work.open([Row(v.where, name, name, 0, name) for name, v in videos.items()], progress)
     return work
 
 
@@ -290,6 +288,7 @@ def _rows(
     videos: Mapping[str, _Video],
     contacts: Mapping[str, Contacts | None],
     every: int | None,
+    sensor: str | None,
 ) -> list[Row]:
     """A row for each frame to take; those in no contact have their video's name for one."""
     rows: list[Row] = []
@@ -314,7 +313,15 @@ def _rows(
             if every
             else [k for k, c in contact_of.items() if c != name]
         )
-        rows += [Row(video.where, f"{name}/{k:010d}", name, k, contact_of[k], "") for k in frames]
+        own = ("id", "video", "frame", "contact")
+        more = {field: value for field, value in video.fields.items() if field not in own}
+        if "split" in more:
+            more["split"] = PART_NAMES.get(more["split"].lower(), "")
+        more |= {column: _place(name, column, path) for column, path in video.still.items()}
+        more |= {} if sensor is None else {"sensor": sensor}
+        for k in frames:
+            further = {**more, "contact": None} if contact_of[k] == name else more
+            rows.append(Row(video.where, f"{name}/{k:010d}", name, k, contact_of[k], further))
     return rows
 
 
@@ -331,21 +338,3 @@ def _copy_images(root: Path, into: Into, rows: list[Row], videos: Mapping[str, _
 
 def _place(video: str, column: str, path: str) -> str:
     return f"images/{video}/{column}/{Path(path).name}"
-
-
-def _cells(
-    work: Recordings, rows: list[Row], videos: Mapping[str, _Video], sensor: str | None
-) -> list[Cells]:
-    """Manifest cells of the rows."""
-    cells: list[dict[str, Any]] = work.cells(rows, work.out.resolve(), sensor)
-    for cell in cells:
-        video = videos[cell["video"]]
-        cell["contact"] = None if cell["contact"] == video.name else cell["contact"]
-        kept = {**video.fields, **{n: cell[n] for n in ("id", "video", "frame", "contact")}}
-        cell |= {"material": None, **kept}
-        cell |= {c: _place(video.name, c, path) for c, path in video.still.items()}
-        if sensor is not None:
-            cell["sensor"] = sensor
-        if "split" in cell:
-            cell["split"] = cell["split"].lower()
-    return cells
