@@ -203,9 +203,9 @@ class _Names:
             pieces += [_literal(path[after:a]), marks[name]]
             after = b
         own_names = "".join([*pieces, _literal(path[after:])]).split("/")
-        for k in (k for k, name in enumerate(bare) if name == _ROLE):
-            same = {own[k] for own in map(_names, files) if len(own) == len(names)}
-            if len(same) > 1:
+        for k, name in enumerate(bare) if len(own_names) == len(bare) else ():
+            same = {other[k] for other in map(_names, files) if len(other) == len(bare)}
+            if name == _ROLE and len(same) > 1:
                 before, _, end = _affixes(sorted(same))
                 own_names[k] = f"{before}{{sensor}}{end}"
         return "/".join(own_names) + _suffix(files)
@@ -296,7 +296,8 @@ def _new(fields: set[str], *names: str) -> str:
 def _folders(folders: Sequence[Sequence[str]], fields: set[str]) -> list[str | None]:
     """The pieces of the folders; None for one that no word and no value names."""
     if len(set(map(len, folders))) > 1:
-        first, last = (_common(folders, end) for end in (1, -1))
+        first = posixpath.commonprefix([list(names) for names in folders])
+        last = posixpath.commonprefix([list(names[len(first) :][::-1]) for names in folders])
         fields.add("video")
         return [*map(_literal, first), "{video:**}", *map(_literal, reversed(last))]
     pieces: list[str | None] = []
@@ -310,13 +311,6 @@ def _folders(folders: Sequence[Sequence[str]], fields: set[str]) -> list[str | N
         else:
             pieces.append(f"{before}{{{_new(fields, column)}}}{after}")
     return pieces
-
-
-def _common(folders: Sequence[Sequence[str]], step: int) -> Sequence[str]:
-    """The folders that all paths begin (step 1) or end (-1) with."""
-    common = posixpath.commonprefix([list(names[::step]) for names in folders])
-    shortest = min(map(len, folders))
-    return common if step == 1 else common[: max(0, shortest - len(_common(folders, 1)))]
 
 
 def _column(before: str, middles: Sequence[str]) -> str:

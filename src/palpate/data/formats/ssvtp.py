@@ -44,7 +44,6 @@ FACTS = Facts(
     group="none is given: clusters of near-duplicates",
 )
 LOOKS_FOR = "ssvtp/, or images_rgb/ with image_<id>_rgb.jpg and images_tac/ with image_<id>_tac.jpg"
-COLUMNS = ("url", "tactile", "caption")
 BACKGROUND = "tac_background.png"
 
 
@@ -115,7 +114,7 @@ def _read_list(
 ) -> None:
     """Add the rows of one list; ``captions`` gets the caption of each listed id."""
     vision, tactile = sides
-    for where, cells in tvl.read_list(result, path, COLUMNS):
+    for where, cells in tvl.read_list(result, path):
         listed = {name: cells.get(name) for name in ("url", "tactile")}
         name = PurePosixPath(listed["url"] or "").name
         match = re.fullmatch(r"image_(.+?)(?:_rgb|_tac)?\.\w+", name)

@@ -30,11 +30,11 @@ def part_lists(folder: Path) -> dict[str, Path]:
     return {part: path for part in PARTS if (path := folder / f"{part}.csv").is_file()}
 
 
-def read_list(scan: Scan, path: Path, columns: Sequence[str] = COLUMNS) -> list[Row]:
+def read_list(scan: Scan, path: Path) -> list[Row]:
     """Read one list; bad rows become problems of the scan.
 
     Returns:
-        (``file:line``, cells by the names in ``columns``); empty cells are None.
+        (``file:line``, cells by those of ``COLUMNS`` that are there); empty cells are None.
     """
     names = [name.lower() for name in header_of(path)]
     if not names:
@@ -46,7 +46,7 @@ def read_list(scan: Scan, path: Path, columns: Sequence[str] = COLUMNS) -> list[
         scan.problem(path, "missing-column", f"no column url among {', '.join(names)}")
         return []
     table = open_table(path, names)
-    rows = table.read([name for name in columns if name in names]).rows(named=True)
+    rows = table.read([name for name in COLUMNS if name in names]).rows(named=True)
     scan.problems += table.problems
     return [(table.place(row[LINE]), row) for row in rows[1:]]  # the first is the header
 
