@@ -1,16 +1,10 @@
-"""What formats share: folders of images by name, pairs of equal names, and JSON lists of pairs.
-
-The number of an image is an integer, so ``frame10.jpg`` comes after ``frame9.jpg``, and ``7.jpg``
-and ``0007.jpg`` are one frame. Nothing is skipped silently: duplicate numbers, images of another
-name and images without a partner are reported.
-"""
+"""What formats share: the names in folders, recordings of frames and videos, folders that lack."""
 
 from __future__ import annotations
 
 import os
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path, PurePosixPath
 
@@ -25,35 +19,6 @@ LISTS = ("label.txt", "train.txt", "test.txt")
 PLACES = ("dataset", "final_dataset", ".")
 #: Modality -> its folder of frames and its video in the folder of a recording.
 RECORDED = {"vision": ("video_frame", "video.mp4"), "tactile": ("gelsight_frame", "gelsight.mp4")}
-
-
-@dataclass(frozen=True)
-class Images:
-    """The images of one folder."""
-
-    folder: str  # the folder, relative to the root
-    files: dict[str, str] = field(default_factory=dict)  # key -> file name, in order
-
-    def path(self, key: str) -> str:
-        """Path of an image, relative to the root."""
-        return f"{self.folder}/{self.files[key]}"
-
-
-def paired(scan: Scan, tactile: Images, vision: Images) -> list[str]:
-    """The keys that both folders have, in order; images without a partner are problems.
-
-    A folder without any images is one problem, not one for each image of its partner.
-    """
-    for images, partner, side in ((tactile, vision, "vision"), (vision, tactile, "tactile")):
-        if images.files and not partner.files:
-            kind = "missing-frames" if (scan.base / partner.folder).is_dir() else "missing-folder"
-            text = f"no {side} images here, for {len(images.files)} in {images.folder}"
-            scan.problem(partner.folder, kind, text)
-        elif partner.files:
-            for key in images.files.keys() - partner.files.keys():
-                text = f"no {side} image {key!r} in {partner.folder}"
-                scan.problem(images.path(key), "unpaired", text)
-    return [key for key in tactile.files if key in vision.files]
 
 
 def report_missing_folders(scan: Scan) -> None:

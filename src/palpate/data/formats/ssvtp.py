@@ -24,13 +24,15 @@ else the list's.
 from __future__ import annotations
 
 import re
+from collections.abc import Mapping
 from pathlib import Path, PurePosixPath
 
 from palpate.core import PalpateError, Progress, quiet
 from palpate.data.formats import tvl
-from palpate.data.formats.layout import Images, file_names, natural, paired, suspect_rows
+from palpate.data.formats.layout import file_names, natural, suspect_rows
 from palpate.data.manifest import CLIMBS
 from palpate.data.scanning import Facts, Format, Scan
+from palpate.data.templates import Template, assign, join
 
 FACTS = Facts(
     name="SSVTP (Touch-Vision-Language)",
@@ -45,6 +47,8 @@ FACTS = Facts(
 )
 LOOKS_FOR = "ssvtp/, or images_rgb/ with image_<id>_rgb.jpg and images_tac/ with image_<id>_tac.jpg"
 BACKGROUND = "tac_background.png"
+FOLDERS = ("images_rgb", "images_tac")
+TEMPLATES = {"tactile": "images_tac/image_{key}_tac", "vision": "images_rgb/image_{key}_rgb"}
 
 
 def detect(source: Path) -> bool:
@@ -56,7 +60,7 @@ def detect(source: Path) -> bool:
 def find(source: Path) -> Path | None:
     """``ssvtp/``, from there or from the folder that holds it."""
     for root in (source, source / "ssvtp"):
-        if (root / "images_rgb").is_dir() and (root / "images_tac").is_dir():
+        if all((root / folder).is_dir() for folder in FOLDERS):
             return root
     return None
 
@@ -69,20 +73,26 @@ def scan(source: Path, *, progress: Progress = quiet) -> Scan:
         raise PalpateError(must, "none of these", f"Unpack it from {tvl.URL}")
     paths = tvl.part_lists(root)
     result = Scan(root, {"layout": "ssvtp"})
-    vision, tactile = (_images(result, side) for side in ("rgb", "tac"))
+    files = [f"{folder}/{name}" for folder in FOLDERS for name in file_names(root / folder)]
+    matches = assign(files, {side: Template.parse(text) for side, text in TEMPLATES.items()})
+    images = {side: {row["key"]: path for path, row in own} for side, own in matches.items()}
+    misnamed = {*files}.difference(*(own.values() for own in images.values()))
+    text = f"not named as {' and '.join(TEMPLATES.values())}"
+    result.suspect(root, "unknown-name", text, sorted(misnamed))
     captions: dict[str, str | None] = {}
     if paths:
-        files = [path.name for path in paths.values()]
-        result.split_name, result.split_rule = "Orig", {"method": "official", "files": files}
+        lists = [path.name for path in paths.values()]
+        result.split_name, result.split_rule = "Orig", {"method": "official", "files": lists}
         for done, (part, path) in enumerate(paths.items()):
             progress("reading lists", done, len(paths))
-            _read_list(result, path, part, (vision, tactile), captions)
-        unlisted = [vision.path(key) for key in vision.files if key not in captions]
+            _read_list(result, path, part, images, captions)
+        unlisted = [path for key, path in images["vision"].items() if key not in captions]
         result.suspect(root, "unlisted", "photos in no list", unlisted)
     else:
-        for key in paired(result, tactile, vision):
-            row = {"id": f"ssvtp/{key}", "vision": vision.path(key), "tactile": tactile.path(key)}
-            result.rows.append((str(root / vision.path(key)), row))
+        pairs, result.problems = join(matches)
+        for row in pairs:
+            cells = {"id": f"ssvtp/{row.pop('key')}", **row}
+            result.rows.append((str(root / row["vision"]), cells))
     _add_words(result, captions)
     background = BACKGROUND if (root / BACKGROUND).is_file() else None
     for _, row in result.rows:
@@ -95,25 +105,14 @@ def scan(source: Path, *, progress: Progress = quiet) -> Scan:
 FORMAT = Format(FACTS, detect, LOOKS_FOR, scan)
 
 
-def _images(result: Scan, side: str) -> Images:
-    """Id -> file of the images of one side."""
-    folder = f"images_{side}"
-    names = file_names(result.base / folder)
-    matches = [(re.fullmatch(rf"image_(.+)_{side}\.\w+", name), name) for name in names]
-    misnamed = [name for match, name in matches if not match]
-    result.suspect(folder, "unknown-name", f"not named image_<id>_{side}", misnamed)
-    return Images(folder, {match[1]: name for match, name in matches if match})
-
-
 def _read_list(
     result: Scan,
     path: Path,
     part: str,
-    sides: tuple[Images, Images],
+    images: Mapping[str, Mapping[str, str]],
     captions: dict[str, str | None],
 ) -> None:
-    """Add the rows of one list; ``captions`` gets the caption of each listed id."""
-    vision, tactile = sides
+    """Add the rows of one list; ``images`` has side -> id -> path, ``captions`` gets id -> text."""
     for where, cells in tvl.read_list(result, path):
         listed = {name: cells.get(name) for name in ("url", "tactile")}
         name = PurePosixPath(listed["url"] or "").name
@@ -128,8 +127,8 @@ def _read_list(
         else:
             key = match[1]
             paths = {
-                "vision": f"images_rgb/{vision.files.get(key, f'image_{key}_rgb.jpg')}",
-                "tactile": f"images_tac/{tactile.files.get(key, f'image_{key}_tac.jpg')}",
+                side: images[side].get(key, f"{text.format(key=key)}.jpg")
+                for side, text in TEMPLATES.items()
             }
             captions.setdefault(key, tvl.clean_caption(cells.get("caption")))
             result.rows.append((where, {"id": f"ssvtp/{key}", **paths, "split": part}))
