@@ -18,6 +18,7 @@ from threading import Event
 from typing import Any, Literal
 
 from palpate.core import PalpateError, Problem, Progress, read_json, require, write_json
+from palpate.data.contacts import Pixels
 from palpate.data.frames import (
     FolderFrames,
     Frames,
@@ -269,17 +270,21 @@ class Recordings:
             r for r in rows if all((r.video, m, r.frame) in decoded for m in self._videos_of(r))
         ]
 
+    def watched(self, video: str) -> tuple[dict[str, Pixels], list[Finding]]:
+        """Thumbnails of a recording by modality, and what looks wrong with it: lag ..."""
+        images, seconds = streams_of(self.frames[video])
+        self.scan.looks[video] = Look.of_video(images)
+        counted = "tactile" in images and self.frames[video]["tactile"].numbers[0] == 0
+        return images, findings(images, seconds, self.in_contact.get(video, ()) if counted else ())
+
     def _check_streams(self, progress: Progress) -> None:
-        """Report what looks wrong with whole recordings: lag, frozen streams, another gel ..."""
+        """Report what looks wrong with whole recordings."""
 
         def check(video: str) -> list[Finding]:
             try:
-                images, seconds = streams_of(self.frames[video])
+                return self.watched(video)[1]
             except PalpateError:
                 return []  # reported where its frames are read
-            self.scan.looks[video] = Look.of_video(images)
-            counted = "tactile" in images and self.frames[video]["tactile"].numbers[0] == 0
-            return findings(images, seconds, self.in_contact.get(video, ()) if counted else ())
 
         results = in_threads(check, sorted(self.frames), "checking streams", progress)
         for video, problems in sorted(results):

@@ -45,12 +45,12 @@ from palpate.data.detection import (
 )
 from palpate.data.formats.layout import has_listed_videos, require_folder
 from palpate.data.formats.recordings import Pairing, Recordings, Row, thin
-from palpate.data.frames import MOVING, streams_of
+from palpate.data.frames import MOVING
 from palpate.data.images import SUFFIXES, Check, in_threads, read_image
 from palpate.data.manifest import PART_NAMES
 from palpate.data.scanning import Cells, Facts, Format, Into, Scan
-from palpate.data.streams import Finding, findings
-from palpate.data.suspicions import Look, startup_frames
+from palpate.data.streams import Finding
+from palpate.data.suspicions import startup_frames
 from palpate.data.templates import FIX, Fields, Template, assign, walk
 
 FACTS = Facts(
@@ -251,11 +251,9 @@ def _contacts(
         try:
             declared = videos[video].still.get("background")
             gel = None if declared is None else thumbnail(read_image(work.scan.base / declared))
-            images, seconds = streams_of(work.frames[video])
+            images, problems = work.watched(video)
         except PalpateError as error:
             return error.got
-        work.scan.looks[video] = Look.of_video(images)
-        problems = findings(images, seconds)
         if (touch := images.get("tactile")) is None:
             return None, problems
         if count := startup_frames(touch):  # they are no contact
