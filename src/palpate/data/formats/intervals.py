@@ -161,7 +161,9 @@ def scan(
     listed = [
         Interval(
             f"{source}:{row[LINE]}",
-            *(row[name] for name in NEEDED),
+            row["video"],
+            row["start"],
+            row["end"],
             {"sensor": options.sensor} | {name: row[name] for name in WORDS if row[name]},
             row["unclear"],
         )

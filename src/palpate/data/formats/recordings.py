@@ -414,7 +414,7 @@ class Recordings:
             background = self.backgrounds.get(row.contact)
             if background is not None:
                 values["background"] = relative(opened["tactile"], background)
-            cells.append(values | row.more)
+            cells.append({**values, **row.more})
         return cells
 
     def _facts(self, rows: Sequence[Row]) -> dict[str, str]:

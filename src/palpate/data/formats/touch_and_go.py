@@ -150,10 +150,10 @@ def _rows(listed: FrameList, words: Mapping[str, FrameTable | None], sensor: str
     where = pl.format("{}:{}", "source", "line")
     table = table.sort("video", "frame").select(where, "id", "video", "frame", *columns)
     rows: list[Row] = []
-    for *place, video, frame, contact, material in table.iter_rows():
-        more = {name: t.values.get((video, frame)) for name, t in words.items() if t is not None}
+    for line, name, video, frame, contact, material in table.iter_rows():
+        more = {c: t.values.get((video, frame)) for c, t in words.items() if t is not None}
         more |= {"material": material, "sensor": sensor}
-        rows.append(Row(*place, video, frame, contact, more))
+        rows.append(Row(line, name, video, frame, contact, more))
     return rows
 
 
