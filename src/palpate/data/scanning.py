@@ -222,7 +222,8 @@ def _checked_paths(scan: Scan) -> list[Row]:
         """(path relative to the root, ""), or (kind of problem, its text)."""
         folder, _, name = written.rpartition("/")
         usual = posixpath.normpath(written) == written and "\\" not in name
-        if usual and not written.startswith("/") and not leaves(folder) and name in files(folder):
+        usual &= not written.startswith("/")
+        if usual and not leaves(folder) and name in files(folder):
             return written, ""
         path = root / written
         # Paths are slow, so only unusual ones and links are resolved one by one.

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
 from pathlib import Path
+from threading import Lock
 from typing import Any
 
 import numpy as np
@@ -16,6 +17,8 @@ from palpate.core import PalpateError
 from palpate.data.contacts import SIZE, thumbnail
 
 SUFFIX = ".npy"
+#: Headers are parsed as Python, which several threads of Python 3.11 may not do at once.
+_PARSING = Lock()
 
 
 class StackReader:
@@ -31,7 +34,8 @@ class StackReader:
     def __init__(self, path: Path) -> None:
         self.path = Path(path)
         try:
-            frames: Any = np.load(self.path, mmap_mode="r", allow_pickle=False)
+            with _PARSING:
+                frames: Any = np.load(self.path, mmap_mode="r", allow_pickle=False)
         except Exception as error:  # a damaged header is parsed as Python, and fails in many ways
             got = "no such file" if not self.path.is_file() else str(error).splitlines()[0]
             raise self._broken(got) from None
