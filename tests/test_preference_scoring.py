@@ -43,7 +43,7 @@ def downloads(plan, tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def results(study, downloads):
-    return preference.score(study, downloads)
+    return preference.score(study, downloads, replicates=400)
 
 
 def codes(results):
@@ -154,7 +154,7 @@ def test_results_are_tables_pages_and_files_as_others(results, tmp_path):
 def test_sides_are_unswapped(plan, study, tmp_path):
     """A rater who always takes the image of one method, wherever it is shown."""
     fan = Crowd({"ours": 99.0, "gvst": 0.0, "wbg": -99.0}, item_sd=0, rater_sd=0)
-    results = preference.score(study, fan.write(plan, tmp_path / "votes", ["r01"]))
+    results = preference.score(study, fan.write(plan, tmp_path / "votes", ["r01"]), replicates=100)
     assert results["human preference", "ours"].value == 1
     assert results["human preference", "wbg"].value == 0
     agreement = results.settings["preference"]["agreement"]
@@ -171,7 +171,7 @@ def test_sides_are_unswapped(plan, study, tmp_path):
     ],
 )
 def test_two_raters_stand_for_themselves_and_four_are_few(study, downloads, count, code, words):
-    results = preference.score(study, sorted(downloads.iterdir())[:count])
+    results = preference.score(study, sorted(downloads.iterdir())[:count], replicates=100)
     assert codes(results)[code] == {"count": count}
     alone = "for these raters alone" in results["human preference", "ours"].interval_method
     assert alone == (code == "these-raters")
@@ -188,7 +188,7 @@ def test_raters_are_excluded_by_rules_that_were_fixed_before(plan, study, tmp_pa
     for download in (left, careless, early):
         path = folder / f"votes-{plan.study}-{download['rater']}.json"
         path.write_text(json.dumps(signed(download)))
-    results = preference.score(study, folder)
+    results = preference.score(study, folder, replicates=100)
     excluded = {n.params["rater"]: n.params["rule"] for n in results.notes if "rater" in n.params}
     assert excluded == {"r01": "side", "r02": "catches", "r03": "finished"}
     assert results.settings["preference"]["agreement"]["raters"] == 9
@@ -214,7 +214,7 @@ def test_unanimous_votes_have_a_bound_and_say_so(plan, study, tmp_path):
 
 def test_left_bias_is_noticed(plan, study, tmp_path):
     crowd = Crowd(CROWD.strengths, left_bias=1.5)
-    results = preference.score(study, crowd.write(plan, tmp_path / "votes"))
+    results = preference.score(study, crowd.write(plan, tmp_path / "votes"), replicates=100)
     agreement = results.settings["preference"]["agreement"]
     assert agreement["left"] > 0.6
     assert agreement["p_left"] < 0.001
@@ -310,7 +310,7 @@ def test_by_method_the_items_of_a_metric_are_resampled_as_those_of_votes(plan, d
 
 def test_scores_of_methods_are_compared_too(study, downloads, results, tmp_path):
     results.save(tmp_path / "scores.json")  # any file of scores of the same methods
-    again = preference.score(study, downloads, metrics=[tmp_path / "scores.json"])
+    again = preference.score(study, downloads, metrics=[tmp_path / "scores.json"], replicates=100)
     assert again["Kendall's tau with people, by method", "human strength"].value == 1
 
 
@@ -320,8 +320,8 @@ def test_votes_of_the_server_count_as_downloads_do(plan, study, downloads, resul
     rows = [[f["rater"], *(v[n] for n in names), ""] for f in files for v in f["votes"]]
     write_database(database, plan, rows)
     try:
-        served = preference.score(study)
-        both = preference.score(study, downloads)
+        served = preference.score(study, replicates=400)
+        both = preference.score(study, downloads, replicates=400)
     finally:
         database.unlink()
     assert served.scores == results.scores == both.scores
@@ -490,7 +490,8 @@ def test_a_material_may_be_called_left(tmp_path):
     folders = write_folders(tmp_path, videos=24, frames=1, materials=("left", "moss"))
     plan = folders.make(tmp_path / "s", 1, task="sort", items=12, raters=3, size=32)
     votes = Crowd({}, skill=0.9).write(plan, tmp_path / "votes")
-    agreement = preference.score(tmp_path / "s", votes).settings["preference"]["agreement"]
+    results = preference.score(tmp_path / "s", votes, replicates=100)
+    agreement = results.settings["preference"]["agreement"]
     assert (agreement["raters"], agreement["sides"]) == (3, 0)
 
 
@@ -499,7 +500,8 @@ def test_a_material_that_was_not_shown_has_no_accuracy(tmp_path):
     folders = write_folders(tmp_path, videos=12, frames=1, materials=materials)
     plan = folders.make(tmp_path / "s", 1, task="sort", items=4, raters=4, size=32)
     crowd = Crowd({}, skill=0.9)
-    results = preference.score(tmp_path / "s", crowd.write(plan, tmp_path / "votes"))
+    votes = crowd.write(plan, tmp_path / "votes")
+    results = preference.score(tmp_path / "s", votes, replicates=100)
     details = results["human accuracy of material", "ours"].details
     shown = {item.material for item in plan.items}
     assert {m for m, share in details["by_material"].items() if share is not None} == shown
