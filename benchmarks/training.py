@@ -2,10 +2,13 @@
 
 ::
 
-    python benchmarks/training.py [--only overhead processes embedding memory]
+    python benchmarks/training.py [--only overhead trust processes embedding memory]
 
 - ``overhead``: seconds of a step of the engine, over a bare PyTorch loop of the same model, batch
   and optimizer (wanted: below 1.03).
+- ``trust``: what digests and flushing add to a training, over its steps (wanted: below .03): the
+  seconds of a checkpoint over those of the same file written alone, next to the steps between two
+  checkpoints; and those of a cache of pixels, written and checked, next to the epochs that read it.
 - ``processes``: images a second of two gloo processes, one thread each, over one process with one
   thread, at equal global batch (wanted: 1.5), and images a processor second of the first process;
   next to it the ceiling: two processes that train apart at the same time, over one.
@@ -33,15 +36,17 @@ import sys
 import tempfile
 import time
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import numpy as np
 import torch
+from safetensors.torch import save_file
 
-from palpate.core import quiet, rng_for
-from palpate.data.images import Preprocess
+from palpate.core import cached, is_whole, quiet, rng_for
+from palpate.data.images import Preprocess, mapped
 from palpate.encoders.contrastive import TactileLoss, TactileModel
 from palpate.encoders.embed import embed_images
 from palpate.encoders.encoder_set import EncoderSet, new_tactile
@@ -49,6 +54,7 @@ from palpate.encoders.losses import in_chunks, three_way
 from palpate.encoders.models import to_unit
 from palpate.encoders.presets import preset_of
 from palpate.encoders.rows import Rows, augmented, draw, numbers, unit
+from palpate.training import engine
 from palpate.training.engine import Task, fit
 from palpate.training.options import Compute, RowOrder
 from palpate.training.steps import Step
@@ -155,6 +161,73 @@ def overhead(steps=40):
     # From the end of a bare step to the next progress, and from there to the end of a bare step.
     turns = np.diff(at, axis=0)[1:].reshape(-1, 2, 2)
     return {"wanted": "below 1.03", **summary(turns[2:])}
+
+
+def trust(rows=10_000, turns=5):
+    """Digests and flushing, with against without, over the steps that they come with.
+
+    A checkpoint is written in a thread beside the steps; here all of its seconds count.
+    """
+    few, course = Images(1024), MINI.tactile_course
+    loss = TactileLoss(few, Preprocess(MINI.image, MINI.image), "identical-text")
+    parameters = dict(tactile_model().named_parameters())
+    parts = ("model", "ema", "exp_avg", "exp_avg_sq")
+    state = {f"{part}.{name}": p.detach() for part in parts for name, p in parameters.items()}
+    pixels = Images(rows).images
+    at = []
+    with tempfile.TemporaryDirectory(dir=".") as name:  # /tmp may be memory
+        folder = Path(name)
+        engine_steps(few, tactile_model(), 12, loss, folder, lambda *words: at.append(clocks()))
+        step = np.median(np.diff(at, axis=0)[1:], axis=0)
+
+        def cache():
+            for file in folder.glob("sealed.npy*"):
+                file.unlink()
+            cached(folder / "sealed.npy", lambda part: np.save(part, pixels), mapped, quiet)
+            assert is_whole(folder / "sealed.npy")
+
+        plain = folder / "plain"
+        tasks = {
+            "checkpoint": (
+                partial(engine._save, state, folder / "sealed.safetensors"),
+                lambda: (save_file(state, plain), plain.replace(folder / "plain.safetensors")),
+            ),
+            "cache": (cache, lambda: np.save(folder / "plain.npy", pixels)),
+        }
+        seconds = {task: differences(*calls, turns) for task, calls in tasks.items()}
+        megabytes = {
+            task: (folder / f"sealed.{suffix}").stat().st_size / 1e6
+            for task, suffix in (("checkpoint", "safetensors"), ("cache", "npy"))
+        }
+    steps = np.array([60 * Compute().checkpoint_minutes] * 2), rows / course.batch * step
+    shares = {
+        "between two checkpoints": seconds["checkpoint"] / steps[0],
+        "first epoch": seconds["cache"] / steps[1],
+        "training": seconds["checkpoint"] / steps[0] + seconds["cache"] / steps[1] / course.epochs,
+    }
+    digits = lambda values: [float(f"{value:.3g}") for value in values]
+    return {
+        "wanted": "below 0.03",
+        "share_by_processor_and_wall": {name: digits(share) for name, share in shares.items()},
+        "more_seconds": {name: digits(each) for name, each in seconds.items()},
+        "megabytes": {name: round(size, 1) for name, size in megabytes.items()},
+        "step_seconds": digits(step),
+        "turns": turns,
+    }
+
+
+def differences(first, second, turns):
+    """The median over turns of what one call takes more than another, by both clocks."""
+    first(), second()
+    more = []
+    for _ in range(turns):
+        at = [clocks()]
+        for call in (first, second):
+            call()
+            at.append(clocks())
+        took = np.diff(at, axis=0)
+        more.append(took[0] - took[1])
+    return np.median(more, axis=0)
 
 
 WORKER = """
@@ -286,7 +359,13 @@ def memory(batch=256, chunk=8):
     }
 
 
-PARTS = {"overhead": overhead, "processes": processes, "embedding": embedding, "memory": memory}
+PARTS = {
+    "overhead": overhead,
+    "trust": trust,
+    "processes": processes,
+    "embedding": embedding,
+    "memory": memory,
+}
 
 
 def main() -> None:

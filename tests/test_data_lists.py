@@ -6,6 +6,7 @@ import pytest
 from forge.errors import fails
 from forge.pictures import write_images
 from palpate.cli import main
+from palpate.core import files
 from palpate.data import tables
 from palpate.data.importing import import_dataset, validate
 from palpate.data.listing import read_list
@@ -148,7 +149,7 @@ def test_large_metadata_are_refused_before_they_are_read(tmp_path):
     for name in ("list.txt", "table.csv", "table.json"):
         with open(tmp_path / name, "wb") as file:
             file.write(b"v/1.jpg,3\n")
-            file.truncate(tables.LARGEST + 1)
+            file.truncate(files.LARGEST + 1)
         fails("at most 256 MiB", load, tmp_path / name)
     fails("at most 256 MiB", read_list, tmp_path / "list.txt")
 

@@ -186,6 +186,24 @@ AutoModel.from_pretrained("a", trust_remote_code=True)
     assert len(list(opened_wrongly(tmp_path / "planted.py", "data/planted.py"))) == 8
 
 
+def parquet_lines(path, *, guarded):
+    """Lines of a file that read Parquet; the ``guarded`` ones, where a panic is an error."""
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        inside = isinstance(node, ast.With) and "reading_parquet()" in map(ast.unparse, node.items)
+        if inside or (not guarded and isinstance(node, ast.Module)):
+            calls = [n for n in ast.walk(node) if isinstance(n, ast.Call)]
+            yield from {n.lineno for n in calls if "pl.read_parquet" in ast.unparse(n.func)}
+
+
+def test_parquet_is_read_where_a_panic_of_polars_is_an_error(tmp_path):
+    for path in (TOP / "src" / "palpate").rglob("*.py"):
+        open_lines = {*parquet_lines(path, guarded=False)} - {*parquet_lines(path, guarded=True)}
+        assert not open_lines, (path, open_lines)
+    planted = tmp_path / "planted.py"
+    planted.write_text("pl.read_parquet('a')\nwith reading_parquet():\n    pl.read_parquet('a')\n")
+    assert {*parquet_lines(planted, guarded=False)} - {*parquet_lines(planted, guarded=True)} == {1}
+
+
 def test_importing_a_room_has_no_effects():
     code = """
 import importlib, os, random

@@ -4,9 +4,11 @@ import json
 import os
 from pathlib import Path
 
+import polars as pl
 import pytest
 import torch
 
+from forge.commands import mistake
 from forge.errors import fails
 from forge.pictures import write_images
 from palpate.cli import main
@@ -99,3 +101,29 @@ def test_torchscript_runs_only_where_the_user_says_so(here, capsys):
     assert Path("notes.txt").read_bytes() == NOTES
     checks = verify("r.json", trust_torchscript=True).checks
     assert [check.status for check in checks if check.name.startswith("FID")] == ["same"]
+
+
+@pytest.mark.parametrize(
+    ("name", "command"),
+    [
+        ("r.json", "report r.json -o page.html"),
+        ("r.json", "audit set --split r.json --vision photo/{id}.png --tactile touch/{id}.png"),
+        ("set/touch/index.json", "score --generated set/touch --reference set/photo"),
+        ("p.txt", "caption set --server http://localhost:1 --prompt p.txt --per frame -o c"),
+    ],
+)
+def test_a_huge_file_of_text_is_refused_before_it_is_read(here, capsys, name, command):
+    with open(name, "wb") as file:
+        file.truncate(3 << 30)
+    mistake(capsys, "at most 256 MiB", *command.split())
+
+
+def test_a_panic_of_polars_over_a_damaged_table_is_a_bad_table(here, capsys, monkeypatch):
+    def panic(*args, **options):
+        raise pl.exceptions.PanicException("range end index 4 out of range")
+
+    pl.DataFrame({"id": ["a"], "text": ["b"]}).write_parquet("t.parquet")
+    for name in ("read_parquet", "read_parquet_schema", "read_parquet_metadata"):
+        with monkeypatch.context() as patch:
+            patch.setattr(pl, name, panic)
+            mistake(capsys, "t.parquet", "import", "t.parquet", "-o", "m")

@@ -25,7 +25,7 @@ from importlib import resources
 from pathlib import Path
 from typing import Any
 
-from palpate.core import PalpateError, digest_json, require
+from palpate.core import PalpateError, content_of, digest_json, require
 
 #: Fields that a reply may have, as JSON schemas.
 FIELDS: dict[str, dict[str, Any]] = {
@@ -102,7 +102,7 @@ class Prompt:
         must = f"must be one of {', '.join(shipped)}, or a prompt file"
         require(path.is_file(), "prompt", must, str(source), fix="Check the name")
         try:
-            return cls.parse(path.read_text(encoding="utf-8"))
+            return cls.parse(content_of(path).decode())
         except (UnicodeDecodeError, ValueError) as error:
             must = f"must have the lines {': ..., '.join(HEAD)}: ..., an empty line and a text"
             fix = "Start from one that ships: palpate/captions/prompts"

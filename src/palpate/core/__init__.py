@@ -4,6 +4,7 @@ from palpate.core.features import FeatureSet
 from palpate.core.files import (
     atomic_folder,
     atomic_path,
+    content_of,
     digest_file,
     digest_folder,
     digest_json,
@@ -67,6 +68,7 @@ __all__ = [
     "atomic_folder",
     "atomic_path",
     "cached",
+    "content_of",
     "decoded",
     "digest_file",
     "digest_folder",

@@ -51,6 +51,9 @@ READERS = {
 #: The files that tell of a folder what it is.
 MARKS, MANIFEST = ("palpate.json", "index.json", "plan.json"), "manifest.parquet"
 _VERSION = re.compile(r"[/@]\d+$")
+#: Bytes of the largest file that is read at once, a table or list or JSON; some ten times as much
+#: of memory.
+LARGEST = 1 << 28
 
 
 def plain(value: Any) -> Any:
@@ -345,6 +348,20 @@ def unsealed(record: Any) -> Any:
     return record
 
 
+def content_of(path: Path) -> bytes:
+    """The bytes of a file that is read at once.
+
+    Raises:
+        OSError: if it cannot be read.
+        PalpateError: if it is larger than any that can be.
+    """
+    size, must = path.stat().st_size, f"A file of text must have at most {LARGEST >> 20} MiB"
+    if size > LARGEST:
+        fix = "Check that it is the right one; write a large table in parts, or as Parquet"
+        raise PalpateError(must, f"{path} of {size >> 20:,} MiB", fix)
+    return path.read_bytes()
+
+
 def read_json(path: Path, role: str) -> Any:
     """Read a JSON file, and check its digest if it is :func:`sealed`.
 
@@ -353,11 +370,11 @@ def read_json(path: Path, role: str) -> Any:
         role: its role, for the error (``"split file"``).
 
     Raises:
-        PalpateError: if the file is missing, is not JSON, or is damaged.
+        PalpateError: if the file is missing, is too large, is not JSON, or is damaged.
     """
     require_regular(Path(path))
     try:
-        value = json.loads(Path(path).read_text(encoding="utf-8"))
+        value = json.loads(content_of(Path(path)).decode())
         # No NaN and no infinity, which JSON has not, and no halves of characters.
         json.dumps(value, ensure_ascii=False, allow_nan=False).encode()
         return unsealed(value)
@@ -411,8 +428,8 @@ def read_record(
 def kind_of(path: Path) -> tuple[str, str] | None:
     """What a file or folder that palpate wrote is, and what reads it; None for all else."""
     for file in [path / name for name in MARKS] if path.is_dir() else [path]:
-        with suppress(OSError, ValueError, RecursionError, AttributeError):
-            form = str(json.loads(file.read_bytes()).get("format"))
+        with suppress(OSError, ValueError, RecursionError, AttributeError, PalpateError):
+            form = str(json.loads(content_of(file)).get("format"))
             if kind := READERS.get(_VERSION.sub("", form)):
                 return kind
     manifest = path / MANIFEST if path.is_dir() else path

@@ -25,7 +25,7 @@ from typing import Any
 
 import polars as pl
 
-from palpate.core import PalpateError, Problem, ProblemsError, require
+from palpate.core import PalpateError, Problem, ProblemsError, content_of, require
 from palpate.data.manifest import PART_NAMES, PATH, ROLE_OF, reading_parquet
 from palpate.data.mapping import LINE, text_of
 
@@ -35,8 +35,6 @@ TABLES = (".csv", ".tsv", ".jsonl", ".json", ".parquet")
 INCONCLUSIVE = -1
 #: Names that the published category table misspells.
 SPELLING = {"Ruber": "Rubber"}
-#: Bytes of a text that is read at once.
-LARGEST = 1 << 28
 #: The encoding of texts that Excel saves as plain CSV.
 WINDOWS = "cp1252"
 CONTROL = re.compile("[\x00-\x08\x0b\x0c\x0e-\x1f]")
@@ -227,18 +225,6 @@ def is_windows(data: bytes) -> bool:
     return False
 
 
-def content_of(path: Path) -> bytes:
-    """The bytes of a table or list.
-
-    Raises:
-        PalpateError: if it is larger than any that can be read at once.
-    """
-    size, must = Path(path).stat().st_size, f"A table or list must have at most {LARGEST >> 20} MiB"
-    got, fix = f"{path} of {size >> 20:,} MiB", "Write it in parts, or as Parquet"
-    require(size <= LARGEST, None, must, got, fix=fix)
-    return Path(path).read_bytes()
-
-
 def lines_of(text: str) -> list[str]:
     """The lines of a text by any of the ends LF, CR LF and CR, and by no other sign."""
     return text.replace("\r\n", "\n").replace("\r", "\n").split("\n")
@@ -409,7 +395,7 @@ def _of_objects(name: str, rows: Sequence[tuple[int, Any]], problems: list[Probl
 
 def _schema(path: Path) -> dict[str, pl.DataType]:
     """Columns of a Parquet file; polars would take brackets in its name for a pattern."""
-    with open(path, "rb") as file:
+    with open(path, "rb") as file, reading_parquet():
         return dict(pl.read_parquet_schema(file))
 
 

@@ -31,7 +31,7 @@ from contextlib import asynccontextmanager, closing, suppress
 from pathlib import Path
 from typing import Any, cast
 
-from palpate.core import MissingExtraError, PalpateError
+from palpate.core import MissingExtraError, PalpateError, locked
 from palpate.preference.page import policy, study_page
 from palpate.preference.plan import Plan, last_day
 from palpate.preference.store import Vote, VoteStore, hashed
@@ -310,13 +310,17 @@ def serve(
 
     Raises:
         MissingExtraError: without the extra ``preference``.
-        PalpateError: if the file of votes is of another study, a rater cannot be invited, ``until``
-            is no date, or the address is taken.
+        PalpateError: if another server has the study, the file of votes is of another one, a rater
+            cannot be invited, ``until`` is no date, or the address is taken.
     """
     folder, public = Path(study), Plan.load(study).public()
+    folder = folder if folder.is_dir() else folder.parent
     public["until"] = last_day(public["until"] if until is None else until)
-    database = (folder if folder.is_dir() else folder.parent) / DATABASE
-    with closing(VoteStore(database, public["study"])) as store, _listening(host, port) as listener:
+    with (
+        locked(folder),  # of two servers the first to end would count the votes of both
+        closing(VoteStore(folder / DATABASE, public["study"])) as store,
+        _listening(host, port) as listener,
+    ):
         tokens = store.invite(list(public["raters"]), invite, reinvite)
         address = f"[{host}]" if ":" in host else host
         app = _Study(public, store).application()

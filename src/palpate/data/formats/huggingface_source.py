@@ -12,7 +12,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from palpate.core import MissingExtraError, PalpateError, require
+from palpate.core import MissingExtraError, PalpateError, content_of, require
 
 #: Kinds of local folders and of hub data sets that are opened; none of them runs code of others.
 LOCAL, REMOTE = ("parquet", "arrow", "imagefolder"), ("parquet",)
@@ -96,9 +96,9 @@ def _saved(source: Path) -> dict[str, Any]:
 
     parts = {"": source}
     if (source / "dataset_dict.json").is_file():
-        names = json.loads((source / "dataset_dict.json").read_bytes())["splits"]
+        names = json.loads(content_of(source / "dataset_dict.json"))["splits"]
         parts = {name: source / name for name in names}
-    rows = {n: json.loads((p / "state.json").read_bytes())["_data_files"] for n, p in parts.items()}
+    rows = {n: json.loads(content_of(p / "state.json"))["_data_files"] for n, p in parts.items()}
     return {n: datasets.load_from_disk(str(p)) for n, p in parts.items() if rows[n]}
 
 

@@ -27,7 +27,7 @@ import re
 from collections.abc import Mapping
 from pathlib import Path, PurePosixPath
 
-from palpate.core import PalpateError, Progress, quiet
+from palpate.core import PalpateError, Progress, content_of, quiet
 from palpate.data.formats import tvl
 from palpate.data.formats.layout import file_names, natural, suspect_rows
 from palpate.data.manifest import CLIMBS
@@ -155,5 +155,5 @@ def _add_words(result: Scan, captions: dict[str, str | None]) -> None:
 def _first_line(path: Path) -> str | None:
     if not path.is_file():
         return None
-    lines = path.read_text("utf-8-sig", errors="replace").splitlines()
+    lines = content_of(path).decode("utf-8-sig", errors="replace").splitlines()
     return tvl.clean_caption(lines[0]) if lines else None
