@@ -61,7 +61,7 @@ from palpate.core import (
     require,
     write_text,
 )
-from palpate.core.files import NO_ROOM, is_stream
+from palpate.core.files import NO_ROOM, is_stream, starting_to_write
 
 if TYPE_CHECKING:
     from palpate.report.results import Audit, Results
@@ -342,7 +342,7 @@ def guard_output(
     is_input = any(output.exists() and p.exists() and output.samefile(p) for p in files)
     must, fix = "An output must not replace an input of the same command", "Choose another file"
     require(not is_input, None, must, str(output), fix=fix)
-    try:
+    with starting_to_write(output):
         if not is_stream(output):
             if output.is_dir():
                 raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR))
@@ -350,11 +350,6 @@ def guard_output(
             # Fail now rather than when all is computed.
             with tempfile.NamedTemporaryFile(dir=folder, prefix=f".{output.name}."):
                 pass
-    except OSError as error:
-        if error.errno in NO_ROOM:
-            raise OSError(error.errno, os.strerror(error.errno), str(output)) from None
-        got, fix = error.strerror or str(error), "Choose another path, or check its rights"
-        raise PalpateError(f"{output} must be writable", got, fix) from None
     if output.is_file():
         with open(output, "rb") as file:
             head = file.read(4096)

@@ -164,7 +164,7 @@ def is_stream(path: Path) -> bool:
 
 
 @contextmanager
-def _starting(path: Path) -> Generator[None]:
+def starting_to_write(path: Path) -> Generator[None]:
     """Raise what stops something from being written with the path that the user named."""
     try:
         yield
@@ -212,7 +212,7 @@ def atomic_path(path: Path, *, flush: bool = True) -> Generator[Path]:
         PalpateError: if nothing can be written there.
     """
     path = Path(path)
-    with _starting(path):
+    with starting_to_write(path):
         stream = is_stream(path)  # the real path of a pipe names nothing
         final = path if stream else Path(os.path.realpath(path))
         if final.is_dir():
@@ -291,7 +291,7 @@ def locked(folder: Path, output: Path | None = None) -> Generator[None]:
         PalpateError: if another process holds it, or it cannot be made.
     """
     new = not folder.exists()
-    with _starting(output or folder):
+    with starting_to_write(output or folder):
         folder.mkdir(parents=True, exist_ok=True)
     handle = -1
     try:

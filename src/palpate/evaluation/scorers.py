@@ -466,10 +466,6 @@ def _compared(
     return [_named(s, metric, sets) for r in results for s in (*r.scores, *r.differences)]
 
 
-def _fid(bench: Bench, sets: Sets) -> list[Score]:
-    return _compared(bench, sets, "FID", compare_fid)
-
-
 def _cmmd(bench: Bench, sets: Sets) -> list[Score]:
     cmmd = partial(
         compare_tmmd, preset="cmmd", permutations=bench.permutations, normalize=bench.normalize
@@ -560,7 +556,7 @@ def _lpips(bench: Bench, pairs: Mapping[str, Images]) -> list[Score]:
 
 
 FEATURES: Mapping[str, Callable[[Bench, Sets], list[Score]]] = {
-    "fid": _fid,
+    "fid": partial(_compared, metric="FID", compared=compare_fid),
     "kid": _kid,
     "prdc": _prdc,
     "cmmd": _cmmd,

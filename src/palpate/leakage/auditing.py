@@ -232,17 +232,18 @@ def known_group(train: Manifest, test: Manifest) -> str:
     """
     named = [str(m.facts["group"]) for m in (test, train) if m.facts.get("group") in GROUPS]
     candidates = (*named, "video", "object", "session", "contact")
-    return next((c for c in candidates if _known(train, c) and _known(test, c)), NO_GROUP)
+    return next((c for c in candidates if all(_knowing(train, test, c))), NO_GROUP)
 
 
-def _known(manifest: Manifest, column: str) -> bool:
-    return manifest.table[column].null_count() < len(manifest)
+def _knowing(train: Manifest, test: Manifest, column: str) -> list[bool]:
+    """Which of both parts know some values of a column."""
+    return [part.table[column].null_count() < len(part) for part in (train, test)]
 
 
 def _compared(train: Manifest, test: Manifest, options: _Options) -> list[str]:
     """The images that are compared: those that both parts have."""
     asked = options.modalities if options.images else ()
-    return [m for m in asked if _known(train, m) and _known(test, m)]
+    return [m for m in asked if all(_knowing(train, test, m))]
 
 
 def _group(train: Manifest, test: Manifest, options: _Options) -> str:
@@ -254,8 +255,7 @@ def _group(train: Manifest, test: Manifest, options: _Options) -> str:
         return known_group(train, test)
     must, got = f"Both parts must know the {options.by} of some samples", "a column of nulls"
     fix = "Audit by another group, or compare images, which needs no group"
-    both = _known(train, options.by) and _known(test, options.by)
-    require(both, None, must, got, fix=fix)
+    require(all(_knowing(train, test, options.by)), None, must, got, fix=fix)
     return options.by
 
 
@@ -348,7 +348,7 @@ def _notes(
         images = bool(_compared(train, test, options))
         notes.append(Note("equal-names", params | {"images": images}))
     for modality in options.modalities if options.images else ():
-        if _known(train, modality) != _known(test, modality):
+        if len({*_knowing(train, test, modality)}) > 1:
             notes.append(Note("images-of-one-part", {"modality": modality}))
     return notes
 

@@ -78,12 +78,10 @@ def questions(
         elif pictures.reason in ("untouched", "similar", "unreadable"):
             recordings = replace(recordings, reason=pictures.reason)
     time = Question("near in time", "", reason="no-frames")
-    if any(f.kind == "time gap" for f in flags):
+    if timed := [f for f in flags if f.kind == "time gap"]:
         unknown = _without_time(train, test, gaps)
         reason = "frames" if unknown > LARGEST * len(test) else ""
-        time = _judged(
-            "near in time", [f for f in flags if f.kind == "time gap"], reason, len(test)
-        )
+        time = _judged("near in time", timed, reason, len(test))
     return [
         replace(q, verdict=CANNOT_TELL, reason="skipped") if skipped and q.verdict == NO_LEAK else q
         for q in (recordings, time, pictures)

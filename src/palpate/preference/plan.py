@@ -192,13 +192,16 @@ class Plan:
         }
         if self.task == "sort":
             page["strips"] = [
-                {"answer": name, "label": name, "images": self._examples(name)}
+                {
+                    "answer": name,
+                    "label": name,
+                    "images": [
+                        self.name(i.id, EXAMPLE) for i in self.examples if i.material == name
+                    ],
+                }
                 for name in self.choices
             ]
         return page
-
-    def _examples(self, material: str) -> list[str]:
-        return [self.name(i.id, EXAMPLE) for i in self.examples if i.material == material]
 
     def _questions(self, code: str) -> list[dict[str, str]]:
         rows: list[dict[str, str]] = []
