@@ -6,12 +6,14 @@ import signal
 import subprocess
 import sys
 import time
+import tracemalloc
 from dataclasses import replace
 from pathlib import Path
 
 import polars as pl
 import pytest
 
+from forge.damage import inflate
 from forge.errors import fails
 from forge.servers import FakeServer
 from palpate.captions import StoppedError, caption
@@ -178,6 +180,12 @@ def test_a_torn_last_line_is_dropped_and_another_line_is_an_error(data, tmp_path
         assert server.count == 13
         assert table_of(tmp_path / "c") == whole
         assert all(json.loads(line) for line in log.read_text().splitlines())
+        inflate(log)
+        tracemalloc.start()
+        describe(data, tmp_path / "c", server)
+        assert tracemalloc.get_traced_memory()[1] < 1 << 30
+        tracemalloc.stop()
+        assert server.count == 13
         log.write_text('{"format": "mine"}\n')
         fails("another line 1", describe, data, tmp_path / "c", server)
 

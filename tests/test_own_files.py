@@ -8,6 +8,7 @@ import json
 import shutil
 from collections.abc import Callable
 from dataclasses import dataclass
+from itertools import product
 from pathlib import Path
 
 import numpy as np
@@ -15,7 +16,7 @@ import pytest
 from PIL import Image
 
 from forge.commands import call
-from forge.damage import DAMAGES, flip
+from forge.damage import DAMAGES, flip, inflate
 from forge.pictures import picture
 from forge.servers import FakeServer
 from palpate.cli import terminal
@@ -184,8 +185,9 @@ def empty(folder):
         shutil.rmtree(path) if path.is_dir() else path.unlink()
 
 
-@pytest.mark.parametrize("damage", DAMAGES)
-@pytest.mark.parametrize("name", ["a.npy", "a.npy.sha256"])
+@pytest.mark.parametrize(
+    ("name", "damage"), [*product(("a.npy", "a.npy.sha256"), DAMAGES), ("a.npy.sha256", inflate)]
+)
 def test_a_damaged_cache_is_made_again_and_says_so(tmp_path, monkeypatch, name, damage):
     monkeypatch.setattr("palpate.core.whole.BLOCK", 64)  # of several blocks
     made, said, array = [], [], np.arange(100.0)

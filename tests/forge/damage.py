@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 
 
@@ -31,6 +32,11 @@ def tail(file: Path) -> None:
     data = bytearray(file.read_bytes())
     data[-4:] = bytes(255 - byte for byte in data[-4:])
     file.write_bytes(data)
+
+
+def inflate(file: Path) -> None:
+    """Add zeros up to 3 GB, which take no room on the disk."""
+    os.truncate(file, 3 << 30)
 
 
 DAMAGES = (flip, cut, head, tail)

@@ -22,11 +22,13 @@ import threading
 from collections import defaultdict
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, fields, replace
+from functools import partial
 from pathlib import Path
 from typing import Any, BinaryIO
 
 from palpate.captions.prompts import Description, Prompt
 from palpate.core import PalpateError, digest_json, sealed, unsealed
+from palpate.core.files import LARGEST
 
 #: Photos are sent at most so many pixels a side, as JPEG of this quality.
 SIDE, QUALITY = 768, 90
@@ -114,7 +116,7 @@ class ReplyLog:
         self._file: BinaryIO | None = None
         if path.exists():
             with open(path, "rb") as file:
-                for number, line in enumerate(file, 1):
+                for number, line in enumerate(iter(partial(file.readline, LARGEST), b""), 1):
                     if line.endswith(b"\n"):
                         self._end += len(line)
                         self._read(line, number)

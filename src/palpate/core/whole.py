@@ -9,13 +9,13 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Callable, Generator
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from functools import lru_cache
 from pathlib import Path
 from typing import TypeVar
 
-from palpate.core.files import atomic_path, digest_lines, write_text
-from palpate.core.messages import Progress
+from palpate.core.files import atomic_path, content_of, digest_lines, write_text
+from palpate.core.messages import PalpateError, Progress
 
 T = TypeVar("T")
 #: Bytes of a file that are digested at a time, each by a thread.
@@ -33,17 +33,15 @@ def sealed_path(path: Path) -> Generator[Path]:
     """
     with atomic_path(path) as part:
         yield part
-        seal = _seal(path)
-        before = seal.read_text("utf-8", "replace").split() if seal.is_file() else []
-        write_text(seal, "\n".join([_digest_once(part), *before[:BEFORE]]) + "\n")
+        lines = [_digest_once(part), *_sealed(path)[:BEFORE]]
+        write_text(_seal(path), "\n".join(lines) + "\n")
 
 
 def is_whole(path: Path) -> bool:
     """Whether a file is, byte for byte, what :func:`sealed_path` wrote; a process reads it once."""
-    try:
-        return _digest_once(path) in _seal(path).read_text("utf-8").split()
-    except (OSError, UnicodeDecodeError):
-        return False
+    with suppress(OSError):
+        return _digest_once(path) in _sealed(path)
+    return False
 
 
 def cached(
@@ -60,6 +58,13 @@ def cached(
 
 def _seal(path: Path) -> Path:
     return path.with_name(f"{path.name}.sha256")
+
+
+def _sealed(path: Path) -> list[str]:
+    """The digests that a file may have; none where they cannot be read."""
+    with suppress(OSError, PalpateError):
+        return content_of(_seal(path)).decode("utf-8", "replace").split()
+    return []
 
 
 def _digest_once(path: Path) -> str:

@@ -63,8 +63,7 @@ class _Options:
     by: str
     near_frames: int
     identity: Identity
-    images: bool
-    modalities: Sequence[str]
+    modalities: Sequence[str]  # whose images are compared
     false_positives: float
     cache: Path | None
     progress: Progress
@@ -142,8 +141,7 @@ def audit(  # noqa: PLR0913
         by,
         near_frames,
         identity,
-        images,
-        modalities,
+        modalities if images else (),
         false_positives,
         None if cache is None else Path(cache),
         progress,
@@ -242,8 +240,7 @@ def _knowing(train: Manifest, test: Manifest, column: str) -> list[bool]:
 
 def _compared(train: Manifest, test: Manifest, options: _Options) -> list[str]:
     """The images that are compared: those that both parts have."""
-    asked = options.modalities if options.images else ()
-    return [m for m in asked if all(_knowing(train, test, m))]
+    return [m for m in options.modalities if all(_knowing(train, test, m))]
 
 
 def _group(train: Manifest, test: Manifest, options: _Options) -> str:
@@ -289,7 +286,7 @@ def _compare(
         gaps,
         flags,
         equal=equal,
-        asked=options.images,
+        asked=bool(options.modalities),
         skipped=options.skipped,
         progress=options.progress,
     )
@@ -347,7 +344,7 @@ def _notes(
         params = {"equal": dict(equal), "roots": [str(train.root), str(test.root)]}
         images = bool(_compared(train, test, options))
         notes.append(Note("equal-names", params | {"images": images}))
-    for modality in options.modalities if options.images else ():
+    for modality in options.modalities:
         if len({*_knowing(train, test, modality)}) > 1:
             notes.append(Note("images-of-one-part", {"modality": modality}))
     return notes
@@ -364,7 +361,7 @@ def _signals(
 ) -> list[Flags]:
     """Every signal that can be checked, the exact ones first."""
     flags: list[Flags | None] = [identical_samples(train, test, gaps, named)]
-    if options.images:
+    if options.modalities:
         flags.append(identical_bytes(train, test, options.progress))
     if group != NO_GROUP:
         columns = dict.fromkeys([group, "video", "object", "session"])
