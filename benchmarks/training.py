@@ -172,7 +172,8 @@ def trust(rows=10_000, turns=5):
     loss = TactileLoss(few, Preprocess(MINI.image, MINI.image), "identical-text")
     parameters = dict(tactile_model().named_parameters())
     parts = ("model", "ema", "exp_avg", "exp_avg_sq")
-    state = {f"{part}.{name}": p.detach() for part in parts for name, p in parameters.items()}
+    state = {f"{part}.{name}": p for part in parts for name, p in parameters.items()}
+    state = engine._copies(state)
     pixels = Images(rows).images
     at = []
     with tempfile.TemporaryDirectory(dir=".") as name:  # /tmp may be memory
