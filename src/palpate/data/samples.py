@@ -16,12 +16,13 @@ from __future__ import annotations
 
 import hashlib
 import os
+import posixpath
 import zipfile
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property, lru_cache
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 from typing import Any, cast
 
 import numpy as np
@@ -45,11 +46,10 @@ from palpate.core import (
 )
 from palpate.core.features import is_missing, to_numpy
 from palpate.core.messages import require_rows
-from palpate.data.images import SUFFIXES as IMAGES
 from palpate.data.images import cached_images, image_size, load_images, read_image, square
 from palpate.data.manifest import Manifest, is_manifest
 from palpate.data.recordings import LEVELS, name_recordings
-from palpate.data.tables import open_table, table_of
+from palpate.data.tables import is_image, open_table, table_of
 
 #: Decoded images of more bytes than this are kept in a file of the cache.
 IN_MEMORY = 1 << 30
@@ -65,6 +65,8 @@ KINDS = (
 SUFFIX = ".png"
 #: Columns that a table of labels may have, and other names of theirs.
 LABELS = ("material", "object", "session", "video", "contact")
+#: Columns of features -> those of a manifest.
+_COLUMNS = {"ids": "id", "labels": "material", "groups": "video"}
 _NAMES = {name: name for name in ("id", *LABELS)} | {"label": "material", "group": "video"}
 
 
@@ -226,11 +228,13 @@ def read_samples(source: Any, name: str) -> Samples:
     elif isinstance(source, Manifest):
         samples = Samples(name, source)
     elif isinstance(source, FeatureSet):
-        columns = (
-            () if column is None else ["" if is_missing(v) else str(v) for v in column]
-            for column in (source.labels, source.groups)
-        )
-        samples = _features(source.features, name, source.ids, source.encoder, *columns)
+        columns = {"ids": source.ids, "labels": source.labels, "groups": source.groups}
+        texts = {
+            column: ["" if is_missing(value) else str(value) for value in values]
+            for column, values in columns.items()
+            if values is not None
+        }
+        samples = _features(source.features, name, texts, source.encoder)
     elif items and isinstance(items[0], str | Path):
         paths = [Path(item).absolute() for item in items]
         ids = [without_suffix(p.name) for p in paths]
@@ -315,7 +319,7 @@ def _files_below(path: Path) -> dict[str, str]:
     for file in sorted(path.rglob("*")):
         relative = file.relative_to(path).as_posix()
         hidden = any(part.startswith(".") for part in relative.split("/"))
-        if hidden or not is_image_file(file) or not file.is_file():
+        if hidden or not is_image(file) or not file.is_file():
             continue
         require_utf8(f"File names in {path}", relative)
         name = without_suffix(relative)
@@ -334,14 +338,9 @@ def require_utf8(subject: str, text: str) -> None:
         raise PalpateError(f"{subject} must be UTF-8", ascii(text), "Rename it") from None
 
 
-def is_image_file(path: str | Path) -> bool:
-    """Whether a path has the suffix of an image."""
-    return PurePosixPath(path).suffix.lower() in IMAGES
-
-
 def without_suffix(name: str) -> str:
     """A path without the suffix of an image; another suffix is part of the name."""
-    return name[: -len(PurePosixPath(name).suffix)] if is_image_file(name) else name
+    return posixpath.splitext(name)[0] if is_image(name) else name
 
 
 # Arrays
@@ -356,7 +355,7 @@ def _of_arrays(source: Any, name: str) -> Samples:
         fix = f"Pass {KINDS}, an array or tensor, or a list of images of one size"
         raise PalpateError(f"{name} must be something to score", str(error), fix) from None
     if array.ndim == 2:
-        return _features(array, name)
+        return _features(array, name, {})
     images = as_images(array, name)
     ids = [str(k) for k in range(len(images))]
     return Samples(name, _manifest(Path(), id=ids), images, numbered=True)
@@ -388,16 +387,12 @@ def as_images(array: NDArray[Any], name: str) -> NDArray[np.uint8]:
     return np.ascontiguousarray(np.broadcast_to(array, (*array.shape[:3], 3)))
 
 
-# Features
-
-
 def _of_feature_file(path: Path) -> Samples:
+    texts: dict[str, list[str]] = {}
     try:
         if path.suffix.lower() == ".npz":
-            arrays = _arrays_in(path)
-            x, encoder = arrays.pop("features"), [*arrays.pop("encoder", ()), None][0]
+            x, texts = _arrays_in(path)
         else:
-            arrays, encoder = {}, None
             x = np.load(path, mmap_mode="r", allow_pickle=False)
             if not isinstance(x, np.ndarray):
                 raise ValueError("an archive of arrays, which is named .npz")
@@ -408,31 +403,26 @@ def _of_feature_file(path: Path) -> Samples:
         reason = (str(error).splitlines() or [type(error).__name__])[0]
         must = f"{path} must be a whole {path.suffix} file without pickles"
         raise PalpateError(must, reason, "Write it again") from None
-    columns = (arrays.get(name, ()) for name in ("labels", "groups"))
-    return _features(x, str(path), arrays.get("ids"), encoder, *columns)
+    encoder = next(iter(texts.pop("encoder", ())), None)
+    return _features(x, str(path), texts, encoder)
 
 
-def _arrays_in(path: Path) -> dict[str, Any]:
-    """``features`` of an archive, and its columns as lists of strings."""
+def _arrays_in(path: Path) -> tuple[NDArray[Any], dict[str, list[str]]]:
+    """``features`` of an archive, and its other arrays as lists of strings."""
     with zipfile.ZipFile(path) as archive:
         for entry in archive.infolist():
             if entry.file_size > UNPACKED + MOST_TIMES * entry.compress_size:
                 size, packed = entry.file_size / 1e9, entry.compress_size / 1e6
                 raise ValueError(f"{entry.filename} unpacks to {size:.1f} GB from {packed:.1f} MB")
     with np.load(path, allow_pickle=False) as data:
-        names = [name for name in ("ids", "labels", "groups", "encoder") if name in data]
-        lists = {name: [str(v) for v in data[name].reshape(-1)] for name in names}
-        return {"features": data["features"], **lists}
+        names = [name for name in (*_COLUMNS, "encoder") if name in data]
+        return data["features"], {name: [*map(str, data[name].reshape(-1))] for name in names}
 
 
 def _features(
-    x: NDArray[Any],
-    source: str,
-    ids: Sequence[Any] | None = None,
-    encoder: str | None = None,
-    *columns: Sequence[str],
+    x: NDArray[Any], source: str, texts: Mapping[str, list[str]], encoder: str | None = None
 ) -> Samples:
-    """Features of samples with columns (labels, groups); half precision is widened to float32.
+    """Features of samples with columns (``_COLUMNS``); half precision is widened to float32.
 
     Raises:
         PalpateError: if they are no floats (n, d), columns have other lengths, or an id is empty or
@@ -442,17 +432,17 @@ def _features(
     must = f"The features in {source} must be floats of shape (n, d), n and d at least 1"
     fix = "Save one row of the encoder's output per sample"
     require(floats, None, must, f"{x.dtype} of shape {x.shape}", fix=fix)
-    names = [str(k) for k in (range(len(x)) if ids is None else ids)]
-    labels, groups = columns or ((), ())
-    for name, column in {"ids": names, "labels": labels, "groups": groups}.items():
+    columns = {"ids": [*map(str, range(len(x)))]} | {
+        n: column for n, column in texts.items() if column
+    }
+    for name, column in columns.items():
         must = f"{name} in {source} must have one entry per row ({len(x)})"
-        require(len(column) in (len(x), 0), None, must, len(column), fix="Write it again")
+        require(len(column) == len(x), None, must, len(column), fix="Write it again")
         require_utf8(f"{name} in {source}", "".join(column))
-    require_ids(names, source)
-    texts = {"id": names, "material": labels, "video": groups}
-    manifest = _manifest(Path(), **{name: column for name, column in texts.items() if column})
+    require_ids(columns["ids"], source)
+    manifest = _manifest(Path(), **{_COLUMNS[name]: column for name, column in columns.items()})
     x = x.astype(np.float32) if x.dtype.itemsize < 4 else x
-    return Samples(source, manifest, x, ids is None, encoder=encoder)
+    return Samples(source, manifest, x, "ids" not in texts, encoder=encoder)
 
 
 def require_ids(ids: Sequence[str], source: str) -> None:
@@ -498,7 +488,7 @@ def named_sources(
 def _is_image_list(items: Sequence[Any]) -> bool:
     """Whether a list holds images of one generator: PIL images, arrays (h, w, c), files."""
     return bool(items) and all(
-        is_image_file(item)
+        is_image(item)
         if isinstance(item, str | Path)
         else hasattr(item, "getbands") or getattr(item, "ndim", 0) == 3
         for item in items
@@ -582,9 +572,7 @@ def labeled(samples: Samples, table: pl.DataFrame | None, source: str = "the lab
 
 
 def labeled_as(samples: Samples, other: Samples) -> Samples:
-    """Samples with what another set knows of the same ids, and they do not; errors as
-    :func:`labeled`.
-    """
+    """Samples with what only another set knows of the same ids; errors as :func:`labeled`."""
     mine, theirs = samples.manifest.filled(), other.manifest.filled()
     lacking = [c for c in LABELS if c in theirs.columns and c not in mine.columns]
     table = theirs.select("id", *lacking) if lacking and not samples.numbered else None
@@ -592,18 +580,18 @@ def labeled_as(samples: Samples, other: Samples) -> Samples:
 
 
 def with_recordings(sets: Sequence[Samples]) -> list[Samples]:
-    """The sets with the recordings that the names of files show, or ids, read together."""
+    """The sets with the recordings that the names of files show, or ids, read together.
+
+    Samples whose names show no recording, where others' do, are recordings of their own.
+    """
     suffix = pl.concat_str("id", pl.lit(SUFFIX)).alias("tactile")
     files = [s if s.rows is None else s.with_columns(suffix) for s in sets if not s.numbered]
     manifests = iter(name_recordings([s.manifest for s in files]))
-    named = [s if s.numbered else replace(s, manifest=next(manifests)) for s in sets]
-    return [
-        s.with_columns(own.manifest.table["tactile"], *_alone(s.manifest))
-        for s, own in zip(named, sets, strict=True)
-    ]
-
-
-def _alone(manifest: Manifest) -> list[pl.Expr]:
-    """Samples whose names show no recording, where others' do, are recordings of their own."""
-    levels = [level for level in LEVELS[:-1] if f"{level}_from" in manifest.facts]
-    return [pl.col(level).fill_null(pl.col("id")) for level in levels]
+    named: list[Samples] = []
+    for samples in sets:
+        manifest = samples.manifest if samples.numbered else next(manifests)
+        levels = [level for level in LEVELS[:-1] if f"{level}_from" in manifest.facts]
+        alone = [pl.col(level).fill_null(pl.col("id")) for level in levels]
+        own = samples.manifest.table["tactile"]
+        named.append(replace(samples, manifest=manifest).with_columns(own, *alone))
+    return named
