@@ -3,6 +3,7 @@
 import json
 import shlex
 
+import polars as pl
 import pytest
 
 from forge.errors import fails
@@ -201,3 +202,12 @@ def test_bad_lines_and_wrong_options_are_named(tmp_path, capsys):
     fails("missing-file", read, table)  # one of its images is there
     assert main(["audit", str(table), str(table), "--map", "nothing"]) == 2
     assert "COLUMN=EXPRESSION" in capsys.readouterr().err
+
+
+def test_columns_of_lists_and_bytes_are_left_alone(tmp_path):
+    frame = pl.DataFrame(
+        {"gel": ["a/1.png", "a/2.png"], "emb": [[1.0], [2.0]], "raw": [b"x", b"y"]}
+    )
+    frame.write_parquet(tmp_path / "t.parquet")
+    for source in (frame, tmp_path / "t.parquet"):
+        assert read(source).manifest.ids == ["a/1", "a/2"]

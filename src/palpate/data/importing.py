@@ -6,11 +6,13 @@ from pathlib import Path
 from typing import Any
 
 from palpate.core import PalpateError, Progress, Split, locked, quiet
-from palpate.data.formats import FORMATS, recognized, require_options
+from palpate.data.formats import FORMATS, scanned
 from palpate.data.images import Check
 from palpate.data.imported import Imported, Validation, imported_of, removing_on_error, templates_of
 from palpate.data.listing import write_table
 from palpate.data.manifest import FOLLOWED, SCHEMA, Manifest, is_manifest
+from palpate.data.mapping import LINE
+from palpate.data.rows import records
 from palpate.data.scanning import (
     MISSING,
     WORLD,
@@ -74,10 +76,9 @@ def import_dataset(
         if text is not None and format == "auto" and is_manifest(source):
             imported = reimported(source)
         else:
-            name, form = recognized(source, format, options)
             options |= {"check": check, "progress": progress}
             options["into"] = Into(output, created, skip_bad)
-            scan = form.read(source, require_options(name, form, options))
+            name, form, scan = scanned(source, format, options)
             facts = {**form.facts.of_manifest(), "format": name}
             check = "none" if form.writes else check  # they were checked on the way
             imported = imported_of(
@@ -116,9 +117,8 @@ def validate(
     if format == "auto" and is_manifest(source):
         name, facts, scan = _scan_of(Manifest.load(source, options.get("root")))
     else:
-        name, form = recognized(source, format, options)
-        options = options | {"check": check, "progress": progress}
-        scan = form.read(source, require_options(name, form, options))
+        options |= {"check": check, "progress": progress}
+        name, form, scan = scanned(source, format, options)
         # palpate's own world has the layouts of real sets and must not be shown as one of them.
         facts = WORLD if world else form.facts
     rows = finished(scan, check, progress)
@@ -138,16 +138,14 @@ def _scan_of(manifest: Manifest) -> tuple[str, Facts, Scan]:
     fact = manifest.facts.get
     facts = Facts(
         name=fact("dataset", "an import"),
-        license=fact("license", "unfact"),
-        citation=fact("citation", "unfact"),
-        url=fact("url", "unfact"),
+        license=fact("license", "unknown"),
+        citation=fact("citation", "unknown"),
+        url=fact("url", "unknown"),
         samples="as many as it has rows",
         group=fact("group", "video"),
     )
-    scan = Scan(manifest.root, dict(manifest.facts), met=manifest.facts.get("links") == FOLLOWED)
-    for k, row in enumerate(manifest.table.iter_rows(named=True), 1):
-        cells = {name: cell for name, cell in row.items() if cell is not None}
-        scan.rows.append((f"row {k}", cells))
+    scan = Scan(manifest.root, dict(manifest.facts), met=fact("links") == FOLLOWED)
+    scan.rows = records(manifest.table.with_row_index(LINE, offset=1), "row {}".format)
     scan.more = tuple(manifest.table.columns[len(SCHEMA) :])
     return "manifest", facts, scan
 

@@ -8,13 +8,13 @@ from typing import Any
 
 from palpate.core import PalpateError, Progress, quiet, require, require_regular
 from palpate.data.foreign import require_native
-from palpate.data.formats import Format, intervals, pairs, recognized, require_options
+from palpate.data.formats import intervals, pairs, scanned
 from palpate.data.imported import Imported, imported_of, splits_of
 from palpate.data.listed import SIDES, read_table
 from palpate.data.listing import is_list, read_list
 from palpate.data.manifest import Manifest, is_manifest
 from palpate.data.recordings import name_recordings
-from palpate.data.scanning import Scan, raise_if
+from palpate.data.scanning import raise_if
 from palpate.data.tables import TABLES, headless_names
 
 
@@ -96,10 +96,16 @@ def read(
             return Imported(Manifest.load(path, options.get("root")), splits=splits_of(path))
         if path.is_file() and (named := _of_file(path, options, images, skip_bad)):
             return named
-    name, form = recognized(path, "pairs" if "side" in options else format, options)
     # Images are not decoded here: broken ones are reported when they are read.
     options |= {"check": "none", "progress": progress}
-    scan = _scanned(form, path, require_options(name, form, options))
+    try:
+        name, form, scan = scanned(path, "pairs" if "side" in options else format, options)
+    except PalpateError as error:
+        if not error.choices:
+            raise
+        # A folder whose names do not say what its images show is one of photos.
+        name, form, scan = scanned(path, format, options | {"side": "vision"})
+        scan.facts["side_assumed"] = "vision"
     facts = {**form.facts.of_manifest(), "format": name}
     return imported_of(scan, path, facts, skip_bad=skip_bad, check="none", progress=progress)
 
@@ -145,15 +151,3 @@ def _require_only(accepted: set[str], options: Mapping[str, Any], kind: str) -> 
     for name in sorted(set(options) - accepted):
         fix = f"It takes {', '.join(sorted(accepted))}"
         require(False, name, f"must be left out for {kind}", repr(options[name]), fix=fix)
-
-
-def _scanned(form: Format, path: Path, options: dict[str, Any]) -> Scan:
-    """Scan a source; a folder whose names do not say what its images show is one of photos."""
-    try:
-        return form.read(path, options)
-    except PalpateError as error:
-        if not error.choices:
-            raise
-        scan = form.read(path, options | {"side": "vision"})
-        scan.facts["side_assumed"] = "vision"
-        return scan

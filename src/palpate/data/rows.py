@@ -165,29 +165,26 @@ def some(items: Sequence[str]) -> Sequence[str]:
 
 
 def odd_groups(source: Path, rows: Sequence[tuple[str, Row]]) -> list[Problem]:
-    """Report group columns that only some rows have, and contacts of one name in several groups."""
+    """Report group columns that only some rows have, and contacts of one name in several groups,
+    which a contact cannot be.
+    """
+    columns = {name: [row.get(name) for _, row in rows] for name in ("contact", *GROUPS)}
+    table = pl.DataFrame(columns, dict.fromkeys(columns, pl.String))
     problems: list[Problem] = []
-    count = len(rows)
     for name in GROUPS:
-        without = [where for where, row in rows if name not in row]
-        if 0 < len(without) < count:
-            text = f"{len(without)} of {count} rows have no {name}, so no split by {name} can place"
-            text += f" them; the first is {without[0]}"
+        without = table[name].is_null().arg_true()
+        if 0 < len(without) < len(rows):
+            text = f"{len(without)} of {len(rows)} rows have no {name}, so no split by {name} can "
+            text += f"place them; the first is {rows[without[0]][0]}"
             problems.append(Problem(str(source), "null-group", text))
-    return problems + _shared_contacts(source, rows)
-
-
-def _shared_contacts(source: Path, rows: Sequence[tuple[str, Row]]) -> list[Problem]:
-    """Report contacts of one name in several videos (or objects ...), which a contact cannot be."""
     for name in GROUPS:
-        groups: dict[str, set[str]] = {}
-        for _, row in rows:
-            if "contact" in row and name in row:
-                groups.setdefault(row["contact"], set()).add(row[name])
-        if shared := [contact for contact, values in groups.items() if len(values) > 1]:
-            few = ", ".join(sorted(groups[shared[0]])[:3])
+        groups = table.select("contact", name).drop_nulls().unique().group_by("contact").agg(name)
+        shared = groups.filter(pl.col(name).list.len() > 1).sort("contact")
+        for contact, values in shared.head(1).iter_rows():
             text = f"{len(shared)} contacts have one name in several {name}s and are taken as one: "
-            text += f"{shared[0]!r} in {few}. Map the contact to a name with its {name}, e.g. "
-            text += f"{name} || '/' || contact, in your column names"
-            return [Problem(str(source), "shared-contact", text)]
-    return []
+            text += (
+                f"{contact!r} in {', '.join(sorted(values)[:3])}. Map the contact to a name with "
+            )
+            text += f"its {name}, e.g. {name} || '/' || contact, in your column names"
+            return [*problems, Problem(str(source), "shared-contact", text)]
+    return problems

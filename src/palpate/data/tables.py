@@ -35,6 +35,8 @@ TABLES = (".csv", ".tsv", ".jsonl", ".json", ".parquet")
 INCONCLUSIVE = -1
 #: Names that the published category table misspells.
 SPELLING = {"Ruber": "Rubber"}
+#: Types of columns that are neither texts nor numbers, besides nested ones.
+UNREAD = (pl.Binary, pl.Object)
 #: The encoding of texts that Excel saves as plain CSV.
 WINDOWS = "cp1252"
 CONTROL = re.compile("[\x00-\x08\x0b\x0c\x0e-\x1f]")
@@ -310,7 +312,7 @@ def _json(path: Path) -> Table:
                 problems.append(Problem(f"{path}:{at}", "bad-row", reason))
     if array and rows:
         data = rows[0][1]
-        flat = isinstance(data, list) and not _all_nested(data)
+        flat = isinstance(data, list) and _any_value_beside(data, (list, Mapping))
         rows = list(enumerate(data if flat else _items(data), 1))
         if not flat and (not rows or rows[0][1] == data):
             must, got = f"{path} must hold a JSON list of objects", repr(text.strip()[:20])
@@ -347,11 +349,6 @@ def _items(data: Any, split: str | None = None, *, row: bool = False) -> Iterato
             yield from _items(item, split, row=rows)
     elif isinstance(data, str):
         yield {PATH: data, "split": split}
-
-
-def _all_nested(data: list[Any]) -> bool:
-    """Whether a list has no object with a value of its own."""
-    return not _any_value_beside(data, (list, Mapping))
 
 
 def _any_value_beside(items: Iterable[Any], kinds: Any) -> bool:
@@ -421,17 +418,25 @@ def _parquet(path: Path) -> Table:
 def _of_frame(
     name: str, schema: Mapping[str, pl.DataType], read: Callable[[Sequence[str]], pl.DataFrame]
 ) -> Table:
+    kinds = {c: kind for c, kind in schema.items() if kind.is_nested() or kind in UNREAD}
+
     def records(columns: Sequence[str]) -> Iterator[Record]:
-        for column in columns:
-            kind = schema[column]
-            plain = not kind.is_nested() and kind.base_type() not in (pl.Binary, pl.Object)
-            must, got = f"Columns of {name} must hold texts or numbers", f"{column} of type {kind}"
-            fix = "For images inside the table use the format hf on its folder"
-            require(plain, None, must, got, fix=fix)
+        odd = next((column for column in columns if column in kinds), "")
+        must, got = (
+            f"Columns of {name} must hold texts or numbers",
+            f"{odd} of type {kinds.get(odd)}",
+        )
+        require(
+            not odd,
+            None,
+            must,
+            got,
+            fix="For images inside the table use the format hf on its folder",
+        )
         for line, cells in enumerate(read(columns).iter_rows(), 1):
             yield (line, *map(text_of, cells))
 
-    return Table(name, list(schema), [], records)
+    return Table(name, list(schema), [], records, nested=set(kinds))
 
 
 def read_categories(path: Path) -> dict[int, str]:

@@ -33,16 +33,7 @@ FORMATS: dict[str, Format] = {
     "pairs": pairs.FORMAT,
 }
 
-__all__ = [
-    "FORMATS",
-    "Facts",
-    "Format",
-    "Row",
-    "Scan",
-    "recognized",
-    "require_options",
-    "require_source",
-]
+__all__ = ["FORMATS", "Facts", "Format", "Row", "Scan", "require_source", "scanned"]
 
 
 def require_source(source: Path) -> None:
@@ -51,9 +42,7 @@ def require_source(source: Path) -> None:
     require(source.exists(), "source", "must exist", f"nothing at {source}", fix=fix)
 
 
-def recognized(
-    source: Path, name: str = "auto", options: Mapping[str, Any] | None = None
-) -> tuple[str, Format]:
+def _recognized(source: Path, name: str, options: Mapping[str, Any]) -> tuple[str, Format]:
     """The named format, or the first that the source looks like; templates give pairs or videos."""
     require_choice("format", name, ("auto", *FORMATS))
     require_regular(source)
@@ -61,7 +50,7 @@ def recognized(
         require_source(source)
         require_native(source)
     if name == "auto":
-        templates = {c: text for c in IMAGE_COLUMNS if (text := (options or {}).get(c))}
+        templates = {c: text for c in IMAGE_COLUMNS if (text := options.get(c))}
         looks = (n for n, form in FORMATS.items() if form.detect(source))
         templated = "videos" if templates and is_templated(source, templates) else "pairs"
         name = templated if templates else next(looks, "")
@@ -76,20 +65,29 @@ def recognized(
     return name, FORMATS[name]
 
 
-def require_options(name: str, form: Format, options: dict[str, Any]) -> dict[str, Any]:
-    """The options of a format that are not None.
+def scanned(source: Path, name: str, options: Mapping[str, Any]) -> tuple[str, Format, Scan]:
+    """Read a source by the named format, or by the one that it looks like.
+
+    Args:
+        source: a path, or a name on the hub.
+        name: of the format, or ``auto``.
+        options: of the format, and ``check``, ``progress`` and ``into``; None is the default.
+
+    Returns:
+        The name of the format, the format, and what it reads.
 
     Raises:
-        PalpateError: if an option does not belong to the format.
+        PalpateError: if there is no such source or format, or an option does not belong to it.
     """
+    name, form = _recognized(source, name, options)
     values = {key: value for key, value in options.items() if value is not None}
-    if unknown := sorted(set(values) - {*form.options, "into"}):
+    for unknown in sorted(set(values) - {*form.options, "into"}):
         common = ("skip_bad", "check", "progress")
-        takes = ", ".join(f"`{name}`" for name in form.options if name not in common)
-        must, got = f"must be left out for the format {name}", repr(values[unknown[0]])
+        takes = ", ".join(f"`{option}`" for option in form.options if option not in common)
+        must, got = f"must be left out for the format {name}", repr(values[unknown])
         fix = f"This format takes {takes or 'no options'}"
-        raise PalpateError(must, got, fix, argument=unknown[0])
-    return values
+        raise PalpateError(must, got, fix, argument=unknown)
+    return name, form, form.read(source, values)
 
 
 def _contents(source: Path) -> str:
