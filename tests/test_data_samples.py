@@ -45,12 +45,13 @@ def test_every_kind_of_object_gives_the_same_embeddings(kind):
     assert (samples.ids, samples.labels, samples.groups) == known
 
 
-@pytest.mark.parametrize("kind", ["folder", "files", "PIL", "uint8", "tensor", "manifest"])
+@pytest.mark.parametrize("kind", ["folder", "files", "PIL", "uint8", "tensor", "manifest", "table"])
 def test_every_kind_of_source_gives_the_same_images(tmp_path, kind):
     folder = tmp_path / "real"
     images = np.stack([*paint(folder, ["a", "b", "c"], 0).values()])
     paths = [folder / f"{n}.png" for n in "abc"]
     rows = [{"id": n, "tactile": f"{n}.png"} for n in "abc"]
+    pl.DataFrame(rows).write_csv(folder / "t.csv")
     source = {
         "folder": lambda: folder,
         "files": lambda: paths,
@@ -58,6 +59,7 @@ def test_every_kind_of_source_gives_the_same_images(tmp_path, kind):
         "uint8": lambda: images,
         "tensor": lambda: pytest.importorskip("torch").from_numpy(images / 255).permute(0, 3, 1, 2),
         "manifest": lambda: Manifest.from_rows(rows, folder),
+        "table": lambda: folder / "t.csv",
     }[kind]()
     samples = read_samples(source, "x")
     assert samples.numbered == (kind in ("PIL", "uint8", "tensor"))

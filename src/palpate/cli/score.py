@@ -71,8 +71,9 @@ class Options(Common):
     """
 
     generated: Annotated[tuple[str, ...], tyro.conf.arg(metavar="[NAME=]PATH ...")]
-    """What to score, one entry a generator: folders of images or of `palpate generate`, manifests,
-    or embeddings (.npy, .npz). In the tables a generator has its NAME, else that of its path."""
+    """What to score, one entry a generator: folders of images or of `palpate generate`, tables,
+    manifests or embeddings (.npy, .npz). In the results a generator has its NAME, else that of its
+    path."""
     reference: Path
     """The real tactile images, of the same kinds. Ids are relative file names."""
     encoder: str | None = None

@@ -2,8 +2,8 @@
 
 Three loaders read all that can be scored:
 
-- image files: a folder, a manifest, a folder of ``palpate generate``, a list of files. The id of an
-  image in a folder is its path below the folder, with ``/`` and without the suffix;
+- image files: a folder, a table, a manifest, a folder of ``palpate generate``, a list of files. The
+  id of an image in a folder is its path below the folder, with ``/`` and without the suffix;
 - images in memory: an array or tensor, a list of arrays or PIL images;
 - features: an array (n, d), a :class:`palpate.core.FeatureSet`, ``.npy`` (memory-mapped), or
   ``.npz`` with ``features`` (n, d) and optionally ``ids``, ``labels``, ``groups`` (n strings each)
@@ -49,7 +49,7 @@ from palpate.core.messages import require_rows
 from palpate.data.images import cached_images, image_size, load_images, read_image, square
 from palpate.data.manifest import Manifest, is_manifest
 from palpate.data.recordings import LEVELS, name_recordings
-from palpate.data.tables import is_image, open_table, table_of
+from palpate.data.tables import TABLES, headless_names, is_image, open_table, table_of
 
 #: Decoded images of more bytes than this are kept in a file of the cache.
 IN_MEMORY = 1 << 30
@@ -58,7 +58,7 @@ IN_MEMORY = 1 << 30
 UNPACKED, MOST_TIMES = 1 << 28, 20
 FEATURES = (".npy", ".npz")
 KINDS = (
-    "a folder of images, a manifest, a folder of palpate generate, or embeddings "
+    "a folder or table of images, a manifest, a folder of palpate generate, or embeddings "
     f"({', '.join(FEATURES)})"
 )
 #: What ids get to be read as names of files.
@@ -261,18 +261,17 @@ def _manifest(root: Path, **columns: Sequence[str]) -> Manifest:
     return Manifest.of_table(table, root)
 
 
-# Image files
-
-
 def _of_path(path: Path) -> Samples:
     must, got = "What is scored must exist", f"nothing at {path}"
     require(path.exists(), None, must, got, fix=f"Pass {KINDS}")
     require_regular(path)
-    if path.is_file() and not is_manifest(path):
-        must, fix = f"{path} must be {KINDS}", "Pass one of these; pickles are never loaded"
-        got = path.suffix or "no suffix"
-        require(path.suffix.lower() in FEATURES, None, must, got, fix=fix)
+    if path.suffix.lower() in FEATURES and path.is_file():
         return _of_feature_file(path)
+    if path.is_file() and not is_manifest(path):
+        is_table = path.suffix.lower() in TABLES or bool(headless_names(path))
+        must, fix = f"{path} must be {KINDS}", "Pass one of these; pickles are never loaded"
+        require(is_table, None, must, path.suffix or "no suffix", fix=fix)
+        return Samples(str(path), _of_table(path))
     require_utf8("Paths of images", os.path.realpath(path))
     if is_manifest(path):
         manifest = Manifest.load(path)
@@ -290,6 +289,16 @@ def _of_path(path: Path) -> Samples:
         return Samples(str(path), manifest, settings=settings)
     files = _files_below(path)
     return Samples(str(path), _manifest(path, id=[*files], tactile=[*files.values()]))
+
+
+def _of_table(path: Path) -> Manifest:
+    from palpate.data.reading import read  # what is scored is a table of images least often
+
+    manifest = read(path, images=True).manifest
+    must, fix = f"{path} must name a tactile image in every row", "Name the column tactile"
+    without = manifest.table["tactile"].null_count()
+    require(not without, None, must, f"{without} rows without", fix=fix)
+    return manifest
 
 
 def generated_files(folder: Path, index: Mapping[str, Any]) -> dict[str, str]:
@@ -341,9 +350,6 @@ def require_utf8(subject: str, text: str) -> None:
 def without_suffix(name: str) -> str:
     """A path without the suffix of an image; another suffix is part of the name."""
     return posixpath.splitext(name)[0] if is_image(name) else name
-
-
-# Arrays
 
 
 def _of_arrays(source: Any, name: str) -> Samples:
@@ -454,9 +460,6 @@ def require_ids(ids: Sequence[str], source: str) -> None:
     got = f"{len(repeated)} that occur more than once, first {''.join(repeated[:1])!r}"
     must = f"Every id in {source} must occur once"
     require(not repeated, None, must, got, fix="Keep one row per id")
-
-
-# Names and labels
 
 
 def named_sources(
