@@ -114,9 +114,11 @@ def _of_file(
     path: Path, options: Mapping[str, Any], images: bool, skip_bad: bool
 ) -> Imported | None:
     """The samples of a list or table; None if it is next to the recordings that it lists."""
-    is_interval = "names" not in options and intervals.detect(path)
-    is_table = path.suffix.lower() in TABLES or "names" in options or headless_names(path)
-    if (set(options) <= {"root"} and is_list(path)) or not (is_interval or is_table):
+    is_interval = is_table = False
+    if not (set(options) <= {"root"} and is_list(path)):
+        is_interval = "names" not in options and intervals.detect(path)
+        is_table = path.suffix.lower() in TABLES or "names" in options or bool(headless_names(path))
+    if not (is_interval or is_table):
         listed = read_list(path, skip_bad=skip_bad)
         return Imported(listed.manifest, listed.skipped, inconclusive=listed.inconclusive)
     if not is_interval:

@@ -46,10 +46,11 @@ from palpate.core import (
 )
 from palpate.core.features import is_missing, to_numpy
 from palpate.core.messages import require_rows
+from palpate.data.images import SUFFIXES as IMAGES
 from palpate.data.images import cached_images, image_size, load_images, read_image, square
 from palpate.data.manifest import Manifest, is_manifest
 from palpate.data.recordings import LEVELS, name_recordings
-from palpate.data.tables import TABLES, headless_names, is_image, open_table, table_of
+from palpate.data.tables import TABLES, headless_names, open_table, table_of
 
 #: Decoded images of more bytes than this are kept in a file of the cache.
 IN_MEMORY = 1 << 30
@@ -61,8 +62,6 @@ KINDS = (
     "a folder or table of images, a manifest, a folder of palpate generate, or embeddings "
     f"({', '.join(FEATURES)})"
 )
-#: What ids get to be read as names of files.
-SUFFIX = ".png"
 #: Columns that a table of labels may have, and other names of theirs.
 LABELS = ("material", "object", "session", "video", "contact")
 #: Columns of features -> those of a manifest.
@@ -347,6 +346,11 @@ def require_utf8(subject: str, text: str) -> None:
         raise PalpateError(f"{subject} must be UTF-8", ascii(text), "Rename it") from None
 
 
+def is_image(path: str | Path) -> bool:
+    """Whether a path has the suffix of an image."""
+    return str(path).lower().endswith(IMAGES)
+
+
 def without_suffix(name: str) -> str:
     """A path without the suffix of an image; another suffix is part of the name."""
     return posixpath.splitext(name)[0] if is_image(name) else name
@@ -356,7 +360,8 @@ def _of_arrays(source: Any, name: str) -> Samples:
     """An array or tensor of features or images, or a list of rows or images."""
     try:
         several = isinstance(source, list)
-        array = np.stack([_array(item) for item in source]) if several else _array(source)
+        rgb = lambda item: to_numpy(item.convert("RGB") if hasattr(item, "getbands") else item)
+        array = np.stack([*map(rgb, source)]) if several else rgb(source)
     except (TypeError, ValueError) as error:
         fix = f"Pass {KINDS}, an array or tensor, or a list of images of one size"
         raise PalpateError(f"{name} must be something to score", str(error), fix) from None
@@ -365,10 +370,6 @@ def _of_arrays(source: Any, name: str) -> Samples:
     images = as_images(array, name)
     ids = [str(k) for k in range(len(images))]
     return Samples(name, _manifest(Path(), id=ids), images, numbered=True)
-
-
-def _array(value: Any) -> NDArray[Any]:
-    return to_numpy(value.convert("RGB") if hasattr(value, "getbands") else value)
 
 
 def as_images(array: NDArray[Any], name: str) -> NDArray[np.uint8]:
@@ -483,8 +484,8 @@ def named_sources(
     require(len(sources) > 0, "generated", must, "nothing", fix=f"Pass {KINDS}")
     must = f"must not be {' or '.join(map(repr, reserved))}, which the tables have already"
     for name, source in sources.items():
-        got, fix = f"{name!r} for {source}", "Pass another name"
-        require(name not in reserved, "names", must, got, fix=fix)
+        got = f"{name!r} for {source}"
+        require(name not in reserved, "names", must, got, fix="Pass another name")
     return sources
 
 
@@ -561,15 +562,14 @@ def labeled(samples: Samples, table: pl.DataFrame | None, source: str = "the lab
         got = f"{len(samples)} and {len(table)}"
         require(len(table) == len(samples), None, must, got, fix="Give them ids")
         samples = replace(samples.with_columns(table["id"]), numbered=False)
-    known = {*table["id"]}
-    missing = [i for i in samples.ids if i not in known]
+    ids = samples.manifest.table["id"]
+    missing = ids.filter(~ids.is_in(table["id"].implode()))
     if len(missing) == len(samples):
         return samples
     columns = " and ".join(table.columns[1:])
     must = f"Every id of {samples.source} must be in {source}, which gives {columns} by id"
     got = f"{len(missing)} of {len(samples)} without, first {next(iter(missing), '')!r}"
-    fix = "Remove these, or pass labels for every id"
-    require(not missing, None, must, got, fix=fix)
+    require(missing.is_empty(), None, must, got, fix="Remove these, or pass labels for every id")
     rows = samples.manifest.table.select("id").join(table, "id", "left", maintain_order="left")
     return samples.with_columns(*rows.drop("id"))
 
@@ -587,13 +587,13 @@ def with_recordings(sets: Sequence[Samples]) -> list[Samples]:
 
     Samples whose names show no recording, where others' do, are recordings of their own.
     """
-    suffix = pl.concat_str("id", pl.lit(SUFFIX)).alias("tactile")
+    suffix = pl.concat_str("id", pl.lit(".png")).alias("tactile")  # ids are read as file names
     files = [s if s.rows is None else s.with_columns(suffix) for s in sets if not s.numbered]
     manifests = iter(name_recordings([s.manifest for s in files]))
     named: list[Samples] = []
     for samples in sets:
         manifest = samples.manifest if samples.numbered else next(manifests)
-        levels = [level for level in LEVELS[:-1] if f"{level}_from" in manifest.facts]
+        levels = (level for level in LEVELS[:-1] if f"{level}_from" in manifest.facts)
         alone = [pl.col(level).fill_null(pl.col("id")) for level in levels]
         own = samples.manifest.table["tactile"]
         named.append(replace(samples, manifest=manifest).with_columns(own, *alone))
