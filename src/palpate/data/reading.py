@@ -151,5 +151,5 @@ def _of_table(source: Any, options: Mapping[str, Any], *, images: bool, skip_bad
 def _require_only(accepted: set[str], options: Mapping[str, Any], kind: str) -> None:
     """Raise for an option that a kind of source does not take."""
     for name in sorted(set(options) - accepted):
-        fix = f"It takes {', '.join(sorted(accepted))}"
+        fix = f"It takes {', '.join(f'`{option}`' for option in sorted(accepted))}"
         require(False, name, f"must be left out for {kind}", repr(options[name]), fix=fix)
