@@ -54,14 +54,15 @@ from palpate.data.tables import TABLES, headless_names, open_table, table_of
 
 #: Decoded images of more bytes than this are kept in a file of the cache.
 IN_MEMORY = 1 << 30
-#: Bytes that an array of an archive may unpack to, and times its packed size on top: floats hardly
-#: shrink, so more is a decompression bomb.
+#: Bytes that an array of an archive may unpack to, and times its packed size on top, at most.
 UNPACKED, MOST_TIMES = 1 << 28, 20
 FEATURES = (".npy", ".npz")
 KINDS = (
     "a folder or table of images, a manifest, a folder of palpate generate, or embeddings "
     f"({', '.join(FEATURES)})"
 )
+#: What ids get to be read as names of files.
+SUFFIX = ".png"
 #: Columns that a table of labels may have, and other names of theirs.
 LABELS = ("material", "object", "session", "video", "contact")
 #: Columns of features -> those of a manifest.
@@ -359,9 +360,8 @@ def without_suffix(name: str) -> str:
 def _of_arrays(source: Any, name: str) -> Samples:
     """An array or tensor of features or images, or a list of rows or images."""
     try:
-        several = isinstance(source, list)
         rgb = lambda item: to_numpy(item.convert("RGB") if hasattr(item, "getbands") else item)
-        array = np.stack([*map(rgb, source)]) if several else rgb(source)
+        array = np.stack([*map(rgb, source)]) if isinstance(source, list) else rgb(source)
     except (TypeError, ValueError) as error:
         fix = f"Pass {KINDS}, an array or tensor, or a list of images of one size"
         raise PalpateError(f"{name} must be something to score", str(error), fix) from None
@@ -587,7 +587,7 @@ def with_recordings(sets: Sequence[Samples]) -> list[Samples]:
 
     Samples whose names show no recording, where others' do, are recordings of their own.
     """
-    suffix = pl.concat_str("id", pl.lit(".png")).alias("tactile")  # ids are read as file names
+    suffix = pl.concat_str("id", pl.lit(SUFFIX)).alias("tactile")
     files = [s if s.rows is None else s.with_columns(suffix) for s in sets if not s.numbered]
     manifests = iter(name_recordings([s.manifest for s in files]))
     named: list[Samples] = []
