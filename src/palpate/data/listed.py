@@ -71,7 +71,7 @@ class Listed:
     def at_hand(self) -> bool:
         """Whether one of the images, of as many as are looked for, is a file."""
         columns = (name for name in (*self.sides, PATH) if name in self.rows.columns)
-        cells = (path for name in columns for path in some(self.rows[name].drop_nulls()))
+        cells = (path for name in columns for path in some(self.rows[name].drop_nulls().to_list()))
         return any(is_there(self.scan.base, path) for path in cells)
 
     def add_images(self) -> None:

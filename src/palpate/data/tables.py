@@ -418,7 +418,7 @@ def _parquet(path: Path) -> Table:
 def _of_frame(
     name: str, schema: Mapping[str, pl.DataType], read: Callable[[Sequence[str]], pl.DataFrame]
 ) -> Table:
-    kinds = {c: kind for c, kind in schema.items() if kind.is_nested() or kind in UNREAD}
+    kinds = {c: k for c, k in schema.items() if k.is_nested() or k.base_type() in UNREAD}
 
     def records(columns: Sequence[str]) -> Iterator[Record]:
         odd = next((column for column in columns if column in kinds), "")
