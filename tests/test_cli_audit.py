@@ -99,7 +99,8 @@ def test_equal_file_names_of_two_roots_are_no_leak_and_a_copied_file_is(layout, 
     assert (status, data["leaking_samples"]) == (1, 1)
 
 
-def test_the_next_commands_of_tactile_data_work_on_it(tmp_path, capsys, monkeypatch):
+@pytest.mark.parametrize("folder", ["plain", pytest.param("with", marks=pytest.mark.nightly)])
+def test_the_next_commands_of_tactile_data_work_on_it(tmp_path, capsys, monkeypatch, folder):
     """With videos, and without any: near-duplicates are then all that can be kept together."""
     monkeypatch.chdir(tmp_path)
     for k in range(60):
@@ -115,15 +116,14 @@ def test_the_next_commands_of_tactile_data_work_on_it(tmp_path, capsys, monkeypa
         "s.json"
     )
     capsys.readouterr()
-    for folder in ("with", "plain"):
-        status, data, _ = run(capsys, folder, "--split", "s.json")
-        assert (status, len(data["commands"])) == (1, 2)
-        by = " --by video" * (folder == "with")
-        assert data["commands"][0] == f"palpate split {folder}{by} --near tactile -o noleak.json"
-        for command in data["commands"]:
-            assert main([*shlex.split(command)[1:], "--json"]) in (0, 3), command
-            answer = json.loads(capsys.readouterr().out)
-        assert answer["leaking_samples"] == 0
+    status, data, _ = run(capsys, folder, "--split", "s.json")
+    assert (status, len(data["commands"])) == (1, 2)
+    by = " --by video" * (folder == "with")
+    assert data["commands"][0] == f"palpate split {folder}{by} --near tactile -o noleak.json"
+    for command in data["commands"]:
+        assert main([*shlex.split(command)[1:], "--json"]) in (0, 3), command
+        answer = json.loads(capsys.readouterr().out)
+    assert answer["leaking_samples"] == 0
 
 
 def test_a_damaged_picture_is_named_and_the_others_are_compared(folders, capsys):
