@@ -56,7 +56,8 @@ def random_case(seed: int, number: int, base: Path, folder: Path) -> list[str]:
             mutations.change_arguments(rng, args, places, outputs)
         else:
             change = mutations.change_content if rng.random() < 0.8 else mutations.change_place
-            if kept := [p for p in files if p.is_file() and not p.is_symlink()]:
+            small = [p for p in files if p.is_file() and p.stat().st_size < mutations.SPARSE]
+            if kept := [p for p in small if not p.is_symlink()]:
                 change(rng, kept)
     return [arg.replace("\0", "") for arg in args]  # no shell can pass one
 
