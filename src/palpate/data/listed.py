@@ -27,11 +27,9 @@ from typing import Any
 
 import polars as pl
 
-from palpate.core import PalpateError, Problem, Split, require
-from palpate.data.imported import Imported
-from palpate.data.manifest import IMAGE_COLUMNS, PATH, ROLES, SCHEMA, Manifest
-from palpate.data.mapping import LINE, compile_maps
-from palpate.data.recordings import USUAL
+from palpate.core import PalpateError, require
+from palpate.data.manifest import IMAGE_COLUMNS, PATH, ROLES, SCHEMA
+from palpate.data.mapping import compile_maps
 from palpate.data.rows import (
     is_there,
     manifest_rows,
@@ -41,9 +39,8 @@ from palpate.data.rows import (
     some,
     without_repeats,
 )
-from palpate.data.scanning import Scan, require_some
+from palpate.data.scanning import Scan
 from palpate.data.tables import Table, names_images, open_table, table_of
-from palpate.data.templates import Template
 
 SIDES = ("vision", "tactile")
 #: Columns of which a table needs at least one, if none names images.
@@ -99,66 +96,6 @@ class Listed:
                 scan.problem(where, "bad-path", text)
             else:
                 scan.rows.append((where, row))
-
-    def by_name(self, template: str | None = None) -> Imported:
-        """The samples without their images, each named by its columns or the path of its image.
-
-        Args:
-            template: of the paths; that it does not match some is a problem if they are many.
-
-        Raises:
-            PalpateError: if no column names samples.
-        """
-        problems = self.scan.problems
-        stated = not {"id", "video", "object"}.isdisjoint(self.rows.columns)
-        usable = stated or PATH in self.rows.columns or bool(problems)
-        must = f"must have at least one of the columns {', '.join(NAMING)}"
-        got = ", ".join(self.table.names) or "no columns"
-        require(usable, "source", must, got, fix="Map a column to one of them")
-        require_some(len(self.rows), self.table.name, problems)
-        rows = self.rows.drop(IMAGE_COLUMNS, strict=False)
-        if template and PATH in rows.columns:
-            problems += self._unlike(Template.parse(template), template)
-        names = {
-            "id": pl.col("id"),
-            "frame": pl.concat_str("video", "frame", separator="/"),
-            PATH: pl.col(PATH).str.replace(r"([^/])\.[^./]*$", "$1"),
-            LINE: pl.concat_str(pl.lit(f"{self.table.name}:"), LINE),
-        }
-        if "video" not in rows.columns:
-            del names["frame"]
-        rows = rows.with_columns(id=pl.coalesce(names[c] for c in names if c in rows.columns))
-        again = rows.filter(~pl.col("id").is_first_distinct())
-        for line, name in again.select(LINE, "id").iter_rows():
-            text = f"the id {name!r} is in an earlier row already"
-            problems.append(Problem(self.table.place(line), "duplicate-id", text))
-        rows = rows.filter(pl.col("id").is_first_distinct()) if len(again) else rows
-        problems.sort(key=Problem.sort_key)
-        path = Path(self.table.name)
-        listed = not stated or path.suffix.lower() in (".json", ".jsonl")
-        facts = {"source": path.name} if listed else {"dataset": path.stem}
-        facts |= {"path_column": self.paths} if self.paths not in ("", PATH) else {}
-        facts |= {"images_absent": "yes"} if PATH in rows.columns and not self.at_hand else {}
-        table = rows.drop(LINE, "split", strict=False)
-        manifest = Manifest.of_table(table, self.scan.base, facts)
-        splits: dict[str, Split] = {}
-        if "split" in rows.columns:
-            parts = rows.drop_nulls("split")
-            stated_parts = dict(zip(parts["id"], parts["split"], strict=True))
-            rule = {"method": "official", "column": self.mapped.get("split", "split")}
-            splits["Orig"] = Split(stated_parts, rule, manifest.digest)
-        scan = self.scan
-        return Imported(manifest, problems, splits, scan.inconclusive, scan.suspicious)
-
-    def _unlike(self, template: Template, text: str) -> list[Problem]:
-        """Problems of the paths that a template does not match, if they are many."""
-        rows = self.rows.select(LINE, PATH).drop_nulls()
-        odd = [(line, path) for line, path in rows.iter_rows() if template.match(path) is None]
-        return [
-            Problem(self.table.place(line), "no-match", f"{path!r} is not like the template {text}")
-            for line, path in odd
-            if len(odd) > (1 - USUAL) * len(self.rows)
-        ]
 
 
 def read_table(

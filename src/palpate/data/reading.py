@@ -6,16 +6,20 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from palpate.core import PalpateError, Progress, quiet, require, require_regular
+import polars as pl
+
+from palpate.core import PalpateError, Problem, Progress, Split, quiet, require, require_regular
 from palpate.data.foreign import require_native
 from palpate.data.formats import intervals, pairs, scanned
 from palpate.data.imported import Imported, imported_of, splits_of
-from palpate.data.listed import SIDES, read_table
+from palpate.data.listed import NAMING, SIDES, Listed, read_table
 from palpate.data.listing import is_list, read_list
-from palpate.data.manifest import Manifest, is_manifest
-from palpate.data.recordings import name_recordings
-from palpate.data.scanning import raise_if
+from palpate.data.manifest import IMAGE_COLUMNS, PATH, Manifest, is_manifest
+from palpate.data.mapping import LINE
+from palpate.data.recordings import USUAL, name_recordings
+from palpate.data.scanning import raise_if, require_some
 from palpate.data.tables import TABLES, headless_names
+from palpate.data.templates import Template
 
 
 def load(
@@ -143,9 +147,72 @@ def _of_table(source: Any, options: Mapping[str, Any], *, images: bool, skip_bad
         facts = {**pairs.FACTS.of_manifest(), "format": "pairs"}
         scan = pairs.scan_of(listed)
         return imported_of(scan, listed.table.name, facts, skip_bad=skip_bad, check="none")
-    imported = listed.by_name(options.get(side))
+    imported = _by_name(listed, options.get(side))
     raise_if(imported.skipped, skip_bad)
     return imported
+
+
+def _by_name(listed: Listed, template: str | None) -> Imported:
+    """The samples without their images, each named by its columns or the path of its image.
+
+    Args:
+        listed: what a table or list says.
+        template: of the paths; that it does not match some is a problem if they are many.
+
+    Raises:
+        PalpateError: if no column names samples.
+    """
+    problems = listed.scan.problems
+    stated = not {"id", "video", "object"}.isdisjoint(listed.rows.columns)
+    usable = stated or PATH in listed.rows.columns or bool(problems)
+    must = f"must have at least one of the columns {', '.join(NAMING)}"
+    got = ", ".join(listed.table.names) or "no columns"
+    require(usable, "source", must, got, fix="Map a column to one of them")
+    require_some(len(listed.rows), listed.table.name, problems)
+    rows = listed.rows.drop(IMAGE_COLUMNS, strict=False)
+    if template and PATH in rows.columns:
+        problems += _unlike(listed, Template.parse(template), template)
+    names = {
+        "id": pl.col("id"),
+        "frame": pl.concat_str("video", "frame", separator="/"),
+        PATH: pl.col(PATH).str.replace(r"([^/])\.[^./]*$", "$1"),
+        LINE: pl.concat_str(pl.lit(f"{listed.table.name}:"), LINE),
+    }
+    if "video" not in rows.columns:
+        del names["frame"]
+    rows = rows.with_columns(id=pl.coalesce(names[c] for c in names if c in rows.columns))
+    again = rows.filter(~pl.col("id").is_first_distinct())
+    for line, name in again.select(LINE, "id").iter_rows():
+        text = f"the id {name!r} is in an earlier row already"
+        problems.append(Problem(listed.table.place(line), "duplicate-id", text))
+    rows = rows.filter(pl.col("id").is_first_distinct()) if len(again) else rows
+    problems.sort(key=Problem.sort_key)
+    path = Path(listed.table.name)
+    named_by_path = not stated or path.suffix.lower() in (".json", ".jsonl")
+    facts = {"source": path.name} if named_by_path else {"dataset": path.stem}
+    facts |= {"path_column": listed.paths} if listed.paths not in ("", PATH) else {}
+    facts |= {"images_absent": "yes"} if PATH in rows.columns and not listed.at_hand else {}
+    table = rows.drop(LINE, "split", strict=False)
+    manifest = Manifest.of_table(table, listed.scan.base, facts)
+    splits: dict[str, Split] = {}
+    if "split" in rows.columns:
+        parts = rows.drop_nulls("split")
+        stated_parts = dict(zip(parts["id"], parts["split"], strict=True))
+        rule = {"method": "official", "column": listed.mapped.get("split", "split")}
+        splits["Orig"] = Split(stated_parts, rule, manifest.digest)
+    scan = listed.scan
+    return Imported(manifest, problems, splits, scan.inconclusive, scan.suspicious)
+
+
+def _unlike(listed: Listed, template: Template, text: str) -> list[Problem]:
+    """Problems of the paths that a template does not match, if they are many."""
+    rows = listed.rows.select(LINE, PATH).drop_nulls()
+    odd = [(line, path) for line, path in rows.iter_rows() if template.match(path) is None]
+    return [
+        Problem(listed.table.place(line), "no-match", f"{path!r} is not like the template {text}")
+        for line, path in odd
+        if len(odd) > (1 - USUAL) * len(listed.rows)
+    ]
 
 
 def _require_only(accepted: set[str], options: Mapping[str, Any], kind: str) -> None:
