@@ -22,7 +22,7 @@ from itertools import islice
 from pathlib import Path
 from queue import SimpleQueue
 from threading import Event
-from typing import TYPE_CHECKING, Any, BinaryIO, Literal, NamedTuple, TypeVar
+from typing import TYPE_CHECKING, Any, BinaryIO, ClassVar, Literal, NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -187,6 +187,10 @@ class Preprocess:
     subtract: tuple[str, ...] = ()
     lag: int = 0
 
+    #: Of what is prepared, and whether a sample without what is subtracted is an error.
+    dtype: ClassVar[np.dtype[Any]] = np.dtype(np.uint8)
+    needs_background: ClassVar[bool] = True
+
     @classmethod
     def from_config(cls, path: Path, size: int | None) -> Preprocess:
         """Read a ``preprocessor_config.json`` of transformers, in old or new spelling.
@@ -271,7 +275,7 @@ class Preprocess:
         image: Image.Image,
         background: Image.Image | None = None,
         previous: Image.Image | None = None,
-    ) -> NDArray[np.uint8]:
+    ) -> NDArray[Any]:
         """One RGB image as 8-bit (height, width, channels).
 
         Args:
@@ -323,7 +327,8 @@ class Preprocess:
         for k, (path, gel) in enumerate(zip(paths, manifest.column("background"), strict=True)):
             need = column == "tactile" and any(word in sensors[k] for word in self.subtract)
             must = f"The encoder subtracts the no-contact image of {names[k] or 'every sensor'}"
-            require(not need or gel is not None, None, must, f"none for {path.name}", fix=fix)
+            there = not need or gel is not None or not self.needs_background
+            require(there, None, must, f"none for {path.name}", fix=fix)
             video, frame = positions[k]
             before = None
             if video is not None and frame is not None:
@@ -366,7 +371,8 @@ def load_images(
         ProblemsError: naming every unreadable file.
     """
     preprocess = shape if isinstance(shape, Preprocess) else Preprocess(shape, shape)
-    images = np.empty((len(files), *preprocess.shape), np.uint8) if into is None else into
+    wanted = (len(files), *preprocess.shape)
+    images = np.empty(wanted, preprocess.dtype) if into is None else into
     frames = [file if isinstance(file, tuple) else (file, None, None) for file in files]
     rows: dict[object, list[int]] = {}
     for k, frame in enumerate(frames):
@@ -428,7 +434,7 @@ def cached_images(
     rows = (len(manifest), *preprocess.shape)
 
     def decode(part: Path) -> None:
-        images = np.lib.format.open_memmap(part, mode="w+", dtype=np.uint8, shape=rows)
+        images = np.lib.format.open_memmap(part, mode="w+", dtype=preprocess.dtype, shape=rows)
         load_images(frames.files, preprocess, progress=progress, into=images)
         images.flush()
 

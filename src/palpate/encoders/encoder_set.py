@@ -74,7 +74,9 @@ from palpate.encoders.models import (
     save_seen,
     silent,
     stated,
+    union,
 )
+from palpate.encoders.rulers import Handcrafted, Ruler
 from palpate.encoders.tactile import TactileModule, load_tactile
 from palpate.encoders.tokenizer import save_tokenizer
 from palpate.training.cards import write_model_cards
@@ -241,6 +243,11 @@ class EncoderSet:
             facts["preprocess"] = asdict(self.preprocesses[modality])
         return digest_modules(parts, facts | architecture(config))
 
+    @property
+    def is_ruler(self) -> bool:
+        """Whether the tactile encoder gives numbers of residuals, which their reference scales."""
+        return isinstance(self.tactile, Ruler)
+
     # --- what the encoders were trained on -------------------------------------------------------
 
     def knows_seen(self, modality: str) -> bool:
@@ -262,7 +269,7 @@ class EncoderSet:
             (n,) booleans; all false where the encoder's images are not known (public ones).
         """
         digests, seen = self.seen.get(modality), np.zeros(len(images), bool)
-        if digests is None:
+        if digests is None or not len(digests):
             return seen
         preprocess = replace(self.preprocess(modality), subtract=())
         alone = isinstance(images, Sequence)
@@ -279,7 +286,8 @@ class EncoderSet:
         """What is known of an encoder that others trained; None of palpate's and one's own."""
         self._require(modality)
         if modality == "tactile":
-            return self.tactile.format if isinstance(self.tactile, TactileModule) else None
+            public = isinstance(self.tactile, TactileModule) and not self.is_ruler
+            return self.tactile.format if public else None
         if "trained_on" not in self.clip_card:
             return None
         return Origin(self.name, self.clip_card["license"], tuple(self.clip_card["trained_on"]))
@@ -381,7 +389,12 @@ class EncoderSet:
             public = load_tactile(folder)
             card = {"name": str(source), "license": public.format.license}
             shape = {"tactile": public.preprocess}
-            return cls(tactile=public, preprocesses=shape, card=card, sensor=sensor).to(device)
+            encoders = cls(tactile=public, preprocesses=shape, card=card, sensor=sensor)
+            if isinstance(public, Handcrafted):  # it has seen none
+                encoders.seen["tactile"] = union()
+            elif isinstance(public, Ruler):
+                encoders.card["synthetic"] = True
+            return encoders.to(device)
         note = folder / "palpate.json"
         if not note.is_file() or read_record(note, "card").get("format") == CLIP_FORMAT:
             return load_clip(source, device=device)

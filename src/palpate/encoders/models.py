@@ -54,6 +54,8 @@ if TYPE_CHECKING:  # names are checked before torch is imported, which takes sec
 Part = Literal["clip", "encoders", "autoencoder", "generator"]
 #: The shipped names, and the folder of each in :func:`shipped_root`.
 SHIPPED = {"palpate/mini": "mini"}
+#: Rulers in one file each.
+RULERS = {"palpate/handcrafted": "mini/rulers/handcrafted.safetensors"}
 #: Where the parts are in the folder of a name.
 PARTS: dict[Part, str] = {
     "clip": "encoders/clip",
@@ -135,7 +137,8 @@ def shipped_folder(name: str | Path, part: Part) -> Path | None:
     """
     if not is_shipped(name):
         return None
-    must = f"A name that begins with {PREFIX} must be one of {', '.join(SHIPPED)}"
+    names = (*SHIPPED, *(RULERS if part == "encoders" else ()))
+    must = f"A name that begins with {PREFIX} must be one of {', '.join(names)}"
     fix = f"Choose one of these; a folder of that name is written ./{name}"
     require(name in SHIPPED, None, must, f"{name!r}", fix=fix)
     folder = shipped_root() / SHIPPED[str(name)] / PARTS[part]
@@ -194,6 +197,8 @@ def find_encoder(source: str | Path) -> tuple[Path, str | None]:
         PalpateError: if there is none of that name, a folder holds none, or the hub is out of
             reach.
     """
+    if is_shipped(source) and source in RULERS:
+        return shipped_root() / RULERS[str(source)], None
     name, _, sensor = str(source).partition("#")
     owner, colon, file = name.partition(":")
     if str(source) and Path(source).exists() and not is_shipped(source):

@@ -69,7 +69,7 @@ class Format(Origin):
 
 
 class TactileModule(nn.Module):
-    """A frozen tactile encoder of others: ``(pixels, sensors) -> (n, dim)``, not normalized.
+    """A frozen tactile encoder in one file: ``(pixels, sensors) -> (n, dim)``, not normalized.
 
     Attributes:
         dim: width of the features.
@@ -318,8 +318,10 @@ def load_tactile(path: Path) -> TactileModule:
         PalpateError: for a file that holds more than weights, of no known format, or whose weights
             lack a name, have one more, or another shape.
     """
+    from palpate.encoders.rulers import RULERS  # which are modules of this kind
+
     state = read_weights(path, f"Pass {KNOWN}")
-    form = next((f for f in FORMATS if f.prefix + f.signature in state), None)
+    form = next((f for f in (*RULERS, *FORMATS) if f.prefix + f.signature in state), None)
     if form is None:
         must = f"{path} must be a tactile encoder that is recognized by the names of its weights"
         got = f"{len(state)} weights, first {', '.join(list(state)[:3]) or 'none'}"

@@ -8,7 +8,9 @@ one size, that of the smaller test part, since chance depends on it.
 
 from __future__ import annotations
 
+import tempfile
 from collections.abc import Mapping, Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
@@ -162,11 +164,20 @@ def probe(  # noqa: PLR0913 - one argument a choice
         Plan(modality, label, group, top, pool, text_threshold, seed, allow_seen, axis),
     )
     runs: dict[str, list[Probed]] = {}
-    for s, e in ((s, e) for s in loaded for e in sets):
-        subject = {"split": s, "encoder": e}.get(axis, "real")
-        runs[subject] = [
-            measure(manifest, loaded[s], sets[e], subject, plan, cache=cache, progress=progress)
-        ]
+    with tempfile.TemporaryDirectory() if cache is None else nullcontext(cache) as folder:
+        if modality == "tactile" and any(e.is_ruler for e in sets.values()):
+            from palpate.data.residuals import with_gels
+
+            kind, (backed,) = with_gels(manifest, [], Path(folder))
+            plan = replace(plan, notes=[*plan.notes, Note("background-kind", {"kind": kind})])
+        else:
+            backed = manifest
+        for s, e in ((s, e) for s in loaded for e in sets):
+            subject = {"split": s, "encoder": e}.get(axis, "real")
+            source = backed if sets[e].is_ruler else manifest
+            runs[subject] = [
+                measure(source, loaded[s], sets[e], subject, plan, cache=cache, progress=progress)
+            ]
     results = results_of(f"Probe of the {modality} encoder", runs, plan, manifest, loaded)
     digests = {
         f"{modality} encoder{f' {name}' if axis == 'encoder' else ''}": e.digest(modality)

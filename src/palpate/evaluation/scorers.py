@@ -174,6 +174,8 @@ class Bench:
 
         encoders, progress = self.encoders, self.progress
         assert encoders is not None  # `score` requires one for what compares features
+        if encoders.is_ruler:
+            return next(x for s, x in self.ruled if s is samples)
         digest = encoders.digest("tactile")
         if samples.rows is not None:
             x = embed_images(samples.rows, encoders, "tactile", progress=progress)
@@ -183,6 +185,13 @@ class Bench:
         manifest = self._in_context(samples.manifest, encoders)
         x = embed(manifest, encoders, cache=folder, still=True, progress=progress)
         return samples.feature_set(x.features, digest)
+
+    @cached_property
+    def ruled(self) -> list[tuple[Samples, FeatureSet]]:
+        """Features of everything by a ruler."""
+        from palpate.evaluation.ruling import ruler_features
+
+        return ruler_features(self)
 
     def _in_context(self, manifest: Manifest, encoders: EncoderSet) -> Manifest:
         """Image files with the sensor and the no-contact image of the reference's sample of the

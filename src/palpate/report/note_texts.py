@@ -50,6 +50,16 @@ EXCLUDED = {
 }
 #: What a parameter of a note stands for.
 WORDS: dict[str, dict[str, str]] = {
+    "background": {
+        "no contact": "their no-contact images",
+        "other objects": "the median of images of other objects on the same gel and day",
+        "own video": "the median of their own video",
+        "whole set": "the median of the whole reference, which must be of one gel",
+        "low-pass": (
+            "their own low frequencies, by which faint contacts are lost (no background, too few "
+            "images for a median): pass one no-contact image, or run palpate background"
+        ),
+    },
     "undefined": {
         **EXCLUDED,
         "few-samples": "fewer than {least} samples",
@@ -387,6 +397,10 @@ EVALUATION: dict[str, Sentence] = {
     ),
     "encoder-of-other-split": (
         "The tactile encoder was trained on another split: it may have seen test samples"
+    ),
+    "background-kind": (
+        "The ruler measures images minus {kind:background}; scores of another kind of background, "
+        "or of another reference, share no column with these"
     ),
     "encoder-without-split": "The tactile encoder comes without a record of its split",
     "generator-of-other-split": (

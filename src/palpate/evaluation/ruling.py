@@ -1,0 +1,71 @@
+"""Ruler features of all that is scored in one call: one kind of background, one standardization.
+
+A ruler's numbers are centered and divided by the reference's mean and deviation, then
+L2-normalized. Digest of encoder, kind and standardization together name the features, so that
+scores of different ones share no column.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+import polars as pl
+from PIL import Image
+
+from palpate.core import FeatureSet, Note, digest_json
+from palpate.data.manifest import Manifest
+from palpate.data.residuals import with_gels
+from palpate.data.samples import Samples
+
+if TYPE_CHECKING:
+    from palpate.evaluation.scorers import Bench
+
+#: Least deviation that numbers are divided by, as a share of that of simulated contacts.
+LEAST_SPREAD = 0.1
+
+
+def ruler_features(bench: Bench) -> list[tuple[Samples, FeatureSet]]:
+    """Every set of the bench with its features."""
+    from palpate.encoders.embed import embed
+
+    some = (bench.reference, *bench.subjects.values(), bench.train, bench.seen)
+    sets, encoders = [s for s in some if s is not None], bench.encoders
+    assert encoders is not None  # whose ruler it is
+    folder = bench.cache / "rulers"
+    real, *others = (_of_files(s, folder) for s in sets)
+    kind, parts = with_gels(real, others, folder)
+    bench.notes.append(Note("background-kind", {"kind": kind}))
+    keep = folder if bench.keep else None
+    embedded = [embed(p, encoders, cache=keep, still=True, progress=bench.progress) for p in parts]
+    rows = [e.features.astype(np.float64) for e in embedded]
+    mean, spread = rows[0].mean(axis=0), np.maximum(rows[0].std(axis=0), LEAST_SPREAD)
+    scales = [mean.round(4).tolist(), spread.round(4).tolist()]
+    digest = digest_json([encoders.digest("tactile"), kind, scales])
+    features: list[tuple[Samples, FeatureSet]] = []
+    for samples, x in zip(sets, rows, strict=True):
+        z = (x - mean) / spread
+        z /= np.maximum(np.linalg.norm(z, axis=1, keepdims=True), 1e-9)
+        features.append((samples, samples.feature_set(z.astype(np.float32), digest)))
+    return features
+
+
+def _of_files(samples: Samples, folder: Path) -> Manifest:
+    """A manifest of image files, with the one background of all if there is one."""
+    manifest, columns = samples.manifest, list[pl.Series]()
+    if samples.rows is not None:
+        place = samples.folder(folder)
+        files = [_saved(row, place / f"{k}.png") for k, row in enumerate(samples.rows)]
+        columns.append(pl.Series("tactile", files, pl.String))
+    if samples.gel is not None:
+        gel = _saved(samples.gel, samples.folder(folder) / "background.png")
+        columns.append(pl.Series("background", [gel] * len(samples), pl.String))
+    return replace(manifest, table=manifest.table.with_columns(columns))
+
+
+def _saved(image: np.ndarray, file: Path) -> str:
+    file.parent.mkdir(parents=True, exist_ok=True)
+    Image.fromarray(image).save(file)
+    return str(file.resolve())

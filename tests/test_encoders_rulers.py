@@ -1,0 +1,264 @@
+"""Rulers: residuals, what is subtracted where the right image is missing, and numbers without
+training, against loops written here.
+"""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import polars as pl
+import pytest
+import torch
+from PIL import Image
+
+from forge.errors import fails
+from forge.worlds import by_video, six_videos
+from palpate import probe, score
+from palpate.data.manifest import Manifest
+from palpate.data.residuals import Residual, with_gels
+from palpate.encoders import Encoder, EncoderSet
+from palpate.encoders.embed import embed
+from palpate.encoders.rulers import Gel, Handcrafted
+from palpate.encoders.tactile import load_tactile
+from palpate.report.notes import sentence
+
+SIDE = 24
+NAME = "palpate/handcrafted"
+
+
+@pytest.fixture(scope="module")
+def handcrafted():
+    return EncoderSet.load(NAME)
+
+
+def touches(folder, n=24, *, seed=0, gel=None, **columns):
+    """A manifest of touches (a bump on a gel of colored light), with columns k -> value."""
+    rng, rows = np.random.default_rng(seed), []
+    y, x = np.mgrid[:SIDE, :SIDE]
+    gel = np.stack([90 + 3 * x, 140 - 2 * y, 100 + x + y], 2) if gel is None else gel
+    folder.mkdir(parents=True, exist_ok=True)
+    Image.fromarray(gel.astype(np.uint8)).save(folder / "gel.png")
+    for k in range(n):
+        cy, cx = rng.uniform(6, 18, 2)
+        bump = 30 * np.exp(-((y - cy) ** 2 + (x - cx) ** 2) / rng.uniform(4, 20))
+        image = (
+            gel + (bump * np.sin(x * rng.uniform(0.5, 2)))[..., None] + rng.normal(0, 1, gel.shape)
+        )
+        Image.fromarray(image.clip(0, 255).astype(np.uint8)).save(folder / f"{k}.png")
+        row = {"id": f"{k}", "tactile": f"{k}.png"}
+        rows.append(row | {name: of(k) for name, of in columns.items()})
+    return Manifest.from_rows(rows, folder)
+
+
+def files(manifest):
+    return [p and str(manifest.path(p)) for p in manifest.column("background")]
+
+
+def pixels(manifest, rows=None):
+    paths = manifest.paths("tactile")
+    return np.stack([np.asarray(Image.open(paths[k])) for k in rows or range(len(paths))])
+
+
+def test_a_residual_keeps_what_averages_of_8_bits_lose():
+    gel = np.full((8, 12, 3), 100, np.uint8)
+    image = gel.copy()
+    image[::2, 2:10, 1] += 1  # half a gray level on average
+    prepared = Residual(4, 4).prepare(Image.fromarray(image), Image.fromarray(gel))
+    assert prepared.dtype == np.float16
+    assert prepared.shape == (4, 4, 3)
+    assert prepared[1:3, :, 1].mean() == pytest.approx(0.5, abs=0.02)
+    assert not prepared[..., [0, 2]].any()
+    # Negative and large differences are not cut.
+    dark = Residual(4, 4).prepare(Image.fromarray(gel * 0), Image.fromarray(gel))
+    assert (dark == -100).all()
+
+
+def test_without_a_background_low_frequencies_go_and_an_offset_with_them():
+    y, x = np.mgrid[:64, :64]
+    light = 60 + x + y / 2
+    grain = 20 * np.sin(x * 1.5)
+    image = Image.fromarray(np.repeat((light + grain)[..., None], 3, 2).round().astype(np.uint8))
+    plain = Image.fromarray(np.repeat(light[..., None], 3, 2).round().astype(np.uint8))
+    left, none = (Residual(64, 64).prepare(i).astype(float) for i in (image, plain))
+    assert left.std() > 12
+    assert np.abs(none[8:-8, 8:-8]).max() < 2
+
+
+LEVELS = {
+    "no contact": {"background": lambda k: "gel.png"},
+    "other objects": {
+        "sensor": lambda k: "g1",
+        "session": lambda k: f"day {k % 2}",
+        "object": lambda k: f"o{k // 2}",
+    },
+    "own video": {"video": lambda k: f"v{k // 8}"},
+    "whole set": {"video": lambda k: f"v{k // 2}"},
+}
+
+
+@pytest.mark.parametrize("kind", LEVELS)
+def test_the_best_background_that_there_is(tmp_path, kind):
+    real = touches(tmp_path / "r", 48, **LEVELS[kind])
+    generated = replace(real, table=real.table.select("id", "tactile")).table
+    generated = Manifest.from_rows(generated.to_dicts(), real.root).take(real.ids[:5])
+    got, (r, g) = with_gels(real, [generated], tmp_path / "gels")
+    assert got == kind
+    assert files(g) == files(r)[:5]  # of the real images that they stand for
+    gels = [np.asarray(Image.open(f)) for f in files(r)]
+    rows = {
+        "other objects": [k for k in range(48) if k % 2 == 0],
+        "own video": range(8),
+        "whole set": range(48),
+    }
+    if kind == "no contact":
+        assert {*files(r)} == {str((tmp_path / "r" / "gel.png").resolve())}
+    else:
+        middle = np.median(pixels(real, [*rows[kind]]), axis=0)
+        assert np.abs(gels[0] - middle).max() <= 0.5
+
+
+def test_sets_that_stand_for_no_real_image_take_the_same_kind(tmp_path):
+    own = touches(tmp_path / "r", 48, video=lambda k: f"v{k // 8}")
+    other = touches(tmp_path / "g", 30, seed=1)
+    other = replace(other, table=other.table.with_columns(id="new " + pl.col("id")))
+    kind, (r, g) = with_gels(own, [other], tmp_path / "gels")
+    assert kind == "whole set"  # of the reference: never of generated images
+    assert {*files(r)} == {*files(g)}
+    kind, (r, g) = with_gels(own.take(own.ids[:19]), [other], tmp_path / "gels")
+    assert kind == "low-pass"
+    assert {*files(r), *files(g)} == {None}
+    recorded = touches(tmp_path / "x", 5, background=lambda k: "gel.png")
+    assert with_gels(recorded, [other], tmp_path / "gels")[0] == "no contact"  # one gel for all
+    # One object touched often is no background of its touches.
+    same = touches(tmp_path / "s", 48, object=lambda k: "one")
+    assert with_gels(same, [], tmp_path / "gels")[0] == "low-pass"
+
+
+def numbers_of(residuals):
+    encoder = Handcrafted({"center": torch.zeros(149)})
+    return encoder.numbers(torch.tensor(residuals, dtype=torch.float32)).numpy()
+
+
+def test_the_numbers_of_a_residual_are_those_of_loops():
+    r = np.random.default_rng(0).normal(0, 5, (3, 96, 96))
+    numbers = numbers_of(r[None])[0]
+    assert numbers.shape == (149,)
+    gray, side = r.mean(0), 96
+    # The seventh ring of the spectrum of gray.
+    edges = [0.5, 1.5, 2.5, 3.5, 4.5, *np.geomspace(5.5, 48, 13)]
+    window = [0.5 - 0.5 * math.cos(2 * math.pi * k / (side - 1)) for k in range(side)]
+    power = np.abs(np.fft.fft2((gray - gray.mean()) * np.outer(window, window))) ** 2 / side**2
+    inside = []
+    for i in range(side):
+        for j in range(side):
+            radius = math.hypot(min(i, side - i), min(j, side - j))
+            if edges[6] <= radius < edges[7]:
+                inside.append(power[i, j])
+    assert numbers[6] == pytest.approx(math.log(np.mean(inside) + 1e-4), rel=1e-4)
+    # The area above 4 gray levels, of a field that is blurred by (1, 4, 6, 4, 1) / 16.
+    colors = np.stack([gray, r[0] - r[1], (r[0] + r[1]) / 2 - r[2]])
+    small = colors.reshape(3, 48, 2, 48, 2).mean((2, 4))
+    for axis in (1, 2):
+        turned = np.moveaxis(small, axis, 0)
+        padded = np.pad(turned, ((2, 2), (0, 0), (0, 0)), mode="reflect")
+        weights = (1, 4, 6, 4, 1)
+        blurred = sum(w / 16 * padded[k : k + 48] for k, w in enumerate(weights))
+        small = np.moveaxis(blurred, 0, axis)
+    assert numbers[51 + 36] == pytest.approx((np.sqrt((small**2).sum(0)) > 1).mean(), abs=1e-3)
+    # Binary patterns of single pixels.
+    counts = np.zeros(10)
+    ring = [(0, 1), (1, 1), (1, 0), (1, -1), (0, -1), (-1, -1), (-1, 0), (-1, 1)]
+    for i in range(1, side - 1):
+        for j in range(1, side - 1):
+            above = [gray[i + a, j + b] >= gray[i, j] for a, b in ring]
+            changes = sum(above[k] != above[k - 1] for k in range(8))
+            counts[sum(above) if changes <= 2 else 9] += 1
+    assert numbers[119:129] == pytest.approx(counts / counts.sum(), abs=1e-5)
+
+
+def test_numbers_are_finite_where_nothing_touches_and_turn_with_the_light():
+    assert np.isfinite(numbers_of(np.zeros((1, 3, 96, 96)))).all()
+    r = np.random.default_rng(1).normal(0, 4, (1, 3, 96, 96))
+    a, b = numbers_of(r)[0], numbers_of(r[..., ::-1, :].copy())[0]
+    same = [*range(51), *range(87, 98)]  # spectrum, areas and strengths know no up
+    assert a[same] == pytest.approx(b[same], abs=2e-3)
+
+
+def test_a_folder_with_and_one_without_backgrounds(tmp_path, handcrafted):
+    columns = {"video": lambda k: f"v{k // 4}"}
+    bare = touches(tmp_path / "r", 48, **columns)
+    known = touches(tmp_path / "k", 48, background=lambda k: "gel.png", **columns)
+    fakes = [touches(tmp_path / name, 48, seed=s) for name, s in (("g", 7), ("h", 8))]
+    options = {"companions": [], "permutations": 0, "encoder": NAME}
+    results = [score(tmp_path / "g", r, **options) for r in (bare, known)]
+    words = [" ".join(sentence(n) for n in r.notes) for r in results]
+    assert "the median of the whole reference" in words[0]
+    assert "their no-contact images" in words[1]
+    digests = [r["TMMD", "g"].encoder for r in results]
+    assert len({*digests, handcrafted.digest("tactile")}) == 3
+    # Features of other kinds of background are those of another encoder: never in one column.
+    again = score(tmp_path / "h", known, **options)
+    assert again["TMMD", "h"].encoder == digests[1]
+    # Generators that all make one image are as bad as any: their residual is that of their image.
+    one = np.repeat(pixels(fakes[0], [0]), 48, axis=0)
+    collapsed = score({"good": pixels(fakes[1]), "one": one}, pixels(known), **options)
+    good, bad = (collapsed["TMMD", n].value for n in ("good", "one"))
+    assert bad > 2 * abs(good)
+
+
+def test_one_background_for_all_and_arrays_in_memory(tmp_path):
+    real, other = (touches(tmp_path / n, 30, seed=s) for n, s in (("r", 0), ("g", 1)))
+    gel = np.asarray(Image.open(tmp_path / "r" / "gel.png"))
+    options = {"companions": [], "permutations": 0, "encoder": NAME, "background": gel}
+    memory = score(pixels(other), pixels(real), **options)
+    assert any("no-contact" in sentence(n) for n in memory.notes)
+    known = real.table.with_columns(background=pl.lit("gel.png"))
+    direct = score({"generated": pixels(other)}, replace(real, table=known), **options)
+    assert memory["TMMD", "generated"].value == pytest.approx(
+        direct["TMMD", "generated"].value, abs=1e-6
+    )
+
+
+def test_probe_and_embeddings_by_a_ruler(tmp_path, handcrafted):
+    manifest = six_videos(tmp_path)
+    split = by_video(manifest, "v0", "v1", "v2")
+    results = probe(manifest, split, encoder=[NAME, "palpate/mini"], top=())
+    assert results["material accuracy", "handcrafted"].value == 1.0  # three levels of gray
+    assert any(note.code == "background-kind" for note in results.notes)
+    rows = embed(manifest, handcrafted).features
+    assert rows.shape == (48, 149)
+    encoder = Encoder(handcrafted, "tactile")
+    assert encoder.license == "Apache-2.0"
+    assert not encoder.saw(manifest).any()
+
+
+def test_a_network_of_a_file_is_the_same_as_its_layers(tmp_path):
+    from safetensors.torch import save_file
+
+    torch.manual_seed(0)
+    widths, state = (3, 4, 5, 6, 7, 6), {}  # body.12 comes before body.3 in a file
+    for k in range(5):
+        state[f"body.{3 * k}.weight"] = torch.randn(widths[k + 1], widths[k], 3, 3) * 0.3
+        for name, value in (
+            ("weight", 1.5),
+            ("bias", 0.2),
+            ("running_mean", 0.1),
+            ("running_var", 2),
+        ):
+            state[f"body.{3 * k + 1}.{name}"] = torch.full((widths[k + 1],), float(value))
+        state[f"body.{3 * k + 1}.num_batches_tracked"] = torch.tensor(9)
+    state |= {"center": torch.zeros(12), "spread": torch.full((12,), 2.0)}
+    save_file({f"gel.{k}": v for k, v in state.items()}, tmp_path / "gel.safetensors")
+    net = load_tactile(tmp_path / "gel.safetensors")
+    assert isinstance(net, Gel)
+    x = torch.randn(2, 3, 32, 32) * 9
+    maps = torch.asinh((x - x[:, :, ::4, ::4].flatten(2).median(2).values[:, :, None, None]) / 3)
+    for k, stride in enumerate((2, 2, 2, 2, 1)):
+        maps = torch.conv2d(maps, state[f"body.{3 * k}.weight"], stride=stride, padding=1)
+        maps = ((maps - 0.1) / math.sqrt(2 + 1e-5) * 1.5 + 0.2).relu()
+    pooled = torch.cat([maps.mean((2, 3)), (maps.var((2, 3)) + 1e-4).sqrt()], 1)
+    assert torch.allclose(net.encode(x), pooled / 2, atol=1e-5)
+    del state["body.13.bias"]
+    save_file({f"gel.{k}": v for k, v in state.items()}, tmp_path / "bad.safetensors")
+    fails("must hold the weights of palpate gel", load_tactile, tmp_path / "bad.safetensors")
+    fails("palpate/mini, palpate/handcrafted", EncoderSet.load, "palpate/other")
