@@ -184,24 +184,28 @@ def test_numbers_are_finite_where_nothing_touches_and_turn_with_the_light():
     assert a[same] == pytest.approx(b[same], abs=2e-3)
 
 
+OPTIONS = {"companions": [], "permutations": 0, "encoder": NAME, "presets": ["paper"], "sigma": 10}
+
+
 def test_a_folder_with_and_one_without_backgrounds(tmp_path, handcrafted):
     columns = {"video": lambda k: f"v{k // 4}"}
     bare = touches(tmp_path / "r", 48, **columns)
     known = touches(tmp_path / "k", 48, background=lambda k: "gel.png", **columns)
     fakes = [touches(tmp_path / name, 48, seed=s) for name, s in (("g", 7), ("h", 8))]
-    options = {"companions": [], "permutations": 0, "encoder": NAME}
-    results = [score(tmp_path / "g", r, **options) for r in (bare, known)]
+    for name in "gh":
+        (tmp_path / name / "gel.png").unlink()  # in a folder every image is a sample
+    results = [score(tmp_path / "g", r, **OPTIONS) for r in (bare, known)]
     words = [" ".join(sentence(n) for n in r.notes) for r in results]
     assert "the median of the whole reference" in words[0]
     assert "their no-contact images" in words[1]
     digests = [r["TMMD", "g"].encoder for r in results]
     assert len({*digests, handcrafted.digest("tactile")}) == 3
     # Features of other kinds of background are those of another encoder: never in one column.
-    again = score(tmp_path / "h", known, **options)
+    again = score(tmp_path / "h", known, **OPTIONS)
     assert again["TMMD", "h"].encoder == digests[1]
     # Generators that all make one image are as bad as any: their residual is that of their image.
     one = np.repeat(pixels(fakes[0], [0]), 48, axis=0)
-    collapsed = score({"good": pixels(fakes[1]), "one": one}, pixels(known), **options)
+    collapsed = score({"good": pixels(fakes[1]), "one": one}, pixels(known), **OPTIONS)
     good, bad = (collapsed["TMMD", n].value for n in ("good", "one"))
     assert bad > 2 * abs(good)
 
@@ -209,11 +213,11 @@ def test_a_folder_with_and_one_without_backgrounds(tmp_path, handcrafted):
 def test_one_background_for_all_and_arrays_in_memory(tmp_path):
     real, other = (touches(tmp_path / n, 30, seed=s) for n, s in (("r", 0), ("g", 1)))
     gel = np.asarray(Image.open(tmp_path / "r" / "gel.png"))
-    options = {"companions": [], "permutations": 0, "encoder": NAME, "background": gel}
+    options = OPTIONS | {"background": gel}
     memory = score(pixels(other), pixels(real), **options)
     assert any("no-contact" in sentence(n) for n in memory.notes)
     known = real.table.with_columns(background=pl.lit("gel.png"))
-    direct = score({"generated": pixels(other)}, replace(real, table=known), **options)
+    direct = score({"generated": pixels(other)}, replace(real, table=known), **OPTIONS)
     assert memory["TMMD", "generated"].value == pytest.approx(
         direct["TMMD", "generated"].value, abs=1e-6
     )

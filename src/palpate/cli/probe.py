@@ -93,7 +93,7 @@ class Options(Common):
     split: Annotated[tuple[Path, ...], tyro.conf.arg(aliases=["--splits"])]
     """Split files; their order is that of the differences: `--splits orig.json noleak.json`."""
     encoder: tuple[str, ...] = ()
-    """Folders of `palpate train encoder`, hub ids, or palpate/mini."""
+    """Folders of `palpate train encoder`, hub ids, palpate/mini or palpate/handcrafted."""
     allow_seen: Switch = False
     """Probe an encoder that was trained on some of the test images; every score says so."""
     output: OptionalOutPath = None

@@ -77,10 +77,11 @@ class Options(Common):
     reference: Path
     """The real tactile images, of the same kinds. Ids are relative file names."""
     encoder: str | None = None
-    """Folder of `palpate train encoder`, a hub id, or palpate/mini; the tactile encoder gives the
-    features. Embeddings need none."""
+    """Folder of `palpate train encoder`, a hub id, palpate/mini or palpate/handcrafted; the tactile
+    encoder gives the features. Embeddings need none."""
     background: Path | None = None
-    """One image of the sensor without contact, for all images of a folder: gives contact scores."""
+    """One image of the sensor without contact, for all images of a folder: gives contact scores,
+    and rulers what they subtract."""
     split: Path | None = None
     """Split file: its test part is scored, its train part gives the floor of TMMD, a material probe
     and the controls."""
