@@ -227,7 +227,7 @@ def test_probe_and_embeddings_by_a_ruler(tmp_path, handcrafted):
     manifest = six_videos(tmp_path)
     split = by_video(manifest, "v0", "v1", "v2")
     results = probe(manifest, split, encoder=[NAME, "palpate/mini"], top=())
-    assert results["material accuracy", "handcrafted"].value == 1.0  # three levels of gray
+    assert results["material accuracy, 20-NN", "handcrafted"].value == 1.0  # three levels of gray
     assert any(note.code == "background-kind" for note in results.notes)
     rows = embed(manifest, handcrafted).features
     assert rows.shape == (48, 149)

@@ -77,7 +77,8 @@ from palpate.encoders.models import (
     union,
 )
 from palpate.encoders.rulers import Handcrafted, Ruler
-from palpate.encoders.tactile import TactileModule, load_tactile
+from palpate.encoders.tactile import load_tactile
+from palpate.encoders.tactile_module import TactileModule
 from palpate.encoders.tokenizer import save_tokenizer
 from palpate.training.cards import write_model_cards
 from palpate.training.steps import seeded

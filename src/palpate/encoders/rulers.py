@@ -33,7 +33,7 @@ from torch.nn.functional import avg_pool2d, pad
 
 from palpate.data.images import Preprocess
 from palpate.data.residuals import Residual
-from palpate.encoders.tactile import Format, State, TactileModule
+from palpate.encoders.tactile_module import Format, State, TactileModule
 
 #: Side of the residuals in pixels.
 SIDE = 96

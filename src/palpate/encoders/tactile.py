@@ -26,8 +26,8 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -38,9 +38,10 @@ from transformers import CLIPVisionConfig, CLIPVisionModel
 
 from palpate.core import PalpateError
 from palpate.data.images import Preprocess
-from palpate.encoders.models import Origin, read_weights
+from palpate.encoders.models import read_weights
+from palpate.encoders.rulers import RULERS
+from palpate.encoders.tactile_module import Format, State, TactileModule
 
-State = Mapping[str, Tensor]
 NON_COMMERCIAL = "CC-BY-NC-4.0"
 IMAGENET = ((0.485, 0.456, 0.406), (0.229, 0.224, 0.225))
 SPARSH = "the .safetensors file of facebook/sparsh-{mae,dino,dinov2,ijepa}-{small,base}"
@@ -51,43 +52,6 @@ SENSOR_NUMBERS = {"digit": 1, "gelslim": 2, "mini": 3, "duragel": 4, "gelsight":
 HEAD_WIDTH = 64
 #: Sides in pixels of the patches of Sparsh and TVL, and of AnyTouch.
 PATCH, ANYTOUCH_PATCH = 16, 14
-
-
-@dataclass(frozen=True)
-class Format(Origin):
-    """A public encoder.
-
-    Attributes:
-        prefix: of the names of its weights; others are not read. '' reads all.
-        signature: a name after the prefix by which it is recognized.
-        build: makes the module for given weights.
-    """
-
-    prefix: str
-    signature: str
-    build: Callable[[State], TactileModule]
-
-
-class TactileModule(nn.Module):
-    """A frozen tactile encoder in one file: ``(pixels, sensors) -> (n, dim)``, not normalized.
-
-    Attributes:
-        dim: width of the features.
-        preprocess: for its images.
-        needs_sensors: whether it needs the sensors' numbers.
-        format: whose it is.
-    """
-
-    dim: int
-    preprocess: Preprocess
-    needs_sensors = False
-    format: Format
-
-    def encode(self, pixels: Tensor, sensors: Sequence[str] | None = None) -> Tensor:
-        """Prepared pixels (n, channels, h, w), and names of sensors, to (n, dim), L2-normalized."""
-        names = [""] * len(pixels) if sensors is None else list(sensors)
-        numbers = sensor_numbers(names, pixels.device) if self.needs_sensors else None
-        return normalize(self(pixels, numbers), dim=-1)
 
 
 class Attention(nn.Module):
@@ -249,7 +213,6 @@ class AnyTouch(TactileModule):
     """AnyTouch 1: a CLIP vision encoder with tokens of the sensor."""
 
     preprocess = Preprocess(224, 224, *IMAGENET, fitting="squash", resample=2)
-    needs_sensors = True
 
     def __init__(self, state: State) -> None:
         super().__init__()
@@ -272,6 +235,11 @@ class AnyTouch(TactileModule):
         self.touch_model = getattr(model, "vision_model", model)  # a level less in transformers 5
         self.sensor_token = nn.Parameter(torch.empty(10, 5, width))  # sensors, tokens
         self.touch_projection = nn.Linear(width, self.dim, bias=False)
+
+    def encode(self, pixels: Tensor, sensors: Sequence[str] | None = None) -> Tensor:
+        """Prepared pixels (n, 3, h, w), and names of sensors, to (n, dim), L2-normalized."""
+        names = [""] * len(pixels) if sensors is None else list(sensors)
+        return normalize(self(pixels, sensor_numbers(names, pixels.device)), dim=-1)
 
     def forward(self, pixels: Tensor, sensors: Tensor | None = None) -> Tensor:
         """(n, 3, 224, 224) and the sensors' numbers (n,) to (n, dim)."""
@@ -318,8 +286,6 @@ def load_tactile(path: Path) -> TactileModule:
         PalpateError: for a file that holds more than weights, of no known format, or whose weights
             lack a name, have one more, or another shape.
     """
-    from palpate.encoders.rulers import RULERS  # which are modules of this kind
-
     state = read_weights(path, f"Pass {KNOWN}")
     form = next((f for f in (*RULERS, *FORMATS) if f.prefix + f.signature in state), None)
     if form is None:
