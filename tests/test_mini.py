@@ -82,7 +82,8 @@ def test_a_folder_of_the_same_name_does_not_shadow_what_ships(mini):
 
 @pytest.mark.parametrize("load", LOADERS)
 def test_names_of_no_model_are_explained(mini, load, no_network):
-    message = r"must be one of palpate/mini(, palpate/handcrafted)?\. Got 'palpate/.*folder .* is written \./palpate"
+    message = r"must be one of palpate/mini(, palpate/handcrafted)?\. Got 'palpate/"
+    message += r".*folder .* is written \./palpate"
     for name in ("palpate/maxi", "palpate/", "palpate/mini/", "palpate/mini/../mini"):
         fails(message, load, name)
     for name in ("no-such", "a/b/c", "../x", "", "./palpate/mini"):

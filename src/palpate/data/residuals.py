@@ -96,8 +96,9 @@ def _resized(
     """Values (h, w, 3) at another (h, w), antialiased, without rounding."""
     if values.shape[:2] == shape:
         return values
+    rows, columns = shape
     channels = (Image.fromarray(np.ascontiguousarray(values[..., c])) for c in range(3))
-    return np.stack([np.asarray(c.resize(shape[::-1], resample)) for c in channels], axis=2)
+    return np.stack([np.asarray(c.resize((columns, rows), resample)) for c in channels], axis=2)
 
 
 def with_gels(

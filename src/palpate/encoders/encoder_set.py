@@ -287,8 +287,10 @@ class EncoderSet:
         """What is known of an encoder that others trained; None of palpate's and one's own."""
         self._require(modality)
         if modality == "tactile":
-            public = isinstance(self.tactile, TactileModule) and not self.is_ruler
-            return self.tactile.format if public else None
+            public = self.tactile
+            if isinstance(public, Ruler) or not isinstance(public, TactileModule):
+                return None
+            return public.format
         if "trained_on" not in self.clip_card:
             return None
         return Origin(self.name, self.clip_card["license"], tuple(self.clip_card["trained_on"]))
