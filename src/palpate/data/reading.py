@@ -139,8 +139,14 @@ def _of_table(source: Any, options: Mapping[str, Any], *, images: bool, skip_bad
     """The samples of a table or list, with its images if one of these is there, or all must."""
     _require_only({"columns", "names", "classes", "root", *SIDES}, options, "a list or table")
     side = next((side for side in ("tactile", "vision") if side in options), "")
-    own = {name: value for name, value in options.items() if name not in SIDES}
-    listed = read_table(source, side=side, **own)
+    listed = read_table(
+        source,
+        columns=options.get("columns"),
+        names=options.get("names"),
+        classes=options.get("classes"),
+        root=options.get("root"),
+        side=side,
+    )
     if listed.sides and (images or listed.at_hand):
         must = "must come with a folder, or a list whose images are not at hand"
         require(not side, side, must, listed.table.name, fix="Leave it out")

@@ -122,8 +122,14 @@ def scan(source: Path, options: Options, *, progress: Progress = quiet) -> Scan:
         require(value is None, name, must, str(source), fix="Leave it out")
     progress("reading rows", 0, 1)
     if is_table:
-        more = {c: getattr(options, c) for c in ("columns", "names", "classes", "root")}
-        result = scan_of(read_table(source, **more))
+        listed = read_table(
+            source,
+            columns=options.columns,
+            names=options.names,
+            classes=options.classes,
+            root=options.root,
+        )
+        result = scan_of(listed)
     else:
         result = _of_folder(source, options, templates)
     progress("reading rows", 1, 1)
