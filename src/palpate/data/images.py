@@ -187,9 +187,9 @@ class Preprocess:
     subtract: tuple[str, ...] = ()
     lag: int = 0
 
-    #: Of what is prepared, and whether a sample without what is subtracted is an error.
+    #: Of what is prepared, and whether it is a residual, which no sample must have an image for.
     dtype: ClassVar[np.dtype[Any]] = np.dtype(np.uint8)
-    needs_background: ClassVar[bool] = True
+    residual: ClassVar[bool] = False
 
     @classmethod
     def from_config(cls, path: Path, size: int | None) -> Preprocess:
@@ -327,7 +327,7 @@ class Preprocess:
         for k, (path, gel) in enumerate(zip(paths, manifest.column("background"), strict=True)):
             need = column == "tactile" and any(word in sensors[k] for word in self.subtract)
             must = f"The encoder subtracts the no-contact image of {names[k] or 'every sensor'}"
-            there = not need or gel is not None or not self.needs_background
+            there = not need or gel is not None or self.residual
             require(there, None, must, f"none for {path.name}", fix=fix)
             video, frame = positions[k]
             before = None

@@ -62,7 +62,7 @@ class Residual(Preprocess):
     subtract: tuple[str, ...] = ("",)
 
     dtype = np.dtype(np.float16)
-    needs_background = False
+    residual = True
 
     def prepare(
         self,

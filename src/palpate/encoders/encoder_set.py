@@ -76,7 +76,7 @@ from palpate.encoders.models import (
     stated,
     union,
 )
-from palpate.encoders.rulers import Handcrafted, Ruler
+from palpate.encoders.rulers import Gel, Handcrafted, Ruler
 from palpate.encoders.tactile import load_tactile
 from palpate.encoders.tactile_module import TactileModule
 from palpate.encoders.tokenizer import save_tokenizer
@@ -244,11 +244,6 @@ class EncoderSet:
             facts["preprocess"] = asdict(self.preprocesses[modality])
         return digest_modules(parts, facts | architecture(config))
 
-    @property
-    def is_ruler(self) -> bool:
-        """Whether the tactile encoder gives numbers of residuals, which their reference scales."""
-        return isinstance(self.tactile, Ruler)
-
     # --- what the encoders were trained on -------------------------------------------------------
 
     def knows_seen(self, modality: str) -> bool:
@@ -287,10 +282,8 @@ class EncoderSet:
         """What is known of an encoder that others trained; None of palpate's and one's own."""
         self._require(modality)
         if modality == "tactile":
-            public = self.tactile
-            if isinstance(public, Ruler) or not isinstance(public, TactileModule):
-                return None
-            return public.format
+            public = isinstance(self.tactile, TactileModule) and not isinstance(self.tactile, Ruler)
+            return getattr(self.tactile, "format", None) if public else None
         if "trained_on" not in self.clip_card:
             return None
         return Origin(self.name, self.clip_card["license"], tuple(self.clip_card["trained_on"]))
@@ -390,14 +383,14 @@ class EncoderSet:
         folder, sensor = find_encoder(source)
         if folder.is_file():
             public = load_tactile(folder)
-            card = {"name": str(source), "license": public.format.license}
+            card: dict[str, Any] = {"name": str(source), "license": public.format.license}
             shape = {"tactile": public.preprocess}
-            encoders = cls(tactile=public, preprocesses=shape, card=card, sensor=sensor)
-            if isinstance(public, Handcrafted):  # it has seen none
-                encoders.seen["tactile"] = union()
-            elif isinstance(public, Ruler):
-                encoders.card["synthetic"] = True
-            return encoders.to(device)
+            seen: Any = (
+                {"tactile": union()} if isinstance(public, Handcrafted) else {}
+            )  # it saw none
+            card |= {"synthetic": True} if isinstance(public, Gel) else {}
+            alone = cls(None, None, public, shape, card=card, seen=seen, sensor=sensor)
+            return alone.to(device)
         note = folder / "palpate.json"
         if not note.is_file() or read_record(note, "card").get("format") == CLIP_FORMAT:
             return load_clip(source, device=device)

@@ -165,16 +165,20 @@ def probe(  # noqa: PLR0913 - one argument a choice
     )
     runs: dict[str, list[Probed]] = {}
     with tempfile.TemporaryDirectory() if cache is None else nullcontext(cache) as folder:
-        if modality == "tactile" and any(e.is_ruler for e in sets.values()):
+        rulers = [
+            name
+            for name, e in sets.items()
+            if modality == "tactile" and e.preprocess(modality).residual
+        ]
+        backed = manifest
+        if rulers:
             from palpate.data.residuals import with_gels
 
             kind, (backed,) = with_gels(manifest, [], Path(folder))
             plan = replace(plan, notes=[*plan.notes, Note("background-kind", {"kind": kind})])
-        else:
-            backed = manifest
         for s, e in ((s, e) for s in loaded for e in sets):
             subject = {"split": s, "encoder": e}.get(axis, "real")
-            source = backed if sets[e].is_ruler else manifest
+            source = backed if e in rulers else manifest
             runs[subject] = [
                 measure(source, loaded[s], sets[e], subject, plan, cache=cache, progress=progress)
             ]
