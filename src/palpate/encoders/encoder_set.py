@@ -389,8 +389,7 @@ class EncoderSet:
                 {"tactile": union()} if isinstance(public, Handcrafted) else {}
             )  # it saw none
             card |= {"synthetic": True} if isinstance(public, Gel) else {}
-            alone = cls(None, None, public, shape, card=card, seen=seen, sensor=sensor)
-            return alone.to(device)
+            return cls(None, None, public, shape, "", {}, card, seen, sensor).to(device)
         note = folder / "palpate.json"
         if not note.is_file() or read_record(note, "card").get("format") == CLIP_FORMAT:
             return load_clip(source, device=device)
