@@ -264,5 +264,5 @@ def test_a_network_of_a_file_is_the_same_as_its_layers(tmp_path):
     assert torch.allclose(net.encode(x), pooled / 2, atol=1e-5)
     del state["body.13.bias"]
     save_file({f"gel.{k}": v for k, v in state.items()}, tmp_path / "bad.safetensors")
-    fails("must hold the weights of palpate gel", load_tactile, tmp_path / "bad.safetensors")
+    fails("must hold the weights of ruler of residuals", load_tactile, tmp_path / "bad.safetensors")
     fails("palpate/mini, palpate/handcrafted", EncoderSet.load, "palpate/other")

@@ -215,6 +215,6 @@ def _blurred(images: Tensor) -> Tensor:
 
 
 RULERS = (
-    Format("palpate handcrafted", "Apache-2.0", (), "handcrafted.", "center", Handcrafted),
-    Format("palpate gel", "Apache-2.0", (), "gel.", "center", Gel),
+    Format("palpate/handcrafted", "Apache-2.0", (), "handcrafted.", "center", Handcrafted),
+    Format("ruler of residuals", "Apache-2.0", (), "gel.", "center", Gel),
 )

@@ -87,9 +87,12 @@ def read_all(
     """
     parts: list[Source] = []
     problems: list[Problem] = []
-    for source, name in zip(sources, arguments, strict=False):
+    saved = [isinstance(s, str | Path) and is_manifest(Path(s)) for s in sources]
+    for source, name, is_saved in zip(sources, arguments, saved, strict=False):
+        alone = is_saved and not all(saved)  # what else is stated is for the others
+        own = {"root": (reading or {}).get("root")} if alone else reading
         try:
-            parts.append(read(source, skip_bad, progress, root, reading))
+            parts.append(read(source, skip_bad, progress, root, own))
         except ProblemsError as error:
             problems += error.problems
         except PalpateError as error:
