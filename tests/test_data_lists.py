@@ -263,3 +263,9 @@ def test_utf16_without_a_mark(tmp_path):
         table = listed(tmp_path / "t.csv", str, encoding=encoding, material="Béton")
         result = import_dataset(table, tmp_path / "out", overwrite=True)
         assert set(result.manifest.table["material"]) == {"Béton"}
+
+
+@pytest.mark.parametrize("name", ["*", "^v.*$"])
+def test_a_column_that_is_a_pattern_is_refused(tmp_path, name):
+    (tmp_path / "t.csv").write_text(f"{name},video\na,v\n")
+    fails("must have plain names", load, tmp_path / "t.csv", columns={"id": name})

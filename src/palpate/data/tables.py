@@ -44,6 +44,8 @@ CONTROL = re.compile("[\x00-\x08\x0b\x0c\x0e-\x1f]")
 UNFIT = "[\ufffd\x00]"
 #: Halves of characters, which JSON can write.
 HALVES = re.compile("[\ud800-\udfff]")
+#: Names that polars takes as patterns of names.
+PATTERN = re.compile(r"\*|\^.*\$", re.DOTALL)
 #: Where a row was read, and the texts in the requested columns.
 Record = tuple[Any, ...]
 _Records = Callable[[Sequence[str]], Iterable[Record]]
@@ -71,6 +73,9 @@ class Table:
         if double := [name for name in columns if self.names.count(name) > 1]:
             must = f"Columns of {self.name} must have different names"
             raise PalpateError(must, f"{double[0]} twice or more", "Rename one of them")
+        for name in columns:  # polars would take such a name as several columns
+            must = f"Columns of {self.name} must have plain names"
+            require(not PATTERN.fullmatch(name), None, must, repr(name), fix="Rename it")
         schema = {LINE: pl.Int64} | dict.fromkeys(columns, pl.String)
         rows = pl.DataFrame(list(self.records(columns)), schema, orient="row")
         cells = [pl.col(name).str.strip_chars() for name in columns]
