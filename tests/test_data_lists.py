@@ -269,3 +269,37 @@ def test_utf16_without_a_mark(tmp_path):
 def test_a_column_that_is_a_pattern_is_refused(tmp_path, name):
     (tmp_path / "t.csv").write_text(f"{name},video\na,v\n")
     fails("must have plain names", load, tmp_path / "t.csv", columns={"id": name})
+
+
+def test_a_table_that_pairs_images_of_its_folder_goes_before_their_names(tmp_path):
+    for side in ("photo", "touch"):
+        write_images(tmp_path, [f"{side}/{k}.png" for k in range(4)])
+    rows = [f"photo/{k}.png;touch/{3 - k}.png;m{k}" for k in range(4)]
+    (tmp_path / "pairs.csv").write_text("\n".join(["Photo;Touch;Label", *rows]) + "\n")
+    table = load(tmp_path).table
+    pairs = {(f"photo/{k}.png", f"touch/{3 - k}.png", f"m{k}") for k in range(4)}
+    assert {*table.select("vision", "tactile", "material").iter_rows()} == pairs
+    (tmp_path / "pairs.csv").write_text("Photo;Touch\na.png;b.png\n")  # of other images
+    assert {*load(tmp_path).table.select("vision", "tactile").iter_rows()} == {
+        (f"photo/{k}.png", f"touch/{k}.png") for k in range(4)
+    }
+
+
+def test_folders_named_as_parts_in_any_words_are_a_split(tmp_path):
+    for part in ("Training", "Testing", "validate"):
+        write_images(tmp_path, [f"{part}/{s}/v1_{k}.png" for s in ("rgb", "gel") for k in range(2)])
+    split = read(tmp_path).splits["Orig"]
+    assert split.counts() == {"train": 2, "val": 2, "test": 2}
+
+
+def test_rows_that_contradict_each_other_or_name_nothing_are_named(tmp_path):
+    objects = ("cup", "mug")
+    write_images(tmp_path, [f"{side}/{o}/0.png" for side in ("rgb", "gel") for o in objects])
+    labels = "object,material\ncup,glass\ncup,steel\nmug,clay\nteapot,clay\n"
+    (tmp_path / "labels.csv").write_text(labels)
+    result = read(tmp_path)
+    assert {*result.manifest.table["material"]} == {"glass", "clay"}
+    texts = {p.kind: p.text for p in result.suspicious}
+    assert "1 cells differ" in texts["two-values"]
+    assert "is glass and steel" in texts["two-values"]
+    assert texts["of-no-image"].endswith("by object: teapot")

@@ -270,7 +270,8 @@ def test_ctrl_c_while_libraries_load_is_no_traceback(monkeypatch, capsys):
 @pytest.mark.parametrize(
     ("variable", "words"),
     [
-        ("SOURCE_DATE_EPOCH=x", "SOURCE_DATE_EPOCH must be a number, as libraries need it. Got x."),
+        ("SOURCE_DATE_EPOCH=x", "must be a number under 2**32, as libraries need it. Got x."),
+        ("SOURCE_DATE_EPOCH=99999999999", "SOURCE_DATE_EPOCH must be a number under 2**32"),
         ("PYTHONOPTIMIZE=2", "PYTHONOPTIMIZE must be 0 or 1, as libraries need it. Got 2."),
     ],
 )

@@ -13,7 +13,7 @@ import pytest
 
 from forge.errors import fails
 from palpate.cli import main
-from palpate.core import digest_folder
+from palpate.core import digest_folder, sealed, write_json
 from palpate.sim import MINI_SEEDS, PRESETS, WorldOptions, write_world
 
 TINY = dataclasses.replace(PRESETS["tiny"], size=16, tile=64)
@@ -64,6 +64,10 @@ def test_a_finished_world_is_kept_and_another_rejected(world):
     fails("other options", write_world, world.folder, dataclasses.replace(TINY, seed=1))
     path = world.folder / "world.json"
     path.write_text(path.read_text().replace("palpate-world/1", "palpate-world/0"))
+    fails("damaged", write_world, world.folder, TINY)
+    record = json.loads(path.read_text())
+    del record["sealed"]
+    write_json(path, sealed(record))
     fails("of another version", write_world, world.folder, TINY)
 
 

@@ -302,7 +302,7 @@ def _require_variables() -> None:
     """
     epoch = os.environ.get("SOURCE_DATE_EPOCH", "0")
     for name, holds, form in (
-        ("SOURCE_DATE_EPOCH", epoch.isdecimal(), "a number"),
+        ("SOURCE_DATE_EPOCH", epoch.isdecimal() and int(epoch) < 1 << 32, "a number under 2**32"),
         ("PYTHONOPTIMIZE", sys.flags.optimize < 2, "0 or 1"),  # 2 removes docstrings
     ):
         must = f"The variable {name} must be {form}, as libraries need it"

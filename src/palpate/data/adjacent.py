@@ -10,8 +10,10 @@ what the samples lack. A table that fits nothing is reported.
 from __future__ import annotations
 
 import posixpath
+import re
 from collections.abc import Sequence
 from contextlib import suppress
+from itertools import product
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -19,10 +21,10 @@ import polars as pl
 
 from palpate.core import PalpateError, Split, few
 from palpate.data.images import SUFFIXES
-from palpate.data.manifest import PART_NAMES
+from palpate.data.manifest import PART_NAMES, ROLES
 from palpate.data.mapping import LINE
-from palpate.data.rows import relocated
-from palpate.data.tables import TABLES, Table, header_of, open_table
+from palpate.data.rows import is_there, relocated, some
+from palpate.data.tables import TABLES, Table, open_table
 
 if TYPE_CHECKING:
     from palpate.data.scanning import Cells, Scan
@@ -34,6 +36,8 @@ SYNONYMS = {
     "part": "split",
 }
 FILLED = ("object", "session", "material", "text", "sensor", "domain", "video", "contact", "split")
+#: The sides of a pair.
+SIDES = ("vision", "tactile")
 #: Fields that a column may name, and the share of rows that a column must name images in.
 FIELDS, SHARE = ("object", "video", "session", "contact"), 0.5
 
@@ -45,16 +49,39 @@ def adjacent_tables(folder: Path) -> list[Path]:
     return own + [p for s in TABLES if (p := named.with_name(named.name + s)).is_file()]
 
 
-def tables_of_pairs(folder: Path) -> list[Path]:
-    """The tables next to the images of a folder that name photos and tactile images of it."""
-    pairs: list[Path] = []
+def tables_of_pairs(folder: Path) -> dict[Path, dict[str, str]]:
+    """The tables next to the images of a folder that pair photos and tactile images of it.
+
+    Returns:
+        File -> side -> its column; none where the columns have the names of the sides.
+    """
+    pairs: dict[Path, dict[str, str]] = {}
     for path in adjacent_tables(folder):
         with suppress(PalpateError):
-            if {"vision", "tactile"} <= set(header_of(path)):
-                cells = open_table(path).read(["vision", "tactile"])["tactile"].drop_nulls()
-                below = path.parent == folder or relocated(cells, folder)
-                pairs += [path] if below and len(cells) else []
+            table = open_table(path)
+            own = {side: side for side in SIDES if side in table.names}
+            columns = own if len(own) == len(SIDES) else _columns_of_sides(table)
+            if len(columns) == len(SIDES):
+                cells = table.read([*columns.values()])
+                below = path.parent == folder if columns == own else _pairs_images(cells, folder)
+                tactile = cells[columns["tactile"]].drop_nulls()
+                if len(tactile) and (below or relocated(tactile, folder)):
+                    named = {SYNONYMS[n.lower()]: n for n in table.names if n.lower() in SYNONYMS}
+                    pairs[path] = {} if columns == own else named | columns
     return pairs
+
+
+def _columns_of_sides(table: Table) -> dict[str, str]:
+    """Side -> the only column that a word of the side names."""
+    words = {name: {*re.findall("[a-z]+", name.lower())} for name in table.names}
+    named = {side: [n for n in words if words[n] & {*ROLES[side]}] for side in SIDES}
+    return {side: names[0] for side, names in named.items() if len(names) == 1}
+
+
+def _pairs_images(cells: pl.DataFrame, folder: Path) -> bool:
+    """Whether each column of a table names images that are below a folder."""
+    columns = [cells[name].drop_nulls().to_list() for name in cells.columns if name != LINE]
+    return all(any(is_there(folder, path) for path in some(paths)) for paths in columns)
 
 
 def join_tables(result: Scan, rows: Sequence[tuple[str, Cells]]) -> None:
@@ -96,22 +123,34 @@ def _join(
     result.suspicious += [*table.suspicious, *table.problems]
     targets = {c: target for c, target in targets.items() if target in FILLED and c != column}
     filled: set[int] = set()
+    cells: dict[tuple[int, str], str] = {}  # (row, column) -> the first value
+    unknown: list[str | None] = []
+    contradicting: list[str] = []
     parts: dict[str, str] = {}
     for record in frame.iter_rows(named=True):
-        for k in keys[form].get(_key(record[column] or ""), ()):
-            row = rows[k][1]
-            filled.add(k)
-            for name, target in targets.items():
-                value = record[name]
-                if target == "split" and value is not None:
-                    parts[row["id"]] = PART_NAMES.get(value.lower(), "")
-                elif value is not None and row.get(target) is None:
-                    row[target] = value
+        named = keys[form].get(_key(record[column] or ""), [])
+        filled.update(named)
+        if not named:
+            unknown.append(record[column])
+        for k, (name, target) in product(named, targets.items()):
+            row, value = rows[k][1], record[name]
+            if value is None:
+                continue
+            if (first := cells.setdefault((k, name), value)) != value:
+                contradicting.append(f"{row['id']} is {first} and {value}")
+            elif target == "split":
+                parts[row["id"]] = PART_NAMES.get(value.lower(), "")
+            elif row.get(target) is None:
+                row[target] = value
     if split := {i: part for i, part in parts.items() if part}:
         result.splits[path.stem] = Split(split, {"method": "official", "files": [path.name]})
     text = f"{', '.join(dict.fromkeys(targets.values())) or 'nothing'} of {len(filled)} of "
     text += f"{len(rows)} samples, by its column {column}"
     result.suspect(path, "joined-table", text)
+    text = f"{len(contradicting)} cells differ from earlier rows, which are taken"
+    result.suspect(path, "two-values", text, contradicting)
+    text = f"{len(unknown)} rows name no image of this folder by {column}"
+    result.suspect(path, "of-no-image", text, unknown)
 
 
 def _keys(rows: Sequence[tuple[str, Cells]]) -> dict[str, dict[str, list[int]]]:

@@ -79,7 +79,7 @@ FOLLOWED = "followed"
 DIGITS = 18
 #: What tools call the parts of a split.
 _SPLIT = {part: part for part in PARTS} | {"training": "train", "testing": "test"}
-PART_NAMES = _SPLIT | dict.fromkeys(("validation", "valid", "dev"), "val")
+PART_NAMES = _SPLIT | dict.fromkeys(("validation", "validate", "valid", "dev"), "val")
 #: Absolute paths, drive letters, and ``..`` as a component.
 CLIMBS = r"^[/\\]|^[A-Za-z]:[/\\]|(?:^|[/\\])\.\.(?:[/\\]|$)"
 

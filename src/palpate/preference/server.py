@@ -103,9 +103,10 @@ class _Connection(H11Protocol):
         self.deadline = None
 
     def end(self) -> None:
-        """Close it when what is under way has been sent."""
+        """Close it when what is under way has been sent, or is not read."""
         self.admit()
         self.transport.close()
+        self.loop.call_later(LONGEST_WAIT, self.transport.abort)
 
     def on_response_complete(self) -> None:
         """Wait for the next request."""

@@ -219,4 +219,4 @@ def _finish(unfinished: Path, world: World) -> None:
         "leak": {"rule": options.leak, **leak_counts(leak)},
         "options": dataclasses.asdict(options),
     }
-    write_json(unfinished / "world.json", record)
+    write_json(unfinished / "world.json", sealed(record))

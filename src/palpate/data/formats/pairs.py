@@ -152,9 +152,10 @@ def scan_of(listed: Listed) -> Scan:
 def _of_folder(source: Path, options: Options, templates: Mapping[str, str]) -> Scan:
     """The images of a folder, by the tables in it that pair them, else by their names."""
     result, maps = Scan(source), options.columns or {}
-    for path in () if templates or options.side or maps else tables_of_pairs(source):
+    stated = templates or options.side or maps
+    for path, columns in ({} if stated else tables_of_pairs(source)).items():
         first = len(result.rows)
-        read_table(path, classes=options.classes, scan=result).add_images()
+        read_table(path, columns=columns, classes=options.classes, scan=result).add_images()
         result.suspect(path, "table-first", "the images are those of this table")
         part = PART_NAMES.get(path.stem.lower())
         for _, row in result.rows[first:] if part else ():
