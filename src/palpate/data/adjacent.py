@@ -21,7 +21,7 @@ import polars as pl
 
 from palpate.core import PalpateError, Split, few
 from palpate.data.images import SUFFIXES
-from palpate.data.manifest import PART_NAMES, ROLES
+from palpate.data.manifest import PART_NAMES, ROLES, SIDES
 from palpate.data.mapping import LINE
 from palpate.data.rows import is_there, relocated, some
 from palpate.data.tables import TABLES, Table, open_table
@@ -36,8 +36,6 @@ SYNONYMS = {
     "part": "split",
 }
 FILLED = ("object", "session", "material", "text", "sensor", "domain", "video", "contact", "split")
-#: The sides of a pair.
-SIDES = ("vision", "tactile")
 #: Fields that a column may name, and the share of rows that a column must name images in.
 FIELDS, SHARE = ("object", "video", "session", "contact"), 0.5
 

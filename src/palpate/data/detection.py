@@ -31,12 +31,11 @@ from typing import Literal
 from palpate.core import PalpateError, few, require
 from palpate.data.captions import ADJECTIVES
 from palpate.data.foreign import counted
-from palpate.data.manifest import DIGITS, PART_NAMES, ROLE_OF, ROLES, SCHEMA
+from palpate.data.manifest import DIGITS, PART_NAMES, ROLE_OF, ROLES, SCHEMA, SIDES
 from palpate.data.scanning import Cells, Scan
 from palpate.data.templates import TIME, Fields, Matches, Template, assign, join, walk
 
 Side = Literal["vision", "tactile"]
-SIDES = ("vision", "tactile")
 #: Columns of files; the first one that is there decides the order of rows.
 ORDER = ("tactile", "vision", "background")
 #: What may be mapped.
@@ -58,7 +57,7 @@ MEANING = {
 _MEANING_OF = {word: column for column, words in MEANING.items() for word in words}
 _MATERIALS = {name.lower() for name in ADJECTIVES}
 _TOKEN = re.compile(r"[A-Za-z]+|[0-9]+|[^A-Za-z0-9]")
-#: A time stamp at the end of a name, and what stands in its place.
+#: A time stamp at the end of a name, and what replaces it.
 _TIMED, _TIME = re.compile(r"(?:[0-9]{9,}(?:\.[0-9]+)?|[0-9]+\.[0-9]+)(?=\.\w+$)"), "\ue001"
 #: In place of a name that says nothing but its side.
 _ROLE = "\ue000"
@@ -199,7 +198,7 @@ class _Names:
         for (first, last), name in sorted((match.span(n), n) for n in marks if match[n]):
             a, b = places[first], places[last - 1] + 1
             if path[a:b] != text[first:last]:
-                return ""  # a word of the side stands within a field
+                return ""  # a word of the side is within a field
             pieces += [_literal(path[after:a]), marks[name]]
             after = b
         own_names = "".join([*pieces, _literal(path[after:])]).split("/")

@@ -28,7 +28,7 @@ from typing import Any
 import polars as pl
 
 from palpate.core import PalpateError, require
-from palpate.data.manifest import IMAGE_COLUMNS, PATH, ROLES, SCHEMA
+from palpate.data.manifest import IMAGE_COLUMNS, PATH, ROLES, SCHEMA, SIDES
 from palpate.data.mapping import compile_maps
 from palpate.data.rows import (
     is_there,
@@ -42,7 +42,6 @@ from palpate.data.rows import (
 from palpate.data.scanning import Scan
 from palpate.data.tables import Table, names_images, open_table, table_of
 
-SIDES = ("vision", "tactile")
 #: Columns of which a table needs at least one, if none names images.
 NAMING = ("id", "video", "object", *SIDES)
 #: No file system has names of more bytes.

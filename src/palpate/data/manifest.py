@@ -68,6 +68,8 @@ ROLES = {
     "background": ("background", "backgrounds", "bg", "nocontact"),
 }
 ROLE_OF = {word: role for role, words in ROLES.items() for word in words}
+#: The images of a pair.
+SIDES = ("vision", "tactile")
 #: Modality -> its image column.
 MODALITIES = {"vision": "vision", "tactile": "tactile"}
 FORMAT = "palpate-manifest/1"

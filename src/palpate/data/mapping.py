@@ -24,7 +24,7 @@ PADS = re.compile(r"(?i)\b[lr]pad\s*\(.*?,\s*([0-9]+)")
 #: A cast to an integer; what rounding may change.
 INTEGER = re.compile(r"(?i)(\bas|::)\s*(?:tiny|small|big)?int(?:eger)?[0-9]*\b")
 SLACK = 100
-#: A column beside those of every table: the line of each row.
+#: A further column of every table: the line of each row.
 LINE = "palpate_line"
 FIX = "Use SQL functions on columns: substr, split_part, replace, regexp_replace, left, right, ||"
 

@@ -12,9 +12,9 @@ from palpate.core import PalpateError, Problem, Progress, Split, quiet, require,
 from palpate.data.foreign import require_native
 from palpate.data.formats import intervals, pairs, scanned
 from palpate.data.imported import Imported, imported_of, splits_of
-from palpate.data.listed import NAMING, SIDES, Listed, read_table
+from palpate.data.listed import NAMING, Listed, read_table
 from palpate.data.listing import is_list, read_list
-from palpate.data.manifest import IMAGE_COLUMNS, PATH, Manifest, is_manifest
+from palpate.data.manifest import IMAGE_COLUMNS, PATH, SIDES, Manifest, is_manifest
 from palpate.data.mapping import LINE
 from palpate.data.recordings import USUAL, name_recordings
 from palpate.data.scanning import raise_if, require_some

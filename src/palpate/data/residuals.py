@@ -3,7 +3,7 @@
 A residual is ``image - no-contact image`` in gray levels, of the center square, averaged to the
 encoder's side. 8 bits would round away what averages keep of a faint contact.
 
-Where the right no-contact image is missing, the next best stands for it. From best to worst, as
+Where the right no-contact image is missing, the next best takes its place. From best to worst, as
 measured on held-out real videos (the ruler's accuracy, and TMMD's power at five videos a side):
 
 1. the manifest's column ``background``, or one image for all; ``palpate background`` fills it with
@@ -16,8 +16,8 @@ measured on held-out real videos (the ruler's accuracy, and TMMD's power at five
 
 Never the raw image, by which another gel or lamp outweighs every contact. All sets that are
 compared take the same kind: of unequal kinds 58 to 100 % of equal sets differ at p < .05. A
-generated image takes what the real image takes that it stands for (the same id); by a median of
-their own, images that are all alike would have no residual.
+generated image takes what the real image of its id takes; by a median of
+their own, equal images would have no residual.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ import polars as pl
 from numpy.typing import NDArray
 from PIL import Image
 
-from palpate.core import digest_lines, short
+from palpate.core import digest_lines, is_whole, save_image, sealed_path, short
 from palpate.data.images import Preprocess, image_stamp, read_image
 
 if TYPE_CHECKING:
@@ -169,10 +169,10 @@ def _median(part: Manifest, rows: Sequence[int], folder: Path) -> str | None:
     """The file of the median of images; None where they differ in size."""
     some = replace(part, table=part.table[list(rows)])
     file = folder / f"median-{short(digest_lines([image_stamp(some, 'tactile')]))}.png"
-    if not file.is_file():
+    if not is_whole(file):
         images = [np.asarray(read_image(path)) for path in some.paths("tactile")]
         if len({image.shape for image in images}) > 1:
             return None
-        folder.mkdir(parents=True, exist_ok=True)
-        Image.fromarray(np.median(images, axis=0).round().astype(np.uint8)).save(file)
+        with sealed_path(file) as temporary:
+            save_image(temporary, np.median(images, axis=0).round().astype(np.uint8))
     return str(file.resolve())

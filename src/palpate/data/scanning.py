@@ -32,8 +32,8 @@ from palpate.core import (
     require,
 )
 from palpate.data.images import Check, Checked, check_image, in_threads
-from palpate.data.manifest import CLIMBS, FOLLOWED, IMAGE_COLUMNS, Manifest
-from palpate.data.suspicions import SIDES, Look, evenly, looks_of, suspicions
+from palpate.data.manifest import CLIMBS, FOLLOWED, IMAGE_COLUMNS, SIDES, Manifest
+from palpate.data.suspicions import Look, evenly, looks_of, suspicions
 
 #: Manifest column -> cell; ``split`` may hold the part of the data set's own split.
 Cells = dict[str, Any]

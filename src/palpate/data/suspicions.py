@@ -34,6 +34,7 @@ from numpy.typing import NDArray
 from palpate.core import Problem, Progress
 from palpate.data.contacts import Pixels
 from palpate.data.images import SMALL, Checked, check_image, in_threads
+from palpate.data.manifest import SIDES
 
 #: Frames of a recording that are looked at.
 FRAMES = 32
@@ -44,7 +45,6 @@ GEL_TIMES, GEL_LEAST, GEL_SHARE = 6.0, 15.0, 0.2
 EARLY, JUMP, JUMP_TIMES = 0.05, 25.0, 4.0
 STILL_FRAMES = 15
 EXCHANGED = "exchanged-sides"
-SIDES = ("vision", "tactile")
 #: Columns that name a recording, and that say which recordings are of one rig.
 LEVELS, RIG = ("video", "object", "contact"), ("domain", "sensor")
 Row = Mapping[str, Any]

@@ -427,17 +427,10 @@ def _of_frame(
 
     def records(columns: Sequence[str]) -> Iterator[Record]:
         odd = next((column for column in columns if column in kinds), "")
-        must, got = (
-            f"Columns of {name} must hold texts or numbers",
-            f"{odd} of type {kinds.get(odd)}",
-        )
-        require(
-            not odd,
-            None,
-            must,
-            got,
-            fix="For images inside the table use the format hf on its folder",
-        )
+        must = f"Columns of {name} must hold texts or numbers"
+        got = f"{odd} of type {kinds.get(odd)}"
+        fix = "For images inside the table use the format hf on its folder"
+        require(not odd, None, must, got, fix=fix)
         for line, cells in enumerate(read(columns).iter_rows(), 1):
             yield (line, *map(text_of, cells))
 

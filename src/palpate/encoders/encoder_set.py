@@ -76,7 +76,7 @@ from palpate.encoders.models import (
     stated,
     union,
 )
-from palpate.encoders.rulers import Gel, Handcrafted, Ruler
+from palpate.encoders.rulers import Handcrafted
 from palpate.encoders.tactile import load_tactile
 from palpate.encoders.tactile_module import TactileModule
 from palpate.encoders.tokenizer import save_tokenizer
@@ -282,8 +282,8 @@ class EncoderSet:
         """What is known of an encoder that others trained; None of palpate's and one's own."""
         self._require(modality)
         if modality == "tactile":
-            public = isinstance(self.tactile, TactileModule) and not isinstance(self.tactile, Ruler)
-            return getattr(self.tactile, "format", None) if public else None
+            public = self.tactile if isinstance(self.tactile, TactileModule) else None
+            return None if public is None or isinstance(public, Handcrafted) else public.format
         if "trained_on" not in self.clip_card:
             return None
         return Origin(self.name, self.clip_card["license"], tuple(self.clip_card["trained_on"]))
@@ -383,12 +383,11 @@ class EncoderSet:
         folder, sensor = find_encoder(source)
         if folder.is_file():
             public = load_tactile(folder)
-            card: dict[str, Any] = {"name": str(source), "license": public.format.license}
+            card = {"name": str(source), "license": public.format.license}
             shape = {"tactile": public.preprocess}
-            seen: Any = (
-                {"tactile": union()} if isinstance(public, Handcrafted) else {}
-            )  # it saw none
-            card |= {"synthetic": True} if isinstance(public, Gel) else {}
+            seen: dict[str, Digests | None] = {}
+            if isinstance(public, Handcrafted):  # it saw no image
+                seen["tactile"] = union()
             return cls(None, None, public, shape, "", {}, card, seen, sensor).to(device)
         note = folder / "palpate.json"
         if not note.is_file() or read_record(note, "card").get("format") == CLIP_FORMAT:

@@ -54,7 +54,7 @@ if TYPE_CHECKING:  # names are checked before torch is imported, which takes sec
 Part = Literal["clip", "encoders", "autoencoder", "generator"]
 #: The shipped names, and the folder of each in :func:`shipped_root`.
 SHIPPED = {"palpate/mini": "mini"}
-#: Rulers in one file each.
+#: Rulers, and the file of each.
 RULERS = {"palpate/handcrafted": "mini/rulers/handcrafted.safetensors"}
 #: Where the parts are in the folder of a name.
 PARTS: dict[Part, str] = {

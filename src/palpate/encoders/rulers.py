@@ -1,11 +1,7 @@
-"""Rulers: tactile encoders whose numbers measure residuals (:mod:`palpate.data.residuals`).
+"""The ruler ``palpate/handcrafted``: 149 numbers of residuals (:mod:`palpate.data.residuals`).
 
-=================  ==========================================================================
-``Handcrafted``    149 numbers without training: what a learned ruler must beat
-``Gel``            a convolutional network of 280,000 weights, learned without real images
-=================  ==========================================================================
-
-``Handcrafted``, of a residual r in the opponent colors gray, red - green and yellow - blue:
+It is not trained: what a learned ruler must beat. Of a residual r in the opponent colors gray,
+red - green and yellow - blue:
 
 - 51: log power of the spectrum in 17 rings, of each color;
 - 36: at three scales (1, 2, 4 pixels) the structure tensor of gray: its energy by direction (8, as
@@ -13,9 +9,6 @@
 - 18: area above five strengths, strength of each color, extent and elongation of the contact;
 - 14: deviation, skew and kurtosis of each color, five quantiles of gray;
 - 30: rotation-invariant uniform local binary patterns of gray at the same scales.
-
-``Gel`` sees ``asinh((r - median) / 3)``. Its numbers are mean and deviation over the image of its
-last 128 maps, so that images of every aspect fit.
 
 Numbers are compared after ``(x - center) / spread``: deviations of the simulated contacts that lie
 with the weights; ``score`` takes those of the reference.
@@ -47,67 +40,35 @@ DIRECTIONS = 8
 STRENGTHS = (1.0, 2.0, 4.0, 8.0, 16.0)
 
 
-class Ruler(TactileModule):
-    """Numbers of residuals, standardized but of no unit length.
+class Handcrafted(TactileModule):
+    """149 numbers of residuals, standardized but of no unit length.
 
     Attributes:
-        center, spread: mean and deviation (dim,) of simulated contacts.
+        center, spread: mean and deviation (149,) of simulated contacts.
     """
 
     preprocess: Preprocess = Residual(SIDE, SIDE)
 
-    def __init__(self, dim: int) -> None:
-        super().__init__()
-        self.dim = dim
-        self.center, self.spread = (nn.Parameter(torch.empty(dim)) for _ in range(2))
-
-    def numbers(self, residuals: Tensor) -> Tensor:
-        """Residuals (n, 3, h, w) in gray levels to (n, dim)."""
-        raise NotImplementedError
-
-    def forward(self, pixels: Tensor, sensors: Tensor | None = None) -> Tensor:
-        """Residuals (n, 3, h, w) in gray levels to (n, dim), standardized."""
-        return (self.numbers(pixels) - self.center) / self.spread
-
-    def encode(self, pixels: Tensor, sensors: Sequence[str] | None = None) -> Tensor:
-        """The same; its rows keep their length, which the reference's deviations need."""
-        return self(pixels)
-
-
-class Handcrafted(Ruler):
-    """149 numbers without training."""
-
     def __init__(self, state: State) -> None:
-        super().__init__(len(state["center"]))
+        super().__init__()
+        self.dim = len(state["center"])
+        self.center, self.spread = (nn.Parameter(torch.empty(self.dim)) for _ in range(2))
 
     def numbers(self, residuals: Tensor) -> Tensor:
-        """See the head of this file."""
+        """Residuals (n, 3, h, w) in gray levels to (n, 149): see the head of this file."""
         red, green, blue = residuals.unbind(1)
         gray, yellow = residuals.mean(1), (red + green) / 2
         colors = torch.stack([gray, red - green, yellow - blue], 1)
         parts = [_spectrum(colors), _directions(gray), _contact(colors), _moments(colors)]
         return torch.cat([*parts, _patterns(gray)], 1)
 
+    def forward(self, pixels: Tensor, sensors: Tensor | None = None) -> Tensor:
+        """Residuals (n, 3, h, w) in gray levels to (n, 149), standardized."""
+        return (self.numbers(pixels) - self.center) / self.spread
 
-class Gel(Ruler):
-    """A convolutional network, pooled by mean and deviation."""
-
-    def __init__(self, state: State) -> None:
-        numbers = {int(k.split(".")[1]) for k, v in state.items() if v.ndim == 4}
-        shapes = [state[f"body.{k}.weight"].shape for k in sorted(numbers)]
-        super().__init__(2 * shapes[-1][0])
-        layers: list[nn.Module] = []
-        for k, (out, into, side, _) in enumerate(shapes):
-            stride = 1 if k == len(shapes) - 1 else 2
-            conv = nn.Conv2d(into, out, side, stride, side // 2, bias=False)
-            layers += [conv, nn.BatchNorm2d(out), nn.ReLU()]
-        self.body = nn.Sequential(*layers)
-
-    def numbers(self, residuals: Tensor) -> Tensor:
-        """See the head of this file."""
-        median = residuals[:, :, ::4, ::4].flatten(2).median(2).values[:, :, None, None]
-        maps = self.body(torch.asinh((residuals - median) / 3))
-        return torch.cat([maps.mean((2, 3)), (maps.var((2, 3)) + 1e-4).sqrt()], 1)
+    def encode(self, pixels: Tensor, sensors: Sequence[str] | None = None) -> Tensor:
+        """The same; its rows keep their length, which the reference's deviations need."""
+        return self(pixels)
 
 
 def _spectrum(colors: Tensor) -> Tensor:
@@ -214,7 +175,4 @@ def _blurred(images: Tensor) -> Tensor:
     return images
 
 
-RULERS = (
-    Format("palpate/handcrafted", "Apache-2.0", (), "handcrafted.", "center", Handcrafted),
-    Format("ruler of residuals", "Apache-2.0", (), "gel.", "center", Gel),
-)
+HANDCRAFTED = Format("palpate/handcrafted", "Apache-2.0", (), "handcrafted.", "center", Handcrafted)

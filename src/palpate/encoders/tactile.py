@@ -39,7 +39,7 @@ from transformers import CLIPVisionConfig, CLIPVisionModel
 from palpate.core import PalpateError
 from palpate.data.images import Preprocess
 from palpate.encoders.models import read_weights
-from palpate.encoders.rulers import RULERS
+from palpate.encoders.rulers import HANDCRAFTED
 from palpate.encoders.tactile_module import Format, State, TactileModule
 
 NON_COMMERCIAL = "CC-BY-NC-4.0"
@@ -287,7 +287,7 @@ def load_tactile(path: Path) -> TactileModule:
             lack a name, have one more, or another shape.
     """
     state = read_weights(path, f"Pass {KNOWN}")
-    form = next((f for f in (*RULERS, *FORMATS) if f.prefix + f.signature in state), None)
+    form = next((f for f in (HANDCRAFTED, *FORMATS) if f.prefix + f.signature in state), None)
     if form is None:
         must = f"{path} must be a tactile encoder that is recognized by the names of its weights"
         got = f"{len(state)} weights, first {', '.join(list(state)[:3]) or 'none'}"

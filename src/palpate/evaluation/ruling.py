@@ -13,9 +13,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import polars as pl
-from PIL import Image
 
-from palpate.core import FeatureSet, Note, digest_json
+from palpate.core import FeatureSet, Note, digest_json, save_image
 from palpate.data.manifest import Manifest
 from palpate.data.residuals import with_gels
 from palpate.data.samples import Samples
@@ -66,6 +65,5 @@ def _of_files(samples: Samples, folder: Path) -> Manifest:
 
 
 def _saved(image: np.ndarray, file: Path) -> str:
-    file.parent.mkdir(parents=True, exist_ok=True)
-    Image.fromarray(image).save(file)
+    save_image(file, image)
     return str(file.resolve())
