@@ -19,7 +19,6 @@ import dataclasses
 import importlib
 import inspect
 import io
-import json
 import pkgutil
 import re
 import subprocess
@@ -190,13 +189,14 @@ def main() -> int:
             print(f"  {name:22} {now:9} {most:7}{more}{'  ABOVE' * bad}")
             if args.lower and table != "documented":
                 budget[table][name] = min(now, most)
-    if args.lower:
-        head = BUDGET.read_text(encoding="utf-8").partition("[")[0]
-        tables = (
-            "\n".join([f"[{table}]", *(f"{json.dumps(n)} = {v}" for n, v in values.items())])
-            for table, values in budget.items()
-        )
-        BUDGET.write_text(head + "\n\n".join(tables) + "\n", encoding="utf-8")
+    if args.lower:  # numbers alone: the reasons stay
+        table, rows = "", list[str]()
+        for row in BUDGET.read_text(encoding="utf-8").splitlines():
+            table = row.strip("[]") if row.startswith("[") else table
+            name = re.match('"(.+?)" = ', row)
+            number = str(budget[table][name[1]]) if name else ""
+            rows.append(re.sub(r"(?<= = )[\d.]+", number, row, count=1) if name else row)
+        BUDGET.write_text("\n".join(rows) + "\n", encoding="utf-8")
     if above:
         print("Above budget.toml: delete, or raise the line there with its reason in the diff.")
     return int(above > 0)
