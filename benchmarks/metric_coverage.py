@@ -30,7 +30,7 @@ FIDELITY = 0.7  # correlation of the effects of a video, generated and real
 FRAMES, UNEQUAL = (3, 8), (1, 60)  # fewest and most frames of a video
 SECOND = 0.8  # shift of the second generator, relative to the first
 COVERAGE, REJECTION = (0.92, 0.99), (0.03, 0.08)
-KINDS = ("unpaired", "paired")
+KINDS = {"unpaired": False, "paired": True}
 SCENES = (12, 36, 200)
 
 
@@ -91,11 +91,9 @@ def truth_of(model, videos=200_000):
         return 1000 * (k(first, second) - apart)
 
     apart = lambda x, y: distance(x, y, backend="moments").value  # of different videos
-    mixed = sample(rng.integers(c, size=videos))
-    shifted = {
-        size: apart(sample(rng.integers(c, size=videos), size)[0], mixed[0])
-        for size in (1.0, SECOND)
-    }
+    labels = lambda: rng.integers(c, size=videos)
+    mixed = sample(labels())
+    shifted = {size: apart(sample(labels(), size)[0], mixed[0]) for size in (1.0, SECOND)}
     each = [sample(np.full(videos // c, k)) for k in range(c)]
     between = np.array([apart(a[0], b[0]) for a in each for b in each if a is not b])
     within = np.array([excess(*pair) for pair in each])
@@ -131,30 +129,21 @@ def draw_classes(model, rng, videos, lengths=FRAMES):
     return feature_set(rows, video, labels, "v")
 
 
-class Tally:
+class Tally(list):
     """Estimates, intervals and truths of one quantity over the replicates."""
 
-    def __init__(self):
-        self.rows = []
-
     def add(self, value, interval, truth):
-        low, high = interval if interval is not None else (np.nan, np.nan)
-        self.rows.append((np.nan if value is None else value, low, high, truth))
-
-    @property
-    def table(self):
-        return np.array(self.rows, dtype=np.float64)
+        self.append((np.nan if value is None else value, *(interval or (np.nan, np.nan)), truth))
 
     @property
     def covered(self):
-        _, low, high, truth = self.table.T
+        _, low, high, truth = np.array(self).T
         return (low <= truth) & (truth <= high)
 
 
 def tally_tmmd(model, truth, videos, paired, replicates, seed, frames=0, permutations=199):
     """TMMD with a shift, and p-values without; the first ``frames`` replicates also groupless."""
-    tallies = {name: Tally() for name in ("TMMD", "TMMD, frames", "TMMD null", "TMMD null, frames")}
-    rejected = {"videos": [], "frames": []}
+    tallies, rejected = defaultdict(Tally), defaultdict(list)
     for r in range(replicates):
         rng = rng_for(seed, "metric coverage", f"{videos} {paired} {r}")
         for shift, name in ((1.0, "TMMD"), (0.0, "TMMD null")):
@@ -169,12 +158,12 @@ def tally_tmmd(model, truth, videos, paired, replicates, seed, frames=0, permuta
                 tally.add(score.value, score.interval, truth.tmmd[shift])
                 if not shift and permutations:
                     rejected[unit].append(score.details["p_value"] <= 0.05)
-    return tallies, {unit: np.array(hits) for unit, hits in rejected.items()}
+    return tallies, rejected
 
 
 def tally_scenes(model, truth, scenes, replicates, seed):
     """TMMD of two sets with the same ids and no groups: row k of both is of scene k."""
-    tallies = {}
+    tallies = defaultdict(Tally)
     for r in range(replicates):
         rng = rng_for(seed, "metric coverage", f"scenes {scenes} {r}")
         real = model.videos(rng, scenes)
@@ -186,14 +175,13 @@ def tally_scenes(model, truth, scenes, replicates, seed):
             x, _ = model.frames(rng, shared, labels, one, shift)
             for preset in (None, "paper"):
                 score = tmmd(x, y, ids=ids, reference_ids=ids, preset=preset, permutations=0)
-                tally = tallies.setdefault((shift, preset), Tally())
-                tally.add(score.value, score.interval, truth.tmmd[shift])
+                tallies[shift, preset].add(score.value, score.interval, truth.tmmd[shift])
     return tallies
 
 
 def tally_halves(model, truth, videos, replicates, seed, lengths=FRAMES):
     """What I-, CI- and D-TMMD say whatever the numbers of frames and videos."""
-    tallies = {name: Tally() for name in ("I-TMMD: E", "CI-TMMD: E", "D: inter", "D: E_ratio")}
+    tallies = defaultdict(Tally)
     for r in range(replicates):
         rng = rng_for(seed, "metric coverage", f"halves {videos} {r}")
         mixed = i_tmmd(draw_pair(model, rng, videos, False, 0.0, lengths)[0]).details
@@ -214,12 +202,12 @@ def tally_difference(model, truth, videos, replicates, seed, shifts=(1.0, SECOND
     for r in range(replicates):
         rng = rng_for(seed, "metric coverage", f"difference {videos} {r}")
         labels, real = rng.integers(len(model.classes), size=videos), model.videos(rng, videos)
-        sizes = rng.integers(FRAMES[0], FRAMES[1] + 1, size=videos)
-        shared, sets = like(model, rng, real), []
-        for effects, shift in ((shared, shifts[0]), (shared, shifts[1]), (real, 0.0)):
-            made = model.frames(rng, effects, labels, sizes, shift)
-            sets.append(feature_set(*made, labels, "v"))
-        result = compare({"a": sets[0], "b": sets[1]}, sets[2], permutations=0)
+        sizes, shared = rng.integers(FRAMES[0], FRAMES[1] + 1, size=videos), like(model, rng, real)
+        a, b, reference = (
+            feature_set(*model.frames(rng, effects, labels, sizes, shift), labels, "v")
+            for effects, shift in ((shared, shifts[0]), (shared, shifts[1]), (real, 0.0))
+        )
+        result = compare({"a": a, "b": b}, reference, permutations=0)
         delta, scores = result.differences[0], [s for s in result.scores if s.metric == "TMMD"]
         tally.add(delta.value, delta.interval, truth.tmmd[shifts[0]] - truth.tmmd[shifts[1]])
         unpaired = np.hypot(*[s.interval[1] - s.interval[0] for s in scores])
@@ -229,7 +217,7 @@ def tally_difference(model, truth, videos, replicates, seed, shifts=(1.0, SECOND
 
 def cell(tally):
     """``94.7 % (-0.0136)``: the share of intervals that hold the truth, and the bias."""
-    value, _, _, truth = tally.table.T
+    value, _, _, truth = np.array(tally).T
     return f"{100 * np.mean(tally.covered):.1f} % ({np.nanmean(value - truth):+.4f})"
 
 
@@ -238,23 +226,20 @@ def misses(replicates, videos=(10, 20, 40)):
     model, rows = Model.make(), defaultdict(list)
     truth = truth_of(model)
     for count in videos:
-        for kind in KINDS:
-            pair = kind == "paired"
+        for kind, pair in KINDS.items():
             tallies, _ = tally_tmmd(model, truth, count, pair, replicates, 0, permutations=0)
             for name in ("TMMD", "TMMD null"):
-                _, low, high, exact = tallies[name].table.T
-                shares = [
-                    100 * np.mean(v) for v in (tallies[name].covered, high < exact, low > exact)
-                ]
-                rows[f"{name}, {kind}"].append("{:.1f} ({:.1f}, {:.1f})".format(*shares))
+                _, low, high, exact = np.array(tallies[name]).T
+                shares = np.stack([tallies[name].covered, high < exact, low > exact]).mean(axis=1)
+                rows[f"{name}, {kind}"].append("{:.1f} ({:.1f}, {:.1f})".format(*100 * shares))
     return table("videos", videos, rows)
 
 
 def table(unit, counts, rows):
     """Cells by name, a column for each number of ``unit``."""
-    head = f"| | {' | '.join(f'{count} {unit}' for count in counts)} |"
-    body = [f"| {' | '.join([name, *cells])} |" for name, cells in rows.items()]
-    return [head, f"|---|{'---|' * len(counts)}", *body, ""]
+    lines = [["", *(f"{count} {unit}" for count in counts)], ["---"] * (len(counts) + 1)]
+    lines += [[name, *cells] for name, cells in rows.items()]
+    return [*(f"| {' | '.join(line)} |" for line in lines), ""]
 
 
 def tables(replicates, videos=(12, 24, 40)):
@@ -263,18 +248,15 @@ def tables(replicates, videos=(12, 24, 40)):
     truth, frames = truth_of(model), replicates // 2
     rows, scenes = defaultdict(list), defaultdict(list)
     for count in videos:
-        for kind in KINDS:
-            pair = kind == "paired"
+        for kind, pair in KINDS.items():
             tallies, rejected = tally_tmmd(model, truth, count, pair, replicates, 0, frames)
             for name, tally in tallies.items():
                 rows[f"{name}, {kind}"].append(cell(tally))
             for unit, hits in rejected.items():
-                rows[f"true null rejected at 5 %, {unit}, {kind}"].append(
-                    f"{100 * hits.mean():.1f} %"
-                )
+                name = f"true null rejected at 5 %, {unit}, {kind}"
+                rows[name].append(f"{100 * np.mean(hits):.1f} %")
         for lengths, suffix in ((FRAMES, ""), (UNEQUAL, ", videos of 1 to 60 frames")):
-            halves = tally_halves(model, truth, count, replicates, 0, lengths)
-            for name, tally in halves.items():
+            for name, tally in tally_halves(model, truth, count, replicates, 0, lengths).items():
                 rows[name + suffix].append(cell(tally))
         tally, ratio = tally_difference(model, truth, count, frames, 0)
         rows["difference of TMMD, paired"].append(cell(tally))

@@ -1,12 +1,10 @@
 """Statistics of tactile images (n, n, 3) in gray levels 0 .. 255, real or rendered.
 
-- Markers: pixels whose luma is below 0.82 of the median luma in a window of a sixth of the side (of
-  every 2nd pixel from 128 px on, and so forth), joined to blobs (8-neighbors).
+- Markers: pixels whose luma is below 0.82 of the median luma around, joined to blobs (8-neighbors).
 - Contrast: over the pixels without marker in either image, of d = contact - background: rms and 95
   % of |d| a channel. Chroma share: with m the mean of d over the channels, 1 - 3 sum(m²) / sum(d²):
   0 if the color never changes, 1 if the brightness never does.
-- Contact area: share of the pad where the root mean square over the channels of d, blurred by 1/48
-  of the side, exceeds a threshold that two frames without contact seldom exceed.
+- Contact area: share of the pad where d changes more than two frames without contact seldom do.
 """
 
 import numpy as np
@@ -16,7 +14,7 @@ from palpate.sim.arrays import f32
 
 
 def marker_mask(image):
-    """Where the image is darker than 0.82 of the median around: bool, (n, n)."""
+    """Where the image is darker than 0.82 of the median in a sixth of the side: bool, (n, n)."""
     gray = f32(image) @ f32([0.299, 0.587, 0.114])
     n = gray.shape[0]
     step = max(1, n // 64)  # the median changes slowly, and costs the fourth power of the side
@@ -48,19 +46,17 @@ def contrast(contact, background):
     return values | {"rms": float(np.sqrt((d * d).mean())), "chroma": chroma}
 
 
-def fill(d, keep):
-    """``d`` (n, n, 3) with the pixels not kept replaced by a blur of the kept ones around."""
-    sigma = d.shape[0] / 32
-    weight = np.maximum(ndimage.gaussian_filter(f32(keep), sigma)[..., None], 1e-6)
-    around = ndimage.gaussian_filter(d * keep[..., None], (sigma, sigma, 0)) / weight
-    return np.where(keep[..., None], d, around)
-
-
 def change(contact, background):
-    """Rms over the channels of the blurred difference, markers filled, in gray levels, (n, n)."""
+    """Rms over the channels of the blurred difference, in gray levels, (n, n).
+
+    Markers are first filled with a blur of the pixels around.
+    """
     d, keep = difference(contact, background)
-    sigma = d.shape[0] / 48
-    return np.sqrt((ndimage.gaussian_filter(fill(d, keep), (sigma, sigma, 0)) ** 2).mean(2))
+    wide, narrow = d.shape[0] / 32, d.shape[0] / 48
+    weight = np.maximum(ndimage.gaussian_filter(f32(keep), wide)[..., None], 1e-6)
+    around = ndimage.gaussian_filter(d * keep[..., None], (wide, wide, 0)) / weight
+    filled = np.where(keep[..., None], d, around)
+    return np.sqrt((ndimage.gaussian_filter(filled, (narrow, narrow, 0)) ** 2).mean(2))
 
 
 def contact_area(contact, background, threshold):
