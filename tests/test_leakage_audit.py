@@ -234,6 +234,17 @@ def test_equal_bytes_match_under_other_names_and_bad_files_do_not(tmp_path):
     assert signals.identical_bytes(train, manifest([{}], "x", tmp_path)) is None
 
 
+@pytest.mark.parametrize("other", [False, True])
+def test_samples_of_one_name_with_other_images_are_not_identical(other, tmp_path):
+    rows = [{"video": "rec1", "frame": k, "tactile": f"t/{k}.png"} for k in range(3)]
+    train, test = (manifest(rows, "r", tmp_path / part) for part in ("train", "test"))
+    for part, first in (("train", 0), ("test", 100 * other)):
+        for k in range(2):  # the third is not at hand
+            image(tmp_path / part / "t" / f"{k}.png", first + 10 * k)
+    flags = signals.identical_samples(train, test, nearest_in_video(train.table, test.table))
+    assert flags.flag.tolist() == [not other, not other, True]
+
+
 def test_only_the_audits_group_counts_and_the_table_holds_every_signal():
     train = manifest([{"video": "a", "frame": f, "object": "cup"} for f in (0, 9)], "r")
     test = manifest(

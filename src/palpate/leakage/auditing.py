@@ -26,6 +26,7 @@ from palpate.data.recordings import (
     Identity,
     is_sequence,
     number_contacts,
+    published,
     same_names,
     shared_groups,
 )
@@ -360,7 +361,8 @@ def _signals(
     named: Sequence[str],
 ) -> list[Flags]:
     """Every signal that can be checked, the exact ones first."""
-    flags: list[Flags | None] = [identical_samples(train, test, gaps, named)]
+    stated = options.identity == "names" or published(test)
+    flags: list[Flags | None] = [identical_samples(train, test, gaps, named, stated=stated)]
     if options.modalities:
         flags.append(identical_bytes(train, test, options.progress))
     if group != NO_GROUP:

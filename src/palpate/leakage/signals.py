@@ -5,7 +5,8 @@ Each gives every test sample a score in [0, 1] and a flag:
 ===================  =====================================================  ==================
 signal               score                                                  flagged
 ===================  =====================================================  ==================
-identical sample     1 if the id, or the video and frame, are in train      score 1
+identical sample     1 if the id, or the video and frame, are in train and  score 1
+                     no image file of the two differs
 identical bytes      1 if an image file equals one of a train sample        score 1
 shared group         1 if the video (object, session ...) is in train       score 1
 time gap             ``2^(-gap / near)``, gap in frames within the video    gap <= near
@@ -147,10 +148,16 @@ class Flags(Signal):
 
 
 def identical_samples(
-    train: Manifest, test: Manifest, gaps: Gaps, named: Collection[str] = ("id", "video")
+    train: Manifest,
+    test: Manifest,
+    gaps: Gaps,
+    named: Collection[str] = ("id", "video"),
+    *,
+    stated: bool = False,
 ) -> Flags:
     """Test samples whose id, or whose video and frame, are in train.
 
+    Those with other images than there are not; unless they are ``stated`` to be the same.
     ``named`` are the columns in which equal names mean the same thing; without ``id`` and ``video``
     nothing can be checked.
     """
@@ -159,9 +166,25 @@ def identical_samples(
     rows = test.table.select("id").join(ids, on="id", how="left", maintain_order="left")["row"]
     same = rows.cast(pl.Int64).fill_null(-1).to_numpy()
     nearest = np.where(same >= 0, same, np.where(gaps.frames == 0, gaps.row, -1))
+    if not stated:
+        nearest[_differ(train, test, nearest)] = -1
     flag = nearest >= 0
     score = np.where(bool({"id", "video"} & {*named}), flag, np.nan).astype(np.float32)
     return Flags.of("identical sample", score, flag, nearest)
+
+
+def _differ(train: Manifest, test: Manifest, row: Ints) -> NDArray[np.bool_]:
+    """(n,) whether a sample and that row of train have files of one kind that are not equal."""
+    differ = np.zeros(len(test), bool)
+    for column in MODALITIES:
+        mine, base = test.column(column), train.column(column)
+        for k in np.flatnonzero(row >= 0).tolist():
+            if (name := mine[k]) and (other := base[row[k]]):
+                files = [test.path(name), train.path(other)]
+                sizes = {file_stamp(file)[0] for file in files}
+                if -1 not in sizes and files[0] != files[1]:
+                    differ[k] |= len(sizes) > 1 or len({*map(file_digest, files)}) > 1
+    return differ
 
 
 def shared_group(train: Manifest, test: Manifest, column: str, *, counts: bool) -> Flags | None:
