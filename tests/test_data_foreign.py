@@ -148,6 +148,21 @@ def test_photos_that_nothing_ties_to_touches_are_not_paired(tmp_path, photo, tou
 
 
 @pytest.mark.parametrize(
+    "last", [("rgb", "gelsight"), ("photo", "gelsight"), ("camera", "touch"), ("rgb_1", "gel_1")]
+)
+def test_a_session_with_other_words_for_its_sides_is_read_or_named(tmp_path, last):
+    words = {"s1": ("photo", "touch"), "s2": ("photo", "touch"), "s3": last}
+    for n in range(2):
+        paths = [f"{s}/{own[n]}/{k}.png" for s, own in words.items() for k in range(4)]
+        write_images(tmp_path / "own", paths, 32 * n + 1)
+    result = import_dataset(tmp_path / "own", tmp_path / "out")
+    table = result.manifest.table.select("vision", "tactile")
+    folders = {(a.rpartition("/")[0], b.rpartition("/")[0]) for a, b in table.iter_rows()}
+    assert folders == {(f"{s}/{a}", f"{s}/{b}") for s, (a, b) in words.items()}
+    assert len(table) == 12
+
+
+@pytest.mark.parametrize(
     ("photo", "touch"),
     [
         ("{o}/photo.jpg", "{o}/touch/{k}.png"),

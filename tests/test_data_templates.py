@@ -17,6 +17,8 @@ from palpate.data.templates import Template, assign, join, walk
         ("{video}/{frame:d}*.png", "v/12-0.5.png", {"video": "v", "frame": "12"}),
         ("2024{frame:d}.png", "202407.png", {"frame": "7"}),
         ("{video}/*/{frame}.png", "v/left/1.png", {"video": "v", "frame": "1"}),
+        ("{video}/{cam|rgb.1}/{frame}.png", "v/rgb.1/1.png", {"video": "v", "frame": "1"}),
+        ("{video}/{cam|rgb.1}/{frame}.png", "v/rgbx1/1.png", None),
         ("{video}/**/{frame}.png", "v/1.png", {"video": "v", "frame": "1"}),
         ("{video}/**/{frame}.png", "v/a/b/1.png", {"video": "v", "frame": "1"}),
         ("t/{video:**}/{frame}.png", "t/a/b/1.png", {"video": "a/b", "frame": "1"}),

@@ -204,9 +204,11 @@ class _Names:
         own_names = "".join([*pieces, _literal(path[after:])]).split("/")
         for k, name in enumerate(bare) if len(own_names) == len(bare) else ():
             same = {other[k] for other in map(_names, files) if len(other) == len(bare)}
-            if name == _ROLE and len(same) > 1:
+            if name == _ROLE and len(same) > 1:  # left and right, two sensors, or two words
                 before, _, end = _affixes(sorted(same))
-                own_names[k] = f"{before}{{sensor}}{end}"
+                words = "|".join(map(_literal, sorted(same)))
+                units = before or end or all(_MEANING_OF.get(name) == "sensor" for name in same)
+                own_names[k] = f"{before}{{sensor}}{end}" if units else f"{{{words}}}"
         return "/".join(own_names) + _suffix(files)
 
 
@@ -496,7 +498,8 @@ def _fit(files: Sequence[str], templates: Mapping[str, str]) -> bool:
         sides = {*matches, "sensor"}  # several sensors may share a photo
         samples = len({tuple(v for n, v in row.items() if n not in sides) for row in rows})
         shared = numbered and any(len({row[s] for row in rows}) < samples for s in both)
-        return not shared and 2 * len(rows) >= min(len(matches[side]) for side in both)
+        alike = len({*templates.values()}) < len(templates)
+        return not (shared or alike) and 2 * len(rows) >= min(len(matches[side]) for side in both)
     return False
 
 

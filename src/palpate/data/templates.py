@@ -6,6 +6,7 @@ in a template   matches
 ``{name}``      one or more characters of one name; the earlier field takes as many as it can
 ``{name:d}``    all digits of a number (``0007`` is 7); the field ``frame`` is always one
 ``{name:**}``   any number of folders, also none
+``{a|b}``       one of these words
 ``{time}``      the same as the first: a time stamp, by which sides are joined to the nearest
 ``*``  ``**``   the same as the first and the last, but not kept
 ==============  ====================================================================================
@@ -31,7 +32,8 @@ from palpate.data.manifest import CLIMBS, DIGITS, IMAGE_COLUMNS
 
 _TOKEN = re.compile(
     r"(?<![^/])(?:\*\*|\{(?P<deep>\w+):\*\*\})(?P<end>/|$)"
-    r"|\{(?P<field>\w+)(?::(?P<spec>[^{}]*))?\}|(?P<star>\*+)|(?P<literal>[^{}*]+)|(?P<wrong>.)"
+    r"|\{(?P<field>\w+)(?::(?P<spec>[^{}]*))?\}|\{(?P<words>[^{}|]+(?:\|[^{}|]+)+)\}"
+    r"|(?P<star>\*+)|(?P<literal>[^{}*]+)|(?P<wrong>.)"
 )
 #: The field of a time stamp.
 TIME = "time"
@@ -85,7 +87,8 @@ class Template:
             if name in IMAGE_COLUMNS:
                 must = f"must have fields other than {', '.join(IMAGE_COLUMNS)}"
                 raise wrong(must, f"{token[0]!r} in {text!r}")
-            kind = token.lastgroup if token["literal"] or token["end"] else spec or "any"
+            written = token["literal"] or token["words"]
+            kind = "literal" if written else "end" if token["end"] else spec or "any"
             if before == kind == "any":
                 got = f"{token[0]!r} right after another in {text!r}"
                 raise wrong("must have a sign between fields", got)
@@ -100,7 +103,8 @@ class Template:
             pieces.append(r"\.[^/]*" if not last.endswith(":**}") else "")
         digits = frozenset(name for name, spec in specs.items() if spec == "d")
         pattern = re.compile("".join(pieces), re.DOTALL)
-        letters = sum(len(token["literal"] or "") for token in _TOKEN.finditer(path))
+        written = ((t["literal"], t["words"] or "") for t in _TOKEN.finditer(path))
+        letters = sum(len(text or min(words.split("|"), key=len)) for text, words in written)
         return cls(path, tuple(specs), digits, pattern, letters)
 
     def match(self, path: str) -> Fields | None:
@@ -121,6 +125,8 @@ def _piece(token: re.Match[str], name: str | None, spec: str, *, loose: bool) ->
     """The pattern of a token."""
     if token["literal"]:
         return re.escape(token["literal"])
+    if token["words"]:
+        return f"(?:{'|'.join(map(re.escape, token['words'].split('|')))})"
     if token["star"]:
         return "[^/]*"
     group = f"(?P<{name}>" if name else "(?:"
