@@ -1,5 +1,7 @@
 """Lists and tables as people have them: other machines, encodings, repeated rows, flags."""
 
+import unicodedata
+
 import polars as pl
 import pytest
 
@@ -34,6 +36,7 @@ WRITTEN = {
     "a folder above": lambda p: f"set/{p}",
     "without the folder": lambda p: p.removeprefix("img/"),
     "two machines": lambda p: f"{'/mnt/bob' if 'cup' in p else '/home/ann/data'}/{p}",
+    "capitals": lambda p: p.upper(),
     "a dot": lambda p: f"./{p}",
 }
 
@@ -51,6 +54,40 @@ def test_paths_of_another_machine_are_read_by_their_end(tmp_path, form):
 def test_two_paths_never_become_one_file(tmp_path):
     write_images(tmp_path, ["1_v.png", "1_t.png", "2_v.png", "2_t.png"])
     fails("missing-file", import_dataset, listed(tmp_path / "t.csv", str), tmp_path / "out")
+
+
+FORMS = ("NFC", "NFD")
+
+
+@pytest.mark.parametrize("form", FORMS)
+def test_names_in_another_form_of_letters_are_those_of_the_only_file(tmp_path, form):
+    """A table written on macOS may spell the names of files on Linux in another form."""
+    paths = [f"{s}/{name}.png" for name in ("Käse", "Öl", "wood") for s in ("photo", "touch")]
+    spell = lambda form: [unicodedata.normalize(form, path) for path in paths]
+    written, files = spell(form), spell(FORMS[form == "NFC"])
+    write_images(tmp_path, files)
+    rows = [*zip(written[::2], written[1::2], strict=True)]
+    pl.DataFrame(rows, ["vision", "tactile"], orient="row").write_csv(tmp_path / "t.csv")
+    result = import_dataset(tmp_path / "t.csv", tmp_path / "out")
+    assert result.manifest.table["vision"].to_list() == files[::2]
+    (said,) = (p.text for p in result.suspicious if p.kind == "other-paths")
+    assert "spelling" in said
+    write_images(tmp_path, [files[0].upper(), files[0].title()])  # which of the two is meant?
+    (tmp_path / files[0]).unlink()
+    fails("missing-file", import_dataset, tmp_path / "t.csv", tmp_path / "out2")
+
+
+@pytest.mark.parametrize("twice", [False, True])
+def test_paths_that_begin_in_several_folders_are_found_in_the_only_one(tmp_path, twice):
+    here = {"cup": "diskA", "mug": "diskB"}
+    places = [f"{here[path.split('/')[1]]}/{path}" for path in IMAGES]
+    write_images(tmp_path, [*places, *(p.replace("diskA", "diskB") for p in places if twice)])
+    table = listed(tmp_path / "t.csv", str)
+    if twice:  # one of the two cups is a copy, or another recording
+        fails("missing-file", import_dataset, table, tmp_path / "out")
+    else:
+        table = import_dataset(table, tmp_path / "out").manifest.table
+        assert [*table["vision"], *table["tactile"]] == places[::2] + places[1::2]
 
 
 def test_paths_that_climb_name_the_root(tmp_path):

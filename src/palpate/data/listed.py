@@ -152,7 +152,7 @@ def read_table(
     if places := relocated(written.unique(maintain_order=True), scan.base):
         rows = rows.with_columns(pl.col(images).replace(places))
         before, below = next(iter(places.items()))
-        text = f"{len(places)} paths are read by their end: {before!r} is {below!r}"
+        text = f"{len(places)} paths are read by their end in any spelling: {before!a} is {below!a}"
         scan.suspect(table.name, "other-paths", text)
     return Listed(table, scan, rows, column, texts)
 

@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+import posixpath
 import re
+import unicodedata
+from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -106,15 +110,23 @@ def without_repeats(rows: pl.DataFrame, place: Place, problems: list[Problem]) -
     return rows.filter(~pl.col(LINE).is_in(again[LINE].implode()))
 
 
+def spelled(path: str) -> str:
+    """A path or name, whoever wrote it: one kind of slash, no capitals, one form of letters."""
+    text = path.strip().replace("\\", "/").casefold()
+    return unicodedata.normalize("NFC", text).removeprefix("./")
+
+
 def relocated(written: Iterable[str], root: Path) -> dict[str, str]:
     """Paths of another machine -> where their files are below the root.
 
     The longest end that all paths of one beginning (``/home``, ``C:``) have below the root, or
-    below a folder in it; backslashes separate folders where nothing has such a name. Two paths
-    never become one. Paths that are right as they are written, or found nowhere, are left out.
+    below a folder in it; backslashes separate folders where nothing has such a name, and a name in
+    another spelling is that of the only file with it. Two paths never become one. Paths that are
+    right as they are written, or found nowhere or in two folders, are left out.
     """
     distinct = list(dict.fromkeys(written))
-    if all(is_there(root, path) for path in some(distinct)):
+    odd = (path for path in distinct if not path.isascii())
+    if all(is_there(root, path) for path in (*some(distinct), *odd)):
         return {}
     by_head: dict[str, list[str]] = {}
     for path in distinct:
@@ -125,27 +137,46 @@ def relocated(written: Iterable[str], root: Path) -> dict[str, str]:
     places: dict[str, str] = {}
     for paths in by_head.values():
         places |= _ends(paths, root)
-    return {path: below for path, below in places.items() if path != below}
+    uses = Counter(places.values())
+    return {path: below for path, below in places.items() if path != below and uses[below] == 1}
 
 
 def _ends(paths: Sequence[str], root: Path) -> dict[str, str]:
-    """Path -> its end that is a file below the root, by one rule for all; empty without one."""
-    tried = [_parts(path) for path in some(paths)]
-    folders = (
-        sorted(entry.name for entry in root.iterdir() if entry.is_dir()) if root.is_dir() else []
-    )
-    best, rule = len(tried) // 2, (0, "")
-    for start in ("", *(f"{name}/" for name in folders[:TRIED])):
-        for k in range(min(map(len, tried), default=0)):
-            ends = ["/".join(parts[k:]) for parts in tried]
-            count = sum(is_there(root, start + end) for end in ends)
-            if count > best:
-                every = {"/".join(_parts(path)[k:]) for path in paths}
-                apart = len(every) == len(paths) and "" not in every
-                best, rule = (count, (k, start)) if apart else (best, rule)
-    if best == len(tried) // 2:
+    """Path -> its file below the root, by one length of the ends of all; empty without one."""
+
+    @cache
+    def names(folder: str) -> dict[str, str]:
+        """Spelling -> the name in a folder that has it."""
+        with suppress(OSError):
+            every = [path.name for path in (root / folder).iterdir()]
+            spellings = Counter(map(spelled, every))
+            once = {spelled(name): name for name in every if spellings[spelled(name)] == 1}
+            return once | dict(zip(every, every, strict=True))
         return {}
-    return {path: rule[1] + "/".join(_parts(path)[rule[0] :]) for path in paths}
+
+    def below(folder: str, end: Sequence[str]) -> str:
+        for part in end:
+            name = names(folder).get(part) or names(folder).get(spelled(part))
+            if name is None:
+                return ""
+            folder = posixpath.join(folder, name)
+        return folder if is_there(root, folder) else ""
+
+    def place(folders: Iterable[str], end: Sequence[str]) -> tuple[str, str]:
+        """(folder, file) of an end: in the root, or in the only folder that has it."""
+        found = [(folder, file) for folder in folders if (file := below(folder, end))]
+        return found[0] if found and (not found[0][0] or len(found) == 1) else ("", "")
+
+    tried = [_parts(path) for path in some(paths)]
+    folders = ["", *sorted(name for name in names("") if (root / name).is_dir())[:TRIED]]
+    best, cut, starts = len(tried) // 2, 0, set[str]()
+    for k in range(min(map(len, tried), default=0)):
+        found = [place(folders, parts[k:]) for parts in tried]
+        count = sum(bool(file) for _, file in found)
+        if count > best and len({tuple(_parts(path)[k:]) for path in paths}) == len(paths):
+            best, cut, starts = count, k, {folder for folder, _ in found}
+    every = {path: place(sorted(starts), _parts(path)[cut:])[1] for path in paths if starts}
+    return {path: file for path, file in every.items() if file}
 
 
 def _parts(path: str) -> list[str]:
