@@ -24,7 +24,7 @@ from palpate.report.plots import HEIGHT, axis_of, axis_row, bar
 from palpate.report.results import Audit, Results
 from palpate.report.study import of_study
 from palpate.report.tables import FLOOR, REAL, Row, Table, families, grid
-from palpate.report.thumbnails import Wanted, read_image
+from palpate.report.thumbnails import ImageRequest, read_image
 
 #: Samples and pairs side by side.
 SAMPLES, PAIRS = 8, 6
@@ -53,7 +53,7 @@ class Picture:
     """Images in rows and columns: a heading for each column, a label for each row."""
 
     headings: Sequence[str]
-    rows: Sequence[tuple[str, Sequence[Wanted]]]
+    rows: Sequence[tuple[str, Sequence[ImageRequest]]]
     crop: bool = True
 
 
@@ -125,9 +125,12 @@ def _background(results: Results) -> Picture | None:
         if (background := item.background or item.sample.background) and item.sample.tactile
     ][:SAMPLES]
     rows = [
-        ("No contact", [Wanted(background, "", "") for _, background, _ in items]),
-        ("Real", [Wanted(tactile, "", "") for *_, tactile in items]),
-        ("Contact", [Wanted(tactile, "", "", background) for _, background, tactile in items]),
+        ("No contact", [ImageRequest(background, "", "") for _, background, _ in items]),
+        ("Real", [ImageRequest(tactile, "", "") for *_, tactile in items]),
+        (
+            "Contact",
+            [ImageRequest(tactile, "", "", background) for _, background, tactile in items],
+        ),
     ]
     return Picture([material_of(sample) for sample, *_ in items], rows) if items else None
 
@@ -141,7 +144,7 @@ def _pairs(audit: Audit) -> Picture | None:
     headings = [audits.pair_facts(pair, "")[0] for pair in pairs]
     columns = [{w.label: w for w in pair_images(pair, audits.head_of(audit))} for pair in pairs]
     labels = list(dict.fromkeys(label for column in columns for label in column))
-    rows = [(n, [column.get(n, Wanted(None, "", n)) for column in columns]) for n in labels]
+    rows = [(n, [column.get(n, ImageRequest(None, "", n)) for column in columns]) for n in labels]
     return Picture(headings, rows, crop=False)
 
 
@@ -169,17 +172,15 @@ def _grid(picture: Picture, base: Path) -> Image.Image:
         y = top + r * (SIDE + GAP)
         corner = (left - 2 * GAP, y + SIDE // 2)
         pen.text(corner, label, COLORS["ink"], font, "rm")
-        for k, wanted in enumerate(row):
-            image.paste(_field(wanted, base, picture.crop), (left + k * (SIDE + GAP), y))
+        for k, request in enumerate(row):
+            image.paste(_field(request, base, picture.crop), (left + k * (SIDE + GAP), y))
     return image
 
 
-def _field(wanted: Wanted, base: Path, crop: bool) -> Image.Image:
+def _field(request: ImageRequest, base: Path, crop: bool) -> Image.Image:
     """An image in a square: its center, or all of it on white."""
     try:
-        if wanted.path is None:
-            raise ImageError
-        image, tiny = read_image(base, wanted.path, 4 * SIDE, less=wanted.less, like=wanted.like)
+        image, tiny = read_image(base, request, 4 * SIDE)
     except ImageError:
         field = Image.new("RGB", (SIDE, SIDE), COLORS["paper"])
         ImageDraw.Draw(field).rectangle((0, 0, SIDE - 1, SIDE - 1), outline=COLORS["line"], width=3)

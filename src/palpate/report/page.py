@@ -40,7 +40,7 @@ from palpate.report.notes import sentence
 from palpate.report.records import GalleryItem, LeakPair, Strip
 from palpate.report.results import Results
 from palpate.report.tables import REAL, Cell, Head, Row, Table, families
-from palpate.report.thumbnails import Album, Wanted, fit
+from palpate.report.thumbnails import Album, ImageRequest, fit
 
 #: Samples of the first screen; their images take at most a third of the bytes.
 HERO_ROWS = 3
@@ -145,7 +145,7 @@ def render_page(
     columns = first_screen.telling_columns(by_family)
     cards = first_screen.cards(results, columns, results.controls)
     samples = gallery_images(results.gallery)
-    hero_rows: dict[Hashable, list[Wanted]] = {
+    hero_rows: dict[Hashable, list[ImageRequest]] = {
         id(item): images for item, images in samples[:HERO_ROWS]
     }
     script = _template("page.js")
@@ -157,7 +157,7 @@ def render_page(
         "caution": first_screen.caution(results),
         "facts": list(results.facts) or ([] if cards else findings.summary_lines(results)),
         "cards": cards,
-        "row_labels": [wanted.label for wanted in samples[0][1]] if samples else [],
+        "row_labels": [request.label for request in samples[0][1]] if samples else [],
         "studied": list(map(study.of_study, results.tables)),
         "families": by_family,
         "verdict": tables.grid(columns),
@@ -208,14 +208,14 @@ def render_page(
         budget -= excess + 1_000
 
 
-def image_rows(results: Results) -> tuple[dict[Hashable, list[Wanted]], int]:
+def image_rows(results: Results) -> tuple[dict[Hashable, list[ImageRequest]], int]:
     """Return all rows of images by key, the most important first, and how many are essential.
 
     Pairs take turns: every list of every audit shows its strongest pair before any shows its
     second. Keys are (audit, list, pair) and ``id`` of a gallery item.
     """
-    pairs: dict[Hashable, list[Wanted]] = {}
-    folded_pairs: dict[Hashable, list[Wanted]] = {}
+    pairs: dict[Hashable, list[ImageRequest]] = {}
+    folded_pairs: dict[Hashable, list[ImageRequest]] = {}
     lists = [
         (a, k, pair_list.pairs, audits.head_of(audit))
         for a, audit in enumerate(results.audits)
@@ -232,12 +232,12 @@ def image_rows(results: Results) -> tuple[dict[Hashable, list[Wanted]], int]:
     return dict([*first, *gallery[OPEN_ROWS:], *folded_pairs.items()]), len(first)
 
 
-def pair_images(pair: LeakPair, head: str) -> list[Wanted]:
+def pair_images(pair: LeakPair, head: str) -> list[ImageRequest]:
     """Photos above, tactile images below, test left; without photos, tactile images and contact."""
     samples = (("Test", pair.test), (head, pair.train))
     kinds = ("photo", "tactile image") if pair.has_photos else ("tactile image", "contact")
     return [
-        Wanted(
+        ImageRequest(
             s.vision if kind == "photo" else s.tactile,
             f"{name} {kind}: {where(s)}",
             f"{name} {kind}",
@@ -249,20 +249,20 @@ def pair_images(pair: LeakPair, head: str) -> list[Wanted]:
     ]
 
 
-def gallery_images(gallery: Sequence[GalleryItem]) -> list[tuple[GalleryItem, list[Wanted]]]:
+def gallery_images(gallery: Sequence[GalleryItem]) -> list[tuple[GalleryItem, list[ImageRequest]]]:
     """Every sample with its images, materials in turn; a column that no sample has is skipped.
 
     Where a background is known, the contacts follow: without the background, both amplified alike.
     """
-    rows: list[tuple[GalleryItem, list[Wanted]]] = []
+    rows: list[tuple[GalleryItem, list[ImageRequest]]] = []
     for item in in_turns(gallery):
         sample, background = item.sample, item.background or item.sample.background
         name = f"{sample.material or 'sample'}, {where(sample)}"
         tactile = (("Real", sample.tactile), ("Generated", item.generated))
-        images = [Wanted(sample.vision, f"Photo: {name}", "Photo")]
-        images += [Wanted(p, f"{kind} tactile image: {name}", kind) for kind, p in tactile]
+        images = [ImageRequest(sample.vision, f"Photo: {name}", "Photo")]
+        images += [ImageRequest(p, f"{kind} tactile image: {name}", kind) for kind, p in tactile]
         images += [
-            Wanted(
+            ImageRequest(
                 p and background and p,
                 f"{kind} contact: {name}",
                 f"{kind} contact",
@@ -278,7 +278,7 @@ def gallery_images(gallery: Sequence[GalleryItem]) -> list[tuple[GalleryItem, li
     return [(item, list(compress(images, present))) for item, images in rows]
 
 
-def _strip_images(strip: Strip) -> list[Wanted]:
+def _strip_images(strip: Strip) -> list[ImageRequest]:
     """The query, then what was retrieved; a text has no image."""
     texts = (strip.query_text, *(match.text for match in strip.matches))
     samples = (strip.query, *(match.sample for match in strip.matches))
@@ -286,7 +286,7 @@ def _strip_images(strip: Strip) -> list[Wanted]:
     labels = ["Query"]
     labels += [f"{m.similarity:.2f}{' right' if m.right else ''}" for m in strip.matches]
     return [
-        Wanted(
+        ImageRequest(
             None if text else getattr(sample, kind, None),
             text or f"{kind} image: {where(sample)}",
             label,

@@ -1,10 +1,13 @@
-"""Results and audits as text for a terminal: one row a score, so that names and notes have room."""
+"""Results and audits as plain text, for the terminal and for ``print`` in Python.
+
+Every score has a row of its own, so that its name, interval and notes have room.
+"""
 
 from __future__ import annotations
 
 import io
 from collections.abc import Sequence
-from itertools import pairwise
+from itertools import pairwise, takewhile
 
 from rich.console import Console
 from rich.table import Table as Grid
@@ -42,21 +45,30 @@ RANKED = "Best first on the same samples: > decided, ~ not decided"
 
 
 def print_result(result: Results | Audit, console: Console, style: Style = COMMAND_LINE) -> None:
-    """Print a result as wide as the console; of a study its tables instead of every score."""
+    """Print a result as wide as the console.
+
+    The result of a study is printed as its tables; they stand for the single scores.
+
+    Args:
+        result: scores and audits, or one audit.
+        console: where to print.
+        style: whether notes name options of the command line or arguments of Python.
+    """
     if isinstance(result, Audit):
         console.print(audit_text(result, style), markup=False, soft_wrap=True)
         return
-    for family in () if result.tables else families(result.scores, result.controls):
-        _print_table(listing(family), console, style)
-        if ranked := rankings(family):
-            _print_table(ranked, console, style)
-        elif family.differences:
-            _print_table(of_differences(family), console, style)
-        console.print()
+    if not result.tables:
+        for family in families(result.scores, result.controls):
+            _print_table(listing(family), console, style)
+            if ranked := rankings(family):
+                _print_table(ranked, console, style)
+            elif family.differences:
+                _print_table(of_differences(family), console, style)
+            console.print()
     for audit in result.audits:
         print_result(audit, console, style)
-    for table in map(of_study, result.tables):
-        _print_table(table, console, style)
+    for table in result.tables:
+        _print_table(of_study(table), console, style)
         console.print()
     if result.tables and result.scores:
         console.print(f"The {len(result.scores):,} scores behind them: Results.to_frame()\n")
@@ -65,7 +77,7 @@ def print_result(result: Results | Audit, console: Console, style: Style = COMMA
 
 
 def as_text(result: Results | Audit, width: int = 140) -> str:
-    """Return a result as text, in the wording of Python."""
+    """Return a result as text for ``print``; ``width`` in characters."""
     file = io.StringIO()
     print_result(result, Console(file=file, width=width, color_system=None), PYTHON)
     return "\n".join(line.rstrip() for line in file.getvalue().rstrip().splitlines())
@@ -84,7 +96,7 @@ def _print_table(table: Table, console: Console, style: Style) -> None:
 
 
 def _print_rows(heads: Sequence[Head], rows: Sequence[Sequence[str]], console: Console) -> None:
-    """Print rows as a table, or as lists where that is too wide."""
+    """Print rows as a table; where that is too wide, each as a list of ``head: text`` lines."""
     if not rows:
         return
     grid = Grid(box=None, pad_edge=False, padding=(0, 2, 0, 0))
@@ -92,14 +104,15 @@ def _print_rows(heads: Sequence[Head], rows: Sequence[Sequence[str]], console: C
         grid.add_column(Text(str(head)), justify="right" if head.scores else "left", no_wrap=True)
     for row in rows:
         grid.add_row(*map(Text, row))
-    wide = console.measure(grid, options=console.options.update(width=10_000)).maximum
-    if wide <= console.width:
+    unlimited = console.options.update(width=10_000)
+    if console.measure(grid, options=unlimited).maximum <= console.width:
         console.print(grid)
         return
-    names = next((k for k, head in enumerate(heads[:3]) if head.scores), min(3, len(heads)))
+    # The columns before the first score, three at most, name the row: they head its list.
+    first_score = len([*takewhile(lambda head: not head.scores, heads[:3])])
     for row in rows:
-        console.print(Text(", ".join(row[:names]), "bold"), soft_wrap=True)
-        pairs = zip(heads[names:], row[names:], strict=True)
+        console.print(Text(", ".join(row[:first_score]), "bold"), soft_wrap=True)
+        pairs = zip(heads[first_score:], row[first_score:], strict=True)
         _print_lines([f"  {head}: {text}" for head, text in pairs if text], console)
 
 
@@ -114,7 +127,11 @@ def _print_claims(claims: Sequence[Claim], console: Console) -> None:
 
 
 def audit_text(audit: Audit, style: Style = PYTHON) -> str:
-    """Return the finding, a line for each signal, the notes and what leaking costs."""
+    """Return an audit as lines of text.
+
+    They are the verdict, the shared groups and the time gap, a line for each signal of leaking, the
+    notes, how much leaking changes the scores, and the same of further audits.
+    """
     lines = [audit_line(audit), *(f"  {line}" for line in question_lines(audit))]
     if audit.groups_in_all:
         lines.append(
@@ -125,9 +142,11 @@ def audit_text(audit: Audit, style: Style = PYTHON) -> str:
         lines.append(f"  gap to the nearest train frame of the video: {gaps}")
     width = max((len(signal.kind) for signal in audit.signals), default=0)
     for signal in audit.signals:
-        share = f"{count(signal.flagged)} of {count(signal.checked)} ({percent(signal.fraction)})"
-        facts = [share, threshold_text(signal), *cause_texts(signal), chance_text(signal)]
-        facts = facts if signal.checked else ["none could be checked"]
+        facts = ["none could be checked"]
+        if signal.checked:
+            number = f"{count(signal.flagged)} of {count(signal.checked)}"
+            share = f"{number} ({percent(signal.fraction)})"
+            facts = [share, threshold_text(signal), *cause_texts(signal), chance_text(signal)]
         lines.append(f"  {signal.kind:<{width}}  {', '.join(filter(None, facts))}")
     lines += [f"  {kinds}: {sentence(note, style)}" for kinds, note in signal_notes(audit)]
     lines += [sentence(note, style) for note in audit.notes]
@@ -140,28 +159,45 @@ def audit_text(audit: Audit, style: Style = PYTHON) -> str:
 def rankings(family: Family) -> Table | None:
     """Return the generators of each metric from best to worst where three or more are compared.
 
-    ``>`` separates neighbors whose paired difference is decided (Holm's p under 0.05), ``~``
-    between the others. Metrics without a better direction have no row.
+    ``>`` separates neighbors whose paired difference is decided (Holm-adjusted p under 0.05), ``~``
+    the others. A metric of which neither low nor high is better has no row.
     """
     by_metric: dict[str, list[Score]] = {}
-    for d in family.differences:
-        by_metric.setdefault(with_arrow(d), []).append(d)
-    if max(map(len, by_metric.values()), default=0) < 3:
+    for difference in family.differences:
+        by_metric.setdefault(with_arrow(difference), []).append(difference)
+    if max(map(len, by_metric.values()), default=0) < 3:  # three generators make three pairs
         return None
-    orders = [(metric, _ranking(each)) for metric, each in by_metric.items()]
+    orders = [(metric, _ranking(pairs)) for metric, pairs in by_metric.items()]
     rows = [Row([Cell(metric), Cell(order)]) for metric, order in orders if order]
     return Table(RANKED, "", [Head("metric"), Head("best first")], rows) if rows else None
 
 
 def _ranking(differences: Sequence[Score]) -> str:
-    wins = dict.fromkeys([name for d in differences for name in (d.a, d.b or "")], 0)
-    apart: set[frozenset[str]] = set()
-    for d in differences:
-        better, p = d.details.get("p_better"), d.details.get("p_adjusted")
-        if better is not None:
-            wins[d.a if better > 0.5 else d.b or ""] += 1
-            apart |= {frozenset((d.a, d.b or ""))} if p is not None and p < 0.05 else set()
+    """Order generators by the number of paired comparisons that each wins: ``"b ~ c > a"``.
+
+    Args:
+        differences: of one metric, a pair of generators each. ``details`` hold ``p_better``, the
+            confidence in [0, 1] that ``a`` is better than ``b``, and ``p_adjusted``.
+
+    Returns:
+        The order; empty where no difference says which one is better.
+    """
+    wins: dict[str, int] = {}
+    decided: set[frozenset[str]] = set()
+    for difference in differences:
+        a, b = difference.a, difference.b or ""
+        wins.setdefault(a, 0)
+        wins.setdefault(b, 0)
+        better, p = difference.details.get("p_better"), difference.details.get("p_adjusted")
+        if better is None:
+            continue
+        wins[a if better > 0.5 else b] += 1
+        if p is not None and p < 0.05:
+            decided.add(frozenset((a, b)))
+    if not any(wins.values()):
+        return ""
     names = sorted(wins, key=lambda name: -wins[name])
-    signs = [">" if frozenset(pair) in apart else "~" for pair in pairwise(names)]
-    steps = (f" {sign} {name}" for sign, name in zip(signs, names[1:], strict=True))
-    return names[0] + "".join(steps) if any(wins.values()) else ""
+    order = names[0]
+    for pair in pairwise(names):
+        order += f" {'>' if frozenset(pair) in decided else '~'} {pair[1]}"
+    return order
