@@ -53,7 +53,7 @@ from palpate.encoders.encoder_set import EncoderSet, new_tactile
 from palpate.encoders.losses import in_chunks, three_way
 from palpate.encoders.models import to_unit
 from palpate.encoders.presets import preset_of
-from palpate.encoders.rows import Rows, augmented, draw, numbers, unit
+from palpate.encoders.rows import Rows, augmented, bytes_to_unit, draw_augmentation, factorize
 from palpate.training import engine
 from palpate.training.engine import Task, fit
 from palpate.training.options import Compute, RowOrder
@@ -71,7 +71,7 @@ class Images(Rows):
         side = MINI.image
         self.images = rng.integers(0, 256, (n, side, side, 3), dtype=np.uint8)
         self.captions = [", ".join(rng.choice(WORDS, 3, replace=False)) for _ in range(n)]
-        self.texts = numbers(self.captions)
+        self.caption_ids = factorize(self.captions)
         self.photo, self.without_photo = torch.arange(n), 0
         self.text, self.vision = (torch.randn(n, 128) for _ in range(2))
         self.text, self.vision = (t / t.norm(dim=1, keepdim=True) for t in (self.text, self.vision))
@@ -137,13 +137,13 @@ def overhead(steps=40):
         optimizer.zero_grad(set_to_none=True)
         step = Step(k, order(k), 0)
         index = torch.from_numpy(step.rows)
-        pixels = unit(torch.from_numpy(rows.images[step.rows]))
-        pixels = preprocess.normalize(augmented(pixels, draw(course.augment, step)))
+        pixels = bytes_to_unit(torch.from_numpy(rows.images[step.rows]))
+        pixels = preprocess.normalize(augmented(pixels, draw_augmentation(course.augment, step)))
         embedded = model.tactile(pixel_values=pixels).image_embeds
         embedded = embedded / embedded.norm(dim=1, keepdim=True)
         text, vision = rows.text[index], rows.vision[index]
         how = {"targets": "identical-text"}
-        scale, texts = model.log_scale.exp(), rows.texts[index]
+        scale, texts = model.log_scale.exp(), rows.caption_ids[index]
         total, _ = three_way(embedded, text, vision, scale, texts, **how)
         total.backward()
         torch.nn.utils.clip_grad_norm_(model.parameters(), 1.0)

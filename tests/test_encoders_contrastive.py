@@ -505,7 +505,7 @@ def test_losses_and_averaged_weights_are_those_of_the_loop_before_the_engine(wor
     log = fit(engine, task, options, tmp_path)
     text = torch.from_numpy(embed(train, clip, "text").features)
     losses, average = plain_loop(
-        plain, rows.images, text, rows.vision, rows.texts, TINY.preprocess, options
+        plain, rows.images, text, rows.vision, rows.caption_ids, TINY.preprocess, options
     )
     assert [line["step"] for line in log] == [0, 10, 20]
     for line in log:

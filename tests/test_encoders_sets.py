@@ -22,7 +22,7 @@ from palpate.encoders.embed import embed_images, embed_texts
 from palpate.encoders.encoder_set import EncoderSet, load_clip, new_tactile, tokens
 from palpate.encoders.models import pick_device, to_unit
 from palpate.encoders.presets import Augment, preset_of
-from palpate.encoders.rows import augmented, draw
+from palpate.encoders.rows import augmented, draw_augmentation
 from palpate.encoders.tokenizer import train_tokenizer
 from palpate.training.steps import Step
 
@@ -215,7 +215,7 @@ def test_augmentation():
     images = torch.rand(6, 3, 16, 16, generator=torch.Generator().manual_seed(0))
 
     def changed(augment, seed):
-        return augmented(images, draw(augment, Step(0, np.arange(len(images)), seed)))
+        return augmented(images, draw_augmentation(augment, Step(0, np.arange(len(images)), seed)))
 
     nothing = Augment(crop=0, gain=0, offset=0)
     assert torch.allclose(changed(nothing, 1), images, atol=1e-5)

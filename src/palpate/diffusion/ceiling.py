@@ -25,7 +25,7 @@ from palpate.diffusion.gels import gels_of, has_gels
 from palpate.encoders.embed import embed_images, words_of
 from palpate.encoders.encoder_set import EncoderSet
 from palpate.encoders.models import pick_device
-from palpate.encoders.rows import evenly, with_cells
+from palpate.encoders.rows import evenly_spaced, with_values
 from palpate.metrics.images import per_image
 from palpate.metrics.probe import fit_probe, material_accuracy
 from palpate.metrics.tactile import tmmd
@@ -78,9 +78,9 @@ def measure_reconstruction(
 
 
 def some_whole(part: Manifest, columns: Sequence[str], n: int) -> Manifest:
-    """Up to ``n`` samples, evenly, of those that have an image in each of these columns."""
-    complete = with_cells(part, *columns)
-    return complete.take([complete.ids[k] for k in evenly(len(complete), n)])
+    """Up to ``n`` samples, evenly spaced, of those that have an image in each of these columns."""
+    complete = with_values(part, *columns)
+    return complete.take([complete.ids[k] for k in evenly_spaced(len(complete), n)])
 
 
 def judge_of(
@@ -166,7 +166,7 @@ def measure_ceiling(
             interval = score.interval if real.groups else None
             scores |= {"tmmd": score.value, "tmmd_interval": interval}
         if len({*train.column("material")} - {None}) > 1:
-            some = evenly(len(train), FITTED)
+            some = evenly_spaced(len(train), FITTED)
             pixels = np.asarray(cached_images(train, "tactile", size, cache, progress)[some])
             with suppress(PalpateError):  # no material outside of train
                 fitted = features(train.take([train.ids[k] for k in some]), pixels)

@@ -25,7 +25,7 @@ from scipy import ndimage
 from palpate.core import Note, Progress, quiet
 from palpate.data.images import cached_images, read_image, square
 from palpate.data.manifest import Manifest
-from palpate.encoders.rows import evenly
+from palpate.encoders.rows import evenly_spaced
 from palpate.metrics.contact import marker_mask
 
 MEDIAN = 500  # images that a stock gel is the median of, at most
@@ -61,7 +61,7 @@ def gels_of(
     if like is not None:
         return np.broadcast_to(like[0], (len(part), size, size, 3))
     images = cached_images(part, "tactile", size, cache, progress)
-    stock = np.median(images[evenly(len(images), MEDIAN)], axis=0).astype(np.uint8)
+    stock = np.median(images[evenly_spaced(len(images), MEDIAN)], axis=0).astype(np.uint8)
     return np.broadcast_to(stock, images.shape)
 
 

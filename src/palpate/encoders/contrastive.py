@@ -54,12 +54,12 @@ from palpate.encoders.presets import Course, EncoderPreset, Targets, preset_of
 from palpate.encoders.rows import (
     Rows,
     augmented,
-    draw,
+    bytes_to_unit,
+    draw_augmentation,
+    factorize,
     load_samples,
-    numbers,
     train_part,
-    unit,
-    with_cells,
+    with_values,
 )
 from palpate.encoders.tokenizer import train_tokenizer
 from palpate.metrics.probe import material_accuracy
@@ -123,7 +123,7 @@ def train_encoder(
             source = load_clip(source)
         encoders = train_tactile(manifest, split, source, chosen, run.stage("tactile"))
         parts = [
-            with_cells(manifest.part(split, part), "tactile", "material")
+            with_values(manifest.part(split, part), "tactile", "material")
             for part in ("train", "test")
         ]
         if len(parts[1]) and len(set(parts[0].column("material"))) > 1:
@@ -199,15 +199,15 @@ class TactileLoss:
         """Return the loss of the three pairs, and each of them to log."""
         assert isinstance(module, TactileModel)
         scale = clamped_scale(module.log_scale)
-        images = augmented(unit(batch["images"]), batch)
+        images = augmented(bytes_to_unit(batch["images"]), batch)
         tactile = in_chunks(partial(self.encode, module), images, self.chunk)
         total, logs = three_way(
-            gather_rows(tactile, batch=len(batch["texts"])),
+            gather_rows(tactile, batch=len(batch["caption_ids"])),
             batch.get("text"),
             batch.get("vision"),
             scale,
-            batch["texts"],
-            photos=batch.get("photos"),
+            batch["caption_ids"],
+            photos=batch.get("has_photo"),
             targets=self.targets,
         )
         return Losses(total, {**logs, "scale": scale.detach()}, tactile.sum(dim=1))
@@ -388,7 +388,7 @@ def train_clip(
     where = pick_device(connect(str(run.device)))
     train = train_part(manifest, split)
     side = _sides(train)[0]
-    pictured, course = with_cells(train, side), _clip_course(preset)
+    pictured, course = with_values(train, side), _clip_course(preset)
     with fields_of("clip_course"):
         options = course.options(len(pictured), run.seed)
     with agreed():
@@ -406,23 +406,25 @@ def train_clip(
     else:
         clip = _copy_that_sees(start)
     clip.to(where)
-    preprocess, words, distinct = clip.preprocess("vision"), numbers(texts), sorted(set(texts))
+    preprocess = clip.preprocess("vision")
+    caption_ids, distinct = factorize(texts), sorted(set(texts))
 
     def load(step: Step) -> Batch:
-        pixels = torch.from_numpy(np.array(images[step.rows]))
-        every = words[torch.from_numpy(step.all_rows)]
-        batch = {"images": pixels, "phrase": every[step.mine], **draw(course.augment, step)}
-        return {**batch, "texts": every}
+        batch = draw_augmentation(course.augment, step)
+        batch["images"] = torch.from_numpy(np.array(images[step.rows]))
+        batch["caption_ids"] = caption_ids[torch.from_numpy(step.all_rows)]
+        batch["phrase"] = batch["caption_ids"][step.mine]
+        return batch
 
     def loss(module: nn.Module, batch: Batch) -> Losses:
-        pixels = preprocess(augmented(unit(batch["images"]), batch))
+        pixels = preprocess(augmented(bytes_to_unit(batch["images"]), batch))
         encoded = in_chunks(partial(encode_vision, module), pixels, run.compute.chunk)
         some, inverse = torch.unique(batch["phrase"], return_inverse=True)  # each text once
         text = encode_text(module, clip.tokenizer, [distinct[int(k)] for k in some])[inverse]
         text, scale = gather_rows(text), clamped_scale(clip.clip.logit_scale)
         with torch.autocast(encoded.device.type, enabled=False):
             vision, text = gather_rows(encoded).float(), text.float()
-            targets = text_targets(preset.targets, batch["texts"], text)
+            targets = text_targets(preset.targets, batch["caption_ids"], text)
             total = info_nce(vision, text, scale, targets)
         return Losses(total, {"scale": scale.detach()}, encoded.sum(dim=1))
 
@@ -477,7 +479,7 @@ def _sides(train: Manifest) -> list[str]:
 def _stamps(train: Manifest) -> list[str]:
     """What must not have changed on disk for a checkpoint to be continued."""
     sides = [*_sides(train), "background"]
-    return [image_stamp(with_cells(train, side), side) for side in sides]
+    return [image_stamp(with_values(train, side), side) for side in sides]
 
 
 def _facts(
