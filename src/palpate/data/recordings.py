@@ -22,7 +22,6 @@ from __future__ import annotations
 
 import posixpath
 import re
-from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -32,7 +31,7 @@ import polars as pl
 
 from palpate.core import NO_LEAK, Note, Split, few, require
 from palpate.data.manifest import IMAGE_COLUMNS, PART_NAMES, PATH, ROLE_OF, SCHEMA, Manifest
-from palpate.data.templates import Fields, Template
+from palpate.data.templates import Template
 
 LEVELS = ("object", "session", "video", "contact", "frame")
 #: Columns of names: those that inputs may have in common.
@@ -55,6 +54,8 @@ USUAL, LOOKED_AT = 0.95, 50_000
 FRAMES, SPREAD = 2, 100
 #: The fewest recordings a side that intervals and p-values are made of.
 LEAST = 8
+#: A column of paths, with a name that no field can have.
+MATCHED = "a path"
 #: What equal names of two inputs mean: the same, nothing, or (auto) what their sources say.
 Identity = Literal["auto", "names", "images"]
 
@@ -249,13 +250,17 @@ def name_recordings(manifests: Sequence[Manifest], template: str | None = None) 
         as they are.
     """
     bare = [_unread(m, manifests, stated=template is not None) for m in manifests]
-    names = [[] if own is None else _names_of(own) for own in bare]
-    rows, levels, source = _read([[n for n in own if n] for own in names if own], template)
+    schema = {PATH: pl.String, "input": pl.Int64}
+    names = pl.concat(
+        pl.DataFrame([] if own is None else {PATH: _names_of(own), "input": k}, schema)
+        for k, own in enumerate(bare)
+    )
+    fields, levels, source = _read(names, template)
     if not levels:
         return list(manifests)
     named = [
-        m if own is None else _filled(own, [rows.get(name or "") for name in paths], source)
-        for m, own, paths in zip(manifests, bare, names, strict=True)
+        m if own is None else _filled(own, fields.filter(names["input"] == k), source)
+        for k, (m, own) in enumerate(zip(manifests, bare, strict=True))
     ]
     return _with_sessions(named) if "HCT" in source else named
 
@@ -279,56 +284,83 @@ def _templates(manifest: Manifest) -> dict[str, str]:
     return {k: text for k, text in manifest.facts.items() if k.startswith("template_")}
 
 
-def _names_of(manifest: Manifest) -> list[str | None]:
+def _names_of(manifest: Manifest) -> pl.Series:
     """The paths of samples, without the place that a machine has them in; their ids without any."""
     table = manifest.table
     columns = (c for c in (PATH, "tactile", "vision") if c in table.columns and table[c].count())
     names = table[next(columns, "id")].str.replace_all("\\", "/", literal=True)
-    return names.str.replace(r"^(?:[A-Za-z]:)?(?:\.?/)+", "").to_list()
+    return names.str.replace(r"^(?:[A-Za-z]:)?(?:\.?/)+", "")
 
 
-def _read(
-    inputs: Sequence[Sequence[str]], template: str | None
-) -> tuple[dict[str, Fields], Sequence[str], str]:
-    """What the paths of some inputs say: path -> fields, their levels, and how they were read."""
-    paths = [path for own in inputs for path in own]
-    if not paths:
-        return {}, (), ""
-    usual = _usual(paths)
-    lists = [next((n for n, p in KNOWN.items() if re.fullmatch(p, path)), "") for path in usual]
-    if template is None and len(usual) and lists.count("") <= (1 - USUAL) * len(usual):
-        chosen = [name for name in KNOWN if name in lists]
-        patterns = [re.compile(KNOWN[name]) for name in chosen]
-        found = {p: next((m for own in patterns if (m := own.fullmatch(p))), None) for p in paths}
-        rows = {path: match.groupdict() for path, match in found.items() if match}
-        return rows, ("video", "frame"), f"file names of {', '.join(chosen)}"
-    if template is None and all(posixpath.splitext(path)[0].isdecimal() for path in usual):
-        return {}, (), ""  # bare numbers name no recording
+def _read(names: pl.DataFrame, template: str | None) -> tuple[pl.DataFrame, Sequence[str], str]:
+    """What the paths of some inputs say: fields of each, their levels, and how they were read."""
+    paths = names.filter(pl.col(PATH) != "")
+    if not len(paths):
+        return paths, (), ""
+    usual = _usual(paths[PATH])
+    counts = {n: usual.str.contains(f"^(?:{pattern})$").sum() for n, pattern in KNOWN.items()}
+    if template is None and sum(counts.values()) >= USUAL * len(usual):
+        chosen = [name for name, count in counts.items() if count]
+        tables = [_matched(re.compile(KNOWN[name]), names[PATH]) for name in chosen]
+        fields = tables[0].with_columns(
+            pl.col("frame").fill_null(table["frame"]) for table in tables[1:]
+        )
+        return fields, ("video", "frame"), f"file names of {', '.join(chosen)}"
+    some = usual.to_list()
+    if template is None and all(posixpath.splitext(path)[0].isdecimal() for path in some):
+        return paths, (), ""  # bare numbers name no recording
+    text = template or _suggested(some, paths)
+    parsed = Template.parse(text)
+    numbers = (pl.col(name).cast(pl.Int64).cast(pl.String) for name in parsed.digits)
+    rows = _matched(parsed.pattern, names[PATH]).with_columns(numbers)
+    rows = _apart(rows, parsed.fields).with_columns(names["input"])
+    levels = parsed.fields if template else _convincing(rows.drop_nulls(MATCHED), parsed)
+    kept = [name for name in parsed.fields if name in (*levels, "material")]
+    return rows.select(kept), levels, f"file names `{text}`"
+
+
+def _matched(pattern: re.Pattern[str], paths: pl.Series) -> pl.DataFrame:
+    """What a pattern says of paths, a column for each group; ``MATCHED`` is null for others."""
+    schema = dict.fromkeys((MATCHED, *pattern.groupindex), pl.String)
+    matches = (pattern.fullmatch(path) if path else None for path in paths.to_list())
+    none = (None,) * len(schema)
+    rows = [(match[0], *match.groups()) if match else none for match in matches]
+    return pl.DataFrame(rows, schema, orient="row")
+
+
+def _apart(rows: pl.DataFrame, fields: Sequence[str]) -> pl.DataFrame:
+    """The rows with videos and contacts of one name named apart."""
     from palpate.data.detection import name_apart
 
-    text = template or _suggested(usual, inputs)
-    parsed = Template.parse(text)
-    rows = {path: fields for path in paths if (fields := parsed.match(path)) is not None}
-    name_apart(list(rows.values()), parsed.fields)
-    levels = parsed.fields if template else _convincing(rows, inputs, parsed)
-    kept = [name for name in parsed.fields if name in (*levels, "material")]
-    rows = {path: {n: row[n] for n in kept if n in row} for path, row in rows.items()}
-    return rows, levels, f"file names `{text}`"
+    columns = [c for c in ("material", *LEVELS[:-1]) if c in fields]
+    if not columns:
+        return rows
+    distinct = rows.select(columns).unique(maintain_order=True)
+    cells = [{c: v for c, v in row.items() if v is not None} for row in distinct.to_dicts()]
+    name_apart(cells, fields)
+    apart = pl.DataFrame(cells, dict.fromkeys(columns, pl.String))
+    if apart.equals(distinct):
+        return rows
+    named = pl.concat([distinct, apart.rename("{}_apart".format)], how="horizontal")
+    rows = rows.join(named, on=columns, how="left", nulls_equal=True, maintain_order="left")
+    return rows.with_columns(pl.col(f"{c}_apart").alias(c) for c in columns)
 
 
-def _usual(paths: Sequence[str]) -> Sequence[str]:
+def _usual(paths: pl.Series) -> pl.Series:
     """The paths of the usual shape, of so many that they show it; all if there is none."""
-    some = paths[:: max(1, len(paths) // LOOKED_AT)]
-    shapes = {p: re.sub("[0-9]+", "0", re.sub("[A-Za-z]+", "a", p)) for p in some}
-    for shape in (shapes, {p: (p.count("/"), "." in posixpath.basename(p)) for p in some}):
-        usual, count = Counter(shape[p] for p in some).most_common(1)[0]
+    some = paths.gather_every(max(1, len(paths) // LOOKED_AT))
+    signs = some.str.replace_all("[A-Za-z]+", "a").str.replace_all("[0-9]+", "0")
+    depth = some.str.replace_all("[^/]*/", "/").str.replace_all("[^/.]", "")
+    depth = depth.str.replace_all(r"\.+", ".")  # folders, and whether there is a suffix
+    for shape in (signs, depth):
+        usual, count = shape.value_counts(sort=True).row(0)
         if count >= USUAL * len(some):
-            return [p for p in some if shape[p] == usual]
+            return some.filter(shape == usual)
     return some
 
 
-def _suggested(paths: Sequence[str], inputs: Sequence[Sequence[str]]) -> str:
-    """The template that paths suggest.
+def _suggested(usual: Sequence[str], paths: pl.DataFrame) -> str:
+    """The template that the usual of some paths suggest.
 
     Folders and endings that say what images show are ``*`` in it, as are folders of which every
     input has another one: they say where an input is.
@@ -338,12 +370,13 @@ def _suggested(paths: Sequence[str], inputs: Sequence[Sequence[str]]) -> str:
     roles = "|".join(ROLE_OF)
     folder = re.compile(rf"(?i)(?:(?:{roles}|images?|frames?)[_\-. ]?)+")
     end = re.compile(rf"(?i)(?<=[_\-. ])(?:{roles})(?=\.\w+$)")
-    own = [_folders(some) for some in map(set(paths).intersection, inputs) if some]
-    if len({match[0] for path in paths if (match := end.search(path))}) > 1:
-        paths = [end.sub("*", path) for path in paths]
+    inputs = paths.filter(pl.col(PATH).is_in(usual)).partition_by("input")
+    own = [_folders(table[PATH].to_list()) for table in inputs]
+    if len({match[0] for path in usual if (match := end.search(path))}) > 1:
+        usual = [end.sub("*", path) for path in usual]
     shown = {
         k
-        for k, values in enumerate(_folders(paths))
+        for k, values in enumerate(_folders(usual))
         if len(values) > 1
         and (
             all(map(folder.fullmatch, values))
@@ -351,9 +384,9 @@ def _suggested(paths: Sequence[str], inputs: Sequence[Sequence[str]]) -> str:
         )
     }
     if shown:
-        split = (path.split("/") for path in paths)
-        paths = ["/".join("*" if k in shown else n for k, n in enumerate(own)) for own in split]
-    return template_of(paths)
+        split = (path.split("/") for path in usual)
+        usual = ["/".join("*" if k in shown else n for k, n in enumerate(own)) for own in split]
+    return template_of(usual)
 
 
 def _folders(paths: Iterable[str]) -> list[set[str]]:
@@ -361,9 +394,7 @@ def _folders(paths: Iterable[str]) -> list[set[str]]:
     return [set(names) for names in zip(*(p.split("/")[:-1] for p in paths), strict=False)]
 
 
-def _convincing(
-    rows: Mapping[str, Fields], inputs: Sequence[Sequence[str]], template: Template
-) -> list[str]:
+def _convincing(rows: pl.DataFrame, template: Template) -> list[str]:
     """The levels that names show: those of which numbers run, or that a word names.
 
     A name that differs between inputs alone is that of an input.
@@ -371,16 +402,11 @@ def _convincing(
     from palpate.data.detection import MEANING
 
     fields = [name for name in LEVELS if name in template.fields]
-    cells = [
-        [k, *map(rows[p].get, fields)] for k, own in enumerate(inputs) for p in own if p in rows
-    ]
-    schema = ["input", *fields]
-    table = pl.DataFrame(cells, dict.fromkeys(schema, pl.String), orient="row", strict=False)
     levels: list[str] = []
     for level in (name for name in fields if name != "frame"):
         word = rf"(?i)(?<![a-z])(?:{'|'.join(MEANING[level])})[^A-Za-z0-9{{}}/]*\{{{level}\b"
-        groups = table.drop_nulls(level).group_by(level)
-        varied = table.group_by("input").agg(pl.col(level).n_unique())[level].max()
+        groups = rows.drop_nulls(level).group_by(level)
+        varied = rows.group_by("input").agg(pl.col(level).n_unique())[level].max()
         if "frame" in fields:
             number = pl.col("frame").cast(pl.Int64)
             sizes = groups.agg(n=pl.len(), span=number.max() - number.min())
@@ -394,17 +420,16 @@ def _convincing(
     return [*levels, *(["frame"] if "frame" in fields and levels else [])]
 
 
-def _filled(manifest: Manifest, rows: Sequence[Fields | None], source: str) -> Manifest:
+def _filled(manifest: Manifest, fields: pl.DataFrame, source: str) -> Manifest:
     """The samples with what their names say in the columns that are empty."""
     table, facts = manifest.table, dict(manifest.facts)
     columns: list[pl.Series] = []
-    for name in dict.fromkeys(name for row in rows if row for name in row):
-        if name in SCHEMA and not table[name].count():
-            values = pl.Series(name, [row and row.get(name) for row in rows], pl.String)
+    for values in fields:
+        name = values.name
+        if name in SCHEMA and values.count() and not table[name].count():
             columns.append(values.cast(SCHEMA[name], strict=False))
             facts[f"{name}_from"] = source
-    table = table.with_columns(columns)
-    return replace(manifest, table=table, facts=facts)
+    return replace(manifest, table=table.with_columns(columns), facts=facts)
 
 
 def _with_sessions(manifests: Sequence[Manifest]) -> list[Manifest]:
