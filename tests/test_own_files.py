@@ -189,7 +189,7 @@ def empty(folder):
     ("name", "damage"), [*product(("a.npy", "a.npy.sha256"), DAMAGES), ("a.npy.sha256", inflate)]
 )
 def test_a_damaged_cache_is_made_again_and_says_so(tmp_path, monkeypatch, name, damage):
-    monkeypatch.setattr("palpate.core.whole.BLOCK", 64)  # of several blocks
+    monkeypatch.setattr("palpate.core.caches.BLOCK", 64)  # of several blocks
     made, said, array = [], [], np.arange(100.0)
 
     def make(part):

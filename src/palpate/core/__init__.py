@@ -1,5 +1,18 @@
-"""The vocabulary that every room shares; needs NumPy alone."""
+"""What every room uses. Importing it loads NumPy, no other library.
 
+- ``messages``: errors (``PalpateError``, raised by ``require``), notes, problems of the input,
+  progress; ``few`` and ``problem_lines`` shorten lists for them.
+- ``files``: files that are whole or absent (``atomic_path``, ``write_json``), and read with checks
+  (``read_json``, ``read_record``); digests (``short``: their first digits); random numbers of a
+  sample (``rng_for``). ``sealed`` and ``unsealed`` add and check an object's own digest, ``inside``
+  checks that a path stays in its root, ``got_and_fix`` says in an error what palpate wrote there.
+- ``caches``: files that palpate reads back, each with its digest beside it.
+- ``images``: image files, opened in one way and by fixed rules.
+- ``features``, ``score``: what metrics compare, and what they return.
+- ``split``: which samples are of train, val and test.
+"""
+
+from palpate.core.caches import cached, is_whole, sealed_path
 from palpate.core.features import FeatureSet
 from palpate.core.files import (
     atomic_folder,
@@ -10,8 +23,8 @@ from palpate.core.files import (
     digest_json,
     digest_lines,
     fact_lines,
+    got_and_fix,
     inside,
-    instead,
     locked,
     plain,
     read_json,
@@ -47,7 +60,6 @@ from palpate.core.messages import (
 )
 from palpate.core.score import Measure, Score, require_comparable
 from palpate.core.split import NO_LEAK, PARTS, Split
-from palpate.core.whole import cached, is_whole, sealed_path
 
 __all__ = [
     "NO_LEAK",
@@ -77,9 +89,9 @@ __all__ = [
     "fact_lines",
     "few",
     "fields_of",
+    "got_and_fix",
     "image_bytes",
     "inside",
-    "instead",
     "is_whole",
     "locked",
     "open_image",

@@ -5,7 +5,7 @@ over canonical forms: equal content has one name, and a random draw depends on (
 sample), never on order.
 
 What palpate reads back is checked before it is believed: an object in JSON holds its own digest,
-see :func:`sealed`; for other files see :mod:`palpate.core.whole`.
+see :func:`sealed`; for other files see :mod:`palpate.core.caches`.
 """
 
 from __future__ import annotations
@@ -381,15 +381,15 @@ def read_json(path: Path, role: str) -> Any:
     except FileNotFoundError:
         got, fix = f"no file {path}", "Check the path"
         if Path(path).name in MARKS:
-            got, fix = instead(Path(path).parent, got, fix)
+            got, fix = got_and_fix(Path(path).parent, got, fix)
         raise PalpateError(f"The {role} must exist", got, fix) from None
     except IsADirectoryError:
-        got, fix = instead(Path(path), f"the folder {path}", "Name the file itself")
+        got, fix = got_and_fix(Path(path), f"the folder {path}", "Name the file itself")
         raise PalpateError(f"The {role} must be a file", got, fix) from None
     except (ValueError, RecursionError) as error:  # no JSON, no UTF-8, nested too deep
         got, fix = str(error), "Write it again with palpate"
         if isinstance(error, UnicodeDecodeError):  # no text at all: it may be a manifest
-            got, fix = instead(Path(path), got, fix)
+            got, fix = got_and_fix(Path(path), got, fix)
         raise PalpateError(f"The {role} {path} must be JSON", got, fix) from None
 
 
@@ -417,7 +417,7 @@ def read_record(
         got = repr(record.get("format"))
         fix = "Name another one, or install the release of palpate that wrote it"
         if _VERSION.sub("", str(record.get("format"))) != _VERSION.sub("", forms[0]):
-            got, fix = instead(Path(path), got, fix)
+            got, fix = got_and_fix(Path(path), got, fix)
         raise PalpateError(f"The {role} {path} must have the format {forms[0]}", got, fix)
     if missing := [name for name in keys if name not in record]:
         must = f"The {role} {path} must have the keys {', '.join(keys)}"
@@ -437,8 +437,11 @@ def kind_of(path: Path) -> tuple[str, str] | None:
     return READERS["palpate-manifest"] if there else None
 
 
-def instead(path: Path, got: str, fix: str) -> tuple[str, str]:
-    """What an error says was given, and to do: of what palpate wrote, what it is and is for."""
+def got_and_fix(path: Path, got: str, fix: str) -> tuple[str, str]:
+    """Return ``got`` and ``fix`` of an error about a path that holds something else than it must.
+
+    If palpate wrote it, they say what it is and which command reads it.
+    """
     if (kind := kind_of(path)) is None:
         return got, fix
     return f"{path}, {kind[0]}", f"Name another one: this is for {kind[1]}"

@@ -1,4 +1,8 @@
-"""Dataclasses from JSON, checked by the types of their fields."""
+"""Dataclasses read from JSON: every value is checked against the annotated type of its field.
+
+Types may be ``str``, ``bool``, ``int``, ``float``, ``Literal``, ``Any``, dataclasses, and of these
+``Sequence``, ``Mapping``, ``tuple`` of a fixed length, and unions.
+"""
 
 from __future__ import annotations
 
@@ -10,17 +14,18 @@ from types import UnionType
 from typing import Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
 
 T = TypeVar("T")
-#: JSON has numbers of any size; no count of ours is larger.
+#: Numbers from here on are refused: JSON has them of any size, NumPy and polars of 64 bits.
 LARGEST = 2**63
 
 
 def from_plain(cls: type[T], data: Any) -> T:
-    """Return the inverse of :func:`palpate.core.plain`, also for nested dataclasses.
+    """Build a dataclass from parsed JSON: the inverse of :func:`palpate.core.plain`.
 
-    A field whose class has a method ``from_json`` is read by it.
+    Nested dataclasses are built as well, by their own ``from_json`` where they have one.
 
     Raises:
-        ValueError: on a missing, unknown or wrong field, with its name.
+        ValueError: on a missing, unknown or wrong field. Its text names the field and says what is
+            there, so that an error can go on with it after "Got".
     """
     hints = _hints(cls)
     if not isinstance(data, Mapping):
@@ -28,7 +33,7 @@ def from_plain(cls: type[T], data: Any) -> T:
     if unknown := sorted(set(data) - set(hints)):
         raise ValueError(f"unknown field {unknown[0]}")
     try:
-        return cls(**{name: _value(hints[name], value, name) for name, value in data.items()})
+        return cls(**{name: _typed(hints[name], value, name) for name, value in data.items()})
     except TypeError as error:  # a field is missing
         raise ValueError(str(error)) from None
 
@@ -38,8 +43,12 @@ def _hints(cls: type) -> dict[str, Any]:
     return get_type_hints(cls)
 
 
-def _value(hint: Any, value: Any, name: str) -> Any:
-    """``value`` as the type ``hint``."""
+def _typed(hint: Any, value: Any, name: str) -> Any:
+    """Convert the value of the field ``name`` to the type ``hint``.
+
+    Raises:
+        ValueError: if it has another type.
+    """
     origin, inner = get_origin(hint), get_args(hint)
     if hint is Any:
         return value
@@ -47,10 +56,10 @@ def _value(hint: Any, value: Any, name: str) -> Any:
         if value is None and type(None) in inner:
             return None
         *first, last = (kind for kind in inner if kind is not type(None))
-        for kind in first:  # the first that fits, such as a text or a record
+        for kind in first:
             with suppress(ValueError):
-                return _value(kind, value, name)
-        return _value(last, value, name)
+                return _typed(kind, value, name)
+        return _typed(last, value, name)  # if this type does not fit either, its error is raised
     if dataclasses.is_dataclass(hint):
         try:
             kind: Any = hint
@@ -58,18 +67,18 @@ def _value(hint: Any, value: Any, name: str) -> Any:
         except (AttributeError, TypeError):
             raise ValueError(f"{name} that holds no object") from None
     if origin is tuple and isinstance(value, list | tuple) and len(value) == len(inner):
-        return tuple(_value(kind, item, name) for kind, item in zip(inner, value, strict=True))
+        return tuple(_typed(kind, item, name) for kind, item in zip(inner, value, strict=True))
     if origin is Sequence and isinstance(value, list | tuple):
-        return [_value(inner[0], item, name) for item in value]
+        return [_typed(inner[0], item, name) for item in value]
     if origin is Mapping and isinstance(value, Mapping):
-        return {key: _value(inner[1], item, name) for key, item in value.items()}
-    if _is(hint, value):
+        return {key: _typed(inner[1], item, name) for key, item in value.items()}
+    if _has_type(hint, value):
         return value
     raise ValueError(f"{name} of type {type(value).__name__}")
 
 
-def _is(hint: Any, value: Any) -> bool:
-    """Whether ``value`` is of a simple JSON type; an int is a float, a bool is no number."""
+def _has_type(hint: Any, value: Any) -> bool:
+    """Whether ``value`` has the scalar type ``hint``; an int is a float, a bool is no number."""
     if hint in (int, float):
         kinds = int if hint is int else int | float
         return isinstance(value, kinds) and not isinstance(value, bool) and abs(value) < LARGEST

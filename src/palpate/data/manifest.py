@@ -47,8 +47,8 @@ from palpate.core import (
     atomic_path,
     digest_lines,
     fact_lines,
+    got_and_fix,
     inside,
-    instead,
     require,
 )
 from palpate.core.messages import require_rows
@@ -313,7 +313,7 @@ class Manifest:
         fix = "Write one with: palpate import"
         if not path.is_file():
             raise PalpateError(
-                "The manifest must exist", *instead(path.parent, f"no file {path}", fix)
+                "The manifest must exist", *got_and_fix(path.parent, f"no file {path}", fix)
             )
         try:
             meta = _metadata(path)

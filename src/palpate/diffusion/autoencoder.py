@@ -38,7 +38,7 @@ from palpate.core import (
     PalpateError,
     digest_file,
     digest_json,
-    instead,
+    got_and_fix,
     read_json,
     read_record,
     require,
@@ -382,7 +382,7 @@ def load_autoencoder(source: str | Path) -> AnyAutoencoder:
     kind = about.get("_class_name") if isinstance(about, dict) else None
     must = f"The autoencoder {source} must be a diffusers VQModel, or of palpate"
     if kind not in KINDS:
-        got, fix = instead(root, f"{kind or 'no'} model in {config.name}", FIX)
+        got, fix = got_and_fix(root, f"{kind or 'no'} model in {config.name}", FIX)
         raise PalpateError(must, got, fix)
     local = name == str(root)
     net = load_model(KINDS[kind], name, must, FIX, low_cpu_mem_usage=False, local_files_only=local)

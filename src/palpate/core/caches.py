@@ -1,7 +1,8 @@
 """Caches and checkpoints, which palpate reads back: checked before they are believed.
 
 The digest of such a file, ``NAME``, lies beside it in ``NAME.sha256``, one line of 64 hex digits:
-SHA-256 over those of its blocks of 64 MB. Lines below it are of the files before.
+SHA-256 over the digests of its blocks of 64 MiB. The lines below it are of earlier versions of the
+file.
 """
 
 from __future__ import annotations
