@@ -1,5 +1,8 @@
 """Lists and tables as people have them: other machines, encodings, repeated rows, flags."""
 
+import json
+import re
+import shlex
 import unicodedata
 
 import polars as pl
@@ -12,6 +15,7 @@ from palpate.core import files
 from palpate.data import tables
 from palpate.data.importing import import_dataset, validate
 from palpate.data.listing import read_list
+from palpate.data.manifest import Manifest
 from palpate.data.mapping import compile_maps
 from palpate.data.reading import load, read
 from palpate.leakage import audit
@@ -319,6 +323,88 @@ def test_a_table_that_pairs_images_of_its_folder_goes_before_their_names(tmp_pat
     (tmp_path / "pairs.csv").write_text("Photo;Touch\na.png;b.png\n")  # of other images
     assert {*load(tmp_path).table.select("vision", "tactile").iter_rows()} == {
         (f"photo/{k}.png", f"touch/{k}.png") for k in range(4)
+    }
+
+
+PHOTOS, TOUCHES = ([f"img/{sign}{7 * k + 3}.png" for k in range(6)] for sign in "xq")
+PAIRS = [*zip(PHOTOS, TOUCHES, strict=True)]
+#: Name of a table -> its text; the names of its images say nothing.
+TABLES = {
+    "nested.json": [
+        {"object": k, "pairs": [{"rgb": a, "gel": b}]} for k, (a, b) in enumerate(PAIRS)
+    ],
+    "keyed.json": {a: {"camera": {"path": a, "size": 9}, "touch": {"path": b}} for a, b in PAIRS},
+    "lines.jsonl": "\n".join(json.dumps({"photo": {"file": a}, "gel": b}) for a, b in PAIRS),
+    "lists.json": {"pairs": PAIRS},
+    "images.json": [{"images": pair, "object": "cup"} for pair in PAIRS],
+    "dictionary.json": dict(PAIRS),
+    "Liste.csv": "Bild;Tastbild;Objekt\n" + "".join(f"{a};{b};Schlüssel\n" for a, b in PAIRS),
+}
+
+
+@pytest.mark.parametrize("name", TABLES)
+def test_a_table_that_names_two_images_a_row_pairs_them_or_asks(tmp_path, name, capsys):
+    """Where nothing says which side is which, the answer is the table with a choice of columns."""
+    write_images(tmp_path / "own", [*PHOTOS, *TOUCHES])
+    data = TABLES[name] if isinstance(TABLES[name], str) else json.dumps(TABLES[name])
+    (tmp_path / "own" / name).write_bytes(data.encode("cp1252"))
+    decided = name in ("nested.json", "keyed.json", "lines.jsonl")
+    for source in ("own", f"own/{name}") if not decided else ("own",):
+        command = ["import", str(tmp_path / source), "-o", str(tmp_path / "out"), "--overwrite"]
+        assert main(command) == (0 if decided else 2)
+        answers = re.findall("(?m)^  (palpate .*)$", capsys.readouterr().err)
+        assert len(answers) == 2 * (not decided)
+        for answer, step in zip(
+            answers or [shlex.join(["palpate", *command])], (1, -1), strict=False
+        ):
+            assert main(shlex.split(answer)[1:]) == 0
+            table = Manifest.load(tmp_path / "out").require_valid().table
+            pairs = {pair[::step] for pair in PAIRS}
+            assert {*table.select("vision", "tactile").iter_rows()} == pairs
+    if not decided:  # an audit does not take them for photos, either
+        fails("must be read by its table", audit, tmp_path / "own", tmp_path / "own")
+
+
+def test_images_in_a_list_are_pairs_only_if_they_differ_in_more_than_numbers(tmp_path):
+    lists = [[f"v{k}/{n}.png" for n in range(2)] for k in range(3)]
+    (tmp_path / "a.json").write_text(json.dumps({"train": lists}))
+    assert len(read(tmp_path / "a.json").manifest) == 6
+    talk = [{"image": PHOTOS[0], "talk": [{"from": "a", "value": "b"}] * 2}]
+    (tmp_path / "a.json").write_text(json.dumps(talk))
+    assert len(read(tmp_path / "a.json").manifest) == 1
+
+
+def test_a_table_in_each_session_is_read_and_what_none_names_is_counted(tmp_path):
+    for s in range(3):
+        write_images(tmp_path / f"s{s}", [*PHOTOS, *TOUCHES], 8 * s + 1)
+        rows = "".join(f"{a},{b},m{s}\n" for a, b in PAIRS)
+        (tmp_path / f"s{s}" / "index.csv").write_text("rgb,gel,material\n" + rows)
+    write_images(tmp_path / "s3", PHOTOS)
+    result = read(tmp_path)
+    wanted = {(f"s{s}/{a}", f"s{s}/{b}", f"m{s}") for s in range(3) for a, b in PAIRS}
+    table = result.manifest.table
+    assert {*table.select("vision", "tactile", "material").iter_rows()} == wanted
+    (left,) = (p.text for p in result.suspicious if p.kind == "unmatched")
+    assert "s3/img/x3.png" in left
+
+
+@pytest.mark.parametrize("written", ["{p}", "/home/ann/set/{p}", "{p},3"])
+def test_lists_beside_the_images_are_their_split(tmp_path, written):
+    paths = [
+        f"disk{d}/v{v}/{s}/{k}.png"
+        for d in "AB"
+        for v in range(3)
+        for k in range(2)
+        for s in ("rgb", "gel")
+    ]
+    write_images(tmp_path, paths)
+    for part, videos in (("train", "01"), ("test", "2")):
+        own = [p for p in paths if p.split("/")[1][1] in videos and "rgb" in p]
+        (tmp_path / f"{part}.txt").write_text("".join(f"{written.format(p=p)}\n" for p in own))
+    split = read(tmp_path).splits["Orig"]
+    assert split.counts() == {"train": 8, "test": 4}
+    assert {i for i, part in split.parts.items() if part == "test"} == {
+        f"disk{d}/v2/{k}" for d in "AB" for k in range(2)
     }
 
 

@@ -10,9 +10,10 @@ what the samples lack. A table that fits nothing is reported.
 from __future__ import annotations
 
 import posixpath
-import re
-from collections.abc import Sequence
+from collections import Counter
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
+from functools import cache
 from itertools import product
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -21,10 +22,11 @@ import polars as pl
 
 from palpate.core import PalpateError, Split, few
 from palpate.data.images import SUFFIXES
-from palpate.data.manifest import PART_NAMES, ROLES, SIDES
+from palpate.data.manifest import PART_NAMES, SIDES
 from palpate.data.mapping import LINE
-from palpate.data.rows import is_there, relocated, some
-from palpate.data.tables import TABLES, Table, open_table
+from palpate.data.rows import TRIED, is_there, relocated, some, spelled
+from palpate.data.tables import TABLES, Table, headless_names, names_images, open_table, pairings
+from palpate.data.templates import walk
 
 if TYPE_CHECKING:
     from palpate.data.scanning import Cells, Scan
@@ -38,69 +40,94 @@ SYNONYMS = {
 FILLED = ("object", "session", "material", "text", "sensor", "domain", "video", "contact", "split")
 #: Fields that a column may name, and the share of rows that a column must name images in.
 FIELDS, SHARE = ("object", "video", "session", "contact"), 0.5
+#: Suffixes of lists, besides those of tables.
+LISTS = (".txt", ".lst")
 
 
-def adjacent_tables(folder: Path) -> list[Path]:
-    """The tables in a folder, and the one next to it that has its name."""
-    own = sorted(p for p in folder.iterdir() if p.suffix.lower() in TABLES and p.is_file())
-    named = folder.resolve()
-    return own + [p for s in TABLES if (p := named.with_name(named.name + s)).is_file()]
-
-
-def tables_of_pairs(folder: Path) -> dict[Path, dict[str, str]]:
-    """The tables next to the images of a folder that pair photos and tactile images of it.
+def adjacent_tables(folder: Path) -> list[tuple[Path, str]]:
+    """The tables and lists in a folder and below it, and the table next to it that has its name.
 
     Returns:
-        File -> side -> its column; none where the columns have the names of the sides.
+        Files, and the folder that each lies in, below the first and with a slash. Of a kind that
+        samples have one each of there are none.
     """
-    pairs: dict[Path, dict[str, str]] = {}
-    for path in adjacent_tables(folder):
+    names = [name for suffix in (*TABLES, *LISTS) for name in walk(folder, (suffix,))[0]]
+    often = Counter(Path(name).suffix.lower() for name in names)
+    own = [name for name in names if often[Path(name).suffix.lower()] <= TRIED]
+    tables = [(folder / name, name[: name.rfind("/") + 1]) for name in own]
+    tables = [t for t in tables if t[0].suffix.lower() in TABLES or headless_names(t[0])]
+    named = folder.resolve()
+    return tables + [(p, "") for s in TABLES if (p := named.with_name(named.name + s)).is_file()]
+
+
+def tables_of_pairs(
+    folder: Path, stated: Mapping[str, str]
+) -> dict[Path, tuple[str, list[dict[str, str]]]]:
+    """The tables next to the images of a folder that pair photos and tactile images of it.
+
+    Args:
+        folder: the folder.
+        stated: map expressions, of which the sides are columns if there are any.
+
+    Returns:
+        File -> the folder that its paths start in; and columns by which it may be read, one or, if
+        nothing says which one shows what, several; none where the columns have the sides' names.
+    """
+    pairs: dict[Path, tuple[str, list[dict[str, str]]]] = {}
+    for path, below in adjacent_tables(folder):
         with suppress(PalpateError):
             table = open_table(path)
-            own = {side: side for side in SIDES if side in table.names}
-            columns = own if len(own) == len(SIDES) else _columns_of_sides(table)
-            if len(columns) == len(SIDES):
-                cells = table.read([*columns.values()])
-                below = path.parent == folder if columns == own else _pairs_images(cells, folder)
-                tactile = cells[columns["tactile"]].drop_nulls()
-                if len(tactile) and (below or relocated(tactile, folder)):
-                    named = {SYNONYMS[n.lower()]: n for n in table.names if n.lower() in SYNONYMS}
-                    pairs[path] = {} if columns == own else named | columns
+            fits = {stated[side] for side in SIDES if stated} <= {*table.names}
+            ways = ([dict(stated)] if fits else []) if stated else pairings(table)
+            if {*SIDES} <= {*table.names} and not stated:
+                ways = [dict(zip(SIDES, SIDES, strict=True))]
+            columns = {way[side] for way in ways for side in SIDES}
+            cells = [c.drop_nulls().to_list() for c in table.read([*columns]) if c.name in columns]
+            starts = [
+                s
+                for s in dict.fromkeys((below, ""))
+                if all(_any_there(folder / s, c) for c in cells)
+            ]
+            if columns and (starts or all(relocated(c, folder) for c in cells)):
+                named = {SYNONYMS[n.lower()]: n for n in table.names if n.lower() in SYNONYMS}
+                own = [{} if way["vision"] == "vision" else named | way for way in ways]
+                pairs[path] = starts[0] if starts else "", own
     return pairs
 
 
-def _columns_of_sides(table: Table) -> dict[str, str]:
-    """Side -> the only column that a word of the side names."""
-    words = {name: {*re.findall("[a-z]+", name.lower())} for name in table.names}
-    named = {side: [n for n in words if words[n] & {*ROLES[side]}] for side in SIDES}
-    return {side: names[0] for side, names in named.items() if len(names) == 1}
-
-
-def _pairs_images(cells: pl.DataFrame, folder: Path) -> bool:
-    """Whether each column of a table names images that are below a folder."""
-    columns = [cells[name].drop_nulls().to_list() for name in cells.columns if name != LINE]
-    return all(any(is_there(folder, path) for path in some(paths)) for paths in columns)
+def _any_there(root: Path, paths: Sequence[str]) -> bool:
+    return any(is_there(root, path) for path in some(paths))
 
 
 def join_tables(result: Scan, rows: Sequence[tuple[str, Cells]]) -> None:
     """Fill the rows of a folder from the tables next to them; the parts of lists become splits."""
-    for path in adjacent_tables(result.base):
+    keys = cache(lambda below: _keys(rows, _key(below)))
+    for path, below in adjacent_tables(result.base):
         try:
             table = open_table(path)
             names = list(dict.fromkeys(n for n in table.names if n and n not in table.nested))
             frame = table.read(names)
+            for name in filter(lambda name: names_images(frame[name]), names):
+                places = relocated(frame[name].drop_nulls(), result.base / below)
+                frame = frame.with_columns(pl.col(name).replace(places)) if places else frame
         except PalpateError as error:
             result.suspect(path, "unread-table", f"not read: {error.got}")
             continue
-        _join(result, rows, path, table, frame)
+        if (part := PART_NAMES.get(path.stem.lower())) and "split" not in names:
+            frame = frame.with_columns(split=pl.lit(part))
+        _join(result, rows, keys(below), table, frame)
     if len(result.splits) == 1:
         result.splits = {"Orig": result.splits.popitem()[1]}
 
 
 def _join(
-    result: Scan, rows: Sequence[tuple[str, Cells]], path: Path, table: Table, frame: pl.DataFrame
+    result: Scan,
+    rows: Sequence[tuple[str, Cells]],
+    keys: Mapping[str, Mapping[str, list[int]]],
+    table: Table,
+    frame: pl.DataFrame,
 ) -> None:
-    keys = _keys(rows)
+    path = Path(table.name)
     targets = {c: SYNONYMS.get(c.lower(), c.lower()) for c in frame.columns if c != LINE}
     naming = {
         column: frame[column].drop_nulls().unique().map_elements(_key, pl.String)
@@ -141,7 +168,7 @@ def _join(
             elif row.get(target) is None:
                 row[target] = value
     if split := {i: part for i, part in parts.items() if part}:
-        result.splits[path.stem] = Split(split, {"method": "official", "files": [path.name]})
+        _add_split(result, path, split)
     text = f"{', '.join(dict.fromkeys(targets.values())) or 'nothing'} of {len(filled)} of "
     text += f"{len(rows)} samples, by its column {column}"
     result.suspect(path, "joined-table", text)
@@ -151,8 +178,22 @@ def _join(
     result.suspect(path, "of-no-image", text, unknown)
 
 
-def _keys(rows: Sequence[tuple[str, Cells]]) -> dict[str, dict[str, list[int]]]:
-    """Form of a name -> name -> the rows that it names; names of several images are left out."""
+def _add_split(result: Scan, path: Path, split: Mapping[str, str]) -> None:
+    """Add a split of a table; lists that are named as parts are of one."""
+    name = "Orig" if path.stem.lower() in PART_NAMES else path.stem
+    before, files = dict[str, str](), [path.name]
+    if name in result.splits:
+        before = dict(result.splits[name].parts)
+        files = [*result.splits[name].rule["files"], *files]
+    twice = {i for i, part in split.items() if before.get(i, part) != part}
+    text = f"{len(twice)} samples are of another part, too, and so of none"
+    result.suspect(path, "two-parts", text, sorted(twice))
+    parts = {i: part for i, part in {**before, **split}.items() if i not in twice}
+    result.splits[name] = Split(parts, {"method": "official", "files": files})
+
+
+def _keys(rows: Sequence[tuple[str, Cells]], below: str) -> dict[str, dict[str, list[int]]]:
+    """Form of a name -> name -> the rows below a folder that it names; of several images none."""
     forms: dict[str, dict[str, list[int]]] = {}
 
     def add(form: str, name: str, k: int) -> None:
@@ -161,13 +202,15 @@ def _keys(rows: Sequence[tuple[str, Cells]]) -> dict[str, dict[str, list[int]]]:
             places.append(k)
 
     for k, (_, row) in enumerate(rows):
-        for path in (_key(row[side]) for side in ("vision", "tactile") if row.get(side)):
+        paths = [_key(row[side]) for side in SIDES if row.get(side)]
+        paths = [path.removeprefix(below) for path in paths if path.startswith(below)]
+        for path in paths:
             *folders, name = path.split("/")
             add("path", path, k)
             add("file name", name, k)
             for depth, folder in enumerate(folders):
                 add(f"folder {depth}", folder, k)
-        for name in ("id", *FIELDS):
+        for name in ("id", *FIELDS) if paths else ():
             if row.get(name) is not None:
                 add(name, _key(row[name]), k)
     for form in forms.keys() & {"path", "file name", "id"}:
@@ -177,5 +220,5 @@ def _keys(rows: Sequence[tuple[str, Cells]]) -> dict[str, dict[str, list[int]]]:
 
 def _key(name: str) -> str:
     """A name or path as another person may have written it."""
-    text = name.strip().replace("\\", "/").casefold().removeprefix("./")
+    text = spelled(name)
     return posixpath.splitext(text)[0] if text.endswith(SUFFIXES) else text

@@ -22,6 +22,7 @@ from __future__ import annotations
 import contextlib
 import posixpath
 import re
+import unicodedata
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import cache
@@ -72,6 +73,7 @@ def detect_layout(files: Sequence[str], folder: str) -> dict[str, str]:
         files: paths below it, at least one.
         folder: its name, which may say what its only side shows.
     """
+    files = [unicodedata.normalize("NFC", path) for path in files]
     for timed in (False, True):
         paths = [_TIMED.sub(_TIME, path) for path in files] if timed else files
         names = _Names(paths, folder)
@@ -442,6 +444,9 @@ def joined(
     used = {path for found in matches.values() for path, _ in found}
     unmatched = [path for path in files if path not in used]
     result.suspect(result.base, "unmatched", f"{kind} of no template", unmatched)
+    odd = [path for path in files if path != unicodedata.normalize("NFC", path)]
+    text = "names in the other form of letters (NFD), which are compared as composed ones"
+    result.suspect(result.base, "other-letters", text, odd)
     result.facts |= {f"template_{column}": template.text for column, template in templates.items()}
     fields = tuple(dict.fromkeys(name for t in templates.values() for name in t.fields))
     if TIME in fields and len(templates) > 1:

@@ -19,7 +19,6 @@ another machine are read by their end.
 
 from __future__ import annotations
 
-import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -40,7 +39,7 @@ from palpate.data.rows import (
     without_repeats,
 )
 from palpate.data.scanning import Scan
-from palpate.data.tables import Table, names_images, open_table, table_of
+from palpate.data.tables import Table, names_images, open_table, pairings, side_of, table_of
 
 #: Columns of which a table needs at least one, if none names images.
 NAMING = ("id", "video", "object", *SIDES)
@@ -82,7 +81,10 @@ class Listed:
             got = f"no tactile among {columns}, and no vision" if columns else "an empty file"
             must = f"{name} must have the columns vision and tactile, or one of them"
             example = {"columns": {"vision": self.paths or "YOUR_COLUMN"}}
-            raise PalpateError(must, got, "Map your columns to them", example=example)
+            choices = [{"columns": pair} for pair in pairings(self.table)]
+            fix = "Choose one of these" if choices else "Map your columns to them"
+            example = {} if choices else example
+            raise PalpateError(must, got, fix, example=example, choices=choices)
         # A column may be empty.
         sides = [side for side in self.sides if self.rows[side].count()] or self.sides
         for where, row in records(self.rows.drop(PATH, strict=False), self.table.place):
@@ -106,6 +108,7 @@ def read_table(
     root: Path | None = None,
     side: str = "",
     scan: Scan | None = None,
+    below: str = "",
 ) -> Listed:
     """Read a table or list.
 
@@ -117,6 +120,7 @@ def read_table(
         root: folder that paths are relative to; default: that of the table.
         side: the side whose paths name the samples; default: tactile, if there are any.
         scan: takes what is wrong, below its own root; default: a new one.
+        below: folder in that root that the paths start in.
 
     Raises:
         PalpateError: if it is none, or a map is wrong.
@@ -148,6 +152,7 @@ def read_table(
     scan.inconclusive += inconclusive
     scan.suspicious += table.suspicious
     images = [name for name in IMAGE_COLUMNS if name in rows.columns]
+    rows = rows.with_columns((pl.lit(below) + pl.col(name)).alias(name) for name in images)
     written = pl.concat([pl.Series(dtype=pl.String), *(rows[name].drop_nulls() for name in images)])
     if places := relocated(written.unique(maintain_order=True), scan.base):
         rows = rows.with_columns(pl.col(images).replace(places))
@@ -162,11 +167,5 @@ def _by_role(names: Sequence[str], side: str) -> list[str]:
 
     With a side, those of the side first, then those that may be of it, then those of the other.
     """
-
-    def place(name: str) -> int:
-        words = set(re.findall("[a-z]+", name.lower()))
-        role = next((r for r in ("tactile", "vision") if words & set(ROLES[r])), "")
-        order = (side, "", *ROLES) if side else ("tactile", "vision", "")
-        return order.index(role)
-
-    return sorted(names, key=place)
+    order = (side, "", *ROLES) if side else ("tactile", "vision", "", "background")
+    return sorted(names, key=lambda name: order.index(side_of([name])))

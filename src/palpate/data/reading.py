@@ -105,7 +105,7 @@ def read(
     try:
         name, form, scan = scanned(path, "pairs" if "side" in options else format, options)
     except PalpateError as error:
-        if not error.choices:
+        if not error.choices or any("columns" in choice for choice in error.choices):
             raise
         # A folder whose names do not say what its images show is one of photos.
         name, form, scan = scanned(path, format, options | {"side": "vision"})

@@ -20,13 +20,14 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
+from itertools import islice, permutations
 from pathlib import Path
 from typing import Any
 
 import polars as pl
 
 from palpate.core import PalpateError, Problem, ProblemsError, content_of, require
-from palpate.data.manifest import PART_NAMES, PATH, ROLE_OF, reading_parquet
+from palpate.data.manifest import PART_NAMES, PATH, ROLE_OF, SIDES, reading_parquet
 from palpate.data.mapping import LINE, text_of
 
 csv.field_size_limit(1 << 30)  # by default a long text is an error, for the whole process
@@ -187,12 +188,17 @@ def headless_names(path: Path) -> list[str]:
     images = list(map(is_image, first))
     names: list[str] = []
     for k, image in enumerate(images if any(images) else ()):
-        words = re.findall("[a-z]+", " ".join(row[k] for row in rows if len(row) > k).lower())
-        roles = Counter(ROLE_OF[word] for word in words if word in ROLE_OF)
-        side = max(roles, key=lambda role: roles[role], default=PATH)
-        name = (side if sum(images) > 1 else PATH) if image else "label"
+        side = side_of(row[k] for row in rows if len(row) > k) if sum(images) > 1 else ""
+        name = (side or PATH) if image else "label"
         names.append(name if name not in names else f"{name}_{len(names) + 1}")
     return names
+
+
+def side_of(texts: Iterable[str]) -> str:
+    """What most words of some names or paths say that they show; empty without such a word."""
+    words = re.findall("[a-z]+", " ".join(texts).lower())
+    roles = Counter(ROLE_OF[word] for word in words if word in ROLE_OF)
+    return max(roles, key=lambda role: roles[role], default="")
 
 
 def is_image(name: object) -> bool:
@@ -208,6 +214,20 @@ def names_images(cells: pl.Series) -> bool:
 
     ends = "|".join(map(re.escape, SUFFIXES))
     return 2 * (cells.str.contains(rf"(?i)(?:{ends})$").sum() or 0) > cells.count()
+
+
+def pairings(table: Table) -> list[dict[str, str]]:
+    """Which columns of a table may be the sides: side -> column.
+
+    One where words of the columns, else of their paths, say it; else all that they do not exclude.
+    """
+    cells = table.read([n for n in dict.fromkeys(table.names) if n and n not in table.nested])
+    images = [n for n in cells.columns if n != LINE and names_images(cells[n])]
+    sides = {n: side_of([n]) or side_of(cells[n].drop_nulls().head(99)) for n in images}
+    pairs = [dict(zip(SIDES, two, strict=True)) for two in permutations(images, 2)]
+    stated = [pair for pair in pairs if all(sides[n] == side for side, n in pair.items())]
+    open_ = [pair for pair in pairs if all(sides[n] in (side, "") for side, n in pair.items())]
+    return stated or open_
 
 
 def decoded(data: bytes) -> str:
@@ -250,17 +270,19 @@ def _csv(path: Path, names: Sequence[str] | None) -> Table:
     problems: list[Problem] = []
     data = content_of(path)
     text = decoded(data)
-    rows = _csv_rows(path, text, problems)
-    header = list(names or [cell.strip() for cell in next(rows, (0, []))[1]])
+    first = next(_csv_rows(path, text, problems), (0, []))[1]
+    header = list(names or [cell.strip() for cell in first])
 
     def records(columns: Sequence[str]) -> Iterator[Record]:
+        problems.clear()
+        rows = islice(_csv_rows(path, text, problems), 0 if names else 1, None)
         places = [header.index(name) for name in columns]
         for line, cells in rows:
             if len(cells) == len(header):
                 yield (line, *[cells[k] for k in places])  # tuples: nothing to collect
             else:
-                text = f"{len(cells)} cells under {len(header)} columns"
-                problems.append(Problem(f"{path}:{line}", "bad-row", text))
+                width = f"{len(cells)} cells under {len(header)} columns"
+                problems.append(Problem(f"{path}:{line}", "bad-row", width))
 
     table = Table(str(path), header, problems, records)
     if not text.isascii() and is_windows(data):
@@ -329,9 +351,13 @@ def _items(data: Any, split: str | None = None, *, row: bool = False) -> Iterato
     """The objects, pairs or paths in nested lists, with the part whose key they are under.
 
     An object of a list is a ``row``, also without a value of its own besides what it nests; so is
-    the sibling of an object with one.
+    the sibling of an object with one, and an object whose keys name both sides.
     """
-    if isinstance(data, Mapping):
+    if isinstance(data, Mapping) and _all_images([*data, *data.values()]):
+        for pair in data.items():
+            yield _numbered(pair) | {"split": split}
+    elif isinstance(data, Mapping):
+        row |= {*SIDES} <= {side_of([str(key)]) for key in data}
         lists = {key: value for key, value in data.items() if isinstance(value, (list, Mapping))}
         below = [item for value in lists.values() for item in value if isinstance(value, list)]
         is_list = split is None and not row and lists and len(lists) == len(data)
@@ -350,6 +376,9 @@ def _items(data: Any, split: str | None = None, *, row: bool = False) -> Iterato
         yield pair | ({"frame": data[1]} if group == "video" else {})
     elif isinstance(data, list):
         rows = _any_value_beside(data, list)
+        if all(isinstance(item, list) and len(item) == 2 and _all_images(item) for item in data):
+            first, second = ({re.sub("[0-9]+", "", item[k]) for item in data} for k in (0, 1))
+            data = map(_numbered, data) if first.isdisjoint(second) else data  # else two frames
         for item in data:
             yield from _items(item, split, row=rows)
     elif isinstance(data, str):
@@ -366,19 +395,39 @@ def _scalars(items: Sequence[Any]) -> bool:
     return bool(items) and all(isinstance(item, (str, int)) for item in items)
 
 
-def _flat(item: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
-    """Cells of nested objects under names like ``image.path``."""
+def _all_images(items: Sequence[Any]) -> bool:
+    return bool(items) and all(isinstance(item, str) and is_image(item) for item in items)
+
+
+def _numbered(items: Sequence[Any], name: str = "image") -> dict[str, Any]:
+    return {f"{name}_{k}": item for k, item in enumerate(items, 1)}
+
+
+def _flat(item: Mapping[str, Any], prefix: str = "") -> list[dict[str, Any]]:
+    """Rows of the cells of nested objects under names like ``image.path``.
+
+    Two or three images in a list are a column each; objects in a list with images are a row each.
+    """
+    rows: list[dict[str, Any]] = [{}]
     for key, value in item.items():
+        name, cells = f"{prefix}{key}", [{f"{prefix}{key}": value}]
         if isinstance(value, Mapping):
-            yield from _flat(value, f"{prefix}{key}.")
-        else:
-            yield f"{prefix}{key}", value
+            cells = _flat(value, f"{name}.")
+        elif isinstance(value, list) and len(value) in (2, 3) and _all_images(value):
+            cells = [_numbered(value, name)]
+        elif isinstance(value, list) and len(rows) == 1:
+            inner = [row for i in value if isinstance(i, Mapping) for row in _flat(i, f"{name}.")]
+            cells = (
+                inner if inner and all(any(map(is_image, row.values())) for row in inner) else cells
+            )
+        rows = [row | more for row in rows for more in cells]
+    return rows
 
 
 def _of_objects(name: str, rows: Sequence[tuple[int, Any]], problems: list[Problem]) -> Table:
     wrong = [line for line, row in rows if not isinstance(row, Mapping)]
     problems += [Problem(f"{name}:{line}", "bad-row", "not a JSON object") for line in wrong]
-    objects = [(line, dict(_flat(row))) for line, row in rows if isinstance(row, Mapping)]
+    objects = [(n, cells) for n, row in rows if isinstance(row, Mapping) for cells in _flat(row)]
     names = list(dict.fromkeys(str(key) for _, row in objects for key in row))
     lists = {str(k) for _, row in objects for k, cell in row.items() if isinstance(cell, list)}
 

@@ -19,6 +19,7 @@ from __future__ import annotations
 
 import os
 import re
+import unicodedata
 from bisect import bisect_left
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
@@ -66,7 +67,7 @@ class Template:
             PalpateError: if it is empty, leaves the root, or has a field that cannot be read or
                 is named like the column of the paths themselves.
         """
-        path = text.removeprefix("./")
+        path = unicodedata.normalize("NFC", text.removeprefix("./"))
 
         def wrong(must: str, got: str) -> PalpateError:
             clause = must if argument else f"A template {must}"
@@ -110,9 +111,11 @@ class Template:
     def match(self, path: str) -> Fields | None:
         """The fields of a path below the root, numbers without leading zeros; None if it differs.
 
+        Letters are in their composed form (NFC), in which systems write them differently.
+
         A field of folders that matches none is left out.
         """
-        match = self.pattern.fullmatch(path)
+        match = self.pattern.fullmatch(unicodedata.normalize("NFC", path))
         if match is None:
             return None
         values = {name: value for name, value in match.groupdict().items() if value is not None}

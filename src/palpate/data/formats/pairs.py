@@ -24,6 +24,7 @@ from __future__ import annotations
 import os
 import posixpath
 from collections.abc import Mapping
+from contextlib import nullcontext, suppress
 from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
@@ -31,7 +32,7 @@ from typing import TYPE_CHECKING
 
 import polars as pl
 
-from palpate.core import Progress, few, quiet, require
+from palpate.core import PalpateError, Progress, few, quiet, require
 from palpate.data.adjacent import join_tables, tables_of_pairs
 from palpate.data.detection import (
     SIDES,
@@ -52,7 +53,7 @@ from palpate.data.mapping import LINE, compile_maps
 from palpate.data.rows import manifest_rows, odd_groups, read_classes, records
 from palpate.data.scanning import Facts, Format, Scan
 from palpate.data.tables import TABLES, header_of, headless_names
-from palpate.data.templates import FIX, Fields, Matches, Template, assign
+from palpate.data.templates import FIX, Fields, Matches, Template, assign, walk
 
 if TYPE_CHECKING:
     from palpate.data.formats.published import Layout
@@ -152,17 +153,31 @@ def scan_of(listed: Listed) -> Scan:
 def _of_folder(source: Path, options: Options, templates: Mapping[str, str]) -> Scan:
     """The images of a folder, by the tables in it that pair them, else by their names."""
     result, maps = Scan(source), options.columns or {}
-    stated = templates or options.side or maps
-    for path, columns in ({} if stated else tables_of_pairs(source)).items():
-        first = len(result.rows)
-        read_table(path, columns=columns, classes=options.classes, scan=result).add_images()
+    by_names = templates or options.side or (maps and not {*SIDES} <= maps.keys())
+    tables = {} if by_names else tables_of_pairs(source, maps)
+    undecided = [path for path, (_, ways) in tables.items() if len(ways) > 1]
+    for path, (below, ways) in tables.items() if not undecided else ():
+        first, classes = len(result.rows), options.classes
+        listed = read_table(path, columns=ways[0], classes=classes, scan=result, below=below)
+        listed.add_images()
         result.suspect(path, "table-first", "the images are those of this table")
         part = PART_NAMES.get(path.stem.lower())
         for _, row in result.rows[first:] if part else ():
             row.setdefault("split", part)
-    if not result.rows and not result.problems:
+    if result.rows:
+        named = {posixpath.normpath(r[c]) for _, r in result.rows for c in IMAGE_COLUMNS if c in r}
+        left = [name for name in walk(source, SUFFIXES)[0] if name not in named]
+        result.suspect(source, "unmatched", "images that no table names", left)
+    elif not result.problems:
         labels = None if options.classes is None else read_classes(Path(options.classes))
-        _read_folder(result, templates, options.side, maps, labels)
+        with suppress(PalpateError) if undecided else nullcontext():
+            _read_folder(result, templates, options.side, maps, labels)
+        if undecided and not all(f"template_{side}" in result.facts for side in SIDES):
+            path, (_, ways) = undecided[0], tables[undecided[0]]
+            must = f"{source} must be read by its table {path.name}"
+            got = f"the columns {few(ways[0].values())} of images, without a word of what they show"
+            choices = [{"columns": {side: way[side] for side in SIDES}} for way in ways]
+            raise PalpateError(must, got, "Choose one of these", choices=choices)
     _describe(result, source, maps)
     return result
 
