@@ -14,12 +14,17 @@ from PIL import Image
 from forge.errors import fails
 from forge.worlds import by_video, six_videos
 from palpate import probe, score
+from palpate.core import FeatureSet, rng_for
 from palpate.data.manifest import Manifest
 from palpate.data.residuals import Residual, with_gels
 from palpate.encoders import Encoder, EncoderSet
 from palpate.encoders.embed import embed
 from palpate.encoders.rulers import Handcrafted
+from palpate.evaluation import power as module
+from palpate.evaluation.power import power
+from palpate.metrics import tmmd
 from palpate.report.notes import sentence
+from palpate.report.tables import families
 
 SIDE = 24
 NAME = "palpate/handcrafted"
@@ -233,6 +238,84 @@ def test_probe_and_embeddings_by_a_ruler(tmp_path, handcrafted):
     encoder = Encoder(handcrafted, "tactile")
     assert encoder.license == "Apache-2.0"
     assert not encoder.saw(manifest).any()
+
+
+def test_power_is_the_share_of_draws_that_tell_two_classes_apart(monkeypatch):
+    monkeypatch.setattr(module, "DRAWS", 16)
+    rng, quiet = np.random.default_rng(0), lambda *_: None
+    recordings = np.repeat(np.arange(50), 3)  # 20 of a, 30 of b
+    x = rng.normal(size=(150, 6))
+    x[recordings >= 20] += 4  # as the classes are, far apart
+    x /= np.linalg.norm(x, axis=1, keepdims=True)
+    noise = rng.normal(size=(150, 6))
+    noise /= np.linalg.norm(noise, axis=1, keepdims=True)
+    labels = ["a" if r < 20 else "b" for r in recordings]
+    groups = [f"v{r}" for r in recordings]
+    ids = [str(k) for k in range(150)]
+    sets = {n: FeatureSet(ids, f, labels, groups) for n, f in (("sees", x), ("blind", noise))}
+    means = power(sets, "hardness", progress=quiet)
+    names = [(m.score.metric, m.score.features) for m in means["sees"]]
+    power_at = "power of TMMD, {} recordings a side"
+    assert names == [(power_at.format(n), "hardness") for n in (5, 10)]  # 20 would be all of a
+    assert [m.score.value for m in means["sees"]] == [1, 1]
+    assert max(m.score.value for m in means["blind"]) <= 0.25
+    # The share by hand: the same draws, one test each.
+    hits = []
+    for draw in range(16):
+        draws = rng_for(0, "power", f"hardness 5 {draw}")
+        sides = [
+            draws.choice(np.array(sorted({*g})), 5, replace=False)
+            for g in ([v for v, c in zip(groups, labels, strict=True) if c == k] for k in "ab")
+        ]
+        rows = [[k for k, v in enumerate(groups) if v in side] for side in sides]
+        first, second = (noise[r] for r in rows)
+        of = [[groups[k] for k in r] for r in rows]
+        test = tmmd(
+            first,
+            second,
+            groups=of[0],
+            reference_groups=of[1],
+            preset="grouped",
+            permutations=199,
+            seed=draw,
+        )
+        hits.append(test.details["p_value"] <= 0.05)
+    assert means["blind"][0].score.value == np.mean(hits)
+    # A recording with both classes stands for neither: of four recordings none has five.
+    both = [labels[k] if k % 3 else "a" for k in range(150)]
+    assert not power({"sees": replace(sets["sees"], labels=both)}, "hardness", progress=quiet)[
+        "sees"
+    ]
+
+
+def test_probe_of_one_encoder_against_another(tmp_path, monkeypatch):
+    manifest = touches(
+        tmp_path, 96, video=lambda k: f"v{k // 3}", material=lambda k: f"m{k // 3 % 2}"
+    )
+    monkeypatch.setattr(module, "DRAWS", 16)
+    split = by_video(manifest, *(f"v{k}" for k in range(10)))
+    results = probe(manifest, split, encoder=NAME, against="palpate/mini", top=())
+    power_of = [s for s in results.scores if s.metric.startswith("power")]
+    assert {s.a for s in power_of} == {"handcrafted", "mini"}
+    assert {(s.metric, s.features) for s in power_of} == {
+        ("power of TMMD, 5 recordings a side", "material")
+    }
+    assert any(s.b for s in power_of)  # paired
+    assert any(note.code == "verdict-of-two" for note in results.notes)
+    assert "Power of material" in [family.title for family in families(results.scores)]
+    fails("against", probe, manifest, split, encoder=[NAME, NAME + "/"], against="palpate/mini")
+
+
+def test_a_second_opinion_by_the_ruler_without_training(tmp_path):
+    columns = {"video": lambda k: f"v{k // 4}", "background": lambda k: "gel.png"}
+    real, fake = (touches(tmp_path / n, 48, seed=s, **columns) for n, s in (("r", 0), ("g", 1)))
+    options = OPTIONS | {"encoder": "palpate/mini"}
+    results = score(fake, real, check_ruler=True, **options)
+    second = results["TMMD (handcrafted)", "generated"]
+    direct = score(fake, real, **OPTIONS | {"presets": None, "sigma": None})
+    assert second.value == pytest.approx(direct["TMMD", "generated"].value)
+    assert second.encoder != results["TMMD", "generated"].encoder
+    fails("palpate/handcrafted", score, fake, real, check_ruler=True, **OPTIONS)
 
 
 def test_an_unknown_name_of_palpate_is_refused():

@@ -65,8 +65,6 @@ class Machine:
     """auto, cpu, cuda, mps."""
     precision: Literal["float32", "bf16", "fp16"] = "float32"
     """Of matrix products; the weights stay float32."""
-    tf32: bool = True
-    """Let float32 products on CUDA round their factors to 10 bits."""
     gradient_checkpointing: Switch = False
     """Compute activations twice instead of keeping them."""
     checkpoint_minutes: float = 5.0
@@ -94,6 +92,9 @@ class Options(Common):
     """Split files; their order is that of the differences: `--splits orig.json noleak.json`."""
     encoder: tuple[str, ...] = ()
     """Folders of `palpate train encoder`, hub ids, palpate/mini or palpate/handcrafted."""
+    against: str | None = None
+    """Another encoder, to choose between the two: adds how often TMMD by each tells two classes
+    apart with 5, 10, 20 and 40 test recordings a side."""
     allow_seen: Switch = False
     """Probe an encoder that was trained on some of the test images; every score says so."""
     output: OptionalOutPath = None
@@ -111,6 +112,9 @@ def run(options: Options, terminal: Terminal) -> dict[str, Any]:
     got, fix = "both" if training.train else "neither", "E.g. --encoder palpate/mini"
     must = "Either an encoder or training must be chosen"
     require(bool(options.encoder) != training.train, None, must, got, fix=fix)
+    must = "must go with an encoder"
+    fix = "Drop it"
+    require(options.against is None or not training.train, "against", must, "training", fix=fix)
     is_page = output is not None and output.suffix == ".html"
     files = Files(page=output) if is_page else Files(output=output)
     files.guard([options.manifest, *options.split])
@@ -142,6 +146,7 @@ def run(options: Options, terminal: Terminal) -> dict[str, Any]:
                 options.manifest,
                 one_or_all(options.split),
                 encoder=one_or_all(options.encoder),
+                against=options.against,
                 cache=options.cache,
                 allow_seen=options.allow_seen,
                 progress=progress,

@@ -79,6 +79,9 @@ class Options(Common):
     encoder: str | None = None
     """Folder of `palpate train encoder`, a hub id, palpate/mini or palpate/handcrafted; the tactile
     encoder gives the features. Embeddings need none."""
+    check_ruler: Switch = False
+    """Add TMMD by palpate/handcrafted, which nobody trained: a second opinion on what the encoder
+    sees."""
     background: Path | None = None
     """One image of the sensor without contact, for all images of a folder: gives contact scores,
     and rulers what they subtract."""

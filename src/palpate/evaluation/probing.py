@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 
 from palpate.core import (
+    FeatureSet,
     Measure,
     Note,
     PalpateError,
@@ -33,12 +34,13 @@ from palpate.core import (
 from palpate.core.features import is_missing
 from palpate.core.files import canonical_json
 from palpate.data.recordings import described, resampled_by, rule_notes
+from palpate.evaluation.power import power
 from palpate.metrics.intervals import without_interval
 from palpate.metrics.means import Mean, over_seeds
 from palpate.metrics.paired import differences_of_means
 from palpate.metrics.probe import class_accuracies
 from palpate.metrics.retrieval import TIE, Floats, retrieval, unit_rows
-from palpate.report.labels import measured, subject_of
+from palpate.report.labels import measured, subject_of, verdict_of_two
 from palpate.report.records import Match, Strip
 from palpate.report.results import Call, Results
 
@@ -84,12 +86,15 @@ class Plan:
 
 @dataclass
 class Probed:
-    """What one encoder scores under one split: means, median ranks, retrieved keys, notes."""
+    """What one encoder scores under one split: means, median ranks, retrieved keys, notes; and, by
+    label, the test features.
+    """
 
     means: list[Mean] = field(default_factory=list[Mean])
     medians: list[Score] = field(default_factory=list[Score])
     strips: list[Strip] = field(default_factory=list[Strip])
     notes: list[Note] = field(default_factory=list[Note])
+    labeled: dict[str, FeatureSet] = field(default_factory=dict[str, FeatureSet])
 
 
 def probe(  # noqa: PLR0913 - one argument a choice
@@ -97,6 +102,7 @@ def probe(  # noqa: PLR0913 - one argument a choice
     split: Any,
     *,
     encoder: Any,
+    against: Any = None,
     modality: Modality = "tactile",
     label: str | Sequence[str] = "material",
     group: str = "auto",
@@ -116,6 +122,9 @@ def probe(  # noqa: PLR0913 - one argument a choice
             part. Several, as a list or name -> split, are compared.
         encoder: name or folder of a set of encoders, or an ``EncoderSet``. Several, as a list or
             name -> encoders, are compared; not together with several splits.
+        against: another encoder, to choose between the two: adds how often TMMD by each tells two
+            classes apart with 5, 10, 20 and 40 test recordings a side
+            (:mod:`palpate.evaluation.power`), and which is better by which scores.
         modality: whose encoder.
         label: columns to predict; those that the data lack, or that have one value in train, are
             left out, with a note.
@@ -149,6 +158,10 @@ def probe(  # noqa: PLR0913 - one argument a choice
 
     manifest = load(data)
     splits, encoders = named(split, "split"), named(encoder, "encoder")
+    if against is not None:
+        one = len(encoders) == len(splits) == 1
+        require(one, "against", "must go with one encoder and one split", "several", fix="Drop it")
+        encoders = named([*encoders.values(), against], "encoder")
     several = {"split": splits, "encoder": encoders}  # names are those of today's files
     arguments |= {name: sets for name, sets in several.items() if len(sets) > 1}
     call = Call.of("probe", probe, arguments)
@@ -182,6 +195,21 @@ def probe(  # noqa: PLR0913 - one argument a choice
             runs[subject] = [
                 measure(source, loaded[s], sets[e], subject, plan, cache=cache, progress=progress)
             ]
+        if against is not None and plan.sure:
+            firsts = {name: run.labeled for name, (run,) in runs.items()}
+            (tested,) = loaded.values()
+            for name in next(iter(firsts.values())):
+                found = power(
+                    {subject: labeled[name] for subject, labeled in firsts.items()},
+                    name,
+                    rulers=rulers,
+                    seed=seed,
+                    progress=progress,
+                    split=tested.digest,
+                    settings=plan.settings,
+                )
+                for subject, means in found.items():
+                    runs[subject][0].means += means
     results = results_of(f"Probe of the {modality} encoder", runs, plan, manifest, loaded)
     digests = {
         f"{modality} encoder{f' {name}' if axis == 'encoder' else ''}": e.digest(modality)
@@ -189,7 +217,10 @@ def probe(  # noqa: PLR0913 - one argument a choice
     }
     digests = {**results.settings["digests"], **digests}
     settings, calls = {**results.settings, "digests": digests}, [call.with_digests(digests)]
-    return replace(results, settings=settings, calls=calls)
+    notes = [*results.notes]
+    if against is not None and plan.sure:
+        notes += verdict_of_two(sets, results.scores)
+    return replace(results, settings=settings, calls=calls, notes=notes)
 
 
 def plan_of(manifest: Manifest, splits: Mapping[str, Split], plan: Plan) -> Plan:
@@ -264,6 +295,7 @@ def measure(
         if without := values[1].count(""):
             result.notes.append(Note("probe-unlabeled", {"label": label, "count": without}))
         train, test = (replace(f, labels=v) for f, v in zip(features, values, strict=True))
+        result.labeled[label] = test
         result.means += class_accuracies(
             train,
             test,

@@ -7,12 +7,14 @@ scores of different ones share no column.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import polars as pl
+from numpy.typing import NDArray
 
 from palpate.core import FeatureSet, Note, digest_json, save_image
 from palpate.data.manifest import Manifest
@@ -40,15 +42,24 @@ def ruler_features(bench: Bench) -> list[tuple[Samples, FeatureSet]]:
     keep = folder if bench.keep else None
     embedded = [embed(p, encoders, cache=keep, still=True, progress=bench.progress) for p in parts]
     rows = [e.features.astype(np.float64) for e in embedded]
-    mean, spread = rows[0].mean(axis=0), np.maximum(rows[0].std(axis=0), LEAST_SPREAD)
-    scales = [mean.round(4).tolist(), spread.round(4).tolist()]
+    rows, scales = standardized(rows, rows[0])
     digest = digest_json([encoders.digest("tactile"), kind, scales])
-    features: list[tuple[Samples, FeatureSet]] = []
-    for samples, x in zip(sets, rows, strict=True):
+    return [(s, s.feature_set(x, digest)) for s, x in zip(sets, rows, strict=True)]
+
+
+def standardized(
+    sets: Sequence[NDArray[Any]], reference: NDArray[Any]
+) -> tuple[list[NDArray[np.float32]], list[list[float]]]:
+    """Rows (n, d) of each set centered and divided by the reference's (m, d) mean and deviation,
+    then of length 1; and mean and deviation.
+    """
+    mean, spread = reference.mean(axis=0), np.maximum(reference.std(axis=0), LEAST_SPREAD)
+    result: list[NDArray[np.float32]] = []
+    for x in sets:
         z = (x - mean) / spread
         z /= np.maximum(np.linalg.norm(z, axis=1, keepdims=True), 1e-9)
-        features.append((samples, samples.feature_set(z.astype(np.float32), digest)))
-    return features
+        result.append(z.astype(np.float32))
+    return result, [mean.round(4).tolist(), spread.round(4).tolist()]
 
 
 def _of_files(samples: Samples, folder: Path) -> Manifest:

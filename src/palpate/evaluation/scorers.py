@@ -55,6 +55,8 @@ MANY = 50_000
 SIGMA = 10.0
 #: The CLIP of published CMMD (arXiv 2401.09603).
 CMMD_CLIP = "openai/clip-vit-large-patch14-336"
+#: The ruler of a second opinion (:mod:`palpate.encoders.rulers`).
+HANDCRAFTED = "palpate/handcrafted"
 #: Name of the reference in tables and errors.
 REFERENCE = "reference"
 
@@ -414,6 +416,15 @@ def tmmd_family(bench: Bench) -> list[Score]:
                     bench.notes.append(Note("below-floor", params))
         bench.progress("TMMD family", done + 1, len(columns))
     return scores
+
+
+def second_opinion(bench: Bench) -> list[Score]:
+    """TMMD by the ruler that is not trained, next to that of the bench's encoder."""
+    from palpate.encoders.encoder_set import EncoderSet
+
+    other = replace(bench, encoders=EncoderSet.load(HANDCRAFTED))
+    compared = partial(compare_tmmd, permutations=bench.permutations)
+    return _compared(bench, replace(other.tactile, name="handcrafted"), "TMMD", compared)
 
 
 def bandwidths(

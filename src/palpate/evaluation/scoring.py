@@ -40,6 +40,7 @@ from palpate.evaluation.clusters import clustered, of_clusters
 from palpate.evaluation.controls import control_samples, material_accuracies
 from palpate.evaluation.memorization import memorized
 from palpate.evaluation.scorers import (
+    HANDCRAFTED,
     PAIRS,
     REFERENCE,
     Bench,
@@ -48,12 +49,13 @@ from palpate.evaluation.scorers import (
     bandwidths,
     choose,
     companion,
+    second_opinion,
     tmmd_family,
 )
 from palpate.metrics.inputs import require_same_ids
 from palpate.metrics.intervals import without_interval
 from palpate.metrics.mmd import Preset
-from palpate.report.labels import measured
+from palpate.report.labels import verdict_of_two
 from palpate.report.records import GalleryItem
 from palpate.report.results import OBJECT, PATH, Call, Results
 from palpate.report.tables import BACKGROUND, REAL, SAME_MATERIAL
@@ -67,6 +69,7 @@ def score(  # noqa: PLR0913
     reference: Any,
     *,
     encoder: Any = None,
+    check_ruler: bool = False,
     split: Split | str | Path | None = None,
     names: Sequence[str] | None = None,
     labels: Any = None,
@@ -97,6 +100,8 @@ def score(  # noqa: PLR0913
         reference: the real samples, of the same kind. Ids (relative file names) pair samples.
         encoder: name or folder of a set of encoders, or an ``EncoderSet``; its tactile encoder
             gives the features of images. Embeddings need none.
+        check_ruler: add TMMD by ``palpate/handcrafted``, which nobody trained: a second opinion on
+            what the encoder sees.
         split: a split or its file: its test part is scored, its train part gives the floor of TMMD
             (train videos matched by material), a material probe and the controls.
         names: of the generators, in the tables.
@@ -162,6 +167,10 @@ def score(  # noqa: PLR0913
     for name, value in of_images.items():
         usable = images or value is None
         require(usable, name, "must go with images", "embeddings", fix="Drop it")
+    second = images and encoder is not None and str(encoder) != HANDCRAFTED
+    must = f"must go with images and an encoder that is not {HANDCRAFTED}"
+    fix = "Pass one, e.g. palpate/mini, or drop it"
+    require(second or not check_ruler, "check_ruler", must, str(encoder), fix=fix)
     bench = Bench(
         generators={name: read_samples(source, name) for name, source in sources.items()},
         reference=real if background is None else replace(real, gel=one_image(background)),
@@ -199,6 +208,7 @@ def score(  # noqa: PLR0913
         if controls and learns:
             bench = replace(bench, controls=control_samples(bench))
         scorers: list[Callable[[Bench], list[Score]]] = [tmmd_family] * embeds
+        scorers += [second_opinion] * check_ruler
         scorers += [partial(companion, name=n, default=companions is None) for n in chosen]
         scorers += [material_accuracies] * learns
         scorers += [memorized] * (bench.seen is not None)
@@ -212,12 +222,14 @@ def score(  # noqa: PLR0913
     settings |= {"split rule": dict(split.rule)} if split is not None else {}
     settings |= {"encoder": str(encoder)} if encoders is not None else {}
     scores = _with_warnings(scores, bench, of_encoder)
+    two = len(bench.generators) == 2 and bench.sure
+    better = verdict_of_two(bench.generators, scores) if two else []
     return Results(
         title=f"Scores of {', '.join(bench.generators)}",
         scores=sorted(scores, key=lambda s: s.b is not None),
         gallery=_gallery(bench),
         settings=settings,
-        notes=[*bench.notes, *_verdict_of_two(bench, scores)],
+        notes=[*bench.notes, *better],
         calls=[_with_names(call, bench).with_digests(_digests_read(settings))],
     )
 
@@ -369,21 +381,6 @@ def _companions(bench: Bench, requested: Sequence[str] | None, *, encoder: bool)
     if unpaired:
         notes.append(Note("no-pairs", {"names": unpaired}))
     return [n for n in chosen if n not in PAIRS] if len(unpaired) == len(generators) else chosen
-
-
-def _verdict_of_two(bench: Bench, scores: Sequence[Score]) -> list[Note]:
-    """Which of two generators is better by which metrics; of three, tables rank them."""
-    if len(bench.generators) != 2 or not bench.sure:
-        return []
-    a, b = bench.generators
-    better: dict[str, list[str]] = {a: [], b: [], "": []}
-    for d in scores:
-        if d.b is not None and d.value is not None and d.details.get("better"):
-            winner = d.details["better"] if d.details.get("decided") else ""
-            every = [name for names in better.values() for name in names]
-            better[winner] += [measured(d)] * (measured(d) not in every)
-    params = {"a": a, "b": b, "by_a": better[a], "by_b": better[b], "open": better[""]}
-    return [Note("verdict-of-two", params)] if any(better.values()) else []
 
 
 def _with_names(call: Call, bench: Bench) -> Call:

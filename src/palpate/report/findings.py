@@ -196,7 +196,7 @@ def purpose(results: Results) -> str:
     """Return the question that the page answers."""
     parts: list[str] = []
     asked = {family_of(score)[1] for score in results.scores}
-    probed = asked and not results.gallery and asked <= {"Recognition", "Retrieval"}
+    probed = asked and not results.gallery and asked <= {"Power", "Recognition", "Retrieval"}
     if "Captions" in asked:
         parts.append("what do captions give away about their labels, and can they be used")
     elif results.strips or probed:

@@ -12,7 +12,7 @@ import re
 import statistics
 from collections.abc import Iterable, Sequence
 
-from palpate.core import Measure, SampleRef, Score
+from palpate.core import Measure, Note, SampleRef, Score
 
 
 def measured(score: Score | Measure) -> str:
@@ -155,3 +155,18 @@ def file_names(kind: str, titles: Sequence[str]) -> list[str]:
         same = itertools.chain([name], (f"{name}-{k}" for k in itertools.count(2)))
         names.append(next(n for n in same if n not in names))
     return names
+
+
+def verdict_of_two(names: Iterable[str], scores: Sequence[Score]) -> list[Note]:
+    """Which of two is better by which metrics, from their paired differences; of three, tables rank
+    them.
+    """
+    a, b = names
+    better: dict[str, list[str]] = {a: [], b: [], "": []}
+    for d in scores:
+        if d.b is not None and d.value is not None and d.details.get("better"):
+            winner = d.details["better"] if d.details.get("decided") else ""
+            every = [name for names in better.values() for name in names]
+            better[winner] += [measured(d)] * (measured(d) not in every)
+    params = {"a": a, "b": b, "by_a": better[a], "by_b": better[b], "open": better[""]}
+    return [Note("verdict-of-two", params)] if any(better.values()) else []

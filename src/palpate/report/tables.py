@@ -47,6 +47,11 @@ FAMILIES: tuple[tuple[str, str, tuple[str, ...]], ...] = (
         ("tau with people",),
     ),
     (
+        "Power",
+        "How often does TMMD tell two classes apart (p <= .05), by the number of recordings?",
+        ("power of ",),
+    ),
+    (
         "Tactile features",
         "Are generated and real images similar to a tactile encoder? I-, CI- and D-TMMD need no "
         "reference images.",
