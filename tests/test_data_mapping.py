@@ -154,9 +154,49 @@ def test_the_paths_of_a_real_published_list_follow_from_one_another(real_data):
         assert len(rows) == count
 
 
-def test_an_aggregate_of_all_rows_is_no_value_of_a_row():
-    table = pl.DataFrame({"video": ["a", "b", "c"]})
-    with pytest.raises(PalpateError, match="one value of all rows"):
-        compile_maps({"object": "max(video)"}, ["video"], ["object"]).apply(table)
-    constant = compile_maps({"object": "'cup'"}, ["video"], ["object"]).apply(table)
-    assert constant["object"].to_list() == ["cup"] * 3
+NUMBERS = {"path": ["a/b", "a/c"], "n": ["2", "9000000000000"], "k": ["5", "7"]}
+
+
+def column(text):
+    maps = compile_maps({"object": text}, list(NUMBERS), ["object"])
+    return maps.apply(pl.DataFrame(NUMBERS))["object"].to_list()
+
+
+@pytest.mark.parametrize(
+    ("text", "got"),
+    [
+        *[(t, "no function of the cells of one row") for t in ("max(path)", "unnest(path)")],
+        *[(t, "no function of the cells of one row") for t in ("path || count(*)", "first(path)")],
+        ("rpad(substr(path, 1, 3), 60000)", "texts of more than"),
+        ("rpad(path, 60000+300)", "texts of more than"),
+        ("rpad/**/(path, 60000)", "texts of more than"),
+        ("rpad(k, n)", "texts of more than"),  # as long as the second row says
+        ("length(rpad(path, 1000000000000))", "texts of more than"),  # not even on the way
+        (f"replace(path, '/', '{'x' * 5000}')", "texts of more than"),
+        (f"concat_ws('{'Plus ' * 1000}', path, k)", "texts of more than"),
+        (r"regexp_replace(rpad(path, 500), '(.*)', '\1\1\1\1\1\1\1\1\1')", "texts of more than"),
+        ("substr(path, cast(n as bigint) * 10000000000)", "too large for its type"),
+        ("(cast(n as bigint) * 10000000000) % 7", "too large for its type"),
+        ("'a' || (cast(n as bigint) * 10000000000)", "too large for its type"),
+        ("cast(k as tinyint) * 20 > 0", "too large for its type"),
+        ("cast(cast(cast(n as bigint) * 10000000000 as text) as bigint)", "too large"),
+    ],
+)
+def test_an_expression_sees_one_row_and_makes_no_long_text_and_no_wrong_number(text, got):
+    assert got in fails("", column, text).got
+
+
+@pytest.mark.parametrize(
+    ("text", "values"),
+    [
+        ("'cup'", ["cup", "cup"]),
+        ("n * 10", ["20", "90000000000000"]),
+        ("lpad(k, 10, '0')", ["0000000005", "0000000007"]),
+        ("replace(replace(path, '/', '/of/'), '/', '/by/')", ["a/by/of/by/b", "a/by/of/by/c"]),
+        ("split_part(split_part(split_part(path, '/', 1), 'x', 1), 'y', 1)", ["a", "a"]),
+        ("n - 9000000000000 * 2", ["-17999999999998", "-9000000000000"]),
+        ("case when k in ('5', '6') then path else upper(path) end", ["a/b", "A/C"]),
+    ],
+)
+def test_what_an_expression_may_do(text, values):
+    assert column(text) == values

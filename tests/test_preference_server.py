@@ -9,10 +9,13 @@ import socket
 import sqlite3
 import time
 from contextlib import ExitStack, closing, suppress
+from itertools import product
+from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
 
+from forge.damage import DAMAGES
 from forge.errors import fails
 from forge.people import Crowd, pair_study
 from forge.servers import AT, Serving
@@ -247,29 +250,35 @@ def test_a_server_that_is_stopped_leaves_all_votes_in_one_file(planned, tmp_path
         pytest.skip("these tests run under nohup, and so would the server")
     count, status = voted(planned, tmp_path / "study", number)
     assert status in (0, 130)
-    log = tmp_path / "study" / "study.db-wal"
-    assert not log.exists() or not log.stat().st_size
-    log.unlink(missing_ok=True)
+    assert [path.name for path in (tmp_path / "study").glob("study.db*")] == ["study.db"]
     results = preference.score(tmp_path / "study", replicates=100)
     assert sum(r["votes"] for r in results.settings["preference"]["raters"]) == count
     assert not any(note.code == "votes-so-far" for note in results.notes)
 
 
-def test_votes_in_a_log_that_was_not_copied_are_missed(planned, tmp_path):
+def test_the_file_of_a_killed_server_holds_all_votes_or_is_refused(planned, tmp_path):
     folder = tmp_path / "study"
     count, _ = voted(planned, folder, signal.SIGKILL)
-    assert Note("votes-so-far", {"count": count}) in preference.score(folder, replicates=100).notes
     shutil.copytree(planned, tmp_path / "copy")
-    shutil.copy(folder / "study.db", tmp_path / "copy")
-    for _ in "twice":  # to read the file must not make a log
-        fails(r"also those in study\.db-wal\. Got 0", preference.score, tmp_path / "copy")
-    VoteStore(folder / "study.db", Plan.load(folder).study).close()
-    with closing(sqlite3.connect(folder / "study.db")) as disk, disk:
-        disk.execute("DELETE FROM votes WHERE rater = 'r02'")
-    fails(rf"the {count} that its server counted\. Got {count // 2}", preference.score, folder)
-    VoteStore(folder / "study.db", Plan.load(folder).study).close()  # it counts anew
-    notes = preference.score(folder, replicates=100).notes
-    assert not any(note.code == "votes-so-far" for note in notes)
+    copy = Path(
+        shutil.copy(folder / "study.db", tmp_path / "copy")
+    )  # alone, without what lies beside it
+    so_far = Note("votes-so-far", {"count": count})
+    assert so_far in preference.score(tmp_path / "copy", replicates=100).notes
+    for file, damage in product(sorted(folder.glob("study.db*")), DAMAGES):
+        whole = file.read_bytes()
+        damage(file)
+        with suppress(PalpateError):
+            assert so_far in preference.score(folder, replicates=100).notes, (file, damage)
+        file.write_bytes(whole)
+    for path in (folder / "study.db", copy):
+        with closing(sqlite3.connect(path)) as disk, disk:
+            disk.execute("DELETE FROM votes WHERE rater = 'r02'")
+        text = rf"the {count} that its server counted\. Got {count // 2}"
+        fails(text, preference.score, path.parent)
+        VoteStore(path, Plan.load(folder).study).close()  # it counts anew
+        notes = preference.score(path.parent, replicates=100).notes
+        assert not any(note.code == "votes-so-far" for note in notes)
 
 
 def half_open(server, address, count):

@@ -7,7 +7,8 @@ use other mapped columns; columns of the table go first. See ``docs/concepts/dat
 
 from __future__ import annotations
 
-import re
+import json
+import operator
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -17,13 +18,22 @@ import polars as pl
 from palpate.core import PalpateError
 
 #: What polars raises for expressions that it cannot parse or compute.
-ERRORS = (pl.exceptions.PolarsError, pl.exceptions.PanicException, ValueError, TypeError)
-#: Bytes of the longest text that an expression may make of a row, and signs that it may pad to.
-LONGEST, LONGEST_PAD = 1 << 16, 255
-PADS = re.compile(r"(?i)\b[lr]pad\s*\(.*?,\s*([0-9]+)")
-#: A cast to an integer; what rounding may change.
-INTEGER = re.compile(r"(?i)(\bas|::)\s*(?:tiny|small|big)?int(?:eger)?[0-9]*\b")
-SLACK = 100
+ERRORS = (
+    *(pl.exceptions.PolarsError, pl.exceptions.PanicException),
+    *(ValueError, TypeError, RecursionError),
+)
+#: Bytes of the longest text that an expression may make, besides ten times those of its cells.
+LONGEST = 1 << 12
+#: The parts that an expression may have, as polars calls them: none sees another row, and none but
+#: ``PadStart``, ``PadEnd``, ``Replace`` makes text that is longer than its parts together.
+PARTS = set(
+    """Column Literal BinaryExpr Cast Ternary
+    Abs Ceil Coalesce Contains ConcatHorizontal EndsWith FillNull Find Floor Get IsIn IsNotNull
+    IsNull LenBytes LenChars Length Lowercase MaxHorizontal MinHorizontal Not PadEnd PadStart
+    Replace Reverse Sign Slice Split Sql StartsWith StripChars StripCharsEnd StripCharsStart
+    Strptime Titlecase Truncate Uppercase""".split()  # noqa: SIM905 - readable as a list of words
+)
+EXACT = {"Plus": operator.add, "Minus": operator.sub, "Mul": operator.mul, "Multiply": operator.mul}
 #: A further column of every table: the line of each row.
 LINE = "palpate_line"
 FIX = "Use SQL functions on columns: substr, split_part, replace, regexp_replace, left, right, ||"
@@ -61,8 +71,11 @@ class ColumnMaps:
             empty; and the column ``LINE``, if the table has it.
         """
         computed = [table[LINE]] if LINE in table.columns else []
+        limit = LONGEST + 10 * max(
+            (_bytes(table, pl.col(name)) for name in self.columns), default=0
+        )
         for target, expression in self.expressions.items():
-            values = _values(target, self.texts[target], expression, table)
+            values = _values(target, self.texts[target], expression, table, limit)
             computed.append(values.str.strip_chars())
             if target not in table.columns:
                 table = table.with_columns(values)
@@ -105,29 +118,83 @@ def compile_maps(
     return ColumnMaps(ordered, _columns(ordered, columns), texts)
 
 
-def _values(target: str, text: str, expression: pl.Expr, table: pl.DataFrame) -> pl.Series:
+def _values(
+    target: str, text: str, expression: pl.Expr, table: pl.DataFrame, limit: int
+) -> pl.Series:
     """(n,) texts: of cells as texts, else of numbers where all cells of a column are some."""
     failed: BaseException | None = None
-    if any(int(width) > LONGEST_PAD for width in PADS.findall(text)):
-        raise _unusable(target, text, f"it pads to more than {LONGEST_PAD} signs")
     for cells in (table, None):
         if cells is None:
             cells = table.with_columns(map(_as_numbers, table))
         try:
-            two = cells.head(2)
-            if expression.meta.root_names() and two.select(expression).height < two.height:
-                raise _unusable(target, text, "it makes one value of all rows")
-            first = cells.head(1).with_columns(expression.alias(target))[target]
-            if (first.cast(pl.String).str.len_bytes() > LONGEST).any():
-                raise _unusable(target, text, f"it makes texts of more than {LONGEST:,} bytes")
-            values = cells.with_columns(expression.alias(target))[target]
+            _longest(expression, cells, limit, {})
+            return cells.with_columns(expression.alias(target))[target].cast(pl.String)
         except ERRORS as error:
             failed = failed or error
-            continue
-        if values.dtype.is_integer() and _overflows(text, cells, values):
-            raise _unusable(target, text, "a number is too large for its type; cast to bigint")
-        return values.cast(pl.String)
     raise _unusable(target, text, failed or "") from None
+
+
+def _bytes(cells: pl.DataFrame, expression: pl.Expr) -> int:
+    return cells.select(expression.cast(pl.String).str.len_bytes().max()).item() or 0
+
+
+def _longest(expression: pl.Expr, cells: pl.DataFrame, limit: int, seen: dict[str, int]) -> int:
+    """Bytes of the longest text that an expression may make of a row, by those of its parts.
+
+    Args:
+        expression: what is looked at.
+        cells: the table.
+        limit: bytes of the longest text that is allowed.
+        seen: JSON of parts -> theirs; ``split_part`` has one three times.
+
+    Raises:
+        ValueError: if a part is none of ``PARTS``, may make a longer text, or overflows.
+    """
+    text = expression.meta.serialize(format="json")
+    if text in seen:
+        return seen[text]
+    node = json.loads(text)
+    match node:
+        case {"Function": {"function": inner}}:
+            pass
+        case {"BinaryExpr": {"op": op}}:
+            inner = {"BinaryExpr": op}
+        case _:
+            inner = next(iter(node))
+    names = list[Any]()  # a family, one of it, its options
+    while isinstance(inner, dict):
+        name, inner = next(iter(inner.items()))
+        names.append(name)
+    names = [*names, inner][: 3 if names[:1] == ["Sql"] else 2]
+    if PARTS.isdisjoint(names[:2]):
+        raise ValueError(f"it is no function of the cells of one row: {names[-1]}")
+    parts, name = expression.meta.pop()[::-1], names[-1]
+    lengths = [_longest(part, cells, limit, seen) for part in parts]
+    kind = cells.lazy().select(expression).collect_schema().dtypes()[0]
+    if name in EXACT and kind.is_integer():
+        exact = EXACT[name](*(part.cast(pl.Int64).cast(pl.Int128) for part in parts))
+        if not cells.select((exact == expression).all()).item():
+            raise ValueError("a number is too large for its type; cast to bigint")
+    most = max(lengths, default=len(text))
+    if not parts and kind == pl.String:
+        most = _bytes(cells, expression)
+    elif name in ("PadStart", "PadEnd"):
+        most = max(most, 4 * (cells.select(parts[1].max().cast(pl.Int64)).item() or 0))
+    elif name == "Replace":
+        options = node["Function"]["function"]["StringExpr"]["Replace"]
+        shortest, groups = 1, 0  # of the patterns; the most that a replacement repeats
+        if options["literal"]:
+            shortest = cells.select(parts[1].str.len_bytes().min()).item() or 1
+        else:
+            groups = cells.select(parts[2].str.count_matches("$", literal=True).max()).item() or 0
+        matches = 1 if options["n"] == 1 else lengths[0] // shortest + 1
+        most = lengths[0] * (1 + groups) + matches * lengths[2]
+    elif name in ("Plus", "ConcatHorizontal"):
+        most = sum(lengths) + len(parts) * len(str(inner))  # with what is between them
+    if most > limit:
+        raise ValueError(f"it may make texts of more than {limit:,} bytes")
+    seen[text] = 40 if kind.is_numeric() or kind == pl.Boolean else most
+    return seen[text]
 
 
 def _as_numbers(column: pl.Series) -> pl.Series:
@@ -136,17 +203,6 @@ def _as_numbers(column: pl.Series) -> pl.Series:
         if column.dtype == pl.String and column.count() and column.str.contains(pattern).all():
             return column.cast(kind, strict=False)
     return column
-
-
-def _overflows(text: str, cells: pl.DataFrame, values: pl.Series) -> bool:
-    """Whether integers differ from what the expression gives in floating point."""
-    try:
-        exact = pl.sql_expr(INTEGER.sub(r"\1 double", text)).cast(pl.Float64)
-        floats = cells.drop(LINE, strict=False).with_columns(pl.col(pl.Int64).cast(pl.Float64))
-        difference = (floats.select(exact).to_series() - values).abs()
-    except ERRORS:
-        return False
-    return bool((difference > SLACK + 1e-6 * values.cast(pl.Float64).abs()).any())
 
 
 def text_of(value: Any) -> str | None:

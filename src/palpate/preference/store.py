@@ -3,9 +3,9 @@
 Its key is (rater, trial), so that a vote sent again counts once, and only a later ``undone``
 replaces it. Of an invitation a hash is kept.
 
-The header's ``user_version`` is the end mark: ``OPEN`` while a server has the file, then the number
-of votes. Votes of a server that has not ended may lie in ``study.db-wal`` alone, and a copy without
-that file has the mark ``OPEN``.
+The file alone is the truth: a vote is in it when it is acknowledged, and no log lies beside it but
+while a vote is written. Its header's ``user_version`` counts the votes n, in the same transaction:
+n, or -1 - n while a server has the file.
 """
 
 from __future__ import annotations
@@ -21,11 +21,10 @@ from typing import Any
 from palpate.core import PalpateError, require
 
 Vote = Mapping[str, Any]
-OPEN = -1
 #: What a vote is, next to its rater.
 CELLS = ("trial", "choice", "ms", "at", "undone")
 _TABLES = """
-PRAGMA journal_mode=WAL;
+PRAGMA synchronous=EXTRA;
 CREATE TABLE IF NOT EXISTS study (name TEXT PRIMARY KEY) WITHOUT ROWID;
 CREATE TABLE IF NOT EXISTS invitations (token TEXT PRIMARY KEY, rater TEXT UNIQUE) WITHOUT ROWID;
 CREATE TABLE IF NOT EXISTS votes (
@@ -58,13 +57,12 @@ class VoteStore:
         self._writes = mode != "ro"
         with _usable(path):
             if self._writes:
-                path.touch(0o600)  # SQLite gives the files next to it the same rights
+                path.touch(0o600)  # SQLite gives the file next to it the same rights
             self._disk = sqlite3.connect(
                 uri, uri=True, isolation_level=None, check_same_thread=False
             )
             if self._writes:
                 self._disk.executescript(_TABLES)
-                self._disk.execute("PRAGMA synchronous=FULL")
                 self._disk.execute("INSERT OR IGNORE INTO study VALUES (?)", (study,))
             names = [name for (name,) in self._disk.execute("SELECT name FROM study")]
         try:
@@ -74,11 +72,10 @@ class VoteStore:
             raise
         if self._writes:
             with _usable(path):
-                self._mark(OPEN)
-                self._disk.execute(f"PRAGMA user_version = {OPEN}")  # now the log is not empty
+                self._mark(-1 - self._count())
 
     def close(self) -> None:
-        """Close the file, whose end mark then counts the votes."""
+        """Close the file, and say in it that its server has ended."""
         if self._writes:
             self._writes = False
             with suppress(sqlite3.Error):  # a full disk: the file stays open, as a killed server's
@@ -86,9 +83,7 @@ class VoteStore:
         self._disk.close()
 
     def _mark(self, mark: int) -> None:
-        """Write the end mark into the file itself."""
         self._disk.execute(f"PRAGMA user_version = {mark}")
-        self._disk.execute("PRAGMA wal_checkpoint(TRUNCATE)")
 
     def _count(self) -> int:
         return self._disk.execute("SELECT count(*) FROM votes").fetchone()[0]
@@ -97,20 +92,18 @@ class VoteStore:
         """Whether the server has ended, and the file thus has its last vote.
 
         Raises:
-            PalpateError: if the log was not copied, or the end mark counts other votes.
+            PalpateError: if the file has other votes than were counted, or cannot be read.
         """
         with _usable(self._path):
             count, (mark,) = self._count(), self._disk.execute("PRAGMA user_version").fetchone()
-        log = self._path.with_name(f"{self._path.name}-wal")
-        holds = log.is_file() and log.stat().st_size > 0 if mark == OPEN else mark == count
-        wanted = f"those in {log.name}" if mark == OPEN else f"the {mark:,} that its server counted"
-        must = f"{self._path} must hold all votes, also {wanted}"
+        counted = max(mark, -1 - mark)
+        must = f"{self._path} must hold all votes, the {counted:,} that its server counted"
         fix = (
-            f"Copy it with {log.name} next to it, or after the server has ended. To go on without "
+            "Copy it after the server has ended. To go on without the others, serve the study and "
         )
-        fix += "them, serve the study and stop it: it counts anew"
-        require(holds, None, must, f"{count:,}", fix=fix)
-        return mark != OPEN
+        fix += "stop it: it counts anew"
+        require(count == counted, None, must, f"{count:,}", fix=fix)
+        return mark >= 0
 
     def invite(
         self, raters: Sequence[str], count: int, again: Sequence[str] = ()
@@ -153,6 +146,7 @@ class VoteStore:
         self._disk.execute("BEGIN IMMEDIATE")
         try:
             new = [self._disk.execute(_STORE, vote).rowcount == 1 for vote in votes]
+            self._mark(-1 - self._count())
             self._disk.execute("COMMIT")
         except BaseException:
             if self._disk.in_transaction:
@@ -180,7 +174,7 @@ def _usable(path: Path) -> Generator[None]:
         yield
     except (sqlite3.Error, OSError) as error:
         must = f"{path} must be a file of votes that the server can read and write"
-        fix = "Name the one that it wrote, with the files next to it"
+        fix = "Name the one that it wrote; after a kill, serve the study once more and stop it"
         raise PalpateError(must, str(error), fix) from None
 
 
