@@ -8,6 +8,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from forge.errors import fails
+from forge.pictures import write_images
 from palpate.cli import main
 from palpate.data.importing import import_dataset, validate
 from palpate.data.streams import findings
@@ -102,6 +104,30 @@ def test_what_is_planted_in_a_folder_of_pairs_is_named(tmp_path, make):
     assert report.ok
     assert planted(report.suspicious) == set(PLANTED[make])
     assert planted(import_dataset(tmp_path, tmp_path / "out").suspicious) == set(PLANTED[make])
+
+
+@pytest.mark.parametrize(
+    ("photos", "touches", "word"),
+    [
+        (range(20), range(1, 21), "1 apart"),  # one side is counted from 1
+        (range(30), range(15), "other rates"),  # 30 and 15 frames a second
+        (range(15), range(25), "other rates"),
+        (range(30), range(0, 30, 2), ""),  # one clock
+        (range(20), range(20), ""),
+        (range(20), [*range(7), *range(9, 20)], ""),  # two frames are lost
+        (range(1), range(20), ""),  # one photo of all touches
+    ],
+)
+@pytest.mark.parametrize("form", ["v{v}/{s}/{k:04d}.png", "{s}/v{v}_{k:04d}.png"])
+def test_frames_of_other_rates_or_first_numbers_are_named(tmp_path, form, photos, touches, word):
+    own = {"photo": photos, "touch": touches}
+    names = [form.format(s=s, v=v, k=k) for s in own for v in range(3) for k in own[s]]
+    write_images(tmp_path / "own", names)
+    said = [p for p in validate(tmp_path / "own").suspicious if p.kind == "other-clock"]
+    assert len(said) == 3 * bool(word)
+    assert all(word in problem.text for problem in said)
+    if word:  # a refusal says it, too
+        fails(word, import_dataset, tmp_path / "own", tmp_path / "out")
 
 
 @pytest.mark.parametrize("make", [sides, exchanged, bgr_touch, other_gel, green_start])

@@ -34,6 +34,7 @@ from palpate.data.captions import ADJECTIVES
 from palpate.data.foreign import counted
 from palpate.data.manifest import DIGITS, PART_NAMES, ROLE_OF, ROLES, SCHEMA, SIDES
 from palpate.data.scanning import Cells, Scan
+from palpate.data.suspicions import other_clocks
 from palpate.data.templates import TIME, Fields, Matches, Template, assign, join, walk
 
 Side = Literal["vision", "tactile"]
@@ -454,6 +455,7 @@ def joined(
         text = "within half a step of the slower side; files that are nearest to none"
         text = f"images are paired by time, {text}: {len(used - pairs)}"
         result.suspect(result.base, "paired-by-time", text)
+    result.suspicious += [] if TIME in fields else other_clocks(matches)
     result.more = tuple(name for name in fields if name not in TARGETS)
     return rows, fields
 

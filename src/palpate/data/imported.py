@@ -15,7 +15,7 @@ from palpate.data.captions import NAMED
 from palpate.data.images import Check
 from palpate.data.manifest import IMAGE_COLUMNS, Manifest
 from palpate.data.scanning import Facts, Scan, finished, manifest_of, raise_if, require_some
-from palpate.data.suspicions import Look
+from palpate.data.suspicions import CLOCK, Look
 
 #: Rows that an import shows of a folder.
 EXAMPLES = 3
@@ -104,7 +104,8 @@ def imported_of(
         PalpateError: if no usable row is left.
     """
     rows = finished(scan, check, progress)
-    raise_if(scan.problems, skip_bad)
+    clocks = [problem for problem in scan.suspicious if problem.kind == CLOCK]  # why some are alone
+    raise_if([*clocks, *scan.problems] if scan.problems else [], skip_bad)
     require_some(len(rows), source, scan.problems)
     manifest = manifest_of(scan, rows, {**facts, **scan.facts})
     ids = set(manifest.ids)

@@ -16,6 +16,8 @@ distance to a side is that to the nearest quarter of the other recordings.
   is; at most a fifth of the recordings.
 * ``startup-frames``: the mean color of up to a twentieth of the frames, the first ones, is by over
   25 gray levels another one, and the step after them is four times every later one.
+* ``other-clock``: both sides of a recording are numbered without gaps, as many from another first
+  number, or from the same one at other rates (by a fifth), and no time stamp says what is together.
 * ``frozen-stream``: all photos, of at least 15 files, are one image, while the gel moves.
 """
 
@@ -24,7 +26,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from itertools import permutations
+from itertools import pairwise, permutations
 from pathlib import Path
 from typing import Any
 
@@ -44,7 +46,8 @@ NEARER, FARTHER, LEAST = 0.5, 2.0, 10.0
 GEL_TIMES, GEL_LEAST, GEL_SHARE = 6.0, 15.0, 0.2
 EARLY, JUMP, JUMP_TIMES = 0.05, 25.0, 4.0
 STILL_FRAMES = 15
-EXCHANGED = "exchanged-sides"
+CLOCKED, RATES = 8, 1.2
+EXCHANGED, CLOCK = "exchanged-sides", "other-clock"
 #: Columns that name a recording, and that say which recordings are of one rig.
 LEVELS, RIG = ("video", "object", "contact"), ("domain", "sensor")
 Row = Mapping[str, Any]
@@ -189,6 +192,40 @@ def startup_frames(frames: Pixels) -> int:
     later = float(steps[count:].max())
     sudden = steps[count - 1] > max(JUMP, JUMP_TIMES * later)
     return count if sudden and (away > JUMP).all() else 0
+
+
+def other_clocks(sides: Mapping[str, Sequence[tuple[str, Mapping[str, str]]]]) -> list[Problem]:
+    """Recordings whose frames of equal number are of other times, by side -> (path, fields)."""
+    every = [{n for _, fields in sides.get(side, ()) for n in fields} for side in SIDES]
+    keys = sorted(set.intersection(*every) - {"frame"})
+    numbers: dict[str, dict[str, set[int]]] = {}
+    for side in SIDES:
+        for path, fields in sides.get(side, ()):
+            if "frame" in fields:
+                name = "/".join(fields[key] for key in keys if key in fields) or path.split("/")[0]
+                numbers.setdefault(name, {}).setdefault(side, set()).add(int(fields["frame"]))
+    problems: list[Problem] = []
+    for name, both in numbers.items():
+        ordered = [sorted(both.get(side, ())) for side in SIDES]
+        steps = {b - a for own in ordered for a, b in pairwise(own)}
+        few, many = sorted(map(len, ordered))
+        if few < CLOCKED or len(steps) > 1:
+            continue
+        spans = " and ".join(
+            f"{own[0]} to {own[-1]} ({s})" for s, own in zip(SIDES, ordered, strict=True)
+        )
+        shift = abs(ordered[0][0] - ordered[1][0])
+        if shift and few == many:
+            text = f"as many frames are numbered {spans}: equal numbers may be {shift} apart"
+        elif shift <= 1 and many >= RATES * few:
+            text = (
+                f"frames are numbered {spans}: of other rates, or one side ends early, and equal "
+            )
+            text += "numbers may be of other times. Time stamps in the names pair them"
+        else:
+            continue
+        problems.append(Problem(name, CLOCK, text))
+    return problems
 
 
 def _still(look: Look) -> bool:
