@@ -20,7 +20,7 @@ import polars as pl
 from palpate._version import __version__
 from palpate.captions.columns import template_texts
 from palpate.captions.prompts import Description, Prompt
-from palpate.captions.querying import Photo, outcomes, pending, photos_of, query_all
+from palpate.captions.querying import Photo, describe_units, pending, photos_of, query_all
 from palpate.captions.replies import Question, ReplyLog
 from palpate.captions.units import Per, Units, units_of
 from palpate.core import (
@@ -198,7 +198,7 @@ def caption(  # noqa: PLR0913 (a public verb)
                 done = sum(photo.key in log.answers for photo in photos)
                 raise StoppedError(error, done, total, output) from None
             source = _source(question, photos, log, server) | {"per": per}
-            descriptions, problems = outcomes(photos, log, instruction, failed)
+            descriptions, problems = describe_units(photos, log, instruction, failed)
             return _write(manifest, units, descriptions, output, source, problems=problems)
 
 

@@ -1,7 +1,11 @@
-"""Query a model about many photos at once; every reply is kept, and answers are asked for once."""
+"""Ask a vision-language model about many photos at once.
+
+Every reply goes to the log as it arrives; a photo whose answer is there already is not sent.
+"""
 
 from __future__ import annotations
 
+import math
 import threading
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -14,33 +18,36 @@ from PIL import Image
 from palpate.captions.prompts import Description, Prompt
 from palpate.captions.replies import QUALITY, SIDE, Question, RejectedError, Reply, ReplyLog
 from palpate.captions.units import Units
-from palpate.core import PalpateError, Problem, Progress, image_bytes, require
+from palpate.core import PalpateError, Problem, Progress, image_bytes
 from palpate.data.images import file_digest, in_threads, read_image
 from palpate.data.manifest import Manifest
 
 if TYPE_CHECKING:
     from palpate.captions.server import Server
 
-#: Requests until a reply can be used; from the second on the model samples.
+#: Most requests about one photo: until a reply can be used.
 ATTEMPTS = 3
-AGAIN_TEMPERATURE = 0.5
-#: So many photos, spread over all, are tried first: if the server takes none, others are not sent.
-PROBES = 16
-#: Seconds after which Ctrl-C is noticed: once polars has run, it interrupts no waiting.
-CTRL_C = 0.2
-# One photo at a time: a photo is read in many small steps, and threads that take turns after each
-# of them need half as much time again.
-_READING = threading.Lock()
+#: Temperature of repeated requests; the first one has 0, and would give the same reply again.
+RETRY_TEMPERATURE = 0.5
+#: About so many photos, spread over all, are sent first: if all are rejected, the rest is not sent.
+FIRST_PHOTOS = 16
+#: Seconds between two looks for Ctrl-C: once polars has run, it does not interrupt a thread that
+#: waits for a queue.
+WAIT = 0.2
+# Threads that decode photos at the same time take half as long again: one decodes at a time.
+_DECODING = threading.Lock()
+#: Key of a photo, and what is wrong with it or with the request about it.
+Outcome = tuple[str, Problem | None]
 
 
 @dataclass(frozen=True)
 class Photo:
-    """The photo of a unit.
+    """The photo of one unit, that is of the samples that share a caption.
 
     Attributes:
-        sample: id of the described sample.
-        path: its photo; None without one.
-        key: of the reply about it; None without a photo that can be read.
+        sample: id of the sample whose photo it is; '' if no sample of the unit has one.
+        path: the photo; None if there is none.
+        key: key of the reply about it in the log; None if there is no photo that can be read.
     """
 
     sample: str
@@ -51,7 +58,7 @@ class Photo:
 def photos_of(
     manifest: Manifest, units: Units, question: Question, progress: Progress
 ) -> list[Photo]:
-    """Read the photos' bytes; one photo a unit."""
+    """Return the photo of each unit; its key is made of its bytes and the question."""
     ids, vision = manifest.ids, manifest.column("vision")
     paths = [None if row is None else manifest.path(vision[row]) for row in units.described]
     distinct = list(dict.fromkeys(path for path in paths if path is not None))
@@ -64,50 +71,53 @@ def photos_of(
     return photos
 
 
-#: Of a request: the key of its photo, and what is wrong with it.
-Ended = tuple[str, Problem | None]
-
-
-def prepared(path: Path) -> bytes:
-    """The file that is sent for a photo: a JPEG without metadata.
+def encode_photo(path: Path) -> bytes:
+    """Return a photo as it is sent: a JPEG of at most 768 pixels a side, without metadata.
 
     Raises:
-        PalpateError: if the photo is missing, truncated or none.
+        PalpateError: if the photo is missing, truncated or no image.
     """
-    with _READING:
+    with _DECODING:
         photo = read_image(path)
         photo.thumbnail((SIDE, SIDE), Image.Resampling.LANCZOS)
         return image_bytes(photo, "JPEG", quality=QUALITY, exif=b"", icc_profile=None)
 
 
 def pending(photos: Sequence[Photo], log: ReplyLog) -> list[Photo]:
-    """Photos without an answer, each once."""
-    first = {photo.key: photo for photo in reversed(photos) if photo.key is not None}
-    return [photo for key, photo in reversed(first.items()) if key not in log.answers]
+    """Return the readable photos without an answer, in order; of equal ones the first."""
+    first: dict[str, Photo] = {}
+    for photo in photos:
+        if photo.key is not None and photo.key not in log.answers:
+            first.setdefault(photo.key, photo)
+    return list(first.values())
 
 
-def outcomes(
+def describe_units(
     photos: Sequence[Photo], log: ReplyLog, prompt: Prompt, failed: Mapping[str, Problem]
 ) -> tuple[list[Description], list[Problem]]:
-    """What the answers say of every unit, and what is wrong with photos, by path.
+    """Read the description of each unit from the log.
 
     Args:
         photos: one a unit.
         log: the answers.
-        prompt: what they answer.
-        failed: key -> what is wrong with the request.
+        prompt: the instruction that they answer.
+        failed: key -> why a photo has no answer; of :func:`query_all`.
+
+    Returns:
+        A description a unit, flagged where there is none; the problems with photos, by path.
     """
     descriptions: list[Description] = []
     problems: dict[str, Problem] = {}
     for photo in photos:
         if photo.key in log.answers:
             descriptions.append(log.answers[photo.key].read(prompt))
-            continue
-        kind, path = "no-photo", str(photo.path)
-        if photo.path is not None:
+        elif photo.path is None:
+            descriptions.append(Description(None, flags=("no-photo",)))
+        else:
             problem = failed.get(photo.key or "", Problem("", "bad-image", "cannot be read"))
-            problems[path], kind = replace(problem, where=path), problem.kind
-        descriptions.append(Description(None, flags=(kind,)))
+            problem = replace(problem, where=str(photo.path))  # equal photos share one request
+            problems[problem.where] = problem
+            descriptions.append(Description(None, flags=(problem.kind,)))
     return descriptions, [problems[path] for path in sorted(problems)]
 
 
@@ -121,21 +131,29 @@ def query_all(
     progress: Progress,
     answered: bool,
 ) -> dict[str, Problem]:
-    """Send a request for every photo; replies go to the log as they arrive.
+    """Ask about every photo; replies go to the log as they arrive.
 
-    Where some photo is ``answered`` already, the server is not to blame if it takes none of these.
+    Args:
+        photos: of :func:`pending`.
+        question: what to ask about each.
+        server: the model server.
+        log: where replies go.
+        threads: requests at the same time.
+        progress: called after each photo.
+        answered: whether the log has an answer about another photo: the requests as such are then
+            right, and these photos may all be rejected.
 
     Returns:
-        Key -> what is wrong, of photos that cannot be read or that the server does not take.
+        Key -> what is wrong, of photos that cannot be read or that the server rejects.
 
     Raises:
-        PalpateError: if the server fails, or takes no request at all.
+        PalpateError: if the server fails, or rejects every request.
     """
 
-    def work(photo: Photo) -> Ended:
+    def ask(photo: Photo) -> Outcome:
         key, path = str(photo.key), str(photo.path)
         try:
-            image = prepared(Path(path))
+            image = encode_photo(Path(path))
         except PalpateError as error:
             return key, Problem(path, "bad-image", error.got)
         try:
@@ -148,28 +166,33 @@ def query_all(
         return key, None
 
     failed: dict[str, Problem] = {}
-    done, step = 0, -(-len(photos) // PROBES) or 1
+    done, step = 0, math.ceil(len(photos) / FIRST_PHOTOS) or 1
     progress("describing", done, len(photos))
     later = [photo for k, photo in enumerate(photos) if k % step]
     for part in (photos[::step], later):
-        for result in in_daemons(work, part, threads):
+        for result in in_daemons(ask, part, threads):
             if isinstance(result, BaseException):
                 raise result
             key, problem = result
-            answered |= problem is None
-            failed |= {} if problem is None else {key: problem}
+            if problem is None:
+                answered = True
+            else:
+                failed[key] = problem
             done += 1
             progress("describing", done, len(photos))
         rejected = [problem.text for problem in failed.values() if problem.kind == "rejected"]
-        must, fix = "The model must take the requests", "Check it and the further fields"
-        require(answered or not rejected, None, must, "".join(rejected[:1]), fix=fix)
+        if rejected and not answered:
+            raise PalpateError(
+                "The model must take the requests", rejected[0], "Check it and the further fields"
+            )
     return failed
 
 
 def _replies(image: bytes, question: Question, server: Server) -> Iterator[Reply]:
-    """Replies until one can be used or there were ``ATTEMPTS``; all but the last are ``unused``.
+    """Ask until a reply can be used, at most ``ATTEMPTS`` times; yield every reply.
 
-    The request after a reply that cannot be used samples, with more room if that was cut.
+    All but the last are marked as ``unused``. A repeated request has another seed and temperature,
+    and twice the room if the reply was cut.
     """
     for attempt in range(1, ATTEMPTS + 1):
         reply = server.describe(image, question)
@@ -181,30 +204,30 @@ def _replies(image: bytes, question: Question, server: Server) -> Iterator[Reply
         question = replace(
             question,
             max_tokens=question.max_tokens * (2 if reply.finish == "length" else 1),
-            temperature=AGAIN_TEMPERATURE,
+            temperature=RETRY_TEMPERATURE,
             seed=question.seed + 1,
         )
 
 
 def in_daemons(
-    function: Callable[[Photo], Ended], items: Iterable[Photo], threads: int
-) -> Iterator[Ended | BaseException]:
-    """Yield results, or what was raised, as they finish; a caller that leaves waits for nothing.
+    ask: Callable[[Photo], Outcome], photos: Iterable[Photo], threads: int
+) -> Iterator[Outcome | BaseException]:
+    """Yield what ``ask`` returned or raised, as it finishes.
 
-    Other than :func:`palpate.data.images.in_threads`, which waits for its threads: a request may
-    hang for minutes. No item and no result is None.
+    Its threads are daemons: a caller that stops (Ctrl-C, an error) does not wait for requests that
+    may hang for minutes, as it would with :func:`palpate.data.images.in_threads`.
     """
-    lock, stop, source = threading.Lock(), threading.Event(), iter(items)
-    results: SimpleQueue[Ended | BaseException | None] = SimpleQueue()  # None: a thread ended
+    lock, stop, remaining = threading.Lock(), threading.Event(), iter(photos)
+    results: SimpleQueue[Outcome | BaseException | None] = SimpleQueue()  # None: a thread ended
 
     def work() -> None:
         while not stop.is_set():
-            with lock:
-                item = next(source, None)
-            if item is None:
+            with lock:  # an iterator serves one thread at a time
+                photo = next(remaining, None)
+            if photo is None:
                 break
             try:
-                results.put(function(item))
+                results.put(ask(photo))
             except BaseException as error:
                 results.put(error)
         results.put(None)
@@ -215,7 +238,7 @@ def in_daemons(
     try:
         while running:
             try:
-                result = results.get(timeout=CTRL_C)
+                result = results.get(timeout=WAIT)
             except Empty:
                 continue
             if result is None:
