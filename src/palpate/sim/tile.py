@@ -217,7 +217,7 @@ class Tile:
         height: float,
         bend: float = 0.3,
     ) -> Array:
-        """Draw curved ridges (blades, fibres, scratches); the highest wins where they cross.
+        """Draw curved ridges (blades, fibers, scratches); the highest wins where they cross.
 
         Args:
             count: how many.

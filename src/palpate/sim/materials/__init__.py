@@ -1,20 +1,23 @@
-"""The table of materials: Touch and Go's twenty, with their label ids.
+"""The table of simulated materials: the twenty of Touch and Go, with their label ids.
 
-A custom material is one function ``(tile) -> Surface`` in one file, and one line that adds
-it::
+A custom material is a function that draws a piece of it, and one line that adds it::
 
     from palpate.sim import MATERIALS, Material, Surface
+
+    def cork(tile):  # heights in mm, colors as reflectance in [0, 1]
+        return Surface(tile.noise(0.5, 4.0) * 0.1, tile.ones()[..., None] * [0.6, 0.4, 0.3], "cork")
+
     MATERIALS["Cork"] = Material(20, cork)
 
 Its name then works in ``WorldOptions(materials=...)``. With more than one worker the function must
-be importable (not defined in ``__main__``). A world does not record the function: after an edit
-write another one.
+be importable (not defined in ``__main__``). A world records the material's name, not the function:
+after an edit of the function, write the world into another folder.
 """
 
 from __future__ import annotations
 
 from palpate.core import few, require
-from palpate.sim.materials.made import glass, metal, other, paper, plastic, rubber
+from palpate.sim.materials.man_made import glass, metal, other, paper, plastic, rubber
 from palpate.sim.materials.mineral import brick, ceramic_tile, concrete, gravel, rock, sand, soil
 from palpate.sim.materials.plant import grass, plants, tree, wood
 from palpate.sim.materials.soft import leather, natural_fabric, synthetic_fabric
@@ -42,12 +45,12 @@ _DRAWS: dict[str, Draw] = {
     "Plants": plants,
     "Others": other,
 }
-#: Name in ``category_reference.txt`` -> label, function.
+#: Name in ``category_reference.txt`` of Touch and Go -> label (its place above), function.
 MATERIALS = {name: Material(label, draw) for label, (name, draw) in enumerate(_DRAWS.items())}
 
 
 def object_prefix(name: str) -> str:
-    """Return the beginning of the ids of a material's objects, e.g. ``natural_fabric``."""
+    """Return what the ids of a material's objects begin with: ``natural_fabric`` (``_003``)."""
     return name.lower().replace(" ", "_")
 
 
@@ -55,7 +58,7 @@ def check_material(name: str) -> None:
     """Check that no other material has the label of this one.
 
     Raises:
-        PalpateError: if one has.
+        PalpateError: naming those with the same label.
     """
     label = MATERIALS[name].label
     names = [n for n, material in MATERIALS.items() if material.label == label]

@@ -1,6 +1,10 @@
-"""Man-made hard goods: plastic, glass, metal, rubber, paper, and others.
+"""Man-made materials: plastic, glass, metal, rubber, paper, and others.
 
-Their color is free: it must not predict the relief.
+Every function draws a variant (``kind``) and its dimensions at random; no number is measured from a
+real material. Lengths are in mm: heights of the relief, and the wavelengths, periods and sizes that
+go to the methods of :class:`~palpate.sim.tile.Tile`. ``draw(low, high)`` is uniform, ``draw()`` is
+in [0, 1); ``hsv`` takes hue, saturation and value in [0, 1]. But for cardboard and rust, the base
+color is drawn independently of the relief, so that color alone does not predict it.
 """
 
 from __future__ import annotations
@@ -34,8 +38,12 @@ def plastic(tile: Tile) -> Surface:
 
 
 def glass(tile: Tile) -> Surface:
-    """Draw clear, frosted, or fluted glass with soft mirrored windows, which cannot be felt."""
-    kind, draw = tile.pick("clear", "clear", "clear", "frosted", "fluted"), tile.draw
+    """Draw clear, frosted, or fluted glass.
+
+    Reflections of windows and specks of dust are in its color alone: they cannot be felt.
+    """
+    kind = tile.pick("clear", "clear", "clear", "frosted", "fluted")  # three of five are clear
+    draw = tile.draw
     color = hsv(draw(0.3, 0.62), draw(0.03, 0.25), draw(0.35, 0.8))
     height = tile.noise(8.0, 60.0, 3.0) * 0.01
     if kind == "frosted":
@@ -48,20 +56,24 @@ def glass(tile: Tile) -> Surface:
         angle = tile.angle()
         dy, dx = (wrapped_offset(at, draw(0.0, TILE_MM)) for at in (tile.y, tile.x))
         u, v = turned(dy, dx, angle)
-        reach = np.maximum(np.abs(u) * (1 / draw(3.0, 12.0)), np.abs(v) * (1 / draw(5.0, 16.0)))
-        window = smoothstep(reach, 1.08, 0.95) * draw(0.25, 0.7)
+        # 1 on the edge of a rectangle with these half sides.
+        edge = np.maximum(np.abs(u) * (1 / draw(3.0, 12.0)), np.abs(v) * (1 / draw(5.0, 16.0)))
+        window = smoothstep(edge, 1.08, 0.95) * draw(0.25, 0.7)
         albedo = blend(albedo, f32([0.93, 0.96, 1.0]), window)
     dust = f32(tile.noise(0.2, 0.8, 0.0) > 3.0)
     return Surface(height, blend(albedo, f32([0.9, 0.9, 0.9]), dust), kind, gloss=1.0)
 
 
 def _tread(tile: Tile) -> Array:
-    """Draw tread plate: interleaved lozenges of two directions at right angles; in [0, 1]."""
+    """Draw the raised ellipses of tread plate, one each way in every period; in [0, 1].
+
+    Half axes are in radians of the phases ``u`` and ``v``; the second ellipse is half a period off.
+    """
     u, v = tile.waves(tile.draw(10.0, 14.0), tile.angle())
     long, short = 1.0 / tile.draw(1.7, 2.2), 1.0 / tile.draw(0.55, 0.75)
-    turn = lambda a: (a + math.pi) % (2.0 * math.pi) - math.pi
-    first = np.hypot(turn(u) * long, turn(v) * short)
-    second = np.hypot(turn(u + math.pi) * short, turn(v + math.pi) * long)
+    wrapped = lambda phase: (phase + math.pi) % (2.0 * math.pi) - math.pi
+    first = np.hypot(wrapped(u) * long, wrapped(v) * short)
+    second = np.hypot(wrapped(u + math.pi) * short, wrapped(v + math.pi) * long)
     return smoothstep(np.minimum(first, second), 1.0, 0.6)
 
 
@@ -71,7 +83,7 @@ def metal(tile: Tile) -> Surface:
     draw = tile.draw
     value = draw(0.45, 0.85)
     color = f32([value, value * draw(0.93, 1.0), value * draw(0.85, 1.05)])
-    if tile.flip(0.25):
+    if tile.flip(0.25):  # brass or copper instead of gray
         color = hsv(draw(0.06, 0.13), 0.5, value)
     angle = tile.angle()
     height = tile.noise(6.0, 50.0, 3.0) * 0.015
@@ -106,7 +118,7 @@ def rubber(tile: Tile) -> Surface:
     if kind == "studded":
         height = smoothstep(np.cos(u) + np.cos(v), 0.1, 0.7) * 0.5
     elif kind == "treaded":
-        zigzag = np.abs((v * (1.0 / math.pi)) % 2.0 - 1.0) * math.pi
+        zigzag = np.abs((v * (1.0 / math.pi)) % 2.0 - 1.0) * math.pi  # a triangle wave in [0, pi]
         height = smoothstep(np.sin(u + 0.9 * zigzag), -0.15, 0.3) * 0.7
     elif kind == "ribbed":
         height = (0.5 + 0.5 * np.cos(u)) * 0.6
@@ -118,11 +130,14 @@ def rubber(tile: Tile) -> Surface:
 
 
 def paper(tile: Tile) -> Surface:
-    """Draw a sheet, corrugated board, or crumpled paper; half printed, which cannot be felt."""
+    """Draw a sheet, corrugated board, or crumpled paper; half of them printed.
+
+    Print is in the color alone: it cannot be felt.
+    """
     kind, draw = tile.pick("sheet", "corrugated", "crumpled"), tile.draw
     color = hsv(draw(0.08, 0.15), draw(0.0, 0.15), draw(0.8, 0.97))
-    fibre = tile.noise(0.25, 2.0, 0.9)
-    height = fibre * 0.010 + tile.noise(8.0, 50.0, 3.0) * 0.06
+    fiber = tile.noise(0.25, 2.0, 0.9)
+    height = fiber * 0.010 + tile.noise(8.0, 50.0, 3.0) * 0.06
     if kind == "corrugated":
         color = hsv(0.09, draw(0.3, 0.5), draw(0.5, 0.75))
         flutes = np.cos(tile.wave(draw(5.0, 8.0), tile.pick(0.0, math.pi / 2.0)))
@@ -131,11 +146,11 @@ def paper(tile: Tile) -> Surface:
         cells = tile.cells(draw(9.0, 16.0))
         height += (cells.far - cells.near) * 0.16
         height += tile.ridged(3.0, 24.0, 2.6) * 0.07
-    albedo = tint(color, 1.0 + 0.03 * fibre)
+    albedo = tint(color, 1.0 + 0.03 * fiber)
     if tile.flip(0.5):
         line = smoothstep(np.sin(tile.wave(draw(3.0, 6.0), math.pi / 2.0)), 0.2, 0.4)
-        print_ = line * (tile.noise(0.6, 3.0, 0.5, 3.0) > 0) * 0.85
-        albedo = blend(albedo, f32([0.1, 0.1, 0.15]), print_)
+        ink = line * (tile.noise(0.6, 3.0, 0.5, 3.0) > 0) * 0.85  # lines broken into words
+        albedo = blend(albedo, f32([0.1, 0.1, 0.15]), ink)
     return Surface(height, albedo, kind, gloss=0.05, softness=0.3)
 
 
