@@ -31,7 +31,7 @@ from palpate.diffusion.options import SamplerOptions
 from palpate.diffusion.pipeline import TactilePipeline
 from palpate.encoders.embed import texts_of
 from palpate.encoders.encoder_set import EncoderSet
-from palpate.studies.files import fresh
+from palpate.studies.files import cleared
 from palpate.training.run import TrainingRun
 
 sys.path.append(str(Path(__file__).parents[1] / "recipes"))
@@ -79,7 +79,7 @@ def trained(seed, world, work):
             run = TrainingRun(folder / "training", seed + number, cache, progress=Line())
             parts = world, encoders, autoencoder, pipeline
             made = train_round(*parts, GENERATOR_STEPS, run)
-            made.save(fresh(folder / "model"), half=True, shared=NAME)
+            made.save(cleared(folder / "model"), half=True, shared=NAME)
         pipeline = TactilePipeline.from_pretrained(folder / "model")
     return replace(pipeline, sampler=GENERATOR.sampler)
 

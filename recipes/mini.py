@@ -53,7 +53,7 @@ from palpate.encoders.encoder_set import EncoderSet, load_clip
 from palpate.encoders.models import SHIPPED, shipped_root
 from palpate.encoders.presets import EncoderPreset, preset_of
 from palpate.sim import PRESETS, VERSION, WorldOptions, write_world
-from palpate.studies.files import fresh
+from palpate.studies.files import cleared
 from palpate.studies.stages import Stage, run_stage, stored_stage
 from palpate.training.options import Compute
 from palpate.training.run import TrainingRun
@@ -188,7 +188,7 @@ class Recipe:
         def build(folder: Path) -> Mapping[str, Any]:
             preset = _seeing(ENCODER, CLIP_EPOCHS)
             clip = train_clip(train, everything(train), preset, self._run(folder))
-            clip.save(fresh(folder / "clip"))
+            clip.save(cleared(folder / "clip"))
             return {"vision": clip.digest("vision"), "text": clip.digest("text")}
 
         inputs = {"preset": ENCODER, "epochs": CLIP_EPOCHS, "seed": SEED, "train": train.digest}
@@ -206,7 +206,7 @@ class Recipe:
             pair = load_clip(clip.folder / "clip")
             run = self._run(folder)
             encoders = train_tactile(train, everything(train), pair, preset, run)
-            encoders.save(fresh(folder / "encoders"))
+            encoders.save(cleared(folder / "encoders"))
             return {"tactile": encoders.digest("tactile"), "text": encoders.digest("text")}
 
         inputs = {"preset": preset, "seed": SEED, "clip": clip.digest}
@@ -222,7 +222,7 @@ class Recipe:
             run = replace(self._run(folder), compute=COMPUTE)
             preset = _seeing(VISION, VISION_EPOCHS)
             clip = train_clip(train, everything(train), preset, run, start=encoders)
-            clip.with_tactile(encoders).save(fresh(folder / "encoders"))
+            clip.with_tactile(encoders).save(cleared(folder / "encoders"))
             return {"vision": clip.digest("vision")}
 
         inputs = {"preset": VISION, "epochs": VISION_EPOCHS, "seed": SEED, "train": train.digest}
@@ -242,7 +242,7 @@ class Recipe:
             run = TrainingRun(folder / "training", SEED, compute=COMPUTE, progress=self.progress)
             data = images("tactile"), images("background"), AUTOENCODER, run
             model = fit_autoencoder(*data, key=digest_json(digests))
-            model.save(fresh(folder / "autoencoder"))
+            model.save(cleared(folder / "autoencoder"))
             return {"digest": model.digest}
 
         inputs = {"options": AUTOENCODER, "seed": SEED, "train": digests}
@@ -286,7 +286,7 @@ class Recipe:
             parts = train, encoders, autoencoder
             run = TrainingRun(folder / "training", seed, **self.common)
             pipeline = train_round(*parts, start, GENERATOR_STEPS, run)
-            pipeline.save(fresh(folder / "model"))
+            pipeline.save(cleared(folder / "model"))
             return {"digest": pipeline.digest, "train": len(train)}
 
         name = f"generator {number + 1}" if number else "generator"

@@ -38,8 +38,8 @@ from palpate.sim.options import WorldOptions
 from palpate.sim.presets import PRESETS as WORLDS
 from palpate.studies.controls import nearest_rows
 from palpate.studies.files import (
+    cleared,
     data_of,
-    fresh,
     gallery,
     read_audits,
     read_scores,
@@ -258,7 +258,7 @@ def train_on(
         run,
         start=EncoderSet.load(start),
     )
-    encoders.save(fresh(work.folder / "encoders"))
+    encoders.save(cleared(work.folder / "encoders"))
     source = encoders.card.get("text_source")
     return {"digest": encoders.digest("tactile"), "text_source": source}
 

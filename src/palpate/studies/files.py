@@ -1,4 +1,8 @@
-"""What stages keep in their folders, and read of each other's: data, splits, images, scores."""
+"""The files that the stages of a study write, and read from the folders of earlier stages.
+
+``work.after`` has the folder of each earlier stage by name: ``data`` holds a manifest, ``split`` a
+file for each split and ``audits.json``, ``controls-<split>`` a folder of images for each control.
+"""
 
 from __future__ import annotations
 
@@ -22,109 +26,128 @@ from palpate.studies.graph import Work
 from palpate.studies.names import NOLEAK, ORIG, slug
 
 
-def fresh(folder: Path) -> Path:
-    """The folder, without what a killed call left in it between saving and finishing its stage."""
+def cleared(folder: Path) -> Path:
+    """Delete a folder, which a run killed before the end of its stage may have left; return it."""
     shutil.rmtree(folder, ignore_errors=True)
     return folder
 
 
 def data_of(work: Work, split: str = NOLEAK) -> tuple[Manifest, Split]:
-    """The data and one of its splits."""
+    """Load the data and the split of that name, from the stages before."""
     return Manifest.load(work.after["data"]), Split.load(work.after["split"] / f"{split}.json")
 
 
 def splits_of(work: Work) -> tuple[Manifest, dict[str, Split]]:
-    """The data and both splits."""
+    """Load the data and both splits by name."""
     manifest, split = data_of(work)
     return manifest, {ORIG: data_of(work, ORIG)[1], NOLEAK: split}
 
 
 def write_images(folder: Path, ids: Sequence[str], images: NDArray[np.uint8]) -> None:
-    """Images as PNGs with the manifest that names their samples: what :func:`score` reads."""
+    """Write images (n, h, w, 3) as PNGs, and a manifest with the n ids of their samples.
+
+    :func:`palpate.score` reads such a folder as generated images.
+    """
     folder.mkdir(exist_ok=True)
-    rows = [{"id": i, "tactile": f"{k}.png"} for k, i in enumerate(ids)]
+    rows = [{"id": sample, "tactile": f"{k}.png"} for k, sample in enumerate(ids)]
     for row, image in zip(rows, images, strict=True):
         save_image(folder / row["tactile"], np.asarray(image))
     Manifest.from_rows(rows, folder).save(folder / "manifest.parquet")
 
 
 def control_folders(work: Work, split: str, names: Sequence[str]) -> dict[str, Path]:
-    """Folders of the images of those controls that the data allow, by name."""
+    """Return name -> folder of images, of those controls that were made from this data set.
+
+    Others need what it lacks, as materials or backgrounds.
+    """
     folders = {name: work.after[f"controls-{split}"] / slug(name) for name in names}
     return {name: folder for name, folder in folders.items() if folder.is_dir()}
 
 
 def write_scores(folder: Path, scores: Sequence[Score]) -> None:
-    """Scores of a stage."""
+    """Write the scores of a stage to ``scores.json``."""
     write_json(folder / "scores.json", [score.to_json() for score in scores])
 
 
 def read_scores(folder: Path) -> list[Score]:
-    """What :func:`write_scores` wrote."""
-    return [Score.from_json(s) for s in read_json(folder / "scores.json", "scores")]
+    """Read what :func:`write_scores` wrote."""
+    return [Score.from_json(score) for score in read_json(folder / "scores.json", "scores")]
 
 
 def with_stage(score: Score, stage: str) -> Score:
-    """The score with the name of the stage that it was made in."""
+    """Return the score with the name of the stage that made it in its details."""
     return replace(score, details={**score.details, "stage": stage})
 
 
-_MEAN = ("values", "weights", "groups")
+#: The arrays of a :class:`Mean`, in the order of its fields: a value for every sample.
+_ARRAYS = ("values", "weights", "groups")
 
 
 def write_probed(work: Work, probed: Probed) -> None:
-    """What encoders score in probing, with the values of every sample."""
+    """Write the scores of probed encoders, and the values of every sample behind them.
+
+    The arrays of the k-th score are ``values<k>``, ``weights<k>`` and ``groups<k>`` in
+    ``means.npz``.
+    """
     write_scores(work.folder, [with_stage(mean.score, work.stage) for mean in probed.means])
-    means = enumerate(probed.means)
-    arrays = ((f"{name}{k}", getattr(mean, name)) for k, mean in means for name in _MEAN)
-    np.savez(work.folder / "means.npz", **dict(arrays))
+    arrays = {
+        f"{name}{k}": getattr(mean, name) for k, mean in enumerate(probed.means) for name in _ARRAYS
+    }
+    np.savez(work.folder / "means.npz", **arrays)
 
 
 def read_probed(folder: Path) -> Probed:
-    """What :func:`write_probed` wrote."""
-    scores = read_scores(folder)
+    """Read what :func:`write_probed` wrote."""
+    scores = enumerate(read_scores(folder))
     with np.load(folder / "means.npz", allow_pickle=False) as arrays:
-        parts = [[arrays[f"{name}{k}"] for name in _MEAN] for k in range(len(scores))]
-    return Probed([Mean(s, *part) for s, part in zip(scores, parts, strict=True)])
+        return Probed([Mean(s, *(arrays[f"{name}{k}"] for name in _ARRAYS)) for k, s in scores])
 
 
 def probing_plan(manifest: Manifest, splits: Mapping[str, Split]) -> Plan:
-    """What encoders are probed for: the paper's material accuracy and retrieval.
+    """Return the plan to probe encoders for the paper's material accuracy and recall at 1 and 5.
 
-    A leaking split may hold a test image in train as well: that is what is measured.
+    ``allow_seen``: a leaking split may have test images that train has too; that is what the study
+    measures.
     """
     plan = Plan(top=(1, 5), allow_seen=True, axis="split", trained=True)
     return plan_of(manifest, splits, plan)
 
 
 def read_audits(work: Work) -> list[Audit]:
-    """The audits of the splits."""
+    """Read the audits of the splits."""
     audits = read_json(work.after["split"] / "audits.json", "audits")
     return [Audit.from_json(audit) for audit in audits]
 
 
-#: Rows of a gallery; further ones would be collapsed.
+#: Most rows of a gallery; the page would fold further ones.
 GALLERY = 40
-#: Rows per contact, whose frames are nearly equal.
+#: Most rows of one contact: its frames are nearly equal.
 PER_CONTACT = 2
 
 
 def gallery(manifest: Manifest, generated: Generated, seed: int) -> list[GalleryItem]:
-    """Test samples in turn from every material, one per contact first; chosen by seed alone."""
-    table, number = manifest.take(generated.ids).table, pl.int_range(pl.len())
-    order = pl.Series("order", [rng_for(seed, "gallery", i).random() for i in table["id"]])
-    material = pl.col("material").fill_null("None")
+    """Choose generated samples for the page: random ones, from every material in turn.
+
+    First comes one frame of every contact, then a second one. The choice depends on ``seed`` and
+    the ids alone.
+    """
+    table, rank = manifest.take(generated.ids).table, pl.int_range(pl.len())
+    draws = pl.Series("draw", [rng_for(seed, "gallery", name).random() for name in table["id"]])
     rows = (
-        table.with_columns(order)
-        .sort("order")
-        .with_columns(of_contact=number.over("video", "contact"))
-        .with_columns(of_material=number.over("material", "of_contact"))
-        .filter(pl.col("of_contact") < PER_CONTACT)
-        .sort("of_contact", "of_material", material, maintain_order=True)
+        table.with_columns(draws)
+        .sort("draw")
+        .with_columns(in_contact=rank.over("video", "contact"))
+        .with_columns(in_material=rank.over("material", "in_contact"))
+        .filter(pl.col("in_contact") < PER_CONTACT)
+        .sort(
+            "in_contact", "in_material", pl.col("material").fill_null("None"), maintain_order=True
+        )
     )
     items: list[GalleryItem] = []
     for row in rows.head(GALLERY).iter_rows(named=True):
-        gel = row["background"] and str(manifest.path(row["background"]).resolve())
+        background = None
+        if row["background"]:
+            background = str(manifest.path(row["background"]).resolve())
         path = str(generated.path(row["id"]).resolve())
-        items.append(GalleryItem(manifest.ref(row), path, gel or None))
+        items.append(GalleryItem(manifest.ref(row), path, background))
     return items

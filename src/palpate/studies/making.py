@@ -35,7 +35,7 @@ from palpate.leakage.splitting import split as leak_free_split
 from palpate.sim.options import WorldOptions
 from palpate.sim.presets import MINI_SEEDS
 from palpate.sim.writer import write_world
-from palpate.studies.files import data_of, fresh, write_images
+from palpate.studies.files import cleared, data_of, write_images
 from palpate.studies.graph import Work
 from palpate.studies.methods import Images, Make, Setting
 from palpate.studies.names import NOLEAK, ORIG, slug
@@ -135,7 +135,7 @@ def make_encoders(
         *(data or data_of(work, split)),
         preset=preset,
         clip=clip,
-        output=fresh(work.folder / "encoders"),
+        output=cleared(work.folder / "encoders"),
         epochs=epochs,
         seed=seed,
         device=work.device,
@@ -156,7 +156,7 @@ def make_autoencoder(
     else:
         run = TrainingRun(training, cache=work.cache, device=work.device, progress=work.progress)
         model = autoencoder_of(manifest, parts, options, size, run)
-    model.save(fresh(work.folder / "autoencoder"))
+    model.save(cleared(work.folder / "autoencoder"))
     setting = Setting(*_parts(manifest, parts), work, size)
     real, gels = setting.pixels(setting.test), None
     if isinstance(model, BackgroundAutoencoder):
@@ -214,7 +214,7 @@ def make_generator(
         progress=work.progress,
     )
     pipeline = train_pipeline(*data_of(work, split), parts, run)
-    pipeline.save(fresh(work.folder / "model"))
+    pipeline.save(cleared(work.folder / "model"))
     keep_logs(folder, work.folder / "model")
     shutil.rmtree(folder)
     loop = pipeline.training["loop"]
