@@ -1,4 +1,4 @@
-"""``palpate report``: results become a page."""
+"""``palpate report``: files of results become one page."""
 
 from __future__ import annotations
 
@@ -20,8 +20,8 @@ from palpate.core import Note, PalpateError, few, inside, require, short
 from palpate.report.results import Results
 
 TITLE = "palpate report"
-#: Names of the files that a folder of figures holds.
-WRITTEN = re.compile(r"(background|pairs|samples|strips)\b.*\.(png|svg)")
+#: Names of the figures that this command writes.
+FIGURES = re.compile(r"(background|pairs|samples|strips)\b.*\.(png|svg)")
 
 
 @option_group
@@ -38,7 +38,7 @@ class Options(Common):
     title: str = TITLE
     """Heading of the page."""
     images: tuple[Path, ...] = ()
-    """Folders whose images the page may show, next to those of the results."""
+    """Further folders whose images the page may show; else those next to the results alone."""
     figures: Path | None = None
     """Folder for figures: scores (.svg), samples and pairs (.png)."""
 
@@ -50,62 +50,72 @@ def run(options: Options, terminal: Terminal) -> dict[str, Any]:
         raise PalpateError("A report needs results", "no file", "Name some", example=example)
     from palpate.report import write_report
 
-    if options.output.suffix == ".html":
-        marks = (options.title.encode(), b"palpate")
+    if options.output.suffix == ".html":  # any other is refused below
+        marks = (options.title.encode(), b"palpate")  # words in what an earlier report wrote there
         guard_output(options.output, options.results, marks)
         guard_output(options.output.with_suffix(".json"), options.results)
         guard_output(options.output.with_suffix(".md"), options.results, marks)
     _guard_folder(options.figures)
-    results = [read(path, options.images) for path in options.results]
-    titles = (options.title, *(each.title for each in results))
-    names = [f.name for f in fields(Results) if f.name not in ("title", "settings")]
-    merged = Results(
-        title=next((title for title in titles if title not in ("", TITLE)), TITLE),
-        settings={name: value for each in results for name, value in each.settings.items()},
-        **{name: [item for each in results for item in getattr(each, name)] for name in names},
-    )
-    for note in merged.notes:
-        if note.code == "images-outside":
+    results = merged([read(path, options.images) for path in options.results], options.title)
+    for note in results.notes:
+        if note.code == "images-outside":  # --images is the remedy; other notes are on the page
             terminal.note(note)
-    audited, scored = (
-        {x.split for x in items if x.split} for items in (merged.audits, merged.scores)
-    )
-    if merged.audits and (others := scored - audited):  # no audit is of the scores' split
-        note = Note("other-split", {"splits": ", ".join(map(short, sorted(others)))})
-        merged = replace(merged, notes=[*merged.notes, note])
-    files = terminal.run(write_report, merged, options.output, base=Path())
-    paths = {"page": str(files.page), "json": str(files.json), "markdown": str(files.markdown)}
+    files = terminal.run(write_report, results, options.output, base=Path())
+    paths = files._asdict()
     if options.figures:
-        merged.save_figures(options.figures)
-        paths["figures"] = str(options.figures)
-    return terminal.facts("Report", paths)
+        results.save_figures(options.figures)
+        paths["figures"] = options.figures
+    return terminal.facts("Report", {name: str(paths[name]) for name in paths})
+
+
+def merged(parts: Sequence[Results], title: str) -> Results:
+    """Join results; a note names the splits of scores that no audit is of, if there are audits.
+
+    Args:
+        parts: the results; of settings with one name the last counts.
+        title: the heading; while it is the default, the first other one of the parts is taken.
+    """
+    titles = (title, *(part.title for part in parts))
+    lists = {field.name for field in fields(Results)} - {"title", "settings"}
+    results = Results(
+        title=next((name for name in titles if name not in ("", TITLE)), TITLE),
+        settings={name: value for part in parts for name, value in part.settings.items()},
+        **{name: [item for part in parts for item in getattr(part, name)] for name in lists},
+    )
+    unaudited = {score.split for score in results.scores if score.split}
+    unaudited -= {audit.split for audit in results.audits}
+    if results.audits and unaudited:
+        note = Note("other-split", {"splits": ", ".join(map(short, sorted(unaudited)))})
+        results = replace(results, notes=[*results.notes, note])
+    return results
 
 
 def _guard_folder(folder: Path | None) -> None:
-    """Check that a folder of figures holds no other files, which might be replaced.
+    """Check that a folder for figures is new, or holds figures of this command alone.
 
     Raises:
-        PalpateError: if it holds one, or is a file.
+        PalpateError: if it holds anything else, or is a file.
     """
     if folder is None or not folder.exists():
         return
     require(folder.is_dir(), "figures", "must be a folder", str(folder), fix="Name another")
-    foreign = sorted(path.name for path in folder.iterdir() if not WRITTEN.fullmatch(path.name))
+    foreign = sorted(path.name for path in folder.iterdir() if not FIGURES.fullmatch(path.name))
     must = "must be a new folder, or hold nothing but files of this command"
     got = f"{folder} with {few(foreign)}"
     require(not foreign, "figures", must, got, fix="Choose another folder")
 
 
 def read(path: Path, folders: Sequence[Path] = ()) -> Results:
-    """Read one file of results or an audit, with image paths from the working directory.
+    """Read results or an audit, with image paths from the working directory.
 
-    Images outside its folder and ``folders`` are removed: a page of results from elsewhere must not
-    show what their author may not see.
+    Paths of images outside the file's folder and ``folders`` are removed, and a note counts them: a
+    file from somebody else could name any image of this computer, and the page, which holds copies
+    of its images, may go back to its author.
 
     Raises:
         PalpateError: if it is missing, of another format, or incomplete.
     """
-    results, outside = Results.load(path), set[str]()
+    outside = set[str]()
 
     def keep(name: str) -> str | None:
         if any(inside(root, str(Path(name).absolute())) for root in (path.parent, *folders)):
@@ -113,6 +123,8 @@ def read(path: Path, folders: Sequence[Path] = ()) -> Results:
         outside.add(name)
         return None
 
-    results = results.with_paths(keep)
+    results = Results.load(path).with_paths(keep)
+    if not outside:
+        return results
     note = Note("images-outside", {"count": len(outside), "file": str(path)})
-    return replace(results, notes=[*results.notes, note]) if outside else results
+    return replace(results, notes=[*results.notes, note])
