@@ -39,7 +39,7 @@ FILES = {
     "split.pkl": (pickle.dumps({"train": []}), "a pickle.* JSON"),
     "split.npy": (saved(np.array({"train": ["a"]}, dtype=object)), "pickle.* JSON"),
     "list.npy": (saved(np.arange(3)), "array of int64"),
-    "table.xlsx": (b"PK\x03\x04", "spreadsheet.* CSV"),
+    "table.xlsx": (b"PK\x03\x04", "spreadsheet.*fill each row.* CSV"),
 }
 
 

@@ -352,6 +352,23 @@ def test_a_table_that_names_two_images_a_row_pairs_them_or_asks(tmp_path, name, 
         fails("must be read by its table", audit, tmp_path / "own", tmp_path / "own")
 
 
+def test_a_refusal_names_the_tables_that_do_not_help(tmp_path, capsys):
+    write_images(tmp_path / "own", [path.removeprefix("img/") for path in (*PHOTOS, *TOUCHES)])
+    (tmp_path / "own" / "index.csv").write_text("Bild;Tastbild\nx03;q03\n")
+    assert main(["import", str(tmp_path / "own"), "-o", str(tmp_path / "out")]) == 2
+    assert "index.csv (Bild, Tastbild)" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("merged", [True, False])
+def test_merged_cells_of_a_spreadsheet_are_named(tmp_path, merged):
+    write_images(tmp_path, [*PHOTOS, *TOUCHES])
+    objects = ["cup", "", "", "mug", "", ""] if merged else ["", "cup", "cup", "", "cup", ""]
+    rows = [f"{a},{b},{o}" for (a, b), o in zip(PAIRS, objects, strict=True)]
+    (tmp_path / "t.csv").write_text("\n".join(["rgb,gel,object", *rows]))
+    (said,) = (p.text for p in read(tmp_path).suspicious if p.kind == "null-group")
+    assert ("Merged cells" in said) == merged
+
+
 def test_images_in_a_list_are_pairs_only_if_they_differ_in_more_than_numbers(tmp_path):
     lists = [[f"v{k}/{n}.png" for n in range(2)] for k in range(3)]
     (tmp_path / "a.json").write_text(json.dumps({"train": lists}))

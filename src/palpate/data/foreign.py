@@ -19,9 +19,10 @@ _PLAIN = (
     "It may run code when it is opened. Where you trust it, save what it holds as JSON, such "
     'as {{"train": [..], "test": [..]}}, as CSV, or its images as files'
 )
+_SHEET = "Unmerge its cells, fill each row, as only the first keeps the value, and save it as CSV"
 #: (what it is, suffixes, bytes that it may begin with, the way in).
 KINDS: tuple[tuple[str, tuple[str, ...], tuple[bytes, ...], str], ...] = (
-    ("a spreadsheet", (".xlsx", ".xls", ".ods"), (), "Save it as CSV (UTF-8)"),
+    ("a spreadsheet", (".xlsx", ".xls", ".ods"), (), _SHEET),
     ("a pickle", (".pkl", ".pickle", ".pt", ".pth", ".joblib", ".ckpt"), (), _PLAIN),
     ("a pickle", (), (b"\x80\x02", b"\x80\x03", b"\x80\x04", b"\x80\x05"), _PLAIN),
     ("an archive of arrays", (".npz",), (), _FILES),

@@ -249,6 +249,8 @@ def name_recordings(manifests: Sequence[Manifest], template: str | None = None) 
         The manifests in their order; those that know their videos, or whose names suggest nothing,
         as they are.
     """
+    if not manifests:
+        return []
     bare = [_unread(m, manifests, stated=template is not None) for m in manifests]
     schema = {PATH: pl.String, "input": pl.Int64}
     names = pl.concat(

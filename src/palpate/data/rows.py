@@ -207,6 +207,10 @@ def odd_groups(source: Path, rows: Sequence[tuple[str, Row]]) -> list[Problem]:
         if 0 < len(without) < len(rows):
             text = f"{len(without)} of {len(rows)} rows have no {name}, so no split by {name} can "
             text += f"place them; the first is {rows[without[0]][0]}"
+            below = table[name].is_null() & table[name].shift(1).is_not_null()
+            gaps, full = int(below.sum()), len(rows) - len(without)
+            merged = table[name][0] is not None and 2 * gaps > full and len(without) > full
+            text += ". Merged cells keep their value in the first row alone: fill them" * merged
             problems.append(Problem(str(source), "null-group", text))
     for name in GROUPS:
         groups = table.select("contact", name).drop_nulls().unique().group_by("contact").agg(name)

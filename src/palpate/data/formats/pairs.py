@@ -24,7 +24,6 @@ from __future__ import annotations
 import os
 import posixpath
 from collections.abc import Mapping
-from contextlib import nullcontext, suppress
 from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
@@ -33,7 +32,7 @@ from typing import TYPE_CHECKING
 import polars as pl
 
 from palpate.core import PalpateError, Progress, few, quiet, require
-from palpate.data.adjacent import join_tables, tables_of_pairs
+from palpate.data.adjacent import adjacent_tables, join_tables, tables_of_pairs
 from palpate.data.detection import (
     SIDES,
     TARGETS,
@@ -170,8 +169,15 @@ def _of_folder(source: Path, options: Options, templates: Mapping[str, str]) -> 
         result.suspect(source, "unmatched", "images that no table names", left)
     elif not result.problems:
         labels = None if options.classes is None else read_classes(Path(options.classes))
-        with suppress(PalpateError) if undecided else nullcontext():
+        try:
             _read_folder(result, templates, options.side, maps, labels)
+        except PalpateError as error:
+            beside = [
+                f"{path.name} ({few(header_of(path))})" for path, _ in adjacent_tables(source)
+            ]
+            error.got += f"; next to {few(beside)}, of which no columns pair them" * bool(beside)
+            if not undecided:
+                raise
         if undecided and not all(f"template_{side}" in result.facts for side in SIDES):
             path, (_, ways) = undecided[0], tables[undecided[0]]
             must = f"{source} must be read by its table {path.name}"
