@@ -6,6 +6,7 @@ from itertools import product
 from pathlib import Path
 
 import numpy as np
+import polars as pl
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -126,7 +127,8 @@ def test_fields_beyond_the_columns_are_kept_with_the_digest(tmp_path):
     assert (again.digest, again.column("finger")) == (manifest.digest, list("llrrllrr"))
     renamed = {"tactile": "{object}/{side}/{frame}.png"}
     assert load(tmp_path / "own", **renamed).digest != manifest.digest
-    assert "finger" in Manifest.join(again, again.prefixed("x/")).table.columns
+    other = Manifest(again.table.with_columns(id=pl.lit("x/") + pl.col("id")), again.root)
+    assert "finger" in Manifest.join(again, other).table.columns
 
 
 SESSIONS, NESTED = ["mon/cup/0", "mon/mug/0", "tue/cup/0"], ["bark/0/0", "wool/0/0"]

@@ -77,26 +77,21 @@ def tables_of_pairs(
     for path, below in adjacent_tables(folder):
         with suppress(PalpateError):
             table = open_table(path)
-            fits = {stated[side] for side in SIDES if stated} <= {*table.names}
-            ways = ([dict(stated)] if fits else []) if stated else pairings(table)
-            if {*SIDES} <= {*table.names} and not stated:
-                ways = [dict(zip(SIDES, SIDES, strict=True))]
+            ways = [dict(stated)] if stated else pairings(table)
             columns = {way[side] for way in ways for side in SIDES}
-            cells = [c.drop_nulls().to_list() for c in table.read([*columns]) if c.name in columns]
-            starts = [
-                s
-                for s in dict.fromkeys((below, ""))
-                if all(_any_there(folder / s, c) for c in cells)
-            ]
-            if columns and (starts or all(relocated(c, folder) for c in cells)):
-                named = {SYNONYMS[n.lower()]: n for n in table.names if n.lower() in SYNONYMS}
-                own = [{} if way["vision"] == "vision" else named | way for way in ways]
-                pairs[path] = starts[0] if starts else "", own
+            cells = table.read([*columns]) if columns <= {*table.names} else pl.DataFrame()
+            named = {SYNONYMS[n.lower()]: n for n in table.names if n.lower() in SYNONYMS}
+            own = [{} if way["vision"] == "vision" else named | way for way in ways]
+            for start in dict.fromkeys((below, "")) if columns and len(cells) else ():
+                if all(_names_files(cells[name].drop_nulls(), folder / start) for name in columns):
+                    pairs.setdefault(path, (start, own))
     return pairs
 
 
-def _any_there(root: Path, paths: Sequence[str]) -> bool:
-    return any(is_there(root, path) for path in some(paths))
+def _names_files(paths: pl.Series, root: Path) -> bool:
+    return any(is_there(root, path) for path in some(paths.to_list())) or bool(
+        relocated(paths, root)
+    )
 
 
 def join_tables(result: Scan, rows: Sequence[tuple[str, Cells]]) -> None:

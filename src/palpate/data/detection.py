@@ -210,7 +210,9 @@ class _Names:
             if name == _ROLE and len(same) > 1:  # left and right, two sensors, or two words
                 before, _, end = _affixes(sorted(same))
                 words = "|".join(map(_literal, sorted(same)))
-                units = before or end or all(_MEANING_OF.get(name) == "sensor" for name in same)
+                units = bool(before or end) or all(
+                    _MEANING_OF.get(name) == "sensor" for name in same
+                )
                 own_names[k] = f"{before}{{sensor}}{end}" if units else f"{{{words}}}"
         return "/".join(own_names) + _suffix(files)
 

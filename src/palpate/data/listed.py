@@ -132,7 +132,7 @@ def read_table(
         require(names is None, "names", "must be left out for rows in memory", names)
         table, base = table_of(source), Path()
     scan = Scan(base if root is None else Path(root)) if scan is None else scan
-    labels = None if classes is None else read_classes(Path(classes))
+    labels = read_classes(classes)
     texts = {"material": "label"} if table.bare and "label" in table.names else {}
     texts |= columns or {}
     broken = bool(table.problems) and not table.names

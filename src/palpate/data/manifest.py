@@ -208,11 +208,6 @@ class Manifest:
         table = self.table.filter(pl.col("id").is_in(ids))
         return replace(self, table=table if len(table) == len(ids) else self.take(ids).table)
 
-    def prefixed(self, prefix: str) -> Manifest:
-        """The same samples with ``prefix`` before their ids, videos, contacts and sessions."""
-        names = ("id", "video", "contact", "session")
-        return replace(self, table=_with_prefix(self.table, prefix, names))
-
     @classmethod
     def join(cls, *manifests: Manifest) -> Manifest:
         """The samples of several manifests in one, whose root is the folder that holds all their
@@ -226,7 +221,8 @@ class Manifest:
         for m in manifests:
             folder = os.path.relpath(m.root.resolve(), root)
             prefix = "" if folder == "." else f"{folder}/"
-            tables.append(_with_prefix(m.table, prefix, IMAGE_COLUMNS))
+            paths = ((pl.lit(prefix) + pl.col(name)).alias(name) for name in IMAGE_COLUMNS)
+            tables.append(m.table.with_columns(paths))
         table = pl.concat(tables, how="diagonal")
         shared = table.filter(pl.col("id").is_duplicated())["id"].unique().sort()
         if len(shared):
@@ -340,10 +336,6 @@ class Manifest:
         must, got = f"The digest in {path} must match its rows", "rows of another program"
         require(manifest.digest == meta["palpate.digest"], None, must, got, fix=fix)
         return manifest
-
-
-def _with_prefix(table: pl.DataFrame, prefix: str, names: Iterable[str]) -> pl.DataFrame:
-    return table.with_columns((pl.lit(prefix) + pl.col(name)).alias(name) for name in names)
 
 
 @contextmanager

@@ -90,10 +90,12 @@ def records(rows: pl.DataFrame, place: Place) -> list[tuple[str, Row]]:
     ]
 
 
-def read_classes(path: Path) -> dict[int, str]:
-    """Read a table of classes, as :func:`read_categories`."""
+def read_classes(path: Path | None) -> dict[int, str] | None:
+    """Read a table of classes, as :func:`read_categories`, if there is one."""
+    if path is None:
+        return None
     must, got = "must be a table of classes", f"no file {path}"
-    require(path.is_file(), "classes", must, got, fix="Check the path")
+    require(Path(path).is_file(), "classes", must, got, fix="Check the path")
     return read_categories(path)
 
 

@@ -46,11 +46,10 @@ from palpate.core import (
 )
 from palpate.core.features import is_missing, to_numpy
 from palpate.core.messages import require_rows
-from palpate.data.images import SUFFIXES as IMAGES
 from palpate.data.images import cached_images, image_size, load_images, read_image, square
 from palpate.data.manifest import Manifest, is_manifest
 from palpate.data.recordings import LEVELS, name_recordings
-from palpate.data.tables import TABLES, headless_names, open_table, table_of
+from palpate.data.tables import TABLES, headless_names, is_image, open_table, table_of
 
 #: Decoded images of more bytes than this are kept in a file of the cache.
 IN_MEMORY = 1 << 30
@@ -345,11 +344,6 @@ def require_utf8(subject: str, text: str) -> None:
         text.encode()
     except UnicodeEncodeError:
         raise PalpateError(f"{subject} must be UTF-8", ascii(text), "Rename it") from None
-
-
-def is_image(path: str | Path) -> bool:
-    """Whether a path has the suffix of an image."""
-    return str(path).lower().endswith(IMAGES)
 
 
 def without_suffix(name: str) -> str:

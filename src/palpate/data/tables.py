@@ -224,7 +224,10 @@ def pairings(table: Table) -> list[dict[str, str]]:
     cells = table.read([n for n in dict.fromkeys(table.names) if n and n not in table.nested])
     images = [n for n in cells.columns if n != LINE and names_images(cells[n])]
     sides = {n: side_of([n]) or side_of(cells[n].drop_nulls().head(99)) for n in images}
-    pairs = [dict(zip(SIDES, two, strict=True)) for two in permutations(images, 2)]
+    images = [*SIDES] if {*SIDES} <= {*images} else images
+    pairs: list[dict[str, str]] = [
+        dict(zip(SIDES, two, strict=True)) for two in permutations(images, 2)
+    ]
     stated = [pair for pair in pairs if all(sides[n] == side for side, n in pair.items())]
     open_ = [pair for pair in pairs if all(sides[n] in (side, "") for side, n in pair.items())]
     return stated or open_

@@ -83,7 +83,7 @@ def scan(
         must, example = f"{opened.name} must have a column for the images", {"vision": "COLUMN"}
         raise PalpateError(must, got, "Map your columns", example={"columns": example})
     names = dict(enumerate(opened.labels.get(maps.source("material") or "", ()))) or None
-    names = names if classes is None else read_classes(Path(classes))
+    names = read_classes(classes) or names
     folder, created = (into.out / "images", into.created) if into else (None, list[Path]())
     store = _Store(folder, created, check)
     result = Scan(folder or opened.folder or Path(), dict(opened.facts))

@@ -246,7 +246,7 @@ def _read(
         if name not in cells.columns
     )
     unclear = (pl.col("material") == str(INCONCLUSIVE)).fill_null(False)
-    labels = None if classes is None else read_classes(Path(classes))
+    labels = read_classes(classes)
     parts = [
         manifest_rows(cells.filter(~unclear), table.place, labels, result.problems)[0],
         manifest_rows(cells.filter(unclear), table.place, None, result.problems)[0],

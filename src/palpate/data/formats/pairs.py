@@ -168,7 +168,7 @@ def _of_folder(source: Path, options: Options, templates: Mapping[str, str]) -> 
         left = [name for name in walk(source, SUFFIXES)[0] if name not in named]
         result.suspect(source, "unmatched", "images that no table names", left)
     elif not result.problems:
-        labels = None if options.classes is None else read_classes(Path(options.classes))
+        labels = read_classes(options.classes)
         try:
             _read_folder(result, templates, options.side, maps, labels)
         except PalpateError as error:
