@@ -39,8 +39,8 @@ def data_of(work: Work, split: str = NOLEAK) -> tuple[Manifest, Split]:
 
 def splits_of(work: Work) -> tuple[Manifest, dict[str, Split]]:
     """Load the data and both splits by name."""
-    manifest, split = data_of(work)
-    return manifest, {ORIG: data_of(work, ORIG)[1], NOLEAK: split}
+    manifest, noleak = data_of(work)
+    return manifest, {ORIG: data_of(work, ORIG)[1], NOLEAK: noleak}
 
 
 def write_images(folder: Path, ids: Sequence[str], images: NDArray[np.uint8]) -> None:
@@ -90,10 +90,11 @@ def write_probed(work: Work, probed: Probed) -> None:
     ``means.npz``.
     """
     write_scores(work.folder, [with_stage(mean.score, work.stage) for mean in probed.means])
-    arrays = {
-        f"{name}{k}": getattr(mean, name) for k, mean in enumerate(probed.means) for name in _ARRAYS
-    }
-    np.savez(work.folder / "means.npz", **arrays)
+    means = [(str(k), mean) for k, mean in enumerate(probed.means)]
+    np.savez(
+        work.folder / "means.npz",
+        **{name + k: getattr(mean, name) for k, mean in means for name in _ARRAYS},
+    )
 
 
 def read_probed(folder: Path) -> Probed:
