@@ -77,7 +77,7 @@ def shared_groups(train: pl.DataFrame, test: pl.DataFrame) -> dict[str, tuple[in
     """Column -> (test groups that are in train, test groups), of those that both parts know."""
     shared: dict[str, tuple[int, int]] = {}
     for column in ("video", "session", "object"):
-        base, queries = (set(t[column].drop_nulls()) for t in (train, test))
+        base, queries = (set(t[column].drop_nulls().unique()) for t in (train, test))
         if base and queries:
             shared[column] = len(base & queries), len(queries)
     return shared

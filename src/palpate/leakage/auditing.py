@@ -11,6 +11,7 @@ that no metadata reveals.
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -58,16 +59,16 @@ MeasureImpact = Callable[[Manifest, Split, str, str], Impact]
 
 
 @dataclass(frozen=True)
-class _Options:
+class Options:
     """How two parts are compared; see :func:`audit`."""
 
-    by: str
-    near_frames: int
-    identity: Identity
     modalities: Sequence[str]  # whose images are compared
-    false_positives: float
-    cache: Path | None
-    progress: Progress
+    cache: Path | None = None
+    by: str = "auto"
+    near_frames: int = 30
+    identity: Identity = "auto"
+    false_positives: float = 0.001
+    progress: Progress = quiet
     skipped: bool = False  # whether many rows of the inputs were
 
 
@@ -138,13 +139,13 @@ def audit(  # noqa: PLR0913
     require(accepted, "modalities", must, list(modalities), ["vision"])
     accepted, must = 0 < false_positives <= 0.1, "must lie in (0, 0.1]"
     require(accepted, "false_positives", must, false_positives, 0.001)
-    options = _Options(
+    options = Options(
+        modalities if images else (),
+        None if cache is None else Path(cache),
         by,
         near_frames,
         identity,
-        modalities if images else (),
         false_positives,
-        None if cache is None else Path(cache),
         progress,
     )
     must, fix = "needs all samples and a split", "Import them, and audit them with a split"
@@ -158,14 +159,14 @@ def audit(  # noqa: PLR0913
         parts = number_contacts(parts)
     if test is not None:
         title = name or f"{_name(train_or_data, 'train')} / {_name(test, 'test')}"
-        result = _compare(parts[0], parts[1], options, title)
+        result = compare(parts[0], parts[1], options, title)
         test_part = parts[1]
     else:
         samples = parts[0]
         parted = _stated(read[0].splits) if split is None else Split.load(split)
         test_part, val = samples.part(parted, "test"), samples.part(parted, "val")
         title = name or str(parted.rule.get("name") or _name(split, "split"))
-        result = _compare(samples.part(parted, "train"), test_part, options, title, val=val)
+        result = compare(samples.part(parted, "train"), test_part, options, title, val=val)
         notes += _split_notes(samples, parted, val, result.group)
         result = replace(result, split=parted.digest)
         nothing = {"untouched", "similar"} & {question.reason for question in result.questions}
@@ -179,7 +180,7 @@ def audit(  # noqa: PLR0913
                 notes.append(Note("impact-failed", {"reason": f"{bare}", "example": error.example}))
     if pretrain is not None:
         title = f"{_name(pretrain, 'pretraining')} / test"
-        against = _compare(parts[-1], test_part, options, title, against="pretraining")
+        against = compare(parts[-1], test_part, options, title, against="pretraining")
         result = replace(result, others=[against])
     notes = [note for k, note in enumerate(notes) if note not in notes[:k]]  # of train and test
     return replace(result, notes=[*result.notes, *notes])
@@ -217,8 +218,8 @@ def _split_notes(samples: Manifest, split: Split, val: Manifest, group: str) -> 
     if unused := len(samples) - len(split.parts):
         notes.append(Note("samples-in-no-part", {"count": unused, "of": len(samples)}))
     if len(val) and group != NO_GROUP:
-        elsewhere = samples.part(split, "train", "test").column(group)
-        if shared := set(val.column(group)) & set(elsewhere) - {None}:
+        elsewhere = samples.part(split, "train", "test").table[group].unique()
+        if shared := set(val.table[group].unique()) & set(elsewhere) - {None}:
             notes.append(Note("validation-leaks", {"count": len(shared), "group": group}))
     return notes
 
@@ -239,12 +240,12 @@ def _knowing(train: Manifest, test: Manifest, column: str) -> list[bool]:
     return [part.table[column].null_count() < len(part) for part in (train, test)]
 
 
-def _compared(train: Manifest, test: Manifest, options: _Options) -> list[str]:
+def _compared(train: Manifest, test: Manifest, options: Options) -> list[str]:
     """The images that are compared: those that both parts have."""
     return [m for m in options.modalities if all(_knowing(train, test, m))]
 
 
-def _group(train: Manifest, test: Manifest, options: _Options) -> str:
+def _group(train: Manifest, test: Manifest, options: Options) -> str:
     """The group to audit by."""
     for part, samples in (("train", train), ("test", test)):
         must, fix = f"The {part} part must hold samples", "Check the split or list file"
@@ -257,10 +258,10 @@ def _group(train: Manifest, test: Manifest, options: _Options) -> str:
     return options.by
 
 
-def _compare(
+def compare(
     train: Manifest,
     test: Manifest,
-    options: _Options,
+    options: Options,
     name: str,
     *,
     val: Manifest | None = None,
@@ -271,7 +272,9 @@ def _compare(
     shared = same_names(train, test, options.identity)
     test, equal = rename_unrelated(train, test, shared)
     a, b = train.table, test.table
-    groups = [set(t[group].drop_nulls()) if group != NO_GROUP else set[str]() for t in (a, b)]
+    groups = [
+        set(t[group].drop_nulls().unique()) if group != NO_GROUP else set[str]() for t in (a, b)
+    ]
     in_both = sorted(groups[0] & groups[1])
     in_shared = int(b[group].is_in(in_both).fill_null(False).sum()) if in_both else 0
     timed_tables = [a, b]
@@ -333,7 +336,7 @@ def _compare(
 
 
 def _notes(
-    train: Manifest, test: Manifest, group: str, equal: Mapping[str, int], options: _Options
+    train: Manifest, test: Manifest, group: str, equal: Mapping[str, int], options: Options
 ) -> list[Note]:
     notes = [Note("no-group")] if group == NO_GROUP else []
     numbers = [m.table["frame"].drop_nulls() for m in (train, test)]
@@ -356,7 +359,7 @@ def _signals(
     test: Manifest,
     group: str,
     gaps: Gaps,
-    options: _Options,
+    options: Options,
     *,
     named: Sequence[str],
 ) -> list[Flags]:
@@ -428,11 +431,11 @@ def _worst_pairs(train: Manifest, test: Manifest, group: str, gaps: Gaps) -> lis
     chosen = varied(np.flatnonzero(gaps.frames >= 0), -gaps.frames, test)
     pairs = [(k, int(gaps.row[k]), int(gaps.frames[k])) for k in chosen]
     if not pairs and group != NO_GROUP:  # no frames: a shared group is still a pair worth showing
-        first_of = [
-            dict(zip(m.column(group)[::-1], range(len(m))[::-1], strict=True))
+        first_of = (
+            m.table.with_row_index("row").drop_nulls(group).group_by(group).agg(pl.first("row"))
             for m in (test, train)
-        ]
-        shared = sorted((first_of[0].keys() & first_of[1].keys()) - {None})
-        pairs = [(first_of[0][g], first_of[1][g], None) for g in shared[:WORST]]
+        )
+        shared = functools.reduce(lambda a, b: a.join(b, on=group), first_of).sort(group)
+        pairs = [(i, j, None) for _, i, j in shared.head(WORST).iter_rows()]
     row = lambda m, k: m.ref(m.table.row(k, named=True))
     return [LeakPair(row(test, k), row(train, j), gap) for k, j, gap in pairs]

@@ -85,7 +85,7 @@ def _lacks(table: pl.DataFrame, column: str, parts: int) -> Note | None:
     return Note("group-materials", params | {"materials": materials.height})
 
 
-def components(manifest: Manifest, by: Sequence[str], links: Sequence[Ints] = ()) -> list[str]:
+def components(manifest: Manifest, by: Sequence[str], links: Sequence[Ints] = ()) -> pl.Series:
     """The group of each sample.
 
     Args:
@@ -97,17 +97,17 @@ def components(manifest: Manifest, by: Sequence[str], links: Sequence[Ints] = ()
     Returns:
         n names, in row order; ``sample:<id>`` for samples without any value.
     """
-    table, n = manifest.table, len(manifest)
+    table = manifest.table
     for column in by:
         require(column in GROUPS, "by", f"must be among {', '.join(GROUPS)}", repr(column), "video")
         empty = table[column].null_count()
         must = f"Every sample needs a {column} to be split by it"
-        got = f"{empty} of {n} samples without"
+        got = f"{empty} of {len(table)} samples without"
         require(not empty, None, must, got, fix="Fill the column, or choose another one")
     if len(by) == 1 and not links:  # its values are the groups already
-        return table[by[0]].to_list()
+        return table[by[0]]
     labels = [table[c].rank("dense").cast(pl.Int64).fill_null(0).to_numpy() - 1 for c in by]
-    return _names(manifest, by, _joined([*labels, *links], n))
+    return _names(manifest, by, _joined([*labels, *links], len(table)))
 
 
 def _joined(labels: Sequence[Ints], n: int) -> Ints:
@@ -124,7 +124,7 @@ def _joined(labels: Sequence[Ints], n: int) -> Ints:
     return connected_components(graph, directed=False)[1][:n].astype(np.int64)
 
 
-def _names(manifest: Manifest, by: Sequence[str], component: Ints) -> list[str]:
+def _names(manifest: Manifest, by: Sequence[str], component: Ints) -> pl.Series:
     """A name for each sample's component: the smallest value of the first column that has one."""
     prefix = ["" if k == 0 else f"{c}:" for k, c in enumerate(by)]
     candidates = [
@@ -140,5 +140,4 @@ def _names(manifest: Manifest, by: Sequence[str], component: Ints) -> list[str]:
     named = named.sort("component").with_columns(
         name=pl.when(number > 0).then(pl.format("{}'{}", "name", number)).otherwise("name")
     )
-    names = dict(named.iter_rows())
-    return [names[k] for k in component.tolist()]
+    return pl.Series(component).replace_strict(named["component"], named["name"])

@@ -9,6 +9,7 @@ there are parts are named and go along.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, overload
 
@@ -17,7 +18,7 @@ import polars as pl
 
 from palpate.core import Note, PalpateError, Progress, Split, quiet, require
 from palpate.data.manifest import MODALITIES, Manifest
-from palpate.leakage.auditing import audit
+from palpate.leakage.auditing import Options, compare
 from palpate.leakage.groups import Ints, choose_group, components, nested_groups
 from palpate.leakage.inputs import Data, read, read_all
 from palpate.leakage.noleak import HCT_GROUPS, published
@@ -101,7 +102,7 @@ def split(  # noqa: PLR0913  # pyright: ignore[reportInconsistentOverload]
     shares = {part: round(share, 12) for part, share in shares.items() if share > 1e-9}
     columns, reason = _columns(manifest, by, links, len(shares))
     groups = components(manifest, columns, links)
-    names, materials, problem = _problem(manifest, groups, columns, list(shares.values()))
+    number, materials, problem = _problem(manifest, groups, columns, list(shares.values()))
     optimum = optimize(problem)
     rule = {
         "name": name,
@@ -110,7 +111,7 @@ def split(  # noqa: PLR0913  # pyright: ignore[reportInconsistentOverload]
         "group": columns[0] if columns else LINKED,
         "by": list(columns),
         "near": near_facts,
-        "groups": len(names),
+        "groups": len(problem.counts),
         "shares": shares,
     }
     notes += reason
@@ -126,10 +127,11 @@ def split(  # noqa: PLR0913  # pyright: ignore[reportInconsistentOverload]
         if folds is not None:
             shares = {p: parts.count(p) / folds for p in dict.fromkeys(parts)}
             facts |= {"folds": folds, "fold": fold, "shares": shares}
-        where = {g: parts[k] for g, k in zip(names, assignment.tolist(), strict=True)}
-        part_of = {i: where[g] for i, g in zip(manifest.ids, groups, strict=True)}
+        part_of = np.array(parts, object)[assignment[number]].tolist()
+        assigned = dict(zip(manifest.ids, part_of, strict=True))
         more = [*notes, *_notes(manifest, facts)]
-        fresh = _audited(manifest, Split(part_of, dict(facts), manifest.digest, more), cache)
+        fresh = Split(assigned, dict(facts), manifest.digest, more)
+        fresh = _audited(manifest, fresh, pl.Series(part_of), cache)
         fold_name = f"{fresh.rule['name']}, fold {fold} of {folds}" if folds else fresh.rule["name"]
         splits.append(fresh.changed(rule={**fresh.rule, "name": fold_name}))
     return splits[0] if folds is None else splits
@@ -179,19 +181,21 @@ def _columns(
 
 
 def _problem(
-    manifest: Manifest, groups: Sequence[str], columns: Sequence[str], target: Sequence[float]
-) -> tuple[list[str], list[str], Problem]:
-    """The names of groups and of materials, and the samples by both with the wanted shares."""
+    manifest: Manifest, groups: pl.Series, columns: Sequence[str], target: Sequence[float]
+) -> tuple[Ints, list[str], Problem]:
+    """The number of each sample's group, the names of materials, and the samples by both with the
+    wanted shares.
+    """
     kind = " and ".join(columns) or LINKED
-    names = sorted(set(groups))
+    names = groups.unique().sort()
     if len(names) < len(target):
         must = f"A split into {len(target)} parts needs at least as many groups"
         got = f"{len(names)} {kind} group(s)"
         raise PalpateError(must, got, "Choose a finer group", example={"by": "contact"})
-    materials: list[str] = sorted(manifest.table["material"].drop_nulls().unique())
+    materials = manifest.table["material"].drop_nulls().unique().sort()
     row, column = (
-        series.rank("dense").cast(pl.Int64).fill_null(0).to_numpy() - 1
-        for series in (pl.Series(groups), manifest.table["material"])
+        series.cast(pl.Enum(values)).to_physical().cast(pl.Int64).fill_null(-1).to_numpy()
+        for series, values in ((groups, names), (manifest.table["material"], materials))
     )
     counts = np.zeros((len(names), len(materials) + 1), np.int64)
     np.add.at(counts[:, -1], row, 1)
@@ -203,7 +207,7 @@ def _problem(
     got += f", which leaves them {1 - largest:.2%} at best"
     fix = "Choose a finer group, thin that group out, or choose a larger train share"
     require(1 - largest >= LEAST_FILL * wanted, None, must, got, fix=fix)
-    return names, materials, Problem(counts, np.array(target))
+    return row, materials.to_list(), Problem(counts, np.array(target))
 
 
 def _achieved(
@@ -229,19 +233,20 @@ def _achieved(
     }
 
 
-def _audited(manifest: Manifest, fresh: Split, cache: str | Path | None) -> Split:
+def _audited(
+    manifest: Manifest, fresh: Split, part_of: pl.Series, cache: str | Path | None
+) -> Split:
     """The split with the verdict of its own audit, and a name that says what train and test share.
 
     The audit is by all that is known of the samples, and by the images that were kept together.
     """
     near = fresh.rule["near"]
-    own = audit(
-        manifest,
-        split=fresh,
-        images=near is not None,
-        cache=cache,
-        modalities=near["modalities"] if near else [*MODALITIES],
+    options = Options(near["modalities"] if near else (), None if cache is None else Path(cache))
+    train, test = (
+        replace(manifest, table=manifest.table.filter(part_of == part))
+        for part in ("train", "test")
     )
+    own = compare(train, test, options, "")
     facts = {**fresh.rule, "audit": own.verdict}
     notes = [*fresh.notes, *_question(manifest, own.shared)]
     if own.verdict != NO_LEAK:
