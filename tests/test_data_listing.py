@@ -118,14 +118,14 @@ def test_joined_lists_detect_a_frame_in_both(tmp_path):
 def test_contacts_by_hand_and_against_a_slow_count():
     videos, frames, labels = list("bbbaabba"), [5, 4, 9, 1, 2, 6, 7, 4], [0, 0, 0, 1, 1, 2, 2, 1]
     names = [f"{v}#000{k}" for v, k in zip(videos, (1, 1, 3, 1, 1, 2, 2, 2), strict=True)]
-    assert contact_names(videos, frames, labels) == names
+    assert contact_names(videos, frames, labels).to_list() == names
     assert contact_names(videos, frames, None)[5] == "b#0001"
     rng = np.random.default_rng(0)
     cells = rng.permutation([(v, f) for v in range(3) for f in range(200) if rng.random() < 0.8])
     videos, frames = [f"v{v}" for v, _ in cells], [int(f) for _, f in cells]
     labels = [int(f // 17) for f in frames]
-    assert contact_names(videos, frames, labels) == slow_contacts(videos, frames, labels)
-    assert contact_names([], [], []) == []
+    assert contact_names(videos, frames, labels).to_list() == slow_contacts(videos, frames, labels)
+    assert contact_names([], [], []).to_list() == []
 
 
 def test_write_list_can_be_read_back_and_rejects_what_could_not(tmp_path):

@@ -97,9 +97,7 @@ def read_lists(
     if categories is not None:
         names_by_label = {str(k): name for k, name in categories.items()}
         label = label.replace(list(names_by_label), list(names_by_label.values()))
-    table = rows.select("id", "video", "frame", material=label).with_columns(
-        contact=pl.Series(names, dtype=pl.String)
-    )
+    table = rows.select("id", "video", "frame", material=label, contact=names)
     facts = {"source": ", ".join(Path(path).name for path in paths)}
     manifest = Manifest.of_table(table, Path(root), facts)
     contact = every.select("video", "frame")

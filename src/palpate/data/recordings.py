@@ -451,7 +451,7 @@ def contact_names(
     videos: Sequence[str] | pl.Series,
     frames: Sequence[int] | pl.Series,
     labels: Sequence[object] | pl.Series | None,
-) -> list[str]:
+) -> pl.Series:
     """The contact ``video#0001`` that each frame belongs to, in the order given.
 
     The numbers count the contacts of a video from 1 in the order of frames. Frames are integers in
@@ -460,12 +460,14 @@ def contact_names(
     schema = {"video": pl.String, "frame": pl.Int64}
     table = pl.DataFrame({"video": videos, "frame": frames}, schema).with_row_index("row")
     table = table.with_columns(label=pl.lit(0) if labels is None else pl.Series(labels))
-    table = table.sort("video", "frame", maintain_order=True)
-    same = (pl.col(name) == pl.col(name).shift(1) for name in ("video", "label"))
+    named = pl.Enum(table["video"].drop_nulls().unique())
+    table = table.with_columns(code=pl.col("video").cast(named).to_physical())
+    table = table.sort("code", "frame", maintain_order=True)  # names take twice as long
+    same = (pl.col(name) == pl.col(name).shift(1) for name in ("code", "label"))
     first = ~pl.all_horizontal(*same, pl.col("frame").diff() <= 1).fill_null(False)
-    number = first.cast(pl.Int64).cum_sum().over("video").cast(pl.String).str.zfill(4)
-    named = table.with_columns(contact=pl.format("{}#{}", "video", number))
-    return named.sort("row")["contact"].to_list()
+    number = first.cast(pl.Int64).cum_sum().over("code").cast(pl.String).str.zfill(4)
+    contacts = table.select("row", contact=pl.format("{}#{}", "video", number))
+    return contacts.sort("row")["contact"]
 
 
 def number_contacts(manifests: Sequence[Manifest]) -> list[Manifest]:
@@ -482,7 +484,7 @@ def number_contacts(manifests: Sequence[Manifest]) -> list[Manifest]:
     # A frame in two lists belongs to one contact.
     distinct = rows.unique(place, maintain_order=True)
     names = contact_names(*(distinct[name] for name in (*place, "material")))
-    distinct = distinct.with_columns(contact=pl.Series(names, dtype=pl.String))
+    distinct = distinct.with_columns(contact=names)
     contacts = rows.join(distinct, on=place, how="left", maintain_order="left")
     numbered = list(manifests)
     for k in bare:

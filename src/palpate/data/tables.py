@@ -20,7 +20,7 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
-from itertools import islice, permutations
+from itertools import permutations
 from pathlib import Path
 from typing import Any
 
@@ -49,7 +49,7 @@ HALVES = re.compile("[\ud800-\udfff]")
 PATTERN = re.compile(r"\*|\^.*\$", re.DOTALL)
 #: Where a row was read, and the texts in the requested columns.
 Record = tuple[Any, ...]
-_Records = Callable[[Sequence[str]], Iterable[Record]]
+_Records = Callable[[Sequence[str]], pl.DataFrame | Iterable[Record]]
 
 
 @dataclass
@@ -78,7 +78,9 @@ class Table:
             must = f"Columns of {self.name} must have plain names"
             require(not PATTERN.fullmatch(name), None, must, repr(name), fix="Rename it")
         schema = {LINE: pl.Int64} | dict.fromkeys(columns, pl.String)
-        rows = pl.DataFrame(list(self.records(columns)), schema, orient="row")
+        rows = self.records(columns)
+        if not isinstance(rows, pl.DataFrame):
+            rows = pl.DataFrame(list(rows), schema, orient="row")
         cells = [pl.col(name).str.strip_chars() for name in columns]
         rows = rows.with_columns(pl.when(cell != "").then(cell) for cell in cells)
         unfit = pl.any_horizontal(pl.lit(False), pl.col(pl.String).str.contains(UNFIT))
@@ -273,19 +275,20 @@ def _csv(path: Path, names: Sequence[str] | None) -> Table:
     problems: list[Problem] = []
     data = content_of(path)
     text = decoded(data)
-    first = next(_csv_rows(path, text, problems), (0, []))[1]
-    header = list(names or [cell.strip() for cell in first])
+    rows = _csv_rows(path, text, problems)
+    header = list(names or [cell.strip() for cell in (rows["cells"][0] if len(rows) else [])])
+    rows, width = rows.slice(0 if names else 1), pl.col("cells").list.len()
+    for line, count in rows.filter(width != len(header)).select(LINE, width).iter_rows():
+        words = f"{count} cells under {len(header)} columns"
+        problems.append(Problem(f"{path}:{line}", "bad-row", words))
+    rows, wrong = rows.filter(width == len(header)), [*problems]
+    if header:
+        problems.clear()  # they count with the columns that are read
 
-    def records(columns: Sequence[str]) -> Iterator[Record]:
-        problems.clear()
-        rows = islice(_csv_rows(path, text, problems), 0 if names else 1, None)
-        places = [header.index(name) for name in columns]
-        for line, cells in rows:
-            if len(cells) == len(header):
-                yield (line, *[cells[k] for k in places])  # tuples: nothing to collect
-            else:
-                width = f"{len(cells)} cells under {len(header)} columns"
-                problems.append(Problem(f"{path}:{line}", "bad-row", width))
+    def records(columns: Sequence[str]) -> pl.DataFrame:
+        problems[:] = wrong
+        cells = (pl.col("cells").list.get(header.index(name)).alias(name) for name in columns)
+        return rows.select(LINE, *cells)
 
     table = Table(str(path), header, problems, records)
     if not text.isascii() and is_windows(data):
@@ -295,9 +298,24 @@ def _csv(path: Path, names: Sequence[str] | None) -> Table:
     return table
 
 
-def _csv_rows(path: Path, text: str, problems: list[Problem]) -> Iterator[tuple[int, list[str]]]:
-    """(first line, cells) of each row that is not blank."""
+def _csv_rows(path: Path, text: str, problems: list[Problem]) -> pl.DataFrame:
+    """First line (``LINE``) and ``cells`` of each row that is not blank."""
     lines = list(io.StringIO(text, newline=""))
+    sign = _cells(path, lines).dialect.delimiter
+    if '"' in text or sign == " ":
+        rows = list(_quoted_rows(path, lines, problems))
+        return pl.DataFrame(rows, {LINE: pl.Int64, "cells": pl.List(pl.String)}, orient="row")
+    row = pl.col("row").str.strip_chars_end("\r\n")
+    table = pl.DataFrame({"row": lines}, {"row": pl.String}).with_columns(row)
+    table = table.with_row_index(LINE, offset=1).cast({LINE: pl.Int64})
+    blank = pl.col("row").str.replace_all(sign, "", literal=True).str.strip_chars() == ""
+    return table.filter(~blank).select(LINE, cells=pl.col("row").str.split(sign))
+
+
+def _quoted_rows(
+    path: Path, lines: Sequence[str], problems: list[Problem]
+) -> Iterator[tuple[int, list[str]]]:
+    """The same of lines with quotation marks."""
     reader = _cells(path, lines)
     first = 1
     try:
