@@ -253,10 +253,12 @@ def name_recordings(manifests: Sequence[Manifest], template: str | None = None) 
         return []
     bare = [_unread(m, manifests, stated=template is not None) for m in manifests]
     schema = {PATH: pl.String, "input": pl.Int64}
-    names = pl.concat(
-        pl.DataFrame([] if own is None else {PATH: _names_of(own), "input": k}, schema)
+    read = [
+        pl.DataFrame({PATH: _names_of(own), "input": k}, schema)
         for k, own in enumerate(bare)
-    )
+        if own is not None
+    ]
+    names = pl.concat([pl.DataFrame(schema=schema), *read])
     fields, levels, source = _read(names, template)
     if not levels:
         return list(manifests)
