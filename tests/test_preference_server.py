@@ -281,6 +281,16 @@ def test_the_file_of_a_killed_server_holds_all_votes_or_is_refused(planned, tmp_
         assert not any(note.code == "votes-so-far" for note in notes)
 
 
+def test_damaged_names_in_the_file_of_votes_are_refused(planned, tmp_path):
+    folder = Path(shutil.copytree(planned, tmp_path / "study"))
+    store = folder / "study.db"
+    VoteStore(store, Plan.load(folder).study).close()
+    whole = store.read_bytes()
+    for name in (b"TABLE", b"study", b"votes", b"name"):
+        store.write_bytes(whole.replace(name, name[:-1] + b"\x87"))
+        fails("must be a file of votes|must be of study", preference.score, folder)
+
+
 def half_open(server, address, count):
     """Connections from an address of this machine that never end the head of their request."""
     sockets = []

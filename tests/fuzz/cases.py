@@ -88,7 +88,8 @@ def failures(args: Sequence[str], folder: Path, ending: tuple[int, ...] = ()) ->
     NETWORK.clear()
     before = snapshot(folder / "in") | snapshot(folder / "out")
     status, out, err = run(args, folder)
-    wrong = [*_ending(status, out, err, "--json" in args), *_traces(folder, before)]
+    as_json = "--json" in args and not {"-h", "--help"} & {*args}
+    wrong = [*_ending(status, out, err, as_json), *_traces(folder, before)]
     if ending and NETWORK:
         wrong.append(f"a connection to {NETWORK}")
     lacking = status == 2 and re.search(r"the extra (\w+) brings it", err)

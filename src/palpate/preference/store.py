@@ -172,7 +172,11 @@ def _usable(path: Path) -> Generator[None]:
     """Raise what SQLite raises inside as an error of the file."""
     try:
         yield
-    except (sqlite3.Error, OSError) as error:
+    except (
+        sqlite3.Error,
+        OSError,
+        UnicodeDecodeError,
+    ) as error:  # SQLite's message quotes the file
         must = f"{path} must be a file of votes that the server can read and write"
         fix = "Name the one that it wrote; after a kill, serve the study once more and stop it"
         raise PalpateError(must, str(error), fix) from None
