@@ -51,7 +51,7 @@ def adjacent_tables(folder: Path) -> list[tuple[Path, str]]:
         Files, and the folder that each lies in, below the first and with a slash. Of a kind that
         samples have one each of there are none.
     """
-    names = [name for suffix in (*TABLES, *LISTS) for name in walk(folder, (suffix,))[0]]
+    names = walk(folder, (*TABLES, *LISTS))[0]
     often = Counter(Path(name).suffix.lower() for name in names)
     own = [name for name in names if often[Path(name).suffix.lower()] <= TRIED]
     tables = [(folder / name, name[: name.rfind("/") + 1]) for name in own]
