@@ -164,7 +164,7 @@ def _ends(paths: Sequence[str], root: Path) -> dict[str, str]:
             folder = posixpath.join(folder, name)
         return folder if is_there(root, folder) else ""
 
-    def place(folders: Iterable[str], end: Sequence[str]) -> tuple[str, str]:
+    def located(folders: Iterable[str], end: Sequence[str]) -> tuple[str, str]:
         """(folder, file) of an end: in the root, or in the only folder that has it."""
         found = [(folder, file) for folder in folders if (file := below(folder, end))]
         return found[0] if found and (not found[0][0] or len(found) == 1) else ("", "")
@@ -173,11 +173,11 @@ def _ends(paths: Sequence[str], root: Path) -> dict[str, str]:
     folders = ["", *sorted(name for name in names("") if (root / name).is_dir())[:TRIED]]
     best, cut, starts = len(tried) // 2, 0, set[str]()
     for k in range(min(map(len, tried), default=0)):
-        found = [place(folders, parts[k:]) for parts in tried]
+        found = [located(folders, parts[k:]) for parts in tried]
         count = sum(bool(file) for _, file in found)
         if count > best and len({tuple(_parts(path)[k:]) for path in paths}) == len(paths):
             best, cut, starts = count, k, {folder for folder, _ in found}
-    every = {path: place(sorted(starts), _parts(path)[cut:])[1] for path in paths if starts}
+    every = {path: located(sorted(starts), _parts(path)[cut:])[1] for path in paths if starts}
     return {path: file for path, file in every.items() if file}
 
 
