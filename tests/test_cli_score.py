@@ -126,6 +126,20 @@ def test_mistakes_are_one_line_with_status_2(capsys, sets, args, words):
     commands.mistake(capsys, words, "score", *args.split(), "-q")
 
 
+def test_a_missing_folder_is_named_before_what_takes_seconds_is_imported():
+    words = ["score", "--generated", "nowhere", "--reference", "nowhere"]
+    code = f"""
+import sys
+from palpate.cli import main
+assert main({words}) == 2
+heavy = {{"scipy", "polars", "torch", "palpate.evaluation.scoring"}} & {{*sys.modules}}
+assert not heavy, heavy
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    assert "nothing at nowhere" in done.stderr
+
+
 def test_a_full_disk_loses_no_scores(capsys, sets, monkeypatch):
     def fail(*_):
         raise OSError(errno.ENOSPC, "No space left on device", "o.json")

@@ -1,10 +1,11 @@
 """The manifest: round trip, digest, validation with every problem at once, joining."""
 
 import polars as pl
+import pytest
 
 from forge.errors import fails
 from palpate.core import Split
-from palpate.data.manifest import Manifest
+from palpate.data.manifest import FOLLOWED, Manifest
 
 
 def test_round_trip_keeps_rows_digest_facts_and_a_root_that_moves_along(small_manifest, tmp_path):
@@ -64,6 +65,26 @@ def test_a_manifest_whose_paths_climb_out_is_not_loaded(tmp_path):
         manifest = Manifest.from_rows([{"id": "1", "vision": path}], tmp_path / "root")
         manifest.save(tmp_path / "root" / "manifest.parquet")
         fails("inside the root", Manifest.load, tmp_path / "root")
+
+
+@pytest.mark.parametrize("value", ["a.png", "folder/a.png"])
+def test_a_link_out_of_the_root_is_not_followed_but_where_an_import_met_it(tmp_path, value):
+    (tmp_path / "secret" / "folder").mkdir(parents=True)
+    (tmp_path / "secret" / value).touch()
+    root = tmp_path / "root"
+    root.mkdir()
+    link = root / value.split("/")[0]
+    link.symlink_to(tmp_path / "secret" / link.name)
+    for facts in ({}, {"links": FOLLOWED}):
+        manifest = Manifest.from_rows([{"id": "1", "tactile": value}], root, facts)
+        manifest.save(root / "manifest.parquet")
+        loaded = Manifest.load(root)
+        if facts:
+            assert loaded.paths("tactile") == [loaded.path(value)] == [root / value]
+            continue
+        for one in (loaded, loaded.take(["1"]), Manifest.join(loaded)):
+            fails("must stay inside", one.path, value)
+            fails("must stay inside", one.paths, "tactile")
 
 
 def test_parts_follow_the_split_and_foreign_ids_are_named(small_manifest):

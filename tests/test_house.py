@@ -186,13 +186,16 @@ AutoModel.from_pretrained("a", trust_remote_code=True)
     assert len(list(opened_wrongly(tmp_path / "planted.py", "data/planted.py"))) == 8
 
 
+READS = ("pl.read_parquet", "pl.scan_parquet")
+
+
 def parquet_lines(path, *, guarded):
     """Lines of a file that read Parquet; the ``guarded`` ones, where a panic is an error."""
     for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
         inside = isinstance(node, ast.With) and "reading_parquet()" in map(ast.unparse, node.items)
         if inside or (not guarded and isinstance(node, ast.Module)):
             calls = [n for n in ast.walk(node) if isinstance(n, ast.Call)]
-            yield from {n.lineno for n in calls if "pl.read_parquet" in ast.unparse(n.func)}
+            yield from {n.lineno for n in calls if ast.unparse(n.func).startswith(READS)}
 
 
 def test_parquet_is_read_where_a_panic_of_polars_is_an_error(tmp_path):

@@ -17,7 +17,7 @@ from PIL import Image
 
 from forge.commands import call
 from forge.damage import DAMAGES, flip, inflate
-from forge.pictures import picture
+from forge.pictures import picture, write_video
 from forge.servers import FakeServer
 from palpate.cli import terminal
 from palpate.core import (
@@ -33,6 +33,7 @@ from palpate.core import (
     sealed_path,
     write_json,
 )
+from palpate.data.manifest import Manifest
 
 pytest.importorskip("torch")
 
@@ -62,6 +63,12 @@ def everything(folder, out):
     return digest_folder(folder / "out")
 
 
+def imported(folder, out):
+    """Of the manifest and its images."""
+    images = sorted((folder / "out").rglob("*.jpg"))
+    return digest_lines([Manifest.load(folder / "out").digest, *map(digest_file, images)])
+
+
 def captions(folder, out):
     return digest_file(folder / "out" / "captions.parquet")
 
@@ -77,6 +84,9 @@ MINI = ("--clip", "palpate/mini")
 WORLD = ("world", "-o", "out", "--preset", "tiny", "--materials", "2", "--workers", "1")
 WORLD += ("--objects-per-material", "1", "--size", "16", "--layout")
 VERBS = {
+    "import": Verb(
+        ("import", "../videos", "-o", "out", "--every", "4"), ("extracting frames", 1), imported
+    ),
     "world": Verb((*WORLD, "videos"), ("rendering videos", 1), everything),
     "world of frames": Verb((*WORLD, "frames"), ("rendering videos", 1), everything),
     "generate": Verb(
@@ -109,7 +119,7 @@ VERBS = {
 
 
 #: The others take minutes: a file for each frame, or trainings.
-DAILY = ("world", "generate", "caption", "score")
+DAILY = ("import", "world", "generate", "caption", "score")
 
 
 class Stopper:
@@ -133,6 +143,8 @@ def place(tag, tmp_path, monkeypatch):
     (tmp_path / "photos").mkdir()
     for k in range(3):
         Image.fromarray(picture(k + 1, 32)).save(tmp_path / "photos" / f"{k}.png")
+    for side in ("vision", "tactile"):
+        write_video(tmp_path / "videos" / "a" / f"{side}.mp4", 12)
     monkeypatch.setattr(terminal, "_LogProgress", Stopper)
     monkeypatch.setattr(Stopper, "stop", None)
     (tmp_path / "run").mkdir()
@@ -177,7 +189,7 @@ def test_each_damaged_file_of_a_stopped_run_is_made_again_or_refused(
                 else:
                     assert "Traceback" not in err, case
                     assert any(w in err for w in ("damaged", "must be JSON", "another line")), case
-    assert said or name in ("generate", "caption")
+    assert said or name in ("import", "generate", "caption")
 
 
 def empty(folder):

@@ -1,6 +1,7 @@
 """The page as a file: well-formed, self-contained, escaped, within its size, honest about gaps."""
 
 import base64
+import hashlib
 import io
 import json
 import re
@@ -119,6 +120,9 @@ def test_a_page_is_well_formed_self_contained_and_complete(tmp_path):
     assert [p for p in places if not p.startswith(("data:", "#"))] == []
     assert "@import" not in html
     assert "default-src 'none'" in html
+    (script,) = re.findall(r"<script>(.*?)</script>", html, re.DOTALL)
+    digest = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
+    assert f"script-src 'sha256-{digest}';" in html  # of the very text that stands there
     tree = Tree(html)
     for text in (
         "A title",

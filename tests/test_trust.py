@@ -2,6 +2,7 @@
 
 import json
 import os
+import shutil
 from pathlib import Path
 
 import polars as pl
@@ -12,6 +13,7 @@ from forge.commands import mistake
 from forge.errors import fails
 from forge.pictures import write_images
 from palpate.cli import main
+from palpate.encoders.models import shipped_root
 from palpate.evaluation.scorers import Weights
 from palpate.evaluation.scoring import score
 from palpate.studies.verifying import verify
@@ -116,6 +118,35 @@ def test_a_huge_file_of_text_is_refused_before_it_is_read(here, capsys, name, co
     with open(name, "wb") as file:
         file.truncate(3 << 30)
     mistake(capsys, "at most 256 MiB", *command.split())
+
+
+@pytest.mark.parametrize(
+    ("name", "command"),
+    [
+        ("config.json", "score --generated set/touch --reference set/photo --encoder model"),
+        (
+            "tactile/config.json",
+            "score --generated set/touch --reference set/photo --encoder model",
+        ),
+        ("tokenizer/vocab.json", "generate set/photo/1.png --model model -o t.png"),
+    ],
+)
+def test_a_huge_text_of_a_model_is_refused_before_another_library_reads_it(
+    here, capsys, name, command
+):
+    shutil.copytree(shipped_root() / "mini" / "encoders", "model")
+    Path("model", name).parent.mkdir(exist_ok=True)
+    with open(Path("model", name), "wb") as file:
+        file.truncate(3 << 30)
+    mistake(capsys, "at most 256 MiB", *command.split())
+
+
+@pytest.mark.parametrize("command", ["import rows.parquet -o m", "audit rows.parquet"])
+def test_a_small_parquet_file_of_many_equal_rows_is_refused(here, capsys, command):
+    columns = {name: pl.repeat("photo/1.png", 9_000_000, eager=True) for name in ("id", "vision")}
+    pl.DataFrame(columns).write_parquet("rows.parquet")
+    assert Path("rows.parquet").stat().st_size < 1 << 20
+    mistake(capsys, "at most 256 MiB are read at once", *command.split())
 
 
 def test_a_panic_of_polars_over_a_damaged_table_is_a_bad_table(here, capsys, monkeypatch):

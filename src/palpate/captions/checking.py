@@ -39,7 +39,7 @@ from palpate.core import (
     track,
 )
 from palpate.core.messages import require_joined
-from palpate.data.manifest import Manifest, reading_parquet
+from palpate.data.manifest import Manifest, read_parquet
 from palpate.data.reading import load
 from palpate.data.texts import TABLE, joined, read_texts
 from palpate.metrics.means import mean_of
@@ -147,8 +147,7 @@ def _read(
     require(texts > 0, "captions", must, got, fix=fix)
     flags: dict[str, list[str]] = {}
     if isinstance(captions, Path) and captions.suffix == ".parquet":
-        with reading_parquet():
-            table = pl.read_parquet(captions, glob=False)
+        table = read_parquet(captions)
         if table.schema.get("flags") == pl.List(pl.String):
             flags = dict(table.select("id", "flags").iter_rows())
     return manifest, flags

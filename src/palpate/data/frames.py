@@ -1,8 +1,8 @@
 """Frames of one modality of a recording: a folder, or a video or stack with a cache of images.
 
 A cached frame is ``<cache>/%010d.jpg`` (quality 95, no chroma subsampling, since the color of a gel
-carries the surface normal), written whole or not at all, so an interrupted run goes on
-where it stopped.
+carries the surface normal), written whole or not at all; its digest and name are a line of
+``frames.sha256`` beside it. An interrupted run goes on with the frames that have theirs.
 """
 
 from __future__ import annotations
@@ -16,13 +16,16 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from palpate.core import require_regular, save_image
+from palpate.core import digest_file, require_regular, save_image
 from palpate.data.contacts import SIZE, thumbnail
 from palpate.data.images import SUFFIXES, VIDEOS, read_image
 from palpate.data.manifest import DIGITS
 from palpate.data.stacks import SUFFIX, StackReader
+from palpate.data.tables import text_in
 from palpate.data.video import VideoReader
 
+#: Digests of the cached frames.
+SEAL = "frames.sha256"
 #: Files that hold many frames.
 MOVING = (*VIDEOS, SUFFIX)
 
@@ -120,18 +123,24 @@ class VideoFrames:
             return reader.thumbnails(SIZE), reader.seconds
 
     def extract(self, frames: set[int], created: list[Path], stop: Event) -> None:
-        """Cache the frames that are not cached yet; new files are added to ``created``.
+        """Cache the frames that are not, or are damaged; new files are added to ``created``.
 
         Raises:
             PalpateError: if the video breaks off; earlier frames stay.
         """
+        seal, line = self.cache / SEAL, lambda path: f"{digest_file(path)} {path.name}"
+        sealed = set(text_in(seal).split("\n")) if seal.is_file() else set[str]()
         needed = {self.path(k): k for k in sorted(frames)}
-        missing = [k for path, k in needed.items() if not path.is_file()]
+        whole = lambda path: path.is_file() and line(path) in sealed
+        missing = [k for path, k in needed.items() if not whole(path)]
         for k, image in self.read(missing) if missing else ():
             if stop.is_set():
                 return
-            created.append(self.path(k))
-            save_frame(self.path(k), image, self.size)
+            path = self.path(k)
+            created += [path] if seal.exists() else [path, seal]
+            save_frame(path, image, self.size)
+            with open(seal, "a", encoding="utf-8") as file:
+                file.write(f"\n{line(path)}\n")  # a kill may have cut the line before
 
 
 class TimedFrames(VideoFrames):

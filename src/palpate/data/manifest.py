@@ -31,7 +31,7 @@ import re
 from collections.abc import Generator, Iterable, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, replace
-from functools import cache, cached_property
+from functools import cache, cached_property, lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -51,6 +51,7 @@ from palpate.core import (
     inside,
     require,
 )
+from palpate.core.files import LARGEST
 from palpate.core.messages import require_rows
 
 IMAGE_COLUMNS = ("vision", "tactile", "background")
@@ -95,11 +96,13 @@ class Manifest:
         root: folder that the image paths are relative to.
         facts: facts about the source (``dataset``, ``text_source`` ...), kept in the file, not in
             the digest.
+        guarded: whether links out of the root are refused: in a file of others.
     """
 
     table: pl.DataFrame
     root: Path
     facts: Mapping[str, str] = field(default_factory=dict)
+    guarded: bool = False
 
     @classmethod
     def from_rows(
@@ -173,21 +176,31 @@ class Manifest:
         return self.table.select(c for c in self.table if c.null_count() < len(self))
 
     def path(self, relative: str) -> Path:
-        """The absolute path of an image named in the table."""
-        return self.root / relative
+        """The absolute path of an image named in the table.
+
+        Raises:
+            PalpateError: if a link leads out of the root, and no import followed one.
+        """
+        path = self.root / relative
+        if self.guarded:
+            stays = _stays(self.root, Path(relative).parent)
+            stays &= not path.is_symlink() or inside(self.root, relative) is not None
+            must, fix = f"Images must stay inside {self.root}, also by links", "Import again"
+            require(stays, None, must, repr(relative), fix=fix)
+        return path
 
     def paths(self, column: str) -> list[Path]:
         """Absolute paths of one image column.
 
         Raises:
-            PalpateError: if a row has no such image.
+            PalpateError: if a row has no such image, or as :meth:`path`.
         """
         values = self.column(column)
         if missing := values.count(None):
             must = f"Every sample must have a {column} image here"
             got = f"{missing} without, first {self.ids[values.index(None)]!r}"
             raise PalpateError(must, got, f"Drop those samples, or fill the column {column}")
-        return [self.root / value for value in values]
+        return [self.path(value) for value in values]
 
     def take(self, ids: Sequence[str]) -> Manifest:
         """The rows of ``ids``, in that order.
@@ -232,7 +245,8 @@ class Manifest:
         names = " + ".join(m.facts.get("dataset", "?") for m in manifests)
         first, *further = (m.facts for m in manifests)
         same = {k: v for k, v in first.items() if all(facts.get(k) == v for facts in further)}
-        return cls(table, root, same | {"dataset": names})
+        guarded = all(m.guarded for m in manifests)
+        return cls(table, root, same | {"dataset": names}, guarded)
 
     @property
     def synthetic(self) -> bool | None:
@@ -313,8 +327,7 @@ class Manifest:
             )
         try:
             meta = _metadata(path)
-            with reading_parquet():
-                table = pl.read_parquet(path, glob=False)  # a path may hold brackets
+            table = read_parquet(path, most=4 * LARGEST)
         except Exception as error:  # polars raises several kinds for a file that is not Parquet
             got = str(error).splitlines()[0]
             raise PalpateError(f"The manifest {path} must be a Parquet file", got, fix) from None
@@ -332,10 +345,15 @@ class Manifest:
                 raise PalpateError(must, got, "Remove the row, or import again")
         facts = {k.removeprefix(FACT): v for k, v in meta.items() if k.startswith(FACT)}
         home = Path(root) if root else Path(os.path.normpath(path.parent / meta["palpate.root"]))
-        manifest = cls(table, home, facts)
+        manifest = cls(table, home, facts, facts.get("links") != FOLLOWED)
         must, got = f"The digest in {path} must match its rows", "rows of another program"
         require(manifest.digest == meta["palpate.digest"], None, must, got, fix=fix)
         return manifest
+
+
+@lru_cache(1 << 16)
+def _stays(root: Path, folder: Path) -> bool:
+    return inside(root, str(folder)) is not None
 
 
 @contextmanager
@@ -345,6 +363,24 @@ def reading_parquet() -> Generator[None]:
         yield
     except pl.exceptions.PanicException as error:
         raise ValueError(str(error)) from None
+
+
+def read_parquet(path: Path, columns: Sequence[str] = ("*",), most: int = LARGEST) -> pl.DataFrame:
+    """Read columns of a Parquet file.
+
+    Raises:
+        ValueError: if it is damaged, or its cells take more than ``most`` bytes, however few they
+            are on the disk.
+    """
+    with reading_parquet():
+        rows = pl.scan_parquet(path, glob=False).select(columns)  # a path may hold brackets
+        cells = pl.len().cast(pl.Int64).alias("") * 16 * len(rows.collect_schema())
+        texts = pl.col(pl.String).str.len_bytes().cast(pl.Int64).sum()
+        size = sum(rows.select(cells, texts).collect(engine="streaming").row(0))
+        got = f"{size >> 20:,} MiB of cells, and at most {most >> 20:,} MiB are read at once"
+        if size > most:
+            raise ValueError(got)
+        return rows.collect()
 
 
 def is_manifest(path: Path) -> bool:

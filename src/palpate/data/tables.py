@@ -27,7 +27,7 @@ from typing import Any
 import polars as pl
 
 from palpate.core import PalpateError, Problem, ProblemsError, content_of, require
-from palpate.data.manifest import PART_NAMES, PATH, ROLE_OF, SIDES, reading_parquet
+from palpate.data.manifest import PART_NAMES, PATH, ROLE_OF, SIDES, read_parquet, reading_parquet
 from palpate.data.mapping import LINE, text_of
 
 csv.field_size_limit(1 << 30)  # by default a long text is an error, for the whole process
@@ -474,11 +474,10 @@ def _schema(path: Path) -> dict[str, pl.DataType]:
 def _parquet(path: Path) -> Table:
     def read(columns: Sequence[str]) -> pl.DataFrame:
         try:
-            with reading_parquet():
-                return pl.read_parquet(path, columns=list(columns), glob=False)
+            return read_parquet(path, columns)
         except Exception as error:  # polars raises several kinds
             must, got = f"{path} must be a whole Parquet file", str(error).splitlines()[0]
-            raise PalpateError(must, got, "Write it again") from None
+            raise PalpateError(must, got, "Write it again, a large one in parts") from None
 
     try:
         with reading_parquet():

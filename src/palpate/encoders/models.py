@@ -43,7 +43,7 @@ from numpy.typing import NDArray
 from safetensors import SafetensorError
 from safetensors.numpy import load_file, save_file
 
-from palpate.core import PalpateError, require, require_regular
+from palpate.core import PalpateError, content_of, require, require_regular
 from palpate.core.files import canonical_json
 
 if TYPE_CHECKING:  # names are checked before torch is imported, which takes seconds
@@ -173,11 +173,19 @@ def find_model(
     if (shipped := shipped_folder(source, part)) is not None:
         return shipped
     if is_hub_id(source):
-        return _fetch(str(source), files, role, fix)
+        return _of_size(_fetch(str(source), files, role, fix))
     must = f"The {role} must be a folder, one of {', '.join(SHIPPED)}, or a hub id (owner/name)"
     found = str(source) != "" and Path(source).is_dir()
     require(found, None, must, f"no folder {source or repr('')}", fix=fix)
-    return Path(source)
+    return _of_size(Path(source))
+
+
+def _of_size(folder: Path) -> Path:
+    """The folder, whose texts other libraries read at once; PalpateError where one is too large."""
+    for path in (*folder.glob("*"), *folder.glob("*/*")):
+        if path.suffix in (".json", ".txt") and path.is_file():
+            content_of(path)
+    return folder
 
 
 def parts_of(source: str | Path) -> list[str | Path]:
@@ -216,7 +224,7 @@ def find_encoder(source: str | Path) -> tuple[Path, str | None]:
         got, fix = ", ".join(p.name for p in files), "Pass the file" if files else FIX_ENCODERS
         require(len(files) == 1, None, must, got or "none of these", fix=fix)
         path = files[0]
-    return path, sensor.lower() or None
+    return _of_size(path) if path.is_dir() else path, sensor.lower() or None
 
 
 def find_single(

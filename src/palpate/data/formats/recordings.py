@@ -17,7 +17,7 @@ from pathlib import Path
 from threading import Event
 from typing import Any, Literal
 
-from palpate.core import PalpateError, Problem, Progress, read_json, require, write_json
+from palpate.core import PalpateError, Problem, Progress, read_json, require, sealed, write_json
 from palpate.data.contacts import Pixels
 from palpate.data.frames import (
     FolderFrames,
@@ -386,7 +386,7 @@ class Recordings:
             sizes = sizes_before | sizes
         else:
             into.created.append(path)
-        write_json(path, {**settings, "videos": sizes})
+        write_json(path, sealed({**settings, "videos": sizes}))
 
     def cells(self, rows: Sequence[Row], root: Path) -> list[dict[str, Any]]:
         """Manifest cells of the rows, with paths relative to ``root``.

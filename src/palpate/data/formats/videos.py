@@ -26,12 +26,13 @@ import os
 import shutil
 from collections.abc import Mapping
 from dataclasses import dataclass
+from filecmp import cmp
 from itertools import islice
 from pathlib import Path
 
 import numpy as np
 
-from palpate.core import PalpateError, ProblemsError, Progress, few, quiet, require
+from palpate.core import PalpateError, ProblemsError, Progress, atomic_path, few, quiet, require
 from palpate.data.contacts import Contacts, find_contacts, thumbnail
 from palpate.data.detection import (
     ORDER,
@@ -328,10 +329,10 @@ def _copy_images(root: Path, into: Into, rows: list[Row], videos: Mapping[str, _
     for name in dict.fromkeys(row.video for row in rows):
         for column, path in videos[name].still.items():
             target = into.out / _place(name, column, path)
-            if not target.is_file():
-                target.parent.mkdir(parents=True, exist_ok=True)
+            if not (target.is_file() and cmp(target, root / path, shallow=False)):
                 into.created.append(target)
-                shutil.copyfile(root / path, target)
+                with atomic_path(target) as part:
+                    shutil.copyfile(root / path, part)
 
 
 def _place(video: str, column: str, path: str) -> str:
