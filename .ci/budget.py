@@ -1,7 +1,7 @@
 """Holds the size of palpate: `make lint` prints it next to budget.toml and fails above.
 
     .venv/bin/python .ci/budget.py             # the table
-    .venv/bin/python .ci/budget.py --lower     # writes what is there where it is less
+    .venv/bin/python .ci/budget.py --lower     # writes what is there where it is better
 
 Tokens are those of Python's ``tokenize`` without comments, docstrings and line ends; of templates,
 style sheets, scripts and JSON in the package, words and signs (shipped models and split lists are
@@ -187,8 +187,8 @@ def main() -> int:
             above += bad
             more = f"  {lines[name]} lines" if table == "tokens" and name in lines else ""
             print(f"  {name:22} {now:9} {most:7}{more}{'  ABOVE' * bad}")
-            if args.lower and table != "documented":
-                budget[table][name] = min(now, most)
+            if args.lower:
+                budget[table][name] = max(now, most) if table == "documented" else min(now, most)
     if args.lower:  # numbers alone: the reasons stay
         table, rows = "", list[str]()
         for row in BUDGET.read_text(encoding="utf-8").splitlines():

@@ -84,9 +84,8 @@ def world_facts(folder: Path) -> dict[str, str]:
 
     The blank entries replace the license, citation and address of the real set.
     """
-    places = (folder / "world.json", folder.parent / "world.json")  # HCT's rigs are one level down
-    path = next((file for file in places if file.is_file()), None)
-    world = read_json(path, "world record") if path else {}
+    path = folder / "world.json"
+    world = read_json(path, "world record") if path.is_file() else {}
     if not str(world.get("format", "")).startswith("palpate-world/"):
         return {}
     facts = {"dataset": "palpate's procedural world", "synthetic": "yes"}

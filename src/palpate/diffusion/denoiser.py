@@ -1,7 +1,7 @@
 """The denoiser eps_theta(z_t, t, condition), a diffusers U-Net with its condition, and sampling.
 
 The condition is one *projected* embedding c of the shared space, so that text and vision embeddings
-fit into the same slot (paper section 2; section 9, "token type"):
+fit into the same slot (paper section 2):
 
     token = sqrt(d) * (c - m_source) / ||c - m_source||
 

@@ -161,8 +161,8 @@ MINI = DiffusionPreset(
     sampler=SamplerOptions("dpm", steps=10, guidance=3.0, rescale=0.7, high=0.8),
 )
 
-#: The paper's model as far as it is known; reference/paper.md section 9 gives the reason for each
-#: open choice.
+#: The paper's model as far as it is known; what it leaves open is as usual in latent diffusion
+#: (docs/concepts/generator.md says what else was tried).
 PAPER = DiffusionPreset(
     name="paper",
     size=256,
