@@ -33,6 +33,11 @@ if TYPE_CHECKING:
 
 #: Pillow's names of the images that are read. What is in the file chooses among these alone.
 IMAGE_FORMATS = ("JPEG", "PNG", "TIFF", "BMP", "WEBP", "PPM", "GIF", "AVIF", "HEIF")
+#: Suffixes of the names of images.
+SUFFIXES = (
+    *(".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".webp"),
+    *(".ppm", ".pgm", ".gif", ".avif", ".heic", ".heif"),
+)
 #: Pixels of the largest image that is decoded: some twenty bytes each while it becomes RGB.
 MOST_PIXELS = 50_000_000
 #: White of 16-bit pixels, and the least brightest pixel of an image that is one of them.

@@ -21,8 +21,7 @@ from typing import TYPE_CHECKING
 import polars as pl
 
 from palpate.core import PalpateError, Split, few
-from palpate.data.images import SUFFIXES
-from palpate.data.manifest import PART_NAMES, SIDES
+from palpate.data.manifest import PART_NAMES, SIDES, is_image
 from palpate.data.mapping import LINE
 from palpate.data.rows import TRIED, is_there, relocated, some, spelled
 from palpate.data.tables import TABLES, Table, headless_names, names_images, open_table, pairings
@@ -216,4 +215,4 @@ def _keys(rows: Sequence[tuple[str, Cells]], below: str) -> dict[str, dict[str, 
 def _key(name: str) -> str:
     """A name or path as another person may have written it."""
     text = spelled(name)
-    return posixpath.splitext(text)[0] if text.endswith(SUFFIXES) else text
+    return posixpath.splitext(text)[0] if is_image(text) else text

@@ -17,8 +17,9 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from palpate.core import digest_file, require_regular, save_image
+from palpate.core.images import SUFFIXES
 from palpate.data.contacts import SIZE, thumbnail
-from palpate.data.images import SUFFIXES, VIDEOS, read_image
+from palpate.data.images import VIDEOS, read_image
 from palpate.data.manifest import DIGITS
 from palpate.data.stacks import SUFFIX, StackReader
 from palpate.data.tables import text_in

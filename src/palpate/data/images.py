@@ -52,10 +52,6 @@ if TYPE_CHECKING:
     from palpate.data.manifest import Manifest
 
 Check = Literal["decode", "header", "none"]
-SUFFIXES = (
-    *(".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".webp"),
-    *(".ppm", ".pgm", ".gif", ".avif", ".heic", ".heif"),
-)
 VIDEOS = (".mp4", ".mov", ".avi", ".mkv", ".m4v", ".webm")
 #: What to do about unreadable files that are not being imported now.
 REFETCH = "Fetch these files again, or skip the bad ones with: palpate import"

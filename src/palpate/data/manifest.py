@@ -52,6 +52,7 @@ from palpate.core import (
     require,
 )
 from palpate.core.files import LARGEST
+from palpate.core.images import SUFFIXES
 from palpate.core.messages import require_rows
 
 IMAGE_COLUMNS = ("vision", "tactile", "background")
@@ -381,6 +382,11 @@ def read_parquet(path: Path, columns: Sequence[str] = ("*",), most: int = LARGES
         if size > most:
             raise ValueError(got)
         return rows.collect()
+
+
+def is_image(name: object) -> bool:
+    """Whether a name has the suffix of an image."""
+    return str(name).strip().lower().endswith(SUFFIXES)
 
 
 def is_manifest(path: Path) -> bool:

@@ -47,9 +47,9 @@ from palpate.core import (
 from palpate.core.features import is_missing, to_numpy
 from palpate.core.messages import require_rows
 from palpate.data.images import cached_images, image_size, load_images, read_image, square
-from palpate.data.manifest import Manifest, is_manifest
+from palpate.data.manifest import Manifest, is_image, is_manifest
 from palpate.data.recordings import LEVELS, name_recordings
-from palpate.data.tables import TABLES, headless_names, is_image, open_table, table_of
+from palpate.data.tables import TABLES, headless_names, open_table, table_of
 
 #: Decoded images of more bytes than this are kept in a file of the cache.
 IN_MEMORY = 1 << 30

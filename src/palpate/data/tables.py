@@ -27,7 +27,16 @@ from typing import Any
 import polars as pl
 
 from palpate.core import PalpateError, Problem, ProblemsError, content_of, require
-from palpate.data.manifest import PART_NAMES, PATH, ROLE_OF, SIDES, read_parquet, reading_parquet
+from palpate.core.images import SUFFIXES
+from palpate.data.manifest import (
+    PART_NAMES,
+    PATH,
+    ROLE_OF,
+    SIDES,
+    is_image,
+    read_parquet,
+    reading_parquet,
+)
 from palpate.data.mapping import LINE, text_of
 
 csv.field_size_limit(1 << 30)  # by default a long text is an error, for the whole process
@@ -203,17 +212,8 @@ def side_of(texts: Iterable[str]) -> str:
     return max(roles, key=lambda role: roles[role], default="")
 
 
-def is_image(name: object) -> bool:
-    """Whether a name has the suffix of an image."""
-    from palpate.data.images import SUFFIXES  # lists are read without Pillow
-
-    return str(name).strip().lower().endswith(SUFFIXES)
-
-
 def names_images(cells: pl.Series) -> bool:
     """Whether most of some texts have the suffix of an image."""
-    from palpate.data.images import SUFFIXES
-
     ends = "|".join(map(re.escape, SUFFIXES))
     return 2 * (cells.str.contains(rf"(?i)(?:{ends})$").sum() or 0) > cells.count()
 

@@ -42,7 +42,8 @@ from palpate.core import (
     write_json,
 )
 from palpate.core.files import canonical_json
-from palpate.data.images import SUFFIXES, check_image, read_image, square
+from palpate.core.images import SUFFIXES
+from palpate.data.images import check_image, read_image, square
 from palpate.diffusion.generated import Generated, Index, file_name, old_index
 from palpate.encoders.models import FIX_MODEL, find_model
 

@@ -30,8 +30,9 @@ from palpate.core import (
     require_choice,
     short,
 )
+from palpate.core.images import SUFFIXES
 from palpate.data.captions import NAMED, caption
-from palpate.data.images import REFETCH, SUFFIXES, Frames, image_stamp, load_images
+from palpate.data.images import REFETCH, Frames, image_stamp, load_images
 from palpate.encoders.encoder_set import MODALITIES, EncoderSet, Modality
 from palpate.encoders.models import to_unit
 

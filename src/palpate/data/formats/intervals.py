@@ -35,7 +35,7 @@ from palpate.data.formats.layout import find_videos, require_videos
 from palpate.data.formats.recordings import Pairing, Recordings, Row
 from palpate.data.images import Check
 from palpate.data.imported import Imported
-from palpate.data.manifest import Manifest
+from palpate.data.manifest import Manifest, is_image
 from palpate.data.mapping import LINE, compile_maps
 from palpate.data.rows import manifest_rows, read_classes, without_repeats
 from palpate.data.scanning import Facts, Format, Into, Scan, require_some
@@ -46,7 +46,6 @@ from palpate.data.tables import (
     Table,
     decoded,
     header_of,
-    is_image,
     lines_of,
     open_table,
     text_in,

@@ -9,7 +9,7 @@ from functools import cache
 from pathlib import Path, PurePosixPath
 
 from palpate.core import PalpateError, inside, require
-from palpate.data.images import SUFFIXES
+from palpate.core.images import SUFFIXES
 from palpate.data.scanning import Row, Scan
 
 NUMBER = r"([0-9]+)"

@@ -32,6 +32,7 @@ from typing import TYPE_CHECKING
 import polars as pl
 
 from palpate.core import PalpateError, Progress, few, quiet, require
+from palpate.core.images import SUFFIXES
 from palpate.data.adjacent import adjacent_tables, join_tables, tables_of_pairs
 from palpate.data.detection import (
     SIDES,
@@ -45,9 +46,8 @@ from palpate.data.detection import (
 )
 from palpate.data.formats.layout import require_folder
 from palpate.data.frames import VIDEOS
-from palpate.data.images import SUFFIXES
 from palpate.data.listed import Listed, read_table
-from palpate.data.manifest import IMAGE_COLUMNS, PART_NAMES
+from palpate.data.manifest import IMAGE_COLUMNS, PART_NAMES, is_image
 from palpate.data.mapping import LINE, compile_maps
 from palpate.data.rows import manifest_rows, odd_groups, read_classes, records
 from palpate.data.scanning import Facts, Format, Scan
@@ -78,7 +78,7 @@ def detect(source: Path) -> bool:
     files = (
         name for _, _, names in islice(os.walk(source, followlinks=True), 500) for name in names
     )
-    return any(name.lower().endswith(SUFFIXES) for name in files)
+    return any(map(is_image, files))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -249,7 +249,7 @@ def _read_folder(
     videos = [path for path in files if path.lower().endswith(VIDEOS)]
     text = "videos, which are read with a template of their own"
     result.suspect(result.base, "unmatched", text, videos)
-    files = [path for path in files if path.lower().endswith(SUFFIXES)]
+    files = [*filter(is_image, files)]
     result.facts |= {"templates": "stated"} if texts else {}
     templates = parsed(texts or templates_of(files, result.base, side))
     matches = {s: _distinct(result, found) for s, found in assign(files, templates).items()}

@@ -33,6 +33,7 @@ from pathlib import Path
 import numpy as np
 
 from palpate.core import PalpateError, ProblemsError, Progress, atomic_path, few, quiet, require
+from palpate.core.images import SUFFIXES
 from palpate.data.contacts import Contacts, find_contacts, thumbnail
 from palpate.data.detection import (
     ORDER,
@@ -47,8 +48,8 @@ from palpate.data.detection import (
 from palpate.data.formats.layout import has_listed_videos, require_folder
 from palpate.data.formats.recordings import Pairing, Recordings, Row, thin
 from palpate.data.frames import MOVING
-from palpate.data.images import SUFFIXES, Check, in_threads, read_image
-from palpate.data.manifest import PART_NAMES
+from palpate.data.images import Check, in_threads, read_image
+from palpate.data.manifest import PART_NAMES, is_image
 from palpate.data.scanning import Cells, Facts, Format, Into, Scan
 from palpate.data.streams import Finding
 from palpate.data.suspicions import startup_frames
@@ -82,7 +83,7 @@ def detect(source: Path) -> bool:
     files = [
         name for _, _, names in islice(os.walk(source, followlinks=True), 500) for name in names
     ]
-    images = any(name.lower().endswith(SUFFIXES) for name in files)
+    images = any(map(is_image, files))
     return not images and any(name.lower().endswith(MOVING) for name in files)
 
 
