@@ -11,7 +11,7 @@ import pytest
 from PIL import Image
 
 from palpate.cli import main
-from palpate.core import Split
+from palpate.core import PalpateError, Split
 from palpate.data.manifest import Manifest
 from palpate.data.recordings import groups_of, name_recordings, same_names
 from palpate.leakage import audit, split
@@ -114,6 +114,13 @@ def test_what_cannot_be_read_is_never_reported_as_fine(run):
         path.write_bytes(b"")
     status, data = run("audit ma mb")
     assert (status, data["verdict"], answers(data)[2][1]) == (3, "cannot tell", "unreadable")
+    shutil.rmtree("b")  # images of one side, and none of those that the other's table names
+    for part, many in (("a", 40), ("b", 8)):
+        names = (f"{part}/v{k // 4}_{k}.png,{part}{k // 4}" for k in range(many))
+        Path(f"{part}.csv").write_text("path,video\n" + "\n".join(names))
+    status, data = run("audit a.csv b.csv --map vision=path")
+    assert (status, answers(data)[2]) == (3, ("cannot tell", "unreadable"))
+    assert run("audit a.csv b.csv --map vision=path --no-images")[0] == 0
     Path("a.csv").write_text("id,video\n" + "\n".join(f"{k},v{k}" for k in range(9)))
     Path("b.csv").write_text("id,video,frame\nx,w,1\ny,w,x\n")
     status, data = run("audit a.csv b.csv --skip-bad")
@@ -231,3 +238,63 @@ def test_frames_that_are_counted_anew_in_each_part_are_of_other_recordings(tmp_p
     assert same_names(*files) == ()
     later = Manifest(files[1].table.with_columns(frame=files[1].table["frame"] + 9), files[1].root)
     assert "video" in same_names(files[0], later)
+
+
+def table_of(path, rows):
+    """A table of contacts of 10 frames, six a video, in videos of one material each."""
+    columns = "id,video,frame,contact,object,material"
+    lines = [
+        f"{k},v{k // 60},{k % 60},v{k // 60}#{k // 10},"
+        f"o{k // 10 % 6 + 6 * (k // 120)},m{k // 60 % 2}"
+        for k in range(rows)
+    ]
+    Path(path).write_text("\n".join([columns, *lines]))
+
+
+@pytest.mark.parametrize(
+    ("rows", "by", "offered"),
+    [(360, "contact", "contact video"), (360, "object", "object video"), (60, "contact", "")],
+)
+def test_what_is_offered_keeps_whole_what_leaks_in_time(rows, by, offered, run):
+    table_of("all.csv", rows)
+    run(f"split all.csv --by {by} -o s.json")
+    status, data = run(f"audit all.csv --split s.json --by {by}")
+    assert (status, answers(data)[1][0]) == (1, "leaks")
+    first = f"palpate split all.csv --by {offered} -o noleak.json"
+    assert data["commands"][:1] == [first] * bool(offered)
+    for command in data["commands"]:
+        status, data = run(command.removeprefix("palpate "))
+    assert (status, data["commands"]) == ((0, []) if offered else (1, []))
+
+
+def test_nothing_is_offered_that_fails_or_made_what_leaks(run):
+    Path("a.csv").write_text("id,video\n" + "\n".join(f"{k},v{k % 9}" for k in range(90)) + "\nx,")
+    Path("b.csv").write_text("id,video\n" + "\n".join(f"t{k},v{k % 9}" for k in range(20)))
+    assert run("audit a.csv b.csv")[1]["commands"] == []  # no split has a sample without a video
+    for k in range(48):  # a black photo in each of 8 videos, which no split keeps apart
+        picture(f"d/v{k // 6}_{k:03d}.png", k)
+        if k % 6 == 0:
+            Image.new("RGB", (48, 48)).save(f"d/v{k // 6}_{k:03d}.png")
+    run("import d --as vision -o m")
+    run("split m --by video -o s.json")
+    status, data = run("audit m --split s.json")
+    assert (status, data["commands"]) == (1, [])
+    for k in range(0, 48, 6):
+        picture(f"d/v{k // 6}_{k:03d}.png", 99)
+    with pytest.raises(PalpateError, match=r"near-duplicates group.* Leave near out"):
+        split("m", by="video", near="vision")
+
+
+@pytest.mark.parametrize("level", ["video", "object"])
+def test_a_split_is_audited_by_the_template_that_made_it(level, tmp_path):
+    """Names suggest v{video}_...; it was stated that the number behind is the recording."""
+    paths = [f"v{k % 4}_{k // 40}_{k:03d}.png" for k in range(400)]
+    Path(tmp_path / "l.csv").write_text("\n".join(["gel", *paths]))
+    text = f"v*_{{{level}}}_{{frame}}.png"
+    made = split(tmp_path / "l.csv", reading={"tactile": text})
+    assert (made.rule["group"], made.rule["groups"], made.rule["name"]) == (level, 10, "NoLeak")
+    (levels,) = [note.params["levels"] for note in made.notes if note.code == "recordings"]
+    assert [level, f"file names `{text}`"] in levels
+    own = audit(tmp_path / "l.csv", split=made, reading={"tactile": text})
+    assert (own.verdict, own.group) == ("no leak found", level)
+    assert audit(tmp_path / "l.csv", split=made).verdict == "leaks"  # by what names suggest

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shlex
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -21,7 +22,7 @@ from palpate.cli.terminal import (
     working_folder,
 )
 from palpate.cli.verbs import FAILED_CHECK, OK, UNKNOWN
-from palpate.core import require, write_text
+from palpate.core import PalpateError, Split, require, write_text
 from palpate.report.labels import percent
 from palpate.report.records import LEAKS
 from palpate.report.results import Audit
@@ -162,20 +163,39 @@ def _next_commands(options: Options, audit: Audit) -> list[str]:
         return []  # no split can keep these groups whole
     skip = ["--skip-bad"] * options.skip_bad
     source = shlex.join([*map(str, paths), *options.reading.arguments(), *skip])
-    checked = {s.kind: s for s in audit.signals if s.checked and s.kind.startswith("near-dup")}
+    signals = {s.kind: s for s in audit.signals if s.checked}
+    checked = {kind: s for kind, s in signals.items() if kind.startswith("near-dup")}
     sides = [kind.split()[-1] for kind, s in checked.items() if s.flagged or audit.group == "none"]
     near = f" --near {'both' if len(sides) == 2 else sides[0]}" if sides else ""
-    if audit.group == "none" and not near:
-        return []
-    group = f" --by {audit.group}" if audit.group != "none" else ""
-    by = "" if options.comparison.by == "auto" else group
+    columns = [audit.group] * (audit.group != "none")
+    if columns and audit.group != "video" and "time gap" in signals and signals["time gap"].flagged:
+        columns.append("video")  # frames of one video in two groups are near
+    rule = {} if options.split is None else Split.load(options.split).rule
+    kept = {*rule.get("by", ()), *(rule.get("near") or {}).get("modalities", ())}
+    if {*columns, *sides} <= kept or (len(columns) > 1 and not _works(options, columns)):
+        return []  # a split that keeps these whole cannot be made, or is what leaks
+    by = "" if options.comparison.by == "auto" else f" --by {audit.group}"
+    group = f" --by {' '.join(columns)}" if columns else ""
     commands = [f"palpate split {source}{group}{near} -o noleak.json"]
     if len(paths) == 1:
         commands.append(f"palpate audit {source}{by} --split noleak.json")
-        if not options.comparison.impact and checked and len(audit.materials) > 1:
+        several = [m for m in audit.materials if max(m["groups_train"], m["groups_test"]) > 1]
+        if not options.comparison.impact and checked and len(several) > 1:
             split = f" --split {shlex.quote(str(options.split))}" if options.split else ""
             commands.append(f"palpate audit {source}{by}{split} --impact")
     return commands
+
+
+def _works(options: Options, columns: Sequence[str]) -> bool:
+    """Whether a split keeps several columns whole and does not leak."""
+    from palpate.leakage import split
+
+    reading = options.reading.keywords()
+    try:
+        made = split(list(options.paths), by=columns, skip_bad=options.skip_bad, **reading)
+    except PalpateError:
+        return False
+    return made.rule["audit"] != LEAKS
 
 
 def _write(outputs: Outputs, audit: Audit, terminal: Terminal) -> None:

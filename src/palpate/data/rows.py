@@ -121,10 +121,10 @@ def spelled(path: str) -> str:
 def relocated(written: Iterable[str], root: Path) -> dict[str, str]:
     """Paths of another machine -> where their files are below the root.
 
-    The longest end that all paths of one beginning (``/home``, ``C:``) have below the root, or
-    below a folder in it; backslashes separate folders where nothing has such a name, and a name in
-    another spelling is that of the only file with it. Two paths never become one. Paths that are
-    right as they are written, or found nowhere or in two folders, are left out.
+    The longest end that all paths of one beginning (``/home``, ``C:``) have below the root, or the
+    whole paths below a folder in it; backslashes separate folders where nothing has such a name,
+    and a name in another spelling is that of the only file with it. Two paths never become one.
+    Paths that are right as they are written, or found nowhere or in two folders, are left out.
     """
     distinct = list(dict.fromkeys(written))
     odd = (path for path in distinct if not path.isascii())
@@ -173,7 +173,8 @@ def _ends(paths: Sequence[str], root: Path) -> dict[str, str]:
     folders = ["", *sorted(name for name in names("") if (root / name).is_dir())[:TRIED]]
     best, cut, starts = len(tried) // 2, 0, set[str]()
     for k in range(min(map(len, tried), default=0)):
-        found = [located(folders, parts[k:]) for parts in tried]
+        # ``test/1.png`` is not ``train/1.png``: no folder stands for one that is written.
+        found = [located([""] if k else folders, parts[k:]) for parts in tried]
         count = sum(bool(file) for _, file in found)
         if count > best and len({tuple(_parts(path)[k:]) for path in paths}) == len(paths):
             best, cut, starts = count, k, {folder for folder, _ in found}

@@ -177,7 +177,8 @@ def audit(  # noqa: PLR0913
                 result = replace(result, impact=impact(samples, parted, result.group, title))
             except PalpateError as error:  # the audit itself must not be lost
                 bare = PalpateError(*error.args, argument=error.argument)
-                notes.append(Note("impact-failed", {"reason": f"{bare}", "example": error.example}))
+                example = {"by" if k == "group" else k: v for k, v in error.example.items()}
+                notes.append(Note("impact-failed", {"reason": f"{bare}", "example": example}))
     if pretrain is not None:
         title = f"{_name(pretrain, 'pretraining')} / test"
         against = compare(parts[-1], test_part, options, title, against="pretraining")
@@ -301,7 +302,9 @@ def compare(
     parts = {"train": a, "val": b.clear() if val is None else val.table, "test": b}
     rows = _rows(parts, group, leaks)
     compared = rows.filter(~pl.col("val"))
-    sizes = compared["group"].drop_nulls().value_counts()["count"]
+    named = compared["group"].drop_nulls()
+    largest = int(named.value_counts()["count"].max() or 0)  # pyright: ignore[reportArgumentType]
+    largest = len(compared) if 0 < len(named) < len(compared) else largest
     pairs = _worst_pairs(train, test, group, gaps)
     signals = [f.summary(train, test, gaps) for f in flags]
     return Audit(
@@ -330,7 +333,7 @@ def compare(
         groups_in_all=len(groups[0] | groups[1]),
         shared={c: n for c, n in shared_groups(a, b).items() if c not in equal},
         questions=answers,
-        largest_group=round(int(sizes.max() or 0) / len(compared), 5),  # pyright: ignore[reportArgumentType]
+        largest_group=round(largest / len(compared), 5),
         table=signal_table(test, train, flags, gaps),
     )
 

@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from palpate.core import Progress
-from palpate.data.manifest import Manifest
+from palpate.data.manifest import MODALITIES, Manifest
 from palpate.leakage.content import shows_nothing
 from palpate.leakage.signals import Flags, Gaps
 from palpate.report.records import CANNOT_TELL, LEAKS, NO_LEAK, Question
@@ -61,6 +61,13 @@ def questions(
     """
     near = [f for f in flags if f.kind.startswith("near-duplicate")]
     pictures = Question("near-duplicates", "", reason="no-images" if asked else "images-off")
+    absent = [m for m in (train, test) if "images_absent" in m.facts]
+    if (
+        asked
+        and len(absent) == 1
+        and any(m.table[c].count() for m in (train, test) for c in MODALITIES)
+    ):
+        pictures = replace(pictures, verdict=CANNOT_TELL, of=len(test), reason="unreadable")
     if near:
         reason = next(filter(None, (_open_images(f, train, test, progress) for f in near)), "")
         files = [f for f in flags if f.kind == "identical bytes"]

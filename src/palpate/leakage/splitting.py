@@ -102,7 +102,8 @@ def split(  # noqa: PLR0913  # pyright: ignore[reportInconsistentOverload]
     shares = {part: round(share, 12) for part, share in shares.items() if share > 1e-9}
     columns, reason = _columns(manifest, by, links, len(shares))
     groups = components(manifest, columns, links)
-    number, materials, problem = _problem(manifest, groups, columns, list(shares.values()))
+    kind = " and ".join([*columns, *[LINKED] * bool(links)])
+    number, materials, problem = _problem(manifest, groups, kind, list(shares.values()))
     optimum = optimize(problem)
     rule = {
         "name": name,
@@ -181,17 +182,19 @@ def _columns(
 
 
 def _problem(
-    manifest: Manifest, groups: pl.Series, columns: Sequence[str], target: Sequence[float]
+    manifest: Manifest, groups: pl.Series, kind: str, target: Sequence[float]
 ) -> tuple[Ints, list[str], Problem]:
     """The number of each sample's group, the names of materials, and the samples by both with the
     wanted shares.
     """
-    kind = " and ".join(columns) or LINKED
     names = groups.unique().sort()
     if len(names) < len(target):
         must = f"A split into {len(target)} parts needs at least as many groups"
         got = f"{len(names)} {kind} group(s)"
-        raise PalpateError(must, got, "Choose a finer group", example={"by": "contact"})
+        fix, example = "Choose a finer group", {"by": "contact"}
+        if LINKED in kind:
+            fix, example = "Leave near out: near-duplicates join most groups", {}
+        raise PalpateError(must, got, fix, example=example)
     materials = manifest.table["material"].drop_nulls().unique().sort()
     row, column = (
         series.cast(pl.Enum(values)).to_physical().cast(pl.Int64).fill_null(-1).to_numpy()

@@ -251,7 +251,8 @@ class Audit(Document):
             train, test groups): whether the test part asks for new videos, or for new objects.
         questions: what was asked, each with its verdict.
         verdict: the worst of theirs.
-        largest_group: the share of all samples that are in one group; 0 where none is known.
+        largest_group: the share of all samples that are in one group; 0 where none is known, 1
+            where some samples lack theirs: no split then keeps groups whole.
         impact: what the leak does to scores, if requested.
         commands: command lines that say what to do next.
         others: audits of the same test part against other data (an encoder's pretraining list).
