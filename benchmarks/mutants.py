@@ -35,6 +35,9 @@ FAST = ("-m", "not slow and not browser and not nightly", "-p", "no:cacheprovide
 # Of those at 3e0af63 four lines are gone: metrics/tactile.py:231 (a default for a set without rows,
 # which is rejected before), 283 (p_value and z are None already where the value is) and 822, and
 # metrics/mmd.py:446 (bounds of halves and of D-TMMD).
+# Each record is named by its commit: 3e0af63 before the house was made smaller (66 of 99 killed);
+# 7787e94 (metrics, leakage) and af5ec70 (training) after; a0962ca has the 20 of data, and the nine
+# survivors of the two that got a test, run again. leakage/thumbnails.py:65 of 7787e94 is gone.
 SURVIVORS = {
     "metrics/intervals.py: False -> True in"
     " design: Array = field(default_factory=lambda: np.zeros(0), repr=False)": (
@@ -115,6 +118,13 @@ SURVIVORS = {
     ),
     "training/engine.py: step + 1 < options.steps -> step + 1 <= options.steps": (
         "one batch more is read at the end, which nobody takes"
+    ),
+    "data/texts.py: text is not None -> text is None": (
+        "seen by tests/test_captions_columns.py, which joins a table with empty texts"
+    ),
+    'data/residuals.py: several and len(at) >= (LEAST_OF_VIDEO if kind == "own video" else LEAST)'
+    " -> several or len(at) >= (LEAST_OF_VIDEO if kind == 'own video' else LEAST)": (
+        "seen by tests/test_encoders_rulers.py, which holds the tests of rulers"
     ),
     "training/cards.py: size / 1e6 -> size * 1000000.0": (
         "seen by tests/test_mini.py, which compares the pages of what ships"

@@ -6,6 +6,7 @@ from palpate.core import Split
 from palpate.data.importing import import_dataset, validate, write_lists
 from palpate.data.manifest import Manifest
 from palpate.data.reading import read
+from palpate.data.recordings import same_names
 from test_data_touch_and_go import make_recordings, shown
 
 
@@ -68,3 +69,15 @@ def test_a_custom_table_of_classes_is_kept_for_the_lists_of_a_split(tmp_path):
     assert sorted(path.read_text().splitlines()) == lines
     (root / "category_reference.txt").unlink()
     assert "classes" not in import_dataset(root, tmp_path / "plain", format="touch-and-go").facts
+
+
+def test_parts_without_videos_share_the_names_that_they_declare_alone(tmp_path):
+    rows = [{"id": str(k), "tactile": f"{k}.png", "session": "monday"} for k in range(4)]
+    train, test, other = (Manifest.from_rows(rows, tmp_path / n) for n in ("train", "test", "b"))
+    assert same_names(train, test) == same_names(train, other)
+    of_videos = [{**row, "video": f"v{k}", "frame": k} for k, row in enumerate(rows)]
+    train = Manifest.from_rows(of_videos, tmp_path / "train")
+    test = Manifest.from_rows(
+        [{**r, "frame": r["frame"] + 9} for r in of_videos], tmp_path / "test"
+    )
+    assert "session" in same_names(train, test)

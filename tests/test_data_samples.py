@@ -129,6 +129,8 @@ def test_damaged_and_foreign_files_are_named(tmp_path):
         (np.full((2, 4, 4, 3), 2.0), r"floats in \[0, 1\]"),
         (["a", "b"], "nothing at a"),
         (3, "shape"),
+        (np.zeros((6, 6, 3), np.uint8), "must be several images"),
+        (np.zeros((6, 6, 4), np.uint8), "must be several images"),
         (np.zeros((0, 4, 4, 3), np.uint8), "There must be samples"),
     ],
 )
