@@ -36,7 +36,7 @@ FAST = ("-m", "not slow and not browser and not nightly", "-p", "no:cacheprovide
 # which is rejected before), 283 (p_value and z are None already where the value is) and 822, and
 # metrics/mmd.py:446 (bounds of halves and of D-TMMD).
 # Each record is named by its commit: 3e0af63 before the house was made smaller (66 of 99 killed);
-# 7787e94 (metrics, leakage) and af5ec70 (training) after; a0962ca has the 20 of data, and the nine
+# 7787e94 (metrics, leakage) and af5ec70 (training) after; 9034be1 has the 20 of data, and the nine
 # survivors of the two that got a test, run again. leakage/thumbnails.py:65 of 7787e94 is gone.
 SURVIVORS = {
     "metrics/intervals.py: False -> True in"
