@@ -163,13 +163,14 @@ def _next_commands(options: Options, audit: Audit) -> list[str]:
         return []  # no split can keep these groups whole
     skip = ["--skip-bad"] * options.skip_bad
     source = shlex.join([*map(str, paths), *options.reading.arguments(), *skip])
-    signals = {s.kind: s for s in audit.signals if s.checked}
-    checked = {kind: s for kind, s in signals.items() if kind.startswith("near-dup")}
-    sides = [kind.split()[-1] for kind, s in checked.items() if s.flagged or audit.group == "none"]
+    flagged = {s.kind: s.flagged for s in audit.signals if s.checked}
+    checked = [kind.split()[-1] for kind in flagged if kind.startswith("near-duplicate")]
+    no_group = audit.group == "none"
+    sides = [m for m in checked if flagged[f"near-duplicate {m}"] or no_group]
     near = f" --near {'both' if len(sides) == 2 else sides[0]}" if sides else ""
-    columns = [audit.group] * (audit.group != "none")
-    if columns and audit.group != "video" and "time gap" in signals and signals["time gap"].flagged:
-        columns.append("video")  # frames of one video in two groups are near
+    # Frames of one video in two groups may be near in time.
+    wanted = (audit.group, *["video"] * bool(flagged.get("time gap")))
+    columns = [] if no_group else list(dict.fromkeys(wanted))
     rule = {} if options.split is None else Split.load(options.split).rule
     kept = {*rule.get("by", ()), *(rule.get("near") or {}).get("modalities", ())}
     if {*columns, *sides} <= kept or (len(columns) > 1 and not _works(options, columns)):

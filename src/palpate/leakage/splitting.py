@@ -191,10 +191,9 @@ def _problem(
     if len(names) < len(target):
         must = f"A split into {len(target)} parts needs at least as many groups"
         got = f"{len(names)} {kind} group(s)"
-        fix, example = "Choose a finer group", {"by": "contact"}
         if LINKED in kind:
-            fix, example = "Leave near out: near-duplicates join most groups", {}
-        raise PalpateError(must, got, fix, example=example)
+            raise PalpateError(must, got, "Leave near out: near-duplicates join most groups")
+        raise PalpateError(must, got, "Choose a finer group", example={"by": "contact"})
     materials = manifest.table["material"].drop_nulls().unique().sort()
     row, column = (
         series.cast(pl.Enum(values)).to_physical().cast(pl.Int64).fill_null(-1).to_numpy()
@@ -252,6 +251,8 @@ def _audited(
     own = compare(train, test, options, "")
     facts = {**fresh.rule, "audit": own.verdict}
     notes = [*fresh.notes, *_question(manifest, own.shared)]
+    if near is None and any(manifest.table[m].count() for m in MODALITIES):
+        notes.append(Note("near-not-asked"))
     if own.verdict != NO_LEAK:
         what = f"{own.group}s shared" if own.groups_shared else own.verdict
         facts["name"] = f"by {' and '.join(facts['by']) or LINKED}: {what}"
