@@ -251,8 +251,6 @@ def _audited(
     own = compare(train, test, options, "")
     facts = {**fresh.rule, "audit": own.verdict}
     notes = [*fresh.notes, *_question(manifest, own.shared)]
-    if near is None and any(manifest.table[m].count() for m in MODALITIES):
-        notes.append(Note("near-not-asked"))
     if own.verdict != NO_LEAK:
         what = f"{own.group}s shared" if own.groups_shared else own.verdict
         facts["name"] = f"by {' and '.join(facts['by']) or LINKED}: {what}"

@@ -274,9 +274,6 @@ LEAKAGE: dict[str, Sentence] = {
         "{frames:Flagged up to {frames} frames; the score is 2^(-gap/{frames})|Flagged at a gap of "
         "0 frames only}"
     ),
-    "near-not-asked": (
-        "Images were not compared: {arg:near=both} keeps near-duplicates together as well"
-    ),
     "no-group": (
         "Neither videos nor objects, sessions or contacts are known: only samples and images "
         "were compared"
