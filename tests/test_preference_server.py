@@ -28,7 +28,8 @@ from preference_load import measure
 
 from palpate.preference import server as served
 from palpate.preference.plan import Plan
-from palpate.preference.store import VoteStore
+from palpate.preference.store import CELLS, VoteStore
+from palpate.preference.votes import read_votes
 
 
 @pytest.fixture(scope="module")
@@ -279,6 +280,61 @@ def test_the_file_of_a_killed_server_holds_all_votes_or_is_refused(planned, tmp_
         VoteStore(path, Plan.load(folder).study).close()  # it counts anew
         notes = preference.score(path.parent, replicates=100).notes
         assert not any(note.code == "votes-so-far" for note in notes)
+
+
+def test_a_kill_in_the_middle_of_a_write_loses_no_vote_silently(planned, tmp_path):
+    """Every number of its pages may be on disk, with the journal whole, damaged or lost."""
+    folder = Path(shutil.copytree(planned, tmp_path / "study"))
+    plan, file, journal = Plan.load(folder), folder / "study.db", folder / "study.db-journal"
+
+    def rows(rater):
+        votes = Crowd({"ours": 1.0, "gvst": 0.0}).download(plan, rater)["votes"]
+        return [v | {"rater": rater, "received": AT} for v in votes]
+
+    def counted():
+        """Votes by rater; None where the file is refused."""
+        with suppress(PalpateError):
+            votes = read_votes(plan, [file]).by_rater
+            return {rater: len(of_rater) for rater, of_rater in votes.items()}
+        return None
+
+    first, second = (rows(rater.code) for rater in plan.raters)
+    columns = [*CELLS, "received", "rater"]
+    insert = f"INSERT INTO votes ({', '.join(columns)}) VALUES (:{', :'.join(columns)})"
+    with closing(VoteStore(file, plan.study)) as store:
+        store.store(first)
+        before = file.read_bytes()
+        with closing(sqlite3.connect(file, isolation_level=None)) as disk:
+            disk.execute("PRAGMA cache_size = 1")  # pages are written before the transaction ends
+            disk.execute("BEGIN")
+            disk.executemany(
+                insert, [v | {"trial": f"{v['trial']}{k:03}"} for v in second for k in range(40)]
+            )
+            begun, written = file.read_bytes(), journal.read_bytes()
+            disk.execute("ROLLBACK")
+    earlier, size = {plan.raters[0].code: len(first)}, 4096
+    pages = [k for k in range(0, len(begun), size) if begun[k : k + size] != before[k : k + size]]
+    assert len(pages) > 1
+    whole = lambda file: None
+    for number, damage in product(
+        range(len(pages) + 1), (whole, *DAMAGES, Path.unlink, lambda file: file.write_bytes(b""))
+    ):
+        state = bytearray(before.ljust(len(begun) if number else len(before), b"\0"))
+        for k in pages[:number]:
+            state[k : k + size] = begun[k : k + size]
+        file.write_bytes(state)
+        journal.write_bytes(written)
+        damage(journal)
+        results = [counted()]
+        with suppress(PalpateError):  # as it advises
+            VoteStore(file, plan.study).close()
+        results.append(counted())
+        case = number, damage, results
+        assert all(result in (None, earlier) for result in results), case
+        assert damage is not whole or results[1] == earlier, case
+    file.write_bytes(begun)
+    journal.write_bytes(written)
+    fails("serve the study once more and stop it", preference.score, folder)
 
 
 def test_damaged_names_in_the_file_of_votes_are_refused(planned, tmp_path):
