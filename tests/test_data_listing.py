@@ -169,18 +169,19 @@ def test_words_for_frames(tmp_path):
     text = 'frame,text\nv/0001.jpg,"hard, cold"\nv/2.jpg,soft, warm\n'
     text += "x,hard\nv/3.jpg,\nv/1.jpg,soft\n"
     path = write(tmp_path / "captions.csv", text)
-    table = read_frame_table(path)
-    assert table.values == {("v", 1): "hard, cold", ("v", 2): "soft, warm"}
+    problems = []
+    assert read_frame_table(path, problems) == {("v", 1): "hard, cold", ("v", 2): "soft, warm"}
     kinds = enumerate(("bad-path", "bad-line", "two-labels"), 4)
-    assert places(table.skipped) == [(f"{path}:{k}", kind) for k, kind in kinds]
+    assert places(problems) == [(f"{path}:{k}", kind) for k, kind in kinds]
 
 
 @pytest.mark.parametrize("stray", ['v/3.jpg,"soft', '"v/3.jpg,soft', 'v/3.jpg,soft"'])
 def test_a_stray_quote_costs_at_most_its_own_caption(tmp_path, stray):
     lines = [f'v/{k}.jpg,"hard, cold"' if k != 3 else stray for k in range(9)]
-    table = read_frame_table(write(tmp_path / "captions.csv", "\n".join(lines)))
-    assert set(table.values) | {("v", 3)} == {("v", k) for k in range(9)}
-    assert len(table.values) + len(table.skipped) == 9
+    problems = []
+    words = read_frame_table(write(tmp_path / "captions.csv", "\n".join(lines)), problems)
+    assert set(words) | {("v", 3)} == {("v", k) for k in range(9)}
+    assert len(words) + len(problems) == 9
 
 
 def test_facts_of_the_official_lists(real_data):

@@ -175,15 +175,13 @@ def _join(
 def _add_split(result: Scan, path: Path, split: Mapping[str, str]) -> None:
     """Add a split of a table; lists that are named as parts are of one."""
     name = "Orig" if path.stem.lower() in PART_NAMES else path.stem
-    before, files = dict[str, str](), [path.name]
-    if name in result.splits:
-        before = dict(result.splits[name].parts)
-        files = [*result.splits[name].rule["files"], *files]
-    twice = {i for i, part in split.items() if before.get(i, part) != part}
+    before = result.splits.get(name, Split({}, {"files": []}))
+    twice = {i for i, part in split.items() if before.parts.get(i, part) != part}
     text = f"{len(twice)} samples are of another part, too, and so of none"
     result.suspect(path, "two-parts", text, sorted(twice))
-    parts = {i: part for i, part in {**before, **split}.items() if i not in twice}
-    result.splits[name] = Split(parts, {"method": "official", "files": files})
+    parts = {i: part for i, part in {**before.parts, **split}.items() if i not in twice}
+    rule = {"method": "official", "files": [*before.rule["files"], path.name]}
+    result.splits[name] = Split(parts, rule)
 
 
 def _keys(rows: Sequence[tuple[str, Cells]], below: str) -> dict[str, dict[str, list[int]]]:

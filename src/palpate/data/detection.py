@@ -447,7 +447,7 @@ def joined(
     used = {path for found in matches.values() for path, _ in found}
     unmatched = [path for path in files if path not in used]
     result.suspect(result.base, "unmatched", f"{kind} of no template", unmatched)
-    odd = [path for path in files if path != unicodedata.normalize("NFC", path)]
+    odd = [path for path in files if not unicodedata.is_normalized("NFC", path)]
     text = "names in the other form of letters (NFD), which are compared as composed ones"
     result.suspect(result.base, "other-letters", text, odd)
     result.facts |= {f"template_{column}": template.text for column, template in templates.items()}

@@ -53,7 +53,7 @@ class Imported:
 
         Splits of an earlier import into the same folder that this one lacks are removed.
         """
-        splits, path = Path(output) / "splits", Path(output) / "manifest.parquet"
+        splits, path = output / "splits", output / "manifest.parquet"
         items = {splits / f"{name}.json": split for name, split in self.splits.items()}
         for stale in set(splits.glob("*.json")) - set(items):
             stale.unlink()

@@ -80,11 +80,11 @@ class Listed:
             columns = ", ".join(self.table.names)
             got = f"no tactile among {columns}, and no vision" if columns else "an empty file"
             must = f"{name} must have the columns vision and tactile, or one of them"
-            example = {"columns": {"vision": self.paths or "YOUR_COLUMN"}}
+            fix, example = "Map your columns to them", {"vision": self.paths or "YOUR_COLUMN"}
             choices = [{"columns": pair} for pair in pairings(self.table)]
-            fix = "Choose one of these" if choices else "Map your columns to them"
-            example = {} if choices else example
-            raise PalpateError(must, got, fix, example=example, choices=choices)
+            if choices:
+                raise PalpateError(must, got, "Choose one of these", choices=choices)
+            raise PalpateError(must, got, fix, example={"columns": example})
         # A column may be empty.
         sides = [side for side in self.sides if self.rows[side].count()] or self.sides
         for where, row in records(self.rows.drop(PATH, strict=False), self.table.place):

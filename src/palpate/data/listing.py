@@ -22,7 +22,7 @@ import polars as pl
 from palpate.core import Problem, ProblemsError, write_text
 from palpate.data.manifest import CLIMBS, Manifest
 from palpate.data.recordings import contact_names
-from palpate.data.tables import INCONCLUSIVE, decoded, lines_of, read_categories, text_in
+from palpate.data.tables import INCONCLUSIVE, first_line, lines_of, read_categories, text_in
 
 PATH = r"^(?P<video>[^/\\]+)/(?P<stem>[^/\\]+)\.(?P<suffix>[A-Za-z0-9]+)$"
 #: A good line; the video takes all commas before the slash.
@@ -51,9 +51,7 @@ class FrameList:
 
 def is_list(path: Path) -> bool:
     """Whether the first line that is not empty is a row of a frame list."""
-    with open(path, "rb") as file:
-        lines = lines_of(decoded(file.read(1 << 16)))
-    return re.match(LINE, next((line.strip() for line in lines if line.strip()), "")) is not None
+    return re.match(LINE, first_line(path)) is not None
 
 
 def read_list(
@@ -69,7 +67,7 @@ def read_list(
             there is one, else a label stays as it is (``"3"``). With a table, a label that it lacks
             is a problem.
     """
-    root = Path(path).parent
+    root = path.parent
     categories = categories_in(root) if categories is None else categories
     return read_lists([path], root=root, skip_bad=skip_bad, categories=categories)
 
@@ -86,7 +84,7 @@ def read_lists(
     Arguments as :func:`read_list`; labels without ``categories`` stay text.
     """
     problems: list[Problem] = []
-    every = pl.concat([_parse(Path(path), problems) for path in paths])
+    every = pl.concat([_parse(path, problems) for path in paths])
     conclusive = every.filter(pl.col("label") != INCONCLUSIVE)
     rows = _without_duplicates(_with_known_labels(conclusive, categories, problems), problems)
     problems.sort(key=Problem.sort_key)
@@ -98,8 +96,8 @@ def read_lists(
         names_by_label = {str(k): name for k, name in categories.items()}
         label = label.replace(list(names_by_label), list(names_by_label.values()))
     table = rows.select("id", "video", "frame", material=label, contact=names)
-    facts = {"source": ", ".join(Path(path).name for path in paths)}
-    manifest = Manifest.of_table(table, Path(root), facts)
+    facts = {"source": ", ".join(path.name for path in paths)}
+    manifest = Manifest.of_table(table, root, facts)
     contact = every.select("video", "frame")
     return FrameList(manifest, problems, every.height - conclusive.height, rows, contact)
 
@@ -121,7 +119,7 @@ def write_list(path: Path, rows: Iterable[tuple[str, int]]) -> None:
         lines.append(f"{name},{int(label)}\n")
     if problems:
         raise ProblemsError(problems, "Name samples video/frame, with an integer frame")
-    write_text(Path(path), "".join(lines))
+    write_text(path, "".join(lines))
 
 
 def write_table(path: Path, manifest: Manifest) -> Path:
@@ -136,18 +134,13 @@ def categories_in(folder: Path) -> dict[int, str] | None:
     return read_categories(table) if table.is_file() else None
 
 
-@dataclass(frozen=True)
-class FrameTable:
-    """Words for frames, by (video, frame), and the lines that could not be read."""
+def read_frame_table(path: Path, problems: list[Problem]) -> dict[tuple[str, int], str]:
+    """Read ``video/frame.jpg,words`` lines; the header ``frame,...`` is optional, so are quotes.
 
-    values: dict[tuple[str, int], str]
-    skipped: list[Problem]
-
-
-def read_frame_table(path: Path) -> FrameTable:
-    """Read ``video/frame.jpg,words`` lines; the header ``frame,...`` is optional, so are quotes."""
+    Returns:
+        (video, frame) -> its words; lines that cannot be read join ``problems``.
+    """
     values: dict[tuple[str, int], str] = {}
-    skipped: list[Problem] = []
     for number, line in enumerate(lines_of(text_in(path)), 1):
         if not line.strip() or (number == 1 and line.lower().startswith("frame,")):
             continue
@@ -161,8 +154,8 @@ def read_frame_table(path: Path) -> FrameTable:
             problem = "two-labels", f"{name!r} has other words on an earlier line"
         else:
             continue
-        skipped.append(Problem(f"{path}:{number}", *problem))
-    return FrameTable(values, skipped)
+        problems.append(Problem(f"{path}:{number}", *problem))
+    return values
 
 
 def _frame_of(name: str) -> tuple[str, int] | None:

@@ -72,8 +72,6 @@ ROLES = {
 ROLE_OF = {word: role for role, words in ROLES.items() for word in words}
 #: The images of a pair.
 SIDES = ("vision", "tactile")
-#: Modality -> its image column.
-MODALITIES = {"vision": "vision", "tactile": "tactile"}
 FORMAT = "palpate-manifest/1"
 #: Prefix of the keys of facts in the metadata.
 FACT = "palpate.fact."
@@ -327,7 +325,7 @@ class Manifest:
                 "The manifest must exist", *got_and_fix(path.parent, f"no file {path}", fix)
             )
         try:
-            meta = _metadata(path)
+            meta = parquet_metadata(path)
             table = read_parquet(path, most=4 * LARGEST)
         except Exception as error:  # polars raises several kinds for a file that is not Parquet
             got = str(error).splitlines()[0]
@@ -396,11 +394,12 @@ def is_manifest(path: Path) -> bool:
     if path.suffix.lower() != ".parquet" or not path.is_file():
         return False
     with suppress(Exception):  # polars raises several kinds for a file that is not Parquet
-        return _metadata(path).get("palpate.format", "").startswith("palpate-manifest/")
+        return parquet_metadata(path).get("palpate.format", "").startswith("palpate-manifest/")
     return False
 
 
-def _metadata(path: Path) -> dict[str, str]:
+def parquet_metadata(path: Path) -> dict[str, str]:
+    """The facts that a Parquet file holds besides its rows."""
     with open(path, "rb") as file, reading_parquet():
         return pl.read_parquet_metadata(file)
 

@@ -11,6 +11,7 @@ import polars as pl
 from palpate.core import PalpateError, Problem, Progress, Split, quiet, require, require_regular
 from palpate.data.foreign import require_native
 from palpate.data.formats import intervals, pairs, scanned
+from palpate.data.formats.layout import find_videos
 from palpate.data.imported import Imported, imported_of, splits_of
 from palpate.data.listed import NAMING, Listed, read_table
 from palpate.data.listing import is_list, read_list
@@ -127,7 +128,7 @@ def _of_file(
         return Imported(listed.manifest, listed.skipped, inconclusive=listed.inconclusive)
     if not is_interval:
         return _of_table(path, options, images=images, skip_bad=skip_bad)
-    if intervals.has_recordings(path, options.get("root")):
+    if find_videos(Path(options.get("root", path.parent))):
         return None
     _require_only({"root", "columns", "classes"}, options, "a list of intervals alone")
     imported = intervals.by_name(path, options.get("columns"), options.get("classes"))
@@ -139,14 +140,8 @@ def _of_table(source: Any, options: Mapping[str, Any], *, images: bool, skip_bad
     """The samples of a table or list, with its images if one of these is there, or all must."""
     _require_only({"columns", "names", "classes", "root", *SIDES}, options, "a list or table")
     side = next((side for side in ("tactile", "vision") if side in options), "")
-    listed = read_table(
-        source,
-        columns=options.get("columns"),
-        names=options.get("names"),
-        classes=options.get("classes"),
-        root=options.get("root"),
-        side=side,
-    )
+    own = (item for item in options.items() if item[0] not in SIDES)
+    listed = read_table(source, side=side, **dict(own))
     if listed.sides and (images or listed.at_hand):
         must = "must come with a folder, or a list whose images are not at hand"
         require(not side, side, must, listed.table.name, fix="Leave it out")
@@ -187,11 +182,11 @@ def _by_name(listed: Listed, template: str | None) -> Imported:
     if "video" not in rows.columns:
         del names["frame"]
     rows = rows.with_columns(id=pl.coalesce(names[c] for c in names if c in rows.columns))
-    again = rows.filter(~pl.col("id").is_first_distinct())
-    for line, name in again.select(LINE, "id").iter_rows():
+    first = rows["id"].is_first_distinct()
+    for line, name in rows.filter(~first).select(LINE, "id").iter_rows():
         text = f"the id {name!r} is in an earlier row already"
         problems.append(Problem(listed.table.place(line), "duplicate-id", text))
-    rows = rows.filter(pl.col("id").is_first_distinct()) if len(again) else rows
+    rows = rows.filter(first)
     problems.sort(key=Problem.sort_key)
     path = Path(listed.table.name)
     named_by_path = not stated or path.suffix.lower() in (".json", ".jsonl")
@@ -202,10 +197,9 @@ def _by_name(listed: Listed, template: str | None) -> Imported:
     manifest = Manifest.of_table(table, listed.scan.base, facts)
     splits: dict[str, Split] = {}
     if "split" in rows.columns:
-        parts = rows.drop_nulls("split")
-        stated_parts = dict(zip(parts["id"], parts["split"], strict=True))
+        parts = dict(rows.drop_nulls("split").select("id", "split").iter_rows())
         rule = {"method": "official", "column": listed.mapped.get("split", "split")}
-        splits["Orig"] = Split(stated_parts, rule, manifest.digest)
+        splits["Orig"] = Split(parts, rule, manifest.digest)
     scan = listed.scan
     return Imported(manifest, problems, splits, scan.inconclusive, scan.suspicious)
 

@@ -96,7 +96,7 @@ def read_classes(path: Path | None) -> dict[int, str] | None:
         return None
     must, got = "must be a table of classes", f"no file {path}"
     require(Path(path).is_file(), "classes", must, got, fix="Check the path")
-    return read_categories(path)
+    return read_categories(Path(path))
 
 
 def without_repeats(rows: pl.DataFrame, place: Place, problems: list[Problem]) -> pl.DataFrame:

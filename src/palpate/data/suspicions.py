@@ -198,15 +198,15 @@ def other_clocks(sides: Mapping[str, Sequence[tuple[str, Mapping[str, str]]]]) -
     """Recordings whose frames of equal number are of other times, by side -> (path, fields)."""
     every = [{n for _, fields in sides.get(side, ()) for n in fields} for side in SIDES]
     keys = sorted(set.intersection(*every) - {"frame"})
-    numbers: dict[str, dict[str, set[int]]] = {}
-    for side in SIDES:
+    numbers: dict[str, list[set[int]]] = {}
+    for k, side in enumerate(SIDES):
         for path, fields in sides.get(side, ()):
             if "frame" in fields:
                 name = "/".join(fields[key] for key in keys if key in fields) or path.split("/")[0]
-                numbers.setdefault(name, {}).setdefault(side, set()).add(int(fields["frame"]))
+                numbers.setdefault(name, [set(), set()])[k].add(int(fields["frame"]))
     problems: list[Problem] = []
     for name, both in numbers.items():
-        ordered = [sorted(both.get(side, ())) for side in SIDES]
+        ordered = [*map(sorted, both)]
         steps = {b - a for own in ordered for a, b in pairwise(own)}
         few, many = sorted(map(len, ordered))
         if few < CLOCKED or len(steps) > 1:

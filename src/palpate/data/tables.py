@@ -113,7 +113,6 @@ def open_table(path: Path, names: Sequence[str] | None = None) -> Table:
     Raises:
         PalpateError: if the file is missing, or of another form.
     """
-    path = Path(path)
     suffix = path.suffix.lower()
     fix = "Check the path"
     require(path.is_file(), None, "The table must be a file", f"no file {path}", fix=fix)
@@ -153,7 +152,7 @@ def table_of(data: Any, name: str = "row") -> Table:
 
 def header_of(path: Path) -> list[str]:
     """The columns that the first row of a table shows; empty if it cannot be read. Never raises."""
-    suffix = Path(path).suffix.lower()
+    suffix = path.suffix.lower()
     try:
         if suffix == ".parquet":
             return list(_schema(path))
@@ -169,6 +168,11 @@ def header_of(path: Path) -> list[str]:
 def _start_of(path: Path) -> str:
     with open(path, "rb") as file:
         return decoded(file.read(1 << 16))
+
+
+def first_line(path: Path) -> str:
+    """The first line of a text that is not blank, without the space around it."""
+    return next(filter(None, map(str.strip, lines_of(_start_of(path)))), "")
 
 
 def _head(path: Path) -> list[list[str]]:
@@ -272,30 +276,32 @@ def csv_text(header: Sequence[str], rows: Iterable[Sequence[object]]) -> str:
 
 
 def _csv(path: Path, names: Sequence[str] | None) -> Table:
-    problems: list[Problem] = []
     data = content_of(path)
     text = decoded(data)
+    table = csv_table(path, text, names)
+    if not text.isascii() and is_windows(data):
+        first = next(line for line in text.splitlines() if not line.isascii())
+        words = f"not UTF-8, and read as {WINDOWS}, the encoding of Windows: {first[:80]!r}"
+        table.suspicious.append(Problem(str(path), "encoding", words))
+    return table
+
+
+def csv_table(path: Path, text: str, names: Sequence[str] | None) -> Table:
+    """The table of the text of a CSV file, whose columns are its first row or ``names``."""
+    problems: list[Problem] = []
     rows = _csv_rows(path, text, problems)
     header = list(names or [cell.strip() for cell in (rows["cells"][0] if len(rows) else [])])
     rows, width = rows.slice(0 if names else 1), pl.col("cells").list.len()
     for line, count in rows.filter(width != len(header)).select(LINE, width).iter_rows():
         words = f"{count} cells under {len(header)} columns"
         problems.append(Problem(f"{path}:{line}", "bad-row", words))
-    rows, wrong = rows.filter(width == len(header)), [*problems]
-    if header:
-        problems.clear()  # they count with the columns that are read
+    rows = rows.filter(width == len(header))
 
     def records(columns: Sequence[str]) -> pl.DataFrame:
-        problems[:] = wrong
         cells = (pl.col("cells").list.get(header.index(name)).alias(name) for name in columns)
         return rows.select(LINE, *cells)
 
-    table = Table(str(path), header, problems, records)
-    if not text.isascii() and is_windows(data):
-        first = next(line for line in text.splitlines() if not line.isascii())
-        words = f"not UTF-8, and read as {WINDOWS}, the encoding of Windows: {first[:80]!r}"
-        table.suspicious.append(Problem(str(path), "encoding", words))
-    return table
+    return Table(str(path), header, problems, records)
 
 
 def _csv_rows(path: Path, text: str, problems: list[Problem]) -> pl.DataFrame:
@@ -518,7 +524,7 @@ def read_categories(path: Path) -> dict[int, str]:
     text = text_in(path)
     names: dict[int, str] = {}
     problems: list[Problem] = []
-    sign = delimiter_of(Path(path), text)
+    sign = delimiter_of(path, text)
     for number, line in enumerate(text.splitlines(), 1):
         bare = re.sub(r"\([^)]*\)|[\"'“”‘’]", "", line).strip().rstrip(",").strip()
         name, colon, label = (part.strip() for part in bare.rpartition(":"))
@@ -552,7 +558,6 @@ def whole(text: str) -> int | None:
 
 def text_in(path: Path) -> str:
     """The file as text; what is neither UTF-8 nor UTF-16 becomes U+FFFD."""
-    path = Path(path)
     got = f"the folder {path}" if path.is_dir() else f"no file {path}"
     require(path.is_file(), None, "The list must be a file", got, fix="Check the path")
     return decoded(content_of(path))

@@ -16,7 +16,7 @@ from palpate.core import PalpateError, Problem, ProblemsError, digest_lines, req
 from palpate.core.messages import require_joined
 from palpate.data.images import file_digest
 from palpate.data.imported import Imported, splits_of
-from palpate.data.manifest import Manifest, reading_parquet, write_parquet
+from palpate.data.manifest import Manifest, parquet_metadata, write_parquet
 from palpate.data.tables import open_table
 
 TEXTS_FORMAT = "palpate-captions/1"
@@ -88,10 +88,7 @@ def read_texts(path: Path) -> Texts:
         raise ProblemsError(table.problems, "Correct the table of texts")
     pairs = dict(rows.select("id", "text").iter_rows())
     texts = {name: text for name, text in pairs.items() if text is not None}
-    metadata: dict[str, str] = {}
-    if path.suffix.lower() == ".parquet":
-        with open(path, "rb") as file, reading_parquet():
-            metadata = pl.read_parquet_metadata(file)
+    metadata = parquet_metadata(path) if path.suffix.lower() == ".parquet" else {}
     source = metadata.get("palpate.source") or f"{path.name}, captions {short(texts_digest(rows))}"
     images = json.loads(metadata.get("palpate.images", "{}"))
     return Texts(texts, frozenset(pairs), source, images)

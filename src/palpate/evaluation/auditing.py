@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from palpate.core import FeatureSet, Note, Progress, Split, quiet, require
-from palpate.data.manifest import MODALITIES, Manifest
+from palpate.data.manifest import SIDES, Manifest
 from palpate.leakage.auditing import audit as audit_leakage
 from palpate.report.records import Impact
 from palpate.report.results import Audit, Call
@@ -69,7 +69,7 @@ def audit(
             # every sample is in the test part of some leak-free split
             judged = samples.part(split, "train", "test")
             for m in encoders.modalities:
-                if m not in MODALITIES or not judged.table[m].count():
+                if m not in SIDES or not judged.table[m].count():
                     continue
                 new = guard(encoders, m, judged, allow_seen=allow_seen, progress=progress)
                 notes += new

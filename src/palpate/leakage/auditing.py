@@ -11,7 +11,6 @@ that no metadata reveals.
 
 from __future__ import annotations
 
-import functools
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -22,7 +21,7 @@ import polars as pl
 from numpy.typing import NDArray
 
 from palpate.core import Note, PalpateError, Progress, Split, few, quiet, require, require_choice
-from palpate.data.manifest import MODALITIES, Manifest
+from palpate.data.manifest import SIDES, Manifest
 from palpate.data.recordings import (
     Identity,
     is_sequence,
@@ -135,10 +134,16 @@ def audit(  # noqa: PLR0913
     require(by in (*GROUPS, "auto"), "by", f"must be auto or one of {', '.join(GROUPS)}", repr(by))
     require(near_frames >= 0, "near_frames", "must be at least 0", near_frames, 30)
     require_choice("identity", identity, ("auto", "names", "images"))
-    accepted, must = set(modalities) <= set(MODALITIES), "must be among vision, tactile"
+    accepted, must = set(modalities) <= {*SIDES}, "must be among vision, tactile"
     require(accepted, "modalities", must, list(modalities), ["vision"])
     accepted, must = 0 < false_positives <= 0.1, "must lie in (0, 0.1]"
     require(accepted, "false_positives", must, false_positives, 0.001)
+    must, fix = "needs all samples and a split", "Import them, and audit them with a split"
+    require(impact is None or test is None, "impact", must, "train and test apart", fix=fix)
+    sources = [x for x in (train_or_data, test, pretrain) if x is not None]
+    read = read_all(sources, skip_bad, progress, root, reading)
+    parts = [source.manifest for source in read]
+    notes = [note for source in read for note in source.notes]
     options = Options(
         modalities if images else (),
         None if cache is None else Path(cache),
@@ -147,14 +152,8 @@ def audit(  # noqa: PLR0913
         identity,
         false_positives,
         progress,
+        any(map(_skips_many, read)),
     )
-    must, fix = "needs all samples and a split", "Import them, and audit them with a split"
-    require(impact is None or test is None, "impact", must, "train and test apart", fix=fix)
-    sources = [x for x in (train_or_data, test, pretrain) if x is not None]
-    read = read_all(sources, skip_bad, progress, root, reading)
-    parts = [source.manifest for source in read]
-    notes = [note for source in read for note in source.notes]
-    options = replace(options, skipped=any(map(_skips_many, read)))
     if by == "contact":
         parts = number_contacts(parts)
     if test is not None:
@@ -434,11 +433,11 @@ def _worst_pairs(train: Manifest, test: Manifest, group: str, gaps: Gaps) -> lis
     chosen = varied(np.flatnonzero(gaps.frames >= 0), -gaps.frames, test)
     pairs = [(k, int(gaps.row[k]), int(gaps.frames[k])) for k in chosen]
     if not pairs and group != NO_GROUP:  # no frames: a shared group is still a pair worth showing
-        first_of = (
+        queries, base = (
             m.table.with_row_index("row").drop_nulls(group).group_by(group).agg(pl.first("row"))
             for m in (test, train)
         )
-        shared = functools.reduce(lambda a, b: a.join(b, on=group), first_of).sort(group)
+        shared = queries.join(base, on=group).sort(group)
         pairs = [(i, j, None) for _, i, j in shared.head(WORST).iter_rows()]
     row = lambda m, k: m.ref(m.table.row(k, named=True))
     return [LeakPair(row(test, k), row(train, j), gap) for k, j, gap in pairs]

@@ -16,7 +16,7 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
 from palpate.core import Note, PalpateError, require
-from palpate.data.manifest import MODALITIES, Manifest
+from palpate.data.manifest import SIDES, Manifest
 from palpate.data.recordings import cuts
 
 #: Columns that a split can keep whole, and by which a split can be audited.
@@ -37,7 +37,7 @@ def choose_group(manifest: Manifest, parts: int = 2) -> tuple[str, Note | None]:
     named = manifest.facts.get("group")
     chain = list(dict.fromkeys([*_known(manifest, [str(named)]), *nested_groups(manifest)]))
     if not chain:
-        images = any(manifest.table[modality].count() for modality in MODALITIES)
+        images = any(manifest.table[modality].count() for modality in SIDES)
         raise PalpateError(
             "A leak-free split needs the video, object or contact of every sample",
             "nulls in each of these columns",

@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 from palpate.core import Progress
 from palpate.data.manifest import MODALITIES, Manifest
 from palpate.leakage.content import shows_nothing
-from palpate.leakage.signals import Flags, Gaps
+from palpate.leakage.signals import Flags, Gaps, leaking
 from palpate.report.records import CANNOT_TELL, LEAKS, NO_LEAK, Question
 
 #: In place of a group where none is known.
@@ -97,11 +97,10 @@ def questions(
 
 def _judged(name: str, flags: Sequence[Flags], reason: str, count: int) -> Question:
     """A question by its signals; ``reason``: why too many samples cannot be judged, or ''."""
-    counted = [f for f in flags if f.counts]
-    leaking = int(np.any([f.flag for f in counted], axis=0).sum()) if counted else 0
-    verdict = LEAKS if leaking else CANNOT_TELL if reason else NO_LEAK
+    leaks = int(leaking(flags, count).sum())
+    verdict = LEAKS if leaks else CANNOT_TELL if reason else NO_LEAK
     checked = max((f.checked for f in flags), default=0)
-    return Question(name, verdict, leaking, checked, count, reason)
+    return Question(name, verdict, leaks, checked, count, reason)
 
 
 def _open_names(train: Manifest, test: Manifest, group: str, equal: Collection[str]) -> str:

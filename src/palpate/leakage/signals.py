@@ -28,7 +28,7 @@ from numpy.typing import NDArray
 
 from palpate.core import Note, Progress, quiet
 from palpate.data.images import file_digest, file_stamp, in_threads
-from palpate.data.manifest import MODALITIES, Manifest
+from palpate.data.manifest import SIDES, Manifest
 from palpate.report.records import CANNOT_TELL, CAUSES, LeakPair, Signal
 
 Ints = NDArray[np.int64]
@@ -176,7 +176,7 @@ def identical_samples(
 def _differ(train: Manifest, test: Manifest, row: Ints) -> NDArray[np.bool_]:
     """(n,) whether a sample and that row of train have files of one kind that are not equal."""
     differ = np.zeros(len(test), bool)
-    for column in MODALITIES:
+    for column in SIDES:
         mine, base = test.column(column), train.column(column)
         for k in np.flatnonzero(row >= 0).tolist():
             if (name := mine[k]) and (other := base[row[k]]):
@@ -292,7 +292,7 @@ def _files(manifest: Manifest) -> list[tuple[int, Path]]:
     """(row, file) of all images but backgrounds, which are shared on purpose."""
     return [
         (row, manifest.path(name))
-        for column in MODALITIES
+        for column in SIDES
         for row, name in enumerate(manifest.column(column))
         if name is not None
     ]

@@ -17,7 +17,7 @@ import numpy as np
 import polars as pl
 
 from palpate.core import Note, PalpateError, Progress, Split, quiet, require
-from palpate.data.manifest import MODALITIES, Manifest
+from palpate.data.manifest import SIDES, Manifest
 from palpate.leakage.auditing import Options, compare
 from palpate.leakage.groups import Ints, choose_group, components, nested_groups
 from palpate.leakage.inputs import Data, read, read_all
@@ -86,6 +86,7 @@ def split(  # noqa: PLR0913  # pyright: ignore[reportInconsistentOverload]
             one group too large to be split off.
     """
     _check(train, val, folds, noleak)
+    cache = None if cache is None else Path(cache)
     if noleak == "touch-and-go":
         source = None if data is None else read(data, skip_bad, progress)
         manifest, notes = (source.manifest, source.notes) if source else (None, [])
@@ -150,21 +151,20 @@ def _check(train: float, val: float, folds: int | None, noleak: str | None) -> N
 
 
 def _near_links(
-    manifest: Manifest, near: str | None, cache: str | Path | None, progress: Progress
+    manifest: Manifest, near: str | None, cache: Path | None, progress: Progress
 ) -> tuple[list[Any], dict[str, Any] | None]:
     """Labels of near-duplicate clusters, and their description for the rule."""
     if near is None:
         return [], None
-    accepted = near in (*MODALITIES, "both")
+    accepted = near in (*SIDES, "both")
     require(accepted, "near", "must be vision, tactile or both", repr(near), "both")
     from palpate.leakage.near import near_groups
 
-    modalities = [m for m in MODALITIES if near in (m, "both") and manifest.table[m].count()]
+    modalities = [m for m in SIDES if near in (m, "both") and manifest.table[m].count()]
     must = f"Near-duplicates need {'' if near == 'both' else f'{near} '}images"
     fix = "Leave it out, or import the images"
     require(len(modalities) > 0, None, must, "samples without any", fix=fix)
-    folder = None if cache is None else Path(cache)
-    links = [near_groups(manifest, m, cache=folder, progress=progress) for m in modalities]
+    links = [near_groups(manifest, m, cache=cache, progress=progress) for m in modalities]
     return links, {"modalities": modalities}
 
 
@@ -235,15 +235,13 @@ def _achieved(
     }
 
 
-def _audited(
-    manifest: Manifest, fresh: Split, part_of: pl.Series, cache: str | Path | None
-) -> Split:
+def _audited(manifest: Manifest, fresh: Split, part_of: pl.Series, cache: Path | None) -> Split:
     """The split with the verdict of its own audit, and a name that says what train and test share.
 
     The audit is by all that is known of the samples, and by the images that were kept together.
     """
     near = fresh.rule["near"]
-    options = Options(near["modalities"] if near else (), None if cache is None else Path(cache))
+    options = Options(near["modalities"] if near else (), cache)
     train, test = (
         replace(manifest, table=manifest.table.filter(part_of == part))
         for part in ("train", "test")

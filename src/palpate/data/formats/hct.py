@@ -87,7 +87,7 @@ def scan(source: Path, *, swap: Swap = "report", progress: Progress = quiet) -> 
             are, with the other suspicions; ``fix`` puts their paths back.
     """
     require_choice("swap", swap, ("report", "fix"))
-    root, rigs = find(Path(source))
+    root, rigs = find(source)
     must = f"{source} must be HCT: {LOOKS_FOR}"
     require(bool(rigs), None, must, "none of these", fix=f"Unpack it from {tvl.URL}")
     result = Scan(root, {"layout": f"hct: {', '.join(rigs)}"} | world_facts(root))
@@ -105,7 +105,7 @@ def scan(source: Path, *, swap: Swap = "report", progress: Progress = quiet) -> 
     result.split_name, result.split_rule = "Orig", {"method": "official", "files": files}
     worded = sorted({f"{row['split']}.csv" for _, row in result.rows if row["text"]})
     result.facts["text_source"] = f"captions of {', '.join(worded)}" if worded else "none"
-    if root == Path(source) / "hct" and (root.parent / "ssvtp").is_dir():
+    if root == source / "hct" and (root.parent / "ssvtp").is_dir():
         text = "ssvtp/ is next to hct/ and was not read: import it as the format ssvtp"
         result.suspect(source, "other-half", text)
     return result
@@ -124,7 +124,7 @@ def write_lists(manifest: Manifest, split: Split, folder: Path) -> list[Path]:
             cells = [path and path.removeprefix(f"{domain}/") for path in paths]
             rows[domain].append([*cells, text])
         for domain, cells in sorted(rows.items()):
-            path = Path(folder) / domain / f"{part}.csv"
+            path = folder / domain / f"{part}.csv"
             files.append(tvl.write_list(path, tvl.COLUMNS, cells))
     return files
 

@@ -24,14 +24,14 @@ from __future__ import annotations
 
 import re
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import polars as pl
 
 from palpate.core import PalpateError, Problem, Progress, quiet, require
-from palpate.data.formats.layout import find_videos, require_videos
+from palpate.data.formats.layout import require_videos
 from palpate.data.formats.recordings import Pairing, Recordings, Row
 from palpate.data.images import Check
 from palpate.data.imported import Imported
@@ -42,9 +42,9 @@ from palpate.data.scanning import Facts, Format, Into, Scan, require_some
 from palpate.data.tables import (
     INCONCLUSIVE,
     TABLES,
-    Record,
     Table,
-    decoded,
+    csv_table,
+    first_line,
     header_of,
     lines_of,
     open_table,
@@ -85,11 +85,6 @@ def detect(source: Path) -> bool:
     if {"vision", "tactile"} & set(first):
         return False
     return _is_bare(first) or set(NEEDED) <= set(first)
-
-
-def has_recordings(source: Path, root: Path | None = None) -> bool:
-    """Whether there are recordings next to a list."""
-    return bool(find_videos(source.parent if root is None else Path(root)))
 
 
 def by_name(
@@ -151,7 +146,6 @@ def scan(
     """Read a list and its recordings; without ``into`` nothing is written."""
     every, columns = options.every, options.columns
     require(every >= 1, "every", "must be at least 1", every)
-    source = Path(source)
     base = source.parent if options.root is None else Path(options.root)
     must = "must be the folder of the recordings"
     require(base.is_dir(), "root", must, f"no folder {base}", fix="Check the path")
@@ -185,9 +179,7 @@ def _first_row(path: Path) -> list[str]:
     """The cells of the first line that is not empty."""
     if path.suffix.lower() in TABLES:
         return header_of(path)
-    with open(path, "rb") as file:
-        lines = lines_of(decoded(file.read(1 << 12)))
-    return SEPARATORS.split(next((line.strip() for line in lines if line.strip()), ""))
+    return SEPARATORS.split(first_line(path))
 
 
 def _is_bare(cells: list[str]) -> bool:
@@ -197,23 +189,14 @@ def _is_bare(cells: list[str]) -> bool:
 
 
 def _of_lines(path: Path, names: Sequence[str] | None) -> Table:
-    """The table of a text whose cells spaces, tabs, commas or semicolons separate."""
-    lines = ((k, line.strip()) for k, line in enumerate(lines_of(text_in(path)), 1))
-    rows = [(k, SEPARATORS.split(line)) for k, line in lines if line]
-    header = list(ORDER if names else rows.pop(0)[1])
-    text = f"is not {' '.join(header)}, or without the last"
-    good = [(k, cells) for k, cells in rows if 0 <= len(header) - len(cells) <= 1]
-    problems = [
-        Problem(f"{path}:{k}", "bad-row", f"{' '.join(cells)!r} {text}")
-        for k, cells in rows
-        if not 0 <= len(header) - len(cells) <= 1
-    ]
+    """The table of a text whose cells spaces, tabs, commas or semicolons separate.
 
-    def records(columns: Sequence[str]) -> Iterator[Record]:
-        places = [header.index(name) for name in columns]
-        return ((k, *[[*cells, None][place] for place in places]) for k, cells in good)
-
-    return Table(str(path), header, problems, records)
+    The last cell of a line may be absent.
+    """
+    header = ORDER if names else SEPARATORS.split(first_line(path))
+    rows = (SEPARATORS.split(line.strip()) for line in lines_of(text_in(path)))
+    filled = ([*cells, ""] if len(cells) == len(header) - 1 else cells for cells in rows)
+    return csv_table(path, "\n".join(map(",".join, filled)), ORDER if names else None)
 
 
 def _read(
@@ -232,7 +215,7 @@ def _read(
         maps.setdefault("material", "label")
     compiled = compile_maps(maps, table.names, [*NEEDED, *WORDS])
     absent = [name for name in NEEDED if name not in compiled.expressions]
-    if absent and not table.problems:
+    if absent and (table.names or not table.problems):
         got = f"no {', '.join(absent)} among {', '.join(table.names) or 'no columns'}"
         must, example = f"{path} must have the columns {', '.join(NEEDED)}", {absent[0]: "COLUMN"}
         raise PalpateError(must, got, "Map your columns", example={"columns": example})

@@ -6,6 +6,7 @@ import os
 import re
 from collections.abc import Mapping, Sequence
 from functools import cache
+from itertools import islice
 from pathlib import Path, PurePosixPath
 
 from palpate.core import PalpateError, inside, require
@@ -65,6 +66,12 @@ def file_names(folder: Path, suffixes: Sequence[str] = SUFFIXES) -> list[str]:
     )
 
 
+def first_files(root: Path) -> list[str]:
+    """Names of the files in up to 500 folders, the first one included."""
+    folders = islice(os.walk(root, followlinks=True), 500)
+    return [name for _, _, names in folders for name in names]
+
+
 def subfolders(folder: Path) -> list[str]:
     """Names of the folders in a folder, in natural order; an unreadable folder has none."""
     return sorted((entry.name for entry in _entries(folder) if entry.is_dir()), key=natural)
@@ -85,7 +92,6 @@ def natural(name: str) -> tuple[int, int, str]:
 
 def require_folder(source: Path, name: str) -> Path:
     """The source of a data set, which must be a folder."""
-    source = Path(source)
     got = f"the file {source}" if source.exists() else f"nothing at {source}"
     fix = "Check the path"
     require(source.is_dir(), None, f"The source of {name} must be a folder", got, fix=fix)

@@ -44,7 +44,7 @@ from palpate.data.detection import (
     templates_of,
     walked,
 )
-from palpate.data.formats.layout import require_folder
+from palpate.data.formats.layout import first_files, require_folder
 from palpate.data.frames import VIDEOS
 from palpate.data.listed import Listed, read_table
 from palpate.data.manifest import IMAGE_COLUMNS, PART_NAMES, is_image
@@ -75,10 +75,7 @@ def detect(source: Path) -> bool:
         suffix = source.suffix.lower()
         tabular = suffix in TABLES and (suffix != ".json" or bool(header_of(source)))
         return tabular or bool(headless_names(source))
-    files = (
-        name for _, _, names in islice(os.walk(source, followlinks=True), 500) for name in names
-    )
-    return any(map(is_image, files))
+    return any(map(is_image, first_files(source)))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -110,7 +107,6 @@ class Options:
 
 def scan(source: Path, options: Options, *, progress: Progress = quiet) -> Scan:
     """Read the rows of a table, or the images of a folder."""
-    source = Path(source)
     is_table = source.is_file()
     if not is_table:
         require_folder(source, FACTS.name)

@@ -28,14 +28,13 @@ from palpate.data.frames import (
     streams_of,
 )
 from palpate.data.images import Check, check_image, in_threads
+from palpate.data.manifest import IMAGE_COLUMNS, SIDES
 from palpate.data.scanning import Into, Scan, raise_if, require_some
 from palpate.data.streams import FEWEST, SHORTER, Finding, findings
 from palpate.data.suspicions import Look
 
 #: The background is this many frames before the contact.
 BACKGROUND_BEFORE = 4
-MODALITIES = ("vision", "tactile")
-
 
 Pairing = Literal["time", "number"]
 #: One recording: modality -> a folder of frames, a video file, or None.
@@ -86,7 +85,7 @@ class Recordings:
     #: Contact -> the frame before it that is its background, if there is one.
     background_frames: dict[str, int] = field(default_factory=dict)
     extracted: bool = False  # whether frames of videos are files by now
-    modalities: tuple[str, ...] = MODALITIES  # those that every recording has
+    modalities: tuple[str, ...] = SIDES  # those that every recording has
     #: How frames of both sides belong together; None where a data set says that it is by number.
     pairing: Pairing | None = None
 
@@ -208,7 +207,7 @@ class Recordings:
             if check == "decode":
                 rows = self._decode(rows, progress)
                 self._check_streams(progress)
-            hidden = {} if check == "none" else dict.fromkeys((*MODALITIES, "background"))
+            hidden = {} if check == "none" else dict.fromkeys(IMAGE_COLUMNS)
         cells = self.cells(rows, self.scan.base.resolve())
         self.scan.rows = [(r.where, cell | hidden) for r, cell in zip(rows, cells, strict=True)]
 
@@ -419,9 +418,8 @@ class Recordings:
 
     def _facts(self, rows: Sequence[Row]) -> dict[str, str]:
         """How the frames are stored, and how many contacts have which background."""
-        kinds: Counter[str] = Counter()
-        for contact in {row.contact for row in rows}:
-            kinds["frame" if contact in self.backgrounds else "none"] += 1
+        contacts = {row.contact for row in rows}
+        kinds = Counter("frame" if c in self.backgrounds else "none" for c in contacts)
         backgrounds = ", ".join(f"{kind} {count}" for kind, count in sorted(kinds.items()))
         return {"layout": self._layout(rows), "backgrounds": backgrounds}
 

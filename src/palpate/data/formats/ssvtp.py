@@ -67,7 +67,7 @@ def find(source: Path) -> Path | None:
 
 def scan(source: Path, *, progress: Progress = quiet) -> Scan:
     """Read the lists, or the folders where there are none, and find the files of each sample."""
-    root = find(Path(source))
+    root = find(source)
     if root is None:
         must = f"{source} must be SSVTP: {LOOKS_FOR}"
         raise PalpateError(must, "none of these", f"Unpack it from {tvl.URL}")

@@ -28,14 +28,7 @@ from palpate.core import PalpateError, Progress, Split, quiet, write_text
 from palpate.data.formats.layout import has_listed_videos, require_folder, require_videos
 from palpate.data.formats.recordings import Recordings, Row, thin
 from palpate.data.images import Check
-from palpate.data.listing import (
-    FrameList,
-    FrameTable,
-    categories_in,
-    read_frame_table,
-    read_lists,
-    write_list,
-)
+from palpate.data.listing import FrameList, categories_in, read_frame_table, read_lists, write_list
 from palpate.data.manifest import Manifest
 from palpate.data.scanning import WORLD, Facts, Format, Into, Scan, world_facts
 from palpate.data.tables import INCONCLUSIVE
@@ -60,6 +53,8 @@ _NAMES = (
     " Rubber, Paper, Tree, Grass, Soil, Rock, Gravel, Sand, Plants, Others"
 )
 CATEGORIES: dict[int, str] = dict(enumerate(_NAMES.split(", ")))
+#: Manifest column -> (video, frame) -> its words.
+Words = Mapping[str, Mapping[tuple[str, int], str]]
 #: Part of the official split -> its list.
 OFFICIAL = {"train": "train.txt", "test": "test.txt"}
 
@@ -132,10 +127,10 @@ def write_lists(manifest: Manifest, split: Split, folder: Path) -> list[Path]:
                 got = f"{i!r} with video {video!r} and frame {frame!r}"
                 raise PalpateError(must, got, "Write the split file alone")
             rows.append((f"{video}/{frame:010d}.jpg", label))
-        files.append(Path(folder) / f"{part}.txt")
+        files.append(folder / f"{part}.txt")
         write_list(files[-1], rows)
     if more:
-        files.append(Path(folder) / "category_reference.txt")
+        files.append(folder / "category_reference.txt")
         write_text(files[-1], table)
     return files
 
@@ -143,7 +138,7 @@ def write_lists(manifest: Manifest, split: Split, folder: Path) -> list[Path]:
 FORMAT = Format(FACTS, has_listed_videos, LOOKS_FOR, scan, write_lists)
 
 
-def _rows(listed: FrameList, words: Mapping[str, FrameTable | None], sensor: str) -> list[Row]:
+def _rows(listed: FrameList, words: Words, sensor: str) -> list[Row]:
     """The rows of a list, sorted by video and frame."""
     columns = ("contact", "material")
     table = pl.concat([listed.rows, listed.manifest.table.select(columns)], how="horizontal")
@@ -151,7 +146,7 @@ def _rows(listed: FrameList, words: Mapping[str, FrameTable | None], sensor: str
     table = table.sort("video", "frame").select(where, "id", "video", "frame", *columns)
     rows: list[Row] = []
     for line, name, video, frame, contact, material in table.iter_rows():
-        more = {c: t.values.get((video, frame)) for c, t in words.items() if t is not None}
+        more = {column: of.get((video, frame)) for column, of in words.items()}
         more |= {"material": material, "sensor": sensor}
         rows.append(Row(line, name, video, frame, contact, more))
     return rows
@@ -159,7 +154,7 @@ def _rows(listed: FrameList, words: Mapping[str, FrameTable | None], sensor: str
 
 def _read_lists(
     result: Scan, labels: Sequence[Path] | Path | None
-) -> tuple[FrameList, FrameList | None, dict[str, FrameTable | None], dict[str, set[int]]]:
+) -> tuple[FrameList, FrameList | None, Words, dict[str, set[int]]]:
     """Read the lists given, else ``label.txt``, else the official two, and what is next to them.
 
     Returns:
@@ -187,17 +182,19 @@ def _read_lists(
         for (video,), group in frames.contact.group_by("video"):
             in_contact.setdefault(str(video), set()).update(group["frame"].to_list())
     places = {"text": root / "captions.csv", "object": root / "objects.csv"}
-    words = {c: read_frame_table(path) if path.is_file() else None for c, path in places.items()}
-    tables = [listed, *words.values(), official if official is not listed else None]
-    result.problems = [problem for table in tables if table for problem in table.skipped]
-    for column, table in words.items():
-        keys = table.values if table else ()
+    result.problems = [*listed.skipped]
+    words = {
+        c: read_frame_table(path, result.problems) for c, path in places.items() if path.is_file()
+    }
+    if official and official is not listed:
+        result.problems += official.skipped
+    for column, keys in words.items():
         if strays := [(v, k) for v, k in keys if k not in in_contact.get(v, ())]:
             first = "/".join(map(str, strays[0]))
             text = f"{len(strays)} lines are of no listed frame, first {first!r}"
             result.suspect(places[column], "no-sample", text)
     result.inconclusive = listed.inconclusive
-    result.facts |= {"text_source": "captions.csv" if words["text"] else "none"}
+    result.facts |= {"text_source": "captions.csv" if "text" in words else "none"}
     if categories != CATEGORIES:
         result.facts["classes"] = json.dumps({str(k): name for k, name in categories.items()})
     return listed, official, words, in_contact

@@ -22,12 +22,10 @@ contact or not. A contact is ``video#000k``; its background is the gel before it
 
 from __future__ import annotations
 
-import os
 import shutil
 from collections.abc import Mapping
 from dataclasses import dataclass
 from filecmp import cmp
-from itertools import islice
 from pathlib import Path
 
 import numpy as np
@@ -45,7 +43,7 @@ from palpate.data.detection import (
     templates_of,
     walked,
 )
-from palpate.data.formats.layout import has_listed_videos, require_folder
+from palpate.data.formats.layout import first_files, has_listed_videos, require_folder
 from palpate.data.formats.recordings import Pairing, Recordings, Row, thin
 from palpate.data.frames import MOVING
 from palpate.data.images import Check, in_threads, read_image
@@ -80,9 +78,7 @@ def detect(source: Path) -> bool:
     """Whether this is a folder with videos or stacks below it, and without images."""
     if not source.is_dir() or has_listed_videos(source):
         return False
-    files = [
-        name for _, _, names in islice(os.walk(source, followlinks=True), 500) for name in names
-    ]
+    files = first_files(source)
     images = any(map(is_image, files))
     return not images and any(name.lower().endswith(MOVING) for name in files)
 
