@@ -44,7 +44,7 @@ from palpate.core import (
     require,
     short,
 )
-from palpate.core.images import ORIENTATION
+from palpate.core.images import ORIENTATION, SUFFIXES
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -457,6 +457,11 @@ def image_stamp(manifest: Manifest, column: str) -> str:
 def square(image: Image.Image, size: int) -> NDArray[np.uint8]:
     """The center square of an RGB image, resized: (size, size, 3), 0 to 255."""
     return Preprocess(size, size).prepare(image)
+
+
+def images_below(folder: Path) -> list[Path]:
+    """The image files below a folder, sorted."""
+    return sorted(p for p in folder.rglob("*") if p.suffix.lower() in SUFFIXES and p.is_file())
 
 
 def in_threads(

@@ -154,7 +154,7 @@ def read_table(
     images = [name for name in IMAGE_COLUMNS if name in rows.columns]
     rows = rows.with_columns((pl.lit(below) + pl.col(name)).alias(name) for name in images)
     written = pl.concat([pl.Series(dtype=pl.String), *(rows[name].drop_nulls() for name in images)])
-    if places := relocated(written.unique(maintain_order=True), scan.base):
+    if places := relocated(written, scan.base):
         rows = rows.with_columns(pl.col(images).replace(places))
         before, below = next(iter(places.items()))
         text = f"{len(places)} paths are read by their end in any spelling: {before!a} is {below!a}"

@@ -108,7 +108,7 @@ class Scan:
     #: Usable, but a person should look (swapped folders, unexpected counts ...).
     suspicious: list[Problem] = field(default_factory=list)
     splits: dict[str, Split] = field(default_factory=dict)  # the data set's own splits, by name
-    split_name: str = ""  # of the split in the rows' cells ``split``, if they have any
+    #: What says the split in the rows' cells ``split``: files, a column ...; empty without one.
     split_rule: dict[str, Any] = field(default_factory=dict)
     inconclusive: int = 0  # rows skipped because their label marks the material as unclear
     #: How many images were read as something else than upright 8-bit RGB, by how.
@@ -121,6 +121,11 @@ class Scan:
     def problem(self, where: object, kind: str, text: str) -> None:
         """Report something that makes a row or file unusable."""
         self.problems.append(Problem(str(where), kind, text))
+
+    def state_texts(self, source: str) -> None:
+        """Say where the texts of the rows are from, if they have any."""
+        worded = any(row.get("text") for _, row in self.rows)
+        self.facts["text_source"] = source if worded else "none"
 
     def suspect(
         self, where: object, kind: str, text: str, names: Iterable[object] | None = None
@@ -190,7 +195,7 @@ def manifest_of(scan: Scan, rows: Iterable[Row], facts: Mapping[str, str]) -> Ma
 def finished(scan: Scan, check: Check, progress: Progress = quiet) -> list[Row]:
     """Rows with paths inside the root, whole images and unique ids; other rows become problems.
 
-    The cells ``split`` of the rows that remain become the split ``scan.split_name``.
+    The cells ``split`` of the rows that remain become the split ``Orig``.
     """
     rows = _unique(scan, _checked_images(scan, _checked_paths(scan), check, progress))
     scan.suspicious += suspicions(scan.looks)
@@ -311,8 +316,8 @@ def _unique(scan: Scan, rows: list[Row]) -> list[Row]:
             hint = _difference(first, row) or hint
             scan.problem(where, "duplicate-id", f"the id {i!r} is at {before} already{hint}")
     parts = {i: part for i, (_, part, _) in seen.items() if part and i not in in_two}
-    if scan.split_name and parts:
-        scan.splits[scan.split_name] = Split(parts, scan.split_rule)
+    if scan.split_rule and parts:
+        scan.splits["Orig"] = Split(parts, {"method": "official", **scan.split_rule})
     return good
 
 

@@ -385,16 +385,14 @@ def _items(data: Any, split: str | None = None, *, row: bool = False) -> Iterato
             yield _numbered(pair) | {"split": split}
     elif isinstance(data, Mapping):
         row |= {*SIDES} <= {side_of([str(key)]) for key in data}
-        lists = {key: value for key, value in data.items() if isinstance(value, (list, Mapping))}
-        below = [item for value in lists.values() for item in value if isinstance(value, list)]
-        is_list = split is None and not row and lists and len(lists) == len(data)
-        if is_list and not _scalars(below):
+        parts = {key: PART_NAMES.get(str(key).lower()) for key in data}
+        below = [item for value in data.values() if isinstance(value, list) for item in value]
+        nested = all(isinstance(value, (list, Mapping)) for value in data.values())
+        is_list = nested and not (split or row or _scalars(below))
+        if is_list or all(parts.values()):
             rows = _any_value_beside(data.values(), (list, Mapping))
-            for key, value in lists.items():
-                yield from _items(value, PART_NAMES.get(str(key).lower()), row=rows)
-        elif set(map(str.lower, map(str, data))) <= PART_NAMES.keys():
             for key, value in data.items():
-                yield from _items(value, PART_NAMES[str(key).lower()])
+                yield from _items(value, parts[key], row=rows)
         else:
             yield dict(data) | ({"split": split} if split else {})
     elif isinstance(data, list) and _scalars(data) and len(data) >= 2 and not is_image(data[0]):
@@ -437,16 +435,16 @@ def _flat(item: Mapping[str, Any], prefix: str = "") -> list[dict[str, Any]]:
     """
     rows: list[dict[str, Any]] = [{}]
     for key, value in item.items():
-        name, cells = f"{prefix}{key}", [{f"{prefix}{key}": value}]
+        name = f"{prefix}{key}"
+        cells = [{name: value}]
         if isinstance(value, Mapping):
             cells = _flat(value, f"{name}.")
         elif isinstance(value, list) and len(value) in (2, 3) and _all_images(value):
             cells = [_numbered(value, name)]
         elif isinstance(value, list) and len(rows) == 1:
             inner = [row for i in value if isinstance(i, Mapping) for row in _flat(i, f"{name}.")]
-            cells = (
-                inner if inner and all(any(map(is_image, row.values())) for row in inner) else cells
-            )
+            if inner and all(any(map(is_image, row.values())) for row in inner):
+                cells = inner
         rows = [row | more for row in rows for more in cells]
     return rows
 

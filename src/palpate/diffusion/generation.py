@@ -43,7 +43,7 @@ from palpate.core import (
 )
 from palpate.core.files import canonical_json
 from palpate.core.images import SUFFIXES
-from palpate.data.images import check_image, read_image, square
+from palpate.data.images import check_image, images_below, read_image, square
 from palpate.diffusion.generated import Generated, Index, file_name, old_index
 from palpate.encoders.models import FIX_MODEL, find_model
 
@@ -308,8 +308,7 @@ def photo_ids(photos: Photos) -> dict[str, Path]:
         return {i: Path(p) for i, p in photos.items()}
     if isinstance(photos, str | Path) and Path(photos).is_dir():
         folder = Path(photos)
-        files = sorted(p for p in folder.rglob("*") if p.suffix.lower() in SUFFIXES and p.is_file())
-        return {p.relative_to(folder).as_posix(): p for p in files}
+        return {p.relative_to(folder).as_posix(): p for p in images_below(folder)}
     listed: Sequence[Any] = [photos] if isinstance(photos, str | Path) else list(photos)
     files = all(isinstance(photo, str | Path) for photo in listed)
     fix = "Pass images in memory to a TactilePipeline"

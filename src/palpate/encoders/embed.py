@@ -30,9 +30,8 @@ from palpate.core import (
     require_choice,
     short,
 )
-from palpate.core.images import SUFFIXES
 from palpate.data.captions import NAMED, caption
-from palpate.data.images import REFETCH, Frames, image_stamp, load_images
+from palpate.data.images import REFETCH, Frames, image_stamp, images_below, load_images
 from palpate.encoders.encoder_set import MODALITIES, EncoderSet, Modality
 from palpate.encoders.models import to_unit
 
@@ -240,10 +239,7 @@ def list_images(inputs: Any) -> list[Path | Image.Image]:
     """
     if isinstance(inputs, str | Path):
         path = Path(inputs)
-        if not path.is_dir():
-            return [path]
-        files = (p for p in path.rglob("*") if p.suffix.lower() in SUFFIXES and p.is_file())
-        return [*sorted(files)]
+        return [*images_below(path)] if path.is_dir() else [path]
     if isinstance(inputs, Image.Image):
         return [inputs.convert("RGB")]
     if hasattr(inputs, "shape"):

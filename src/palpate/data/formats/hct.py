@@ -102,7 +102,7 @@ def scan(source: Path, *, swap: Swap = "report", progress: Progress = quiet) -> 
     sensor = WORLD.sensor if "synthetic" in result.facts else FACTS.sensor
     for _, row in result.rows:
         row |= {"contact": contacts[_key(row)], "session": sessions[row["video"]], "sensor": sensor}
-    result.split_name, result.split_rule = "Orig", {"method": "official", "files": files}
+    result.split_rule = {"files": files}
     worded = sorted({f"{row['split']}.csv" for _, row in result.rows if row["text"]})
     result.facts["text_source"] = f"captions of {', '.join(worded)}" if worded else "none"
     if root == source / "hct" and (root.parent / "ssvtp").is_dir():

@@ -93,10 +93,8 @@ def scan(
         progress("reading rows", first + len(next(iter(batch.values()))), total)
     parts = sorted(split for split in opened.splits if split in PART_NAMES)
     if len(parts) > 1:
-        result.split_name, result.split_rule = "Orig", {"method": "official", "parts": parts}
-    worded = any("text" in row for _, row in result.rows)
-    column = f"column {maps.texts.get('text', 'text')}"
-    result.facts["text_source"] = column if worded else "none"
+        result.split_rule = {"parts": parts}
+    result.state_texts(f"column {maps.texts.get('text', 'text')}")
     result.suspicious = odd_groups(Path(opened.name), result.rows)
     if check == "decode":
         usable = {path: store.checked[digest] for digest, path in store.paths.items()}

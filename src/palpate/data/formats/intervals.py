@@ -166,9 +166,7 @@ def scan(
     rows = [row for name in contacts for row in _frames(work, name, contacts[name], every)]
     starts = {contact: (i.video, i.first) for contact, i in contacts.items()}
     work.add(rows, starts, check=check, progress=progress)
-    column = f"column {(columns or {}).get('text', 'text')}"
-    worded = any(row.get("text") for _, row in result.rows)
-    result.facts["text_source"] = column if worded else "none"
+    result.state_texts(f"column {(columns or {}).get('text', 'text')}")
     return result
 
 

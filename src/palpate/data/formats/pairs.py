@@ -187,12 +187,10 @@ def _of_folder(source: Path, options: Options, templates: Mapping[str, str]) -> 
 def _describe(result: Scan, source: Path, maps: Mapping[str, str]) -> None:
     """Add what is odd of the rows of a scan, and facts about them."""
     result.suspicious += odd_groups(source, result.rows)
-    worded = any("text" in row for _, row in result.rows)
-    result.facts["text_source"] = f"column {maps.get('text', 'text')}" if worded else "none"
+    result.state_texts(f"column {maps.get('text', 'text')}")
     result.facts["dataset"] = source.resolve().stem
     if any("split" in row for _, row in result.rows) and not result.splits:
-        result.split_name = "Orig"
-        result.split_rule = {"method": "official", "column": maps.get("split", "split")}
+        result.split_rule = {"column": maps.get("split", "split")}
 
 
 FORMAT = Format(FACTS, detect, LOOKS_FOR, scan, record=Options)
@@ -217,8 +215,7 @@ def format_of(layout: Layout) -> Format:
         progress("reading rows", 0, 1)
         _read_folder(result, templates, None, layout.columns, None, published=True)
         result.facts.pop("templates", None)
-        worded = any("text" in row for _, row in result.rows)
-        result.facts |= {"text_source": "table" if worded else "none"}
+        result.state_texts("table")
         result.facts |= {"layout": templates["tactile"]}
         if "template_vision" not in result.facts:
             result.facts["vision"] = "none in this layout"

@@ -82,7 +82,7 @@ def scan(source: Path, *, progress: Progress = quiet) -> Scan:
     captions: dict[str, str | None] = {}
     if paths:
         lists = [path.name for path in paths.values()]
-        result.split_name, result.split_rule = "Orig", {"method": "official", "files": lists}
+        result.split_rule = {"files": lists}
         for done, (part, path) in enumerate(paths.items()):
             progress("reading lists", done, len(paths))
             _read_list(result, path, part, images, captions)

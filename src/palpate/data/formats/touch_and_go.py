@@ -96,8 +96,7 @@ def scan(
         parts = {(video, frame): part_of[Path(source).name] for video, frame, source in cells}
         for _, row in result.rows:
             row["split"] = parts.get((row["video"], row["frame"]))
-        result.split_name = "Orig"
-        result.split_rule = {"method": "official", "files": list(OFFICIAL.values())}
+        result.split_rule = {"files": list(OFFICIAL.values())}
     return result
 
 

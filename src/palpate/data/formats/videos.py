@@ -148,7 +148,7 @@ def scan(
     cells = work.cells(rows, work.out.resolve())
     result.rows = [(row.where, cell | hidden) for row, cell in zip(rows, cells, strict=True)]
     if any("split" in cell for cell in cells):
-        result.split_name, result.split_rule = "Orig", {"method": "official", "column": "split"}
+        result.split_rule = {"column": "split"}
     return result
 
 
