@@ -7,8 +7,6 @@ from palpate.data.contacts import contact_energy, find_contacts, find_reference
 from palpate.data.streams import findings
 from palpate.data.video import VideoReader
 
-SIZE = (64, 48)
-
 
 def gel_video(length=120, presses=((20, 40), (60, 90)), strength=20.0, seed=0):
     """(n, 48, 64, 3): a gel with noise; presses rise in 5 frames, each with its own print."""
@@ -94,7 +92,7 @@ def clips(real_data):
 
 def measured(folder, name):
     with VideoReader(folder / "dataset" / name / "gelsight.mp4") as reader:
-        contacts = find_contacts(reader.thumbnails(SIZE))
+        contacts = find_contacts(reader.thumbnails())
     lines = (folder / "label.txt").read_text().split()
     labeled = {int(line[16:26]) for line in lines if line.startswith(name)}
     return contacts, labeled

@@ -42,10 +42,9 @@ from palpate.data.contacts import (
     find_contacts,
     find_reference,
     rest_before,
-    thumbnail,
 )
-from palpate.data.frames import FolderFrames
-from palpate.data.images import in_threads, read_image
+from palpate.data.frames import FolderFrames, thumbnail_of
+from palpate.data.images import in_threads
 from palpate.data.imported import Imported, removing_on_error, splits_of
 from palpate.data.manifest import Manifest
 from palpate.data.reading import load
@@ -166,12 +165,11 @@ class _Video:
         for row in rows:
             samples.setdefault(manifest.root / row["tactile"], []).append(row)
         paths = _with_siblings(samples, manifest.root)
-        small = (2 * SIZE[0], 2 * SIZE[1])
         images = np.zeros((len(paths), SIZE[1], SIZE[0], 3), np.uint8)
 
         def decode(k: int) -> str | None:
             try:
-                images[k] = thumbnail(read_image(paths[k], at_least=small))
+                images[k] = thumbnail_of(paths[k])
             except PalpateError as error:
                 return error.got
             return None

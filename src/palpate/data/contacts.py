@@ -62,10 +62,10 @@ class Contacts:
         )
 
 
-def thumbnail(image: Any, size: tuple[int, int] = SIZE) -> Pixels:
+def thumbnail(image: Any) -> Pixels:
     """(48, 64, 3) of an image or (h, w, 3), each pixel the mean of those that it covers."""
     picture = image if isinstance(image, Image.Image) else Image.fromarray(image)
-    return np.asarray(picture.convert("RGB").resize(size, Image.Resampling.BOX))
+    return np.asarray(picture.convert("RGB").resize(SIZE, Image.Resampling.BOX))
 
 
 def find_contacts(

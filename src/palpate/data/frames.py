@@ -40,6 +40,11 @@ def reader_of(source: Path) -> VideoReader | StackReader:
     return (StackReader if source.suffix.lower() == SUFFIX else VideoReader)(source)
 
 
+def thumbnail_of(path: Path) -> NDArray[np.uint8]:
+    """(48, 64, 3) of an image file."""
+    return thumbnail(read_image(path, at_least=(2 * SIZE[0], 2 * SIZE[1])))
+
+
 class FolderFrames:
     """Frames in a folder, named by their number (``0000000033.jpg``); other files are ignored.
 
@@ -83,9 +88,7 @@ class FolderFrames:
         """Thumbnails of all frames; None if numbers are missing."""
         if not self.numbers or self.numbers[-1] - self.numbers[0] >= len(self.numbers):
             return None
-        small = (2 * SIZE[0], 2 * SIZE[1])
-        images = (read_image(self.path(k), at_least=small) for k in self.numbers)
-        return np.stack([thumbnail(image) for image in images]), None
+        return np.stack([thumbnail_of(self.path(k)) for k in self.numbers]), None
 
 
 class VideoFrames:
@@ -121,7 +124,7 @@ class VideoFrames:
     def stream(self) -> Stream:
         """Thumbnails of all frames, and when each is presented, in seconds."""
         with reader_of(self.source) as reader:
-            return reader.thumbnails(SIZE), reader.seconds
+            return reader.thumbnails(), reader.seconds
 
     def extract(self, frames: set[int], created: list[Path], stop: Event) -> None:
         """Cache the frames that are not, or are damaged; new files are added to ``created``.

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from palpate.core import PalpateError
-from palpate.data.contacts import SIZE, thumbnail
+from palpate.data.contacts import thumbnail
 
 SUFFIX = ".npy"
 #: Headers are parsed as Python, which several threads of Python 3.11 may not do at once.
@@ -74,9 +74,9 @@ class StackReader:
         """Yield ``(k, (h, w, 3) image)`` as given."""
         return ((k, self[k]) for k in indices)
 
-    def thumbnails(self, size: tuple[int, int] = SIZE) -> NDArray[np.uint8]:
-        """All frames reduced to (width, height): (n, height, width, 3)."""
-        return np.stack([thumbnail(self[k], size) for k in range(len(self))])
+    def thumbnails(self) -> NDArray[np.uint8]:
+        """All frames reduced to (n, 48, 64, 3)."""
+        return np.stack([thumbnail(self[k]) for k in range(len(self))])
 
     def __enter__(self) -> StackReader:
         return self

@@ -22,6 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from palpate.core import MissingExtraError, PalpateError, require
+from palpate.data.contacts import SIZE
 
 REWRITE = "Write it as MP4 again: ffmpeg -i FILE -c copy NEW.mp4"
 
@@ -99,11 +100,11 @@ class VideoReader:
         """(n,) when each frame is presented."""
         return np.asarray(self._pts) * float(self._stream.time_base or 1)
 
-    def thumbnails(self, size: tuple[int, int]) -> NDArray[np.uint8]:
-        """All frames, reduced to (width, height) while they are decoded: (n, height, width, 3)."""
+    def thumbnails(self) -> NDArray[np.uint8]:
+        """All frames, reduced to (n, 48, 64, 3) while they are decoded."""
         from av.video.reformatter import Interpolation, VideoReformatter
 
-        images = np.empty((len(self), size[1], size[0], 3), np.uint8)
+        images = np.empty((len(self), *SIZE[::-1], 3), np.uint8)
         resize, position = VideoReformatter().reformat, {pts: k for k, pts in enumerate(self._pts)}
         area = Interpolation.AREA
         self._last = None
@@ -112,7 +113,7 @@ class VideoReader:
         try:
             for frame in self._decoded:
                 if (k := position.pop(frame.pts, None)) is not None:
-                    width, height = size[::-1] if self._matrix(frame)[1] else size
+                    width, height = SIZE[::-1] if self._matrix(frame)[1] else SIZE
                     image = resize(frame, width, height, "rgb24", interpolation=area)
                     images[k] = self._upright(frame, np.asarray(image.to_ndarray(), np.uint8))
         except self._errors as error:
