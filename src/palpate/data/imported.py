@@ -89,13 +89,7 @@ class Imported:
 
 
 def imported_of(
-    scan: Scan,
-    source: object,
-    facts: Mapping[str, str],
-    *,
-    skip_bad: bool,
-    check: Check,
-    progress: Progress = quiet,
+    scan: Scan, source: object, *, skip_bad: bool, check: Check, progress: Progress = quiet
 ) -> Imported:
     """A scan as an import that is not written yet.
 
@@ -107,7 +101,7 @@ def imported_of(
     clocks = [problem for problem in scan.suspicious if problem.kind == CLOCK]  # why some are alone
     raise_if([*clocks, *scan.problems] if scan.problems else [], skip_bad)
     require_some(len(rows), source, scan.problems)
-    manifest = manifest_of(scan, rows, {**facts, **scan.facts})
+    manifest = manifest_of(scan, rows)
     ids = set(manifest.ids)
     splits: dict[str, Split] = {}
     for name, split in scan.splits.items():

@@ -78,12 +78,9 @@ def import_dataset(
         else:
             options |= {"check": check, "progress": progress}
             options["into"] = Into(output, created, skip_bad)
-            name, form, scan = scanned(source, format, options)
-            facts = {**form.facts.of_manifest(), "format": name}
+            _, form, scan = scanned(source, format, options)
             check = "none" if form.writes else check  # they were checked on the way
-            imported = imported_of(
-                scan, source, facts, skip_bad=skip_bad, check=check, progress=progress
-            )
+            imported = imported_of(scan, source, skip_bad=skip_bad, check=check, progress=progress)
         if text is not None and texts is not None:
             imported = with_texts(imported, texts, Path(text))
         return imported.save(output, created)
@@ -127,7 +124,7 @@ def validate(
     missing = [p for p in scan.problems if p.kind.startswith(MISSING)]
     invalid = [p for p in scan.problems if not p.kind.startswith(MISSING)]
     templated = any(fact.startswith(("template_", "images")) for fact in scan.facts)
-    templates = templates_of(manifest_of(scan, rows, scan.facts)) if templated else {}
+    templates = templates_of(manifest_of(scan, rows)) if templated else {}
     odd = {problem.where for problem in scan.suspicious}
     looks = {recording: look for recording, look in scan.looks.items() if recording in odd}
     return Validation(name, facts, len(rows), missing, invalid, scan.suspicious, templates, looks)

@@ -104,15 +104,14 @@ def read(
     # Images are not decoded here: broken ones are reported when they are read.
     options |= {"check": "none", "progress": progress}
     try:
-        name, form, scan = scanned(path, "pairs" if "side" in options else format, options)
+        scan = scanned(path, "pairs" if "side" in options else format, options)[-1]
     except PalpateError as error:
         if not error.choices or any("columns" in choice for choice in error.choices):
             raise
         # A folder whose names do not say what its images show is one of photos.
-        name, form, scan = scanned(path, format, options | {"side": "vision"})
+        scan = scanned(path, format, options | {"side": "vision"})[-1]
         scan.facts["side_assumed"] = "vision"
-    facts = {**form.facts.of_manifest(), "format": name}
-    return imported_of(scan, path, facts, skip_bad=skip_bad, check="none", progress=progress)
+    return imported_of(scan, path, skip_bad=skip_bad, check="none", progress=progress)
 
 
 def _of_file(
@@ -145,9 +144,9 @@ def _of_table(source: Any, options: Mapping[str, Any], *, images: bool, skip_bad
     if listed.sides and (images or listed.at_hand):
         must = "must come with a folder, or a list whose images are not at hand"
         require(not side, side, must, listed.table.name, fix="Leave it out")
-        facts = {**pairs.FACTS.of_manifest(), "format": "pairs"}
         scan = pairs.scan_of(listed)
-        return imported_of(scan, listed.table.name, facts, skip_bad=skip_bad, check="none")
+        scan.facts = {**pairs.FACTS.of_manifest(), "format": "pairs", **scan.facts}
+        return imported_of(scan, listed.table.name, skip_bad=skip_bad, check="none")
     imported = _by_name(listed, options.get(side))
     raise_if(imported.skipped, skip_bad)
     return imported

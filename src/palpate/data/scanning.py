@@ -174,12 +174,11 @@ class Format:
 
     def read(self, source: Path, values: Mapping[str, Any]) -> Scan:
         """Scan a source with those of the option values that the scan takes."""
-        names = inspect.signature(self.scan).parameters
-        if self.record is None:
-            return self.scan(source, **{k: v for k, v in values.items() if k in names})
-        own = {f.name for f in fields(self.record)}
-        record = self.record(**{k: v for k, v in values.items() if k in own})
-        return self.scan(source, record, **{k: v for k, v in values.items() if k in names})
+        names, records = inspect.signature(self.scan).parameters, list[Any]()
+        if self.record is not None:
+            own = {f.name for f in fields(self.record)}
+            records.append(self.record(**{k: v for k, v in values.items() if k in own}))
+        return self.scan(source, *records, **{k: v for k, v in values.items() if k in names})
 
     @property
     def writes(self) -> bool:
@@ -187,9 +186,9 @@ class Format:
         return "into" in inspect.signature(self.scan).parameters
 
 
-def manifest_of(scan: Scan, rows: Iterable[Row], facts: Mapping[str, str]) -> Manifest:
+def manifest_of(scan: Scan, rows: Iterable[Row]) -> Manifest:
     """The manifest of finished rows."""
-    return Manifest.from_rows((row for _, row in rows), scan.base.resolve(), facts, scan.more)
+    return Manifest.from_rows((row for _, row in rows), scan.base.resolve(), scan.facts, scan.more)
 
 
 def finished(scan: Scan, check: Check, progress: Progress = quiet) -> list[Row]:

@@ -74,7 +74,7 @@ def scanned(source: Path, name: str, options: Mapping[str, Any]) -> tuple[str, F
         options: of the format, and ``check``, ``progress`` and ``into``; None is the default.
 
     Returns:
-        The name of the format, the format, and what it reads.
+        The name of the format, the format, and what it reads, with their facts.
 
     Raises:
         PalpateError: if there is no such source or format, or an option does not belong to it.
@@ -87,7 +87,9 @@ def scanned(source: Path, name: str, options: Mapping[str, Any]) -> tuple[str, F
         must, got = f"must be left out for the format {name}", repr(values[unknown])
         fix = f"This format takes {takes or 'no options'}"
         raise PalpateError(must, got, fix, argument=unknown)
-    return name, form, form.read(source, values)
+    scan = form.read(source, values)
+    scan.facts = {**form.facts.of_manifest(), "format": name, **scan.facts}
+    return name, form, scan
 
 
 def _contents(source: Path) -> str:
