@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from palpate.core import Progress
-from palpate.data.manifest import MODALITIES, Manifest
+from palpate.data.manifest import SIDES, Manifest
 from palpate.leakage.content import shows_nothing
 from palpate.leakage.signals import Flags, Gaps, leaking
 from palpate.report.records import CANNOT_TELL, LEAKS, NO_LEAK, Question
@@ -62,11 +62,7 @@ def questions(
     near = [f for f in flags if f.kind.startswith("near-duplicate")]
     pictures = Question("near-duplicates", "", reason="no-images" if asked else "images-off")
     absent = [m for m in (train, test) if "images_absent" in m.facts]
-    if (
-        asked
-        and len(absent) == 1
-        and any(m.table[c].count() for m in (train, test) for c in MODALITIES)
-    ):
+    if asked and len(absent) == 1 and any(m.table[c].count() for m in (train, test) for c in SIDES):
         pictures = replace(pictures, verdict=CANNOT_TELL, of=len(test), reason="unreadable")
     if near:
         reason = next(filter(None, (_open_images(f, train, test, progress) for f in near)), "")
