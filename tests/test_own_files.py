@@ -16,7 +16,7 @@ import pytest
 from PIL import Image
 
 from forge.commands import call
-from forge.damage import DAMAGES, flip, inflate
+from forge.damage import DAMAGES, cut, flip, inflate
 from forge.pictures import picture, write_video
 from forge.servers import FakeServer
 from palpate.cli import terminal
@@ -25,6 +25,7 @@ from palpate.core import (
     cached,
     digest_file,
     digest_folder,
+    digest_json,
     digest_lines,
     files,
     is_whole,
@@ -46,11 +47,21 @@ class Verb:
         words: the command.
         stop: task and count of its progress at which it is stopped; None: it ends.
         result: a digest of what it gives, of its folder and of what it printed.
+        sampled: one file of each kind is damaged, in two ways; else each in all.
     """
 
     words: tuple[str, ...]
     stop: tuple[str, int] | None
     result: Callable[[Path, str], str]
+    sampled: bool = False
+
+    def damaged(self, left):
+        """Files of a folder, by their names in it, and how each is damaged."""
+        names = [p.relative_to(left) for p in sorted(left.rglob("*")) if p.is_file()]
+        if not self.sampled:
+            return [*product(names, DAMAGES)]
+        kinds = {p.suffix: p for p in names}
+        return [*product(kinds.values(), (flip, cut))]
 
 
 def weights(folder, out):
@@ -79,7 +90,12 @@ def scores(folder, out):
     )
 
 
+def audited(folder, out):
+    return digest_json(json.loads(out))
+
+
 TRAIN = ("../tag", "--split", "../split.json", "--preset", "tiny", "-o", "out", "--seed", "3")
+AUDIT = ("audit", "../tag", "--split", "../split.json", "--cache", "cache", "--json")
 MINI = ("--clip", "palpate/mini")
 WORLD = ("world", "-o", "out", "--preset", "tiny", "--materials", "2", "--workers", "1")
 WORLD += ("--objects-per-material", "1", "--size", "16", "--layout")
@@ -104,6 +120,7 @@ VERBS = {
         None,
         scores,
     ),
+    "audit": Verb(AUDIT, None, audited, sampled=True),
     "train autoencoder": Verb(
         ("train", "autoencoder", *TRAIN, "--set", "autoencoder.steps_free=4"),
         ("autoencoder", 2),
@@ -119,7 +136,7 @@ VERBS = {
 
 
 #: The others take minutes: a file for each frame, or trainings.
-DAILY = ("import", "world", "generate", "caption", "score")
+DAILY = ("import", "world", "generate", "caption", "score", "audit")
 
 
 class Stopper:
@@ -172,23 +189,21 @@ def test_each_damaged_file_of_a_stopped_run_is_made_again_or_refused(
             monkeypatch.setattr(Stopper, "stop", None)
         left = place.with_name("left")
         shutil.copytree(place, left)
-        names = [p.relative_to(left) for p in sorted(left.rglob("*")) if p.is_file()]
-        assert names
-        said = 0
-        for file in names:
-            for damage in DAMAGES:
-                empty(place)
-                shutil.copytree(left, place, dirs_exist_ok=True)
-                damage(place / file)
-                status, out, err = call(capsys, *words)
-                case = f"{file}, {damage.__name__}: {status}\n{err}"
-                assert status in (0, 2), case
-                if status == 0:
-                    assert verb.result(place, out) == whole, case
-                    said += "is damaged: making it again" in err
-                else:
-                    assert "Traceback" not in err, case
-                    assert any(w in err for w in ("damaged", "must be JSON", "another line")), case
+        cases, said = verb.damaged(left), 0
+        assert cases
+        for file, damage in cases:
+            empty(place)
+            shutil.copytree(left, place, dirs_exist_ok=True)
+            damage(place / file)
+            status, out, err = call(capsys, *words)
+            case = f"{file}, {damage.__name__}: {status}\n{err}"
+            assert status in (0, 2), case
+            if status == 0:
+                assert verb.result(place, out) == whole, case
+                said += "is damaged: making it again" in err
+            else:
+                assert "Traceback" not in err, case
+                assert any(w in err for w in ("damaged", "must be JSON", "another line")), case
     assert said or name in ("import", "generate", "caption")
 
 
