@@ -23,6 +23,7 @@ TOP = Path(__file__).resolve().parents[1]
 CONCEPTS = TOP / "docs" / "concepts"
 METRICS, WORLD = ((CONCEPTS / f"{name}.md").read_text("utf-8") for name in ("metrics", "world"))
 COVERAGE = (TOP / "docs" / "studies" / "metric_coverage.md").read_text("utf-8")
+COVERAGE = COVERAGE.partition("## Where")[0]
 PICTURES = {path.name: path for path in sorted((TOP / "docs" / "images").glob("world_*.png"))}
 QUICK_PICTURE = "world_steps.png"
 #: Pages whose blocks run here; those of concepts/ run in tests of their own.

@@ -26,12 +26,12 @@ SIGNATURES = {
     ),
     "load": "source * format images skip_bad progress **options",
     "probe": (
-        "data split * encoder modality label group top pool text_threshold seed "
+        "data split * encoder against modality label group top pool text_threshold seed "
         "allow_seen cache progress"
     ),
     "score": (
-        "generated reference * encoder split names labels group background train presets "
-        "sigma normalize companions controls inception clip lpips "
+        "generated reference * encoder check_ruler split names labels group background train "
+        "presets sigma normalize companions controls inception clip lpips "
         "trust_torchscript permutations seed allow_seen cache progress"
     ),
     "split": ("data * by train val seed folds near noleak cache reading skip_bad progress"),

@@ -204,6 +204,9 @@ def test_a_folder_with_and_one_without_backgrounds(tmp_path, handcrafted):
     assert "their no-contact images" in words[1]
     digests = [r["TMMD", "g"].encoder for r in results]
     assert len({*digests, handcrafted.digest("tactile")}) == 3
+    bare.save(tmp_path / "r" / "manifest.parquet")
+    loaded = score(tmp_path / "g", tmp_path / "r" / "manifest.parquet", **OPTIONS)
+    assert loaded["TMMD", "g"].value == results[0]["TMMD", "g"].value  # medians lie elsewhere
     # Features of other kinds of background are those of another encoder: never in one column.
     again = score(tmp_path / "h", known, **OPTIONS)
     assert again["TMMD", "h"].encoder == digests[1]

@@ -135,8 +135,8 @@ VERBS = {
 }
 
 
-#: The others take minutes: a file for each frame, or trainings.
-DAILY = ("import", "world", "generate", "caption", "score", "audit")
+#: The others take longer: trainings, a file for each frame, or an audit a file.
+DAILY = ("import", "world", "generate", "caption")
 
 
 class Stopper:
