@@ -25,6 +25,7 @@ from palpate.evaluation.power import power
 from palpate.metrics import tmmd
 from palpate.report.notes import sentence
 from palpate.report.tables import families
+from palpate.studies.verifying import verify
 
 SIDE = 24
 NAME = "palpate/handcrafted"
@@ -306,6 +307,12 @@ def test_probe_of_one_encoder_against_another(tmp_path, monkeypatch):
     assert any(s.b for s in power_of)  # paired
     assert any(note.code == "verdict-of-two" for note in results.notes)
     assert "Power of material" in [family.title for family in families(results.scores)]
+    manifest.save(tmp_path / "manifest.parquet")
+    split.save(tmp_path / "split.json")
+    files = (tmp_path / "manifest.parquet", tmp_path / "split.json")
+    probe(*files, encoder=NAME, against="palpate/mini", top=()).save(tmp_path / "results.json")
+    counts = verify(tmp_path / "results.json").counts  # what it records can be called again
+    assert counts["same"] > 0 == counts["differs"] == counts["cannot check"]
     fails("against", probe, manifest, split, encoder=[NAME, NAME + "/"], against="palpate/mini")
 
 

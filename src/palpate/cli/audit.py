@@ -193,10 +193,10 @@ def _works(options: Options, columns: Sequence[str]) -> bool:
 
     reading = options.reading.keywords()
     try:
-        made = split(list(options.paths), by=columns, skip_bad=options.skip_bad, **reading)
+        result = split(list(options.paths), by=columns, skip_bad=options.skip_bad, **reading)
     except PalpateError:
         return False
-    return made.rule["audit"] != LEAKS
+    return result.rule["audit"] != LEAKS
 
 
 def _write(outputs: Outputs, audit: Audit, terminal: Terminal) -> None:

@@ -6,7 +6,7 @@
   (``read_json``, ``read_record``); digests (``short``: their first digits); random numbers of a
   sample (``rng_for``). ``sealed`` and ``unsealed`` add and check an object's own digest, ``inside``
   checks that a path stays in its root, ``got_and_fix`` says in an error what palpate wrote there.
-- ``caches``: files that palpate reads back, each with its digest beside it.
+- ``caches``: files that palpate reads back, each with its digest next to it.
 - ``images``: image files, opened in one way and by fixed rules.
 - ``features``, ``score``: what metrics compare, and what they return.
 - ``split``: which samples are of train, val and test.

@@ -507,8 +507,8 @@ def _fit(files: Sequence[str], templates: Mapping[str, str]) -> bool:
         sides = {*matches, "sensor"}  # several sensors may share a photo
         samples = len({tuple(v for n, v in row.items() if n not in sides) for row in rows})
         shared = numbered and any(len({row[s] for row in rows}) < samples for s in both)
-        alike = len({*templates.values()}) < len(templates)
-        return not (shared or alike) and 2 * len(rows) >= min(len(matches[side]) for side in both)
+        equal = len({*templates.values()}) < len(templates)
+        return not (shared or equal) and 2 * len(rows) >= min(len(matches[side]) for side in both)
     return False
 
 

@@ -2,7 +2,7 @@
 
 A cached frame is ``<cache>/%010d.jpg`` (quality 95, no chroma subsampling, since the color of a gel
 carries the surface normal), written whole or not at all; its digest and name are a line of
-``frames.sha256`` beside it. An interrupted run goes on with the frames that have theirs.
+``frames.sha256`` next to it. An interrupted run goes on with the frames that have theirs.
 """
 
 from __future__ import annotations

@@ -113,7 +113,7 @@ def without_repeats(rows: pl.DataFrame, place: Place, problems: list[Problem]) -
 
 
 def spelled(path: str) -> str:
-    """A path or name, whoever wrote it: one kind of slash, no capitals, one form of letters."""
+    """A path or name in one spelling: one kind of slash, no capitals, one form of letters."""
     text = path.strip().replace("\\", "/").casefold()
     return unicodedata.normalize("NFC", text).removeprefix("./")
 
@@ -173,7 +173,7 @@ def _ends(paths: Sequence[str], root: Path) -> dict[str, str]:
     folders = ["", *sorted(name for name in names("") if (root / name).is_dir())[:TRIED]]
     best, cut, starts = len(tried) // 2, 0, set[str]()
     for k in range(min(map(len, tried), default=0)):
-        # ``test/1.png`` is not ``train/1.png``: no folder stands for one that is written.
+        # ``test/1.png`` is not ``train/1.png``: no folder replaces one that is written.
         found = [located([""] if k else folders, parts[k:]) for parts in tried]
         count = sum(bool(file) for _, file in found)
         if count > best and len({tuple(_parts(path)[k:]) for path in paths}) == len(paths):

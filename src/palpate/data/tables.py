@@ -235,8 +235,8 @@ def pairings(table: Table) -> list[dict[str, str]]:
         dict(zip(SIDES, two, strict=True)) for two in permutations(images, 2)
     ]
     stated = [pair for pair in pairs if all(sides[n] == side for side, n in pair.items())]
-    open_ = [pair for pair in pairs if all(sides[n] in (side, "") for side, n in pair.items())]
-    return stated or open_
+    possible = [pair for pair in pairs if all(sides[n] in (side, "") for side, n in pair.items())]
+    return stated or possible
 
 
 def decoded(data: bytes) -> str:

@@ -158,13 +158,13 @@ def probe(  # noqa: PLR0913 - one argument a choice
 
     manifest = load(data)
     splits, encoders = named(split, "split"), named(encoder, "encoder")
+    several = {"split": splits, "encoder": encoders}  # names are those of today's files
+    arguments |= {name: sets for name, sets in several.items() if len(sets) > 1}
+    call = Call.of("probe", probe, arguments)
     if against is not None:
         one = len(encoders) == len(splits) == 1
         require(one, "against", "must go with one encoder and one split", "several", fix="Drop it")
         encoders = named([*encoders.values(), against], "encoder")
-    several = {"split": splits, "encoder": encoders}  # names are those of today's files
-    arguments |= {name: sets for name, sets in several.items() if len(sets) > 1}
-    call = Call.of("probe", probe, arguments)
     must, fix = "must be one where several splits are compared", "Compare one at a time"
     single = len(splits) == 1 or len(encoders) == 1
     require(single, "encoder", must, len(encoders), fix=fix)

@@ -3,7 +3,7 @@
 Its key is (rater, trial), so that a vote sent again counts once, and only a later ``undone``
 replaces it. Of an invitation a hash is kept.
 
-The file alone is the truth: a vote is in it when it is acknowledged, and no log lies beside it but
+The file alone is the truth: a vote is in it when it is acknowledged, and no log lies next to it but
 while a vote is written. Its header's ``user_version`` counts the votes n, in the same transaction:
 n, or -1 - n while a server has the file.
 """
