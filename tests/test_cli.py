@@ -10,10 +10,20 @@ from pathlib import Path
 import pytest
 import tyro
 
-from forge.commands import call, mistake
+from forge.commands import call, mistake, python
 from palpate.cli import VERBS, main, terminal
 from palpate.cli.terminal import CONFIG, error_line, polish_help
 from palpate.core import PalpateError, Split
+
+#: Commands whose input NONE is not there; HERE is a folder that is.
+ABSENT = """import NONE -o out|validate NONE|background NONE -o out|caption NONE -o out|audit NONE
+audit HERE --split NONE|audit HERE --root NONE|caption check NONE|split NONE -o out.json
+train encoder NONE -o out|train autoencoder NONE -o out|train generator HERE --split NONE -o out
+generate HERE --gel NONE -o out|score --generated NONE --reference HERE
+score --generated HERE --reference HERE --encoder palpate/mini --split NONE|probe NONE --split HERE
+probe HERE --split NONE --train|preference make --reference HERE --generated HERE NONE -o out
+preference serve NONE|preference score HERE NONE|report NONE -o out.html|verify NONE
+demo --data NONE|reproduce tag --root NONE -o out"""
 
 
 @pytest.fixture
@@ -225,3 +235,23 @@ def test_an_error_of_all_processes_is_printed_by_the_first(monkeypatch, capsys):
         assert main(["split", "x"]) == 2
         printed.append(capsys.readouterr().err != "")
     assert printed == [True, True, False]
+
+
+def test_an_input_that_is_not_there_is_named_before_what_takes_seconds_is_imported(tmp_path):
+    commands = [line.split() for line in ABSENT.replace("\n", "|").split("|")]
+    reading = {name for name, verb in VERBS.items() if name not in ("world", "presets")}
+    assert reading == {name for name in VERBS for c in commands if " ".join(c).startswith(name)}
+    code = f"""
+import contextlib, io, sys
+from palpate.cli import main
+for words in {commands}:
+    words = [{{"NONE": "none", "HERE": "."}}.get(word, word) for word in words]
+    error = io.StringIO()
+    with contextlib.redirect_stderr(error):
+        assert main(words) == 2, words
+    assert "othing at none" in error.getvalue(), (words, error.getvalue())
+    heavy = {{"scipy", "polars", "torch", "starlette"}} & {{*sys.modules}}
+    assert not heavy, (words, heavy)
+"""
+    python(code, cwd=tmp_path)
+    assert not list(tmp_path.iterdir())

@@ -1,6 +1,7 @@
 """Hugging Face data sets: read by maps; nothing of theirs is run."""
 
 import json
+import os
 import sys
 
 import pytest
@@ -91,8 +92,12 @@ def test_what_cannot_be_opened_is_reported(source, tmp_path, monkeypatch):
         fails(words, import_dataset, source, tmp_path / "out", format="hf", **options)
 
     rejected("no vision and no tactile among part, path, kind, rgb, gel", source)
-    next(source.glob("train/*.arrow")).write_bytes(b"x")
+    part = next(source.glob("train/*.arrow"))
+    part.write_bytes(b"x")
     rejected("mine must be whole and readable", source, columns=MAPS)
+    part.unlink()
+    os.mkfifo(part)
+    rejected("a pipe or a device", source, columns=MAPS)
     (tmp_path / "csvs").mkdir()
     (tmp_path / "csvs" / "train.csv").write_text("a\n1\n")
     rejected("must be made of parquet or arrow", tmp_path / "csvs")

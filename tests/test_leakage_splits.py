@@ -466,7 +466,7 @@ def test_the_published_split_by_command(capsys, tmp_path, real_data):
         (["LISTS", "-o", "x", "--folds", "1"], "--folds must be at least 2"),
         (["LISTS", "-o", "x", "--by", "object"], "80 of 80 samples without"),
         (["LISTS", "-o", "x", "--near", "tactile"], "need tactile images"),
-        (["LISTS", "nowhere", "-o", "x"], "no file nowhere"),
+        (["LISTS", "nowhere", "-o", "x"], "nothing at nowhere"),
         (["--noleak", "touch-and-go", "-o", "x", "--train", "0.9"], "train 0.8 and val 0.0"),
         (["--noleak", "tarf", "-o", "x"], "--noleak must be one of"),
         (["LISTS", "--noleak", "touch-and-go", "-o", "x"], "8 of 8 that are not"),

@@ -203,7 +203,7 @@ def test_a_dry_run_writes_nothing(tmp_path, capsys):
         (["world-gelsigt"], "must be one of clips, hct, tag, world-digit, world-gelsight"),
         (["world-gelsight", "--preset", "huge"], "--preset must be one of smoke, mini"),
         (["world-gelsight", "--seeds", "1", "1"], "--seeds must hold"),
-        (["world-gelsight", "--root", "x"], "--root must be left out"),
+        (["world-gelsight", "--root", "."], "--root must be left out"),
         (["tag"], "--root must be given for the study tag"),
         (["tag", "--root", "x"], "--root must exist"),
         (["tag", "--root", ".", "--preset", "paper"], "--vq must be given for preset paper"),

@@ -73,7 +73,7 @@ def test_an_unknown_study_is_checked_by_its_records_alone(forged):
         "fact 'Fact: 3 of 4'",
         "digests",
     }
-    assert checked.ok
+    assert checked.ok is None
     assert "The study must be one of" in str(checked)
 
 
@@ -118,7 +118,7 @@ def test_results_without_their_run_folder_cannot_be_checked(forged, tmp_path):
     shutil.copy(forged, tmp_path / "alone.json")
     checked = verify(tmp_path / "alone.json")
     assert {c.status for c in checked.checks} == {"cannot check"}
-    assert checked.ok
+    assert checked.ok is None
 
 
 @pytest.mark.parametrize(
@@ -137,7 +137,7 @@ def test_results_without_their_run_folder_cannot_be_checked(forged, tmp_path):
 )
 def test_edited_settings_give_a_reason(forged, settings):
     edit(forged, lambda data: data.update(settings=settings))
-    assert main(["verify", str(forged), "-q"]) in (0, 1)
+    assert main(["verify", str(forged), "-q"]) in (1, 3)
 
 
 def nightly(test):

@@ -43,7 +43,7 @@ def main(argv: list[str] | None = None) -> int:
 
     Returns:
         0 done, or no leak found; 1 a check failed, or a split leaks; 2 a user's mistake, explained
-        in one line; 3 an audit cannot tell; 70 a bug in palpate; 130 stopped by Ctrl-C, SIGTERM or
+        in one line; 3 cannot tell; 70 a bug in palpate; 130 stopped by Ctrl-C, SIGTERM or
         a terminal that closes.
     """
     for number in (signal.SIGTERM, signal.SIGHUP):

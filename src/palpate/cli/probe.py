@@ -132,9 +132,7 @@ def run(options: Options, terminal: Terminal) -> dict[str, Any]:
                 seeds=training.seeds,
                 work=training.work,
                 device=options.machine.device,
-                compute=Compute(
-                    **{k: v for k, v in vars(options.machine).items() if k != "device"}
-                ),
+                compute=options.machine.compute,
                 print_line=terminal.print_line,
                 progress=progress,
                 **vars(options.probing),

@@ -115,7 +115,7 @@ def run(options: Options, terminal: Terminal) -> dict[str, Any]:
         must, fix = "must not be an input", "Choose a folder outside what is read"
         apart = not any(cache.resolve().is_relative_to(path.resolve()) for path in inputs)
         require(apart, "cache", must, str(cache), fix=fix)
-    for path in (options.reference, *generated):  # before what takes seconds to import
+    for path in generated:  # before what takes seconds to import
         must, got = "What is scored must exist", f"nothing at {path}"
         require(path.exists(), None, must, got, fix="Check the path")
     companions = options.metrics.companions

@@ -2,9 +2,9 @@
 
 A verb's module has a class ``Options`` (its docstring and those of its fields are the help) that
 derives from :class:`Common`, and ``run(options, terminal)``. That returns a record that says by
-itself what it is (``str``, ``to_json``, and ``ok``: else the exit status is 1), or the JSON that
-``--json`` prints, or that and an exit status. A nested class is a group of options in the help; its
-option names stay flat.
+itself what it is (``str``, ``to_json``, and ``ok``: False for the exit status 1, None for 3), or
+the JSON that ``--json`` prints, or that and an exit status. A nested class is a group of options in
+the help; its option names stay flat.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ from tyro._errors import (
     on_parse_error,
 )
 
-from palpate.cli.verbs import BUG, FAILED_CHECK, OK, USER_ERROR, VERBS
+from palpate.cli.verbs import BUG, FAILED_CHECK, OK, UNKNOWN, USER_ERROR, VERBS
 from palpate.core import (
     MissingExtraError,
     Note,
@@ -61,13 +61,15 @@ from palpate.core import (
     require,
     write_text,
 )
-from palpate.core.files import NO_ROOM, is_stream, starting_to_write
+from palpate.core.files import NO_ROOM, is_stream, is_there, starting_to_write
 
 if TYPE_CHECKING:
     from palpate.report.results import Audit, Results
 
 #: Arguments that are paths without a name on the command line.
-_PATHS = ("data", "source", "photos", "paths", "study", "votes", "results")
+_PATHS = ("data", "source", "photos", "paths", "study", "votes", "results", "manifest")
+#: Options that are paths of what is written; and photos, of which absent ones may be skipped.
+WRITTEN = ("output", "page", "latex", "figures", "lists", "cache", "work", "photos")
 #: Verb and argument of its function -> how the command line writes it, where that is not the
 #: argument's own name ("--sigma"). '' is every verb.
 OPTION_NAMES: dict[tuple[str, str], str] = {
@@ -321,6 +323,24 @@ def _require_extra(verb: str, options: Any) -> None:
         for package in ("torch", "diffusers", "transformers", "safetensors", "av"):
             if importlib.util.find_spec(package) is None:
                 raise MissingExtraError(package, "all", f"palpate {verb}{''.join(needing[:1])}")
+
+
+def _require_inputs(options: Any) -> None:
+    """Check that the files are there that a command names, before what takes seconds to import.
+
+    Raises:
+        PalpateError: naming the first that is not.
+    """
+    values = _keywords(options)
+    values |= values.get("reading", {})
+    if values.get("format") == "hf":  # named by its id
+        del values["source"]
+    for name, value in values.items():
+        for path in value if isinstance(value, tuple) else (value,):
+            if isinstance(path, Path) and name not in WRITTEN:
+                hub = "; a data set on the hub needs the format hf" if name == "source" else ""
+                got, fix = f"nothing at {path}", f"Check the path{hub}"
+                require(is_there(path), name, "must exist", got, fix=fix)
 
 
 def guard_output(
@@ -587,9 +607,11 @@ def _call(name: str, args: Sequence[str]) -> tuple[Any, int]:
     module = importlib.import_module(f"palpate.cli.{verb.module}")
     options = parse(name, module.Options, args)
     _require_extra(name, options)
+    _require_inputs(options)
     terminal = Terminal(options, shlex.join(["palpate", *name.split(), *args]))
     answer = module.run(options, terminal)
     if hasattr(answer, "to_json"):
         terminal.print(str(answer))
-        return answer.to_json(), OK if getattr(answer, "ok", True) else FAILED_CHECK
+        statuses = {True: OK, False: FAILED_CHECK, None: UNKNOWN}
+        return answer.to_json(), statuses[getattr(answer, "ok", True)]
     return answer if isinstance(answer, tuple) else (answer, OK)

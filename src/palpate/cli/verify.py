@@ -12,7 +12,8 @@ class Options(Common):
     """Make the numbers of a results file again from its inputs, and compare them.
 
     Each score, audit, table and input is the same, differs, or cannot be checked (an input is
-    missing, or was never a file). Exits with status 1 if something differs.
+    missing, or was never a file). The exit status is 0 if all is the same, 1 if something differs,
+    3 (cannot tell) if nothing does, but not all could be checked.
     """
 
     results: PathArgument

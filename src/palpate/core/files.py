@@ -158,6 +158,11 @@ def rng_for(seed: int, *names: str | int) -> np.random.Generator:
     return np.random.default_rng(seed_for(seed, *names))
 
 
+def is_there(path: Path) -> bool:
+    """Whether there is something at a path; a name that no file can have is none."""
+    return os.path.exists(path)  # noqa: PTH110 - Path.exists raises for some names
+
+
 def is_stream(path: Path) -> bool:
     """Whether there is something at ``path`` but neither a file nor a folder: a device, a pipe."""
     return path.exists() and not path.is_file() and not path.is_dir()

@@ -23,6 +23,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Self, overload
 from palpate.core.files import (
     digest_file,
     digest_folder,
+    is_there,
     plain,
     read_record,
     reading_entry,
@@ -147,11 +148,6 @@ def _recorded_path(path: Path, name: str) -> dict[str, Any]:
     if (digest := digest_of(path, name)) is not None:
         record[DIGEST] = digest
     return record
-
-
-def is_there(path: Path) -> bool:
-    """Whether there is something at a path; a name that no file can have is none."""
-    return os.path.exists(path)  # noqa: PTH110 - Path.exists raises for some names
 
 
 def digest_of(path: Path, name: str) -> str | None:

@@ -22,9 +22,9 @@ from pathlib import Path
 from typing import Any, Literal
 
 from palpate.core import PalpateError, Progress, few, plain, quiet, require
-from palpate.core.files import reading_entry
+from palpate.core.files import is_there, reading_entry
 from palpate.report.labels import label_of, subject_of
-from palpate.report.results import OBJECT, PATH, ROWS, SILENT, Audit, Call, Results, is_there
+from palpate.report.results import OBJECT, PATH, ROWS, SILENT, Audit, Call, Results
 from palpate.studies.graph import Work
 from palpate.studies.stages import Stage, stage_outputs, stored_stage
 
@@ -80,13 +80,20 @@ class Verification:
         return {status: count[status] for status in ("same", "differs", "cannot check")}
 
     @property
-    def ok(self) -> bool:
-        """Whether nothing differs."""
-        return not self.counts["differs"]
+    def ok(self) -> bool | None:
+        """Whether all is the same; None: nothing differs, but not all could be checked."""
+        statuses = {check.status for check in self.checks}
+        if "differs" in statuses:
+            return False
+        return True if statuses == {"same"} else None
 
     def __str__(self) -> str:
         """The counts, then a line for each difference and for each reason of no check."""
-        lines = [", ".join(f"{status} {count}" for status, count in self.counts.items())]
+        counts = self.counts
+        lines = [", ".join(f"{status} {count}" for status, count in counts.items())]
+        if self.ok is None:
+            part = f"{counts['cannot check']} of {len(self.checks)}"
+            lines.append(f"cannot tell: {part} could not be checked")
         lines += [f"differs: {c.name}: {c.why}" for c in self.checks if c.status == "differs"]
         unchecked = [check for check in self.checks if check.status == "cannot check"]
         for why in dict.fromkeys(check.why for check in unchecked):

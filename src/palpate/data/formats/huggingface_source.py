@@ -12,7 +12,8 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from palpate.core import MissingExtraError, PalpateError, content_of, require
+from palpate.core import MissingExtraError, PalpateError, content_of, require, require_regular
+from palpate.core.images import SUFFIXES
 
 #: Kinds of local folders and of hub data sets that are opened; none of them runs code of others.
 LOCAL, REMOTE = ("parquet", "arrow", "imagefolder"), ("parquet",)
@@ -77,6 +78,9 @@ def _loaded(source: Path, name: str, config: str | None, revision: str | None) -
             must = "The source must be a folder, or a name on the hub like user/name"
             raise PalpateError(must, str(source), "Check the path")
         _require_hub(name, revision)
+    for path in source.rglob("*"):
+        if path.suffix.lower() not in SUFFIXES:  # the library waits for a pipe for ever
+            require_regular(path)
     try:
         if any((source / mark).is_file() for mark in ("dataset_dict.json", "state.json")):
             return _saved(source)
