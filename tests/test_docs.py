@@ -13,6 +13,7 @@ import pytest
 from PIL import Image
 
 from palpate.cli import VERBS, main
+from palpate.core.images import IMAGE_FORMATS
 from palpate.metrics import PRESETS as METRIC_PRESETS
 from palpate.sim import MATERIALS, VERSION, WorldOptions, plan_world, write_world
 from palpate.sim import PRESETS as WORLD_PRESETS
@@ -117,6 +118,8 @@ def test_each_claim_on_security_names_its_tests():
         assert tests, row
         for file, name in tests:
             assert f"\ndef {name}(" in (TOP / "tests" / file).read_text(), name
+    decoders = re.search("decoders are (.*?), whatever", text)[1]
+    assert re.split(", | AND ", decoders.upper()) == [*IMAGE_FORMATS]
 
 
 def test_links_resolve():

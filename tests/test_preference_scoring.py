@@ -1,7 +1,7 @@
 """Votes of simulated raters become scores; what is wrong with votes is said."""
 
 import json
-import sqlite3
+from contextlib import closing
 from dataclasses import replace
 from itertools import combinations, product
 
@@ -18,6 +18,7 @@ from palpate.preference.agreement import agreement_scores, of_images
 from palpate.preference.arrays import VoteArrays
 from palpate.preference.plan import Plan
 from palpate.preference.raters import rater_facts
+from palpate.preference.store import CELLS, VoteStore
 from palpate.preference.votes import read_votes
 from palpate.report.results import Results
 
@@ -437,12 +438,8 @@ def test_the_last_day_is_kept_in_one_form(rated, until):
 
 def write_database(path, plan, rows):
     """The server's file with these rows of votes."""
-    with sqlite3.connect(path) as disk:
-        disk.execute("CREATE TABLE study (name TEXT)")
-        disk.execute("INSERT INTO study VALUES (?)", (plan.study,))
-        disk.execute("CREATE TABLE votes (rater, trial, choice, ms, at, undone, received)")
-        disk.executemany("INSERT INTO votes VALUES (?, ?, ?, ?, ?, ?, ?)", rows)
-        disk.execute(f"PRAGMA user_version = {len(rows)}")  # the end mark
+    with closing(VoteStore(path, plan.study)) as store:
+        store.store([dict(zip(("rater", *CELLS, "received"), row, strict=True)) for row in rows])
 
 
 def test_no_vote_is_nothing_to_score(study):

@@ -337,6 +337,23 @@ def test_a_kill_in_the_middle_of_a_write_loses_no_vote_silently(planned, tmp_pat
     fails("serve the study once more and stop it", preference.score, folder)
 
 
+def test_a_flipped_bit_in_the_file_of_votes_changes_none(planned, tmp_path):
+    folder = Path(shutil.copytree(planned, tmp_path / "study"))
+    plan, file = Plan.load(folder), folder / "study.db"
+    with closing(VoteStore(file, plan.study)) as store:
+        for rater in plan.raters:
+            votes = Crowd({"ours": 1.0, "gvst": 0.0}).download(plan, rater.code)["votes"]
+            store.store([v | {"rater": rater.code, "received": AT} for v in votes])
+    whole, votes, refused = file.read_bytes(), read_votes(plan, [file]).by_rater, 0
+    for place in range(7, len(whole), 29):
+        file.write_bytes(whole[:place] + bytes([whole[place] ^ 1]) + whole[place + 1 :])
+        try:
+            assert read_votes(plan, [file]).by_rater == votes, place
+        except PalpateError:
+            refused += 1
+    assert refused > 50
+
+
 def test_damaged_names_in_the_file_of_votes_are_refused(planned, tmp_path):
     folder = Path(shutil.copytree(planned, tmp_path / "study"))
     store = folder / "study.db"

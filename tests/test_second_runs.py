@@ -14,7 +14,7 @@ from PIL import Image
 from forge.commands import mistake
 from forge.pictures import picture
 from forge.servers import FakeServer
-from palpate.cli import main
+from palpate.cli import VERBS, main
 from palpate.core import PalpateError, digest_folder, locked
 from palpate.data.manifest import Manifest
 from palpate.sim.presets import PRESETS
@@ -40,6 +40,10 @@ HELD = {
     "train generator": (("train", "generator", *TRAIN, "--clip", "palpate/mini"), ".out.work"),
     "generate": (("generate", "photos", "-o", "out", "--steps", "1"), "out"),
     "audit": (("audit", "tag", "--split", "split.json", "-o", "out.json"), ".out.json.work"),
+    "audit --impact": (
+        ("audit", "tag", "--split", "split.json", "--impact", "--page", "out.html"),
+        ".out.html.work",
+    ),
     "score": ((*SCORE, "-o", "out.json"), ".out.json.work"),
     "probe": ((*PROBE, "--work", "out"), "out"),
     "preference make": (("preference", "make", *STUDY, "-o", "out"), ".out.part"),
@@ -47,6 +51,10 @@ HELD = {
     "demo": (("demo", "--preset", "tiny", "-o", "out"), "out"),
     "reproduce": (("reproduce", "world-gelsight", "--preset", "smoke", "-o", "out"), "out"),
 }
+
+
+#: What is written at once, at the end of a command.
+AT_ONCE = {"validate", "caption check", "preference score", "presets", "report", "verify"}
 
 
 @pytest.fixture(scope="module")
@@ -69,6 +77,11 @@ def place(tag, study, tmp_path):
     Manifest.from_rows(rows, tag[0].root).save(tmp_path / "bare" / "manifest.parquet")
     shutil.copytree(study, tmp_path / "study")
     return tmp_path
+
+
+def test_every_verb_that_writes_for_long_is_here():
+    verbs = [next(v for v in sorted(VERBS)[::-1] if name.startswith(v)) for name in HELD]
+    assert {*verbs} == {*VERBS} - AT_ONCE
 
 
 @pytest.mark.parametrize("name", HELD)

@@ -89,7 +89,8 @@ def failures(args: Sequence[str], folder: Path, ending: tuple[int, ...] = ()) ->
     before = snapshot(folder / "in") | snapshot(folder / "out")
     status, out, err = run(args, folder)
     as_json = "--json" in args and not {"-h", "--help"} & {*args}
-    wrong = [*_ending(status, out, err, as_json), *_traces(folder, before)]
+    named = {os.path.normpath(folder / "cwd" / arg) for arg in args}  # "-o .."
+    wrong = [*_ending(status, out, err, as_json), *_traces(folder, before, named)]
     if ending and NETWORK:
         wrong.append(f"a connection to {NETWORK}")
     lacking = status == 2 and re.search(r"the extra (\w+) brings it", err)
@@ -158,8 +159,8 @@ def snapshot(folder: Path) -> dict[str, tuple[int, ...]]:
     return found
 
 
-def _traces(folder: Path, before: dict[str, tuple[int, ...]]) -> Iterator[str]:
-    """What was changed, left behind or half written."""
+def _traces(folder: Path, before: dict[str, tuple[int, ...]], named: set[str]) -> Iterator[str]:
+    """What was changed, left behind or half written; ``named`` are paths that the command names."""
     after = snapshot(folder / "in")
     inside = [path for path in before if Path(path).is_relative_to(folder / "in")]
     if changed := [path for path in inside if after.get(path) != before[path]]:
@@ -169,7 +170,8 @@ def _traces(folder: Path, before: dict[str, tuple[int, ...]]) -> Iterator[str]:
         left = [p.name for p in (folder / name).iterdir() if p.name not in parts]
         resumed = (".work", ".part")  # the same command goes on from these
         strange = [n for n in left if n.startswith(".") and not n.endswith(resumed)]
-        if strange or (name in ("tmp", "") and left):
+        free = name in ("tmp", "") and os.path.normpath(folder / name) not in named
+        if strange or (left and free):
             yield f"left behind in {name or 'the folder above'}: {(strange or left)[0]!r}"
     own = snapshot(folder / "out")
     for file in (folder / "out").rglob("*"):

@@ -9,8 +9,8 @@ from typing import Annotated, Any, Literal
 import tyro
 
 from palpate.cli.terminal import Common, Files, OptionalOutPath, Switch, Terminal
+from palpate.cli.training import Computing
 from palpate.core import require
-from palpate.training.options import Compute
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -58,24 +58,11 @@ class Training:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Machine:
+class Machine(Computing):
     """How to train on the machine at hand, as in `palpate train encoder`."""
 
-    device: str = "auto"
-    """auto, cpu, cuda, mps."""
-    precision: Literal["float32", "bf16", "fp16"] = "float32"
-    """Of matrix products; the weights stay float32."""
-    gradient_checkpointing: Switch = False
-    """Compute activations twice instead of keeping them."""
-    checkpoint_minutes: float = 5.0
-    """Time between checkpoints."""
     chunk: int | None = None
     """Rows that the encoder sees at a time; the loss is that of the whole batch."""
-
-    @property
-    def compute(self) -> Compute:
-        """The settings as the rooms take them."""
-        return Compute(**{k: v for k, v in vars(self).items() if k != "device"})
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -38,30 +38,36 @@ PRESETS = {
 
 
 @option_group
-class Machine:
-    """How to run it on the machine at hand; nothing here changes what is computed."""
+class Computing:
+    """How to compute on the machine at hand; nothing here changes what is computed."""
 
     device: str = "auto"
     """auto, cpu, cuda, mps."""
     precision: Literal["float32", "bf16", "fp16"] = "float32"
     """Of matrix products; the weights stay float32. On an x86 CPU without bf16, bf16 is float32."""
+    gradient_checkpointing: Switch = False
+    """Compute activations twice instead of keeping them: less memory, slower."""
+    checkpoint_minutes: float = 5.0
+    """Minutes between checkpoints."""
+
+    @property
+    def compute(self) -> Compute:
+        """The settings as the rooms take them."""
+        return Compute(**{k: v for k, v in vars(self).items() if k != "device"})
+
+
+@option_group
+class Machine(Computing):
+    """How to run it on the machine at hand; nothing here changes what is computed."""
+
     tf32: bool = True
     """Let float32 products on CUDA round their factors to 10 bits."""
     compile: Switch = False
     """Compile the loss with torch.compile: minutes at the start, faster steps."""
     channels_last: Switch = False
     """Store images with channels last, which some GPUs convolve faster."""
-    gradient_checkpointing: Switch = False
-    """Compute activations twice instead of keeping them: less memory, slower."""
-    checkpoint_minutes: float = 5.0
-    """Minutes between checkpoints."""
     trackers: tuple[Literal["tensorboard", "wandb"], ...] = ()
     """Where the log goes, too."""
-
-    @property
-    def compute(self) -> Compute:
-        """The settings as the rooms take them."""
-        return Compute(**{k: v for k, v in vars(self).items() if k != "device"})
 
     def keywords(self) -> dict[str, Any]:
         """What the functions that train take of it."""
@@ -101,13 +107,10 @@ class Training(Common):
         """The preset of a verb with what ``--set`` changes.
 
         Raises:
-            PalpateError: if there is none, the data are not there, or a tracker is not: before
-                torch is imported, which takes seconds.
+            PalpateError: if there is none, or a tracker is not there: before torch is imported,
+                which takes seconds.
         """
-        from palpate.data.formats import require_source
-
         preset, _ = PRESETS[verb].preset(self.preset, self.settings), self.machine.compute
-        require_source(self.data)
         return preset
 
     def print_plan(self, terminal: Terminal, plan: dict[str, Any]) -> dict[str, Any]:

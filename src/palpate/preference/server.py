@@ -7,8 +7,8 @@
                      -> {"stored": true}, or {"stored": "already"} for a vote that is there
 
 The last three take the token as ``Authorization: Bearer``. A vote is answered after it is on disk
-(write-ahead log, ``synchronous=FULL``); votes that arrive together share one transaction. Its key
-is (rater, trial), so that a vote sent again counts once, and only a later ``undone`` replaces it.
+(:mod:`palpate.preference.store`); votes that arrive together share one transaction. Its key is
+(rater, trial), so that a vote sent again counts once, and only a later ``undone`` replaces it.
 Nothing but the routes above exists, and no request names a file.
 
 A connection has ``LONGEST_WAIT`` seconds for a request with an invitation; of too many that wait,

@@ -5,7 +5,8 @@ replaces it. Of an invitation a hash is kept.
 
 The file alone is the truth: a vote is in it when it is acknowledged, and no log lies next to it but
 while a vote is written. Its header's ``user_version`` counts the votes n, in the same transaction:
-n, or -1 - n while a server has the file.
+n, or -1 - n while a server has the file. Each vote holds its digest, which is checked when it is
+read.
 """
 
 from __future__ import annotations
@@ -18,24 +19,26 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
-from palpate.core import PalpateError, require
+from palpate.core import PalpateError, digest_lines, require
 
 Vote = Mapping[str, Any]
 #: What a vote is, next to its rater.
 CELLS = ("trial", "choice", "ms", "at", "undone")
+#: What is read of it, and has its digest.
+READ = (*CELLS, "rater")
 _TABLES = """
 PRAGMA synchronous=EXTRA;
 CREATE TABLE IF NOT EXISTS study (name TEXT PRIMARY KEY) WITHOUT ROWID;
 CREATE TABLE IF NOT EXISTS invitations (token TEXT PRIMARY KEY, rater TEXT UNIQUE) WITHOUT ROWID;
 CREATE TABLE IF NOT EXISTS votes (
     rater TEXT, trial TEXT, choice TEXT, ms INTEGER, at TEXT, undone INTEGER, received TEXT,
-    PRIMARY KEY (rater, trial)
+    seal TEXT, PRIMARY KEY (rater, trial)
 ) WITHOUT ROWID;
 """
 _STORE = """
-INSERT INTO votes VALUES (:rater, :trial, :choice, :ms, :at, :undone, :received)
+INSERT INTO votes VALUES (:rater, :trial, :choice, :ms, :at, :undone, :received, :seal)
 ON CONFLICT (rater, trial) DO UPDATE SET choice = excluded.choice, ms = excluded.ms,
-    at = excluded.at, undone = excluded.undone, received = excluded.received
+    at = excluded.at, undone = excluded.undone, received = excluded.received, seal = excluded.seal
 WHERE excluded.undone > votes.undone
 """
 
@@ -145,7 +148,8 @@ class VoteStore:
         """
         self._disk.execute("BEGIN IMMEDIATE")
         try:
-            new = [self._disk.execute(_STORE, vote).rowcount == 1 for vote in votes]
+            rows = ({**vote, "seal": _seal([vote[name] for name in READ])} for vote in votes)
+            new = [self._disk.execute(_STORE, row).rowcount == 1 for row in rows]
             self._mark(-1 - self._count())
             self._disk.execute("COMMIT")
         except BaseException:
@@ -155,16 +159,27 @@ class VoteStore:
         return new
 
     def votes(self, rater: str) -> list[dict[str, Any]]:
-        """The votes of a rater."""
+        """The votes of a rater.
+
+        Raises:
+            PalpateError: if one is damaged, or they cannot be read.
+        """
         with _usable(self._path):
-            query = f"SELECT {', '.join(CELLS)} FROM votes WHERE rater = ?"
+            query = f"SELECT seal, {', '.join(READ)} FROM votes WHERE rater = ?"
             rows = self._disk.execute(query, (rater,)).fetchall()
-        return [dict(zip(CELLS, row, strict=True)) for row in rows]
+            if any(seal != _seal(cells) for seal, *cells in rows):
+                raise sqlite3.DataError("a damaged vote")
+        return [dict(zip(CELLS, cells, strict=False)) for _, *cells in rows]
 
     def voters(self) -> list[str]:
         """The raters who voted."""
         with _usable(self._path):
             return [r for (r,) in self._disk.execute("SELECT DISTINCT rater FROM votes")]
+
+
+def _seal(cells: Sequence[Any]) -> str:
+    """The digest that a vote holds of its cells ``READ``."""
+    return digest_lines(map(str, cells))
 
 
 @contextmanager
