@@ -93,7 +93,7 @@ def test_fields_are_set_by_their_types():
 )
 def test_mistakes_say_what_must_be(setting, message, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
-    assert main(["train", "generator", "tag", "-o", "out", "--set", setting]) == 2
+    assert main(["train", "generator", ".", "-o", "out", "--set", setting]) == 2
     (line,) = capsys.readouterr().err.splitlines()
     assert line.startswith("palpate train generator: --set ")
     assert message in line

@@ -94,6 +94,13 @@ def audited(folder, out):
     return digest_json(json.loads(out))
 
 
+def studied(folder, out):
+    """Of what a study says, of its models and of its scores."""
+    results = json.loads((folder / "out" / "results.json").read_text())
+    said = {k: v for k, v in json.loads(out).items() if k in ("facts", "digests")}
+    return digest_json([said, [s["value"] for s in results["scores"]]])
+
+
 TRAIN = ("../tag", "--split", "../split.json", "--preset", "tiny", "-o", "out", "--seed", "3")
 AUDIT = ("audit", "../tag", "--split", "../split.json", "--cache", "cache", "--json")
 MINI = ("--clip", "palpate/mini")
@@ -121,6 +128,33 @@ VERBS = {
         scores,
     ),
     "audit": Verb(AUDIT, None, audited, sampled=True),
+    "audit --impact": Verb(
+        (*AUDIT, "--impact", "--encoder", "palpate/mini", "--allow-seen"),
+        None,
+        audited,
+        sampled=True,
+    ),
+    "probe": Verb(
+        (
+            *("probe", "../tag", "--split", "../split.json", "--train", "--preset", "tiny"),
+            *("--seeds", "0", "1", "--epochs", "2", "--work", "out", "--json"),
+        ),
+        ("split-1: training the tactile encoder", 3),
+        scores,
+        sampled=True,
+    ),
+    "demo": Verb(
+        ("demo", "--preset", "tiny", "-o", "out", "--json"),
+        ("generator: generator", 2),
+        studied,
+        sampled=True,
+    ),
+    "demo of images": Verb(
+        ("demo", "--preset", "tiny", "-o", "out", "--json"),
+        ("generated: generating", 8),
+        studied,
+        sampled=True,
+    ),
     "train autoencoder": Verb(
         ("train", "autoencoder", *TRAIN, "--set", "autoencoder.steps_free=4"),
         ("autoencoder", 2),

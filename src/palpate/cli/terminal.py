@@ -94,7 +94,7 @@ OPTION_NAMES: dict[tuple[str, str], str] = {
 #: Arguments whose True and False are words of an option.
 WORDED = ("normalize",)
 #: Options that need the extra ``all`` in verbs that do without.
-NEEDING_EXTRA = ("encoder", "inception", "lpips")
+NEEDING_EXTRA = ("encoder", "inception", "lpips", "clip")
 #: What would break a line of the terminal, or color it.
 _CONTROL = re.compile("[\x00-\x1f\x7f-\x9f\u2028\u2029]")
 #: The default of an option in its help, unless it says nothing.
