@@ -36,12 +36,6 @@ def run(options: Options, terminal: Terminal) -> dict[str, Any]:
     options.files.guard(inputs)
     from palpate.preference import score
 
-    results = terminal.run(
-        score,
-        options.study,
-        options.votes,
-        metrics=options.metrics,
-        replicates=options.replicates,
-        seed=options.seed,
-    )
+    lists = {"votes": options.votes, "metrics": options.metrics}
+    results = terminal.run(score, **options.keywords(**lists))
     return terminal.deliver(results, options.files)

@@ -18,7 +18,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any, ClassVar
 
-from palpate.core import Note, Progress, Score, Split, require, require_choice, write_json
+from palpate.core import Note, Progress, Score, Split, require_choice, write_json
 from palpate.data.images import cached_images
 from palpate.data.importing import import_dataset
 from palpate.data.manifest import Manifest
@@ -138,8 +138,6 @@ class Demo:
             PalpateError: on bad options.
         """
         data, seed, nodes = self.data, self.seed, Nodes()
-        exists, got = data is None or data.exists(), f"nothing at {data}"
-        require(exists, "data", "must exist", got, fix="Check the path")
         require_choice("preset", self.preset, PRESETS)
         preset, size, root = PRESETS[self.preset], None, None
         clip, tactile, autoencoder, start = (

@@ -105,7 +105,8 @@ class Plan:
             require(slug(name) not in taken, "method", must, name, fix=fix)
             must, got = f"{name} must be a folder of images", f"nothing at {folder}"
             require(Path(folder).is_dir(), "method", must, got, fix="Check the path")
-        for name, path in self.weight_files:
+        files = {"inception": [self.weights.inception], "lpips": self.weights.lpips or ()}
+        for name, path in ((n, p) for n, paths in files.items() for p in paths if p is not None):
             exists = Path(path).is_file()
             require(exists, name, "must be a file", f"nothing at {path}", fix="Check the path")
         if size.clip == SHIPPED:
@@ -120,13 +121,6 @@ class Plan:
         size = self.study.presets[self.preset]
         vq = size.vq if self.vq is None else str(self.vq)
         return replace(size, steps=size.steps if self.steps is None else self.steps, vq=vq)
-
-    @property
-    def weight_files(self) -> list[tuple[str, Path | str]]:
-        """The files of published weights, by what they are of; a CLIP may be a hub id."""
-        weights = self.weights
-        files = [] if weights.inception is None else [("inception", weights.inception)]
-        return [*files, *(("lpips", path) for path in weights.lpips or ())]
 
     @property
     def world(self) -> WorldOptions | None:
