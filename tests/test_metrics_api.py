@@ -32,7 +32,7 @@ FUNCTIONS = {
     "i_tmmd": ONE_SET,
     "kid": TWO_SETS,
     "ms_ssim": TWO_SETS,
-    "per_image": f"metric, {IMAGES}",
+    "per_image": f"metric, {IMAGES}, means=None",
     "prdc": "generated, reference, k=5, **options",
     "psnr": TWO_SETS,
     "require_same_ids": "a, b, names=('generated', 'reference')",

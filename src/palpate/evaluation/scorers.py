@@ -32,11 +32,12 @@ import polars as pl
 from numpy.typing import NDArray
 
 from palpate.core import FeatureSet, Note, PalpateError, Progress, Score
+from palpate.core.features import Array
 from palpate.data.samples import Samples
 from palpate.evaluation.controls import matched_features
 from palpate.metrics.contact import contact_per_image
 from palpate.metrics.distributions import compare_fid, prdc_rows
-from palpate.metrics.images import PerImage, per_image
+from palpate.metrics.images import PerImage, fitting_scales, per_image, scale_means
 from palpate.metrics.kernels import Polynomial
 from palpate.metrics.mmd import Preset
 from palpate.metrics.paired import Comparison, compare, compare_tmmd, mean_differences
@@ -302,6 +303,13 @@ class Bench:
             if s.ids == real.ids or (s.numbered and real.numbered)
         }
 
+    @cached_property
+    def means(self) -> dict[str, Array]:
+        """What SSIM and MS-SSIM of :attr:`pairs` are made of."""
+        real = self.pictures[REFERENCE]
+        scales = fitting_scales(real.shape[1:3])
+        return {name: scale_means(x, real, scales) for name, x in self.pairs.items()}
+
     @property
     def of_pairs(self) -> dict[str, Any]:
         """What every metric of pairs takes."""
@@ -538,7 +546,9 @@ def _mean_of_pairs(
     bench: Bench, pairs: Mapping[str, Images], metric: Literal["SSIM", "PSNR", "MS-SSIM"]
 ) -> list[Score]:
     real = bench.pictures[REFERENCE]
-    return _scored(bench, {name: per_image(metric, x, real) for name, x in pairs.items()})
+    means = {} if metric == "PSNR" else bench.means
+    each = {name: per_image(metric, x, real, means.get(name)) for name, x in pairs.items()}
+    return _scored(bench, each)
 
 
 def _scored(bench: Bench, each: Mapping[str, PerImage]) -> list[Score]:

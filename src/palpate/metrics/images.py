@@ -22,8 +22,8 @@ from dataclasses import dataclass, field
 from typing import Any, Literal, TypedDict, Unpack
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
-from scipy import ndimage
 
 from palpate._version import __version__
 from palpate.core import Note, Score, require
@@ -33,6 +33,10 @@ from palpate.metrics.intervals import score_of, spread_of_values
 Border = Literal["valid", "mirror"]
 
 WINDOW, SIGMA, K1, K2 = 11, 1.5, 0.01, 0.03
+_WEIGHTS = np.exp(-0.5 * ((np.arange(WINDOW) - WINDOW // 2) / SIGMA) ** 2)
+#: Rows that are blurred by one product, and its matrix (TILE, TILE + 10): a window a row.
+TILE = 32
+BAND = np.stack([np.pad(_WEIGHTS / _WEIGHTS.sum(), (k, TILE - 1 - k)) for k in range(TILE)])
 #: What a score keeps of the window.
 WINDOW_SETTINGS = {"window": WINDOW, "sigma": SIGMA, "k1": K1, "k2": K2}
 #: The published exponents, finest scale first. Their sum is 1.0001; all five are as published.
@@ -162,27 +166,33 @@ class PerImage:
 
 
 def per_image(
-    metric: Literal["SSIM", "PSNR", "MS-SSIM"], generated: Any, reference: Any
+    metric: Literal["SSIM", "PSNR", "MS-SSIM"],
+    generated: Any,
+    reference: Any,
+    means: Array | None = None,
 ) -> PerImage:
     """SSIM in [-1, 1], PSNR in dB or MS-SSIM in [0, 1] of each pair of images.
 
-    Arguments and errors as :func:`ssim`.
+    Arguments and errors as :func:`ssim`; ``means``: of :func:`scale_means`, where they are known.
     """
     x, y = image_pairs(generated, reference)
-    pairs = ((as_unit(a), as_unit(b)) for a, b in zip(x, y, strict=True))
     size = list(x.shape[1:3])
     settings: dict[str, Any] = {"data_range": 1, "size": size}
     if metric == "PSNR":
+        pairs = ((as_unit(a), as_unit(b)) for a, b in zip(x, y, strict=True))
         with np.errstate(divide="ignore"):
             values = -10 * np.log10([((a - b) ** 2).mean() for a, b in pairs])
         return PerImage(metric, values, settings=settings)
     require_side(size, metric)
     settings |= WINDOW_SETTINGS | {"border": "valid"}
+    if means is None:
+        means = scale_means(x, y, fitting_scales(size) if metric == "MS-SSIM" else 1)
     if metric == "SSIM":
-        values = np.array([local_maps(a, b)[0].mean() for a, b in pairs])
-        return PerImage(metric, values, (-1.0, 1.0), settings)
-    scales = fitting_scales(size)
-    values = np.array([multiscale_similarity(a, b, scales) for a, b in pairs])
+        return PerImage(metric, means[:, 0, 0].mean(axis=1), (-1.0, 1.0), settings)
+    scales = means.shape[1]
+    factors = np.append(means[:, :-1, 1], means[:, -1:, 0], axis=1)
+    powers = np.maximum(factors, 0) ** scale_weights(scales)[:, None]
+    values = powers.prod(axis=1).mean(axis=1)
     weights = [round(float(v), 6) for v in scale_weights(scales)]
     settings |= {"scales": scales, "downsampling": "2 x 2 mean", "weights": weights}
     fewer = Note("fewer-scales", {"scales": scales, "least": least_side(len(WEIGHTS))})
@@ -244,40 +254,50 @@ def local_maps(
     Returns:
         Two (h', w', c).
     """
-    weights = np.exp(-0.5 * ((np.arange(WINDOW) - WINDOW // 2) / SIGMA) ** 2)
-    weights /= weights.sum()
-    cut = WINDOW // 2 if border == "valid" else 0
-    rows, columns = (slice(cut, side - cut) for side in x.shape[:2])
     c1, c2 = (K1 * data_range) ** 2, (K2 * data_range) ** 2
-
-    def blur(image: Array) -> Array:
-        image = ndimage.correlate1d(image, weights, axis=0, mode="mirror")[rows]
-        return ndimage.correlate1d(image, weights, axis=1, mode="mirror")[:, columns]
-
-    mx, my, xx, yy, xy = blur(x), blur(y), blur(x * x), blur(y * y), blur(x * y)
+    mx, my, both, xy = _blurred(x, y, border)
     product, squares = mx * my, mx * mx + my * my
-    structure = (2 * (xy - product) + c2) / (xx + yy - squares + c2)
+    structure = (2 * (xy - product) + c2) / (both - squares + c2)
     similarity = structure * (2 * product + c1) / (squares + c1)
-    return np.where(structure < 0, -np.abs(similarity), similarity), structure
+    similarity = np.where(structure < 0, -np.abs(similarity), similarity)
+    return np.moveaxis(similarity, 0, 2), np.moveaxis(structure, 0, 2)
 
 
-def multiscale_similarity(x: Array, y: Array, scales: int) -> float:
-    """MS-SSIM in [0, 1] of two images (h, w, c)."""
-    means = np.empty((scales, x.shape[2]))
-    for j in range(scales):
-        if j:
-            x, y = _halved(x), _halved(y)
-        similarity, structure = local_maps(x, y)
-        factor = similarity if j == scales - 1 else structure
-        means[j] = factor.mean(axis=(0, 1))
-    powers = np.maximum(means, 0) ** scale_weights(scales)[:, None]
-    return float(powers.prod(axis=0).mean())
+def _blurred(x: Array, y: Array, border: Border) -> Array:
+    """(4, c, h', w'): x, y, x^2 + y^2 and x y under the window, by products of TILE rows, then
+    columns, with one band.
+    """
+    if border == "mirror":
+        edge = (WINDOW // 2, WINDOW // 2)
+        x, y = (np.pad(image, (edge, edge, (0, 0)), mode="reflect") for image in (x, y))
+    (rows, columns, c), (h, w) = x.shape, (side - WINDOW + 1 for side in x.shape[:2])
+    planes = np.zeros((4, c, rows + -h % TILE, columns + -w % TILE))
+    planes[:2, :, :rows, :columns] = np.moveaxis(x, 2, 0), np.moveaxis(y, 2, 0)
+    np.einsum("acij,acij->cij", planes[:2], planes[:2], out=planes[2])
+    np.multiply(planes[0], planes[1], out=planes[3])
+    tiles = sliding_window_view(planes, TILE + WINDOW - 1, axis=2)[:, :, ::TILE]
+    planes = (BAND @ tiles.swapaxes(3, 4)).reshape(4, c, -1, planes.shape[3])[:, :, :h]
+    tiles = sliding_window_view(planes, TILE + WINDOW - 1, axis=3)[:, :, :, ::TILE]
+    blurred = (tiles.swapaxes(2, 3) @ BAND.T).swapaxes(2, 3)
+    return np.ascontiguousarray(blurred.reshape(4, c, h, -1)[..., :w])
+
+
+def scale_means(x: NDArray[Any], y: NDArray[Any], scales: int) -> Array:
+    """(n, scales, 2, c) means over the windows of SSIM and of its contrast-structure factor."""
+    means = np.empty((len(x), scales, 2, x.shape[3]))
+    for k, pair in enumerate(zip(x, y, strict=True)):
+        a, b = map(as_unit, pair)
+        for j in range(scales):
+            a, b = (_halved(a), _halved(b)) if j else (a, b)
+            means[k, j] = [factor.mean(axis=(0, 1)) for factor in local_maps(a, b)]
+    return means
 
 
 def _halved(image: Array) -> Array:
     """Means of 2 x 2 blocks of (h, w, c); an odd last row or column is dropped."""
-    h, w, c = image.shape
-    return image[: h // 2 * 2, : w // 2 * 2].reshape(h // 2, 2, w // 2, 2, c).mean(axis=(1, 3))
+    h, w = (side // 2 * 2 for side in image.shape[:2])
+    rows = image[0:h:2] + image[1:h:2]
+    return (rows[:, 0:w:2] + rows[:, 1:w:2]) / 4
 
 
 def least_side(scales: int) -> int:

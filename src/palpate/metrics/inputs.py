@@ -30,6 +30,10 @@ from palpate.core.features import Array, Index, is_missing
 
 Normalize = Literal["check"] | bool
 
+# glibc returns every freed block of some size to the system, whose pages then cost more than the
+# arithmetic in them, until a block as large as this one was freed once.
+np.empty(31 << 20, np.uint8)
+
 #: Rows may differ from unit length by this much before ``normalize="check"`` rejects them.
 NORM_TOLERANCE = 1e-3
 #: Rows of an array on disk that are read together.
