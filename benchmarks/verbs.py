@@ -59,7 +59,7 @@ def image_folders(folder, n):
 
     for seed, part in enumerate(("a", "b")):
         for k, image in enumerate(smooth_images(n, seed)):
-            path = folder / part / f"{part}{k // 20:03d}" / f"{k:06d}.png"
+            path = folder / part / f"video{k // 20:03d}" / f"{k:06d}.png"
             path.parent.mkdir(parents=True, exist_ok=True)
             Image.fromarray(image).save(path)
 

@@ -28,7 +28,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
-from scipy import ndimage
 
 Floats = NDArray[np.float32]
 Pixels = NDArray[np.uint8]
@@ -85,7 +84,9 @@ def find_contacts(
     else:
         reference = find_reference(thumbnails) if reference is None else reference
         energy = contact_energy(thumbnails, thumbnails[reference])
-    smooth = ndimage.median_filter(energy, 5, mode="nearest")
+    from scipy.ndimage import median_filter  # as below: no other verb has to wait for it
+
+    smooth = median_filter(energy, 5, mode="nearest")
     strong = PROMINENCE * float(np.quantile(smooth, 0.98))
     height = max(strong, LEAST, TIMES_NOISE * _noise(thumbnails))
     runs, backgrounds = _contacts(smooth, height, reference)
@@ -127,7 +128,9 @@ def rest_before(energy: Floats, first: int, after: int, peak: float) -> int | No
 
 def _shapes(thumbnails: Pixels) -> Floats:
     """(n, 48 * 64 * 3): blurred, without the mean of each channel."""
-    blurred = ndimage.gaussian_filter(thumbnails.astype(np.float32), (0, 1, 1, 0))
+    from scipy.ndimage import gaussian_filter
+
+    blurred = gaussian_filter(thumbnails.astype(np.float32), (0, 1, 1, 0))
     return (blurred - blurred.mean(axis=(1, 2), keepdims=True)).reshape(len(blurred), -1)
 
 

@@ -27,7 +27,6 @@ from collections.abc import Collection, Mapping
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import ndimage, stats
 
 from palpate.data.contacts import Pixels, contact_energy, find_reference
 
@@ -124,7 +123,9 @@ def _unequal(
 
 
 def _rate(touch: Pixels, in_contact: Collection[int]) -> list[Finding]:
-    ranks = stats.rankdata(contact_energy(touch, touch[find_reference(touch)]))
+    from scipy.stats import rankdata  # most of a second, which no other verb has to wait
+
+    ranks = rankdata(contact_energy(touch, touch[find_reference(touch)]))
     frames, numbers = np.arange(len(touch)), np.array(sorted(in_contact))
 
     def agreement(factor: float) -> float:
@@ -150,7 +151,8 @@ def lag_of(tactile: NDArray[np.float64], vision: NDArray[np.float64]) -> list[Fi
     count = min(len(tactile), len(vision))
     if count < LEAST_FRAMES:
         return []
-    smooth = ndimage.gaussian_filter1d
+    from scipy.ndimage import gaussian_filter1d as smooth
+
     # Changes over a frame or two, without the level of the second around.
     quick = lambda changes: smooth(changes, 1.5) - smooth(changes, 20)
     x, y = (quick(changes[:count]) for changes in (tactile, vision))

@@ -20,7 +20,6 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
-from scipy import fft
 
 from palpate.core import PalpateError, Progress, quiet
 from palpate.data.images import in_threads, read_image
@@ -71,10 +70,12 @@ def structure(images: Floats, grounds: Floats) -> Floats:
         images: (n, 48, 48, 3).
         grounds: (n, 48, 48, 3) or (1, 48, 48, 3), what is subtracted.
     """
+    from scipy.fft import dctn  # lists and photos are audited without
+
     x, ground = (a - a.mean((1, 2), keepdims=True) for a in (images, grounds))
     gain = (x * ground).sum((1, 2), keepdims=True)
     gain /= np.maximum((ground**2).sum((1, 2), keepdims=True), 1)
-    power = np.asarray(fft.dctn(x - gain * ground, axes=(1, 2), norm="ortho")) ** 2
+    power = np.asarray(dctn(x - gain * ground, axes=(1, 2), norm="ortho")) ** 2
     k = np.maximum(*np.mgrid[:SIDE, :SIDE])
     contact, pixels = (power[:, band].mean((1, 2)) for band in ((k >= 6) & (k < 20), k >= 36))
     return np.sqrt(contact) / np.maximum(np.sqrt(pixels), NOISE)

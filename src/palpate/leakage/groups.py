@@ -12,8 +12,6 @@ from collections.abc import Sequence
 import numpy as np
 import polars as pl
 from numpy.typing import NDArray
-from scipy.sparse import coo_matrix
-from scipy.sparse.csgraph import connected_components
 
 from palpate.core import Note, PalpateError, require
 from palpate.data.manifest import SIDES, Manifest
@@ -120,6 +118,9 @@ def _joined(labels: Sequence[Ints], n: int) -> Ints:
         columns.append(number + nodes)
         nodes += len(values)
     row, column = np.concatenate(rows), np.concatenate(columns)
+    from scipy.sparse import coo_matrix  # an audit does without
+    from scipy.sparse.csgraph import connected_components
+
     graph = coo_matrix((np.ones(len(row), np.int8), (row, column)), (nodes, nodes))
     return connected_components(graph, directed=False)[1][:n].astype(np.int64)
 
