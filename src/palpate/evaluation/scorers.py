@@ -32,12 +32,11 @@ import polars as pl
 from numpy.typing import NDArray
 
 from palpate.core import FeatureSet, Note, PalpateError, Progress, Score
-from palpate.core.features import Array
 from palpate.data.samples import Samples
 from palpate.evaluation.controls import matched_features
 from palpate.metrics.contact import contact_per_image
 from palpate.metrics.distributions import compare_fid, prdc_rows
-from palpate.metrics.images import PerImage, fitting_scales, per_image, scale_means
+from palpate.metrics.images import PerImage, per_image, scale_means
 from palpate.metrics.kernels import Polynomial
 from palpate.metrics.mmd import Preset
 from palpate.metrics.paired import Comparison, compare, compare_tmmd, mean_differences
@@ -304,11 +303,10 @@ class Bench:
         }
 
     @cached_property
-    def means(self) -> dict[str, Array]:
+    def means(self) -> dict[str, NDArray[Any]]:
         """What SSIM and MS-SSIM of :attr:`pairs` are made of."""
         real = self.pictures[REFERENCE]
-        scales = fitting_scales(real.shape[1:3])
-        return {name: scale_means(x, real, scales) for name, x in self.pairs.items()}
+        return {name: scale_means(x, real) for name, x in self.pairs.items()}
 
     @property
     def of_pairs(self) -> dict[str, Any]:

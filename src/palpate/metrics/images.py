@@ -22,8 +22,8 @@ from dataclasses import dataclass, field
 from typing import Any, Literal, TypedDict, Unpack
 
 import numpy as np
-from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
+from scipy import ndimage
 
 from palpate._version import __version__
 from palpate.core import Note, Score, require
@@ -33,10 +33,9 @@ from palpate.metrics.intervals import score_of, spread_of_values
 Border = Literal["valid", "mirror"]
 
 WINDOW, SIGMA, K1, K2 = 11, 1.5, 0.01, 0.03
-_WEIGHTS = np.exp(-0.5 * ((np.arange(WINDOW) - WINDOW // 2) / SIGMA) ** 2)
-#: Rows that are blurred by one product, and its matrix (TILE, TILE + 10): a window a row.
-TILE = 32
-BAND = np.stack([np.pad(_WEIGHTS / _WEIGHTS.sum(), (k, TILE - 1 - k)) for k in range(TILE)])
+#: The window in one direction.
+LINE = np.exp(-0.5 * ((np.arange(WINDOW) - WINDOW // 2) / SIGMA) ** 2)
+LINE /= LINE.sum()
 #: What a score keeps of the window.
 WINDOW_SETTINGS = {"window": WINDOW, "sigma": SIGMA, "k1": K1, "k2": K2}
 #: The published exponents, finest scale first. Their sum is 1.0001; all five are as published.
@@ -186,7 +185,7 @@ def per_image(
     require_side(size, metric)
     settings |= WINDOW_SETTINGS | {"border": "valid"}
     if means is None:
-        means = scale_means(x, y, fitting_scales(size) if metric == "MS-SSIM" else 1)
+        means = scale_means(x, y, 1 if metric == "SSIM" else len(WEIGHTS))
     if metric == "SSIM":
         return PerImage(metric, means[:, 0, 0].mean(axis=1), (-1.0, 1.0), settings)
     scales = means.shape[1]
@@ -255,35 +254,24 @@ def local_maps(
         Two (h', w', c).
     """
     c1, c2 = (K1 * data_range) ** 2, (K2 * data_range) ** 2
-    mx, my, both, xy = _blurred(x, y, border)
+    planes = np.stack([x, y, x * x + y * y, x * y])  # together: half the passes
+    for axis in (1, 2):
+        planes = ndimage.correlate1d(planes, LINE, axis, mode="mirror")
+    cut = WINDOW // 2 if border == "valid" else 0
+    rows, columns = (slice(cut, side - cut) for side in x.shape[:2])
+    mx, my, both, xy = planes[:, rows, columns]
     product, squares = mx * my, mx * mx + my * my
     structure = (2 * (xy - product) + c2) / (both - squares + c2)
     similarity = structure * (2 * product + c1) / (squares + c1)
-    similarity = np.where(structure < 0, -np.abs(similarity), similarity)
-    return np.moveaxis(similarity, 0, 2), np.moveaxis(structure, 0, 2)
+    return np.where(structure < 0, -np.abs(similarity), similarity), structure
 
 
-def _blurred(x: Array, y: Array, border: Border) -> Array:
-    """(4, c, h', w'): x, y, x^2 + y^2 and x y under the window, by products of TILE rows, then
-    columns, with one band.
+def scale_means(x: NDArray[Any], y: NDArray[Any], most: int = len(WEIGHTS)) -> Array:
+    """(n, scales, 2, c) means over the windows of SSIM and of its contrast-structure factor.
+
+    ``most``: of the scales that the images hold.
     """
-    if border == "mirror":
-        edge = (WINDOW // 2, WINDOW // 2)
-        x, y = (np.pad(image, (edge, edge, (0, 0)), mode="reflect") for image in (x, y))
-    (rows, columns, c), (h, w) = x.shape, (side - WINDOW + 1 for side in x.shape[:2])
-    planes = np.zeros((4, c, rows + -h % TILE, columns + -w % TILE))
-    planes[:2, :, :rows, :columns] = np.moveaxis(x, 2, 0), np.moveaxis(y, 2, 0)
-    np.einsum("acij,acij->cij", planes[:2], planes[:2], out=planes[2])
-    np.multiply(planes[0], planes[1], out=planes[3])
-    tiles = sliding_window_view(planes, TILE + WINDOW - 1, axis=2)[:, :, ::TILE]
-    planes = (BAND @ tiles.swapaxes(3, 4)).reshape(4, c, -1, planes.shape[3])[:, :, :h]
-    tiles = sliding_window_view(planes, TILE + WINDOW - 1, axis=3)[:, :, :, ::TILE]
-    blurred = (tiles.swapaxes(2, 3) @ BAND.T).swapaxes(2, 3)
-    return np.ascontiguousarray(blurred.reshape(4, c, h, -1)[..., :w])
-
-
-def scale_means(x: NDArray[Any], y: NDArray[Any], scales: int) -> Array:
-    """(n, scales, 2, c) means over the windows of SSIM and of its contrast-structure factor."""
+    scales = min(most, fitting_scales(x.shape[1:3]))
     means = np.empty((len(x), scales, 2, x.shape[3]))
     for k, pair in enumerate(zip(x, y, strict=True)):
         a, b = map(as_unit, pair)
