@@ -296,9 +296,9 @@ def start_probe(folder):
 
 
 def start_generate(folder):
-    from palpate.diffusion.pipeline import Pipeline
+    from palpate.diffusion.pipeline import TactilePipeline
 
-    Pipeline.load("palpate/mini")
+    TactilePipeline.from_pretrained("palpate/mini")
 
 
 def tmmd(**options):
