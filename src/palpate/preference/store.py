@@ -148,7 +148,9 @@ class VoteStore:
         """
         self._disk.execute("BEGIN IMMEDIATE")
         try:
-            rows = ({**vote, "seal": _seal([vote[name] for name in READ])} for vote in votes)
+            rows = (
+                {**vote, "seal": digest_lines(str(vote[name]) for name in READ)} for vote in votes
+            )
             new = [self._disk.execute(_STORE, row).rowcount == 1 for row in rows]
             self._mark(-1 - self._count())
             self._disk.execute("COMMIT")
@@ -167,7 +169,7 @@ class VoteStore:
         with _usable(self._path):
             query = f"SELECT seal, {', '.join(READ)} FROM votes WHERE rater = ?"
             rows = self._disk.execute(query, (rater,)).fetchall()
-            if any(seal != _seal(cells) for seal, *cells in rows):
+            if any(seal != digest_lines(map(str, cells)) for seal, *cells in rows):
                 raise sqlite3.DataError("a damaged vote")
         return [dict(zip(CELLS, cells, strict=False)) for _, *cells in rows]
 
@@ -175,11 +177,6 @@ class VoteStore:
         """The raters who voted."""
         with _usable(self._path):
             return [r for (r,) in self._disk.execute("SELECT DISTINCT rater FROM votes")]
-
-
-def _seal(cells: Sequence[Any]) -> str:
-    """The digest that a vote holds of its cells ``READ``."""
-    return digest_lines(map(str, cells))
 
 
 @contextmanager

@@ -281,8 +281,10 @@ def material_utility(
         cells = (means.get((label, k)) for k in draws.shots)
         rows.append([label, *(over_draws(runs) if runs else None for runs in cells)])
     for name in generated:
-        pairs = ((means.get((f"{REAL} + {name}", k)), means.get((REAL, k))) for k in draws.shots)
-        rows.append([f"{GAIN}{name}", *(_gain(a, b) if a and b else None for a, b in pairs)])
+        more = f"{REAL} + {name}"
+        pairs = ({m: means.get((m, k)) for m in (more, REAL)} for k in draws.shots)
+        gains = (differences_of_means(pair)[0] if all(pair.values()) else None for pair in pairs)
+        rows.append([f"{GAIN}{name}", *gains])
     label_of = (f"{REAL} + {{}}", "{} alone", f"{GAIN}{{}}")
     control_rows = {label.format(name) for name in controls for label in label_of}
     return StudyTable(
@@ -296,10 +298,6 @@ def material_utility(
         rows,
         controls=[str(row[0]) for row in rows if row[0] in control_rows],
     )
-
-
-def _gain(more: Sequence[Mean], less: Sequence[Mean]) -> Score:
-    return differences_of_means({more[0].score.a: more, less[0].score.a: less})[0]
 
 
 def utility_claims(table: StudyTable, generators: Iterable[str]) -> list[Claim]:
