@@ -195,6 +195,8 @@ def test_files_of_labels_give_ids_to_rows_without(tmp_path):
         (sets(), {"labels": TABLE[:3]}, "the labels, .* Got 1 of 4 without, first 'grün'"),
         (sets(), {"labels": TABLE.with_columns(id=pl.lit("z"))}, "must occur once"),
         (sets(), {"labels": {"z": "m"}}, "The labels must hold ids of these samples"),
+        (sets(), {"labels": TABLE[:0]}, "Got none instead of 'v0/1'"),
+        (sets(), {"labels": []}, "Got an empty list"),
         (sets(), {"labels": TABLE.select("material")}, "must have a column id"),
         (sets(), {"labels": "absent.csv"}, "must be a file. Got no file absent.csv"),
         (X[:3], {"labels": TABLE}, "as many rows"),

@@ -1,6 +1,7 @@
 """Generating to memory, one PNG, or a folder with an index; resuming; broken photos."""
 
 import json
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -211,6 +212,22 @@ def test_an_index_that_points_outside_is_rejected(pipeline, tmp_path):
     index["images"][made.ids[0]] = "../../in/0.png"
     write_json(tmp_path / "out" / "index.json", sealed(index))
     fails("must lie in images/", Generated.load, tmp_path / "out")
+
+
+def test_what_lies_in_an_unfinished_folder_is_not_believed(pipeline, tmp_path):
+    photos, output = write_photos(tmp_path / "in", 1), tmp_path / "out"
+    image = generate(photos, model=pipeline, output=output).paths[0]
+    (tmp_path / "notes").write_text("of years")
+    (tmp_path / "far").mkdir()
+    for link, target in ((image, tmp_path / "notes"), (image.parent, tmp_path / "far")):
+        shutil.rmtree(link) if link.is_dir() else link.unlink()
+        link.symlink_to(target)
+        words = f"{output} must hold no link out of it. Got {link}. Choose another folder"
+        fails(words, generate, photos, model=pipeline, output=output)
+    assert ((tmp_path / "notes").read_text(), [*(tmp_path / "far").iterdir()]) == ("of years", [])
+    (output / "index.json").write_text('{"sealed": "x"}')
+    words = f"{output}/index.json must be JSON. Got damaged.* make it again in another folder"
+    fails(words, generate, photos, model=pipeline, output=output)
 
 
 def test_photos_of_every_kind_give_the_image_of_what_they_show(pipeline, tmp_path):

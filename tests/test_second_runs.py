@@ -96,6 +96,20 @@ def test_what_a_first_run_holds_is_refused_to_a_second_and_stays(place, capsys, 
         assert digest_folder(place) == before
 
 
+@pytest.mark.parametrize("name", HELD)
+def test_a_link_out_of_what_is_held_is_not_written_through(place, capsys, name):
+    words, held = HELD[name]
+    folder = place / held.replace("*", PRESETS["tiny"].digest[:12])
+    folder.mkdir(exist_ok=True)
+    (place / "notes").write_text("of years")
+    (folder / "a").symlink_to(place / "notes")
+    before = digest_folder(place)
+    with FakeServer() as server:
+        words = [server.url if word == "SERVER" else word for word in words]
+        mistake(capsys, "", *words)
+    assert digest_folder(place) == before
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("words", "held"),

@@ -293,11 +293,16 @@ def locked(folder: Path, output: Path | None = None) -> Generator[None]:
         output: what the user named, for the error; default: ``folder``.
 
     Raises:
-        PalpateError: if another process holds it, or it cannot be made.
+        PalpateError: if another process holds it, it cannot be made, or a link leads out of it,
+            through which another file would be written.
     """
     new = not folder.exists()
     with starting_to_write(output or folder):
         folder.mkdir(parents=True, exist_ok=True)
+    for path in folder.rglob("*"):
+        if path.is_symlink() and not inside(folder, path.relative_to(folder)):
+            must, fix = f"{output or folder} must hold no link out of it", "Choose another folder"
+            raise PalpateError(must, str(path), fix)
     handle = -1
     try:
         import fcntl  # not on Windows, where a folder cannot be opened either
@@ -392,7 +397,7 @@ def read_json(path: Path, role: str) -> Any:
         got, fix = got_and_fix(Path(path), f"the folder {path}", "Name the file itself")
         raise PalpateError(f"The {role} must be a file", got, fix) from None
     except (ValueError, RecursionError) as error:  # no JSON, no UTF-8, nested too deep
-        got, fix = str(error), "Write it again with palpate"
+        got, fix = str(error), "Take a whole copy, or make it again in another folder"
         if isinstance(error, UnicodeDecodeError):  # no text at all: it may be a manifest
             got, fix = got_and_fix(Path(path), got, fix)
         raise PalpateError(f"The {role} {path} must be JSON", got, fix) from None
@@ -474,7 +479,7 @@ def require_regular(path: Path) -> None:
         raise PalpateError("An input must be a file or a folder", got, fix)
 
 
-def inside(root: Path, relative: str) -> Path | None:
+def inside(root: Path, relative: str | Path) -> Path | None:
     """Return ``root / relative`` if that stays inside ``root`` (links resolved), else None."""
     root = Path(os.path.realpath(root))  # unlike Path.resolve, not stopped by a loop of links
     try:

@@ -157,21 +157,21 @@ def require_rows(ids: Iterable[str], wanted: Sequence[str], must: str, fix: str)
     return [row[i] for i in wanted]
 
 
-def require_joined(ids: Iterable[str], others: Iterable[str], source: str) -> list[str]:
-    """Check a join by id; return the ids of which ``source``, with the ids ``others``, has none.
+def require_joined(ids: Iterable[str], others: Iterable[str], source: str) -> None:
+    """Check a join by id of samples to a ``source`` with the ids ``others``.
 
     Raises:
-        PalpateError: if that is all of them: the ids are another set's.
+        PalpateError: if it has none of theirs: the ids are another set's.
     """
     own, theirs = [*ids], {*others}
-    lacking = [i for i in own if i not in theirs]
-    if own and len(lacking) == len(own):
+    if own and theirs.isdisjoint(own):
         wrong, right = (", ".join(map(repr, names[:2])) for names in (sorted(theirs), own))
-        got, must = f"ids as {wrong} instead of {right}", f"{source} must hold ids of these samples"
-        raise PalpateError(
-            must, got, "Use what was made for these samples, or write their ids there"
+        got, must = (
+            f"{wrong or 'none'} instead of {right}",
+            f"{source} must hold ids of these samples",
         )
-    return lacking
+        fix = "Use what was made for these samples, or write their ids there"
+        raise PalpateError(must, got, fix)
 
 
 class PalpateWarning(UserWarning):

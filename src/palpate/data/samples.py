@@ -516,7 +516,7 @@ def read_labels(source: Any) -> pl.DataFrame | None:
         return None
     if isinstance(source, str | Path):
         table = open_table(Path(source))
-    elif hasattr(source, "columns") or (isinstance(source, list) and isinstance(source[0], dict)):
+    elif hasattr(source, "columns") or isinstance(next(iter(source), None), dict):
         table = table_of(cast("Any", source), "labels")
     else:
         values = source.items() if isinstance(source, Mapping) else enumerate(source)

@@ -21,7 +21,7 @@ from typing import Any
 
 from PIL import Image
 
-from palpate.core import Note, PalpateError, Problem, read_json, reading_entry, require, short
+from palpate.core import Note, PalpateError, Problem, read_record, reading_entry, require, short
 from palpate.core.records import from_plain
 from palpate.data.images import read_image
 
@@ -121,10 +121,7 @@ def file_name(sample_id: str) -> str:
 
 
 def _read_index(folder: Path) -> Index:
-    index = read_json(folder / "index.json", "index of generated images")
-    fits = isinstance(index, dict) and index.get("format") == FORMAT
-    must, fix = f"{folder} must hold generated images ({FORMAT})", "Choose another folder"
-    require(fits, None, must, "another kind of folder", fix=fix)
+    index = read_record(folder / "index.json", "index of generated images", form=FORMAT)
     with reading_entry(folder / "index.json", "The index"):
         return from_plain(Index, index)
 

@@ -264,7 +264,7 @@ def aligned(bench: Bench, labels: Any, split: Split | None, group: str) -> Bench
     listed = [] if table is None else table["id"].to_list()
     real, full = labeled(real, table), [*real.ids, *listed]
     generators = {n: labeled(with_full_ids(s, full), table) for n, s in bench.generators.items()}
-    if listed:
+    if table is not None:
         every = [i for samples in (real, *generators.values()) for i in samples.ids]
         require_joined(every, listed, "The labels")
     if real.numbered:  # row k of a generator is not row k of the reference
@@ -326,8 +326,7 @@ def _parts(real: Samples, split: Split) -> tuple[Samples, Samples | None]:
     must = "must go with a reference that has ids"
     require(not real.numbered, "split", must, real.source, fix="Save it with ids")
     require_joined(real.ids, split.parts, "The split")
-    ids = {*real.ids}
-    real.take([i for i in split.ids("test") if i not in ids])  # raises for missing ids
+    real.take(split.ids("test"))  # raises for missing ids
     test, train = ([i for i in real.ids if split.parts.get(i) == p] for p in ("test", "train"))
     complete = train and len(train) == len(split.ids("train"))
     return real.take(test), real.take(train) if complete else None
