@@ -109,6 +109,8 @@ def test_torchscript_runs_only_where_the_user_says_so(here, capsys):
     ("name", "command"),
     [
         ("r.json", "report r.json -o page.html"),
+        ("set/metadata.csv", "import set --format hf -o m"),
+        ("set/metadata.jsonl", "import set --format hf -o m"),
         ("r.json", "audit set --split r.json --vision photo/{id}.png --tactile touch/{id}.png"),
         ("set/touch/index.json", "score --generated set/touch --reference set/photo"),
         ("p.txt", "caption set --server http://localhost:1 --prompt p.txt --per frame -o c"),

@@ -301,8 +301,8 @@ def locked(folder: Path, output: Path | None = None) -> Generator[None]:
         folder.mkdir(parents=True, exist_ok=True)
     for path in folder.rglob("*"):
         if path.is_symlink() and not inside(folder, path.relative_to(folder)):
-            must, fix = f"{output or folder} must hold no link out of it", "Choose another folder"
-            raise PalpateError(must, str(path), fix)
+            must = f"{output or folder} must hold no link out of it"
+            raise PalpateError(must, str(path), "Choose another folder")
     handle = -1
     try:
         import fcntl  # not on Windows, where a folder cannot be opened either

@@ -170,8 +170,7 @@ def require_joined(ids: Iterable[str], others: Iterable[str], source: str) -> No
             f"{wrong or 'none'} instead of {right}",
             f"{source} must hold ids of these samples",
         )
-        fix = "Use what was made for these samples, or write their ids there"
-        raise PalpateError(must, got, fix)
+        raise PalpateError(must, got, "Use those made for these, or write their ids there")
 
 
 class PalpateWarning(UserWarning):

@@ -77,10 +77,7 @@ class Generated:
         Raises:
             PalpateError: if there is none.
         """
-        must, fix = (
-            "Every requested id must have been generated",
-            "Generate it into the same folder",
-        )
+        must, fix = "Every requested id must be generated", "Generate it into the same folder"
         require(sample_id in self.files, None, must, repr(sample_id), fix=fix)
         name = self.files[sample_id]
         return Path(name) if self.folder is None else self.folder / "images" / name

@@ -81,6 +81,8 @@ def _loaded(source: Path, name: str, config: str | None, revision: str | None) -
     for path in source.rglob("*"):
         if path.suffix.lower() not in SUFFIXES:  # the library waits for a pipe for ever
             require_regular(path)
+            if path.is_file() and path.suffix.lower() in (".csv", ".json", ".jsonl"):
+                content_of(path)  # raises for those too large, as the library does not
     try:
         if any((source / mark).is_file() for mark in ("dataset_dict.json", "state.json")):
             return _saved(source)
