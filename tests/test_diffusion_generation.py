@@ -61,7 +61,7 @@ def test_a_folder_has_an_index_and_the_images_of_the_pipeline(pipeline, tmp_path
     for file, a, b in zip(loaded.paths, direct, memory.images, strict=True):
         assert np.array_equal(np.asarray(Image.open(file)), np.asarray(a))
         assert np.array_equal(np.asarray(a), np.asarray(b))
-    fails("must have been generated", loaded.path, "nope")
+    fails("must be generated", loaded.path, "nope")
 
 
 def test_a_resumed_folder_equals_an_uninterrupted_one(pipeline, tmp_path):
