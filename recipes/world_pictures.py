@@ -21,7 +21,7 @@ from PIL import Image, ImageDraw, ImageFont
 from palpate.core import atomic_path
 from palpate.sim import MATERIALS, Video, WorldOptions
 from palpate.sim.arrays import f32, resample, to_bytes
-from palpate.sim.gel import PAD_MM, solve_approach
+from palpate.sim.gel import solve_approach
 from palpate.sim.plan import ObjectRef, VideoPlan, first_contact
 from palpate.sim.video import make_object
 
@@ -108,7 +108,7 @@ def steps() -> Board:
     tactile, background = video.tactile(frame), video.background()
     signed = np.clip(tactile.astype(int) - background + 128, 0, 255).astype(np.uint8)
     labels = [
-        f"photo, {video.camera.view:.0f} mm;\nthe pad: {PAD_MM:g} mm",
+        f"photo, {video.camera.view:.0f} mm;\nthe pad: {video.options.pad_mm:g} mm",
         "relief h\nunder the pad",
     ]
     labels += ["gap g: less dome,\ntilt, curvature", "penetration p", "membrane m,\nas bright as p"]

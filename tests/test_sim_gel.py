@@ -144,7 +144,8 @@ def test_digit_has_no_markers_and_one_family_many_units():
         assert not np.array_equal(first.veil, unit.veil)
         assert np.abs(first.light - unit.light).max() < 0.4  # the lights stay nearly in place
     # A unit depends on no option of other things.
-    assert make_sensor(dataclasses.replace(SMALL, hard=0.1), 0) is first
+    other = make_sensor(dataclasses.replace(SMALL, hard=0.1, tile=512), 0)
+    np.testing.assert_array_equal(other.veil, first.veil)
     assert make_sensor(dataclasses.replace(SMALL, markers=0), 0).ink is None
 
 
@@ -193,3 +194,11 @@ def test_neighboring_frames_are_similar_and_materials_are_not():
     first = Video(SMALL, 0).vision(5).astype(float)
     near, far = Video(SMALL, 0).vision(6), Video(SMALL, 1).vision(5)
     assert np.abs(first - near).mean() < np.abs(first - far).mean()
+
+
+def test_a_larger_pad_shows_more_of_the_object_under_the_same_load():
+    wide = dataclasses.replace(SMALL, pad_mm=28.0, load_mm=(0.2, 0.2), sensor_noise=(0.0, 0.0))
+    sensor = make_sensor(wide, 0)
+    assert (sensor.px, sensor.half, sensor.noise) == (28.0 / SMALL.size, 14.0, 0.0)
+    loads = [contact.load for contact in Video(wide, 0).contacts]
+    np.testing.assert_allclose(loads, 0.2)

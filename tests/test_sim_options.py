@@ -7,8 +7,9 @@ import numpy as np
 import pytest
 
 from forge.errors import fails
+from palpate.core import digest_json
 from palpate.sim import DEFAULT, MATERIALS, MINI_SEEDS, PRESETS, WorldOptions, plan_world
-from palpate.sim.options import RANGES
+from palpate.sim.options import LATER, PAIRS, RANGES, VERSION
 from palpate.sim.plan import ObjectRef, contact_frames, first_contact, written_frames
 from palpate.sim.video import make_object
 
@@ -16,9 +17,11 @@ from palpate.sim.video import make_object
 @pytest.mark.parametrize("name", RANGES)
 def test_numbers_have_a_range(name):
     low, high = RANGES[name]
-    for value in (low - 1, high + 1, "many", None, float("nan")):
-        fails(f"`{name}` must be a .*number from", WorldOptions, **{name: value})
-    for value in (low, high):
+    good = [(low, high)] if name in PAIRS else [low, high]
+    bad = [(high, low), (low, low, low), low, (low, "many")] if name in PAIRS else [(low, high)]
+    for value in (low - 1, high + 1, "many", None, float("nan"), *bad):
+        fails(f"`{name}` must be .*numbers? from", WorldOptions, **{name: value})
+    for value in good:
         assert getattr(WorldOptions(**{name: value}), name) == value
 
 
@@ -44,7 +47,11 @@ def test_one_meaning_has_one_digest():
     assert first == second
     assert first.digest == second.digest
     assert first.materials == names
-    assert WorldOptions(tile=512).digest != WorldOptions().digest
+    for other in ({"tile": 512}, {"pad_mm": 20}, {"load_mm": (0.03, 0.5)}, {"quality": 60}):
+        assert WorldOptions(**other).digest != WorldOptions().digest
+    # Fields that came later keep the digests of the worlds that there were.
+    older = {k: v for k, v in dataclasses.asdict(WorldOptions()).items() if k not in LATER}
+    assert WorldOptions().digest == digest_json({"version": VERSION, "options": older})
 
 
 def test_presets_have_their_lengths_and_no_seed_of_the_shipped_models():

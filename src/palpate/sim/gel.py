@@ -46,15 +46,14 @@ from palpate.sim.options import VERSION, WorldOptions
 DRAWN = 256
 #: Penetration in mm at which the gel follows the object half the way; below, it bridges hollows.
 GRIP_MM = 0.04
-#: Side of the gel pad, and its depth, in mm.
-PAD_MM, GEL_MM = 14.0, 1.6
+#: Depth of the gel in mm.
+GEL_MM = 1.6
 #: Blurs in mm of the gel where nothing touches it, one by one, and of the sensor's optics.
 RELAX_MM, OPTICAL_MM = (2.4, 0.9, 0.35), 0.14
 #: Range of the radius in mm of the domed gel of a unit.
 DOME_MM = (30.0, 80.0)
-#: Range of the darkening at half the pad's side, and of the image noise (deviation, of 1), of a
-#: unit.
-VIGNETTE, NOISE = (0.03, 0.16), (0.002, 0.006)
+#: Range of the darkening at half the pad's side of a unit.
+VIGNETTE = (0.03, 0.16)
 #: The lights are green, blue and red.
 _PURE = np.eye(3)[[1, 2, 0]]
 _Triple = tuple[float, float, float]
@@ -105,7 +104,7 @@ class Sensor:
     """One gel unit at one image size n. The family is the same in every world, the unit is not.
 
     Attributes:
-        size, px: n, and the pixel size in mm.
+        size, px, half: n, the pixel size and half the pad's side in mm.
         field: near-field factor of each light, (3, n, n).
         color: RGB of each light, (3, 3).
         light: unit vectors towards the lights, (3, 3).
@@ -117,10 +116,11 @@ class Sensor:
         gamma, noise: of the image; the noise as a deviation.
     """
 
-    def __init__(self, seed: int, name: str, size: int, markers: int, unit: int) -> None:
-        self.size, self.px, look = size, PAD_MM / size, _LOOKS[name]
+    def __init__(self, options: WorldOptions, unit: int) -> None:
+        name, size, pad = options.look, options.size, options.pad_mm
+        self.size, self.px, self.half, look = size, pad / size, pad / 2.0, _LOOKS[name]
         family: np.random.Generator = rng_for(0, "sensor family", VERSION, name)
-        rng = rng_for(seed, "world", VERSION, "sensor", name, unit)
+        rng = options.rng("sensor", name, unit)
         down = lambda a: resample(f32(a), size)
         spread = [math.exp(s * rng.normal()) for s in look.spread]
         azimuth = [a + rng.normal(0.0, 0.05) for a in look.azimuth]
@@ -138,14 +138,14 @@ class Sensor:
             field.append(down(np.clip(1.0 + a + 0.35 * a * a - hump * square, 0.08, None)))
         self.field = np.stack(field)
         self.veil = down((1.0 - rng.uniform(*VIGNETTE) * square) * (1.0 + _dirt(rng)))
-        texture = ndimage.gaussian_filter(_white(rng), 0.3 / (PAD_MM / DRAWN))
+        texture = ndimage.gaussian_filter(_white(rng), 0.3 / (pad / DRAWN))
         self.texture = down(texture * (0.0022 / float(texture.std())))
-        self.dome = down(square * ((PAD_MM / 2.0) ** 2 / (2.0 * rng.uniform(*DOME_MM))))
-        inked = name == "gelsight" and markers > 0
-        self.ink = down(_markers(markers, rng)) if inked else None
+        self.dome = down(square * (self.half**2 / (2.0 * rng.uniform(*DOME_MM))))
+        inked = name == "gelsight" and options.markers > 0
+        self.ink = down(_markers(options.markers, pad, rng)) if inked else None
         self.ambient = f32(np.asarray(look.ambient) * spread[3] * rng.uniform(0.97, 1.03, 3))
         self.dim, self.gamma = rng.normal(0.03, 0.06), rng.uniform(0.9, 1.1)
-        self.noise = rng.uniform(*NOISE)
+        self.noise = rng.uniform(*options.sensor_noise)
 
     def gap(self, surface: Surface, relief: Array, state: State) -> Array:
         """Return the relief minus the gel's dome, tilted and curved, in mm, shape (n, n).
@@ -153,7 +153,7 @@ class Sensor:
         Soft objects flatten under the load.
         """
         y, x = grid(self.size)
-        half, (along, across) = PAD_MM / 2.0, state.tilt
+        half, (along, across) = self.half, state.tilt
         if surface.softness:
             relief = relief * (1.0 - 0.5 * surface.softness * min(1.0, state.load / 0.3))
         slope = x * (half * along) + y * (half * across)
@@ -216,13 +216,8 @@ class Sensor:
         return np.clip(image, 0.0, 1.2) ** self.gamma
 
 
-#: A unit is made once for all worlds of its seed, look, size and markers.
-_unit = lru_cache(maxsize=64)(Sensor)
-
-
-def make_sensor(options: WorldOptions, unit: int) -> Sensor:
-    """Make a unit of ``options.look``."""
-    return _unit(options.seed, options.look, options.size, options.markers, unit)
+#: A unit is made once for all videos of a world.
+make_sensor = lru_cache(maxsize=64)(Sensor)
 
 
 def _white(rng: np.random.Generator) -> Array:
@@ -248,7 +243,7 @@ def _dirt(rng: np.random.Generator) -> Array:
     return dirt
 
 
-def _markers(rows: int, rng: np.random.Generator) -> Array:
+def _markers(rows: int, pad: float, rng: np.random.Generator) -> Array:
     """Draw the opacity of the ink: a jittered grid of small dots, worn ones among them, and dust.
 
     The grid has a pitch of 0.96 pad / rows and begins anywhere, so that a unit shows ``rows`` or
@@ -256,8 +251,8 @@ def _markers(rows: int, rng: np.random.Generator) -> Array:
     with a finer pitch. Worn dots are large and round.
     """
     draw, ink = rng.uniform, np.zeros((DRAWN, DRAWN), np.float32)
-    step, mm = 2.0 * 0.96 / rows, 2.0 / PAD_MM
-    scale = min(1.0, step / 0.24) * mm
+    step, mm = 2.0 * 0.96 / rows, 2.0 / pad
+    scale = min(1.0, step * pad / (0.24 * 14.0)) * mm
     first = -1.0 - step * draw(0.0, 1.0, 2)
     wear_x, wear_y, wear = draw(-1.0, 1.0), draw(-1.0, 1.0), draw(0.15, 0.5)
     for i, j in np.ndindex(rows + 3, rows + 3):

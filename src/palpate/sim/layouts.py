@@ -47,13 +47,17 @@ def image_paths(options: WorldOptions, row: Row) -> dict[str, str]:
 def write_video_files(video: Video, folder: Path) -> None:
     """Render all written frames of a video into its folder."""
     frames = written_frames(video.options)
-    for name, render in (("video", video.vision), ("gelsight", video.tactile)):
+    of_touch = video.options.quality
+    for name, render, quality in (
+        ("video", video.vision, 95),
+        ("gelsight", video.tactile, of_touch),
+    ):
         if video.options.layout == "videos":
             _write_mp4(folder / f"{name}.mp4", map(render, frames), video.options.size)
             continue
         (folder / f"{name}_frame").mkdir()
         for frame in frames:
-            data = image_bytes(render(frame), "JPEG", quality=95, subsampling=0)
+            data = image_bytes(render(frame), "JPEG", quality=quality, subsampling=0)
             (folder / f"{name}_frame" / f"{frame:010d}.jpg").write_bytes(data)
 
 

@@ -14,8 +14,6 @@ from palpate.sim.options import WorldOptions
 from palpate.sim.plan import VideoPlan
 from palpate.sim.tile import TILE_MM
 
-#: Range of the peak load as mean indentation in mm, log-uniform.
-LOAD_MM = (0.09, 0.42)
 #: Deviation of a video's contacts around its first, in mm, and share that goes far away instead.
 REVISIT_MM, JUMP = 3.5, 0.25
 #: Deviations in mm, one drawn a contact, of the sensor's slide.
@@ -51,7 +49,7 @@ def make_contacts(options: WorldOptions, plan: VideoPlan) -> list[State]:
     normal = lambda spread: (spread * rng.normal(), spread * rng.normal())
     anywhere = lambda: (draw(0.0, TILE_MM), draw(0.0, TILE_MM))
     home, turn, last = (0.0, 0.0), 0.0, -1
-    lightest, heaviest = map(math.log, LOAD_MM)
+    lightest, heaviest = map(math.log, options.load_mm)
     for contact, number in enumerate(plan.object_index):
         first = number != last  # on this object
         if first:

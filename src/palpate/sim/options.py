@@ -31,7 +31,15 @@ RANGES: dict[str, tuple[float, float]] = {
     "sensors": (1, 100),
     "markers": (0, 40),
     "hard": (0.0, 1.0),
+    "pad_mm": (5.0, 50.0),
+    "load_mm": (0.01, 1.0),
+    "sensor_noise": (0.0, 0.05),
+    "quality": (10, 100),
 }
+#: Fields that name a world only where they are not the default: older worlds keep their digest.
+LATER = ("pad_mm", "load_mm", "sensor_noise", "quality")
+#: Fields that are a range.
+PAIRS = ("load_mm", "sensor_noise")
 
 
 @dataclass(frozen=True)
@@ -58,6 +66,10 @@ class WorldOptions:
         sensors: gel units, 1 .. 100; each video uses one of them.
         markers: rows of markers a side of a gelsight pad, 0 (none) .. 40.
         hard: how much photos vary in what cannot be felt (light, hands ...), 0 .. 1.
+        pad_mm: side of the gel pad, 5 .. 50 [mm].
+        load_mm: range of a contact's peak load as mean indentation, log-uniform, .01 .. 1 [mm].
+        sensor_noise: range of the units' image noise (deviation, of white), 0 .. 0.05.
+        quality: of the JPEG files of tactile images, 10 .. 100.
 
     Raises:
         PalpateError: if an option is out of range.
@@ -82,14 +94,22 @@ class WorldOptions:
     sensors: int = 3
     markers: int = 8
     hard: float = 0.5
+    pad_mm: float = 14.0
+    load_mm: tuple[float, float] = (0.09, 0.42)
+    sensor_noise: tuple[float, float] = (0.002, 0.006)
+    quality: int = 95
 
     def __post_init__(self) -> None:
         for name, (low, high) in RANGES.items():
             kind, value = type(low), getattr(self, name)
-            fits = isinstance(value, int if kind is int else (int, float)) and low <= value <= high
+            ends = value if isinstance(value, tuple) else (value,)
+            numbers = all(isinstance(v, int if kind is int else (int, float)) for v in ends)
+            fits = numbers and low <= min(ends) and max(ends) <= high and [*ends] == sorted(ends)
             must = f"must be a {'whole ' * (kind is int)}number from {low:g} to {high:g}"
-            require(fits, name, must, repr(value))
-            object.__setattr__(self, name, kind(value))  # 1 and 1.0 are one world
+            must = f"must be two rising numbers from {low:g} to {high:g}" if name in PAIRS else must
+            require(fits and len(ends) == 1 + (name in PAIRS), name, must, repr(value))
+            same = tuple(map(kind, ends))  # 1 and 1.0 are one world
+            object.__setattr__(self, name, same if name in PAIRS else same[0])
         for name, hint in get_type_hints(WorldOptions).items():
             if get_origin(hint) is Literal:
                 require_choice(name, getattr(self, name), get_args(hint))
@@ -112,7 +132,11 @@ class WorldOptions:
     @property
     def digest(self) -> str:
         """SHA-256 over the options and VERSION: names what the world will be."""
-        return digest_json({"version": VERSION, "options": dataclasses.asdict(self)})
+        options = dataclasses.asdict(self)
+        for field in dataclasses.fields(self):
+            if field.name in LATER and options[field.name] == field.default:
+                del options[field.name]
+        return digest_json({"version": VERSION, "options": options})
 
     def rng(self, purpose: str, *ids: str | int) -> np.random.Generator:
         """Return a generator that depends on VERSION, the seed, the purpose and the ids alone."""

@@ -15,7 +15,7 @@ from palpate.core import require, rng_for
 from palpate.sim.arrays import Array, f32, grid, to_bytes, window
 from palpate.sim.camera import Camera
 from palpate.sim.felt import caption, measure
-from palpate.sim.gel import PAD_MM, make_sensor
+from palpate.sim.gel import make_sensor
 from palpate.sim.materials import MATERIALS, Material, Surface, draw_surface
 from palpate.sim.motion import State, make_contacts, state_at
 from palpate.sim.options import BACKGROUND_OFFSET, VERSION, WorldOptions
@@ -111,7 +111,7 @@ class Video:
         """Return the object's relief under the pad in mm, (n, n)."""
         surface = self.surface(state.contact)
         center = state.position[0] / surface.px, state.position[1] / surface.px
-        reach = PAD_MM / 2.0 / surface.px
+        reach = self.sensor.half / surface.px
         return window(surface.height, grid(self.options.size), state.rotation, reach, center)
 
     def background(self) -> np.ndarray:
