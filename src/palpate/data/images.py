@@ -262,6 +262,11 @@ class Preprocess:
         return replace(self, mean=CLIP_MEAN, std=CLIP_STD) == Preprocess(self.size, self.resize)
 
     @property
+    def plainly(self) -> Preprocess:
+        """For the image alone, as its digest is taken: nothing subtracted."""
+        return replace(self, subtract=())
+
+    @property
     def shape(self) -> tuple[int, int, int]:
         """Height, width and channels of what :meth:`prepare` gives."""
         return self.height or self.resize, self.resize, 6 if self.lag else 3
@@ -301,11 +306,20 @@ class Preprocess:
             image = image.crop((left, top, left + w, top + h))
         return np.asarray(image.resize((columns, rows), Image.Resampling(self.resample)))
 
-    def fit(self, images: NDArray[np.uint8]) -> NDArray[np.uint8]:
-        """Images (n, h, w, 3) as :meth:`prepare` gives them; those that are so stay."""
+    def fit(self, images: NDArray[np.uint8], gels: NDArray[np.uint8] | None = None) -> NDArray[Any]:
+        """Images (n, h, w, 3) as :meth:`prepare` gives them; those that are so stay.
+
+        ``gels`` are their no-contact images, for encoders that subtract them.
+        """
         if self.plain and images.shape[1:3] == self.shape[:2]:
             return images
-        fitted = [self.prepare(Image.fromarray(image)) for image in images]
+        empty = (
+            [None] * len(images)
+            if gels is None or not self.subtract
+            else map(Image.fromarray, gels)
+        )
+        pairs = zip(map(Image.fromarray, images), empty, strict=True)
+        fitted = [self.prepare(image, gel) for image, gel in pairs]
         return np.stack(fitted) if fitted else images.reshape(0, *self.shape)
 
     def frames(self, manifest: Manifest, column: str, *, still: bool = False) -> Frames:
@@ -315,12 +329,15 @@ class Preprocess:
             PalpateError: if a sample lacks its image, or the no-contact image of its sensor.
         """
         paths, names = manifest.paths(column), manifest.column("sensor")
+        gels = manifest.column("background")
+        if self.residual and None in gels:  # of one kind for all
+            gels = [None] * len(gels)
         positions = list(zip(manifest.column("video"), manifest.column("frame"), strict=True))
         at = dict(zip(positions, paths, strict=True)) if self.lag and not still else {}
         sensors = [(name or "").lower() for name in names]
         fix = "Fill the column background: palpate background"
         files: list[Frame] = []
-        for k, (path, gel) in enumerate(zip(paths, manifest.column("background"), strict=True)):
+        for k, (path, gel) in enumerate(zip(paths, gels, strict=True)):
             need = column == "tactile" and any(word in sensors[k] for word in self.subtract)
             must = f"The encoder subtracts the no-contact image of {names[k] or 'every sensor'}"
             there = not need or gel is not None or self.residual

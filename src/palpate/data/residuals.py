@@ -25,7 +25,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, ClassVar, Literal
 
 import numpy as np
 import polars as pl
@@ -61,8 +61,16 @@ class Residual(Preprocess):
     std: tuple[float, ...] = (1 / 255,) * 3  # networks take values divided by 255
     subtract: tuple[str, ...] = ("",)
 
+    #: Side at which the digest of an image is taken: of its pixels, not of a residual.
+    plain_side: ClassVar[int] = 64
+
     dtype = np.dtype(np.float16)
     residual = True
+
+    @property
+    def plainly(self) -> Preprocess:
+        """The center square at :attr:`plain_side`."""
+        return Preprocess(self.plain_side, self.plain_side)
 
     def prepare(
         self,

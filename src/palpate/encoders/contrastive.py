@@ -12,25 +12,24 @@ from __future__ import annotations
 
 import copy
 import json
-import platform
-from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
-import transformers
 from numpy.typing import NDArray
 from torch import Tensor, nn
 from transformers import CLIPModel, CLIPVisionModelWithProjection
 
-from palpate._version import __version__
-from palpate.core import Progress, Split, digest_json, digest_lines, fields_of, quiet, require
+from palpate.core import Progress, Split, digest_json, fields_of, quiet, require
 from palpate.data.images import CLIP_MEAN, CLIP_STD, Preprocess, cached_images, image_stamp
 from palpate.data.manifest import Manifest
 from palpate.data.recordings import resampled_by
+from palpate.data.residuals import with_gels
+from palpate.encoders.courses import facts_of, fitted, require_held_out, require_rows, sides, stamps
 from palpate.encoders.embed import embed, texts_of
 from palpate.encoders.encoder_set import (
     EncoderSet,
@@ -41,6 +40,7 @@ from palpate.encoders.encoder_set import (
     load_clip,
     new_tactile,
 )
+from palpate.encoders.gel import GelEncoder
 from palpate.encoders.losses import (
     LOG_SCALE_START,
     clamped_scale,
@@ -50,7 +50,7 @@ from palpate.encoders.losses import (
     three_way,
 )
 from palpate.encoders.models import digest_images, digest_tensors, pick_device, union
-from palpate.encoders.presets import Course, EncoderPreset, Targets, preset_of
+from palpate.encoders.presets import Course, EncoderPreset, Gel, Targets, preset_of
 from palpate.encoders.rows import (
     Rows,
     augmented,
@@ -63,9 +63,9 @@ from palpate.encoders.rows import (
 )
 from palpate.encoders.tokenizer import train_tokenizer
 from palpate.metrics.probe import material_accuracy
-from palpate.training.engine import Batch, Losses, Task, fit
-from palpate.training.options import Compute, LoopOptions
-from palpate.training.processes import agreed, connect, first_alone, gather_rows, place
+from palpate.training.engine import Batch, Losses, Task
+from palpate.training.options import Compute
+from palpate.training.processes import agreed, connect, first_alone, gather_rows
 from palpate.training.run import TrainingRun, estimate, run_for
 from palpate.training.steps import Step, seeded
 
@@ -95,8 +95,9 @@ def train_encoder(
         data: a manifest, or anything that :func:`palpate.data.load` reads.
         split: a split or its file; its digest goes into the card. Default: the one that lies with
             the data.
-        preset: ``mini``, ``tiny``, ``tvl-tiny``, ``tvl-small``, ``tvl-base`` or ``paper``, or a
-            preset.
+        preset: ``mini``, ``tiny``, ``tvl-tiny``, ``tvl-small``, ``tvl-base`` or ``paper``; ``gel``
+            or ``self``, the learned ruler (:mod:`palpate.encoders.gel`), by all that the data say
+            or by touches alone; or a preset.
         clip: hub id or folder of a frozen CLIP, or ``palpate/mini``; a DINO, which teaches without
             texts. Default: the preset's, or a small one that is trained first on the same train
             part.
@@ -120,8 +121,15 @@ def train_encoder(
         if source is None:
             source = train_clip(manifest, split, chosen, run.stage("clip"))
         elif not isinstance(source, EncoderSet):
-            source = load_clip(source)
-        encoders = train_tactile(manifest, split, source, chosen, run.stage("tactile"))
+            source = (EncoderSet.load if chosen.alone else load_clip)(source)
+        train = train_tactile
+        if isinstance(chosen.tactile, Gel):
+            from palpate.encoders.gel_training import train_ruler
+
+            start = source if chosen.alone else None
+            manifest = with_gels(manifest, [], run.folder / "gels")[1][0]
+            train = partial(train_ruler, start=start)
+        encoders = train(manifest, split, source, chosen, run.stage("tactile"))
         parts = [
             with_values(manifest.part(split, part), "tactile", "material")
             for part in ("train", "test")
@@ -162,11 +170,15 @@ def plan_encoder(
     chosen = preset_of(preset, epochs)
     train = train_part(*load_samples(data, split))
 
-    def forward(model: nn.Module, rows: int, where: torch.device) -> Tensor:
-        return encode_tactile(model, torch.zeros(rows, 3, chosen.image, chosen.image, device=where))
+    config = chosen.tactile_config(chosen.dim)
+    gel = isinstance(chosen.tactile, Gel)
+
+    def forward(model: Any, rows: int, where: torch.device) -> Tensor:
+        pixels = torch.zeros((1 + gel) * rows, 3, chosen.image, chosen.image, device=where)
+        return model.shared(model(pixels)) if gel else encode_tactile(model, pixels)
 
     def build() -> nn.Module:
-        return CLIPVisionModelWithProjection(chosen.tactile_config(chosen.dim))
+        return GelEncoder(config) if gel else CLIPVisionModelWithProjection(config)
 
     options = chosen.tactile_course.options(len(train), 0)
     return estimate(build, forward, options, len(train), pick_device(device))
@@ -255,13 +267,13 @@ def train_tactile(
     with fields_of("tactile_course"):
         options = course.options(len(train), run.seed)
     with agreed():
-        _require_rows(train, options.batch)
+        require_rows(train, options.batch)
         must = "A vision encoder without text must have two photos to teach"
         taught = clip.tokenizer is not None or int((rows.photo >= 0).sum()) > 1
         require(taught, None, must, "fewer in the train part", fix="Choose a CLIP")
-        _require_held_out(held, options)
+        require_held_out(held, options)
     texts = rows.captions, rows.text_source
-    facts = _facts(preset, train, split, texts, options)
+    facts = facts_of(preset, train, split, texts, options)
     facts |= {m: clip.digest(m) if m in clip.modalities else None for m in ("vision", "text")}
     facts |= {"start": start.digest("tactile") if start else None}
     facts |= {"held_out": held.digest} if len(held) else {}
@@ -272,11 +284,14 @@ def train_tactile(
         len(train),
         lambda step: rows.load(step, course.augment),
         TactileLoss(rows, preprocess, preset.targets, run.compute.chunk),
-        digest_json([facts, _stamps(train)]),
+        digest_json([facts, stamps(train)]),
         train.ids,
         None if held_rows is None else (len(held), held_rows.load),
     )
-    card = _fit(model, task, options, facts, run) | {"clip": clip.name, "clip_card": clip.clip_card}
+    card = fitted(model, task, options, facts, run) | {
+        "clip": clip.name,
+        "clip_card": clip.clip_card,
+    }
     card["start_card"] = start.card if start else None
     card["synthetic"] = train.synthetic if not start or start.card.get("synthetic") else False
     card["seen_in_part"] = start is not None and not start.knows_seen("tactile")
@@ -289,26 +304,6 @@ def train_tactile(
         card=card,
         seen={**clip.seen, "tactile": seen},
     )
-
-
-def _require_rows(
-    train: Manifest, batch: int, noun: str = "samples", course: str = "tactile_course"
-) -> None:
-    must = f"The train part must hold two {noun}: the loss compares them with each other"
-    fix = "Make another split: palpate split"
-    require(len(train) > 1, None, must, f"one, {train.ids[0]}", fix=fix)
-    must = "must be at least 2: the loss compares rows"
-    require(batch > 1, f"{course}.batch", must, batch, fix="Pass a larger one")
-
-
-def _require_held_out(held: Manifest, options: LoopOptions) -> None:
-    argument = f"tactile_course.{'keep' if options.keep == 'best' else 'patience'}"
-    needless = len(held) > 0 or not (options.keep == "best" or options.patience)
-    must, fix = "needs a part val of the split", "Make one: palpate split --val 0.1"
-    require(needless, argument, must, "none", fix=fix)
-    must = "The held-out part must hold two samples: the loss compares them with each other"
-    got, fix = f"one, {''.join(held.ids[:1])}", "Make another split: palpate split"
-    require(len(held) != 1 or not options.evaluations, None, must, got, fix=fix)
 
 
 def _first_weights(
@@ -387,13 +382,13 @@ def train_clip(
     """
     where = pick_device(connect(str(run.device)))
     train = train_part(manifest, split)
-    side = _sides(train)[0]
+    side = sides(train)[0]
     pictured, course = with_values(train, side), _clip_course(preset)
     with fields_of("clip_course"):
         options = course.options(len(pictured), run.seed)
     with agreed():
         noun = "photos" if side == "vision" else "samples"
-        _require_rows(pictured, options.batch, noun, "clip_course")
+        require_rows(pictured, options.batch, noun, "clip_course")
     texts, source = texts_of(pictured)
     geometry = (
         Preprocess(preset.image, preset.image) if start is None else start.preprocess("vision")
@@ -428,7 +423,7 @@ def train_clip(
             total = info_nce(vision, text, scale, targets)
         return Losses(total, {"scale": scale.detach()}, encoded.sum(dim=1))
 
-    facts = _facts(preset, pictured, split, (texts, source), options)
+    facts = facts_of(preset, pictured, split, (texts, source), options)
     if start is not None:
         facts |= {m: start.digest(m) for m in ("vision", "text")}
         facts |= {"start": digest_tensors(start.clip.state_dict())}
@@ -437,7 +432,7 @@ def train_clip(
         facts["without_photo"] = missing
     key = digest_json([facts, image_stamp(pictured, side)])
     task = Task("training vision and text", len(pictured), load, loss, key, pictured.ids)
-    clip.clip_card = _fit(clip.clip, task, options, facts, run) | clip.clip_card
+    clip.clip_card = fitted(clip.clip, task, options, facts, run) | clip.clip_card
     clip.seen = {
         "vision": union(digest_images(images), start.seen.get("vision") if start else None)
     }
@@ -468,67 +463,3 @@ def _clip_course(preset: EncoderPreset) -> Course:
         got = f"keep {course.keep}, patience {course.patience}"
         require(course.keep != "best" and not course.patience, None, must, got)
     return course
-
-
-def _sides(train: Manifest) -> list[str]:
-    """The image columns that training uses: without a single photo, the tactile images alone."""
-    sides = ["vision", "tactile"]
-    return [side for side in sides if train.table[side].count()] or sides
-
-
-def _stamps(train: Manifest) -> list[str]:
-    """What must not have changed on disk for a checkpoint to be continued."""
-    sides = [*_sides(train), "background"]
-    return [image_stamp(with_values(train, side), side) for side in sides]
-
-
-def _facts(
-    preset: EncoderPreset,
-    train: Manifest,
-    split: Split,
-    texts: tuple[Sequence[str], str],
-    options: LoopOptions,
-) -> dict[str, Any]:
-    """What decides the result of a training run; also the run's key."""
-    return {
-        "preset": preset.name,
-        "settings": {k: v for k, v in asdict(preset).items() if k not in ("cost", "score")},
-        "options": asdict(options),
-        "seed": options.seed,
-        "train_manifest": train.digest,
-        "train_samples": len(train),
-        "split": split.digest,
-        "split_rule": dict(split.rule),
-        "texts": digest_lines(texts[0]),
-        "distinct_texts": len(set(texts[0])),
-        "text_source": texts[1],
-        "targets": preset.targets,
-    }
-
-
-def _fit(
-    model: nn.Module, task: Task, options: LoopOptions, facts: Mapping[str, Any], run: TrainingRun
-) -> dict[str, Any]:
-    """Train and freeze a model.
-
-    Returns:
-        its card: the facts, the versions, and at most 50 points of the loss curve.
-    """
-    log = fit(model, task, options, run.folder, compute=run.compute, progress=run.progress)
-    model.eval().requires_grad_(False)
-    rows = sorted({round(k) for k in np.linspace(0, len(log) - 1, min(50, len(log)))})
-    hidden = ("seconds", "lr")
-    card = {
-        **facts,
-        "steps": options.steps,
-        "device": next(model.parameters()).device.type,
-        "versions": {
-            "palpate": __version__,
-            "torch": torch.__version__,
-            "transformers": transformers.__version__,
-            "python": platform.python_version(),
-        },
-        "processes": place()[1],
-        "loss": [{k: round(v, 6) for k, v in log[r].items() if k not in hidden} for r in rows],
-    }
-    return json.loads(json.dumps(card))  # as it will be read back

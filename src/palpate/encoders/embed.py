@@ -16,6 +16,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from PIL import Image
+from torch.nn.functional import normalize
 
 from palpate.core import (
     FeatureSet,
@@ -66,6 +67,7 @@ def embed(
     groups: str = "video",
     cache: Path | None = None,
     still: bool = False,
+    raw: bool = False,
     batch: int = 128,
     progress: Progress = quiet,
 ) -> FeatureSet:
@@ -78,11 +80,13 @@ def embed(
         groups: column to carry along as groups; one without any value gives None.
         cache: folder for ``<modality>-<key>.npz``; None computes anew.
         still: take each image alone, also for encoders that look at an earlier frame, too.
+        raw: leave the numbers of a ruler as they are, not of length 1.
         batch: images at a time; changes the result by rounding only (1e-5).
         progress: called with the number of samples done.
 
     Returns:
-        n rows, float32, L2-normalized, with the encoder's digest as ``encoder``.
+        n rows, float32, L2-normalized, with the encoder's digest as ``encoder``. A ruler subtracts
+        the no-contact images of the manifest where all samples have one, else low frequencies.
 
     Raises:
         PalpateError: for an unknown modality, an empty manifest, or samples without the image or
@@ -99,14 +103,14 @@ def embed(
         frames = encoders.preprocess(modality).frames(manifest, modality, still=still)
         inputs = [image_stamp(manifest, modality), *frames.stamps(manifest.root)]
     label, group = words_of(manifest, "material"), words_of(manifest, groups)
-    key = digest_json(["palpate-embedding/1", digest, manifest.ids, inputs, label, group])
+    key = digest_json(["palpate-embedding/2", digest, manifest.ids, inputs, label, group, raw])
     file = Path(cache) / f"{modality}-{short(key)}.npz" if cache else None
 
     def compute() -> FeatureSet:
         if frames is None:
             features = embed_texts(texts, encoders, batch=batch, progress=progress)
         else:
-            features = embed_frames(frames, encoders, modality, batch, progress)
+            features = embed_frames(frames, encoders, modality, batch, progress, raw=raw)
         return FeatureSet(manifest.ids, features, label, group, digest)
 
     if file is None:
@@ -121,12 +125,14 @@ def embed_images(
     encoders: EncoderSet,
     modality: Modality = "tactile",
     *,
+    gels: NDArray[np.uint8] | None = None,
     batch: int = 128,
     progress: Progress = quiet,
 ) -> NDArray[np.float32]:
     """Embeddings of images (n, h, w, 3), 0 to 255, in memory or in a mapped file.
 
-    Other sizes than the encoder's are cut and resized as files are.
+    Other sizes than the encoder's are cut and resized as files are. ``gels`` are the no-contact
+    images (n, h, w, 3), for encoders that subtract them.
 
     Returns:
         (n, dim) float32, L2-normalized.
@@ -137,9 +143,11 @@ def embed_images(
     _require(modality, batch)
     require_rgb(images)
     fit, n = encoders.preprocess(modality).fit, len(images)
-    return _embedded(
-        n, lambda rows: fit(images[rows]), encoders, modality, batch=batch, progress=progress
-    )
+
+    def load(rows: slice) -> NDArray[Any]:
+        return fit(images[rows], None if gels is None else gels[rows])
+
+    return _embedded(n, load, encoders, modality, batch=batch, progress=progress)
 
 
 def embed_texts(
@@ -175,7 +183,13 @@ def exact() -> Generator[None]:
 
 
 def embed_frames(
-    frames: Frames, encoders: EncoderSet, modality: Modality, batch: int, progress: Progress
+    frames: Frames,
+    encoders: EncoderSet,
+    modality: Modality,
+    batch: int,
+    progress: Progress,
+    *,
+    raw: bool = False,
 ) -> NDArray[np.float32]:
     """Embed files; report all unreadable ones together."""
     preprocess, n = encoders.preprocess(modality), len(frames.files)
@@ -183,8 +197,9 @@ def embed_frames(
     def load(rows: slice) -> NDArray[np.uint8]:
         return load_images(frames.files[rows], preprocess)
 
+    sensors = frames.sensors
     return _embedded(
-        n, load, encoders, modality, batch=batch, progress=progress, sensors=frames.sensors
+        n, load, encoders, modality, batch=batch, progress=progress, sensors=sensors, raw=raw
     )
 
 
@@ -197,6 +212,7 @@ def _embedded(
     batch: int,
     progress: Progress,
     sensors: Sequence[str] | None = None,
+    raw: bool = False,
 ) -> NDArray[np.float32]:
     """Embed n prepared images, a batch in memory at a time."""
     preprocess = encoders.preprocess(modality)
@@ -213,6 +229,8 @@ def _embedded(
             with exact():
                 pixels = preprocess(to_unit(images, encoders.device))
                 part = encoders.encode(modality, pixels, sensors and sensors[rows])
+                if preprocess.residual and not raw:
+                    part = normalize(part, dim=-1)
             features[rows] = part.float().cpu().numpy()
         progress(f"embedding {modality}", min(start + batch, n), n)
     if problems:

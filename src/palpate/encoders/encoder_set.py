@@ -8,7 +8,8 @@ A saved set is a folder::
 
     palpate.json   {"format": "palpate-encoders/1", "digests": {modality: sha256}, "card": {...}}
     clip/          CLIPModel, its tokenizer and preprocessor_config.json
-    tactile/       CLIPVisionModelWithProjection and preprocessor_config.json
+    tactile/       the learned ruler (:mod:`palpate.encoders.gel`), or a
+                   CLIPVisionModelWithProjection and its preprocessor_config.json
     */seen.safetensors   digests of the images that an encoder was trained on, if they are known
     README.md      the card for people
 
@@ -54,6 +55,7 @@ from palpate.core import (
     write_json,
 )
 from palpate.data.images import SAVE_AGAIN, Frames, Preprocess, load_images
+from palpate.encoders.gel import GEL, GelEncoder
 from palpate.encoders.models import (
     FETCH_AGAIN,
     Digests,
@@ -93,6 +95,8 @@ CLIP_FIX = (
     "Pass a folder that holds config.json, model.safetensors, the tokenizer's files and "
     "preprocessor_config.json"
 )
+#: Encoders of residuals, which palpate makes.
+RULERS = (Handcrafted, GelEncoder)
 #: Kinds of transformers' models that see, and whether they read, too.
 FAMILIES = {
     "clip": True,
@@ -156,6 +160,22 @@ class EncoderSet:
         if modality == "tactile" or family_of(model) == "clip":
             return int(config.projection_dim)
         return int(getattr(config, "vision_config", config).hidden_size)
+
+    @property
+    def shared_width(self) -> int:
+        """Width of the tactile encoder's embeddings in the space of photos and texts."""
+        gel = isinstance(self.tactile, GelEncoder)
+        return self.tactile.config.projection_dim if gel else self.width("tactile")
+
+    def shared(self, rows: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Tactile features (n, width) in the space of photos and texts, (n, dim), L2-normalized.
+
+        Those of a ruler must be its numbers, of any length; of other encoders they are in it.
+        """
+        if not isinstance(self.tactile, GelEncoder):
+            return rows
+        with torch.no_grad():
+            return self.tactile.shared(torch.from_numpy(rows).to(self.device)).cpu().numpy()
 
     @property
     def device(self) -> torch.device:
@@ -267,7 +287,7 @@ class EncoderSet:
         digests, seen = self.seen.get(modality), np.zeros(len(images), bool)
         if digests is None or not len(digests):
             return seen
-        preprocess = replace(self.preprocess(modality), subtract=())
+        preprocess = self.preprocess(modality).plainly
         alone = isinstance(images, Sequence)
         frames = Frames.alone(images) if alone else preprocess.frames(images, modality)
         for start in range(0, len(seen), batch):
@@ -283,7 +303,7 @@ class EncoderSet:
         self._require(modality)
         if modality == "tactile":
             public = self.tactile if isinstance(self.tactile, TactileModule) else None
-            return None if public is None or isinstance(public, Handcrafted) else public.format
+            return None if public is None or isinstance(public, RULERS) else public.format
         if "trained_on" not in self.clip_card:
             return None
         return Origin(self.name, self.clip_card["license"], tuple(self.clip_card["trained_on"]))
@@ -307,7 +327,7 @@ class EncoderSet:
         Raises:
             PalpateError: if the widths of the spaces differ.
         """
-        widths = other.width("tactile"), self.width("vision")
+        widths = other.shared_width, self.width("vision")
         require(
             widths[0] == widths[1],
             None,
@@ -340,7 +360,10 @@ class EncoderSet:
                 tactile encoder is a public one, which is named by its file.
         """
         must, fix = "Encoders to be saved must be palpate's own", "Name the public one's file"
-        own = self.clip is not None and not isinstance(self.tactile, TactileModule)
+        public = isinstance(self.tactile, TactileModule) and not isinstance(
+            self.tactile, GelEncoder
+        )
+        own = self.clip is not None and not public
         require(own, None, must, "a public tactile encoder", fix=fix)
         assert self.clip is not None
         with atomic_folder(Path(folder)) as part:
@@ -399,8 +422,10 @@ class EncoderSet:
         if "tactile" in about["digests"]:
             part = folder / "tactile"
             must = f"The tactile encoder {part} must hold config.json and model.safetensors"
+            config = part / "config.json"
+            gel = config.is_file() and read_record(config, "model").get("model_type") == GEL
             model = load_model(
-                CLIPVisionModelWithProjection,
+                GelEncoder if gel else CLIPVisionModelWithProjection,
                 str(part),
                 must,
                 SAVE_AGAIN,
@@ -409,7 +434,9 @@ class EncoderSet:
             )
             encoders.tactile, size = model, int(model.config.image_size)
             path = part / "preprocessor_config.json"
-            encoders.preprocesses["tactile"] = Preprocess.from_config(path, size)
+            encoders.preprocesses["tactile"] = (
+                model.preprocess if gel else Preprocess.from_config(path, size)
+            )
             encoders.seen["tactile"] = load_seen(part, about["seen"].get("tactile"))
         _require_digests(encoders, about["digests"], folder)
         return encoders.to(device)
@@ -430,7 +457,9 @@ class EncoderSet:
     def _write(self, folder: Path, model: nn.Module, modality: str, half: bool) -> None:
         """Write a model of images, how they are prepared, and which it was trained on."""
         save_model(model, folder, half=half)
-        write_json(folder / "preprocessor_config.json", self.preprocesses[modality].to_config())
+        if not self.preprocesses[modality].residual:
+            config = self.preprocesses[modality].to_config()
+            write_json(folder / "preprocessor_config.json", config)
         save_seen(self.seen.get(modality), folder)
 
     def _about(

@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from transformers import CLIPConfig, CLIPVisionConfig
 
     from palpate.data.images import Preprocess
+    from palpate.encoders.gel import GelConfig
 
 #: ``diagonal``: the paper's, every other row is a negative. ``identical-text``: rows with equal
 #: captions share the target mass of the two text pairs. ``soft-text``: TVL's target of the text
@@ -74,11 +75,22 @@ class Size:
 
 
 @dataclass(frozen=True)
+class Gel:
+    """The learned ruler of residuals (:mod:`palpate.encoders.gel`).
+
+    Attributes:
+        widths: of its layers [channels].
+    """
+
+    widths: tuple[int, ...] = (16, 32, 64, 128, 128)
+
+
+@dataclass(frozen=True)
 class Course:
     """A training course.
 
     Attributes:
-        epochs: passes over the train part.
+        epochs: passes over the train part; None where there are steps.
         batch: of a step, over all processes [rows].
         lr: peak learning rate; a cosine takes it to zero.
         warmup: share of the steps in which the learning rate rises.
@@ -89,9 +101,10 @@ class Course:
         evaluations: how often the held-out part is evaluated, evenly spread over the steps.
         patience: stop after as many evaluations without a better held-out loss; None: never.
         keep: which weights become the result: the last, or those of the best held-out loss.
+        steps: without epochs, whatever the size of the train part [optimizer steps].
     """
 
-    epochs: float
+    epochs: float | None
     batch: int
     lr: float
     warmup: float = 0.05
@@ -102,15 +115,20 @@ class Course:
     evaluations: int = 10
     patience: int | None = None
     keep: Literal["last", "best"] = "last"
+    steps: int = 0
 
     def __post_init__(self) -> None:
         must, fix = "must lie in [0, 1], as a share of the steps", "Choose another value"
         require(0 <= self.warmup <= 1, "warmup", must, self.warmup, fix=fix)
+        must = "must be at least 1 where there are no epochs"
+        require(self.steps >= 1 or self.epochs is not None, "steps", must, self.steps, fix=fix)
 
     def options(self, n: int, seed: int) -> LoopOptions:
         """Return the options for ``n`` rows; no batch is larger than the set."""
         batch = min(self.batch, n)
-        steps = max(1, math.ceil(self.epochs * n / max(1, batch)))
+        steps = self.steps
+        if self.epochs is not None:
+            steps = max(1, math.ceil(self.epochs * n / max(1, batch)))
         return LoopOptions(
             steps,
             batch,
@@ -135,7 +153,7 @@ class EncoderPreset:
         pretrained: hub id or folder of the frozen CLIP, or None: a fresh one is trained first.
         image: side of what the tactile (and a fresh vision) encoder sees [px].
         patch: side of its patches [px].
-        tactile: size of the tactile encoder.
+        tactile: size of the tactile encoder; Gel is the learned ruler.
         vision, text, dim, vocabulary, context: of a fresh CLIP; ``dim`` is the width of the shared
             space, ``context`` in tokens.
         tactile_course, clip_course: how each is trained; None without a fresh CLIP.
@@ -145,6 +163,8 @@ class EncoderPreset:
         fitting: how tactile images become squares: ``crop`` takes the center, ``pad`` the whole
             between black borders, ``squash`` the whole.
         turn: ``left`` turns tactile images counterclockwise, ``portrait`` those that are wide.
+        alone: learn from touches alone, without photos, texts and labels, starting from the
+            encoder of ``pretrained``.
         data_statistics: normalize pixels by the training part's mean and deviation instead of
             CLIP's constants.
         cost: what it takes, and where that was measured.
@@ -155,7 +175,7 @@ class EncoderPreset:
     pretrained: str | None
     image: int
     patch: int
-    tactile: Size
+    tactile: Size | Gel
     tactile_course: Course
     cost: str
     score: str
@@ -168,6 +188,7 @@ class EncoderPreset:
     targets: Targets = "identical-text"
     fitting: Literal["crop", "pad", "squash"] = "crop"
     turn: Literal["none", "left", "portrait"] = "none"
+    alone: bool = False
     data_statistics: bool = True
 
     def __post_init__(self) -> None:
@@ -179,11 +200,18 @@ class EncoderPreset:
     def preprocess(self) -> Preprocess:
         """How tactile images are prepared; their statistics are the training part's."""
         from palpate.data.images import Preprocess
+        from palpate.data.residuals import Residual
 
+        if isinstance(self.tactile, Gel):
+            return Residual(self.image, self.image)
         return Preprocess(self.image, self.image, fitting=self.fitting, turn=self.turn)
 
-    def tactile_config(self, dim: int) -> CLIPVisionConfig:
+    def tactile_config(self, dim: int) -> CLIPVisionConfig | GelConfig:
         """The tactile encoder's configuration for a shared space of width ``dim``."""
+        if isinstance(self.tactile, Gel):
+            from palpate.encoders.gel import GelConfig
+
+            return GelConfig(self.tactile.widths, dim, self.image)
         return _vision(self.tactile, self.image, self.patch, dim)
 
     def clip_config(self, vocabulary: int) -> CLIPConfig:
@@ -259,6 +287,26 @@ MINI = EncoderPreset(
     text=Size(96, 2, 3),
     clip_course=_MINI_CLIP,
 )
+_GEL = Course(None, 32, 2e-3, weight_decay=0.02, clip_norm=2.0, steps=2_000)
+GEL = EncoderPreset(
+    name="gel",
+    pretrained="palpate/mini",
+    image=96,
+    patch=1,
+    tactile=Gel(),
+    tactile_course=_GEL,
+    cost="@",
+    score="@",
+)
+#: On from the shipped ruler, with touches alone; held-out recordings choose the length.
+SELF = replace(
+    GEL,
+    name="self",
+    alone=True,
+    tactile_course=replace(_GEL, steps=700, keep="best", evaluations=7),
+    cost="@",
+    score="@",
+)
 PAPER = EncoderPreset(
     name="paper",
     pretrained="laion/CLIP-ViT-L-14-DataComp.XL-s13B-b90K",
@@ -302,7 +350,7 @@ TVL = (
     _tvl("tvl-small", Size(384, 12, 6), 1.5e-4, f"{_FLOP}: 22 M parameters, 0.08 EFLOP"),
     _tvl("tvl-base", Size(768, 12, 12), 1.5e-4, f"{_FLOP}: 86 M parameters, 0.29 EFLOP"),
 )
-PRESETS = {preset.name: preset for preset in (TINY, MINI, *TVL, PAPER)}
+PRESETS = {preset.name: preset for preset in (TINY, MINI, GEL, SELF, *TVL, PAPER)}
 
 
 def preset_of(preset: str | EncoderPreset, epochs: float | None = None) -> EncoderPreset:

@@ -89,7 +89,7 @@ class Rows:
     def __init__(
         self,
         part: Manifest,
-        clip: EncoderSet,
+        clip: EncoderSet | None,
         preprocess: Preprocess,
         cache: Path | None = None,
         progress: Progress = quiet,
@@ -98,7 +98,7 @@ class Rows:
 
         Args:
             part: the samples.
-            clip: frozen vision and text encoders.
+            clip: frozen vision and text encoders; None embeds nothing.
             preprocess: how tactile images are prepared.
             cache: folder for decoded images and embeddings; None keeps them in memory.
             progress: progress callback.
@@ -112,10 +112,10 @@ class Rows:
         self.photo = torch.where(with_photo, with_photo.cumsum(0) - 1, -1)
         photographed = with_values(part, "vision")
         self.text = self.vision = None
-        if clip.tokenizer is not None:
+        if clip is not None and clip.tokenizer is not None:
             rows = embed(part, clip, "text", cache=cache, progress=progress)
             self.text = torch.from_numpy(rows.features)
-        if len(photographed):
+        if clip is not None and len(photographed):
             rows = embed(photographed, clip, "vision", cache=cache, progress=progress)
             self.vision = torch.from_numpy(rows.features)
 

@@ -275,7 +275,7 @@ def measure(
 
     folder = None if cache is None else Path(cache)
     groups = "id" if plan.group == "frame" else plan.group
-    embedded = partial(embed, groups=groups, cache=folder, progress=progress)
+    embedded = partial(embed, groups=groups, cache=folder, raw=True, progress=progress)
     seen = partial(guard, split=split, allow_seen=plan.allow_seen, progress=progress)
     parts = [manifest.part(split, part) for part in ("train", "test")]
     count = sum(map(len, parts))
@@ -315,7 +315,11 @@ def measure(
             result.notes.append(Note("probe-some-partners", {"modality": other, "count": missing}))
         test = parts[1].take(ids)
         notes += seen(encoders, other, test)
-        queries, keys = features[1].take(ids), embedded(test, encoders, other)
+        sides = {plan.modality: features[1].take(ids), other: embedded(test, encoders, other)}
+        touch = sides.get("tactile")
+        if touch is not None:
+            sides["tactile"] = replace(touch, features=encoders.shared(touch.features))
+        queries, keys = sides[plan.modality], sides[other]
         ranked = partial(
             retrieval,
             queries,

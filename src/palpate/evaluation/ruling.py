@@ -40,7 +40,9 @@ def ruler_features(bench: Bench) -> list[tuple[Samples, FeatureSet]]:
     kind, parts = with_gels(real, others, folder)
     bench.notes.append(Note("background-kind", {"kind": kind}))
     keep = folder if bench.keep else None
-    embedded = [embed(p, encoders, cache=keep, still=True, progress=bench.progress) for p in parts]
+    embedded = [
+        embed(p, encoders, cache=keep, still=True, raw=True, progress=bench.progress) for p in parts
+    ]
     rows = [e.features.astype(np.float64) for e in embedded]
     rows, scales = standardized(rows, rows[0])
     digest = digest_json([encoders.digest("tactile"), kind, scales])

@@ -1,0 +1,119 @@
+"""The learned ruler: a small network that reads the residual of a touch, not its gel.
+
+Of a residual r (:mod:`palpate.data.residuals`) the median of each channel is taken off, and
+``asinh(r / 3)`` keeps faint contacts beside strong ones. Convolutions follow; mean *and deviation*
+of the last maps over the image are the ruler's numbers, from which a linear head leads into the
+space of photos and texts.
+
+Weights of a convolution are standardized where they are used (Qiao et al. 2019, "Weight
+Standardization"): statistics of a batch would make a step depend on how many processes share it,
+and those of an image would hide how strong a contact is.
+
+Numbers are compared after ``(x - center) / spread``, of the images of the training; ``score`` takes
+mean and deviation of the reference.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+from torch.nn.functional import conv2d, layer_norm, normalize, relu
+from transformers import PretrainedConfig, PreTrainedModel
+
+from palpate.data.residuals import Residual
+from palpate.encoders.tactile_module import TactileModule
+
+#: Name of the architecture in ``config.json``.
+GEL = "palpate-gel"
+#: Gray levels at which the response turns from linear to logarithmic.
+KNEE = 3.0
+#: Sides of the kernels, and strides, of the layers.
+KERNELS, STRIDES = (5, 3, 3, 3, 3), (2, 2, 2, 2, 1)
+#: Keeps the variance of standard normal numbers behind a ReLU.
+KEEPS_VARIANCE = math.sqrt(2 / (1 - 1 / math.pi))
+
+
+class GelConfig(PretrainedConfig):
+    """Architecture of a :class:`GelEncoder`: widths of the layers, and of the shared space."""
+
+    model_type = GEL
+
+    def __init__(
+        self,
+        block_out_channels: Sequence[int] = (16, 32, 64, 128, 128),
+        projection_dim: int = 128,
+        image_size: int = 96,
+        **others: Any,
+    ) -> None:
+        self.block_out_channels = [*block_out_channels]
+        self.projection_dim, self.image_size = projection_dim, image_size
+        super().__init__(**others)
+
+
+class Layer(nn.Module):
+    """A convolution of standardized weights with a gain, and a ReLU that keeps the variance."""
+
+    def __init__(self, inputs: int, outputs: int, kernel: int, stride: int) -> None:
+        super().__init__()
+        self.weight = nn.Parameter(torch.randn(outputs, inputs, kernel, kernel))
+        self.gain, self.bias = nn.Parameter(torch.ones(outputs)), nn.Parameter(torch.zeros(outputs))
+        self.stride = stride
+
+    def forward(self, x: Tensor) -> Tensor:
+        """(n, inputs, h, w) to (n, outputs, h / stride, w / stride)."""
+        fan = self.weight[0].numel()
+        weight = layer_norm(self.weight, self.weight.shape[1:]) / math.sqrt(fan)
+        weight = weight * self.gain[:, None, None, None]
+        padding = self.weight.shape[2] // 2
+        return relu(conv2d(x, weight, self.bias, self.stride, padding)) * KEEPS_VARIANCE
+
+
+class GelEncoder(PreTrainedModel, TactileModule):
+    """The learned ruler; see the head of this file.
+
+    Attributes:
+        dim: numbers of the ruler, twice the width of the last layer.
+        center, spread: mean and deviation of the numbers over images of the training, (dim,).
+        preprocess: residuals at the side of the configuration.
+    """
+
+    config_class = GelConfig
+
+    def __init__(self, config: GelConfig) -> None:
+        super().__init__(config)
+        widths = config.block_out_channels
+        sizes = zip((3, *widths), widths, KERNELS, STRIDES, strict=False)
+        self.layers = nn.Sequential(*(Layer(*size) for size in sizes))
+        self.dim = 2 * widths[-1]
+        self.head = nn.Linear(self.dim, config.projection_dim, bias=False)
+        self.register_buffer("center", torch.zeros(self.dim))
+        self.register_buffer("spread", torch.ones(self.dim))
+        self.preprocess = Residual(config.image_size, config.image_size)
+        self.post_init()
+
+    def numbers(self, residuals: Tensor) -> Tensor:
+        """Residuals (n, 3, h, w) in gray levels to (n, dim), as they are."""
+        some = residuals[:, :, ::4, ::4].flatten(2)
+        x = torch.asinh((residuals - some.median(2).values[:, :, None, None]) / KNEE)
+        x = self.layers(x).flatten(2)
+        return torch.cat([x.mean(2), (x.var(2) + 1e-4).sqrt()], 1)
+
+    def forward(self, pixels: Tensor, sensors: Tensor | None = None) -> Tensor:
+        """Residuals (n, 3, h, w) in gray levels to (n, dim), standardized."""
+        return (self.numbers(pixels) - self.center) / self.spread
+
+    def encode(self, pixels: Tensor, sensors: Sequence[str] | None = None) -> Tensor:
+        """The same; its rows keep their length, which the reference's deviations need."""
+        return self(pixels)
+
+    def shared(self, numbers: Tensor) -> Tensor:
+        """Standardized numbers (n, dim) in the space of photos and texts, of length 1."""
+        x = numbers * self.spread + self.center
+        return normalize(self.head(layer_norm(x, (self.dim,))), dim=-1)
+
+    def _init_weights(self, module: nn.Module) -> None:
+        """Keep the weights as the layers draw them."""

@@ -1,0 +1,364 @@
+"""Training of the learned ruler (:mod:`palpate.encoders.gel`).
+
+A step takes rows and a partner of each: another frame of its contact, or another contact of its
+object. Both are changed at random in what tells nothing of the object (angle, hue, zoom, strength,
+blur, noise), and four losses are added:
+
+- contrast (InfoNCE) of a touch with its partner against all touches of other objects;
+- smooth L1 of the 149 numbers of ``palpate/handcrafted`` of the unchanged residual: area and
+  strength of the contact, bands and directions of the surface;
+- cross entropy of the material, where samples have one;
+- InfoNCE with the frozen embeddings of photo and text, where samples have them (paper section 3).
+
+By itself (``self_supervised``) it learns from touches alone, by the first two.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from functools import partial
+
+import numpy as np
+import polars as pl
+import torch
+from numpy.typing import NDArray
+from torch import Tensor, nn
+from torch.nn.functional import (
+    affine_grid,
+    avg_pool2d,
+    cross_entropy,
+    grid_sample,
+    layer_norm,
+    normalize,
+    relu,
+    smooth_l1_loss,
+)
+
+from palpate.core import Split, digest_json, require, rng_for
+from palpate.core.features import is_missing
+from palpate.data.images import Preprocess, cached_images
+from palpate.data.manifest import Manifest
+from palpate.data.residuals import Residual
+from palpate.encoders.courses import facts_of, fitted, require_held_out, require_rows, stamps
+from palpate.encoders.embed import embed, texts_of
+from palpate.encoders.encoder_set import EncoderSet
+from palpate.encoders.gel import GelEncoder
+from palpate.encoders.losses import LOG_SCALE_START, clamped_scale, info_nce, soft_targets
+from palpate.encoders.models import digest_images, pick_device, to_unit, union
+from palpate.encoders.presets import EncoderPreset
+from palpate.encoders.rows import Rows, bytes_to_unit, evenly_spaced, factorize, train_part
+from palpate.training.engine import Batch, Losses, Task
+from palpate.training.processes import agreed, connect, first_alone, gather_rows
+from palpate.training.run import TrainingRun
+from palpate.training.steps import Step, seeded
+
+#: The ruler whose numbers are told.
+HANDCRAFTED = "palpate/handcrafted"
+#: Factors of the four losses.
+CONTRAST, NUMBERS, NAMES, PHOTOS = 0.5, 4.0, 0.5, 1.0
+#: Temperature of the contrast, and width of what it is taken of and of the layer before.
+TEMPERATURE, NARROW, HIDDEN = 0.15, 64, 128
+#: Share of partners that are another contact of the object.
+FAR = 0.5
+#: Largest size of a standardized number to be told.
+LARGEST = 5.0
+#: Images whose numbers are averaged for center and spread.
+STATISTICS = 4096
+#: Range of the zoom; deviations of shift [share of the side], and of the logarithms of saturation
+#: and strength; largest deviation of the noise [gray levels].
+ZOOM, SHIFT, SATURATION, STRENGTH, NOISE = (0.7, 1.45), 0.12, 0.3, 0.35, 1.0
+
+
+class Touches:
+    """The touches of the train part and of the held-out part, as training reads them.
+
+    Attributes:
+        rows: images, captions and what photos and texts are embedded as, of both parts.
+        unit: number of the object of each sample, else of its video, within its part (n,).
+        numbers: what is told of each, standardized (n, 149).
+        names: number of each material (n,), -1 without one; ``classes`` in all.
+    """
+
+    def __init__(
+        self, train: Manifest, held: Manifest, clip: EncoderSet | None, run: TrainingRun, side: int
+    ) -> None:
+        """Decode and embed the samples; without ``clip`` their touches alone.
+
+        Raises:
+            PalpateError: if no two touches of the train part are of one video or object.
+        """
+        part = replace(train, table=pl.concat([train.table, held.table]))
+        self.rows = Rows(part, clip, Residual(side, side), run.cache, run.progress)
+        self.unit = factorize(units_of(train, "train") + units_of(held, "val")).numpy()
+        must = "The train part must hold two touches of one object, contact or video"
+        fix = "Fill the column video, object or contact"
+        several = len({*self.unit[: len(train)].tolist()}) < len(train)
+        require(several, None, must, "none", fix=fix)
+        contacts = part.column("contact")
+        keys = [f"{unit}\n{c}" for unit, c in zip(self.unit.tolist(), contacts, strict=True)]
+        contact = factorize(keys).numpy()
+        self._order = np.lexsort((contact, self.unit))
+        self._place = np.argsort(self._order)
+        starts = (np.flatnonzero(np.diff(v[self._order], prepend=-1)) for v in (self.unit, contact))
+        self._blocks = [np.append(first, len(part)) for first in starts]
+        told = embed(part, EncoderSet.load(HANDCRAFTED), raw=True, cache=run.cache).features
+        told = (told - told.mean(axis=0)) / np.maximum(told.std(axis=0), 1e-3)
+        self.numbers = torch.from_numpy(told.clip(-LARGEST, LARGEST))
+        materials = ["" if is_missing(v) else str(v) for v in part.column("material")]
+        known = sorted({*materials} - {""}) if clip is not None else []
+        number = {name: k for k, name in enumerate(known)}
+        self.names = torch.tensor([number.get(name, -1) for name in materials])
+        self.classes = len(known)
+
+    def partners(self, rows: NDArray[np.int64], u: NDArray[np.float64]) -> NDArray[np.int64]:
+        """A partner of each row, by two uniform numbers (n, 2); the row itself if it has none."""
+        at = self._place[rows]
+        (top, end), (low, high) = (
+            (block[k := np.searchsorted(block, at, "right") - 1], block[k + 1])
+            for block in self._blocks
+        )
+        near, others = high - low - 1, (end - top) - (high - low)
+        within = low + (at - low + 1 + (u[:, 1] * near).astype(int)) % (high - low)
+        beyond = top + (u[:, 1] * others).astype(int)
+        beyond = beyond + (beyond >= low) * (high - low)
+        far = (others > 0) & ((u[:, 0] < FAR) | (near == 0))
+        return self._order[np.where(far, beyond, within)]
+
+    def load(self, step: Step, first: int = 0) -> Batch:
+        """The batch of a step: b rows of this process and B of all, then as many partners.
+
+        Args:
+            step: which rows, and their random numbers.
+            first: row of the part that the step's rows are counted from.
+
+        Returns:
+            ``images`` float16 (2b, s, s, 3) and the random numbers of :func:`views`; ``unit``,
+            ``name`` (2B,), ``numbers`` (2B, 149), and what there is of ``photo`` bool, ``vision``,
+            ``text``, ``caption``.
+        """
+        rows = first + step.all_rows
+        u = torch.rand(len(rows), 2, generator=step.generator).double().numpy()
+        partners = self.partners(rows, u)
+        images = self.rows.images[np.concatenate([rows[step.mine], partners[step.mine]])]
+        every = torch.from_numpy(np.concatenate([rows, partners]))
+        batch = {
+            "images": torch.from_numpy(np.array(images)),
+            "uniform": step.rand(2, 7).transpose(0, 1).flatten(0, 1),
+            "normal": step.randn(2, 4).transpose(0, 1).flatten(0, 1),
+            "noise": step.randn(2, 3, *images.shape[1:3]).transpose(0, 1).flatten(0, 1).half(),
+            "unit": torch.from_numpy(self.unit)[every],
+            "numbers": self.numbers[every],
+            "name": self.names[every],
+        }
+        if self.rows.text is not None:
+            batch |= {"text": self.rows.text[every], "caption": self.rows.caption_ids[every]}
+        if self.rows.vision is not None:
+            photo = self.rows.photo[every]
+            batch |= {"photo": photo >= 0, "vision": self.rows.vision[photo.clamp(min=0)]}
+        return batch
+
+
+def units_of(part: Manifest, name: str) -> list[str]:
+    """What the touches of a part are of: object, else video, else each alone."""
+    columns = zip(part.column("object"), part.column("video"), part.ids, strict=True)
+    return [f"{name}\n{o or v or k}" for o, v, k in columns]
+
+
+def views(images: Tensor, batch: Batch) -> Tensor:
+    """Residuals (n, 3, h, w) in gray levels, changed by the random numbers of a batch.
+
+    Any angle, mirror, zoom and shift; colors turned about gray by any angle and mirrored, their
+    saturation, and the strength of all; blur of half of the images; noise.
+    """
+    u, normal = batch["uniform"], batch["normal"]
+    angle, hue = 2 * math.pi * u[:, 0], 2 * math.pi * u[:, 1]
+    zoom = torch.exp(math.log(ZOOM[0]) + u[:, 2] * math.log(ZOOM[1] / ZOOM[0]))
+    mirror, cos, sin = zoom * (1 - 2 * (u[:, 3] < 0.5).float()), angle.cos(), angle.sin()
+    across = torch.stack([mirror * cos, -zoom * sin, SHIFT * normal[:, 0]], 1)
+    down = torch.stack([mirror * sin, zoom * cos, SHIFT * normal[:, 1]], 1)
+    grid = affine_grid(torch.stack([across, down], 1), list(images.shape), align_corners=False)
+    images = grid_sample(images, grid, padding_mode="reflection", align_corners=False)
+    images = torch.einsum("nkc,nchw->nkhw", _recolored(hue, u[:, 4], normal[:, 2:]), images)
+    blur = (2 * u[:, 5] - 1).clamp(min=0).view(-1, 1, 1, 1)
+    images = images + blur * (avg_pool2d(images, 3, 1, 1, count_include_pad=False) - images)
+    return images + batch["noise"].float() * (NOISE * u[:, 6]).view(-1, 1, 1, 1)
+
+
+def _recolored(hue: Tensor, swap: Tensor, normal: Tensor) -> Tensor:
+    """Matrices (n, 3, 3) of colors: turned about gray, mirrored, less or more saturated, scaled."""
+    eye, gray = torch.eye(3, device=hue.device), torch.full((3, 3), 1 / 3, device=hue.device)
+    cross = eye[[1, 2, 0]] - eye[[2, 0, 1]]
+    cross = cross / math.sqrt(3)
+    sin, cos = hue.sin().view(-1, 1, 1), hue.cos().view(-1, 1, 1)
+    turned = eye + sin * cross + (1 - cos) * (cross @ cross)
+    turned = torch.where((swap < 0.5).view(-1, 1, 1), turned @ eye[[1, 0, 2]], turned)
+    saturation, strength = torch.exp(normal * normal.new_tensor([SATURATION, STRENGTH])).unbind(1)
+    colors = saturation.view(-1, 1, 1) * turned @ (eye - gray) + turned @ gray
+    return strength.view(-1, 1, 1) * colors
+
+
+class GelModel(nn.Module):
+    """What trains: the ruler, and heads that are thrown away."""
+
+    def __init__(self, ruler: GelEncoder, told: int, classes: int) -> None:
+        super().__init__()
+        self.ruler = ruler
+        self.hidden = nn.Linear(ruler.dim, HIDDEN)
+        self.narrow, self.numbers = nn.Linear(HIDDEN, NARROW), nn.Linear(HIDDEN, told)
+        self.names = nn.Linear(HIDDEN, classes) if classes else None
+        self.log_scale = nn.Parameter(torch.tensor(LOG_SCALE_START))
+
+
+@dataclass
+class GelLoss:
+    """The loss of a batch of :class:`Touches`."""
+
+    preprocess: Preprocess
+
+    def __call__(self, module: nn.Module, batch: Batch) -> Losses:
+        """Return the sum of the losses, and each of them to log."""
+        assert isinstance(module, GelModel)
+        images = self.preprocess(bytes_to_unit(batch["images"]))
+        numbers = module.ruler.numbers(views(images, batch))
+        pairs = numbers.unflatten(0, (2, -1)).transpose(0, 1)  # rows of all processes, together
+        pairs = gather_rows(pairs.contiguous(), batch=len(batch["unit"]) // 2)
+        with torch.autocast(numbers.device.type, enabled=False):
+            pooled = pairs.transpose(0, 1).flatten(0, 1).float()
+            hidden = relu(module.hidden(layer_norm(pooled, pooled.shape[1:])))
+            told = smooth_l1_loss(module.numbers(hidden), batch["numbers"])
+            losses = {"contrast": contrast(module.narrow(hidden), batch["unit"]), "numbers": told}
+            total = CONTRAST * losses["contrast"] + NUMBERS * told
+            if module.names is not None and (named := batch["name"] >= 0).any():
+                losses["names"] = cross_entropy(module.names(hidden[named]), batch["name"][named])
+                total = total + NAMES * losses["names"]
+            scale, shared = clamped_scale(module.log_scale), module.ruler.shared(pooled)
+            if "text" in batch:
+                same = soft_targets(batch["caption"])
+                losses["text"] = info_nce(shared, batch["text"], scale, same)
+                total = total + PHOTOS / 2 * losses["text"]
+            if "vision" in batch:
+                some = batch["photo"]
+                losses["vision"] = info_nce(shared[some], batch["vision"][some], scale)
+                total = total + PHOTOS / 2 * losses["vision"]
+        rows = numbers.detach().sum(dim=1).unflatten(0, (2, -1)).sum(dim=0)
+        return Losses(total, {k: v.detach() for k, v in losses.items()}, rows)
+
+
+def contrast(embedded: Tensor, unit: Tensor) -> Tensor:
+    """InfoNCE of rows with their partners, against rows of other objects (Chen et al. 2020).
+
+    Args:
+        embedded: (2n, d); row k + n is the partner of row k.
+        unit: number of the object of each row (2n,).
+    """
+    n = len(embedded) // 2
+    z = normalize(embedded, dim=1)
+    rows = torch.arange(2 * n, device=z.device)
+    partner, hidden = rows.roll(n), unit[:, None] == unit
+    hidden[rows, partner] = False
+    return cross_entropy((z @ z.T / TEMPERATURE).masked_fill(hidden, -1e9), partner)
+
+
+def train_ruler(
+    manifest: Manifest,
+    split: Split,
+    clip: EncoderSet,
+    preset: EncoderPreset,
+    run: TrainingRun,
+    *,
+    start: EncoderSet | None = None,
+) -> EncoderSet:
+    """Train the learned ruler on the train part of a split; run again to resume.
+
+    Args:
+        manifest: samples with tactile images and, all or none, their no-contact images
+            (:func:`palpate.data.residuals.with_gels`).
+        split: its parts ``train`` and ``val`` are read. A preset that learns from touches alone
+            holds a tenth of the recordings of ``train`` out where there is no ``val``.
+        clip: vision and text to learn from, and to be joined with; moved to the run's device.
+        preset: size and course.
+        run: folders, seed and machine.
+        start: go on from this set's ruler instead of random weights.
+
+    Returns:
+        All three encoders with a card, which names the recordings that the ruler saw.
+
+    Raises:
+        PalpateError: if the train part is empty, a sample lacks its image, or ``start`` has no
+            ruler of the preset's size.
+    """
+    where = pick_device(connect(str(run.device)))
+    train, held = train_part(manifest, split), manifest.part(split, "val")
+    if preset.alone and not len(held):
+        train, held = held_out(train, run.seed)
+    with seeded(run.seed, "tactile encoder"):
+        ruler = GelEncoder(preset.tactile_config(clip.dim))
+    if start is not None:
+        same = isinstance(start.tactile, GelEncoder) and start.tactile.config.to_dict()
+        must, fix = "must have a learned ruler of the preset's size", "Leave it out"
+        require(same == ruler.config.to_dict() | {}, "start", must, "another", fix=fix)
+        ruler.load_state_dict(start.tactile.state_dict())
+    options = preset.tactile_course.options(len(train), run.seed)
+    with agreed():
+        require_rows(train, options.batch)
+        require_held_out(held, options)
+    clip.to(where)
+    with first_alone():
+        teacher = None if preset.alone else clip
+        touches = Touches(train, held, teacher, run, preset.image)
+    facts = facts_of(preset, train, split, texts_of(train), options)
+    facts |= {m: clip.digest(m) for m in clip.modalities if m != "tactile"}
+    facts |= {"start": start.digest("tactile") if start else None}
+    facts |= {"held_out": held.digest} if len(held) else {}
+    with seeded(run.seed, "heads of the ruler"):
+        model = GelModel(ruler, touches.numbers.shape[1], touches.classes).to(where)
+    task = Task(
+        "training the ruler",
+        len(train),
+        touches.load,
+        GelLoss(ruler.preprocess),
+        digest_json([facts, stamps(train)]),
+        train.ids,
+        (len(held), partial(touches.load, first=len(train))) if len(held) else None,
+    )
+    card = fitted(model, task, options, facts, run)
+    card |= {"clip": clip.name, "clip_card": clip.clip_card}
+    card["start_card"] = start.card if start else None
+    card["synthetic"] = train.synthetic if not start or start.card.get("synthetic") else False
+    card["seen_in_part"] = start is not None and not start.knows_seen("tactile")
+    card["recordings"] = sorted({name.partition("\n")[2] for name in units_of(train, "")})
+    standardize(ruler, touches, len(train))
+    plain = ruler.preprocess.plainly
+    seen = digest_images(cached_images(train, "tactile", plain, run.cache, run.progress))
+    return replace(
+        clip,
+        tactile=ruler,
+        sensor=None,
+        preprocesses={**clip.preprocesses, "tactile": ruler.preprocess},
+        card=card,
+        seen={**clip.seen, "tactile": union(seen, start.seen.get("tactile") if start else None)},
+    )
+
+
+def held_out(train: Manifest, seed: int) -> tuple[Manifest, Manifest]:
+    """The train part without a tenth of its recordings, and those."""
+    units = units_of(train, "")
+    names = rng_for(seed, "held-out recordings").permutation(sorted({*units}))
+    kept = {*names[max(1, len(names) // 10) :].tolist()}
+    parts = [
+        [k for k, u in zip(train.ids, units, strict=True) if (u in kept) == k_] for k_ in (1, 0)
+    ]
+    return train.take(parts[0]), train.take(parts[1])
+
+
+@torch.no_grad()
+def standardize(ruler: GelEncoder, touches: Touches, n: int) -> None:
+    """Set center and spread to those of the n images of the train part."""
+    parts: list[Tensor] = []
+    rows, images = evenly_spaced(n, STATISTICS), touches.rows.images
+    for some in np.array_split(rows, math.ceil(len(rows) / 128)):
+        parts.append(ruler.numbers(ruler.preprocess(to_unit(images[some], ruler.device))))
+    numbers = torch.cat(parts)
+    ruler.center.copy_(numbers.mean(0))
+    ruler.spread.copy_(numbers.std(0).clamp(min=1e-3))
