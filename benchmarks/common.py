@@ -140,7 +140,7 @@ class Study:
         hits = self.judge.names(images) == self.answers
         features = FeatureSet(
             self.test.ids,
-            embed_images(np.asarray(images), self.encoders),
+            embed_images(np.asarray(images), self.encoders, gels=self.gels),
             self.test.column("material"),
             self.videos,
             self.encoders.digest("tactile"),

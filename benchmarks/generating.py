@@ -297,7 +297,7 @@ class Bench:
 
         def judged(pixels):
             hits = (judge.names(pixels) == answers).astype(float)
-            rows = embed_images(np.asarray(pixels), self.encoders)
+            rows = embed_images(np.asarray(pixels), self.encoders, gels=gels)
             features = replace(real, features=rows)
             row = {
                 "cnn": by_video(hits, videos),

@@ -3,6 +3,7 @@ write their cards.
 
     python recipes/mini.py --work runs/mini                     # everything
     python recipes/mini.py --work runs/mini --only autoencoder  # one part and what it needs
+    python recipes/mini.py --work runs/mini --tactile --ship    # the tactile encoder alone, anew
     python recipes/mini.py --work runs/mini --ship              # and write src/palpate/mini
     python recipes/mini.py --work runs/mini --verify            # score what ships again
 
@@ -15,8 +16,11 @@ world          seed      read by
 gelsight       900000    every part
 digit          900001    the autoencoder alone: the other look of the sensor
 photos         900002    the vision encoder alone: 16,000 more objects, one photo of each
+gel 0 .. 13    900010 .. the tactile encoder: pads of 9 to 22 mm, 0 to 12 rows of markers, DIGIT
 new gelsight   900050    scores: new objects, videos and gel units
 new digit      900051    scores of the autoencoder
+new gel        900052    scores of the tactile encoder: a pad of 14 mm, 8 rows of markers
+new pad        900053    scores of the tactile encoder: a pad of 26 mm, 10 rows of markers
 =============  ========  =========================================================================
 
 Weights are rounded to 16 bits before anything is scored, so the scores are those of the shipped
@@ -39,7 +43,7 @@ from mini_cards import ship, write_page
 from mini_scores import score_all
 from numpy.typing import NDArray
 
-from palpate.core import PalpateError, Split, digest_json, read_json, write_json
+from palpate.core import PalpateError, Split, digest_json, read_json, rng_for, write_json
 from palpate.data.images import cached_images
 from palpate.data.manifest import Manifest
 from palpate.diffusion.autoencoder import AnyAutoencoder, load_autoencoder
@@ -48,8 +52,9 @@ from palpate.diffusion.options import BackgroundOptions, SamplerOptions
 from palpate.diffusion.pipeline import TactilePipeline
 from palpate.diffusion.presets import MINI as DIFFUSION
 from palpate.diffusion.training import Parts, train_pipeline
-from palpate.encoders.contrastive import train_clip, train_tactile
+from palpate.encoders.contrastive import train_clip
 from palpate.encoders.encoder_set import EncoderSet, load_clip
+from palpate.encoders.gel_training import train_ruler
 from palpate.encoders.models import SHIPPED, shipped_root
 from palpate.encoders.presets import EncoderPreset, preset_of
 from palpate.sim import PRESETS, VERSION, WorldOptions, write_world
@@ -72,11 +77,43 @@ WORLDS: dict[str, WorldOptions] = {
     "new gelsight": replace(_BASE, seed=900_050, objects_per_material=10),
     "new digit": replace(_BASE, seed=900_051, objects_per_material=4, look="digit"),
 }
+_GEL = replace(
+    _BASE,
+    size=128,
+    tile=384,
+    mixed=0.0,
+    sensors=24,
+    load_mm=(0.03, 0.5),
+    sensor_noise=(0.001, 0.006),
+)
+for _name, _seed, _pad, _rows in (("new gel", 900_052, 14.0, 8), ("new pad", 900_053, 26.0, 10)):
+    WORLDS[_name] = replace(_GEL, seed=_seed, objects_per_material=20, pad_mm=_pad, markers=_rows)
+
+
+def gel(number: int) -> WorldOptions:
+    """One of the worlds that the tactile encoder learns from beside ``gelsight``: another gel,
+    load, noise and codec each.
+    """
+    rng = rng_for(SEED, "gel world", number)
+    return replace(
+        _GEL,
+        seed=900_010 + number,
+        objects_per_material=6,
+        look="digit" if number % 3 == 0 else "gelsight",
+        pad_mm=round(math.exp(rng.uniform(math.log(9), math.log(22))), 1),
+        markers=int(rng.choice([0, 0, 6, 8, 12])),
+        quality=int(rng.choice([95, 95, 90, 80, 70, 60, 50])),
+    )
+
+
+GELS = [f"gel {number}" for number in range(14)]
+WORLDS |= {name: gel(number) for number, name in enumerate(GELS)}
 ENCODER = preset_of("mini")
 #: Of the vision encoder when it goes on: more rows to tell apart.
+TACTILE = preset_of("gel")
 VISION = replace(ENCODER, clip_course=replace(ENCODER.clip_course, batch=256, lr=2e-3))
 #: Passes over the data. One core sees about 400 images a second in training.
-CLIP_EPOCHS, TACTILE_EPOCHS, VISION_EPOCHS = 14.0, 8.0, 20.0
+CLIP_EPOCHS, VISION_EPOCHS = 14.0, 20.0
 AUTOENCODER = BackgroundOptions(steps=6_000)
 GENERATOR = replace(DIFFUSION, loop=replace(DIFFUSION.loop, batch=32, warmup=100))
 #: Of a round of the generator's training, and how many rounds: each goes on from the last.
@@ -93,10 +130,12 @@ def main() -> int:
     )
     parser.add_argument("--work", type=Path, default=Path("runs/mini"))
     parser.add_argument("--only", choices=PARTS, default="scores", help="the last part to make")
+    parser.add_argument("--tactile", action="store_true", help="keep all else as it ships")
+    parser.add_argument("--seed", type=int, default=SEED, help="of the tactile encoder")
     parser.add_argument("--ship", action="store_true", help="write src/palpate/mini")
     parser.add_argument("--verify", action="store_true", help="score the shipped models again")
     options = parser.parse_args()
-    recipe = Recipe(options.work)
+    recipe = Recipe(options.work, options.tactile, options.seed)
     try:
         if options.verify:
             return recipe.verify()
@@ -145,8 +184,9 @@ def _seeing(preset: EncoderPreset, epochs: float) -> EncoderPreset:
 class Recipe:
     """The parts, each a stage of a run folder; a finished stage is read, not made again."""
 
-    def __init__(self, work: Path) -> None:
-        self.work, self.cache = work, work / "cache"
+    def __init__(self, work: Path, tactile: bool = False, seed: int = SEED) -> None:
+        """Work in a folder; with ``tactile`` all but the tactile encoder is what ships."""
+        self.work, self.cache, self.kept, self.seed = work, work / "cache", tactile, seed
         self.common: dict[str, Any] = {"cache": self.cache, "progress": self.progress}
 
     def stage(
@@ -164,7 +204,8 @@ class Recipe:
     def make(self, last: str) -> None:
         """Make the part ``last`` and what it needs."""
         for name in WORLDS:
-            self.world(name)
+            if not self.kept or name not in ("digit", "photos"):
+                self.world(name)
         if last != "worlds":
             getattr(self, last)()
 
@@ -197,40 +238,47 @@ class Recipe:
     def _run(self, folder: Path) -> TrainingRun:
         return TrainingRun(folder / "training", seed=SEED, cache=self.cache, progress=self.progress)
 
-    def tactile(self) -> EncoderSet:
-        """The pair and a tactile encoder that learns from it."""
-        clip, train = self.clip(), self.world("gelsight")
-        preset = preset_of(ENCODER, TACTILE_EPOCHS)
-
-        def build(folder: Path) -> Mapping[str, Any]:
-            pair = load_clip(clip.folder / "clip")
-            run = self._run(folder)
-            encoders = train_tactile(train, everything(train), pair, preset, run)
-            encoders.save(cleared(folder / "encoders"))
-            return {"tactile": encoders.digest("tactile"), "text": encoders.digest("text")}
-
-        inputs = {"preset": preset, "seed": SEED, "clip": clip.digest}
-        return EncoderSet.load(self.stage("tactile", inputs, build).folder / "encoders")
-
-    def encoders(self) -> EncoderSet:
-        """The three encoders; vision goes on with one photo each of many more objects."""
-        encoders = self.tactile()
+    def pair(self) -> EncoderSet:
+        """Vision and text; vision goes on with one photo each of many more objects."""
+        if self.kept:
+            return load_clip(NAME)
+        clip = self.clip()
         parts = [self.world(name).prefixed(f"{name}/") for name in ("gelsight", "photos")]
         train = Manifest.join(*parts)
 
         def build(folder: Path) -> Mapping[str, Any]:
             run = replace(self._run(folder), compute=COMPUTE)
-            preset = _seeing(VISION, VISION_EPOCHS)
-            clip = train_clip(train, everything(train), preset, run, start=encoders)
-            clip.with_tactile(encoders).save(cleared(folder / "encoders"))
-            return {"vision": clip.digest("vision")}
+            preset, start = _seeing(VISION, VISION_EPOCHS), load_clip(clip.folder / "clip")
+            pair = train_clip(train, everything(train), preset, run, start=start)
+            pair.save(cleared(folder / "pair"))
+            return {"vision": pair.digest("vision")}
 
         inputs = {"preset": VISION, "epochs": VISION_EPOCHS, "seed": SEED, "train": train.digest}
-        inputs |= {m: encoders.digest(m) for m in encoders.modalities}
-        return EncoderSet.load(self.stage("encoders", inputs, build).folder / "encoders")
+        inputs |= {"clip": clip.digest}
+        return EncoderSet.load(self.stage("pair", inputs, build).folder / "pair")
+
+    def encoders(self) -> EncoderSet:
+        """The three encoders: the tactile one learns from many gels, against vision and text."""
+        pair = self.pair()
+        pair.halve()
+        parts = [self.world(name).prefixed(f"{name}/") for name in ("gelsight", *GELS)]
+        train = Manifest.join(*parts)
+
+        def build(folder: Path) -> Mapping[str, Any]:
+            run = replace(self._run(folder), seed=self.seed)
+            encoders = train_ruler(train, everything(train), pair, TACTILE, run)
+            encoders.save(cleared(folder / "encoders"))
+            return {"tactile": encoders.digest("tactile")}
+
+        inputs = {"preset": TACTILE, "seed": self.seed, "train": train.digest}
+        inputs |= {m: pair.digest(m) for m in pair.modalities}
+        name = f"tactile {self.seed}" if self.seed else "tactile"
+        return EncoderSet.load(self.stage(name, inputs, build).folder / "encoders")
 
     def autoencoder(self) -> AnyAutoencoder:
         """The background autoencoder, of tactile images of both looks."""
+        if self.kept:
+            return load_autoencoder(NAME)
         parts = [self.world(name) for name in ("gelsight", "digit")]
         digests = [part.digest for part in parts]
 
@@ -251,7 +299,9 @@ class Recipe:
 
     def generator(self) -> TactilePipeline:
         """From a photo to a tactile image, in the space of the rounded encoders and autoencoder."""
-        parts = self.encoders(), self.autoencoder(), self.world("gelsight")
+        if self.kept:
+            return TactilePipeline.from_pretrained(NAME)
+        parts = self.pair(), self.autoencoder(), self.world("gelsight")
         parts[0].halve()
         parts[1].halve()
         pipeline = None
@@ -307,13 +357,15 @@ class Recipe:
         inputs = {
             "models": [*digests, models[2].digest],
             "sampler": GENERATOR.sampler,
-            "worlds": [self.world(name).digest for name in WORLDS],
+            "worlds": [part.digest for part in self._samples().values()],
         }
-        stage = self.stage("scores", inputs, build)
+        name = f"scores {self.seed}" if self.seed else "scores"
+        stage = self.stage(name, inputs, build)
         return read_json(stage.folder / "scores.json", "scores")
 
     def _samples(self) -> dict[str, Manifest]:
-        return {name: self.world(name) for name in WORLDS}
+        names = "gelsight", "new gelsight", "new digit", "new gel", "new pad"
+        return {name: self.world(name) for name in names}
 
     @staticmethod
     def _halve(
@@ -338,7 +390,13 @@ class Recipe:
 
     def _worlds(self) -> list[dict[str, Any]]:
         rows: list[dict[str, Any]] = []
+        kept = EncoderSet.load(NAME).clip_card["data"] if self.kept else []
+        kept += load_autoencoder(NAME).card["data"] if self.kept else []
+        shipped = {row["world"]: row for row in kept}
         for name, o in WORLDS.items():
+            if self.kept and name in ("digit", "photos"):
+                rows.append(shipped[name])
+                continue
             facts = stored_stage(self.work / f"world {name}").facts
             row = {"world": name, "seed": o.seed, "look": o.look, "version": VERSION}
             rows.append(row | {key: facts[key] for key in ("frames", "videos", "digest")})

@@ -23,10 +23,10 @@ SUMMARIES = {
         "Vision, text and tactile encoders of palpate's world",
         "Three small encoders with one space of 128 dimensions: a CLIP (vision and text, with"
         " its tokenizer) trained on photos and captions of the procedural world, which say "
-        "what is felt and name no material, and a "
-        "tactile encoder trained against it with the three-way InfoNCE; then vision went on "
-        "against the text encoder as it is, with many more photos. They replace the frozen CLIP "
-        "of the paper where no hub is in reach.",
+        "what is felt and name no material; vision went on against the text encoder as it is, with "
+        "many more photos. They replace the frozen CLIP of the paper where no hub is in reach. The "
+        "tactile encoder sees the residual to the no-contact image, learns from many gels which "
+        "touches are of one object, and is trained against photos and texts through its head.",
     ),
     "autoencoder": (
         "Background autoencoder of tactile images of palpate's world",
@@ -47,8 +47,8 @@ PAIR = (
     "Vision and text encoders of palpate's world",
     "A small CLIP with its tokenizer, trained on photos and captions of the procedural world,"
     " which say what is felt and name no material;"
-    " its space has 128 dimensions. The tactile encoder next to it was trained against it;"
-    " then the vision encoder went on, with many more photos, against the text encoder as it is.",
+    " its space has 128 dimensions. The vision encoder went on, with many more photos, against"
+    " the text encoder as it is.",
 )
 LIMITS = (
     "Knows only the procedural world of palpate: 20 simulated materials and a simulated gel. "
@@ -57,7 +57,10 @@ LIMITS = (
     "real data sets.",
 )
 READ = {
-    "encoders": ("gelsight", "photos", "new gelsight"),
+    "encoders": (
+        *("gelsight", "photos", *(f"gel {number}" for number in range(14))),
+        *("new gelsight", "new gel", "new pad"),
+    ),
     "autoencoder": ("gelsight", "digit", "new gelsight", "new digit"),
     "generator": ("gelsight", "photos", "new gelsight"),
 }
@@ -103,7 +106,8 @@ def ship(
     encoders.clip_card = {**encoders.clip_card, **pair}
     autoencoder.card = {**autoencoder.card, **card("autoencoder")}
     pipeline = replace(pipeline, training={**pipeline.training, **card("generator")})
-    shutil.rmtree(target, ignore_errors=True)  # git has what was there
+    for part in READ:  # git has what was there
+        shutil.rmtree(target / part, ignore_errors=True)
     encoders.save(target / "encoders", half=True)
     autoencoder.save(target / "autoencoder", half=True)
     pipeline.save(target / "generator", half=True, shared=NAME)

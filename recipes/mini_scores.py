@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -113,7 +114,9 @@ def score_encoders(
         t: [embed(part, encoders, t, cache=cache, progress=progress) for part in (train, new)]
         for t in ("vision", "tactile")
     }
-    vision, tactile = sides["vision"][1], sides["tactile"][1]
+    vision = sides["vision"][1]
+    numbers = embed(new, encoders, "tactile", raw=True, cache=cache, progress=progress)
+    tactile = replace(numbers, features=encoders.shared(numbers.features))
     text = embed(new, encoders, "text", cache=cache, progress=progress)
     captions = embed_texts(texts_of(new)[0], encoders)
     scores = [
@@ -205,7 +208,7 @@ def score_generator(
         ),
     }
     for subject, images in others.items():
-        features = embed_images(images, encoders, progress=progress)
+        features = embed_images(images, encoders, gels=gels, progress=progress)
         made = FeatureSet(ids, features, real.labels, real.groups, real.encoder)
         rows += [
             _row(f"TMMD, {subject}", tmmd(made, real, preset="grouped"), len(ids)),

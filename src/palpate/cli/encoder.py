@@ -2,17 +2,23 @@
 
 from __future__ import annotations
 
-from dataclasses import field
-from typing import Any
+from dataclasses import field, replace
+from typing import Annotated, Any
+
+import tyro
 
 from palpate.cli.terminal import Switch, Terminal, option_group
 from palpate.cli.training import EncoderMachine, Training
+from palpate.core import require
 
 
 @option_group
 class Options(Training):
-    """Train the tactile encoder against frozen vision and text encoders (three-way InfoNCE)."""
+    """Train a tactile encoder against frozen vision and text encoders, or by touches alone."""
 
+    alone: Annotated[Switch, tyro.conf.arg(name="self")] = False
+    """Learn from your touches alone, without photos, texts and labels (the preset self): the
+    shipped encoder goes on, or that of `--clip`; held-out recordings choose the length."""
     clip: str | None = None
     """Hub id or folder of a pretrained CLIP, or palpate/mini. Default: the preset's, or a small one
     that is trained first on the same train part."""
@@ -26,6 +32,10 @@ class Options(Training):
 
 def run(options: Options, terminal: Terminal) -> dict[str, Any]:
     """Train, and print the accuracy of a linear material probe on the test part."""
+    if options.alone:
+        must, fix = "must be left out beside --self, which is a preset", "Leave one out"
+        require(options.preset in ("mini", "self"), "preset", must, options.preset, fix=fix)
+        options = replace(options, preset="self")
     preset = options.chosen("train encoder")
     from palpate.encoders.contrastive import plan_encoder, train_encoder
 
@@ -38,7 +48,9 @@ def run(options: Options, terminal: Terminal) -> dict[str, Any]:
             device=options.machine.device,
         )
         return options.print_plan(terminal, plan)
-    encoders = terminal.run(train_encoder, **options.keywords("settings", "dry_run", preset=preset))
+    encoders = terminal.run(
+        train_encoder, **options.keywords("settings", "dry_run", "alone", preset=preset)
+    )
     card = encoders.card
     options.note_split(terminal, card["split_rule"])
     facts: dict[str, Any] = {

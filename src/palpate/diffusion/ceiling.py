@@ -153,9 +153,12 @@ def measure_ceiling(
             held, images = held.take(new), images[~seen]
             ground = None if ground is None else ground[~seen]
 
+        backed = not any(p.table["background"].null_count() for p in (train, held))
+
         def features(part: Manifest, pixels: NDArray[np.uint8]) -> FeatureSet:
             labels, groups = words_of(part, "material"), words_of(part, "video")
-            rows = embed_images(pixels, judge, progress=progress)
+            empty = cached_images(part, "background", size, cache, progress) if backed else None
+            rows = embed_images(pixels, judge, gels=empty, progress=progress)
             return FeatureSet(part.ids, rows, labels, groups, scores["judge"])
 
         decoded = autoencoder.decode(autoencoder.encode(images, ground), ground)

@@ -97,13 +97,16 @@ def embed(
     fix = "Check the split: is that part empty?"
     require(len(manifest) > 0, None, "There must be samples to embed", "none", fix=fix)
     digest, frames = encoders.digest(modality), None
+    ruled = modality == "tactile" and encoders.preprocess(modality).residual
     texts = texts_of(manifest)[0] if modality == "text" else []
     inputs: list[Any] = texts
     if modality != "text":
         frames = encoders.preprocess(modality).frames(manifest, modality, still=still)
         inputs = [image_stamp(manifest, modality), *frames.stamps(manifest.root)]
     label, group = words_of(manifest, "material"), words_of(manifest, groups)
-    key = digest_json(["palpate-embedding/2", digest, manifest.ids, inputs, label, group, raw])
+    key = digest_json(
+        ["palpate-embedding/2", digest, manifest.ids, inputs, label, group, raw and ruled]
+    )
     file = Path(cache) / f"{modality}-{short(key)}.npz" if cache else None
 
     def compute() -> FeatureSet:

@@ -59,14 +59,16 @@ class Layer(nn.Module):
 
     def __init__(self, inputs: int, outputs: int, kernel: int, stride: int) -> None:
         super().__init__()
-        self.weight = nn.Parameter(torch.randn(outputs, inputs, kernel, kernel))
+        # Standardized weights turn by lr / size a step: small ones learn.
+        size = (inputs * kernel**2) ** -0.5
+        self.weight = nn.Parameter(size * torch.randn(outputs, inputs, kernel, kernel))
         self.gain, self.bias = nn.Parameter(torch.ones(outputs)), nn.Parameter(torch.zeros(outputs))
         self.stride = stride
 
     def forward(self, x: Tensor) -> Tensor:
         """(n, inputs, h, w) to (n, outputs, h / stride, w / stride)."""
         fan = self.weight[0].numel()
-        weight = layer_norm(self.weight, self.weight.shape[1:]) / math.sqrt(fan)
+        weight = layer_norm(self.weight, self.weight.shape[1:], eps=1e-8) / math.sqrt(fan)
         weight = weight * self.gain[:, None, None, None]
         padding = self.weight.shape[2] // 2
         return relu(conv2d(x, weight, self.bias, self.stride, padding)) * KEEPS_VARIANCE

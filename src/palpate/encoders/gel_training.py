@@ -56,7 +56,7 @@ from palpate.training.steps import Step, seeded
 #: The ruler whose numbers are told.
 HANDCRAFTED = "palpate/handcrafted"
 #: Factors of the four losses.
-CONTRAST, NUMBERS, NAMES, PHOTOS = 0.5, 4.0, 0.5, 1.0
+CONTRAST, NUMBERS, NAMES, PHOTOS = 0.5, 4.0, 0.5, 2.0
 #: Temperature of the contrast, and width of what it is taken of and of the layer before.
 TEMPERATURE, NARROW, HIDDEN = 0.15, 64, 128
 #: Share of partners that are another contact of the object.

@@ -287,7 +287,7 @@ MINI = EncoderPreset(
     text=Size(96, 2, 3),
     clip_course=_MINI_CLIP,
 )
-_GEL = Course(None, 32, 2e-3, weight_decay=0.02, clip_norm=2.0, steps=2_000)
+_GEL = Course(None, 32, 2e-3, weight_decay=0.02, clip_norm=2.0, steps=3_000)
 GEL = EncoderPreset(
     name="gel",
     pretrained="palpate/mini",

@@ -125,7 +125,10 @@ def judge_images(
     images = {n: load_images(image_files(f, test.ids), size) for n, f in folders.items()}
     real = load_images(test.paths("tactile"), size)
     features = embed(test, judge, "tactile", cache=work.cache, still=True)
-    embedded = {n: replace(features, features=embed_images(x, judge)) for n, x in images.items()}
+    empty = load_images(test.paths("background"), size) if gels else None
+    embedded = {
+        n: replace(features, features=embed_images(x, judge, gels=empty)) for n, x in images.items()
+    }
     scores = [s for s in scores if _compares(s, methods)]
     if NEAREST in embedded and features.labels is not None:
         train = manifest.part(parts, "train")
