@@ -40,7 +40,7 @@ from typing import Any
 
 import numpy as np
 from mini_cards import ship, write_page
-from mini_scores import score_all
+from mini_scores import prefixed, score_all
 from numpy.typing import NDArray
 
 from palpate.core import PalpateError, Split, digest_json, read_json, rng_for, write_json
@@ -243,7 +243,7 @@ class Recipe:
         if self.kept:
             return load_clip(NAME)
         clip = self.clip()
-        parts = [self.world(name).prefixed(f"{name}/") for name in ("gelsight", "photos")]
+        parts = [prefixed(self.world(name), f"{name}/") for name in ("gelsight", "photos")]
         train = Manifest.join(*parts)
 
         def build(folder: Path) -> Mapping[str, Any]:
@@ -261,7 +261,7 @@ class Recipe:
         """The three encoders: the tactile one learns from many gels, against vision and text."""
         pair = self.pair()
         pair.halve()
-        parts = [self.world(name).prefixed(f"{name}/") for name in ("gelsight", *GELS)]
+        parts = [prefixed(self.world(name), f"{name}/") for name in ("gelsight", *GELS)]
         train = Manifest.join(*parts)
 
         def build(folder: Path) -> Mapping[str, Any]:

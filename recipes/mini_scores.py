@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import polars as pl
 from numpy.typing import NDArray
 
 from palpate.core import FeatureSet, Measure, Progress, Score, Split, digest_json
@@ -45,6 +46,13 @@ EVERY = 4
 PROMPTS = 200
 
 Rows = list[dict[str, Any]]
+
+
+def prefixed(manifest: Manifest, prefix: str) -> Manifest:
+    """The samples under other names, to be joined with those of another world."""
+    names = (pl.col(n) for n in ("id", "video", "contact", "object"))
+    table = manifest.table.with_columns((prefix + name).name.keep() for name in names)
+    return replace(manifest, table=table)
 
 
 def score_all(
@@ -167,7 +175,7 @@ def score_generator(
     """
     step = max(1, len(new) // GENERATED)
     test, train = new.take(new.ids[::step]), old.take(old.ids[::EVERY])
-    joined = Manifest.join(train.prefixed("train/"), test)
+    joined = Manifest.join(prefixed(train, "train/"), test)
     split = Split.from_ids(
         train=[f"train/{i}" for i in train.ids],
         test=test.ids,

@@ -45,7 +45,7 @@ from palpate.encoders.embed import embed, texts_of
 from palpate.encoders.encoder_set import EncoderSet
 from palpate.encoders.gel import GelEncoder
 from palpate.encoders.losses import LOG_SCALE_START, clamped_scale, info_nce, soft_targets
-from palpate.encoders.models import digest_images, pick_device, to_unit, union
+from palpate.encoders.models import architecture, digest_images, pick_device, to_unit, union
 from palpate.encoders.presets import EncoderPreset
 from palpate.encoders.rows import Rows, bytes_to_unit, evenly_spaced, factorize, train_part
 from palpate.training.engine import Batch, Losses, Task
@@ -102,7 +102,8 @@ class Touches:
         self._place = np.argsort(self._order)
         starts = (np.flatnonzero(np.diff(v[self._order], prepend=-1)) for v in (self.unit, contact))
         self._blocks = [np.append(first, len(part)) for first in starts]
-        told = embed(part, EncoderSet.load(HANDCRAFTED), raw=True, cache=run.cache).features
+        rulers = EncoderSet.load(HANDCRAFTED)
+        told = embed(part, rulers, raw=True, cache=run.cache, progress=run.progress).features
         told = (told - told.mean(axis=0)) / np.maximum(told.std(axis=0), 1e-3)
         self.numbers = torch.from_numpy(told.clip(-LARGEST, LARGEST))
         materials = ["" if is_missing(v) else str(v) for v in part.column("material")]
@@ -295,10 +296,14 @@ def train_ruler(
     with seeded(run.seed, "tactile encoder"):
         ruler = GelEncoder(preset.tactile_config(clip.dim))
     if start is not None:
-        same = isinstance(start.tactile, GelEncoder) and start.tactile.config.to_dict()
+        old = start.tactile
+        same = isinstance(old, GelEncoder) and architecture(old.config) == architecture(
+            ruler.config
+        )
         must, fix = "must have a learned ruler of the preset's size", "Leave it out"
-        require(same == ruler.config.to_dict() | {}, "start", must, "another", fix=fix)
-        ruler.load_state_dict(start.tactile.state_dict())
+        require(same, "start", must, "another", fix=fix)
+        assert old is not None
+        ruler.load_state_dict(old.state_dict())
     options = preset.tactile_course.options(len(train), run.seed)
     with agreed():
         require_rows(train, options.batch)
