@@ -129,13 +129,14 @@ def embed_images(
     modality: Modality = "tactile",
     *,
     gels: NDArray[np.uint8] | None = None,
+    raw: bool = False,
     batch: int = 128,
     progress: Progress = quiet,
 ) -> NDArray[np.float32]:
     """Embeddings of images (n, h, w, 3), 0 to 255, in memory or in a mapped file.
 
     Other sizes than the encoder's are cut and resized as files are. ``gels`` are the no-contact
-    images (n, h, w, 3), for encoders that subtract them.
+    images (n, h, w, 3), for encoders that subtract them; ``raw`` as of :func:`embed`.
 
     Returns:
         (n, dim) float32, L2-normalized.
@@ -150,7 +151,7 @@ def embed_images(
     def load(rows: slice) -> NDArray[Any]:
         return fit(images[rows], None if gels is None else gels[rows])
 
-    return _embedded(n, load, encoders, modality, batch=batch, progress=progress)
+    return _embedded(n, load, encoders, modality, batch=batch, progress=progress, raw=raw)
 
 
 def embed_texts(

@@ -1,0 +1,162 @@
+"""Two tactile encoders side by side: what they find, what they should not see, what they cost.
+
+    python benchmarks/rulers.py --work runs/rulers --against runs/old/encoders [--seed 77]
+
+On a world of new objects and gels (``--seed``; 20 materials, 400 videos), each encoder's features
+are standardized by the reference as ``score`` does it for a ruler. In each of 20 draws the videos
+are halved into "generated" and reference, and a fault is planted in the first half:
+
+- swap: images of a tenth of the videos are given to videos of another material;
+- collapse: of each material the images of one video stand for all;
+- blur: images under a Gaussian of one pixel.
+
+TMMD finds a fault at p < .05; CI- and D-TMMD, which see no reference, where they leave the middle
+95 % of the draws without a fault. Beside it: accuracy of naming the gel unit, TMMD of one half as
+JPEG 40 against the other as it is, and CPU seconds of embedding.
+"""
+
+import argparse
+import io
+import time
+from pathlib import Path
+
+import numpy as np
+from common import Line
+from PIL import Image, ImageFilter
+
+from palpate.core import FeatureSet, write_json
+from palpate.data.images import load_images
+from palpate.data.manifest import Manifest
+from palpate.encoders.embed import embed_images
+from palpate.encoders.encoder_set import EncoderSet
+from palpate.evaluation.ruling import standardized
+from palpate.metrics import ci_tmmd, d_tmmd, tmmd
+from palpate.metrics.probe import material_accuracy
+from palpate.sim import WorldOptions, write_world
+
+DRAWS = 20
+
+
+def blurred(image):
+    return np.asarray(Image.fromarray(image).filter(ImageFilter.GaussianBlur(1)))
+
+
+def as_jpeg(image, quality=40):
+    Image.fromarray(image).save(file := io.BytesIO(), "JPEG", quality=quality)
+    return np.asarray(Image.open(file).convert("RGB"))
+
+
+class Bench:
+    def __init__(self, work, seed):
+        folder = work / f"world {seed}"
+        write_world(
+            folder,
+            WorldOptions(
+                seed=seed,
+                objects_per_material=20,
+                contacts_per_video=2,
+                frames_per_contact=2,
+                free_written="background",
+                mixed=0.0,
+                sensors=8,
+            ),
+            workers=2,
+            progress=Line(),
+        )
+        self.data = Manifest.load(folder)
+        self.images, self.gels = (
+            load_images(self.data.paths(c), 64) for c in ("tactile", "background")
+        )
+        self.changed = {
+            "": self.images,
+            "blur": np.stack([*map(blurred, self.images)]),
+            "jpeg": np.stack([*map(as_jpeg, self.images)]),
+        }
+        self.videos, self.materials = map(
+            np.array, (self.data.column("video"), self.data.column("material"))
+        )
+        self.names = sorted({*self.videos.tolist()})
+        self.of = {v: self.materials[self.videos == v][0] for v in self.names}
+
+    def numbers(self, encoders, images):
+        """Raw numbers of images by one encoder, (n, d)."""
+        return embed_images(images, encoders, gels=self.gels, raw=True).astype(np.float64)
+
+    def rows(self, x, at, labels=None):
+        videos, labels = self.videos[at], self.materials[at] if labels is None else labels
+        return FeatureSet([str(k) for k in range(len(x))], x, labels.tolist(), videos.tolist())
+
+    def planted(self, fault, mine, rng):
+        """Rows of the images that stand in the places of the rows of ``mine``."""
+        rows = {v: np.flatnonzero(self.videos == v) for v in mine}
+        source = {v: v for v in mine}
+        if fault == "swap":
+            for v in rng.permutation(mine)[: len(mine) // 10]:
+                source[v] = rng.choice([w for w in mine if self.of[w] != self.of[v]])
+        if fault == "collapse":
+            one = {self.of[v]: v for v in rng.permutation(mine)}
+            source = {v: one[self.of[v]] for v in mine}
+        at = np.concatenate([rows[v] for v in mine])
+        return at, np.concatenate([rows[source[v]] for v in mine])
+
+    def draws(self, numbers):
+        found = {name: [] for name in ("", "swap", "collapse", "blur")}
+        for draw in range(DRAWS):
+            rng = np.random.default_rng(draw)
+            order = rng.permutation(self.names)
+            mine, rest = order[: len(order) // 2], order[len(order) // 2 :]
+            other = np.flatnonzero(np.isin(self.videos, rest))
+            for fault in found:
+                at, shown = self.planted(fault, mine, np.random.default_rng((draw, 1)))
+                x = numbers["blur" if fault == "blur" else ""][shown]
+                (a, b), _ = standardized([x, numbers[""][other]], numbers[""][other])
+                a, b = self.rows(a, at), self.rows(b, other)
+                p = tmmd(a, b, preset="grouped", permutations=199).details["p_value"]
+                free = [f(a, preset="grouped").value for f in (ci_tmmd, d_tmmd)]
+                found[fault].append((p, *free))
+        return {k: np.array(v, float) for k, v in found.items()}
+
+    def of_encoder(self, encoders):
+        began = time.process_time()
+        numbers = {"": self.numbers(encoders, self.images)}
+        cost = time.process_time() - began
+        numbers |= {k: self.numbers(encoders, v) for k, v in self.changed.items() if k}
+        found, row = self.draws(numbers), {"CPU s": cost}
+        for fault, values in found.items():
+            low, high = np.quantile(found[""][:, 1:], [0.025, 0.975], axis=0)
+            out = ((values[:, 1:] < low) | (values[:, 1:] > high)).mean(0)
+            row[fault or "none"] = [float((values[:, 0] < 0.05).mean()), *out.tolist()]
+        x = numbers[""]
+        (z, coded), _ = standardized([x, numbers["jpeg"]], x)
+        half = np.isin(self.videos, self.names[::2])
+        a, b = np.flatnonzero(half), np.flatnonzero(~half)
+        units = np.array(self.data.column("sensor"))
+        named = material_accuracy(self.rows(z[a], a, units[a]), self.rows(z[b], b, units[b]))
+        row["gel unit"] = [named.value, 1 / len({*units.tolist()})]
+        plain, jpeg = (
+            tmmd(self.rows(y[a], a), self.rows(z[b], b), preset="grouped", permutations=0)
+            for y in (z, coded)
+        )
+        row["JPEG 40"] = [plain.value, *plain.interval, jpeg.value]
+        return row
+
+
+def main():
+    parser = argparse.ArgumentParser(description=__doc__.split("\n", 1)[0])
+    parser.add_argument("--work", type=Path, default=Path("runs/rulers"))
+    parser.add_argument("--encoder", default="palpate/mini")
+    parser.add_argument("--against", default="palpate/handcrafted")
+    parser.add_argument("--seed", type=int, default=77)
+    options = parser.parse_args()
+    bench, rows = Bench(options.work, options.seed), {}
+    for name in (options.encoder, options.against):
+        rows[name] = bench.of_encoder(EncoderSet.load(name))
+        print(name)
+        for key, value in rows[name].items():
+            values = value if isinstance(value, list) else [value]
+            print(f"  {key:10}", *(f"{v:.3g}" for v in values))
+    write_json(options.work / f"rulers-{options.seed}.json", rows)
+
+
+if __name__ == "__main__":
+    main()
