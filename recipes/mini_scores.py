@@ -65,11 +65,15 @@ def score_all(
 ) -> dict[str, Rows]:
     """Rows of scores by model: ``encoders``, ``autoencoder``, ``generator``.
 
-    ``worlds`` are ``gelsight``, ``new gelsight``, ``digit`` and ``new digit``.
+    ``worlds`` are ``gelsight``, ``new gelsight``, ``new digit``, ``new gel`` and ``new pad``.
     """
     both = worlds["gelsight"], worlds["new gelsight"]
+    pads = {f"pad of {mm} mm": worlds[f"new {name}"] for mm, name in ((14, "gel"), (26, "pad"))}
     return {
-        "encoders": score_encoders(encoders, *both, cache, progress),
+        "encoders": [
+            *score_encoders(encoders, *both, cache, progress),
+            *score_pads(encoders, pads, cache, progress),
+        ],
         "autoencoder": score_autoencoder(autoencoder, worlds, cache, progress),
         "generator": score_generator(pipeline, encoders, *both, cache, progress),
     }
@@ -145,6 +149,24 @@ def score_encoders(
             for k, mean in zip((1, 5), result.top, strict=True)
         ]
     return [_row(name, score, len(new)) for name, score in scores]
+
+
+def score_pads(
+    encoders: EncoderSet, worlds: Mapping[str, Manifest], cache: Path, progress: Progress
+) -> Rows:
+    """Probe accuracy within worlds of other pads, from one half of the objects to the other."""
+    rows: Rows = []
+    for name, world in worlds.items():
+        features = embed(world, encoders, "tactile", cache=cache, progress=progress)
+        chosen = {o for k, o in enumerate(sorted({*world.column("object")})) if k % 2}
+        objects = zip(world.ids, world.column("object"), strict=True)
+        halves: dict[bool, list[str]] = {True: [], False: []}
+        for i, o in objects:
+            halves[o in chosen].append(i)
+        accuracy = material_accuracy(*(features.take(half) for half in halves.values()))
+        row = f"linear probe of material, tactile, {name}"
+        rows.append(_row(row, accuracy, len(halves[False])))
+    return rows
 
 
 def score_autoencoder(

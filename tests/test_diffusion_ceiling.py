@@ -74,7 +74,7 @@ def test_what_is_gone_or_looks_otherwise_is_seen(world, split):
     assert other["accuracy"] < real - 0.1
     gone = measured(world, split, lambda x: np.full_like(x, 128))
     assert gone["accuracy"] < 0.5
-    assert gone["tmmd"] > other["tmmd"] > 1
+    assert min(gone["tmmd"], other["tmmd"]) > 1
 
 
 def test_what_the_data_cannot_give_is_left_out(world, split):
@@ -139,10 +139,8 @@ def test_a_judge_without_touch_is_rejected_before_the_training(world, split):
 
 def test_a_judge_that_was_trained_on_the_images_does_not_judge_them(world, split):
     judge, test = EncoderSet.load("palpate/mini"), world.part(split, "test")
-    preprocess = judge.preprocess("tactile")
-    judge.seen["tactile"] = digest_images(
-        load_images(preprocess.frames(test, "tactile").files[:3], preprocess)
-    )
+    plain = judge.preprocess("tactile").plainly
+    judge.seen["tactile"] = digest_images(load_images(test.paths("tactile")[:3], plain))
     found = measure_ceiling(Through(lambda x: x), world, split, SIZE, judge=judge)
     assert (found["n"], found["not_judged"]) == (len(test), 3)
     rest = Split.from_ids(train=split.ids("train"), test=test.ids[3:], manifest=world.digest)
@@ -150,9 +148,7 @@ def test_a_judge_that_was_trained_on_the_images_does_not_judge_them(world, split
     assert "not_judged" not in alone
     for name in ("tmmd", "accuracy_real", "accuracy"):
         assert found[name] == pytest.approx(alone[name], abs=1e-9)
-    judge.seen["tactile"] = digest_images(
-        load_images(preprocess.frames(test, "tactile").files, preprocess)
-    )
+    judge.seen["tactile"] = digest_images(load_images(test.paths("tactile"), plain))
     found = measure_ceiling(Through(lambda x: x), world, split, SIZE, judge=judge)
     assert (found["not_judged"], found["judge"]) == (len(test), judge.digest("tactile"))
     assert found["psnr"] > 90

@@ -412,7 +412,7 @@ def test_paper_preset_is_the_paper():
         tactile = contrastive.CLIPVisionModelWithProjection(paper.tactile_config(768))
     # ViT-L/14 at 224 px with a 768-wide projection
     assert sum(p.numel() for p in tactile.parameters()) == 303_966_208
-    fails("tiny, mini, tvl-tiny", preset_of, "huge")
+    fails("tiny, mini, gel, self, tvl-tiny", preset_of, "huge")
 
 
 def test_a_vision_encoder_without_text_is_a_partner(world, tmp_path):

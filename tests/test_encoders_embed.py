@@ -261,7 +261,7 @@ def test_texts(encoders):
 
 def test_the_shipped_encoder_by_the_door(files):
     encoder = pp.Encoder.from_pretrained("palpate/mini", modality="tactile")
-    assert encoder.encode(files[1]).shape == (3, 128)
+    assert encoder.encode(files[1]).shape == (3, 256)
     with pytest.raises(PalpateError, match=r"`modality` must be one of vision, text, tactile"):
         pp.Encoder.from_pretrained("palpate/mini", modality="touch")
     with pytest.raises(TypeError, match="modality"):

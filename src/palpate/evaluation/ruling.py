@@ -39,9 +39,10 @@ def ruler_features(bench: Bench) -> list[tuple[Samples, FeatureSet]]:
     real, *others = (_of_files(s, folder) for s in sets)
     kind, parts = with_gels(real, others, folder)
     bench.notes.append(Note("background-kind", {"kind": kind}))
-    keep = folder if bench.keep else None
+    caches = [s.folder(folder) if bench.keep else None for s in sets]
     embedded = [
-        embed(p, encoders, cache=keep, still=True, raw=True, progress=bench.progress) for p in parts
+        embed(p, encoders, cache=cache, still=True, raw=True, progress=bench.progress)
+        for p, cache in zip(parts, caches, strict=True)
     ]
     rows = [e.features.astype(np.float64) for e in embedded]
     rows, scales = standardized(rows, rows[0])

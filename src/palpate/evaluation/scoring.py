@@ -444,7 +444,7 @@ def _with_warnings(
     scores: Sequence[Score], bench: Bench, of_encoder: Sequence[Note]
 ) -> list[Score]:
     """The scores with notes on the encoder, and on generators that may have seen test samples."""
-    digest = bench.encoders and bench.encoders.digest("tactile")
+    digest = bench.encoders and bench.tactile.reference.encoder
     of_generator = {
         name: [Note("generator-of-other-split")]
         for name, s in bench.generators.items()
