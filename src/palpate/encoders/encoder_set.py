@@ -164,8 +164,9 @@ class EncoderSet:
     @property
     def shared_width(self) -> int:
         """Width of the tactile encoder's embeddings in the space of photos and texts."""
-        gel = isinstance(self.tactile, GelEncoder)
-        return self.tactile.config.projection_dim if gel else self.width("tactile")
+        if isinstance(self.tactile, GelEncoder):
+            return self.tactile.config.projection_dim
+        return self.width("tactile")
 
     def shared(self, rows: NDArray[np.float32]) -> NDArray[np.float32]:
         """Tactile features (n, width) in the space of photos and texts, (n, dim), L2-normalized.

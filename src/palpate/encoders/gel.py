@@ -84,6 +84,9 @@ class GelEncoder(PreTrainedModel, TactileModule):
     """
 
     config_class = GelConfig
+    config: GelConfig
+    center: Tensor
+    spread: Tensor
 
     def __init__(self, config: GelConfig) -> None:
         super().__init__(config)
