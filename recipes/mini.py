@@ -111,6 +111,8 @@ WORLDS |= {name: gel(number) for number, name in enumerate(GELS)}
 ENCODER = preset_of("mini")
 #: Of the vision encoder when it goes on: more rows to tell apart.
 TACTILE = preset_of("gel")
+#: Fields of a preset that decide nothing.
+TEXTS = {"cost": "", "score": ""}
 VISION = replace(ENCODER, clip_course=replace(ENCODER.clip_course, batch=256, lr=2e-3))
 #: Passes over the data. One core sees about 400 images a second in training.
 CLIP_EPOCHS, VISION_EPOCHS = 14.0, 20.0
@@ -270,7 +272,8 @@ class Recipe:
             encoders.save(cleared(folder / "encoders"))
             return {"tactile": encoders.digest("tactile")}
 
-        inputs = {"preset": TACTILE, "seed": self.seed, "train": train.digest}
+        preset = replace(TACTILE, **TEXTS)
+        inputs = {"preset": preset, "seed": self.seed, "train": train.digest}
         inputs |= {m: pair.digest(m) for m in pair.modalities}
         name = f"tactile {self.seed}" if self.seed else "tactile"
         return EncoderSet.load(self.stage(name, inputs, build).folder / "encoders")

@@ -160,7 +160,7 @@ def test_training_repeats_and_says_what_it_saw(world, trained):
     again = train_encoder(data, split, preset=preset("gel"))
     assert again.digest("tactile") == trained.digest("tactile")
     card = trained.card
-    assert card["recordings"] == sorted({*data.part(split, "train").column("object")})
+    assert card["recordings"]["names"] == sorted({*data.part(split, "train").column("object")})
     assert {"contrast", "numbers", "names", "text", "vision"} <= card["loss"][0].keys()
     assert trained.saw("tactile", data.part(split, "train")).all()
     assert not trained.saw("tactile", data.part(split, "test")).any()
@@ -191,7 +191,7 @@ def test_touches_alone_teach_and_own_frames_are_refused(world, trained, tmp_path
     assert "text" not in own.card["loss"][0]
     train = blind.part(split, "train")
     kept, held = held_out(train, 0)
-    assert own.card["recordings"] == sorted({u.split("\n")[1] for u in units_of(kept, "")})
+    assert own.card["recordings"]["names"] == sorted({u.split("\n")[1] for u in units_of(kept, "")})
     assert {*units_of(kept, "")}.isdisjoint(units_of(held, ""))
     assert own.saw("tactile", kept).all()
     assert own.card["train_samples"] == len(kept)

@@ -36,6 +36,6 @@ def run(options: Options, terminal: Terminal) -> dict[str, Any]:
     options.files.guard(inputs)
     from palpate.preference import score
 
-    lists = {"votes": options.votes, "metrics": options.metrics}
-    results = terminal.run(score, **options.keywords(**lists))
+    keywords = options.keywords(votes=options.votes, metrics=options.metrics)
+    results = terminal.run(score, **keywords)
     return terminal.deliver(results, options.files)

@@ -22,7 +22,7 @@ their own, equal images would have no residual.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar, Literal
@@ -110,7 +110,7 @@ def _resized(
 
 
 def with_gels(
-    reference: Manifest, sets: Sequence[Manifest], folder: Path
+    reference: Manifest, sets: Sequence[Manifest], folder: Path, *, real: Collection[int] = ()
 ) -> tuple[Kind, list[Manifest]]:
     """Samples with what is subtracted from each in their column ``background``.
 
@@ -119,6 +119,8 @@ def with_gels(
         sets: what is compared with it, all with image files; images of the reference's ids take
             its backgrounds.
         folder: for medians, as PNG files.
+        real: numbers of the sets that are other real images under the reference's ids, which take
+            their own backgrounds.
 
     Returns:
         The kind of background, the best that all sets have, and the reference and the sets; of the
@@ -127,7 +129,10 @@ def with_gels(
     kind: Kind
     for kind in ("no contact", *MEDIANS):
         gels = _gels(reference, kind, folder)
-        found = [_lent(part, reference, gels, kind, folder) for part in sets]
+        found = [
+            _gels(part, kind, folder) if k in real else _lent(part, reference, gels, kind, folder)
+            for k, part in enumerate(sets)
+        ]
         if all(None not in column for column in (gels, *found)):
             columns = [gels, *found]
             break

@@ -35,7 +35,7 @@ from torch.nn.functional import (
     smooth_l1_loss,
 )
 
-from palpate.core import Split, digest_json, require, rng_for
+from palpate.core import Split, digest_json, digest_lines, require, rng_for
 from palpate.core.features import is_missing
 from palpate.data.images import Preprocess, cached_images
 from palpate.data.manifest import Manifest
@@ -65,6 +65,8 @@ FAR = 0.5
 LARGEST = 5.0
 #: Images whose numbers are averaged for center and spread.
 STATISTICS = 4096
+#: Recordings that a card lists by name, at most.
+LISTED = 1000
 #: Range of the zoom; deviations of shift [share of the side], and of the logarithms of saturation
 #: and strength; largest deviation of the noise [gray levels].
 ZOOM, SHIFT, SATURATION, STRENGTH, NOISE = (0.7, 1.45), 0.12, 0.3, 0.35, 1.0
@@ -332,7 +334,9 @@ def train_ruler(
     card["start_card"] = start.card if start else None
     card["synthetic"] = train.synthetic if not start or start.card.get("synthetic") else False
     card["seen_in_part"] = start is not None and not start.knows_seen("tactile")
-    card["recordings"] = sorted({name.partition("\n")[2] for name in units_of(train, "")})
+    names = sorted({name.partition("\n")[2] for name in units_of(train, "")})
+    card["recordings"] = {"count": len(names), "digest": digest_lines(names)}
+    card["recordings"] |= {"names": names} if len(names) <= LISTED else {}
     standardize(ruler, touches, len(train))
     plain = ruler.preprocess.plainly
     seen = digest_images(cached_images(train, "tactile", plain, run.cache, run.progress))

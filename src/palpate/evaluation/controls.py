@@ -13,8 +13,9 @@ from __future__ import annotations
 from collections.abc import Collection
 from dataclasses import replace
 from itertools import cycle
-from pathlib import Path
 from typing import TYPE_CHECKING
+
+import polars as pl
 
 from palpate.core import FeatureSet, Score, rng_for
 from palpate.data.images import load_images
@@ -99,12 +100,15 @@ def control_samples(bench: Bench) -> dict[str, Samples]:
     for row, material in enumerate(train.labels or ()):
         rows_of.setdefault(material, []).append(row)
     if real.labels and all(material in rows_of for material in real.labels):
-        paths, chosen = train.manifest.paths("tactile"), list[Path]()
+        chosen: list[int] = []
         for i, material in zip(real.ids, real.labels, strict=True):
             rows = rows_of[material]
-            chosen.append(paths[rows[int(rng_for(bench.seed, "control", i).integers(len(rows)))]])
-        images = load_images(chosen, bench.size, progress=bench.progress)
-        controls[SAME_MATERIAL] = replace(real, source=SAME_MATERIAL, rows=images)
+            chosen.append(rows[int(rng_for(bench.seed, "control", i).integers(len(rows)))])
+        paths, gels = train.manifest.paths("tactile"), train.manifest.column("background")
+        images = load_images([paths[k] for k in chosen], bench.size, progress=bench.progress)
+        own = [gels[k] and str(train.manifest.path(gels[k]).resolve()) for k in chosen]
+        drawn = replace(real, source=SAME_MATERIAL, rows=images)
+        controls[SAME_MATERIAL] = drawn.with_columns(pl.Series("background", own, pl.String))
     return controls
 
 

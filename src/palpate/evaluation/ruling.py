@@ -20,6 +20,7 @@ from palpate.core import FeatureSet, Note, digest_json, save_image
 from palpate.data.manifest import Manifest
 from palpate.data.residuals import with_gels
 from palpate.data.samples import Samples
+from palpate.report.tables import SAME_MATERIAL
 
 if TYPE_CHECKING:
     from palpate.evaluation.scorers import Bench
@@ -37,7 +38,8 @@ def ruler_features(bench: Bench) -> list[tuple[Samples, FeatureSet]]:
     assert encoders is not None  # whose ruler it is
     folder = bench.cache / "rulers"
     real, *others = (_of_files(s, folder) for s in sets)
-    kind, parts = with_gels(real, others, folder)
+    controls = [k for k, s in enumerate(sets[1:]) if s.source == SAME_MATERIAL]
+    kind, parts = with_gels(real, others, folder, real=controls)
     bench.notes.append(Note("background-kind", {"kind": kind}))
     caches = [s.folder(folder) if bench.keep else None for s in sets]
     embedded = [
