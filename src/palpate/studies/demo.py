@@ -66,7 +66,8 @@ class DemoPreset:
     Attributes:
         name: of the preset.
         world: the embedded data set, used where no data is given.
-        encoder, diffusion: how the training of the shipped models goes on.
+        encoder: how the tactile encoder is trained, from random weights.
+        diffusion: how the training of the shipped generator goes on.
         train: share of the train part.
         tactile_epochs: passes of the tactile encoder over the train part.
     """
@@ -100,7 +101,7 @@ PRESETS = {
             ENCODERS["mini"],
             MINI,
             train=0.85,
-            tactile_epochs=6,
+            tactile_epochs=12,
         ),
     )
 }
@@ -140,9 +141,9 @@ class Demo:
         data, seed, nodes = self.data, self.seed, Nodes()
         require_choice("preset", self.preset, PRESETS)
         preset, size, root = PRESETS[self.preset], None, None
-        clip, tactile, autoencoder, start = (
+        clip, autoencoder, start = (
             Stamped(SHIPPED, model_stamp(part, SHIPPED))
-            for part in ("clip", "encoders", "autoencoder", "generator")
+            for part in ("clip", "autoencoder", "generator")
         )
         if data is None:
             nodes.add("world", make_world, options=preset.world)
@@ -168,7 +169,6 @@ class Demo:
             preset=preset.encoder,
             epochs=preset.tactile_epochs,
             clip=clip,
-            start=tactile,
         )
         nodes.add(
             "generator",
@@ -238,10 +238,8 @@ def make_demo_splits(work: Work, *, seed: int, train: float) -> Facts:
     return {"digest": clean.digest, "counts": clean.counts(), "rule": dict(clean.rule)}
 
 
-def train_on(
-    work: Work, *, seed: int, preset: EncoderPreset, epochs: float, clip: str, start: str
-) -> Facts:
-    """The frozen CLIP with a tactile encoder that goes on from the one of ``start``."""
+def train_on(work: Work, *, seed: int, preset: EncoderPreset, epochs: float, clip: str) -> Facts:
+    """The frozen CLIP with a tactile encoder that learns from it."""
     run = TrainingRun(
         work.folder / "training",
         seed=seed,
@@ -249,13 +247,8 @@ def train_on(
         device=work.device,
         progress=work.progress,
     )
-    encoders = train_tactile(
-        *data_of(work, SPLIT),
-        load_clip(clip),
-        preset_of(preset, epochs),
-        run,
-        start=EncoderSet.load(start),
-    )
+    preset = preset_of(preset, epochs)
+    encoders = train_tactile(*data_of(work, SPLIT), load_clip(clip), preset, run)
     encoders.save(cleared(work.folder / "encoders"))
     source = encoders.card.get("text_source")
     return {"digest": encoders.digest("tactile"), "text_source": source}
