@@ -517,7 +517,7 @@ def read_labels(source: Any) -> pl.DataFrame | None:
     if isinstance(source, str | Path):
         table = open_table(Path(source))
     elif hasattr(source, "columns") or isinstance(next(iter(source), None), dict):
-        table = table_of(cast("Any", source), "labels")
+        table = table_of(source, "labels")
     else:
         values = source.items() if isinstance(source, Mapping) else enumerate(source)
         table = table_of([{"id": str(i), "material": value} for i, value in values], "labels")

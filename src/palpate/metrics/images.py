@@ -34,8 +34,8 @@ Border = Literal["valid", "mirror"]
 
 WINDOW, SIGMA, K1, K2 = 11, 1.5, 0.01, 0.03
 #: The window in one direction.
-LINE = np.exp(-0.5 * ((np.arange(WINDOW) - WINDOW // 2) / SIGMA) ** 2)
-LINE /= LINE.sum()
+_BELL = np.exp(-0.5 * ((np.arange(WINDOW) - WINDOW // 2) / SIGMA) ** 2)
+LINE = _BELL / _BELL.sum()
 #: What a score keeps of the window.
 WINDOW_SETTINGS = {"window": WINDOW, "sigma": SIGMA, "k1": K1, "k2": K2}
 #: The published exponents, finest scale first. Their sum is 1.0001; all five are as published.

@@ -282,7 +282,7 @@ def material_utility(
         rows.append([label, *(over_draws(runs) if runs else None for runs in cells)])
     for name in generated:
         more = f"{REAL} + {name}"
-        pairs = ({m: means.get((m, k)) for m in (more, REAL)} for k in draws.shots)
+        pairs = ({m: means.get((m, k), []) for m in (more, REAL)} for k in draws.shots)
         gains = (differences_of_means(pair)[0] if all(pair.values()) else None for pair in pairs)
         rows.append([f"{GAIN}{name}", *gains])
     label_of = (f"{REAL} + {{}}", "{} alone", f"{GAIN}{{}}")
