@@ -69,7 +69,7 @@ CLIP_STD = (0.26862954, 0.26130258, 0.27577711)
 MOST_TIMES = 16
 SAVE_AGAIN = "Save the encoders again"
 #: What an image is prepared from: itself, the sensor's no-contact image, an earlier frame.
-Frame = tuple[Path | Image.Image, Path | None, Path | None]
+Frame = tuple[Path | Image.Image, Path | Image.Image | None, Path | None]
 T = TypeVar("T")
 R = TypeVar("R")
 
@@ -141,13 +141,17 @@ class Frames(NamedTuple):
     sensors: list[str]
 
     @classmethod
-    def alone(cls, images: Sequence[Path | Image.Image]) -> Frames:
-        """Images without further ones, of unknown sensors."""
-        return cls([(image, None, None) for image in images], [""] * len(images))
+    def alone(
+        cls, images: Sequence[Path | Image.Image], gels: Sequence[Path | Image.Image] = ()
+    ) -> Frames:
+        """Images, each with its no-contact image if there are any, of unknown sensors."""
+        empty = gels or [None] * len(images)
+        files = [(image, gel, None) for image, gel in zip(images, empty, strict=True)]
+        return cls(files, [""] * len(images))
 
     def stamps(self, root: Path) -> list[object]:
         """What changes with the no-contact images, the earlier frames and the sensors."""
-        more = {path for _, *further in self.files for path in further if path is not None}
+        more = {path for _, *further in self.files for path in further if isinstance(path, Path)}
         stamp = {path: [os.path.relpath(path, root), *file_stamp(path)] for path in more}
         return [[[path and stamp[path] for path in more] for _, *more in self.files], self.sensors]
 
@@ -397,7 +401,7 @@ def load_images(
         file: object = image
         try:
             image = read_image(image) if isinstance(image, Path) else image
-            empty = background(file := gel) if gel else None
+            empty = background(file := gel) if isinstance(gel, Path) else gel
             previous = read_image(file := before) if before else None
             images[at] = preprocess.prepare(image, empty, previous)
         except PalpateError as error:
@@ -441,6 +445,7 @@ def cached_images(
     if cache is None:
         return load_images(frames.files, preprocess, progress=progress)
     geometry = asdict(replace(preprocess, mean=CLIP_MEAN, std=CLIP_STD))
+    geometry["dtype"] = preprocess.dtype.str
     stamps = [] if preprocess.plain else frames.stamps(manifest.root)
     key = short(digest_json([geometry, image_stamp(manifest, column), stamps]))
 

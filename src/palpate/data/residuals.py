@@ -39,6 +39,8 @@ if TYPE_CHECKING:
     from palpate.data.manifest import Manifest
 
 Kind = Literal["no contact", "other objects", "own video", "whole set", "low-pass"]
+#: The fact of a manifest that says the kind.
+KIND = "background_kind"
 #: Columns within which a median is taken, of each kind.
 MEDIANS: Mapping[Kind, tuple[str, ...]] = {
     "other objects": ("sensor", "session"),
@@ -119,38 +121,53 @@ def with_gels(
         sets: what is compared with it, all with image files; images of the reference's ids take
             its backgrounds.
         folder: for medians, as PNG files.
-        real: numbers of the sets that are other real images under the reference's ids, which take
-            their own backgrounds.
+        real: numbers of the sets that are real images, too, which take their own medians.
 
     Returns:
-        The kind of background, the best that all sets have, and the reference and the sets; of the
-        kind ``low-pass`` without backgrounds.
+        The kind of background, the best that all samples with a tactile image have, and the
+        reference and the sets; of the kind ``low-pass`` without backgrounds. The fact
+        :data:`KIND` of each says the kind.
     """
     kind: Kind
+    parts = [reference, *sets]
     for kind in ("no contact", *MEDIANS):
         gels = _gels(reference, kind, folder)
-        found = [
-            _gels(part, kind, folder) if k in real else _lent(part, reference, gels, kind, folder)
-            for k, part in enumerate(sets)
-        ]
-        if all(None not in column for column in (gels, *found)):
-            columns = [gels, *found]
+        columns = [gels]
+        for k, part in enumerate(sets):
+            own = _gels(part, kind, folder) if k in real or kind == "no contact" else []
+            columns.append(_lent(part, reference, gels, own))
+        if all(map(_complete, parts, columns)):
             break
     else:
-        kind, columns = "low-pass", [[None] * len(part) for part in (reference, *sets)]
+        kind, columns = "low-pass", [[None] * len(part) for part in parts]
     return kind, [
-        replace(part, table=part.table.with_columns(pl.Series("background", gels, pl.String)))
-        for part, gels in zip((reference, *sets), columns, strict=True)
+        replace(
+            part,
+            table=part.table.with_columns(pl.Series("background", gels, pl.String)),
+            facts={**part.facts, KIND: kind},
+        )
+        for part, gels in zip(parts, columns, strict=True)
     ]
 
 
+def kind_of(part: Manifest) -> str:
+    """The kind of background of samples: as :func:`with_gels` found, or by the manifest alone."""
+    alone = "no contact" if _complete(part, part.column("background")) else "low-pass"
+    return part.facts.get(KIND, alone)
+
+
+def _complete(part: Manifest, gels: Sequence[str | None]) -> bool:
+    """Whether each sample with a tactile image has a background."""
+    images = part.column("tactile")
+    return all(gel or not image for gel, image in zip(gels, images, strict=True))
+
+
 def _lent(
-    part: Manifest, reference: Manifest, gels: Sequence[str | None], kind: Kind, folder: Path
+    part: Manifest, reference: Manifest, gels: Sequence[str | None], own: list[str | None]
 ) -> list[str | None]:
-    """The backgrounds of a set: the reference's by id, the only one there is, or recorded ones."""
+    """The backgrounds of a set: the reference's by id, the only one there is, or its own."""
     by_id = dict(zip(reference.ids, gels, strict=True))
-    own = _gels(part, kind, folder) if kind == "no contact" else []
-    if own and None not in own and {*part.ids}.isdisjoint(by_id):
+    if own and _complete(part, own) and {*part.ids}.isdisjoint(by_id):
         return own
     only = gels[0] if len({*gels}) == 1 else None
     return [by_id.get(name, only) for name in part.ids]
@@ -164,7 +181,9 @@ def _gels(part: Manifest, kind: Kind, folder: Path) -> list[str | None]:
     if any(part.table[name].null_count() for name in columns):
         return [None] * len(part)
     gels: list[str | None] = [None] * len(part)
-    rows = part.table.select("object", *columns).with_row_index("row")
+    rows = (
+        part.table.select("object", "tactile", *columns).with_row_index("row").drop_nulls("tactile")
+    )
     for group in rows.partition_by(columns) if columns else [rows]:
         at, objects = group["row"].to_list(), group["object"]
         if kind == "other objects":  # one image of each

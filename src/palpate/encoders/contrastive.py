@@ -25,7 +25,7 @@ from torch import Tensor, nn
 from transformers import CLIPModel, CLIPVisionModelWithProjection
 
 from palpate.core import Progress, Split, digest_json, fields_of, quiet, require
-from palpate.data.images import CLIP_MEAN, CLIP_STD, Preprocess, cached_images, image_stamp
+from palpate.data.images import Preprocess, cached_images, image_stamp
 from palpate.data.manifest import Manifest
 from palpate.data.recordings import resampled_by
 from palpate.data.residuals import with_gels
@@ -122,14 +122,15 @@ def train_encoder(
             source = train_clip(manifest, split, chosen, run.stage("clip"))
         elif not isinstance(source, EncoderSet):
             source = (EncoderSet.load if chosen.alone else load_clip)(source)
-        train = train_tactile
-        if isinstance(chosen.tactile, Gel):
+        train, gel = train_tactile, isinstance(chosen.tactile, Gel)
+        if gel:
             from palpate.encoders.gel_training import train_ruler
 
-            start = source if chosen.alone else None
-            manifest = with_gels(manifest, [], run.folder / "gels")[1][0]
-            train = partial(train_ruler, start=start)
+            train = train_ruler
         encoders = train(manifest, split, source, chosen, run.stage("tactile"))
+        if gel:
+            with first_alone():
+                _, (manifest,) = with_gels(manifest, [], run.folder / "gels")
         parts = [
             with_values(manifest.part(split, part), "tactile", "material")
             for part in ("train", "test")
@@ -226,13 +227,7 @@ class TactileLoss:
 
 
 def train_tactile(
-    manifest: Manifest,
-    split: Split,
-    clip: EncoderSet,
-    preset: EncoderPreset,
-    run: TrainingRun,
-    *,
-    start: EncoderSet | None = None,
+    manifest: Manifest, split: Split, clip: EncoderSet, preset: EncoderPreset, run: TrainingRun
 ) -> EncoderSet:
     """Train a tactile encoder against vision and text; run again to resume.
 
@@ -243,9 +238,6 @@ def train_tactile(
         clip: vision and text to learn from; moved to the run's device.
         preset: size and course.
         run: folders, seed and machine.
-        start: go on from this set's tactile encoder instead of random weights (the paper's); it
-            must have the preset's size. Its card goes into the new card, so that the data it was
-            trained on stays declared.
 
     Returns:
         All three encoders with a card.
@@ -262,7 +254,8 @@ def train_tactile(
             for part in (train, held)
         )
     assert rows is not None
-    tactile, preprocess = _first_weights(preset, clip.dim, rows.images, run.seed, start)
+    tactile = new_tactile(preset.tactile_config(clip.dim), run.seed)
+    preprocess = _with_statistics(preset, rows.images, preset.preprocess)
     course = preset.tactile_course
     with fields_of("tactile_course"):
         options = course.options(len(train), run.seed)
@@ -275,7 +268,6 @@ def train_tactile(
     texts = rows.captions, rows.text_source
     facts = facts_of(preset, train, split, texts, options)
     facts |= {m: clip.digest(m) if m in clip.modalities else None for m in ("vision", "text")}
-    facts |= {"start": start.digest("tactile") if start else None}
     facts |= {"held_out": held.digest} if len(held) else {}
     facts |= {"without_photo": rows.without_photo} if rows.without_photo else {}
     model = TactileModel(tactile).to(where)
@@ -292,10 +284,8 @@ def train_tactile(
         "clip": clip.name,
         "clip_card": clip.clip_card,
     }
-    card["start_card"] = start.card if start else None
-    card["synthetic"] = train.synthetic if not start or start.card.get("synthetic") else False
-    card["seen_in_part"] = start is not None and not start.knows_seen("tactile")
-    seen = union(digest_images(rows.images), start.seen.get("tactile") if start else None)
+    card["synthetic"] = train.synthetic
+    seen = union(digest_images(rows.images))
     return replace(
         clip,
         tactile=model.tactile,
@@ -304,23 +294,6 @@ def train_tactile(
         card=card,
         seen={**clip.seen, "tactile": seen},
     )
-
-
-def _first_weights(
-    preset: EncoderPreset, dim: int, images: NDArray[np.uint8], seed: int, start: EncoderSet | None
-) -> tuple[CLIPVisionModelWithProjection, Preprocess]:
-    """Return the encoder to train and its preprocessing: random, or a copy of ``start``'s."""
-    tactile = new_tactile(preset.tactile_config(dim), seed)
-    if start is None:
-        return tactile, _with_statistics(preset, images, preset.preprocess)
-    before = start.preprocess("tactile")
-    state = start.tactile.state_dict() if start.tactile is not None else {}
-    shapes = [{k: v.shape for k, v in s.items()} for s in (state, tactile.state_dict())]
-    same = replace(before, mean=CLIP_MEAN, std=CLIP_STD) == preset.preprocess
-    must = f"must have the preprocessing and size of the preset {preset.name}"
-    require(same and shapes[0] == shapes[1], "start", must, "another", fix="Leave it out")
-    tactile.load_state_dict(state)
-    return tactile, before
 
 
 def _with_statistics(

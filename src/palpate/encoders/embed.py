@@ -33,6 +33,7 @@ from palpate.core import (
 )
 from palpate.data.captions import NAMED, caption
 from palpate.data.images import REFETCH, Frames, image_stamp, images_below, load_images
+from palpate.data.residuals import kind_of
 from palpate.encoders.encoder_set import MODALITIES, EncoderSet, Modality
 from palpate.encoders.models import to_unit
 
@@ -86,7 +87,8 @@ def embed(
 
     Returns:
         n rows, float32, L2-normalized, with the encoder's digest as ``encoder``. A ruler subtracts
-        the no-contact images of the manifest where all samples have one, else low frequencies.
+        the no-contact images of the manifest where all samples have one, else low frequencies; the
+        digest covers which.
 
     Raises:
         PalpateError: for an unknown modality, an empty manifest, or samples without the image or
@@ -98,6 +100,8 @@ def embed(
     require(len(manifest) > 0, None, "There must be samples to embed", "none", fix=fix)
     digest, frames = encoders.digest(modality), None
     ruled = modality == "tactile" and encoders.preprocess(modality).residual
+    if ruled:  # rulers compare features of one kind
+        digest = digest_json([digest, kind_of(manifest)])
     texts = texts_of(manifest)[0] if modality == "text" else []
     inputs: list[Any] = texts
     if modality != "text":

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -9,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from palpate.core import Progress, quiet, require_choice
+from palpate.core import PalpateWarning, Progress, quiet, require, require_choice
 from palpate.data.images import Frames, Preprocess
 from palpate.data.manifest import Manifest
 from palpate.encoders.embed import embed, embed_frames, embed_texts, list_images
@@ -24,7 +25,7 @@ class Encoder:
     ::
 
         encoder = Encoder.from_pretrained("palpate/mini", modality="tactile")
-        features = encoder.encode(["a.png", "b.png"])  # (2, 128) float32, L2-normalized
+        features = encoder.encode("touches/", backgrounds="gel.png")  # (n, 256), L2-normalized
         encoder.saw("test/")  # whether it was trained on these images
 
     Attributes:
@@ -96,7 +97,7 @@ class Encoder:
         return self.encoders.saw(self.modality, images, batch=batch, progress=progress)
 
     def encode(
-        self, inputs: Any, *, batch: int = 128, progress: Progress = quiet
+        self, inputs: Any, *, backgrounds: Any = None, batch: int = 128, progress: Progress = quiet
     ) -> NDArray[np.float32]:
         """Embeddings of images or texts.
 
@@ -104,6 +105,8 @@ class Encoder:
             inputs: for images: a file or a folder of them, a PIL image, a list of files or PIL
                 images, a uint8 array (n, h, w, 3), a tensor (n, 3, h, w) of bytes or of floats in
                 [0, 1], or a manifest. For text: a string, a list of strings, or a manifest.
+            backgrounds: no-contact images in any of these forms, one for all or one each, for a
+                ruler; without, it takes off low frequencies, and warns. A manifest has its own.
             batch: images or texts at a time; changes the result by rounding only (1e-5).
             progress: called with the number of inputs done.
 
@@ -112,12 +115,21 @@ class Encoder:
             its paths.
 
         Raises:
-            PalpateError: if an image is unreadable, or the inputs are of another kind.
+            PalpateError: if an image is unreadable, the inputs are of another kind, or backgrounds
+                are neither one nor one each.
         """
         if isinstance(inputs, Manifest):
             return np.asarray(embed(inputs, self.encoders, self.modality, batch=batch).features)
         if self.modality == "text":
             texts = [inputs] if isinstance(inputs, str) else list(inputs)
             return embed_texts(texts, self.encoders, batch=batch, progress=progress)
-        frames = Frames.alone(list_images(inputs))
+        images = list_images(inputs)
+        gels = [] if backgrounds is None else list_images(backgrounds)
+        gels = gels * len(images) if len(gels) == 1 else gels
+        must, got = "must be one image, or one for each", f"{len(gels)} for {len(images)}"
+        require(len(gels) in (0, len(images)), "backgrounds", must, got)
+        if not gels and self.modality == "tactile" and self.preprocess.residual:
+            text = "A ruler without no-contact images reads faint contacts badly: pass backgrounds"
+            warnings.warn(text, PalpateWarning, stacklevel=2)
+        frames = Frames.alone(images, gels)
         return embed_frames(frames, self.encoders, self.modality, batch, progress)

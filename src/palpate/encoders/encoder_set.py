@@ -7,7 +7,7 @@ CLIP's ``preprocessor_config.json``.
 A saved set is a folder::
 
     palpate.json   {"format": "palpate-encoders/1", "digests": {modality: sha256}, "card": {...}}
-    clip/          CLIPModel, its tokenizer and preprocessor_config.json
+    clip/          CLIPModel, its tokenizer and preprocessor_config.json; not of a ruler alone
     tactile/       the learned ruler (:mod:`palpate.encoders.gel`), or a
                    CLIPVisionModelWithProjection and its preprocessor_config.json
     */seen.safetensors   digests of the images that an encoder was trained on, if they are known
@@ -364,20 +364,19 @@ class EncoderSet:
         public = isinstance(self.tactile, TactileModule) and not isinstance(
             self.tactile, GelEncoder
         )
-        own = self.clip is not None and not public
-        require(own, None, must, "a public tactile encoder", fix=fix)
-        assert self.clip is not None
+        require(not public, None, must, "a public tactile encoder", fix=fix)
         with atomic_folder(Path(folder)) as part:
             if half:
                 self.halve()
             pair = [m for m in self.modalities if m != "tactile"]
-            self._write(part / "clip", self.clip, "vision", half)
+            if pair:
+                self._write(part / "clip", self.clip, "vision", half)
+                about = {"format": CLIP_FORMAT, "name": self.name}
+                about |= self._about(pair, self.clip_card, "vision")
+                write_json(part / "clip" / "palpate.json", about)
             if self.tokenizer is not None:
                 with silent():
                     save_tokenizer(self.tokenizer, part / "clip")
-            about = {"format": CLIP_FORMAT, "name": self.name}
-            about |= self._about(pair, self.clip_card, "vision")
-            write_json(part / "clip" / "palpate.json", about)
             if self.tactile is not None:
                 self._write(part / "tactile", self.tactile, "tactile", half)
             about = {"format": FORMAT, **self._about(self.modalities, self.card, "tactile")}
@@ -418,7 +417,8 @@ class EncoderSet:
             return load_clip(source, device=device)
         about = _read_card(folder, FORMAT)
         # A shipped CLIP keeps its name, so that cards of what is trained with it say so.
-        encoders = load_clip(source if is_shipped(source) else folder / "clip")
+        pair = any(modality != "tactile" for modality in about["digests"])
+        encoders = load_clip(source if is_shipped(source) else folder / "clip") if pair else cls()
         encoders.card = about["card"]
         if "tactile" in about["digests"]:
             part = folder / "tactile"

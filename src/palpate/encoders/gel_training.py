@@ -5,12 +5,12 @@ object. Both are changed at random in what tells nothing of the object (angle, h
 blur, noise), and four losses are added:
 
 - contrast (InfoNCE) of a touch with its partner against all touches of other objects;
-- smooth L1 of the 149 numbers of ``palpate/handcrafted`` of the unchanged residual: area and
+- smooth L1 to the 149 numbers of ``palpate/handcrafted`` of the unchanged residual: area and
   strength of the contact, bands and directions of the surface;
 - cross entropy of the material, where samples have one;
 - InfoNCE with the frozen embeddings of photo and text, where samples have them (paper section 3).
 
-By itself (``self_supervised``) it learns from touches alone, by the first two.
+The preset ``self`` learns from touches alone, by the first two.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ from palpate.core import Split, digest_json, digest_lines, require, rng_for
 from palpate.core.features import is_missing
 from palpate.data.images import Preprocess, cached_images
 from palpate.data.manifest import Manifest
-from palpate.data.residuals import Residual
+from palpate.data.residuals import Residual, with_gels
 from palpate.encoders.courses import facts_of, fitted, require_held_out, require_rows, stamps
 from palpate.encoders.embed import embed, texts_of
 from palpate.encoders.encoder_set import EncoderSet
@@ -53,7 +53,7 @@ from palpate.training.processes import agreed, connect, first_alone, gather_rows
 from palpate.training.run import TrainingRun
 from palpate.training.steps import Step, seeded
 
-#: The ruler whose numbers are told.
+#: The ruler whose numbers are targets.
 HANDCRAFTED = "palpate/handcrafted"
 #: Factors of the four losses.
 CONTRAST, NUMBERS, NAMES, PHOTOS = 0.5, 4.0, 0.5, 2.0
@@ -61,10 +61,12 @@ CONTRAST, NUMBERS, NAMES, PHOTOS = 0.5, 4.0, 0.5, 2.0
 TEMPERATURE, NARROW, HIDDEN = 0.15, 64, 128
 #: Share of partners that are another contact of the object.
 FAR = 0.5
-#: Largest size of a standardized number to be told.
+#: Largest size of a standardized target.
 LARGEST = 5.0
 #: Images whose numbers are averaged for center and spread.
 STATISTICS = 4096
+#: Objects or videos that are held out, at least.
+LEAST_HELD = 3
 #: Recordings that a card lists by name, at most.
 LISTED = 1000
 #: Range of the zoom; deviations of shift [share of the side], and of the logarithms of saturation
@@ -78,7 +80,7 @@ class Touches:
     Attributes:
         rows: images, captions and what photos and texts are embedded as, of both parts.
         unit: number of the object of each sample, else of its video, within its part (n,).
-        numbers: what is told of each, standardized (n, 149).
+        numbers: targets of each, standardized (n, 149).
         names: number of each material (n,), -1 without one; ``classes`` in all.
     """
 
@@ -105,9 +107,9 @@ class Touches:
         starts = (np.flatnonzero(np.diff(v[self._order], prepend=-1)) for v in (self.unit, contact))
         self._blocks = [np.append(first, len(part)) for first in starts]
         rulers = EncoderSet.load(HANDCRAFTED)
-        told = embed(part, rulers, raw=True, cache=run.cache, progress=run.progress).features
-        told = (told - told.mean(axis=0)) / np.maximum(told.std(axis=0), 1e-3)
-        self.numbers = torch.from_numpy(told.clip(-LARGEST, LARGEST))
+        numbers = embed(part, rulers, raw=True, cache=run.cache, progress=run.progress).features
+        numbers = (numbers - numbers.mean(axis=0)) / np.maximum(numbers.std(axis=0), 1e-3)
+        self.numbers = torch.from_numpy(numbers.clip(-LARGEST, LARGEST))
         materials = ["" if is_missing(v) else str(v) for v in part.column("material")]
         known = sorted({*materials} - {""}) if clip is not None else []
         number = {name: k for k, name in enumerate(known)}
@@ -204,11 +206,11 @@ def _recolored(hue: Tensor, swap: Tensor, normal: Tensor) -> Tensor:
 class GelModel(nn.Module):
     """What trains: the ruler, and heads that are thrown away."""
 
-    def __init__(self, ruler: GelEncoder, told: int, classes: int) -> None:
+    def __init__(self, ruler: GelEncoder, targets: int, classes: int) -> None:
         super().__init__()
         self.ruler = ruler
         self.hidden = nn.Linear(ruler.dim, HIDDEN)
-        self.narrow, self.numbers = nn.Linear(HIDDEN, NARROW), nn.Linear(HIDDEN, told)
+        self.narrow, self.numbers = nn.Linear(HIDDEN, NARROW), nn.Linear(HIDDEN, targets)
         self.names = nn.Linear(HIDDEN, classes) if classes else None
         self.log_scale = nn.Parameter(torch.tensor(LOG_SCALE_START))
 
@@ -229,9 +231,11 @@ class GelLoss:
         with torch.autocast(numbers.device.type, enabled=False):
             pooled = pairs.transpose(0, 1).flatten(0, 1).float()
             hidden = relu(module.hidden(layer_norm(pooled, pooled.shape[1:])))
-            told = smooth_l1_loss(module.numbers(hidden), batch["numbers"])
-            losses = {"contrast": contrast(module.narrow(hidden), batch["unit"]), "numbers": told}
-            total = CONTRAST * losses["contrast"] + NUMBERS * told
+            losses = {
+                "contrast": contrast(module.narrow(hidden), batch["unit"]),
+                "numbers": smooth_l1_loss(module.numbers(hidden), batch["numbers"]),
+            }
+            total = CONTRAST * losses["contrast"] + NUMBERS * losses["numbers"]
             if module.names is not None and (named := batch["name"] >= 0).any():
                 losses["names"] = cross_entropy(module.names(hidden[named]), batch["name"][named])
                 total = total + NAMES * losses["names"]
@@ -264,48 +268,46 @@ def contrast(embedded: Tensor, unit: Tensor) -> Tensor:
 
 
 def train_ruler(
-    manifest: Manifest,
-    split: Split,
-    clip: EncoderSet,
-    preset: EncoderPreset,
-    run: TrainingRun,
-    *,
-    start: EncoderSet | None = None,
+    manifest: Manifest, split: Split, clip: EncoderSet, preset: EncoderPreset, run: TrainingRun
 ) -> EncoderSet:
     """Train the learned ruler on the train part of a split; run again to resume.
 
     Args:
-        manifest: samples with tactile images and, all or none, their no-contact images
-            (:func:`palpate.data.residuals.with_gels`).
+        manifest: samples with tactile images.
         split: its parts ``train`` and ``val`` are read. A preset that learns from touches alone
             holds a tenth of the recordings of ``train`` out where there is no ``val``.
-        clip: vision and text to learn from, and to be joined with; moved to the run's device.
+        clip: vision and text to learn from, moved to the run's device; for touches alone the set
+            whose ruler goes on.
         preset: size and course.
         run: folders, seed and machine.
-        start: go on from this set's ruler instead of random weights.
 
     Returns:
-        All three encoders with a card, which names the recordings that the ruler saw.
+        The ruler with a card, which names the objects or videos that it saw and what was
+        subtracted; with vision and text, unless it learned from touches alone: its head then leads
+        nowhere.
 
     Raises:
-        PalpateError: if the train part is empty, a sample lacks its image, or ``start`` has no
-            ruler of the preset's size.
+        PalpateError: if the train part is empty or too small, a sample lacks its image, or there is
+            no ruler of the preset's size to go on from.
     """
     where = pick_device(connect(str(run.device)))
     train, held = train_part(manifest, split), manifest.part(split, "val")
     if preset.alone and not len(held):
         train, held = held_out(train, run.seed)
+    with first_alone():
+        kind, (backed,) = with_gels(manifest, [], run.folder / "gels")
     with seeded(run.seed, "tactile encoder"):
-        ruler = GelEncoder(preset.tactile_config(clip.dim))
-    if start is not None:
-        old = start.tactile
+        ruler = GelEncoder(preset.tactile_config(clip.shared_width))
+    if preset.alone:
+        old = clip.tactile
         same = isinstance(old, GelEncoder) and architecture(old.config) == architecture(
             ruler.config
         )
-        must, fix = "must have a learned ruler of the preset's size", "Leave it out"
-        require(same, "start", must, "another", fix=fix)
+        must, fix = "must have a learned ruler of the preset's size", "Train one: --preset gel"
+        require(same, "clip", must, "another", fix=fix)
         assert old is not None
         ruler.load_state_dict(old.state_dict())
+        ruler.center.zero_(), ruler.spread.fill_(1)
     options = preset.tactile_course.options(len(train), run.seed)
     with agreed():
         require_rows(train, options.batch)
@@ -313,11 +315,12 @@ def train_ruler(
     clip.to(where)
     with first_alone():
         teacher = None if preset.alone else clip
-        touches = Touches(train, held, teacher, run, preset.image)
+        parts = (backed.take(part.ids) for part in (train, held))
+        touches = Touches(*parts, teacher, run, preset.image)
     facts = facts_of(preset, train, split, texts_of(train), options)
     facts |= {m: clip.digest(m) for m in clip.modalities if m != "tactile"}
-    facts |= {"start": start.digest("tactile") if start else None}
     facts |= {"held_out": held.digest} if len(held) else {}
+    facts |= {"background_kind": kind, "start": clip.digest("tactile") if preset.alone else None}
     with seeded(run.seed, "heads of the ruler"):
         model = GelModel(ruler, touches.numbers.shape[1], touches.classes).to(where)
     task = Task(
@@ -331,34 +334,38 @@ def train_ruler(
     )
     card = fitted(model, task, options, facts, run)
     card |= {"clip": clip.name, "clip_card": clip.clip_card}
-    card["start_card"] = start.card if start else None
-    card["synthetic"] = train.synthetic if not start or start.card.get("synthetic") else False
-    card["seen_in_part"] = start is not None and not start.knows_seen("tactile")
+    start = clip if preset.alone else EncoderSet()
+    card["start_card"] = start.card
+    card["synthetic"] = train.synthetic if start.card.get("synthetic", True) else False
+    card["seen_in_part"] = preset.alone and not start.knows_seen("tactile")
     names = sorted({name.partition("\n")[2] for name in units_of(train, "")})
     card["recordings"] = {"count": len(names), "digest": digest_lines(names)}
     card["recordings"] |= {"names": names} if len(names) <= LISTED else {}
     standardize(ruler, touches, len(train))
     plain = ruler.preprocess.plainly
     seen = digest_images(cached_images(train, "tactile", plain, run.cache, run.progress))
-    return replace(
-        clip,
-        tactile=ruler,
-        sensor=None,
-        preprocesses={**clip.preprocesses, "tactile": ruler.preprocess},
-        card=card,
-        seen={**clip.seen, "tactile": union(seen, start.seen.get("tactile") if start else None)},
-    )
+    seen = union(seen, start.seen.get("tactile"))
+    alone = EncoderSet(None, None, ruler, {"tactile": ruler.preprocess}, "", {}, card)
+    alone.seen["tactile"] = seen
+    return alone if preset.alone else clip.with_tactile(alone)
 
 
 def held_out(train: Manifest, seed: int) -> tuple[Manifest, Manifest]:
-    """The train part without a tenth of its recordings, and those."""
+    """The train part without a tenth of its recordings, at least :data:`LEAST_HELD`, and those.
+
+    Raises:
+        PalpateError: if there are fewer than twice as many: rows are compared with other objects.
+    """
     units = units_of(train, "")
     names = rng_for(seed, "held-out recordings").permutation(sorted({*units}))
-    kept = {*names[max(1, len(names) // 10) :].tolist()}
-    parts = [
-        [k for k, u in zip(train.ids, units, strict=True) if (u in kept) == k_] for k_ in (1, 0)
-    ]
-    return train.take(parts[0]), train.take(parts[1])
+    must = (
+        f"The train part must hold touches of {2 * LEAST_HELD} objects or videos, to hold some out"
+    )
+    require(len(names) >= 2 * LEAST_HELD, None, must, len(names), fix="Record more")
+    held = {*names[: max(LEAST_HELD, len(names) // 10)].tolist()}
+    rows = list(zip(train.ids, units, strict=True))
+    kept = [name for name, unit in rows if unit not in held]
+    return train.take(kept), train.take([name for name, unit in rows if unit in held])
 
 
 @torch.no_grad()

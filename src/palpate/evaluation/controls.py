@@ -15,8 +15,6 @@ from dataclasses import replace
 from itertools import cycle
 from typing import TYPE_CHECKING
 
-import polars as pl
-
 from palpate.core import FeatureSet, Score, rng_for
 from palpate.data.images import load_images
 from palpate.data.samples import Samples
@@ -96,20 +94,23 @@ def control_samples(bench: Bench) -> dict[str, Samples]:
     if real.has_background:
         gels = bench.pixels(real, "background")
         controls[BACKGROUND] = replace(real, source=BACKGROUND, rows=gels)
-    rows_of: dict[str, list[int]] = {}
-    for row, material in enumerate(train.labels or ()):
-        rows_of.setdefault(material, []).append(row)
-    if real.labels and all(material in rows_of for material in real.labels):
-        chosen: list[int] = []
-        for i, material in zip(real.ids, real.labels, strict=True):
-            rows = rows_of[material]
-            chosen.append(rows[int(rng_for(bench.seed, "control", i).integers(len(rows)))])
-        paths, gels = train.manifest.paths("tactile"), train.manifest.column("background")
-        images = load_images([paths[k] for k in chosen], bench.size, progress=bench.progress)
-        own = [gels[k] and str(train.manifest.path(gels[k]).resolve()) for k in chosen]
-        drawn = replace(real, source=SAME_MATERIAL, rows=images)
-        controls[SAME_MATERIAL] = drawn.with_columns(pl.Series("background", own, pl.String))
+    if real.labels and {*real.labels} <= {*(train.labels or ())}:
+        paths = train.manifest.paths("tactile")
+        chosen = [paths[row] for row in rows_of_material(bench)]
+        images = load_images(chosen, bench.size, progress=bench.progress)
+        controls[SAME_MATERIAL] = replace(real, source=SAME_MATERIAL, rows=images)
     return controls
+
+
+def rows_of_material(bench: Bench) -> list[int]:
+    """For each row of the reference a row of train of its material."""
+    assert bench.train is not None
+    rows_of: dict[str, list[int]] = {}
+    for row, material in enumerate(bench.train.labels or ()):
+        rows_of.setdefault(material, []).append(row)
+    named = zip(bench.reference.ids, bench.reference.labels or (), strict=True)
+    some = ((rows_of[material], rng_for(bench.seed, "control", i)) for i, material in named)
+    return [rows[int(rng.integers(len(rows)))] for rows, rng in some]
 
 
 def material_accuracies(bench: Bench) -> list[Score]:

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import tempfile
 from collections.abc import Mapping, Sequence
-from contextlib import nullcontext
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
@@ -177,39 +176,28 @@ def probe(  # noqa: PLR0913 - one argument a choice
         Plan(modality, label, group, top, pool, text_threshold, seed, allow_seen, axis),
     )
     runs: dict[str, list[Probed]] = {}
-    with tempfile.TemporaryDirectory() if cache is None else nullcontext(cache) as folder:
-        rulers = [
-            name
-            for name, e in sets.items()
-            if modality == "tactile" and e.preprocess(modality).residual
+    touch = modality == "tactile"
+    rulers = [name for name, e in sets.items() if touch and e.preprocess(modality).residual]
+    for s, e in ((s, e) for s in loaded for e in sets):
+        subject = {"split": s, "encoder": e}.get(axis, "real")
+        runs[subject] = [
+            measure(manifest, loaded[s], sets[e], subject, plan, cache=cache, progress=progress)
         ]
-        backed = manifest
-        if rulers:
-            from palpate.data.residuals import with_gels
-
-            kind, (backed,) = with_gels(manifest, [], Path(folder))
-            plan = replace(plan, notes=[*plan.notes, Note("background-kind", {"kind": kind})])
-        for s, e in ((s, e) for s in loaded for e in sets):
-            subject = {"split": s, "encoder": e}.get(axis, "real")
-            source = backed if e in rulers else manifest
-            runs[subject] = [
-                measure(source, loaded[s], sets[e], subject, plan, cache=cache, progress=progress)
-            ]
-        if against is not None and plan.sure:
-            firsts = {name: run.labeled for name, (run,) in runs.items()}
-            (tested,) = loaded.values()
-            for name in next(iter(firsts.values())):
-                found = power(
-                    {subject: labeled[name] for subject, labeled in firsts.items()},
-                    name,
-                    rulers=rulers,
-                    seed=seed,
-                    progress=progress,
-                    split=tested.digest,
-                    settings=plan.settings,
-                )
-                for subject, means in found.items():
-                    runs[subject][0].means += means
+    if against is not None and plan.sure:
+        firsts = {name: run.labeled for name, (run,) in runs.items()}
+        (tested,) = loaded.values()
+        for name in next(iter(firsts.values())):
+            found = power(
+                {subject: labeled[name] for subject, labeled in firsts.items()},
+                name,
+                rulers=rulers,
+                seed=seed,
+                progress=progress,
+                split=tested.digest,
+                settings=plan.settings,
+            )
+            for subject, means in found.items():
+                runs[subject][0].means += means
     results = results_of(f"Probe of the {modality} encoder", runs, plan, manifest, loaded)
     digests = {
         f"{modality} encoder{f' {name}' if axis == 'encoder' else ''}": e.digest(modality)
@@ -265,11 +253,43 @@ def measure(
     cache: str | Path | None = None,
     progress: Progress = quiet,
 ) -> Probed:
-    """Everything that one set of encoders scores under one split.
+    """Everything that one set of encoders scores under one split; of a ruler on one kind of
+    background for all samples.
 
     Raises:
         PalpateError: if nothing can be measured.
     """
+    measured = partial(
+        _measured,
+        split=split,
+        encoders=encoders,
+        subject=subject,
+        plan=plan,
+        cache=cache,
+        progress=progress,
+    )
+    touch = "tactile" in (plan.modality, *_others(plan)) and "tactile" in encoders.modalities
+    if not touch or not encoders.preprocess("tactile").residual:
+        return measured(manifest)
+    from palpate.data.residuals import with_gels
+
+    with tempfile.TemporaryDirectory() as folder:
+        kind, (backed,) = with_gels(manifest, [], Path(cache or folder))
+        result = measured(backed)
+    result.notes.append(Note("background-kind", {"kind": kind}))
+    return result
+
+
+def _measured(
+    manifest: Manifest,
+    *,
+    split: Split,
+    encoders: Any,
+    subject: str,
+    plan: Plan,
+    cache: str | Path | None,
+    progress: Progress,
+) -> Probed:
     from palpate.encoders.embed import embed
     from palpate.encoders.guard import guard
 

@@ -1,14 +1,15 @@
 """Ruler features of all that is scored in one call: one kind of background, one standardization.
 
 A ruler's numbers are centered and divided by the reference's mean and deviation, then
-L2-normalized. Digest of encoder, kind and standardization together name the features, so that
-scores of different ones share no column.
+L2-normalized; for scores without a reference (I-, CI- and D-TMMD) by those in the encoder, so that
+they are the same next to any reference. Digest of encoder, kind and standardization together name
+the features, so that scores of different ones share no column.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -20,6 +21,8 @@ from palpate.core import FeatureSet, Note, digest_json, save_image
 from palpate.data.manifest import Manifest
 from palpate.data.residuals import with_gels
 from palpate.data.samples import Samples
+from palpate.evaluation.controls import rows_of_material
+from palpate.metrics.retrieval import unit_rows
 from palpate.report.tables import SAME_MATERIAL
 
 if TYPE_CHECKING:
@@ -29,17 +32,28 @@ if TYPE_CHECKING:
 LEAST_SPREAD = 0.1
 
 
-def ruler_features(bench: Bench) -> list[tuple[Samples, FeatureSet]]:
+@dataclass(frozen=True)
+class Ruled:
+    """A set with its features by a ruler, standardized by the reference and by the encoder."""
+
+    samples: Samples
+    compared: FeatureSet
+    alone: FeatureSet
+
+
+def ruler_features(bench: Bench) -> list[Ruled]:
     """Every set of the bench with its features."""
     from palpate.encoders.embed import embed
 
+    # A control of real train images takes their features: its ids, but not its gels, are others'.
+    drawn = [s for s in bench.controls.values() if s.source == SAME_MATERIAL]
     some = (bench.reference, *bench.subjects.values(), bench.train, bench.seen)
-    sets, encoders = [s for s in some if s is not None], bench.encoders
+    sets, encoders = [s for s in some if s is not None and s not in drawn], bench.encoders
     assert encoders is not None  # whose ruler it is
     folder = bench.cache / "rulers"
     real, *others = (_of_files(s, folder) for s in sets)
-    controls = [k for k, s in enumerate(sets[1:]) if s.source == SAME_MATERIAL]
-    kind, parts = with_gels(real, others, folder, real=controls)
+    also = [k for k, s in enumerate(sets[1:]) if s is bench.train or s is bench.seen]
+    kind, parts = with_gels(real, others, folder, real=also)
     bench.notes.append(Note("background-kind", {"kind": kind}))
     caches = [s.folder(folder) if bench.keep else None for s in sets]
     embedded = [
@@ -47,9 +61,16 @@ def ruler_features(bench: Bench) -> list[tuple[Samples, FeatureSet]]:
         for p, cache in zip(parts, caches, strict=True)
     ]
     rows = [e.features.astype(np.float64) for e in embedded]
-    rows, scales = standardized(rows, rows[0])
-    digest = digest_json([encoders.digest("tactile"), kind, scales])
-    return [(s, s.feature_set(x, digest)) for s, x in zip(sets, rows, strict=True)]
+    for samples in drawn:
+        train = next(k for k, s in enumerate(sets) if s is bench.train)
+        sets.append(samples)
+        rows.append(rows[train][rows_of_material(bench)])
+    compared, scales = standardized(rows, rows[0])
+    digests = digest_json([encoders.digest("tactile"), kind, scales]), embedded[0].encoder
+    return [
+        Ruled(s, s.feature_set(x, digests[0]), s.feature_set(unit_rows(y), digests[1]))
+        for s, x, y in zip(sets, compared, rows, strict=True)
+    ]
 
 
 def standardized(

@@ -46,6 +46,7 @@ from palpate.report.labels import measured
 if TYPE_CHECKING:
     from palpate.data.manifest import Manifest
     from palpate.encoders.encoder_set import EncoderSet
+    from palpate.evaluation.ruling import Ruled
 
 Images = NDArray[np.uint8]
 Name = Literal["fid", "kid", "prdc", "cmmd", "ssim", "psnr", "ms-ssim", "contact", "lpips"]
@@ -163,6 +164,11 @@ class Bench:
         """What every metric of features takes."""
         return {"seed": self.seed, "split": self.split}
 
+    def of_family(self, preset: Preset | None, sigma: float | str) -> dict[str, Any]:
+        """What the TMMD family takes in one column."""
+        column = {"preset": preset, "sigma": sigma, "normalize": self.normalize}
+        return {**self.common, **column}
+
     @property
     def subjects(self) -> dict[str, Samples]:
         """Generators and controls."""
@@ -177,7 +183,7 @@ class Bench:
         encoders, progress = self.encoders, self.progress
         assert encoders is not None  # `score` requires one for what compares features
         if encoders.preprocess("tactile").residual:
-            return next(x for s, x in self.ruled if s is samples)
+            return next(r.compared for r in self.ruled if r.samples is samples)
         digest = encoders.digest("tactile")
         if samples.rows is not None:
             x = embed_images(samples.rows, encoders, "tactile", progress=progress)
@@ -189,7 +195,7 @@ class Bench:
         return samples.feature_set(x.features, digest)
 
     @cached_property
-    def ruled(self) -> list[tuple[Samples, FeatureSet]]:
+    def ruled(self) -> list[Ruled]:
         """Features of everything by a ruler."""
         from palpate.evaluation.ruling import ruler_features
 
@@ -218,6 +224,15 @@ class Bench:
         name = "embeddings" if self.reference.embedded else "tactile"
         sets = {n: self.features(s) for n, s in self.subjects.items()}
         return self._sets(name, sets, self.features(self.reference))
+
+    @cached_property
+    def free(self) -> Sets:
+        """Features for scores without a reference: those of a ruler do not depend on it."""
+        if self.encoders is None or not self.encoders.preprocess("tactile").residual:
+            return self.tactile
+        alone = {id(r.samples): r.alone for r in self.ruled}
+        sets = {n: alone[id(s)] for n, s in self.subjects.items()}
+        return self._sets(self.tactile.name, sets, alone[id(self.reference)])
 
     def _sets(self, name: str, sets: Mapping[str, FeatureSet], reference: FeatureSet) -> Sets:
         generators, controls = (
@@ -381,7 +396,8 @@ def tmmd_family(bench: Bench) -> list[Score]:
     sets, train, scores = bench.tactile, bench.train_features, list[Score]()
     reference, every = sets.reference, {**sets.generators, **sets.controls}
     grouped = [s.groups is not None for s in (reference, *every.values())]
-    floor = reference if len(set(grouped)) == 1 else None
+    free = bench.free
+    floor = free.reference if len(set(grouped)) == 1 else None
     further = train and matched_features(train, reference, bench.seed)
     rows = _most_rows(sets)
     if not bench.sigmas and rows > MANY:
@@ -389,28 +405,16 @@ def tmmd_family(bench: Bench) -> list[Score]:
     columns = bandwidths(bench, grouped=all(grouped), rows=rows)
     for done, (preset, sigma) in enumerate(columns):
         all_four = sigma in (bench.sigmas or (SIGMA,))
-        compared = partial(compare, floor=floor) if all_four else compare_tmmd
+        shared = bench.of_family(preset, sigma)
+        two = free is not sets  # of features
+        compared = partial(compare, floor=floor) if all_four and not two else compare_tmmd
         least = None
         if further is not None:
-            least = tmmd(
-                further,
-                reference,
-                preset=preset,
-                sigma=sigma,
-                normalize=bench.normalize,
-                permutations=0,
-                **bench.common,
-            ).value
-        for some in sets.batches():
-            result = compared(
-                some,
-                reference,
-                preset=preset,
-                sigma=sigma,
-                normalize=bench.normalize,
-                permutations=bench.permutations,
-                **bench.common,
-            )
+            least = tmmd(further, reference, permutations=0, **shared).value
+        for some, alone in zip(sets.batches(), free.batches(), strict=True):
+            result = compared(some, reference, permutations=bench.permutations, **shared)
+            if two and all_four:
+                result = _joined(result, compare(alone, free.reference, floor=floor, **shared))
             of_family = [
                 replace(s, floor=least) if s.metric == "TMMD" else s for s in result.scores
             ]
@@ -422,6 +426,12 @@ def tmmd_family(bench: Bench) -> list[Score]:
                     bench.notes.append(Note("below-floor", params))
         bench.progress("TMMD family", done + 1, len(columns))
     return scores
+
+
+def _joined(with_reference: Comparison, without: Comparison) -> Comparison:
+    """TMMD of the first, the others of the second."""
+    parts = zip(vars(with_reference).values(), vars(without).values(), strict=True)
+    return Comparison(*([*a, *(s for s in b if s.metric != "TMMD")] for a, b in parts))
 
 
 def second_opinion(bench: Bench) -> list[Score]:

@@ -444,7 +444,7 @@ def _with_warnings(
     scores: Sequence[Score], bench: Bench, of_encoder: Sequence[Note]
 ) -> list[Score]:
     """The scores with notes on the encoder, and on generators that may have seen test samples."""
-    digest = bench.encoders and bench.tactile.reference.encoder
+    digests = [s.reference.encoder for s in (bench.tactile, bench.free)] if bench.encoders else []
     of_generator = {
         name: [Note("generator-of-other-split")]
         for name, s in bench.generators.items()
@@ -457,7 +457,7 @@ def _with_warnings(
             s,
             notes=[
                 *s.notes,
-                *(of_encoder if digest and s.encoder == digest else []),
+                *(of_encoder if s.encoder in digests else []),
                 *of_generator.get(s.a, []),
             ],
         )
