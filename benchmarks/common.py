@@ -135,12 +135,14 @@ class Study:
         fit(judge, task, JUDGE, self.work / "judge", compute=BFLOAT, progress=self.progress)
         return judge.eval()
 
-    def judged(self, images):
-        """Accuracy of both judges, and TMMD, of images of the test samples in their order."""
+    def judged(self, images, gels):
+        """Accuracy of both judges, and TMMD, of images of the test samples in their order, on
+        these gels.
+        """
         hits = self.judge.names(images) == self.answers
         features = FeatureSet(
             self.test.ids,
-            embed_images(np.asarray(images), self.encoders, gels=self.gels),
+            embed_images(np.asarray(images), self.encoders, gels=gels),
             self.test.column("material"),
             self.videos,
             self.encoders.digest("tactile"),
@@ -154,13 +156,18 @@ class Study:
         }
 
     def nearest(self, known, cache):
-        """The real images of the photos of ``known`` that are most like the test photos."""
+        """The real images of the photos of ``known`` that are most like the test photos, and their
+        gels.
+        """
         keys, asked = (
             embed(part, self.encoders, "vision", cache=of).features
             for part, of in ((known, cache), (self.test, self.cache))
         )
-        images = cached_images(known, "tactile", MINI.size, cache)
-        return images[(asked @ keys.T).argmax(1)]
+        images, gels = (
+            cached_images(known, column, MINI.size, cache) for column in ("tactile", "background")
+        )
+        rows = (asked @ keys.T).argmax(1)
+        return images[rows], gels[rows]
 
     def gels_like(self, known, cache):
         """A gel of ``known`` for each judged sample."""

@@ -108,22 +108,24 @@ class Goals:
         photos = self.photos
         if permuted:
             photos = photos[rng_for(0, "permuted").permutation(len(photos))]
-        return self.pipeline.sample(
+        background = self.known_gels if gels == "known" else self.study.gels
+        images = self.pipeline.sample(
             photos if photo else None,
             self.study.test.ids,
             texts=self.texts() if text else None,
             seed=seed,
-            background=self.known_gels if gels == "known" else self.study.gels,
+            background=background,
         )
+        return images, background
 
     def measure(self, name, seed, make):
-        """Record what the judges say, and what the CNN says of each image."""
+        """Record what the judges say of images and their gels, and the CNN of each image."""
         seeds = self.record.setdefault(name, {})
         if str(seed) not in seeds:
-            images = np.asarray(make())
+            images, gels = map(np.asarray, make())
             hits = self.study.judge.names(images) == self.study.answers
             day = datetime.date.today().isoformat()
-            judged = {**self.study.judged(images), "hits": hits.astype(int).tolist()}
+            judged = {**self.study.judged(images, gels), "hits": hits.astype(int).tolist()}
             seeds[str(seed)] = {**judged, "day": day}
             write_json(self.path, self.record)
             print(name, seed, percents(seeds[str(seed)]["cnn"]), flush=True)
@@ -218,7 +220,7 @@ def main():
         study = Study(chosen.work / str(materials), materials)
         goals = Goals(study, known, pipeline.digest, asdict(pipeline.sampler))
         goals.take(pipeline)
-        goals.measure("real", 0, lambda s=study: s.real)
+        goals.measure("real", 0, lambda s=study: (s.real, s.gels))
         goals.measure(NEAREST, 0, goals.nearest)
         for seed in chosen.seeds:
             for name, drive in DRIVES.items():

@@ -3,7 +3,8 @@
     python benchmarks/rulers.py --work runs/rulers --against runs/old/encoders [--seed 77]
 
 On a world of new objects and gels (``--seed``; 20 materials, 400 videos), each encoder's features
-are standardized by the reference as ``score`` does it for a ruler. In each of 20 draws the videos
+are standardized by the reference as ``score`` does it for a ruler; those of CI- and D-TMMD by what
+the encoder holds. In each of 20 draws the videos
 are halved into "generated" and reference, and a fault is planted in the first half:
 
 - swap: images of a tenth of the videos are given to videos of another material;
@@ -29,9 +30,9 @@ from palpate.data.images import load_images
 from palpate.data.manifest import Manifest
 from palpate.encoders.embed import embed_images
 from palpate.encoders.encoder_set import EncoderSet
-from palpate.evaluation.ruling import standardized
 from palpate.metrics import ci_tmmd, d_tmmd, tmmd
 from palpate.metrics.probe import material_accuracy
+from palpate.metrics.retrieval import standardized, unit_rows
 from palpate.sim import WorldOptions, write_world
 
 DRAWS = 20
@@ -112,7 +113,8 @@ class Bench:
                 (a, b), _ = standardized([x, numbers[""][other]], numbers[""][other])
                 a, b = self.rows(a, at), self.rows(b, other)
                 p = tmmd(a, b, preset="grouped", permutations=199).details["p_value"]
-                free = [f(a, preset="grouped").value for f in (ci_tmmd, d_tmmd)]
+                alone = self.rows(unit_rows(x), at)
+                free = [f(alone, preset="grouped").value for f in (ci_tmmd, d_tmmd)]
                 found[fault].append((p, *free))
         return {k: np.array(v, float) for k, v in found.items()}
 

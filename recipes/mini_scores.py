@@ -33,7 +33,7 @@ from palpate.evaluation.scoring import score
 from palpate.metrics import tmmd
 from palpate.metrics.means import mean_of
 from palpate.metrics.probe import material_accuracy
-from palpate.metrics.retrieval import retrieval
+from palpate.metrics.retrieval import retrieval, standardized
 from palpate.report.labels import measured
 
 #: Touches generated for the generator's scores, evenly over the new world.
@@ -228,7 +228,9 @@ def score_generator(
         for s in scores
         if s.measure in kept and s.b is None and s.value is not None
     ]
-    known, real = (embed(part, encoders, "tactile", cache=cache) for part in (train, test))
+    known, real = (
+        embed(part, encoders, "tactile", raw=True, cache=cache) for part in (train, test)
+    )
     gels, ids = gels_of(test, pipeline.size, cache), test.ids
     texts = embed(test, encoders, "text", cache=cache).features
     others = {
@@ -237,8 +239,14 @@ def score_generator(
             None, ids, seed=0, texts=texts, background=gels if pipeline.background else None
         ),
     }
-    for subject, images in others.items():
-        features = embed_images(images, encoders, gels=gels, progress=progress)
+    numbers = [
+        embed_images(images, encoders, gels=gels, raw=True, progress=progress)
+        for images in others.values()
+    ]
+    # As `score` does it.
+    sets, _ = standardized([known.features, real.features, *numbers], real.features)
+    known, real = replace(known, features=sets[0]), replace(real, features=sets[1])
+    for subject, features in zip(others, sets[2:], strict=True):
         made = FeatureSet(ids, features, real.labels, real.groups, real.encoder)
         rows += [
             _row(f"TMMD, {subject}", tmmd(made, real, preset="grouped"), len(ids)),

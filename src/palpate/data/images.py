@@ -146,14 +146,16 @@ class Frames(NamedTuple):
     ) -> Frames:
         """Images, each with its no-contact image if there are any, of unknown sensors."""
         empty = gels or [None] * len(images)
-        files = [(image, gel, None) for image, gel in zip(images, empty, strict=True)]
+        files: list[Frame] = [(image, gel, None) for image, gel in zip(images, empty, strict=True)]
         return cls(files, [""] * len(images))
 
     def stamps(self, root: Path) -> list[object]:
         """What changes with the no-contact images, the earlier frames and the sensors."""
         more = {path for _, *further in self.files for path in further if isinstance(path, Path)}
-        stamp = {path: [os.path.relpath(path, root), *file_stamp(path)] for path in more}
-        return [[[path and stamp[path] for path in more] for _, *more in self.files], self.sensors]
+        stamp: dict[object, list[object]] = {
+            path: [os.path.relpath(path, root), *file_stamp(path)] for path in more
+        }
+        return [[[stamp.get(path) for path in more] for _, *more in self.files], self.sensors]
 
 
 @dataclass(frozen=True)

@@ -28,6 +28,7 @@ from palpate.encoders.models import pick_device
 from palpate.encoders.rows import evenly_spaced, with_values
 from palpate.metrics.images import per_image
 from palpate.metrics.probe import fit_probe, material_accuracy
+from palpate.metrics.retrieval import standardized
 from palpate.metrics.tactile import tmmd
 from palpate.training.processes import place
 
@@ -154,15 +155,22 @@ def measure_ceiling(
             ground = None if ground is None else ground[~seen]
 
         backed = not any(p.table["background"].null_count() for p in (train, held))
+        ruled = judge.preprocess("tactile").residual
 
-        def features(part: Manifest, pixels: NDArray[np.uint8]) -> FeatureSet:
-            labels, groups = words_of(part, "material"), words_of(part, "video")
+        def numbers(part: Manifest, pixels: NDArray[np.uint8]) -> NDArray[np.float32]:
             empty = cached_images(part, "background", size, cache, progress) if backed else None
-            rows = embed_images(pixels, judge, gels=empty, progress=progress)
+            return embed_images(pixels, judge, gels=empty, raw=ruled, progress=progress)
+
+        of_real = numbers(held, images)
+
+        def features(part: Manifest, rows: NDArray[np.float32]) -> FeatureSet:
+            if ruled:  # as `score` does it
+                (rows,), _ = standardized([rows], of_real)
+            labels, groups = words_of(part, "material"), words_of(part, "video")
             return FeatureSet(part.ids, rows, labels, groups, scores["judge"])
 
         decoded = autoencoder.decode(autoencoder.encode(images, ground), ground)
-        real, ours = features(held, images), features(held, decoded)
+        real, ours = features(held, of_real), features(held, numbers(held, decoded))
         with suppress(PalpateError):  # too few samples or videos
             score = tmmd(ours, real)
             # Where nobody knows the videos, nobody knows how much they differ.
@@ -172,7 +180,8 @@ def measure_ceiling(
             some = evenly_spaced(len(train), FITTED)
             pixels = np.asarray(cached_images(train, "tactile", size, cache, progress)[some])
             with suppress(PalpateError):  # no material outside of train
-                fitted = features(train.take([train.ids[k] for k in some]), pixels)
+                part = train.take([train.ids[k] for k in some])
+                fitted = features(part, numbers(part, pixels))
                 probe = fit_probe(fitted)
                 scores["accuracy_real"] = material_accuracy(fitted, real, probe=probe).value
                 scores["accuracy"] = material_accuracy(fitted, ours, probe=probe).value

@@ -297,7 +297,8 @@ def train_ruler(
     with first_alone():
         kind, (backed,) = with_gels(manifest, [], run.folder / "gels")
     with seeded(run.seed, "tactile encoder"):
-        ruler = GelEncoder(preset.tactile_config(clip.shared_width))
+        width = clip.shared_width if preset.alone else clip.dim
+        ruler = GelEncoder(preset.tactile_config(width))
     if preset.alone:
         old = clip.tactile
         same = isinstance(old, GelEncoder) and architecture(old.config) == architecture(
@@ -307,7 +308,8 @@ def train_ruler(
         require(same, "clip", must, "another", fix=fix)
         assert old is not None
         ruler.load_state_dict(old.state_dict())
-        ruler.center.zero_(), ruler.spread.fill_(1)
+        ruler.center.zero_()
+        ruler.spread.fill_(1)
     options = preset.tactile_course.options(len(train), run.seed)
     with agreed():
         require_rows(train, options.batch)
@@ -315,7 +317,7 @@ def train_ruler(
     clip.to(where)
     with first_alone():
         teacher = None if preset.alone else clip
-        parts = (backed.take(part.ids) for part in (train, held))
+        parts = backed.take(train.ids), backed.take(held.ids)
         touches = Touches(*parts, teacher, run, preset.image)
     facts = facts_of(preset, train, split, texts_of(train), options)
     facts |= {m: clip.digest(m) for m in clip.modalities if m != "tactile"}
@@ -345,7 +347,7 @@ def train_ruler(
     plain = ruler.preprocess.plainly
     seen = digest_images(cached_images(train, "tactile", plain, run.cache, run.progress))
     seen = union(seen, start.seen.get("tactile"))
-    alone = EncoderSet(None, None, ruler, {"tactile": ruler.preprocess}, "", {}, card)
+    alone = EncoderSet(tactile=ruler, preprocesses={"tactile": ruler.preprocess}, card=card)
     alone.seen["tactile"] = seen
     return alone if preset.alone else clip.with_tactile(alone)
 

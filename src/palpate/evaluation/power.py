@@ -16,9 +16,9 @@ from typing import Any
 import numpy as np
 
 from palpate.core import FeatureSet, Progress, rng_for
-from palpate.evaluation.ruling import standardized
 from palpate.metrics import tmmd
 from palpate.metrics.means import Mean, mean_of
+from palpate.metrics.retrieval import standardized
 
 #: Recordings on each side.
 SIZES = (5, 10, 20, 40)

@@ -8,28 +8,23 @@ the features, so that scores of different ones share no column.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 import polars as pl
-from numpy.typing import NDArray
 
 from palpate.core import FeatureSet, Note, digest_json, save_image
 from palpate.data.manifest import Manifest
 from palpate.data.residuals import with_gels
 from palpate.data.samples import Samples
 from palpate.evaluation.controls import rows_of_material
-from palpate.metrics.retrieval import unit_rows
+from palpate.metrics.retrieval import standardized, unit_rows
 from palpate.report.tables import SAME_MATERIAL
 
 if TYPE_CHECKING:
     from palpate.evaluation.scorers import Bench
-
-#: Least deviation that numbers are divided by, as a share of that of simulated contacts.
-LEAST_SPREAD = 0.1
 
 
 @dataclass(frozen=True)
@@ -71,21 +66,6 @@ def ruler_features(bench: Bench) -> list[Ruled]:
         Ruled(s, s.feature_set(x, digests[0]), s.feature_set(unit_rows(y), digests[1]))
         for s, x, y in zip(sets, compared, rows, strict=True)
     ]
-
-
-def standardized(
-    sets: Sequence[NDArray[Any]], reference: NDArray[Any]
-) -> tuple[list[NDArray[np.float32]], list[list[float]]]:
-    """Rows (n, d) of each set centered and divided by the reference's (m, d) mean and deviation,
-    then of length 1; and mean and deviation.
-    """
-    mean, spread = reference.mean(axis=0), np.maximum(reference.std(axis=0), LEAST_SPREAD)
-    result: list[NDArray[np.float32]] = []
-    for x in sets:
-        z = (x - mean) / spread
-        z /= np.maximum(np.linalg.norm(z, axis=1, keepdims=True), 1e-9)
-        result.append(z.astype(np.float32))
-    return result, [mean.round(4).tolist(), spread.round(4).tolist()]
 
 
 def _of_files(samples: Samples, folder: Path) -> Manifest:

@@ -36,6 +36,8 @@ TIE = 1e-6
 CELLS = 1 << 22
 #: Similarities that random pools may take in all; each needs one pool at least.
 POOLED = 4e8
+#: Least deviation that numbers are divided by, as a share of that of simulated contacts.
+LEAST_SPREAD = 0.1
 Floats = NDArray[np.float32]
 
 
@@ -212,6 +214,17 @@ def unit_rows(x: NDArray[Any], name: str = "The features") -> Floats:
     bad, fix = ~np.isfinite(length[:, 0]), "Check what those rows were made from"
     check(not bad.any(), name, "must be finite", f"NaN or infinity in {rows_text(bad)}", fix)
     return x / np.maximum(length, 1e-12)
+
+
+def standardized(
+    sets: Sequence[NDArray[Any]], reference: NDArray[Any]
+) -> tuple[list[NDArray[np.float32]], list[list[float]]]:
+    """Rows (n, d) of each set centered and divided by the reference's (m, d) mean and deviation,
+    then of length 1; and mean and deviation.
+    """
+    mean, spread = reference.mean(axis=0), np.maximum(reference.std(axis=0), LEAST_SPREAD)
+    rows = [unit_rows((x - mean) / spread) for x in sets]
+    return rows, [mean.round(4).tolist(), spread.round(4).tolist()]
 
 
 def blocks(rows: int, columns: int) -> Generator[slice]:
