@@ -339,24 +339,6 @@ def test_training_depends_on_the_seed_and_the_train_part_alone(world, clip, tmp_
     assert digest("c", preset=quick(targets="diagonal")) != base
 
 
-def test_training_can_go_on_from_another_encoder(world, clip, tmp_path):
-    split = by_video(world)
-    first = train_tactile(world, split, clip, quick(), run(tmp_path / "a", seed=3))
-    digest = first.digest("tactile")
-    frozen = quick(tactile_course=replace(TINY.tactile_course, lr=1e-30, weight_decay=0.0))
-    again = train_tactile(world, split, clip, frozen, run(tmp_path / "b"), start=first)
-    fresh = train_tactile(world, split, clip, frozen, run(tmp_path / "c"))
-    assert again.digest("tactile") == first.digest("tactile") == digest != fresh.digest("tactile")
-    assert again.tactile is not first.tactile
-    assert again.card["start"] == digest
-    assert again.card["start_card"]["seed"] == 3
-    assert fresh.card["start"] is None
-    with pytest.raises(PalpateError, match="size of the preset"):
-        train_tactile(world, split, clip, replace(TINY, patch=4), run(tmp_path / "d"), start=first)
-    with pytest.raises(PalpateError, match="tactile encoder"):
-        train_tactile(world, split, clip, TINY, run(tmp_path / "e"), start=clip)
-
-
 def test_data_without_photos_train_against_words_alone(world, tmp_path):
     bare = [{**row, "vision": None, "text": None} for row in world.table.iter_rows(named=True)]
     bare = Manifest.from_rows(bare, world.root)

@@ -11,7 +11,7 @@ from PIL import Image
 
 import palpate as pp
 from forge.errors import fails
-from palpate.core import PalpateError
+from palpate.core import PalpateError, PalpateWarning
 from palpate.data.images import Preprocess
 from palpate.data.manifest import Manifest
 from palpate.encoders import embed as module
@@ -261,7 +261,15 @@ def test_texts(encoders):
 
 def test_the_shipped_encoder_by_the_door(files):
     encoder = pp.Encoder.from_pretrained("palpate/mini", modality="tactile")
-    assert encoder.encode(files[1]).shape == (3, 256)
+    with pytest.warns(PalpateWarning, match="no-contact images"):
+        plain = encoder.encode(files[1])
+    assert plain.shape == (3, 256)
+    one = encoder.encode(files[1], backgrounds=files[1][0])
+    assert not np.allclose(plain, one, atol=1e-3)
+    each = encoder.encode(files[1], backgrounds=[Image.fromarray(files[1][0])] * 3)
+    assert np.allclose(one, each, atol=1e-5)
+    with pytest.raises(PalpateError, match="one image, or one for each"):
+        encoder.encode(files[1], backgrounds=files[1][:2])
     with pytest.raises(PalpateError, match=r"`modality` must be one of vision, text, tactile"):
         pp.Encoder.from_pretrained("palpate/mini", modality="touch")
     with pytest.raises(TypeError, match="modality"):

@@ -15,7 +15,7 @@ from palpate.data.residuals import Residual  # noqa: E402
 from palpate.encoders.embed import embed  # noqa: E402
 from palpate.encoders.encoder_set import EncoderSet, load_clip  # noqa: E402
 from palpate.encoders.gel import GelConfig, GelEncoder  # noqa: E402
-from palpate.encoders.gel_training import Touches, contrast, held_out, units_of, views  # noqa: E402
+from palpate.encoders.gel_training import Touches, contrast, held_out, train_ruler, units_of, views  # noqa: E402
 from palpate.encoders.presets import PRESETS  # noqa: E402
 from palpate.sim import WorldOptions, write_world  # noqa: E402
 from palpate.training.run import TrainingRun  # noqa: E402
@@ -186,7 +186,7 @@ def test_touches_alone_teach_and_own_frames_are_refused(world, trained, tmp_path
     )
     own = train_encoder(blind, split, preset=preset("self"), clip=tmp_path / "start")
     assert own.digest("tactile") != trained.digest("tactile")
-    assert own.digest("vision") == trained.digest("vision")
+    assert own.modalities == ["tactile"]
     assert {*own.card["loss"][0]} >= {"contrast", "numbers"}
     assert "text" not in own.card["loss"][0]
     train = blind.part(split, "train")
@@ -199,10 +199,28 @@ def test_touches_alone_teach_and_own_frames_are_refused(world, trained, tmp_path
     with pytest.raises(PalpateError, match="that it was trained on"):
         score(kept, kept, encoder=own)
     fails("learned ruler", train_encoder, blind, split, preset=preset("self"), clip="palpate/mini")
+    own.save(tmp_path / "own")
+    assert EncoderSet.load(tmp_path / "own").digest("tactile") == own.digest("tactile")
 
 
-def test_a_tenth_is_held_out_by_recording(world):
+@pytest.mark.parametrize("known", [True, False])
+def test_going_on_keeps_what_the_start_saw(world, trained, known, tmp_path):
+    data, split = world
+    rule = {"name": "every second sample"}
+    other = Split.from_ids(train=data.ids[1::2], rule=rule, manifest=data.digest)
+    start = trained if known else replace(trained, seen={})
+    own = train_ruler(data, other, start, preset("self", steps=2), TrainingRun(tmp_path))
+    assert own.knows_seen("tactile") == known
+    only_start = data.take([*{*split.ids("train")}.difference(data.ids[1::2])])
+    assert {*own.saw("tactile", only_start).tolist()} == {known}
+    assert own.saw("tactile", held_out(data.take(data.ids[1::2]), 0)[0]).all()
+
+
+def test_a_tenth_but_three_at_least_are_held_out_by_recording(world):
     data, _ = world
     kept, held = held_out(data, 3)
-    assert len({*units_of(held, "")}) == max(1, len({*units_of(data, "")}) // 10)
+    assert len({*units_of(held, "")}) == 3
     assert len(kept) + len(held) == len(data)
+    units = units_of(data, "")
+    few = [i for i, u in zip(data.ids, units, strict=True) if u in sorted({*units})[:5]]
+    fails("6 objects or videos", held_out, data.take(few), 3)

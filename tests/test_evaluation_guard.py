@@ -15,13 +15,10 @@ from forge.worlds import by_video, six_videos
 from palpate import audit, probe, score
 from palpate.data.manifest import Manifest
 from palpate.encoders import Encoder, EncoderSet, train_encoder
-from palpate.encoders.contrastive import train_tactile
 from palpate.encoders.guard import guard
 from palpate.encoders.models import digest_images, union
-from palpate.encoders.presets import preset_of
 from palpate.report.notes import COMMAND_LINE, sentence
 from palpate.report.terminal import audit_text
-from palpate.training.run import TrainingRun
 
 FAST = {"permutations": 0, "companions": []}
 
@@ -143,21 +140,6 @@ def test_an_encoder_of_another_split_is_doubted_only_where_its_images_are_unknow
     assert codes(card={**encoders.card, "seen_in_part": True}) == ["encoder-of-other-split"]
     assert codes(seen={}, card={}) == ["encoder-without-split"]
     assert codes(seen={}, card={"split": other.digest}) == []
-
-
-def test_going_on_from_an_encoder_keeps_what_it_saw(trained, small_manifest, tmp_path):
-    start, _ = trained
-    later = by_video(small_manifest, "v3")
-    short = preset_of("tiny", 1)
-    for known in (True, False):
-        begin = start if known else replace(start, seen={})
-        run = TrainingRun(tmp_path / str(known), device="cpu")
-        result = train_tactile(small_manifest, later, start, short, run, start=begin)
-        encoder = Encoder(result, "tactile")
-        assert result.knows_seen("tactile") == known
-        saw = zip(small_manifest.column("video"), encoder.saw(small_manifest), strict=True)
-        videos = {video for video, seen in saw if seen}
-        assert videos == ({"v0", "v1", "v2", "v3"} if known else {"v3"})
 
 
 @pytest.mark.parametrize("damage", ["gone", "cut", "fewer", "no file of tensors"])

@@ -109,7 +109,7 @@ def train_encoder(
         progress: called while the work goes on.
 
     Returns:
-        All three encoders, with a card.
+        All three encoders, or by touches alone the ruler, with a card.
 
     Raises:
         PalpateError: if the train part is empty, or a sample of it lacks an image.
