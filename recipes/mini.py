@@ -4,6 +4,8 @@ write their cards.
     python recipes/mini.py --work runs/mini                     # everything
     python recipes/mini.py --work runs/mini --only autoencoder  # one part and what it needs
     python recipes/mini.py --work runs/mini --tactile --ship    # the tactile encoder alone, anew
+    python recipes/mini.py --work runs/mini --tactile --seed 1  # another training of it, scored
+    python recipes/mini.py --work runs/mini --tactile --wide    # one of other gels, scored
     python recipes/mini.py --work runs/mini --ship              # and write src/palpate/mini
     python recipes/mini.py --work runs/mini --verify            # score what ships again
 
@@ -17,10 +19,12 @@ gelsight       900000    every part
 digit          900001    the autoencoder alone: the other look of the sensor
 photos         900002    the vision encoder alone: 16,000 more objects, one photo of each
 gel 0 .. 13    900010 .. the tactile encoder: pads of 9 to 22 mm, 0 to 12 rows of markers, DIGIT
+wide 0 .. 12   900030 .. with ``--wide`` in place of DIGIT: pads of 26 mm, 10 rows of markers
 new gelsight   900050    scores: new objects, videos and gel units
 new digit      900051    scores of the autoencoder
 new gel        900052    scores of the tactile encoder: a pad of 14 mm, 8 rows of markers
 new pad        900053    scores of the tactile encoder: a pad of 26 mm, 10 rows of markers
+new look       900054    scores of the tactile encoder: DIGIT
 =============  ========  =========================================================================
 
 Weights are rounded to 16 bits before anything is scored, so the scores are those of the shipped
@@ -40,7 +44,7 @@ from typing import Any
 
 import numpy as np
 from mini_cards import ship, write_page
-from mini_scores import prefixed, score_all
+from mini_scores import prefixed, score_all, score_encoders
 from numpy.typing import NDArray
 
 from palpate.core import PalpateError, Split, digest_json, read_json, rng_for, write_json
@@ -86,8 +90,10 @@ _GEL = replace(
     load_mm=(0.03, 0.5),
     sensor_noise=(0.001, 0.006),
 )
-for _name, _seed, _pad, _rows in (("new gel", 900_052, 14.0, 8), ("new pad", 900_053, 26.0, 10)):
-    WORLDS[_name] = replace(_GEL, seed=_seed, objects_per_material=20, pad_mm=_pad, markers=_rows)
+_NEW = replace(_GEL, objects_per_material=20)
+WORLDS["new gel"] = replace(_NEW, seed=900_052, pad_mm=14.0, markers=8)
+WORLDS["new pad"] = replace(_NEW, seed=900_053, pad_mm=26.0, markers=10)
+WORLDS["new look"] = replace(_NEW, seed=900_054, look="digit")
 
 
 def gel(number: int) -> WorldOptions:
@@ -108,11 +114,17 @@ def gel(number: int) -> WorldOptions:
 
 GELS = [f"gel {number}" for number in range(14)]
 WORLDS |= {name: gel(number) for number, name in enumerate(GELS)}
+#: In place of which world with ``--wide``: what the encoder has not learned from is learned there.
+WIDE = {f"gel {n}": f"wide {n}" for n in range(14) if gel(n).look == "digit"}
+WORLDS |= {
+    wide: replace(WORLDS[name], seed=900_030 + k, look="gelsight", pad_mm=26.0, markers=10)
+    for k, (name, wide) in enumerate(WIDE.items())
+}
 ENCODER = preset_of("mini")
-#: Of the vision encoder when it goes on: more rows to tell apart.
 TACTILE = preset_of("gel")
 #: Fields of a preset that decide nothing.
 TEXTS = {"cost": "", "score": ""}
+#: Of the vision encoder when it goes on: more rows to tell apart.
 VISION = replace(ENCODER, clip_course=replace(ENCODER.clip_course, batch=256, lr=2e-3))
 #: Passes over the data. One core sees about 400 images a second in training.
 CLIP_EPOCHS, VISION_EPOCHS = 14.0, 20.0
@@ -134,10 +146,13 @@ def main() -> int:
     parser.add_argument("--only", choices=PARTS, default="scores", help="the last part to make")
     parser.add_argument("--tactile", action="store_true", help="keep all else as it ships")
     parser.add_argument("--seed", type=int, default=SEED, help="of the tactile encoder")
+    parser.add_argument("--wide", action="store_true", help="wide pads instead of DIGIT")
     parser.add_argument("--ship", action="store_true", help="write src/palpate/mini")
     parser.add_argument("--verify", action="store_true", help="score the shipped models again")
     options = parser.parse_args()
-    recipe = Recipe(options.work, options.tactile, options.seed)
+    recipe = Recipe(options.work, options.tactile, options.seed, options.wide)
+    if recipe.compared and (options.ship or not options.tactile):
+        parser.error("--seed and --wide are for comparison: with --tactile, without --ship")
     try:
         if options.verify:
             return recipe.verify()
@@ -186,9 +201,17 @@ def _seeing(preset: EncoderPreset, epochs: float) -> EncoderPreset:
 class Recipe:
     """The parts, each a stage of a run folder; a finished stage is read, not made again."""
 
-    def __init__(self, work: Path, tactile: bool = False, seed: int = SEED) -> None:
+    def __init__(
+        self, work: Path, tactile: bool = False, seed: int = SEED, wide: bool = False
+    ) -> None:
         """Work in a folder; with ``tactile`` all but the tactile encoder is what ships."""
         self.work, self.cache, self.kept, self.seed = work, work / "cache", tactile, seed
+        #: Name of a tactile encoder that is compared with the one that ships, or ''.
+        self.compared = " wide" * wide + f" {seed}" * (seed != SEED)
+        gels = [WIDE.get(name, name) if wide else name for name in GELS]
+        self.learned = ["gelsight", *gels]
+        new = [name for name in WORLDS if name.startswith("new")]
+        self.worlds = [*self.learned, *new, *([] if tactile else ["digit", "photos"])]
         self.common: dict[str, Any] = {"cache": self.cache, "progress": self.progress}
 
     def stage(
@@ -205,9 +228,8 @@ class Recipe:
 
     def make(self, last: str) -> None:
         """Make the part ``last`` and what it needs."""
-        for name in WORLDS:
-            if not self.kept or name not in ("digit", "photos"):
-                self.world(name)
+        for name in self.worlds:
+            self.world(name)
         if last != "worlds":
             getattr(self, last)()
 
@@ -263,7 +285,7 @@ class Recipe:
         """The three encoders: the tactile one learns from many gels, against vision and text."""
         pair = self.pair()
         pair.halve()
-        parts = [prefixed(self.world(name), f"{name}/") for name in ("gelsight", *GELS)]
+        parts = [prefixed(self.world(name), f"{name}/") for name in self.learned]
         train = Manifest.join(*parts)
 
         def build(folder: Path) -> Mapping[str, Any]:
@@ -275,8 +297,8 @@ class Recipe:
         preset = replace(TACTILE, **TEXTS)
         inputs = {"preset": preset, "seed": self.seed, "train": train.digest}
         inputs |= {m: pair.digest(m) for m in pair.modalities}
-        name = f"tactile {self.seed}" if self.seed else "tactile"
-        return EncoderSet.load(self.stage(name, inputs, build).folder / "encoders")
+        stage = self.stage(f"tactile{self.compared}", inputs, build)
+        return EncoderSet.load(stage.folder / "encoders")
 
     def autoencoder(self) -> AnyAutoencoder:
         """The background autoencoder, of tactile images of both looks."""
@@ -348,6 +370,8 @@ class Recipe:
 
     def scores(self) -> dict[str, Any]:
         """Scores of the rounded models on the new worlds, as rows for the cards."""
+        if self.compared:
+            return self._encoder_scores()
         models = self.encoders(), self.autoencoder(), self.generator()
         self._halve(*models)
         digests = [models[0].digest("tactile"), models[0].digest("vision"), models[1].digest]
@@ -362,13 +386,21 @@ class Recipe:
             "sampler": GENERATOR.sampler,
             "worlds": [part.digest for part in self._samples().values()],
         }
-        name = f"scores {self.seed}" if self.seed else "scores"
-        stage = self.stage(name, inputs, build)
+        stage = self.stage("scores", inputs, build)
         return read_json(stage.folder / "scores.json", "scores")
 
+    def _encoder_scores(self) -> dict[str, Any]:
+        """Those of a tactile encoder that does not ship, printed."""
+        encoders = self.encoders()
+        encoders.halve()
+        rows = score_encoders(encoders, self._samples(), self.cache, self.progress)
+        for row in rows:
+            print_line(f"{row['score']}: {row['value']:.4g}")
+        write_json(self.work / f"scores{self.compared}.json", rows)
+        return {"encoders": rows}
+
     def _samples(self) -> dict[str, Manifest]:
-        names = "gelsight", "new gelsight", "new digit", "new gel", "new pad"
-        return {name: self.world(name) for name in names}
+        return {n: self.world(n) for n in self.worlds if n == "gelsight" or n.startswith("new")}
 
     @staticmethod
     def _halve(
@@ -386,7 +418,7 @@ class Recipe:
         models = self.encoders(), self.autoencoder(), self.generator()
         self._halve(*models)
         target = shipped_root() / SHIPPED[NAME]
-        ship(target, *models, scores, self._worlds())
+        ship(target, *models, scores, self._worlds(), self.kept)
         if PAGE.is_file():
             write_page(PAGE, target)
         print_line(f"Shipped in {target}")
@@ -397,8 +429,8 @@ class Recipe:
         kept += load_autoencoder(NAME).card["data"] if self.kept else []
         shipped = {row["world"]: row for row in kept}
         for name, o in WORLDS.items():
-            if self.kept and name in ("digit", "photos"):
-                rows.append(shipped[name])
+            if name not in self.worlds:
+                rows += [shipped[name]] if name in shipped else []
                 continue
             facts = stored_stage(self.work / f"world {name}").facts
             row = {"world": name, "seed": o.seed, "look": o.look, "version": VERSION}

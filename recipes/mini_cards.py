@@ -17,6 +17,7 @@ from palpate.training.cards import write_model_cards
 
 NAME = "palpate/mini"
 RECIPE = "python recipes/mini.py --work runs/mini --ship"
+OF_TACTILE = "python recipes/mini.py --work runs/mini --tactile --ship"
 TAGS = ("synthetic",)
 SUMMARIES = {
     "encoders": (
@@ -59,7 +60,7 @@ LIMITS = (
 READ = {
     "encoders": (
         *("gelsight", "photos", *(f"gel {number}" for number in range(14))),
-        *("new gelsight", "new gel", "new pad"),
+        *("new gelsight", "new gel", "new pad", "new look"),
     ),
     "autoencoder": ("gelsight", "digit", "new gelsight", "new digit"),
     "generator": ("gelsight", "photos", "new gelsight"),
@@ -73,9 +74,10 @@ def ship(
     pipeline: TactilePipeline,
     scores: Mapping[str, Any],
     worlds: Sequence[Mapping[str, Any]],
+    tactile: bool,
 ) -> None:
     """Replaces what is shipped; the models must be rounded to 16 bits already, since the scores are
-    theirs.
+    theirs. ``tactile``: that encoder alone was made anew.
     """
 
     def card(part: str) -> dict[str, Any]:
@@ -100,6 +102,8 @@ def ship(
         }
 
     encoders.card = {**encoders.card, **card("encoders")}
+    if tactile:
+        encoders.card["recipe"] = OF_TACTILE
     pair = card("encoders")
     pair["title"], pair["summary"] = PAIR
     pair["scores"] = [row for row in pair["scores"] if "tactile" not in row["score"]]

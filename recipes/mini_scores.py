@@ -65,15 +65,12 @@ def score_all(
 ) -> dict[str, Rows]:
     """Rows of scores by model: ``encoders``, ``autoencoder``, ``generator``.
 
-    ``worlds`` are ``gelsight``, ``new gelsight``, ``new digit``, ``new gel`` and ``new pad``.
+    ``worlds`` are ``gelsight``, ``new gelsight``, ``new digit``, ``new gel``, ``new pad`` and
+    ``new look``.
     """
     both = worlds["gelsight"], worlds["new gelsight"]
-    pads = {f"pad of {mm} mm": worlds[f"new {name}"] for mm, name in ((14, "gel"), (26, "pad"))}
     return {
-        "encoders": [
-            *score_encoders(encoders, *both, cache, progress),
-            *score_pads(encoders, pads, cache, progress),
-        ],
+        "encoders": score_encoders(encoders, worlds, cache, progress),
         "autoencoder": score_autoencoder(autoencoder, worlds, cache, progress),
         "generator": score_generator(pipeline, encoders, *both, cache, progress),
     }
@@ -117,9 +114,10 @@ def zero_shot_accuracy(
 
 
 def score_encoders(
-    encoders: EncoderSet, old: Manifest, new: Manifest, cache: Path, progress: Progress
+    encoders: EncoderSet, worlds: Mapping[str, Manifest], cache: Path, progress: Progress
 ) -> Rows:
-    """Zero-shot and probe accuracy, and retrieval in the new world."""
+    """Zero-shot and probe accuracy and retrieval in the new world, and probes on other gels."""
+    old, new = worlds["gelsight"], worlds["new gelsight"]
     words = prompts(old)
     train = old.take(old.ids[::EVERY])
     sides = {
@@ -148,15 +146,17 @@ def score_encoders(
             (f"{name}, top-{k} of {POOL}", mean.score)
             for k, mean in zip((1, 5), result.top, strict=True)
         ]
-    return [_row(name, score, len(new)) for name, score in scores]
+    rows = [_row(name, score, len(new)) for name, score in scores]
+    return [*rows, *_score_gels(encoders, worlds, cache, progress)]
 
 
-def score_pads(
+def _score_gels(
     encoders: EncoderSet, worlds: Mapping[str, Manifest], cache: Path, progress: Progress
 ) -> Rows:
-    """Probe accuracy within worlds of other pads, from one half of the objects to the other."""
+    """Probe accuracy within worlds of other gels, from one half of the objects to the other."""
     rows: Rows = []
-    for name, world in worlds.items():
+    for name, short in (("pad of 14 mm", "gel"), ("pad of 26 mm", "pad"), ("DIGIT", "look")):
+        world = worlds[f"new {short}"]
         features = embed(world, encoders, "tactile", cache=cache, progress=progress)
         chosen = {o for k, o in enumerate(sorted({*world.column("object")})) if k % 2}
         objects = zip(world.ids, world.column("object"), strict=True)

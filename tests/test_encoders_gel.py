@@ -203,6 +203,11 @@ def test_touches_alone_teach_and_own_frames_are_refused(world, trained, tmp_path
     assert EncoderSet.load(tmp_path / "own").digest("tactile") == own.digest("tactile")
 
 
+def test_touches_alone_need_a_ruler():
+    fails("ruler to go on from", replace, PRESETS["mini"], alone=True, pretrained="palpate/mini")
+    fails("ruler to go on from", replace, PRESETS["gel"], alone=True, pretrained=None)
+
+
 @pytest.mark.parametrize("known", [True, False])
 def test_going_on_keeps_what_the_start_saw(world, trained, known, tmp_path):
     data, split = world

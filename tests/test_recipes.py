@@ -40,11 +40,15 @@ def small(mini, monkeypatch, tmp_path):
         mini, "WORLDS", {name: replace(options, **few) for name, options in mini.WORLDS.items()}
     )
     monkeypatch.setattr(mini, "CLIP_EPOCHS", 1.0)
-    monkeypatch.setattr(mini, "TACTILE_EPOCHS", 1.0)
+    course = replace(mini.TACTILE.tactile_course, steps=3, batch=8, evaluations=1)
+    monkeypatch.setattr(mini, "TACTILE", replace(mini.TACTILE, image=32, tactile_course=course))
     monkeypatch.setattr(mini, "AUTOENCODER", replace(mini.AUTOENCODER, steps=3))
     monkeypatch.setattr(mini, "GENERATOR_STEPS", 3)
     monkeypatch.setattr(sys.modules["mini_scores"], "GENERATED", 8)
     monkeypatch.setattr(sys.modules["mini_scores"], "POOL", 10)
+    ruler = shipped_module.RULERS["palpate/handcrafted"]
+    (tmp_path / "package" / ruler).parent.mkdir(parents=True)
+    shutil.copy(shipped_module.shipped_root() / ruler, tmp_path / "package" / ruler)
     monkeypatch.setattr(shipped_module, "shipped_root", lambda: tmp_path / "package")
     monkeypatch.setattr(mini, "shipped_root", lambda: tmp_path / "package")
     monkeypatch.setattr(mini, "PAGE", tmp_path / "mini.md")
@@ -93,7 +97,7 @@ def test_every_part_is_made_shipped_and_verified(small, tmp_path, capsys):
     second = scores["generator"]["training"]
     assert (second["seed"], second["start_record"]["seed"]) == (1, 0)
     assert second["start_record"]["start"] is None
-    exact = recipe.run.stages["generator"].facts["digest"]
+    exact = small.stored_stage(tmp_path / "work" / "generator").facts["digest"]
     assert second["start"] != exact  # the rounded weights went on
     assert "900050" in (target / "encoders" / "README.md").read_text()
     assert not any(
@@ -111,7 +115,7 @@ def test_every_part_is_made_shipped_and_verified(small, tmp_path, capsys):
         for part, about in scores.items()
     }
     assert trained == {
-        "encoders": {900_000, 900_002},
+        "encoders": {900_000, 900_002, *range(900_010, 900_024)},
         "autoencoder": {900_000, 900_001},
         "generator": {900_000, 900_002},
     }

@@ -203,7 +203,8 @@ class EncoderSet:
     def encode(
         self, modality: str, batch: Tensor | Sequence[str], sensors: Sequence[str] | None = None
     ) -> Tensor:
-        """One batch to (n, dim), projected and L2-normalized; differentiable.
+        """One batch to (n, dim), projected and L2-normalized, by a ruler to its standardized
+        numbers; differentiable.
 
         Args:
             modality: ``vision``, ``text`` or ``tactile``.

@@ -194,6 +194,9 @@ class EncoderPreset:
         fits = self.patch >= 1 and self.image >= 1 and self.image % self.patch == 0
         must, fix = f"must be a multiple of the patches, {self.patch}", "Choose other sides"
         require(fits, "image", must, self.image, fix=fix)
+        ruler = not self.alone or (isinstance(self.tactile, Gel) and self.pretrained is not None)
+        fix = "Change another preset"
+        require(ruler, "alone", "needs a learned ruler to go on from", self.alone, fix=fix)
 
     @property
     def preprocess(self) -> Preprocess:
@@ -294,7 +297,7 @@ GEL = EncoderPreset(
     patch=1,
     tactile=Gel(),
     tactile_course=_GEL,
-    cost="3,000 steps, 28,080 frames: about 20 CPU-min on one x86-64 core (AVX2)",
+    cost="3,000 steps, 28,080 frames: about 25 CPU-min on one x86-64 core (AVX2)",
     score="palpate/mini on new worlds: linear probe of material 0.62 (chance 0.05)",
 )
 #: On from the shipped ruler, with touches alone; held-out recordings choose the length.
