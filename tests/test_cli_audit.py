@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import polars as pl
 import pytest
+import torch
 from PIL import Image
 
 from forge.formats import TREES
@@ -212,6 +213,7 @@ def test_mistakes_are_one_line_each(tmp_path, small_manifest, capsys):
     (tmp_path / "l.txt").write_text("v/1.jpg,0\n")
     (tmp_path / "bad.txt").write_text("v1\n")
     one, split, lines = tmp_path / "m", tmp_path / "s.json", tmp_path / "l.txt"
+    torch.jit.script(torch.nn.ReLU()).save(script := tmp_path / "ruler.pt")
     for args, words in [
         ([one], "neither test samples nor a split"),
         ([one, one, "--split", split], "TRAIN and TEST"),
@@ -219,6 +221,7 @@ def test_mistakes_are_one_line_each(tmp_path, small_manifest, capsys):
         ([lines, lines, "--impact"], "--impact needs all samples and a split"),
         ([one, "--split", split, "--near-frames", "-1"], "--near-frames"),
         ([one, "--split", split, "--encoder", tmp_path / "none"], "must come with the impact"),
+        ([one, "--split", split, "--impact", "--encoder", script], "weights and nothing"),
         ([lines, tmp_path / "bad.txt"], "1 problem"),
         ([one, "--split", split, "--by", "object", "--no-images"], "object"),
     ]:

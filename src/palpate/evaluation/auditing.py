@@ -54,6 +54,11 @@ def audit(
     arguments |= {"impact": impact, "allow_seen": allow_seen, **options}
     call = Call.of("audit", audit, arguments)
     folder = None if cache is None else Path(cache)
+    encoders: Any = None
+    if encoder is not None:  # a failure within the impact is a note: the audit itself is not lost
+        from palpate.encoders.guard import load_encoders
+
+        encoders = load_encoders(encoder, progress)
 
     def measure(samples: Manifest, split: Split, group: str, name: str) -> Impact:
         from palpate.evaluation.impact import impact as measure_impact
@@ -61,11 +66,11 @@ def audit(
         features: Any = "pixels"
         notes: list[Note] = []
         seen: list[str] = []
-        if encoder is not None:
+        if encoders is not None:
             from palpate.encoders.embed import embed
-            from palpate.encoders.guard import guard, load_encoders
+            from palpate.encoders.guard import guard
 
-            encoders, features = load_encoders(encoder, progress), dict[str, FeatureSet]()
+            features = dict[str, FeatureSet]()
             # every sample is in the test part of some leak-free split
             judged = samples.part(split, "train", "test")
             for m in encoders.modalities:
