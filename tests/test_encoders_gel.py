@@ -14,21 +14,21 @@ from palpate.data.manifest import Manifest  # noqa: E402
 from palpate.data.residuals import Residual  # noqa: E402
 from palpate.encoders.embed import embed  # noqa: E402
 from palpate.encoders.encoder_set import EncoderSet, load_clip  # noqa: E402
-from palpate.encoders.gel import GelConfig, GelEncoder  # noqa: E402
+from palpate.encoders.gel import GelEncoder  # noqa: E402
 from palpate.encoders.gel_training import Touches, contrast, held_out, train_ruler, units_of, views  # noqa: E402
 from palpate.encoders.presets import PRESETS  # noqa: E402
 from palpate.sim import WorldOptions, write_world  # noqa: E402
 from palpate.training.run import TrainingRun  # noqa: E402
 from palpate.training.steps import Step  # noqa: E402
 
-SMALL = GelConfig((4, 4, 8, 8, 8), 6, 32)
+SMALL = (4, 4, 8, 8, 8), 6, 32
 
 
 def preset(name, **changes):
     """A preset of a few steps and small layers."""
     chosen = PRESETS[name]
     course = replace(chosen.tactile_course, **{"steps": 4, "batch": 8, "evaluations": 2} | changes)
-    widths = replace(chosen.tactile, widths=tuple(SMALL.block_out_channels))
+    widths = replace(chosen.tactile, widths=SMALL[0])
     return replace(chosen, tactile=widths, tactile_course=course, image=32)
 
 
@@ -52,7 +52,7 @@ def residuals(n, side=32, seed=0):
 
 
 def test_numbers_see_no_even_shift_and_a_stronger_contact():
-    ruler, x = GelEncoder(SMALL), residuals(5)
+    ruler, x = GelEncoder(*SMALL), residuals(5)
     numbers = ruler.numbers(x)
     assert numbers.shape == (5, 16)
     torch.testing.assert_close(ruler.numbers(x + torch.tensor([3.0, -9, 0]).view(3, 1, 1)), numbers)
@@ -60,7 +60,7 @@ def test_numbers_see_no_even_shift_and_a_stronger_contact():
 
 
 def test_layers_keep_the_variance_and_no_scale_of_their_weights():
-    ruler = GelEncoder(GelConfig())
+    ruler = GelEncoder((16, 32, 64, 128, 128), 128, 96)
     x = torch.randn(4, 3, 96, 96)
     for layer in ruler.layers:
         x = layer(x)

@@ -8,6 +8,7 @@ import huggingface_hub
 import numpy as np
 import pytest
 import torch
+import transformers
 from PIL import Image
 from safetensors.torch import load_file, save_file
 from transformers import AutoTokenizer, CLIPModel
@@ -16,7 +17,6 @@ from forge.errors import fails
 from forge.pictures import photos
 from palpate.core import PalpateError
 from palpate.data.images import CLIP_MEAN, CLIP_STD, Preprocess
-from palpate.encoders import encoder_set as module
 from palpate.encoders.contrastive import new_clip
 from palpate.encoders.embed import embed_images, embed_texts
 from palpate.encoders.encoder_set import EncoderSet, load_clip, new_tactile, tokens
@@ -169,7 +169,7 @@ def test_folders_that_are_no_clip(clip, tmp_path, monkeypatch):
     monkeypatch.setattr(huggingface_hub, "snapshot_download", unreachable)  # called first
     fails(rejection, load_clip, "openai/clip-vit-base-patch32")
     monkeypatch.setattr(huggingface_hub, "snapshot_download", lambda *_, **__: folder)
-    monkeypatch.setattr(module.CLIPModel, "from_pretrained", unreachable)
+    monkeypatch.setattr(transformers.CLIPModel, "from_pretrained", unreachable)
     fails(rejection, load_clip, "openai/clip-vit-base-patch32")
 
 

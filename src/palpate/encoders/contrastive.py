@@ -171,7 +171,6 @@ def plan_encoder(
     chosen = preset_of(preset, epochs)
     train = train_part(*load_samples(data, split))
 
-    config = chosen.tactile_config(chosen.dim)
     gel = isinstance(chosen.tactile, Gel)
 
     def forward(model: Any, rows: int, where: torch.device) -> Tensor:
@@ -179,7 +178,9 @@ def plan_encoder(
         return model.shared(model(pixels)) if gel else encode_tactile(model, pixels)
 
     def build() -> nn.Module:
-        return GelEncoder(config) if gel else CLIPVisionModelWithProjection(config)
+        if isinstance(chosen.tactile, Gel):
+            return GelEncoder(chosen.tactile.widths, chosen.dim, chosen.image)
+        return CLIPVisionModelWithProjection(chosen.tactile_config(chosen.dim))
 
     options = chosen.tactile_course.options(len(train), 0)
     return estimate(build, forward, options, len(train), pick_device(device))

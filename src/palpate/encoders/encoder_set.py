@@ -8,7 +8,7 @@ A saved set is a folder::
 
     palpate.json   {"format": "palpate-encoders/1", "digests": {modality: sha256}, "card": {...}}
     clip/          CLIPModel, its tokenizer and preprocessor_config.json; not of a ruler alone
-    tactile/       the learned ruler (:mod:`palpate.encoders.gel`), or a
+    tactile/       the learned ruler (:mod:`palpate.encoders.gel`), one file, or a
                    CLIPVisionModelWithProjection and its preprocessor_config.json
     */seen.safetensors   digests of the images that an encoder was trained on, if they are known
     README.md      the card for people
@@ -36,13 +36,6 @@ from numpy.typing import NDArray
 from PIL import Image
 from torch import Tensor, nn
 from torch.nn.functional import adaptive_avg_pool2d, normalize
-from transformers import (
-    AutoModel,
-    AutoTokenizer,
-    CLIPModel,
-    CLIPVisionConfig,
-    CLIPVisionModelWithProjection,
-)
 
 from palpate.core import (
     PalpateError,
@@ -55,7 +48,7 @@ from palpate.core import (
     write_json,
 )
 from palpate.data.images import SAVE_AGAIN, Frames, Preprocess, load_images
-from palpate.encoders.gel import GEL, GelEncoder
+from palpate.encoders.gel import WEIGHTS, GelEncoder
 from palpate.encoders.models import (
     FETCH_AGAIN,
     Digests,
@@ -81,11 +74,12 @@ from palpate.encoders.models import (
 from palpate.encoders.rulers import Handcrafted
 from palpate.encoders.tactile import load_tactile
 from palpate.encoders.tactile_module import TactileModule
-from palpate.encoders.tokenizer import save_tokenizer
 from palpate.training.cards import write_model_cards
 from palpate.training.steps import seeded
 
-if TYPE_CHECKING:
+if TYPE_CHECKING:  # transformers takes seconds to import, and a ruler needs none of it
+    from transformers import CLIPVisionConfig, CLIPVisionModelWithProjection
+
     from palpate.data.manifest import Manifest
 
 Modality = Literal["vision", "text", "tactile"]
@@ -165,7 +159,7 @@ class EncoderSet:
     def shared_width(self) -> int:
         """Width of the tactile encoder's embeddings in the space of photos and texts."""
         if isinstance(self.tactile, GelEncoder):
-            return self.tactile.config.projection_dim
+            return self.tactile.head.out_features
         return self.width("tactile")
 
     def shared(self, rows: NDArray[np.float32]) -> NDArray[np.float32]:
@@ -376,6 +370,8 @@ class EncoderSet:
                 about |= self._about(pair, self.clip_card, "vision")
                 write_json(part / "clip" / "palpate.json", about)
             if self.tokenizer is not None:
+                from palpate.encoders.tokenizer import save_tokenizer
+
                 with silent():
                     save_tokenizer(self.tokenizer, part / "clip")
             if self.tactile is not None:
@@ -385,7 +381,7 @@ class EncoderSet:
             write_model_cards(part)
 
     @classmethod
-    def load(cls, source: str | Path, *, device: str = "cpu") -> EncoderSet:
+    def load(cls, source: str | Path, *, device: str = "cpu", alone: bool = False) -> EncoderSet:
         """Load encoders of any kind: palpate's, a CLIP, SigLIP or DINO, a public tactile encoder.
 
         What :meth:`save` wrote is compared with its digests.
@@ -396,12 +392,15 @@ class EncoderSet:
                 ``owner/name:file`` for one on the hub, ``file#digit`` to name the sensor of all
                 images; or ``tactile+clip``, two of these that share a space.
             device: see :func:`palpate.encoders.models.pick_device`.
+            alone: leave out the vision and text that a tactile encoder was trained with.
 
         Raises:
             PalpateError: if the folder is of another kind, incomplete, or changed since, or the hub
                 is out of reach.
         """
-        if len(parts := parts_of(source)) == 2:
+        if len(parts := parts_of(source)) == 2 and alone:
+            return cls.load(parts[0], device=device)
+        if len(parts) == 2:
             tactile, clip = (cls.load(part, device=device) for part in parts)
             return clip.with_tactile(tactile)
         folder, sensor = find_encoder(source)
@@ -418,29 +417,16 @@ class EncoderSet:
             return load_clip(source, device=device)
         about = _read_card(folder, FORMAT)
         # A shipped CLIP keeps its name, so that cards of what is trained with it say so.
-        pair = any(modality != "tactile" for modality in about["digests"])
+        touch = "tactile" in about["digests"]
+        pair = len(about["digests"]) > touch and not (touch and alone)
         encoders = load_clip(source if is_shipped(source) else folder / "clip") if pair else cls()
         encoders.card = about["card"]
-        if "tactile" in about["digests"]:
+        if touch:
             part = folder / "tactile"
-            must = f"The tactile encoder {part} must hold config.json and model.safetensors"
-            config = part / "config.json"
-            gel = config.is_file() and read_record(config, "model").get("model_type") == GEL
-            model = load_model(
-                GelEncoder if gel else CLIPVisionModelWithProjection,
-                str(part),
-                must,
-                SAVE_AGAIN,
-                local_files_only=True,
-                use_safetensors=True,
-            )
-            encoders.tactile, size = model, int(model.config.image_size)
-            path = part / "preprocessor_config.json"
-            encoders.preprocesses["tactile"] = (
-                model.preprocess if gel else Preprocess.from_config(path, size)
-            )
+            encoders.tactile, encoders.preprocesses["tactile"] = _load_trained(part)
             encoders.seen["tactile"] = load_seen(part, about["seen"].get("tactile"))
-        _require_digests(encoders, about["digests"], folder)
+        loaded = {m: d for m, d in about["digests"].items() if m == "tactile" or pair}
+        _require_digests(encoders, loaded, folder)
         return encoders.to(device)
 
     def _modules(self) -> dict[str, nn.Module]:
@@ -458,8 +444,10 @@ class EncoderSet:
 
     def _write(self, folder: Path, model: nn.Module, modality: str, half: bool) -> None:
         """Write a model of images, how they are prepared, and which it was trained on."""
-        save_model(model, folder, half=half)
-        if not self.preprocesses[modality].residual:
+        if isinstance(model, GelEncoder):
+            model.save(folder, half=half)
+        else:
+            save_model(model, folder, half=half)
             config = self.preprocesses[modality].to_config()
             write_json(folder / "preprocessor_config.json", config)
         save_seen(self.seen.get(modality), folder)
@@ -476,6 +464,21 @@ class EncoderSet:
         }
 
 
+def _load_trained(folder: Path) -> tuple[Any, Preprocess]:
+    """A tactile encoder of :meth:`EncoderSet.save`, and how its images are prepared."""
+    if not (folder / "config.json").is_file() and (folder / WEIGHTS).is_file():
+        ruler = load_tactile(folder / WEIGHTS)
+        return ruler, ruler.preprocess
+    from transformers import CLIPVisionModelWithProjection as Vit
+
+    must = f"The tactile encoder {folder} must hold config.json and {WEIGHTS}"
+    model = load_model(
+        Vit, str(folder), must, SAVE_AGAIN, local_files_only=True, use_safetensors=True
+    )
+    size, path = int(model.config.image_size), folder / "preprocessor_config.json"
+    return model, Preprocess.from_config(path, size)
+
+
 def load_clip(source: str | Path, *, device: str = "cpu") -> EncoderSet:
     """Load a frozen CLIP, SigLIP or DINO; only one from the hub needs a network, once.
 
@@ -489,6 +492,8 @@ def load_clip(source: str | Path, *, device: str = "cpu") -> EncoderSet:
         PalpateError: if files are missing, unreadable, of another model or changed since, or the
             hub is out of reach.
     """
+    from transformers import AutoModel, AutoTokenizer, CLIPModel
+
     name, folder = find_single(source, "clip", "CLIP", CLIP_FIX)
     local, must = name == str(folder), f"{source} must be a CLIP model"
     note, config = folder / "palpate.json", folder / "config.json"
@@ -528,6 +533,8 @@ def load_clip(source: str | Path, *, device: str = "cpu") -> EncoderSet:
 
 def new_tactile(config: CLIPVisionConfig, seed: int) -> CLIPVisionModelWithProjection:
     """A tactile encoder with random weights that depend on ``seed`` alone."""
+    from transformers import CLIPVisionModelWithProjection
+
     with seeded(seed, "tactile encoder"):
         return CLIPVisionModelWithProjection(config)
 

@@ -17,41 +17,24 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Any
+from pathlib import Path
 
 import torch
+from safetensors.torch import save_file
 from torch import Tensor, nn
 from torch.nn.functional import conv2d, layer_norm, normalize, relu
-from transformers import PretrainedConfig, PreTrainedModel
 
 from palpate.data.residuals import Residual
-from palpate.encoders.tactile_module import TactileModule
+from palpate.encoders.tactile_module import Format, State, TactileModule
 
-#: Name of the architecture in ``config.json``.
-GEL = "palpate-gel"
+#: The file of the weights.
+WEIGHTS = "model.safetensors"
 #: Gray levels at which the response turns from linear to logarithmic.
 KNEE = 3.0
 #: Sides of the kernels, and strides, of the layers.
 KERNELS, STRIDES = (5, 3, 3, 3, 3), (2, 2, 2, 2, 1)
 #: Keeps the variance of standard normal numbers behind a ReLU.
 KEEPS_VARIANCE = math.sqrt(2 / (1 - 1 / math.pi))
-
-
-class GelConfig(PretrainedConfig):
-    """Architecture of a :class:`GelEncoder`: widths of the layers, and of the shared space."""
-
-    model_type = GEL
-
-    def __init__(
-        self,
-        block_out_channels: Sequence[int] = (16, 32, 64, 128, 128),
-        projection_dim: int = 128,
-        image_size: int = 96,
-        **others: Any,
-    ) -> None:
-        self.block_out_channels = [*block_out_channels]
-        self.projection_dim, self.image_size = projection_dim, image_size
-        super().__init__(**others)
 
 
 class Layer(nn.Module):
@@ -74,31 +57,45 @@ class Layer(nn.Module):
         return relu(conv2d(x, weight, self.bias, self.stride, padding)) * KEEPS_VARIANCE
 
 
-class GelEncoder(PreTrainedModel, TactileModule):
+class GelEncoder(TactileModule):
     """The learned ruler; see the head of this file.
+
+    Args:
+        widths: of the layers.
+        shared: width of the space of photos and texts.
+        side: of the residuals, in pixels.
 
     Attributes:
         dim: numbers of the ruler, twice the width of the last layer.
         center, spread: mean and deviation of the numbers over images of the training, (dim,).
-        preprocess: residuals at the side of the configuration.
+        preprocess: residuals of the side.
     """
 
-    config_class = GelConfig
-    config: GelConfig
     center: Tensor
     spread: Tensor
 
-    def __init__(self, config: GelConfig) -> None:
-        super().__init__(config)
-        widths = config.block_out_channels
+    def __init__(self, widths: Sequence[int], shared: int, side: int) -> None:
+        super().__init__()
         sizes = zip((3, *widths), widths, KERNELS, STRIDES, strict=False)
         self.layers = nn.Sequential(*(Layer(*size) for size in sizes))
         self.dim = 2 * widths[-1]
-        self.head = nn.Linear(self.dim, config.projection_dim, bias=False)
+        self.head = nn.Linear(self.dim, shared, bias=False)
         self.register_buffer("center", torch.zeros(self.dim))
         self.register_buffer("spread", torch.ones(self.dim))
-        self.preprocess = Residual(config.image_size, config.image_size)
-        self.post_init()
+        self.register_buffer("side", torch.tensor(float(side)))
+        self.preprocess = Residual(side, side)
+
+    @classmethod
+    def of(cls, state: State) -> GelEncoder:
+        """A ruler of the shapes of weights."""
+        widths = [len(state[f"layers.{k}.gain"]) for k in range(len(KERNELS))]
+        return cls(widths, len(state["head.weight"]), int(state["side"]))
+
+    def save(self, folder: Path, *, half: bool) -> None:
+        """Write the weights, with ``half`` in 16 bits, as one file of a folder."""
+        state = {GEL.prefix + k: v.half() if half else v for k, v in self.state_dict().items()}
+        folder.mkdir(parents=True)
+        save_file({k: v.contiguous() for k, v in state.items()}, folder / WEIGHTS)
 
     def numbers(self, residuals: Tensor) -> Tensor:
         """Residuals (n, 3, h, w) in gray levels to (n, dim), as they are."""
@@ -120,5 +117,5 @@ class GelEncoder(PreTrainedModel, TactileModule):
         x = numbers * self.spread + self.center
         return normalize(self.head(layer_norm(x, (self.dim,))), dim=-1)
 
-    def _init_weights(self, module: nn.Module) -> None:
-        """Keep the weights as the layers draw them."""
+
+GEL = Format("palpate/gel", "unknown", (), "gel.", "center", GelEncoder.of)

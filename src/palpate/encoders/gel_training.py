@@ -45,8 +45,8 @@ from palpate.encoders.embed import embed, texts_of
 from palpate.encoders.encoder_set import EncoderSet
 from palpate.encoders.gel import GelEncoder
 from palpate.encoders.losses import LOG_SCALE_START, clamped_scale, info_nce, soft_targets
-from palpate.encoders.models import architecture, digest_images, pick_device, to_unit, union
-from palpate.encoders.presets import EncoderPreset
+from palpate.encoders.models import digest_images, pick_device, to_unit, union
+from palpate.encoders.presets import EncoderPreset, Gel
 from palpate.encoders.rows import Rows, bytes_to_unit, evenly_spaced, factorize, train_part
 from palpate.training.engine import Batch, Losses, Task
 from palpate.training.processes import agreed, connect, first_alone, gather_rows
@@ -290,6 +290,7 @@ def train_ruler(
         PalpateError: if the train part is empty or too small, a sample lacks its image, or there is
             no ruler of the preset's size to go on from.
     """
+    assert isinstance(preset.tactile, Gel)
     where = pick_device(connect(str(run.device)))
     train, held = train_part(manifest, split), manifest.part(split, "val")
     if preset.alone and not len(held):
@@ -298,12 +299,11 @@ def train_ruler(
         kind, (backed,) = with_gels(manifest, [], run.folder / "gels")
     with seeded(run.seed, "tactile encoder"):
         width = clip.shared_width if preset.alone else clip.dim
-        ruler = GelEncoder(preset.tactile_config(width))
+        ruler = GelEncoder(preset.tactile.widths, width, preset.image)
     if preset.alone:
         old = clip.tactile
-        same = isinstance(old, GelEncoder) and architecture(old.config) == architecture(
-            ruler.config
-        )
+        shapes = [{k: v.shape for k, v in m.state_dict().items()} for m in (old, ruler) if m]
+        same = isinstance(old, GelEncoder) and shapes[0] == shapes[1]
         must, fix = "must have a learned ruler of the preset's size", "Train one: --preset gel"
         require(same, "clip", must, "another", fix=fix)
         assert old is not None
@@ -376,7 +376,7 @@ def standardize(ruler: GelEncoder, touches: Touches, n: int) -> None:
     parts: list[Tensor] = []
     rows, images = evenly_spaced(n, STATISTICS), touches.rows.images
     for some in np.array_split(rows, math.ceil(len(rows) / 128)):
-        parts.append(ruler.numbers(ruler.preprocess(to_unit(images[some], ruler.device))))
+        parts.append(ruler.numbers(ruler.preprocess(to_unit(images[some], ruler.center.device))))
     numbers = torch.cat(parts)
     ruler.center.copy_(numbers.mean(0))
     ruler.spread.copy_(numbers.std(0).clamp(min=1e-3))

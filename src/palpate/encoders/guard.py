@@ -16,8 +16,8 @@ if TYPE_CHECKING:
     from palpate.encoders.encoder_set import EncoderSet, Modality
 
 
-def load_encoders(encoder: Any, progress: Progress) -> Any:
-    """An ``EncoderSet``, loaded where it is a name or a folder."""
+def load_encoders(encoder: Any, progress: Progress, *, alone: bool = False) -> Any:
+    """An ``EncoderSet``, loaded where it is a name or a folder; ``alone`` as of its ``load``."""
     if encoder is None or not isinstance(encoder, str | Path):
         return encoder
     progress(f"loading {encoder}", 0, 0)
@@ -25,7 +25,7 @@ def load_encoders(encoder: Any, progress: Progress) -> Any:
         find_encoder(part)  # a wrong name answers at once; torch takes seconds to import
     from palpate.encoders.encoder_set import EncoderSet
 
-    encoders = EncoderSet.load(encoder, device="auto")
+    encoders = EncoderSet.load(encoder, device="auto", alone=alone)
     progress(f"loading {encoder}", 1, 1)
     return encoders
 

@@ -210,10 +210,7 @@ class EncoderPreset:
 
     def tactile_config(self, dim: int) -> Any:
         """The tactile encoder's configuration for a shared space of width ``dim``."""
-        if isinstance(self.tactile, Gel):
-            from palpate.encoders.gel import GelConfig
-
-            return GelConfig(self.tactile.widths, dim, self.image)
+        assert isinstance(self.tactile, Size)
         return _vision(self.tactile, self.image, self.patch, dim)
 
     def clip_config(self, vocabulary: int) -> CLIPConfig:

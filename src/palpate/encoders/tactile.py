@@ -34,10 +34,10 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 from torch.nn.functional import gelu, normalize, scaled_dot_product_attention
-from transformers import CLIPVisionConfig, CLIPVisionModel
 
 from palpate.core import PalpateError
 from palpate.data.images import Preprocess
+from palpate.encoders.gel import GEL
 from palpate.encoders.models import read_weights
 from palpate.encoders.rulers import HANDCRAFTED
 from palpate.encoders.tactile_module import Format, State, TactileModule
@@ -215,6 +215,8 @@ class AnyTouch(TactileModule):
     preprocess = Preprocess(224, 224, *IMAGENET, fitting="squash", resample=2)
 
     def __init__(self, state: State) -> None:
+        from transformers import CLIPVisionConfig, CLIPVisionModel
+
         super().__init__()
         self.dim, width = state["touch_projection.weight"].shape
         layers = re.findall(r"encoder\.layers\.(\d+)\.", " ".join(state))
@@ -287,7 +289,7 @@ def load_tactile(path: Path) -> TactileModule:
             lack a name, have one more, or another shape.
     """
     state = read_weights(path, f"Pass {KNOWN}")
-    form = next((f for f in (HANDCRAFTED, *FORMATS) if f.prefix + f.signature in state), None)
+    form = next((f for f in (GEL, HANDCRAFTED, *FORMATS) if f.prefix + f.signature in state), None)
     if form is None:
         must = f"{path} must be a tactile encoder that is recognized by the names of its weights"
         got = f"{len(state)} weights, first {', '.join(list(state)[:3]) or 'none'}"

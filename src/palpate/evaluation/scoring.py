@@ -195,7 +195,7 @@ def score(  # noqa: PLR0913
     if encoder is not None:
         from palpate.encoders.guard import guard, load_encoders
 
-        encoders = load_encoders(encoder, progress)
+        encoders = load_encoders(encoder, progress, alone=not clusters)
         judged: Any = bench.reference.manifest if real.rows is None else bench.reference.rows
         of_encoder = guard(
             encoders, "tactile", judged, split=split, allow_seen=allow_seen, progress=progress
