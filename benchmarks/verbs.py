@@ -284,7 +284,7 @@ def start_score(folder):
     from palpate.encoders.guard import load_encoders
     from palpate.evaluation import scoring  # noqa: F401
 
-    load_encoders("palpate/mini", quiet)
+    load_encoders("palpate/mini", quiet, alone=True)
 
 
 def start_probe(folder):
