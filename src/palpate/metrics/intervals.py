@@ -60,6 +60,11 @@ class Totals:
     squares: Array
     even: Totals | None = None
 
+    def at(self, k: int) -> Totals:
+        """One of several totals."""
+        sides = (self.n, self.sums, self.same, self.pairs, self.diagonal, self.squares)
+        return Totals(*(a[k] for a in sides), self.even and self.even.at(k))
+
     def merge(self, to: Index, segments: int) -> Totals:
         """Segments joined: segment s becomes ``to[s]``; -1 drops it."""
         m = one_hot(to, segments)
@@ -165,36 +170,44 @@ class PairSums:
             bound=None,
         )
 
-    def _part(self, at: Index | slice) -> tuple[Array, Array, Array, Array, Array]:
-        """(n, sums, same, diagonal, squares) of some items against all segments, by segment."""
-        m = one_hot(self.segment[at], self.segments)
-        n, diagonal, squares = (a[at] @ m for a in (self.n, self.diagonal, self.squares))
-        return n, m.T @ self.rows[at], m.T @ self.same[at], diagonal, squares
-
     @cached_property
     def totals(self) -> Totals:
         """Sums over all items."""
-        n, sums, same, diagonal, squares = self._part(slice(None))
+        m = one_hot(self.segment, self.segments)
+        n, diagonal, squares = (a @ m for a in (self.n, self.diagonal, self.squares))
         cell = np.searchsorted(self.units, self.unit) * self.segments + self.segment
         count = np.bincount(cell, weights=self.n, minlength=len(self.units) * self.segments)
         count = count.reshape(-1, self.segments).astype(np.float64)
         even = self.even and self.even.totals
-        return Totals(n, sums, same, count.T @ count, diagonal, squares, even)
+        return Totals(n, m.T @ self.rows, m.T @ self.same, count.T @ count, diagonal, squares, even)
 
     def leave_one_out(self) -> Iterator[Totals]:
         """The totals without each unit in turn: ``sums - C - C' + B``.
 
         C are the sums of the unit with all samples, B those of the unit with itself.
         """
-        full, parts = self.totals, split_by(self.unit)
-        evens = self.even.leave_one_out() if self.even else repeat(None)
-        for at, even in zip(parts, evens, strict=False):
-            n, with_all, inside, diagonal, squares = self._part(at)
+        for t in self.without_units():
+            yield from map(t.at, range(len(t.n)))
+
+    def without_units(self) -> Iterator[Totals]:
+        """The same for several units at a time, whose axis is the first."""
+        full, segments, unit = self.totals, self.segments, np.searchsorted(self.units, self.unit)
+        evens = self.even.without_units() if self.even else repeat(None)
+        step = max(1, TOGETHER // segments**2)
+        for at, even in zip(split_by(unit // step), evens, strict=False):
+            place = unit[at] % step, self.segment[at]
+            count = int(place[0].max()) + 1
+            n, diagonal, squares = np.zeros((3, count, segments))
+            with_all, inside = np.zeros((2, count, segments, segments))
+            sides = (n, diagonal, squares, with_all, inside)
+            parts = (self.n, self.diagonal, self.squares, self.rows, self.same)
+            for side, part in zip(sides, parts, strict=True):
+                np.add.at(side, place, part[at])
             yield Totals(
                 full.n - n,
-                full.sums - with_all - with_all.T + inside,
+                full.sums - with_all - with_all.swapaxes(1, 2) + inside,
                 full.same - inside,
-                full.pairs - np.outer(n, n),
+                full.pairs - n[:, :, None] * n[:, None],
                 full.diagonal - diagonal,
                 full.squares - squares,
                 even,
@@ -208,8 +221,8 @@ def split_by(key: Index) -> list[Index]:
 
 
 def one_hot(to: Index, segments: int) -> Array:
-    """(n, segments) float64 indicators; -1 is a row of zeros."""
-    return (to[:, None] == np.arange(segments)).astype(np.float64)
+    """(..., segments) float64 indicators; -1 is a row of zeros."""
+    return (to[..., None] == np.arange(segments)).astype(np.float64)
 
 
 def mean_of_pairs(sums: Array, pairs: Array) -> Array:
@@ -222,6 +235,8 @@ Interval = tuple[float, float]
 NONE: Array = np.zeros(0)
 #: Coverage of every interval.
 LEVEL = 0.95
+#: Numbers of sums that are left out together.
+TOGETHER = 1 << 16
 #: Relabelings that are computed together.
 BATCH = 256
 
@@ -310,9 +325,15 @@ class Estimate:
     of_classes: bool = False
 
 
-def estimate(sums: PairSums, statistic: Callable[[Totals], Array], unit: str) -> Estimate:
-    """The statistics on all samples, with their leave-one-unit-out jackknife."""
-    replicates = np.array([statistic(t) for t in sums.leave_one_out()], dtype=np.float64)
+def estimate(
+    sums: PairSums, statistic: Callable[[Totals], Array], unit: str, *, together: bool = False
+) -> Estimate:
+    """The statistics on all samples, with their leave-one-unit-out jackknife.
+
+    ``together``: whether the statistic takes totals of several units.
+    """
+    left_out = sums.without_units() if together else sums.leave_one_out()
+    replicates = (np.concatenate if together else np.array)([*map(statistic, left_out)])
     tail = "" if unit == "group" else ", samples taken as independent"
     pairs = zip(statistic(sums.totals), replicates.T, strict=True)
     return Estimate([Spread.of(*pair, unit, tail) for pair in pairs], replicates, sums.units)
@@ -389,15 +410,16 @@ def permutation_test(
     if not both.any() and len(set(inside[alone, 1].tolist())) < 2:
         return None
     rng = rng_for(seed, "permutation test")
-    label = np.tile(sums.segment == 1, (count + 1, 1))  # row 0: as observed
-    swap: Any = rng.random((count, len(sums.units))) < 0.5
-    label[1:] ^= swap[:, number] & both[number]
+    label = np.tile([False, True], (count + 1, len(both), 1))  # row 0: as observed
+    swap: Any = rng.random((count, len(both))) < 0.5
+    label[1:] ^= (swap & both)[..., None]
     if len(alone):
-        dealt = np.zeros((count, len(sums.units)), dtype=bool)
-        dealt[:, alone] = rng.permuted(np.tile(inside[alone, 1], (count, 1)), axis=1)
-        label[1:] = np.where(both[number], label[1:], dealt[:, number])
+        dealt = rng.permuted(np.tile(inside[alone, 1], (count, 1)), axis=1)
+        label[1:, alone] = dealt[..., None]
+    m = one_hot(2 * number + sums.segment, 2 * len(both))  # a cell a unit and segment
+    block, cells = m.T @ sums.block @ m, (sums.n @ m, sums.diagonal @ m)
     batches = [
-        _studentized(label[k : k + BATCH].astype(np.float64), sums, number, estimator)
+        _studentized(label[k : k + BATCH].astype(np.float64), block, *cells, estimator)
         for k in range(0, count + 1, BATCH)
     ]
     values, errors = (np.concatenate(batch) for batch in zip(*batches, strict=True))
@@ -414,33 +436,53 @@ def permutation_test(
     return (1 + hits) / (1 + len(null)), scale * errors[0] * null, counts
 
 
-def _studentized(second: Array, sums: PairSums, unit: Any, estimator: str) -> tuple[Array, Array]:
-    """(B,) MMD^2 for (B, P) labels, 1 for set 1, and its (B,) standard errors over U units."""
-    first, of_unit = 1 - second, one_hot(unit, int(unit.max()) + 1)
-    units, same = of_unit.shape[1], unit[:, None] == unit
-    counts, none = np.outer(sums.n, sums.n), np.zeros_like(sums.n)
-    # What i = j adds to the sum, and to the number of pairs, inside a set.
-    diagonal = sums.diagonal if estimator == "biased" else none
-    alone = -sums.n if estimator == "unbiased" else none
-    value, without = np.zeros(len(second)), np.zeros((len(second), units))
-    for a, b, weight in ((first, first, 1), (second, second, 1), (first, second, -2)):
-        means: list[Array] = []
-        for matrix, added in ((sums.block, diagonal), (counts, alone)):
-            assert matrix is not None  # permutation_test looked
-            inner = np.where(same, matrix, 0.0)
-            if estimator == "grouped":
-                matrix, inner = matrix - inner, np.zeros_like(inner)
-            right = a * (b @ matrix.T)
-            left = right if weight > 0 else b * (a @ matrix)
-            same_row = a * added if weight > 0 else np.zeros_like(a)
-            total = (right + same_row).sum(axis=1)
-            lost = (right + left + same_row - a * (b @ inner.T)) @ of_unit
-            means.append(np.column_stack([total, total[:, None] - lost]))
-        mean = mean_of_pairs(*means)
+def _studentized(
+    second: Array, block: Array, n: Array, diagonal: Array, estimator: str
+) -> tuple[Array, Array]:
+    """(B,) MMD^2 for (B, U, 2) labels, 1 for set 1, and its (B,) standard errors over U units.
+
+    ``block`` (2U, 2U) are the sums of cells with cells, ``n`` and ``diagonal`` (2U,) of them.
+    """
+    shape, grouped = second.shape, estimator == "grouped"
+    inner = np.einsum("uiuj->uij", block.reshape(*shape[1:], *shape[1:]))
+    near = (second.reshape(len(second), -1) @ block).reshape(shape)  # sums with the second set
+    far = block.sum(axis=0).reshape(shape[1:]) - near
+    n, diagonal = n.reshape(shape[1:]), diagonal.reshape(shape[1:])
+    value, without = np.zeros(len(second)), np.zeros(shape[:2])
+
+    def totals(right: Array, left: Array, inside: Array, alone: Array | float) -> Array:
+        """(B, 1 + U) of all units, and without each; ``alone`` is what i = j adds."""
+        total = (right + alone - grouped * inside).sum(axis=1)
+        lost = right + left + alone - (1 + grouped) * inside
+        return np.column_stack([total, total[:, None] - lost])
+
+    def of_units(cells: Array) -> Array:  # a sum over so short an axis is slow
+        return cells[..., 0] + cells[..., 1]
+
+    first = 1 - second
+    for (a, with_a), (b, with_b), weight in (
+        ((first, far), (first, far), 1),
+        ((second, near), (second, near), 1),
+        ((first, far), (second, near), -2),
+    ):
+        x, y, one_set = of_units(a * n), of_units(b * n), weight > 0
+        sums = totals(
+            of_units(a * with_b),
+            of_units(b * with_a),
+            of_units(a * of_units(inner * b[..., None, :])),
+            of_units(a * diagonal) if one_set and estimator == "biased" else 0,
+        )
+        pairs = totals(
+            x * y.sum(axis=1, keepdims=True),
+            y * x.sum(axis=1, keepdims=True),
+            x * y,
+            -x if one_set and estimator == "unbiased" else 0,
+        )
+        mean = mean_of_pairs(sums, pairs)
         value += weight * mean[:, 0]
         without += weight * mean[:, 1:]
     drift = without - without.mean(axis=1, keepdims=True)
-    error = np.sqrt((units - 1) / units * (drift**2).sum(axis=1))
+    error = np.sqrt((shape[1] - 1) / shape[1] * (drift**2).sum(axis=1))
     return value, np.where(error > 0, error, np.nan)
 
 

@@ -28,7 +28,7 @@ import math
 import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from itertools import repeat
+from itertools import pairwise, repeat
 from typing import Any, ClassVar, Literal
 
 import numpy as np
@@ -51,6 +51,8 @@ from palpate.metrics.moments import moments_of
 
 #: Factors on the median distance that make the bandwidths of ``"multi"``: two octaves around it.
 FACTORS = (0.25, 0.5, 1.0, 2.0, 4.0)
+#: Sizes of exponents up to which a series is short.
+SHORT = 0.1
 #: Rows that the median distance is taken over; its standard error is then below one per cent.
 MEDIAN_ROWS = 1000
 
@@ -115,10 +117,19 @@ class Gaussian(Kernel):
 
     def values(self, t: Any, xp: Any) -> Any:
         """``expm1(t)``, averaged over the bandwidths."""
-        if len(self.sigmas) == 1:
-            return xp.expm1(t)
         ratios = [(self.sigmas[0] / sigma) ** 2 for sigma in self.sigmas]
-        return sum(xp.expm1(t * ratio) for ratio in ratios) / len(ratios)
+        if len(ratios) == 1:
+            return _expm1(t, xp)
+        if not all(a == 4 * b for a, b in pairwise(ratios)):
+            return sum(_expm1(t * ratio, xp) for ratio in ratios) / len(ratios)
+        k = _expm1(t * ratios[-1], xp)  # the widest; each other one is the fourth power of the last
+        total = xp.asarray(k, copy=True)
+        for _ in ratios[1:]:
+            for _ in range(2):  # (1 + k)^2 - 1
+                k *= k + 2
+            total += k
+        total /= len(ratios)
+        return total
 
     def settings(self) -> dict[str, Any]:
         """The name; one bandwidth is in ``Score.bandwidth``, several are here."""
@@ -145,16 +156,31 @@ class Polynomial(Kernel):
 
     def values(self, t: Any, xp: Any) -> Any:
         """The power."""
-        base = t + self.coef0
-        k = base
+        t += self.coef0
+        k = xp.asarray(t, copy=True)
         for _ in range(self.degree - 1):
-            k = k * base
+            k *= t
         return k
 
     def settings(self) -> dict[str, Any]:
         """All parameters."""
         gamma = self.gamma or "1/d"
         return super().settings() | {"degree": self.degree, "gamma": gamma, "coef0": self.coef0}
+
+
+def _expm1(t: Any, xp: Any) -> Any:
+    """``expm1(t)`` of t <= 0; by its series where that is short: a third of the time."""
+    reach = -float(xp.min(t)) if 0 not in t.shape else 1.0
+    if reach > SHORT or not isinstance(t, np.ndarray):
+        return xp.expm1(t)
+    count, precision = 1, np.finfo(t.dtype).eps / 4
+    while reach**count / math.factorial(count + 1) > precision:
+        count += 1
+    k = t / math.factorial(count)
+    for n in range(count - 1, 0, -1):
+        k += t.dtype.type(1 / math.factorial(n))
+        k *= t
+    return k
 
 
 def gaussian(sigma: Sigma, x: Any, groups: Sequence[str] | Index | None = None) -> Gaussian:
@@ -321,8 +347,10 @@ def blocked_sums(
     def sums_of(pair: tuple[int, int]) -> list[Array]:
         i, j = pair
         k = pairs.block(blocks[i], blocks[j], diagonal=0 if i == j else None)
-        mirrored = [(k.T, j, i)] if i != j else []
-        return [host(rows[a][1].T @ (v @ columns[b][1])) for v, a, b in [(k, i, j), *mirrored]]
+        sums = [host(rows[i][1].T @ (k @ columns[j][1]))]
+        if i != j:
+            sums.append(sums[0].T if joined else host(rows[j][1].T @ (k.T @ columns[i][1])))
+        return sums
 
     todo = [(i, j) for i in range(len(blocks)) for j in range(i, len(blocks))]
     for (i, j), sums in zip(todo, in_threads(sums_of, todo, x), strict=True):
@@ -335,11 +363,15 @@ def blocked_sums(
     else:
         with_segments, *weighed = np.hsplit(total, len(weights) + 1)
         same = np.zeros((count, segments))
-        for at in split_by(unit):
-            for part in _slices(len(at), block):
-                k = pairs.block(at[part], at, diagonal=part.start)
-                inside = host(k @ _wide(one_hot(segment[at], segments), pairs.z))
-                np.add.at(same, item[at[part]], inside)
+        each = split_by(unit)
+        for of_size in split_by(np.array([len(at) for at in each])):  # units of one size together
+            of = np.stack([each[k] for k in of_size])
+            length = of.shape[1]
+            for some in _slices(len(of), max(1, (SMALL_BLOCK // length) ** 2)):
+                columns_of = _wide(one_hot(segment[of[some]], segments), pairs.z)
+                for part in _slices(length, block):
+                    k = pairs.block(of[some, part], of[some], diagonal=part.start)
+                    np.add.at(same, item[of[some, part]], host(k @ columns_of))
         sums = PairSums(size, size, with_segments, same, diagonal, *items)
     each = zip(weights, weighed, strict=False)
     return replace(sums, weighings=[sums.weighed(w[first], v) for w, v in each])
@@ -367,15 +399,18 @@ class _Pairs:
         self.shift = like(self.half, self.z)
 
     def block(self, rows: Any, columns: Any, diagonal: int | None = None) -> Any:
-        """(n, m) float64 values, 0 at i = j; ``diagonal``: the column of the first row, if any."""
-        k = self._rows(self.z, rows) @ self._rows(self.z, columns).T
+        """(n, m) float64 values, 0 at i = j; ``diagonal``: the column of the first row, if any.
+
+        Of indices (b, n) and (b, m) it is (b, n, m).
+        """
+        k = self._rows(self.z, rows) @ self._rows(self.z, columns).swapaxes(-1, -2)
         if self.kernel.stationary:
-            k -= self._rows(self.shift, rows)[:, None]
-            k -= self._rows(self.shift, columns)
+            k -= self._rows(self.shift, rows)[..., None]
+            k -= self._rows(self.shift, columns)[..., None, :]
         k = self.xp.astype(self.kernel.values(k, self.xp), self.xp.float64, copy=False)
         if diagonal is not None:
-            at = np.arange(k.shape[0])
-            k[at, at + diagonal] = 0
+            at = np.arange(k.shape[-2])
+            k[..., at, at + diagonal] = 0
         return k
 
     def diagonal(self) -> Array:
@@ -383,7 +418,9 @@ class _Pairs:
         return host(self.kernel.values(2 * self.half * (not self.kernel.stationary), np))
 
     def _rows(self, x: Any, at: Any) -> Any:
-        return x[at] if isinstance(at, slice) else rows_at(x, at)
+        if isinstance(at, slice):
+            return x[at]
+        return rows_at(x, at.reshape(-1)).reshape(*at.shape, *x.shape[1:])
 
 
 def _slices(n: int, step: int) -> list[slice]:

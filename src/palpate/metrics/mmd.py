@@ -88,12 +88,12 @@ CHOICES = {
 
 
 def mmd_matrix(t: Totals, estimator: str, scale: float) -> Array:
-    """Eq. 2 between every two segments, (S, S); NaN where there are no pairs to average.
+    """Eq. 2 between every two segments, (..., S, S); NaN where there are no pairs to average.
 
     The diagonal has no meaning. A constant in k cancels, as XX + YY - 2 XY weighs it 1 + 1 - 2.
     """
     inner, cross = _means(t, estimator)
-    return scale * (inner[:, None] + inner[None, :] - 2 * cross)  # Eq. 2
+    return scale * (inner[..., None] + inner[..., None, :] - 2 * cross)  # Eq. 2
 
 
 def mmd_bound(remainder: Totals, estimator: str, scale: float) -> Array:
@@ -104,10 +104,10 @@ def mmd_bound(remainder: Totals, estimator: str, scale: float) -> Array:
 
 def _means(t: Totals, estimator: str) -> tuple[Array, Array]:
     """Mean kernel inside segments (S,) and between them (S, S), over an estimator's pairs."""
-    sums, pairs = t.sums, np.outer(t.n, t.n)
+    sums, pairs = t.sums, t.n[..., None] * t.n[..., None, :]
     if estimator == "grouped":
         sums, pairs = t.sums - t.same, pairs - t.pairs
-    inner_sums, inner_pairs = np.diagonal(sums), np.diagonal(pairs)
+    inner_sums, inner_pairs = (np.diagonal(a, axis1=-2, axis2=-1) for a in (sums, pairs))
     if estimator == "unbiased":
         inner_pairs = t.n * (t.n - 1)
     if estimator == "biased":
@@ -549,5 +549,6 @@ def _segments(generated: FeatureSet, plan: Options) -> tuple[list[str], Index, I
     labels = ["" if is_missing(v) else str(v) for v in generated.labels or [""] * len(ids)]
     classes = sorted(set(labels))
     label = np.searchsorted(classes, labels)
-    halves = 2 * half_of(ids, label, plan) + half_of(ids, np.zeros_like(label), plan)
+    of_set = half_of(ids, np.zeros_like(label), plan)
+    halves = 2 * (half_of(ids, label, plan) if len(classes) > 1 else of_set) + of_set
     return classes, label, 4 * label + halves

@@ -223,7 +223,8 @@ def tmmd_of(table: Table) -> Scored:
     plan, sums, reference = table.plan, table.tmmd(), table.reference
     assert reference is not None  # TMMD is of two sets
     notes: list[Note] = []
-    est = estimate(sums, lambda t: mmd_matrix(t, plan.estimator, plan.scale)[:1, 1], table.unit)
+    distance = lambda t: mmd_matrix(t, plan.estimator, plan.scale)[..., :1, 1]
+    est = estimate(sums, distance, table.unit, together=True)
     if not np.isfinite(est.spreads[0].value):
         reason = "few-groups" if plan.estimator == "grouped" else "one-sample"
         notes.append(Note("undefined", {"reason": reason}))
