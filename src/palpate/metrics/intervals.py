@@ -417,9 +417,10 @@ def permutation_test(
         dealt = rng.permuted(np.tile(inside[alone, 1], (count, 1)), axis=1)
         label[1:, alone] = dealt[..., None]
     m = one_hot(2 * number + sums.segment, 2 * len(both))  # a cell a unit and segment
-    block, cells = m.T @ sums.block @ m, (sums.n @ m, sums.diagonal @ m)
+    block, n = m.T @ sums.block @ m, sums.n @ m
+    block += np.diag(sums.diagonal @ m * (estimator == "biased"))
     batches = [
-        _studentized(label[k : k + BATCH].astype(np.float64), block, *cells, estimator)
+        _studentized(label[k : k + BATCH].astype(np.float64), block, n, estimator)
         for k in range(0, count + 1, BATCH)
     ]
     values, errors = (np.concatenate(batch) for batch in zip(*batches, strict=True))
@@ -436,49 +437,38 @@ def permutation_test(
     return (1 + hits) / (1 + len(null)), scale * errors[0] * null, counts
 
 
-def _studentized(
-    second: Array, block: Array, n: Array, diagonal: Array, estimator: str
-) -> tuple[Array, Array]:
+def _studentized(second: Array, block: Array, n: Array, estimator: str) -> tuple[Array, Array]:
     """(B,) MMD^2 for (B, U, 2) labels, 1 for set 1, and its (B,) standard errors over U units.
 
-    ``block`` (2U, 2U) are the sums of cells with cells, ``n`` and ``diagonal`` (2U,) of them.
+    ``block`` (2U, 2U) are the sums of cells with cells, ``n`` (2U,) their samples.
     """
-    shape, grouped = second.shape, estimator == "grouped"
+    shape, grouped, first = second.shape, estimator == "grouped", 1 - second
     inner = np.einsum("uiuj->uij", block.reshape(*shape[1:], *shape[1:]))
     near = (second.reshape(len(second), -1) @ block).reshape(shape)  # sums with the second set
     far = block.sum(axis=0).reshape(shape[1:]) - near
-    n, diagonal = n.reshape(shape[1:]), diagonal.reshape(shape[1:])
+    n = n.reshape(shape[1:])
     value, without = np.zeros(len(second)), np.zeros(shape[:2])
 
-    def totals(right: Array, left: Array, inside: Array, alone: Array | float) -> Array:
-        """(B, 1 + U) of all units, and without each; ``alone`` is what i = j adds."""
-        total = (right + alone - grouped * inside).sum(axis=1)
-        lost = right + left + alone - (1 + grouped) * inside
-        return np.column_stack([total, total[:, None] - lost])
+    def totals(right: Array, left: Array, inside: Array) -> Array:
+        """(B, 1 + U) of all units, and without each."""
+        total = (right - grouped * inside).sum(axis=1)
+        return np.column_stack([total, total[:, None] - right - left + (1 + grouped) * inside])
 
     def of_units(cells: Array) -> Array:  # a sum over so short an axis is slow
         return cells[..., 0] + cells[..., 1]
 
-    first = 1 - second
     for (a, with_a), (b, with_b), weight in (
         ((first, far), (first, far), 1),
         ((second, near), (second, near), 1),
         ((first, far), (second, near), -2),
     ):
-        x, y, one_set = of_units(a * n), of_units(b * n), weight > 0
-        sums = totals(
-            of_units(a * with_b),
-            of_units(b * with_a),
-            of_units(a * of_units(inner * b[..., None, :])),
-            of_units(a * diagonal) if one_set and estimator == "biased" else 0,
-        )
-        pairs = totals(
-            x * y.sum(axis=1, keepdims=True),
-            y * x.sum(axis=1, keepdims=True),
-            x * y,
-            -x if one_set and estimator == "unbiased" else 0,
-        )
-        mean = mean_of_pairs(sums, pairs)
+        own = of_units(a * of_units(inner * b[..., None, :]))
+        sums = totals(of_units(a * with_b), of_units(b * with_a), own)
+        x, y = of_units(a * n), of_units(b * n)
+        alone = x * (weight > 0 and estimator == "unbiased")  # pairs i = j, which do not count
+        every = (v.sum(axis=1, keepdims=True) for v in (y, x))
+        sides = [v * of_all - alone for v, of_all in zip((x, y), every, strict=True)]
+        mean = mean_of_pairs(sums, totals(*sides, x * y - alone))
         value += weight * mean[:, 0]
         without += weight * mean[:, 1:]
     drift = without - without.mean(axis=1, keepdims=True)
