@@ -93,7 +93,7 @@ def nothing(folder, n):
 
 
 def bare_forward(files):
-    """Decode, resize, and the forward pass of the shipped tactile encoder in plain torch."""
+    """Decode, subtract a gel, resize, and the forward pass of the shipped ruler in plain torch."""
     import torch
     from PIL import Image
     from safetensors.torch import load_file
@@ -101,52 +101,35 @@ def bare_forward(files):
 
     import palpate  # for its folder alone
 
-    folder = Path(palpate.__file__).parent / "mini" / "encoders" / "tactile"
-    config = json.loads((folder / "config.json").read_text())
-    shape = json.loads((folder / "preprocessor_config.json").read_text())
-    w = {k: v.float() for k, v in load_file(folder / "model.safetensors").items()}
-    heads, side = config["num_attention_heads"], config["image_size"]
-    mean, std = (np.array(shape[name], np.float32) for name in ("image_mean", "image_std"))
+    file = Path(palpate.__file__).parent / "mini" / "encoders" / "tactile" / "model.safetensors"
+    w = {k.removeprefix("gel."): v.float() for k, v in load_file(file).items()}
+    side, layers = int(w["side"]), []
+    for k, stride in enumerate((2, 2, 2, 2, 1)):
+        name = f"layers.{k}"
+        flat = w[f"{name}.weight"].flatten(1)
+        flat = (flat - flat.mean(1, keepdim=True)) / flat.std(1, correction=0, keepdim=True)
+        scale = w[f"{name}.gain"] * 1.713 / flat.shape[1] ** 0.5
+        weight = (flat * scale[:, None]).view_as(w[f"{name}.weight"])
+        layers.append((weight, 1.713 * w[f"{name}.bias"], stride, weight.shape[2] // 2))
 
-    def linear(x, name):
-        return functional.linear(x, w[f"{name}.weight"], w.get(f"{name}.bias"))
+    def encode(x):
+        x = torch.asinh((x - x[:, :, ::4, ::4].flatten(2).median(2).values[..., None, None]) / 3)
+        for layer in layers:
+            x = functional.conv2d(x, *layer).relu_()
+        x = torch.cat([x.mean((2, 3)), x.var((2, 3)).add(1e-4).sqrt()], 1)
+        return functional.normalize((x - w["center"]) / w["spread"], dim=1)
 
-    def norm(x, name):
-        return functional.layer_norm(x, x.shape[-1:], w[f"{name}.weight"], w[f"{name}.bias"])
-
-    def encode(pixels):
-        base = "vision_model.embeddings"
-        patch = w[f"{base}.patch_embedding.weight"]
-        x = functional.conv2d(pixels, patch, stride=patch.shape[-1]).flatten(2).transpose(1, 2)
-        first = w[f"{base}.class_embedding"].expand(len(x), 1, -1)
-        x = torch.cat([first, x], 1) + w[f"{base}.position_embedding.weight"]
-        x = norm(x, "vision_model.pre_layrnorm")
-        for k in range(config["num_hidden_layers"]):
-            layer = f"vision_model.encoder.layers.{k}"
-            y = norm(x, f"{layer}.layer_norm1")
-            q, k, v = (
-                linear(y, f"{layer}.self_attn.{name}_proj")
-                .unflatten(2, (heads, -1))
-                .transpose(1, 2)
-                for name in "qkv"
-            )
-            y = functional.scaled_dot_product_attention(q, k, v).transpose(1, 2).flatten(2)
-            x = x + linear(y, f"{layer}.self_attn.out_proj")
-            y = linear(norm(x, f"{layer}.layer_norm2"), f"{layer}.mlp.fc1")
-            x = x + linear(y * torch.sigmoid(1.702 * y), f"{layer}.mlp.fc2")
-        x = norm(x[:, 0], "vision_model.post_layernorm")
-        return functional.normalize(linear(x, "visual_projection"), dim=-1)
-
-    rows = []
+    rows, gel = [], None
     with torch.inference_mode():
         for start in range(0, len(files), 128):
             images = []
             for file in files[start : start + 128]:
                 with Image.open(file) as image:
-                    small = image.convert("RGB").resize((side, side), Image.Resampling.BICUBIC)
-                    images.append((np.asarray(small, np.float32) / 255 - mean) / std)
-            rows.append(encode(torch.from_numpy(np.stack(images)).permute(0, 3, 1, 2)).numpy())
-    return np.concatenate(rows)
+                    small = image.convert("RGB").resize((side, side), Image.Resampling.BILINEAR)
+                    images.append(np.asarray(small, np.float32))
+            gel = np.median(images, axis=0) if gel is None else gel
+            rows.append(encode(torch.from_numpy(np.stack(images) - gel).permute(0, 3, 1, 2)))
+    return torch.cat(rows).numpy()
 
 
 def bare_products(x, y, of_block=lambda k: k):
