@@ -320,6 +320,13 @@ def test_folders_flat_and_nested(tmp_path, names):
     assert tree(tmp_path / "out") == {"manifest.parquet"}
 
 
+def test_a_long_table_beside_the_images_that_names_none_of_them(tmp_path):
+    for side in ("vision", "tactile"):
+        write_image(tmp_path / "in" / side / "0.png", 1)
+    (tmp_path / "in" / "log.csv").write_text("time,volt\n" + "1,2\n" * 60_000)
+    assert len(rows_of(import_pairs(tmp_path / "in", tmp_path / "out"), "id")) == 1
+
+
 def test_unpaired_doubled_and_cut_files_of_folders(tmp_path):
     root = tmp_path / "d"
     for k in range(4):

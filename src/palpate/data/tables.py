@@ -90,9 +90,11 @@ class Table:
         rows = self.records(columns)
         if not isinstance(rows, pl.DataFrame):
             rows = pl.DataFrame(list(rows), schema, orient="row")
+        if not columns:  # polars compares no condition of no column with rows of several chunks
+            return rows
         cells = [pl.col(name).str.strip_chars() for name in columns]
         rows = rows.with_columns(pl.when(cell != "").then(cell) for cell in cells)
-        unfit = pl.any_horizontal(pl.lit(False), pl.col(pl.String).str.contains(UNFIT))
+        unfit = pl.any_horizontal(pl.col(pl.String).str.contains(UNFIT))
         for line in rows.filter(unfit)[LINE]:
             text = "the row holds bytes that are not UTF-8, or a zero character: save the file as"
             self.problems.append(Problem(self.place(line), "bad-encoding", f"{text} UTF-8"))
