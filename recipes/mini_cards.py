@@ -20,6 +20,13 @@ RECIPE = "python recipes/mini.py --work runs/mini --ship"
 OF_TACTILE = "python recipes/mini.py --work runs/mini --tactile --ship"
 TAGS = ("synthetic",)
 SUMMARIES = {
+    "pair": (
+        "Vision and text encoders of palpate's world",
+        "A small CLIP with its tokenizer, trained on photos and captions of the procedural world,"
+        " which say what is felt and name no material;"
+        " its space has 128 dimensions. The vision encoder went on, with many more photos, against"
+        " the text encoder as it is.",
+    ),
     "encoders": (
         "Vision, text and tactile encoders of palpate's world",
         "Three small encoders with one space of 128 dimensions: a CLIP (vision and text, with"
@@ -44,13 +51,6 @@ SUMMARIES = {
         "gel that is given as a picture without contact, or on a stock gel.",
     ),
 }
-PAIR = (
-    "Vision and text encoders of palpate's world",
-    "A small CLIP with its tokenizer, trained on photos and captions of the procedural world,"
-    " which say what is felt and name no material;"
-    " its space has 128 dimensions. The vision encoder went on, with many more photos, against"
-    " the text encoder as it is.",
-)
 LIMITS = (
     "Knows only the procedural world of palpate: 20 simulated materials and a simulated gel. "
     "Real photos and real tactile images are out of its range.",
@@ -58,6 +58,7 @@ LIMITS = (
     "real data sets.",
 )
 READ = {
+    "pair": ("gelsight", "photos", "new gelsight"),
     "encoders": (
         *("gelsight", "photos", *(f"gel {number}" for number in range(14))),
         *("new gelsight", "new gel", "new pad", "new look"),
@@ -82,6 +83,7 @@ def ship(
 
     def card(part: str) -> dict[str, Any]:
         title, summary = SUMMARIES[part]
+        scored = scores["encoders" if part == "pair" else part]
         data = [
             {**world, "used for": "scores" if world["world"].startswith("new") else "training"}
             for world in worlds
@@ -94,7 +96,7 @@ def ship(
             "tags": list(TAGS),
             "license": "apache-2.0",
             "data": data,
-            "scores": scores[part],
+            "scores": scored,
             "limits": list(LIMITS),
             "recipe": RECIPE,
             "world version": VERSION,
@@ -104,13 +106,12 @@ def ship(
     encoders.card = {**encoders.card, **card("encoders")}
     if tactile:
         encoders.card["recipe"] = OF_TACTILE
-    pair = card("encoders")
-    pair["title"], pair["summary"] = PAIR
+    pair = card("pair")
     pair["scores"] = [row for row in pair["scores"] if "tactile" not in row["score"]]
     encoders.clip_card = {**encoders.clip_card, **pair}
     autoencoder.card = {**autoencoder.card, **card("autoencoder")}
     pipeline = replace(pipeline, training={**pipeline.training, **card("generator")})
-    for part in READ:  # git has what was there
+    for part in scores:  # git has what was there
         shutil.rmtree(target / part, ignore_errors=True)
     encoders.save(target / "encoders", half=True)
     autoencoder.save(target / "autoencoder", half=True)

@@ -270,6 +270,9 @@ def test_the_shipped_encoder_by_the_door(files):
     assert np.allclose(one, each, atol=1e-5)
     with pytest.raises(PalpateError, match="one image, or one for each"):
         encoder.encode(files[1], backgrounds=files[1][:2])
+    photos = Encoder(encoder.encoders, "vision")  # subtracts nothing
+    gel = files[1][0]
+    assert np.array_equal(photos.encode(files[1], backgrounds=gel), photos.encode(files[1]))
     with pytest.raises(PalpateError, match=r"`modality` must be one of vision, text, tactile"):
         pp.Encoder.from_pretrained("palpate/mini", modality="touch")
     with pytest.raises(TypeError, match="modality"):

@@ -16,7 +16,7 @@ from palpate.encoders.embed import embed  # noqa: E402
 from palpate.encoders.encoder_set import EncoderSet, load_clip  # noqa: E402
 from palpate.encoders.gel import GelEncoder  # noqa: E402
 from palpate.encoders.gel_training import Touches, contrast, held_out, train_ruler, units_of, views  # noqa: E402
-from palpate.encoders.presets import PRESETS  # noqa: E402
+from palpate.encoders.presets import PRESETS, Gel  # noqa: E402
 from palpate.sim import WorldOptions, write_world  # noqa: E402
 from palpate.training.run import TrainingRun  # noqa: E402
 from palpate.training.steps import Step  # noqa: E402
@@ -199,8 +199,25 @@ def test_touches_alone_teach_and_own_frames_are_refused(world, trained, tmp_path
     with pytest.raises(PalpateError, match="that it was trained on"):
         score(kept, kept, encoder=own)
     fails("learned ruler", train_encoder, blind, split, preset=preset("self"), clip="palpate/mini")
+    other = replace(preset("self"), image=64)  # equal weights, residuals of another side
+    fails("learned ruler", train_encoder, blind, split, preset=other, clip=tmp_path / "start")
     own.save(tmp_path / "own")
     assert EncoderSet.load(tmp_path / "own").digest("tactile") == own.digest("tactile")
+    file = tmp_path / "own" / "tactile" / "model.safetensors"  # does not know what it saw
+    fails(f"Pass {tmp_path / 'own'}", EncoderSet.load, file)
+
+
+@pytest.mark.parametrize(
+    ("changes", "word"),
+    [
+        ({"image": 16}, "32 or more"),
+        ({"fitting": "pad"}, "crop and none"),
+        ({"turn": "left"}, "crop and none"),
+        ({"tactile": Gel((8, 8))}, "must be 5"),
+    ],
+)
+def test_what_a_ruler_cannot_be(changes, word):
+    fails(word, replace, PRESETS["gel"], **changes)
 
 
 def test_touches_alone_need_a_ruler():

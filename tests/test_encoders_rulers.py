@@ -139,6 +139,24 @@ def test_sets_that_stand_for_no_real_image_take_the_same_kind(tmp_path):
     assert with_gels(same, [], tmp_path / "gels")[0] == "low-pass"
 
 
+def test_other_real_images_keep_their_own_gel_whatever_ids_they_share(tmp_path):
+    real = touches(tmp_path / "r", 6, background=lambda k: "gel.png")
+    train = touches(tmp_path / "t", 12, seed=1, background=lambda k: "gel.png")
+    kind, (_, t) = with_gels(real, [train], tmp_path / "gels", real=[0])
+    assert kind == "no contact"
+    assert {*files(t)} == {str((tmp_path / "t" / "gel.png").resolve())}
+
+
+def test_scores_without_a_reference_name_the_medians_of_it(tmp_path, handcrafted):
+    sides = {n: touches(tmp_path / n, 30, seed=s) for s, n in enumerate("abg")}
+    options = OPTIONS | {"presets": ["paper"]}
+    found = [score(pixels(sides["g"]), pixels(sides[n]), **options) for n in "ab"]
+    digests = [r["I-TMMD", "generated"].encoder for r in found]
+    assert digests[0] != digests[1]
+    again = score(pixels(sides["g"]), pixels(sides["a"]), **options)
+    assert again["I-TMMD", "generated"].encoder == digests[0]
+
+
 def numbers_of(residuals):
     encoder = Handcrafted({"center": torch.zeros(149)})
     return encoder.numbers(torch.tensor(residuals, dtype=torch.float32)).numpy()

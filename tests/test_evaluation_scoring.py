@@ -519,6 +519,9 @@ def test_clusters_stand_in_for_materials_and_say_so(tmp_path, small_manifest, mi
     options = {"encoder": mini, "labels": "cluster:2", **FAST}
     of_photos = score(tmp_path / "g", small_manifest, **options)["CI-TMMD", "g"]
     assert of_photos.settings["labels"] == "cluster:2 of photos"
+    ruler = {**options, "encoder": "palpate/handcrafted"}
+    by_ruler = score(tmp_path / "g", small_manifest, **ruler)["CI-TMMD", "g"]  # it sees no photo
+    assert by_ruler.settings["labels"] == "cluster:2 of the reference's features"
     for labels, made, words in (
         ("cluster:x", bare["far"], "cluster: and a number"),
         ("cluster:40", bare["far"], "four samples a cluster"),

@@ -121,7 +121,7 @@ def with_gels(
         sets: what is compared with it, all with image files; images of the reference's ids take
             its backgrounds.
         folder: for medians, as PNG files.
-        real: numbers of the sets that are real images, too, which take their own medians.
+        real: numbers of the sets that are real images, too, which take their own backgrounds.
 
     Returns:
         The kind of background, the best that all samples with a tactile image have, and the
@@ -135,7 +135,10 @@ def with_gels(
         columns = [gels]
         for k, part in enumerate(sets):
             own = _gels(part, kind, folder) if k in real or kind == "no contact" else []
-            columns.append(_lent(part, reference, gels, own))
+            lent = _lent(part, reference, gels, own)
+            if k in real:
+                lent = [mine or other for mine, other in zip(own, lent, strict=True)]
+            columns.append(lent)
         if all(map(_complete, parts, columns)):
             break
     else:

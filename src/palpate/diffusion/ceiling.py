@@ -155,7 +155,8 @@ def measure_ceiling(
             ground = None if ground is None else ground[~seen]
 
         backed = not any(p.table["background"].null_count() for p in (train, held))
-        ruled = judge.preprocess("tactile").residual
+        if ruled := judge.preprocess("tactile").residual:
+            scores["background_kind"] = "no contact" if backed else "low-pass"
 
         def numbers(part: Manifest, pixels: NDArray[np.uint8]) -> NDArray[np.float32]:
             empty = cached_images(part, "background", size, cache, progress) if backed else None

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from palpate.core import PalpateWarning, Progress, quiet, require, require_choice
 from palpate.data.images import Frames, Preprocess
 from palpate.data.manifest import Manifest
+from palpate.data.residuals import kind_of
 from palpate.encoders.embed import embed, embed_frames, embed_texts, list_images
 from palpate.encoders.encoder_set import EncoderSet, Modality
 from palpate.encoders.models import pick_device
@@ -106,7 +107,8 @@ class Encoder:
                 images, a uint8 array (n, h, w, 3), a tensor (n, 3, h, w) of bytes or of floats in
                 [0, 1], or a manifest. For text: a string, a list of strings, or a manifest.
             backgrounds: no-contact images in any of these forms, one for all or one each, for a
-                ruler; without, it takes off low frequencies, and warns. A manifest has its own.
+                ruler, or another encoder that subtracts them; without, a ruler takes off low
+                frequencies, and warns. A manifest has its own.
             batch: images or texts at a time; changes the result by rounding only (1e-5).
             progress: called with the number of inputs done.
 
@@ -118,7 +120,9 @@ class Encoder:
             PalpateError: if an image is unreadable, the inputs are of another kind, or backgrounds
                 are neither one nor one each.
         """
+        ruled = self.modality == "tactile" and self.preprocess.residual
         if isinstance(inputs, Manifest):
+            _warn(ruled and kind_of(inputs) == "low-pass")
             return np.asarray(embed(inputs, self.encoders, self.modality, batch=batch).features)
         if self.modality == "text":
             texts = [inputs] if isinstance(inputs, str) else list(inputs)
@@ -128,8 +132,12 @@ class Encoder:
         gels = gels * len(images) if len(gels) == 1 else gels
         must, got = "must be one image, or one for each", f"{len(gels)} for {len(images)}"
         require(len(gels) in (0, len(images)), "backgrounds", must, got)
-        if not gels and self.modality == "tactile" and self.preprocess.residual:
-            text = "A ruler without no-contact images reads faint contacts badly: pass backgrounds"
-            warnings.warn(text, PalpateWarning, stacklevel=2)
-        frames = Frames.alone(images, gels)
+        _warn(ruled and not gels)
+        frames = Frames.alone(images, gels if self.preprocess.subtract else [])
         return embed_frames(frames, self.encoders, self.modality, batch, progress)
+
+
+def _warn(low_pass: bool) -> None:
+    if low_pass:
+        text = "A ruler without no-contact images reads faint contacts badly: pass backgrounds"
+        warnings.warn(text, PalpateWarning, stacklevel=3)

@@ -406,6 +406,11 @@ class EncoderSet:
         folder, sensor = find_encoder(source)
         if folder.is_file():
             public = load_tactile(folder)
+            must = (
+                f"The ruler {folder} must be named by its set, which knows what it was trained on"
+            )
+            bare = isinstance(public, GelEncoder)
+            require(not bare, None, must, "its weights", fix=f"Pass {folder.parent.parent}")
             card = {"name": str(source), "license": public.format.license}
             shape = {"tactile": public.preprocess}
             seen: dict[str, Digests | None] = {}

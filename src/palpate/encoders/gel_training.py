@@ -303,7 +303,8 @@ def train_ruler(
     if preset.alone:
         old = clip.tactile
         shapes = [{k: v.shape for k, v in m.state_dict().items()} for m in (old, ruler) if m]
-        same = isinstance(old, GelEncoder) and shapes[0] == shapes[1]
+        same = isinstance(old, GelEncoder) and old.preprocess == ruler.preprocess
+        same = same and shapes[0] == shapes[1]
         must, fix = "must have a learned ruler of the preset's size", "Train one: --preset gel"
         require(same, "clip", must, "another", fix=fix)
         assert old is not None

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Generator
+from contextlib import contextmanager
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -28,6 +31,25 @@ def load_encoders(encoder: Any, progress: Progress, *, alone: bool = False) -> A
     encoders = EncoderSet.load(encoder, device="auto", alone=alone)
     progress(f"loading {encoder}", 1, 1)
     return encoders
+
+
+@contextmanager
+def backed(
+    manifest: Manifest, encoders: EncoderSet | None, cache: str | Path | None
+) -> Generator[tuple[Manifest, list[Note]]]:
+    """Samples with backgrounds of one kind, where a ruler of ``encoders`` looks at their touches,
+    and a note on the kind; others as they are.
+    """
+    seeing = encoders is not None and "tactile" in encoders.modalities
+    ruled = encoders is not None and seeing and encoders.preprocess("tactile").residual
+    if not (ruled and any(manifest.column("tactile"))):
+        yield manifest, []
+        return
+    from palpate.data.residuals import with_gels
+
+    with TemporaryDirectory() as folder:
+        kind, (samples,) = with_gels(manifest, [], Path(cache or folder))
+        yield samples, [Note("background-kind", {"kind": kind})]
 
 
 def guard(

@@ -73,6 +73,10 @@ class Size:
         require(possible, None, must, got, fix="Choose other numbers")
 
 
+#: Layers of the learned ruler, and the least side of its images in pixels.
+GEL_LAYERS, GEL_LEAST = 5, 32
+
+
 @dataclass(frozen=True)
 class Gel:
     """The learned ruler of residuals (:mod:`palpate.encoders.gel`).
@@ -197,6 +201,14 @@ class EncoderPreset:
         ruler = not self.alone or (isinstance(self.tactile, Gel) and self.pretrained is not None)
         fix = "Change another preset"
         require(ruler, "alone", "needs a learned ruler to go on from", self.alone, fix=fix)
+        if isinstance(self.tactile, Gel):
+            layers = len(self.tactile.widths)
+            require(layers == GEL_LAYERS, "widths", f"must be {GEL_LAYERS}", layers, fix=fix)
+            least = f"must be {GEL_LEAST} or more for a ruler, which pools over positions"
+            require(self.image >= GEL_LEAST, "image", least, self.image, 96)
+            plain = (self.fitting, self.turn) == ("crop", "none")
+            got, must = f"{self.fitting} and {self.turn}", "must be crop and none for a ruler"
+            require(plain, "fitting", must, got, "crop")
 
     @property
     def preprocess(self) -> Preprocess:

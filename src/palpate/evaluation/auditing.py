@@ -68,20 +68,21 @@ def audit(
         seen: list[str] = []
         if encoders is not None:
             from palpate.encoders.embed import embed
-            from palpate.encoders.guard import guard
+            from palpate.encoders.guard import backed, guard
 
             features = dict[str, FeatureSet]()
             # every sample is in the test part of some leak-free split
             judged = samples.part(split, "train", "test")
-            for m in encoders.modalities:
-                if m not in SIDES or not judged.table[m].count():
-                    continue
-                new = guard(encoders, m, judged, allow_seen=allow_seen, progress=progress)
-                notes += new
-                if any(note.code in ("seen-images", "seen-dataset") for note in new):
-                    seen.append(f"{m} encoder")
-                rows = embed(samples, encoders, m, cache=folder, progress=progress)
-                features[f"{m} encoder"] = rows
+            with backed(samples, encoders, folder) as (ruled, notes):
+                for m in encoders.modalities:
+                    if m not in SIDES or not judged.table[m].count():
+                        continue
+                    new = guard(encoders, m, judged, allow_seen=allow_seen, progress=progress)
+                    notes += new
+                    if any(note.code in ("seen-images", "seen-dataset") for note in new):
+                        seen.append(f"{m} encoder")
+                    rows = embed(ruled, encoders, m, cache=folder, progress=progress)
+                    features[f"{m} encoder"] = rows
         result = measure_impact(
             samples,
             split,

@@ -32,6 +32,7 @@ def clustered(bench: Bench, count: int) -> tuple[Bench, str]:
     photos = real.rows is None and not real.manifest.table["vision"].null_count()
     must, fix = "must be a file where there are no features", "Pass an encoder"
     require(encoders is not None or real.embedded, "labels", must, "clusters", fix=fix)
+    photos = photos and encoders is not None and "vision" in encoders.modalities
     if encoders is not None and photos:
         from palpate.encoders.embed import embed
 
@@ -53,7 +54,7 @@ def clustered(bench: Bench, count: int) -> tuple[Bench, str]:
         require(samples.labels is not None, "labels", must, f"clusters for {samples.source}")
     train = bench.train and _bare(bench.train)
     bench = replace(bench, generators=generators, reference=real, train=train)
-    return bench, "photos" if encoders is not None and photos else "the reference's features"
+    return bench, "photos" if photos else "the reference's features"
 
 
 def _bare(samples: Samples) -> Samples:

@@ -8,7 +8,6 @@ one size, that of the smaller test part, since chance depends on it.
 
 from __future__ import annotations
 
-import tempfile
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -33,6 +32,7 @@ from palpate.core import (
 from palpate.core.features import is_missing
 from palpate.core.files import canonical_json
 from palpate.data.recordings import described, resampled_by, rule_notes
+from palpate.encoders.guard import backed
 from palpate.evaluation.power import power
 from palpate.metrics.intervals import without_interval
 from palpate.metrics.means import Mean, over_seeds
@@ -259,24 +259,18 @@ def measure(
     Raises:
         PalpateError: if nothing can be measured.
     """
-    measured = partial(
-        _measured,
-        split=split,
-        encoders=encoders,
-        subject=subject,
-        plan=plan,
-        cache=cache,
-        progress=progress,
-    )
-    touch = "tactile" in (plan.modality, *_others(plan)) and "tactile" in encoders.modalities
-    if not touch or not encoders.preprocess("tactile").residual:
-        return measured(manifest)
-    from palpate.data.residuals import with_gels
-
-    with tempfile.TemporaryDirectory() as folder:
-        kind, (backed,) = with_gels(manifest, [], Path(cache or folder))
-        result = measured(backed)
-    result.notes.append(Note("background-kind", {"kind": kind}))
+    touch = "tactile" in (plan.modality, *_others(plan))
+    with backed(manifest, encoders if touch else None, cache) as (samples, notes):
+        result = _measured(
+            samples,
+            split=split,
+            encoders=encoders,
+            subject=subject,
+            plan=plan,
+            cache=cache,
+            progress=progress,
+        )
+    result.notes += notes
     return result
 
 

@@ -2,8 +2,8 @@
 
 A ruler's numbers are centered and divided by the reference's mean and deviation, then
 L2-normalized; for scores without a reference (I-, CI- and D-TMMD) by those in the encoder, so that
-they are the same next to any reference. Digest of encoder, kind and standardization together name
-the features, so that scores of different ones share no column.
+they are the same next to any reference with the same backgrounds. Digest of encoder, kind and
+standardization together name the features, so that scores of different ones share no column.
 """
 
 from __future__ import annotations
@@ -15,9 +15,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 import polars as pl
 
-from palpate.core import FeatureSet, Note, digest_json, save_image
+from palpate.core import FeatureSet, Note, digest_file, digest_json, save_image
 from palpate.data.manifest import Manifest
-from palpate.data.residuals import with_gels
+from palpate.data.residuals import MEDIANS, with_gels
 from palpate.data.samples import Samples
 from palpate.evaluation.controls import rows_of_material
 from palpate.metrics.retrieval import standardized, unit_rows
@@ -61,7 +61,11 @@ def ruler_features(bench: Bench) -> list[Ruled]:
         sets.append(samples)
         rows.append(rows[train][rows_of_material(bench)])
     compared, scales = standardized(rows, rows[0])
-    digests = digest_json([encoders.digest("tactile"), kind, scales]), embedded[0].encoder
+    # Medians are the reference's own, and one gel for all is stated: others give other features.
+    own = kind in MEDIANS or bench.reference.gel is not None
+    gels = sorted({*parts[0].column("background")}) if own else []
+    free = [embedded[0].encoder, [digest_file(Path(gel)) for gel in gels]]
+    digests = digest_json([encoders.digest("tactile"), kind, scales]), digest_json(free)
     return [
         Ruled(s, s.feature_set(x, digests[0]), s.feature_set(unit_rows(y), digests[1]))
         for s, x, y in zip(sets, compared, rows, strict=True)

@@ -438,7 +438,7 @@ def second_opinion(bench: Bench) -> list[Score]:
     """TMMD by the ruler that is not trained, next to that of the bench's encoder."""
     from palpate.encoders.encoder_set import EncoderSet
 
-    other = replace(bench, encoders=EncoderSet.load(HANDCRAFTED))
+    other = replace(bench, encoders=EncoderSet.load(HANDCRAFTED), notes=[])
     compared = partial(compare_tmmd, permutations=bench.permutations)
     return _compared(bench, replace(other.tactile, name="handcrafted"), "TMMD", compared)
 
