@@ -100,7 +100,9 @@ class GelEncoder(TactileModule):
     def numbers(self, residuals: Tensor) -> Tensor:
         """Residuals (n, 3, h, w) in gray levels to (n, dim), as they are."""
         some = residuals[:, :, ::4, ::4].flatten(2)
-        x = torch.asinh((residuals - some.median(2).values[:, :, None, None]) / KNEE)
+        x = (residuals - some.median(2).values[:, :, None, None]) / KNEE
+        size = x.abs()
+        x = torch.log(size + (size * size + 1).sqrt()).copysign(x)  # asinh, in half its time
         x = self.layers(x).flatten(2)
         return torch.cat([x.mean(2), (x.var(2) + 1e-4).sqrt()], 1)
 
