@@ -2,7 +2,7 @@
 
 A step takes rows and a partner of each: another frame of its contact, or another contact of its
 object. Both are changed at random in what tells nothing of the object (angle, hue, zoom, strength,
-blur, noise, and half of them by a codec), and four losses are added:
+blur, noise), and four losses are added:
 
 - contrast (InfoNCE) of a touch with its partner against all touches of other objects;
 - smooth L1 to the 149 numbers of ``palpate/handcrafted`` of the unchanged residual: area and
@@ -16,16 +16,13 @@ The preset ``self`` learns from touches alone, by the first two.
 from __future__ import annotations
 
 import math
-import zlib
 from dataclasses import dataclass, replace
 from functools import partial
-from io import BytesIO
 
 import numpy as np
 import polars as pl
 import torch
 from numpy.typing import NDArray
-from PIL import Image
 from torch import Tensor, nn
 from torch.nn.functional import (
     affine_grid,
@@ -40,7 +37,6 @@ from torch.nn.functional import (
 
 from palpate.core import Split, digest_json, digest_lines, require, rng_for
 from palpate.core.features import is_missing
-from palpate.core.images import open_image
 from palpate.data.images import Preprocess, cached_images
 from palpate.data.manifest import Manifest
 from palpate.data.residuals import Residual, with_gels
@@ -73,40 +69,9 @@ STATISTICS = 4096
 LEAST_HELD = 3
 #: Recordings that a card lists by name, at most.
 LISTED = 1000
-#: Share of views that went through a codec; rows of their images, and qualities of JPEG.
-CODED, ROWS, QUALITIES = 0.5, (96, 160, 240), (25, 95)
 #: Range of the zoom; deviations of shift [share of the side], and of the logarithms of saturation
 #: and strength; largest deviation of the noise [gray levels].
 ZOOM, SHIFT, SATURATION, STRENGTH, NOISE = (0.7, 1.45), 0.12, 0.3, 0.35, 1.0
-
-
-@dataclass(frozen=True)
-class Coded(Residual):
-    """Residuals of images that went through JPEG, each with its gel at a quality of its own.
-
-    What codecs of sensors and of generated images leave tells nothing of a touch.
-    """
-
-    rows: tuple[int, ...] = ROWS
-    qualities: tuple[int, int] = QUALITIES
-
-    def prepare(
-        self,
-        image: Image.Image,
-        background: Image.Image | None = None,
-        previous: Image.Image | None = None,
-    ) -> NDArray[np.float16]:
-        """As of a residual; what is drawn depends on the pixels alone."""
-        rng = rng_for(0, "codec", zlib.crc32(image.tobytes()))
-        rows, quality = int(rng.choice(self.rows)), int(rng.integers(*self.qualities))
-
-        def coded(image: Image.Image) -> Image.Image:
-            columns = round(rows * image.width / image.height)
-            image.resize((columns, rows)).save(file := BytesIO(), "JPEG", quality=quality)
-            with open_image(file) as result:
-                return result.convert("RGB")
-
-        return super().prepare(coded(image), background and coded(background))
 
 
 class Touches:
@@ -129,8 +94,6 @@ class Touches:
         """
         part = replace(train, table=pl.concat([train.table, held.table]))
         self.rows = Rows(part, clip, Residual(side, side), run.cache, run.progress)
-        coded = Coded(side, side)
-        self.coded = cached_images(part, "tactile", coded, run.cache, run.progress)
         self.unit = factorize(units_of(train, "train") + units_of(held, "val")).numpy()
         must = "The train part must hold two touches of one object, contact or video"
         fix = "Fill the column video, object or contact"
@@ -154,7 +117,7 @@ class Touches:
         self.classes = len(known)
 
     def partners(self, rows: NDArray[np.int64], u: NDArray[np.float64]) -> NDArray[np.int64]:
-        """A partner of each row, by uniform numbers (n, 2 or more); the row itself without one."""
+        """A partner of each row, by two uniform numbers (n, 2); the row itself if it has none."""
         at = self._place[rows]
         (top, end), (low, high) = (
             (block[k := np.searchsorted(block, at, "right") - 1], block[k + 1])
@@ -180,14 +143,12 @@ class Touches:
             ``text``, ``caption``.
         """
         rows = first + step.all_rows
-        u = torch.rand(len(rows), 4, generator=step.generator).double().numpy()
+        u = torch.rand(len(rows), 2, generator=step.generator).double().numpy()
         partners = self.partners(rows, u)
-        at = np.concatenate([rows[step.mine], partners[step.mine]])
-        coded = (u[step.mine, 2:] < CODED).T.reshape(-1, 1, 1, 1)
-        images = np.where(coded, self.coded[at], self.rows.images[at])
+        images = self.rows.images[np.concatenate([rows[step.mine], partners[step.mine]])]
         every = torch.from_numpy(np.concatenate([rows, partners]))
         batch = {
-            "images": torch.from_numpy(images),
+            "images": torch.from_numpy(np.array(images)),
             "uniform": step.rand(2, 7).transpose(0, 1).flatten(0, 1),
             "normal": step.randn(2, 4).transpose(0, 1).flatten(0, 1),
             "noise": step.randn(2, 3, *images.shape[1:3]).transpose(0, 1).flatten(0, 1).half(),
