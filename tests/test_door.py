@@ -43,7 +43,7 @@ SIGNATURES = {
     ),
     "validate": "source * format check progress **options",
     "Encoder.from_pretrained": "source * modality device",
-    "Encoder.encode": "self inputs * batch progress",
+    "Encoder.encode": "self inputs * backgrounds batch progress",
     "TactilePipeline.from_pretrained": "source * device",
     "TactilePipeline.__call__": (
         "self photos * text weight ids seed guidance steps gel generator callback_on_step_end"

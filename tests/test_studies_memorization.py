@@ -150,7 +150,8 @@ def test_the_command_reports_planted_copies(capsys, world):
         assert scores["nearness to train", space, "others"]["value"] == pytest.approx(0.5), space
     assert "TMMD" in {metric for metric, *_ in scores}
     pair = copied["details"]["nearest"][0]
-    assert pair["distance"] < 1e-3
+    # Not 0: the copy is read against the gel of the sample that it stands for.
+    assert pair["distance"] < 0.2
     assert (Path(world) / "train" / f"{pair['train']}.png").is_file()
 
 
