@@ -262,7 +262,14 @@ class _Graph(Nodes):
         """Encoders of a split, and what they know of it."""
         name, preset = f"encoder-{split}-{seed}", self.size.encoder
         self.add(
-            name, making.make_encoders, *DATA, split=split, seed=seed, preset=preset, clip=self.clip
+            name,
+            making.make_encoders,
+            *DATA,
+            version=2,
+            split=split,
+            seed=seed,
+            preset=preset,
+            clip=self.clip,
         )
         probe = f"probe-{split}-{seed}"
         self.add(probe, probe_encoders, *DATA, name, split=split, encoders=name, measures=True)
