@@ -63,7 +63,9 @@ class Totals:
     def at(self, k: int) -> Totals:
         """One of several totals."""
         sides = (self.n, self.sums, self.same, self.pairs, self.diagonal, self.squares)
-        return Totals(*(a[k] for a in sides), self.even and self.even.at(k))
+        n, sums, same, pairs, diagonal, squares = (a[k] for a in sides)
+        even = self.even and self.even.at(k)
+        return Totals(n, sums, same, pairs, diagonal, squares, even)
 
     def merge(self, to: Index, segments: int) -> Totals:
         """Segments joined: segment s becomes ``to[s]``; -1 drops it."""
@@ -467,8 +469,8 @@ def _studentized(second: Array, block: Array, n: Array, estimator: str) -> tuple
         x, y = of_units(a * n), of_units(b * n)
         alone = x * (weight > 0 and estimator == "unbiased")  # pairs i = j, which do not count
         every = (v.sum(axis=1, keepdims=True) for v in (y, x))
-        sides = [v * of_all - alone for v, of_all in zip((x, y), every, strict=True)]
-        mean = mean_of_pairs(sums, totals(*sides, x * y - alone))
+        right, left = (v * of_all - alone for v, of_all in zip((x, y), every, strict=True))
+        mean = mean_of_pairs(sums, totals(right, left, x * y - alone))
         value += weight * mean[:, 0]
         without += weight * mean[:, 1:]
     drift = without - without.mean(axis=1, keepdims=True)
