@@ -398,11 +398,9 @@ class EncoderSet:
             PalpateError: if the folder is of another kind, incomplete, or changed since, or the hub
                 is out of reach.
         """
-        if len(parts := parts_of(source)) == 2 and alone:
-            return cls.load(parts[0], device=device)
-        if len(parts) == 2:
-            tactile, clip = (cls.load(part, device=device) for part in parts)
-            return clip.with_tactile(tactile)
+        if len(parts := parts_of(source)) == 2:
+            tactile = cls.load(parts[0], device=device)
+            return tactile if alone else cls.load(parts[1], device=device).with_tactile(tactile)
         folder, sensor = find_encoder(source)
         if folder.is_file():
             public = load_tactile(folder)

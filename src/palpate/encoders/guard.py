@@ -39,6 +39,11 @@ def backed(
 ) -> Generator[tuple[Manifest, list[Note]]]:
     """Samples with backgrounds of one kind, where a ruler of ``encoders`` looks at their touches,
     and a note on the kind; others as they are.
+
+    Args:
+        manifest: the samples.
+        encoders: what embeds them; None where no touch is embedded.
+        cache: folder for medians; None: one that is gone after the statements inside.
     """
     seeing = encoders is not None and "tactile" in encoders.modalities
     ruled = encoders is not None and seeing and encoders.preprocess("tactile").residual

@@ -259,31 +259,6 @@ def measure(
     Raises:
         PalpateError: if nothing can be measured.
     """
-    touch = "tactile" in (plan.modality, *_others(plan))
-    with backed(manifest, encoders if touch else None, cache) as (samples, notes):
-        result = _measured(
-            samples,
-            split=split,
-            encoders=encoders,
-            subject=subject,
-            plan=plan,
-            cache=cache,
-            progress=progress,
-        )
-    result.notes += notes
-    return result
-
-
-def _measured(
-    manifest: Manifest,
-    *,
-    split: Split,
-    encoders: Any,
-    subject: str,
-    plan: Plan,
-    cache: str | Path | None,
-    progress: Progress,
-) -> Probed:
     from palpate.encoders.embed import embed
     from palpate.encoders.guard import guard
 
@@ -291,11 +266,19 @@ def _measured(
     groups = "id" if plan.group == "frame" else plan.group
     embedded = partial(embed, groups=groups, cache=folder, raw=True, progress=progress)
     seen = partial(guard, split=split, allow_seen=plan.allow_seen, progress=progress)
-    parts = [manifest.part(split, part) for part in ("train", "test")]
-    count = sum(map(len, parts))
-    parts = [part.take(_with(part, plan.modality)) for part in parts]
-    notes = seen(encoders, plan.modality, parts[1])
-    features = [embedded(part, encoders, plan.modality) for part in parts]
+    partners, others = dict[str, FeatureSet](), _others(plan) if plan.top else ()
+    looking = encoders if "tactile" in (plan.modality, *others) else None
+    with backed(manifest, looking, cache) as (samples, kind):
+        parts = [samples.part(split, part) for part in ("train", "test")]
+        count = sum(map(len, parts))
+        parts = [part.take(_with(part, plan.modality)) for part in parts]
+        notes = seen(encoders, plan.modality, parts[1])
+        features = [embedded(part, encoders, plan.modality) for part in parts]
+        for other in others:
+            ids = _with(parts[1], other) if other in encoders.modalities else []
+            if len(ids) >= 2:
+                notes += seen(encoders, other, parts[1].take(ids))
+                partners[other] = embedded(parts[1].take(ids), encoders, other)
     if plan.trained:  # the encoder belongs to the split, which is the axis
         features = [replace(f, encoder=None) for f in features]
     result = Probed()
@@ -319,45 +302,19 @@ def _measured(
             split=split.digest,
             settings=plan.settings,
         )
-    for other in _others(plan) if plan.top else ():
-        ids = _with(parts[1], other) if other in encoders.modalities else []
-        if len(ids) < 2:
+    for other in others:
+        if other not in partners:
             code = "no-partner" if other in encoders.modalities else "no-encoder"
             result.notes.append(Note(f"probe-{code}", {"modality": other}))
             continue
-        if missing := len(parts[1]) - len(ids):
+        test = parts[1].take(partners[other].ids)
+        if missing := len(parts[1]) - len(test):
             result.notes.append(Note("probe-some-partners", {"modality": other, "count": missing}))
-        test = parts[1].take(ids)
-        notes += seen(encoders, other, test)
-        sides = {plan.modality: features[1].take(ids), other: embedded(test, encoders, other)}
+        sides = {plan.modality: features[1].take(test.ids), other: partners[other]}
         touch = sides.get("tactile")
         if touch is not None:
             sides["tactile"] = replace(touch, features=encoders.shared(touch.features))
-        queries, keys = sides[plan.modality], sides[other]
-        ranked = partial(
-            retrieval,
-            queries,
-            keys,
-            top=plan.top,
-            pool=min(plan.pool or len(test), plan.pools[other]),
-            seed=plan.seed,
-            subject=subject,
-            split=split.digest,
-            settings=plan.settings,
-        )
-        ways = list(ranked(names=(plan.modality, other)))
-        if other == "text":
-            names, threshold = (plan.modality, "similar text"), plan.text_threshold
-            ways += ranked(names=names, texts=keys.features, threshold=threshold)
-        result.means += [mean for way in ways for mean in way.top]
-        result.medians += [way.median for way in ways]
-        for x, y, names in (
-            (queries, keys, (plan.modality, other)),
-            (keys, queries, (other, plan.modality)),
-        ):
-            strips = _strips(test, unit_rows(x.features), unit_rows(y.features), names, plan.seed)
-            subject_shown = subject if plan.axis else ""
-            result.strips += [replace(strip, subject=subject_shown) for strip in strips]
+        _retrieve(result, test, sides, plan=plan, subject=subject, split=split.digest)
     if not result.means:
         must = "There must be a label of two classes, or another modality to retrieve"
         fix = "Name a column with labels, or add texts or photos"
@@ -365,7 +322,45 @@ def _measured(
     noted = lambda score: replace(score, notes=[*score.notes, *notes])
     result.means = [replace(mean, score=noted(mean.score)) for mean in result.means]
     result.medians = [noted(score) for score in result.medians]
+    result.notes += kind
     return result
+
+
+def _retrieve(
+    result: Probed,
+    test: Manifest,
+    sides: Mapping[str, FeatureSet],
+    *,
+    plan: Plan,
+    subject: str,
+    split: str,
+) -> None:
+    """Add what two modalities of the same samples find of each other, the probed one first."""
+    (_, queries), (other, keys) = sides.items()
+    ranked = partial(
+        retrieval,
+        queries,
+        keys,
+        top=plan.top,
+        pool=min(plan.pool or len(test), plan.pools[other]),
+        seed=plan.seed,
+        subject=subject,
+        split=split,
+        settings=plan.settings,
+    )
+    ways = list(ranked(names=(plan.modality, other)))
+    if other == "text":
+        names, threshold = (plan.modality, "similar text"), plan.text_threshold
+        ways += ranked(names=names, texts=keys.features, threshold=threshold)
+    result.means += [mean for way in ways for mean in way.top]
+    result.medians += [way.median for way in ways]
+    for x, y, names in (
+        (queries, keys, (plan.modality, other)),
+        (keys, queries, (other, plan.modality)),
+    ):
+        strips = _strips(test, unit_rows(x.features), unit_rows(y.features), names, plan.seed)
+        subject_shown = subject if plan.axis else ""
+        result.strips += [replace(strip, subject=subject_shown) for strip in strips]
 
 
 def _no_classes(label: str, train: Sequence[str], test: Sequence[str]) -> Note | None:

@@ -28,7 +28,7 @@ import math
 import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from itertools import repeat
+from itertools import pairwise, repeat
 from typing import Any, ClassVar, Literal
 
 import numpy as np
@@ -120,11 +120,11 @@ class Gaussian(Kernel):
         ratios = [(self.sigmas[0] / sigma) ** 2 for sigma in self.sigmas]
         if len(ratios) == 1:
             return _expm1(t, xp)
-        if not self.name.endswith("multi"):
+        if not all(math.isclose(a, 4 * b, rel_tol=1e-12) for a, b in pairwise(ratios)):
             return sum(_expm1(t * ratio, xp) for ratio in ratios) / len(ratios)
         k = total = _expm1(t * ratios[-1], xp)  # the widest
-        for _ in ratios[1:]:
-            k = k * (k + 2)  # (1 + k)^2 - 1; each bandwidth is half of the one before
+        for _ in ratios[1:]:  # each bandwidth is half of the one before
+            k = k * (k + 2)  # (1 + k)^2 - 1
             k *= k + 2
             total = total + k
         return total / len(ratios)
