@@ -2,6 +2,7 @@
 
 import itertools
 import json
+import os
 import pickle
 import shutil
 
@@ -20,6 +21,7 @@ from palpate.core import (
     Split,
     atomic_folder,
     atomic_path,
+    digest_folder,
     digest_json,
     inside,
     plain,
@@ -66,6 +68,16 @@ def test_seeds_depend_on_names_alone_and_are_the_same_in_every_version():
     # A change here would change every generated image.
     assert seed_for(0, "noise", "a/1") == 7037779842902421232
     assert rng_for(1, "x").random() == rng_for(1, "x").random()
+
+
+def test_a_folder_of_names_in_another_encoding_has_a_digest(tmp_path):
+    digests = set()
+    for name in (b"caf\xe9", b"caf\xe8"):
+        folder = tmp_path / name.hex()
+        folder.mkdir()
+        (folder / os.fsdecode(name)).write_bytes(b"1")
+        digests |= {digest_folder(folder), digest_json([os.fsdecode(name)])}
+    assert len(digests) == 4
 
 
 def test_digests_are_canonical():

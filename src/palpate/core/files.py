@@ -116,14 +116,14 @@ def canonical_json(value: Any) -> str:
 
 def digest_json(value: Any) -> str:
     """Return the SHA-256 (64 hex digits) of the canonical JSON of ``value``."""
-    return hashlib.sha256(canonical_json(value).encode()).hexdigest()
+    return hashlib.sha256(canonical_json(value).encode(errors="surrogatepass")).hexdigest()
 
 
 def digest_lines(lines: Iterable[str]) -> str:
     """Return the SHA-256 of the lines, each ended by a newline, in the order given."""
     state, rest = hashlib.sha256(), iter(lines)
     while block := list(islice(rest, 1 << 14)):  # line by line takes thrice as long
-        state.update("\n".join([*block, ""]).encode())
+        state.update("\n".join([*block, ""]).encode(errors="surrogatepass"))
     return state.hexdigest()
 
 
