@@ -366,7 +366,7 @@ def test_no_rows_no_parameters_no_steps_bad_options(tmp_path):
         {"ema": 1.0},
         {"clip_norm": 0.0},
         {"warmup": -1},
-        {"keep": "best", "evaluations": 0},
+        {"keep": "first"},
         {"patience": 1, "evaluations": 0},
     ):
         fails(f"`{next(iter(change))}` must", options, **change)
@@ -444,7 +444,7 @@ def held_out(**change):
 
 
 def test_held_out_loss_is_logged_and_its_best_weights_are_kept(tmp_path):
-    last, steps, counted, how = held_out()
+    last, steps, counted, how = held_out(keep="last")
     log = fit(last, counted, N, how, tmp_path / "last", held_out=(9, load))
     losses = {line["step"]: line["held_out"] for line in log if "held_out" in line}
     assert len(losses) == 7
@@ -534,6 +534,9 @@ def test_the_loss_that_is_shown_is_smoothed_and_seconds_are_those_of_a_step(tmp_
     assert [line["seconds"] for line in log] == [3.0] * len(log)
     assert {*remarks} >= {"loss 2.0000"}
     assert all(remark in ("", "loss 2.0000") for remark in remarks)
+    how = options(evaluations=2)
+    fit(Net(), constant, N, how, tmp_path / "held", progress=report, held_out=(9, load))
+    assert remarks[-1] == "loss 2.0000, held out 2.0000"
 
 
 def test_a_full_disk_ends_in_one_line_and_keeps_the_last_checkpoint(tmp_path, whole):

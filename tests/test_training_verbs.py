@@ -10,7 +10,7 @@ from PIL import Image
 
 from forge.errors import fails
 from palpate.cli import main
-from palpate.core import PalpateError, Split
+from palpate.core import PalpateError, Split, digest_folder
 from palpate.data.manifest import Manifest
 from palpate.diffusion import TactilePipeline, train_generator
 from palpate.diffusion.presets import MINI, TINY
@@ -71,14 +71,25 @@ def test_encoders_and_a_generator_from_the_command_line(tag, tmp_path, capsys):
     both = page[page.index("## Data") : page.index("## Digests")]
     assert "## Data of the models that it went on from" in both
     assert both.count(str(len(tag[1].ids("train")))) >= 2
+    seen = tag[0].part(tag[1], "train")
+    videos = len({*seen.column("video")})
+    assert f"Trained on {len(seen)} samples of {videos} videos, after another model." in page
     assert tuned.autoencoder.digest == pipeline.autoencoder.digest
     assert tuned.encoders.digest("text") == encoders.digest("text")
     assert tuned.training["start"] == pipeline.digest != tuned.digest
     assert tuned.training["start_record"]["loop"]["steps"] == 2
     capsys.readouterr()
-    # The same again does not overwrite.
-    assert main(["train", "encoder", *common, "-o", "encoders"]) == 2
-    assert "a training that is finished" in capsys.readouterr().err
+    # The same again has nothing left to do, and overwrites nothing.
+    before = digest_folder(tmp_path)
+    for verb, words in (("encoder", []), ("generator", options[:-2])):
+        out = {"encoder": "encoders", "generator": "model"}[verb]
+        assert main(["train", verb, *common[:-1], *words, "-o", out]) == 0
+        assert f"Finished before: {out} is" in capsys.readouterr().err
+    assert digest_folder(tmp_path) == before
+    for other in (["--seed", "1"], ["--set", "loop.lr=2e-3"], ["--clip", "palpate/mini"]):
+        words = ["train", "generator", *common, *options, *other]
+        assert main(words) == 2
+        assert "the result of another training" in capsys.readouterr().err
 
 
 def test_a_loss_that_is_no_number_ends_a_generator_in_one_line(tag, tmp_path, capsys):
@@ -177,7 +188,7 @@ def test_the_split_that_lies_with_the_data_is_the_default(tag, tmp_path, capsys)
     assert card["split"] == split.digest
     # What the split shares is said, and stays with the model.
     words = " ".join(capsys.readouterr().err.split())
-    assert "a training that is finished: it cannot go on. Train longer" in words
+    assert "the result of another training: it cannot go on. Train from the start" in words
     assert "Videos: from the column video; contacts: from the column contact" in words
     assert "The split 'Orig' is not NoLeak: 6 of 6 videos of its test part are in train" in words
     assert card["split_rule"]["shared"] == {"video": [6, 6]}

@@ -28,7 +28,9 @@ def run(options: Options, terminal: Terminal) -> dict[str, Any]:
     preset = options.chosen("train autoencoder")
     from palpate.diffusion.autoencoder_training import train_autoencoder
 
-    model = terminal.run(train_autoencoder, **options.keywords("settings", preset=preset))
+    model = options.trained(
+        terminal, train_autoencoder, **options.keywords("settings", preset=preset)
+    )
     options.note_split(terminal, model.card["split_rule"])
     facts: dict[str, Any] = {"folder": str(options.output), "digest": model.digest}
     facts |= {name: model.card[name] for name in ("images", "split")}

@@ -48,8 +48,8 @@ def run(options: Options, terminal: Terminal) -> dict[str, Any]:
             device=options.machine.device,
         )
         return options.print_plan(terminal, plan)
-    encoders = terminal.run(
-        train_encoder, **options.keywords("settings", "dry_run", "alone", preset=preset)
+    encoders = options.trained(
+        terminal, train_encoder, **options.keywords("settings", "dry_run", "alone", preset=preset)
     )
     card = encoders.card
     options.note_split(terminal, card["split_rule"])

@@ -65,8 +65,10 @@ def run(options: Options, terminal: Terminal) -> dict[str, Any]:
             device=options.machine.device,
         )
         return options.print_plan(terminal, plan)
-    pipeline = terminal.run(
-        train_generator, **options.keywords("settings", "epochs", "dry_run", preset=preset)
+    pipeline = options.trained(
+        terminal,
+        train_generator,
+        **options.keywords("settings", "epochs", "dry_run", preset=preset),
     )
     record, loop = pipeline.training, pipeline.training["loop"]
     options.note_split(terminal, record["split_rule"])

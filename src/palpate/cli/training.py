@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import field, fields
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, TypeVar
 
 from palpate.cli.settings import PresetTable, Settings
 from palpate.cli.terminal import Common, OutPath, PathArgument, Switch, Terminal, option_group
@@ -14,6 +14,7 @@ from palpate.diffusion.presets import DiffusionPreset
 from palpate.encoders.presets import PRESETS as ENCODERS
 from palpate.training.options import Compute
 
+T = TypeVar("T")
 _TEXTS = {"name": "", "cost": "", "score": ""}
 #: The presets of each verb, and what ``--set`` leaves to other options.
 PRESETS = {
@@ -112,6 +113,14 @@ class Training(Common):
         """
         preset, _ = PRESETS[verb].preset(self.preset, self.settings), self.machine.compute
         return preset
+
+    def trained(self, terminal: Terminal, train: Callable[..., T], **keywords: Any) -> T:
+        """Train, or load what this command trained before and say so."""
+        before = (self.output / "palpate.json").is_file()
+        model = terminal.run(train, **keywords)
+        if before:
+            terminal.print_line(f"Finished before: {self.output} is what this command trains.")
+        return model
 
     def print_plan(self, terminal: Terminal, plan: dict[str, Any]) -> dict[str, Any]:
         """Print what a training would take, and return it."""

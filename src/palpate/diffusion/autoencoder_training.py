@@ -50,7 +50,7 @@ from palpate.encoders.rows import load_samples, train_part
 from palpate.training.engine import Batch, Losses, Task, fit
 from palpate.training.options import Compute, LoopOptions
 from palpate.training.processes import first_alone, gather_rows
-from palpate.training.run import TrainingRun, run_for
+from palpate.training.run import TrainingRun, finished, request_of, run_for
 from palpate.training.steps import Step, seeded
 
 Images = NDArray[np.uint8]
@@ -108,9 +108,12 @@ def train_autoencoder(
     must = "must be one with an autoencoder of its own"
     require(options is not None, "preset", must, preset.name, fix=fix)
     assert options is not None
-    with run_for(output, seed, device, compute, progress) as run:
+    manifest, split = load_samples(data, split)
+    request = request_of(seed, manifest, split, preset, start, judge)
+    if finished(output, request):
+        return load_autoencoder(str(output))
+    with run_for(output, request, seed, device=device, compute=compute, progress=progress) as run:
         judge = judge_of(judge, run.device)
-        manifest, split = load_samples(data, split)
         if start is not None and not isinstance(start, AnyAutoencoder):
             start = load_autoencoder(start)
         model = autoencoder_of(

@@ -42,7 +42,7 @@ from palpate.encoders.models import is_hub_id, pick_device
 from palpate.encoders.rows import load_samples, train_part
 from palpate.training.options import Compute
 from palpate.training.processes import connect, first_alone, place
-from palpate.training.run import TrainingRun, estimate, run_for
+from palpate.training.run import TrainingRun, estimate, finished, request_of, run_for
 
 DRAWN = 8  # samples outside of train that are drawn while the denoiser trains
 
@@ -86,7 +86,8 @@ def train_generator(  # noqa: PLR0913 - a public verb
     compute: Compute | None = None,
     progress: Progress = quiet,
 ) -> TactilePipeline:
-    """Train a generator on the train part of a split; run again with one ``output`` to resume.
+    """Train a generator on the train part of a split; run again with one ``output`` to resume
+    or, once it is finished, to load.
 
     Args:
         data: a manifest, or anything that :func:`palpate.data.load` reads.
@@ -127,9 +128,13 @@ def train_generator(  # noqa: PLR0913 - a public verb
     options, must = chosen.autoencoder, f"must be given for the preset {chosen.name}"
     fits = autoencoder is not None or options is not None
     require(fits, "autoencoder", must, "none", fix="Pass a folder or a file")
-    with run_for(output, seed, device, compute, progress) as run:
+    manifest, split = load_samples(data, split)
+    models = (clip, autoencoder, start, judge)
+    request = request_of(seed, manifest, split, chosen, background, *models)
+    if finished(output, request):
+        return TactilePipeline.from_pretrained(str(output))
+    with run_for(output, request, seed, device=device, compute=compute, progress=progress) as run:
         judge = judge_of(judge, run.device)
-        manifest, split = load_samples(data, split)
         encoders = load_clip(clip) if isinstance(clip, str | Path) else clip
         needed = _policy(chosen, encoders).modalities
         missing = [m for m in needed if encoders is None or m not in encoders.modalities]
@@ -316,6 +321,8 @@ def train_pipeline(
         "split": split.digest,
         "split_rule": dict(split.rule),
         "train_samples": len(train),
+        "videos": train.table["video"].drop_nulls().n_unique(),
+        "sensors": train.table["sensor"].drop_nulls().unique().sort().to_list(),
         "text_source": text_source,
         "autoencoder": autoencoder.digest,
         "ceiling": measure_ceiling(

@@ -66,7 +66,7 @@ from palpate.metrics.probe import material_accuracy
 from palpate.training.engine import Batch, Losses, Task
 from palpate.training.options import Compute
 from palpate.training.processes import agreed, connect, first_alone, gather_rows
-from palpate.training.run import TrainingRun, estimate, run_for
+from palpate.training.run import TrainingRun, estimate, finished, request_of, run_for
 from palpate.training.steps import Step, seeded
 
 
@@ -116,7 +116,10 @@ def train_encoder(
     """
     chosen = preset_of(preset, epochs)
     manifest, split = load_samples(data, split)
-    with run_for(output, seed, device, compute, progress) as run:
+    request = request_of(seed, manifest, split, chosen, clip)
+    if finished(output, request):
+        return EncoderSet.load(str(output))
+    with run_for(output, request, seed, device=device, compute=compute, progress=progress) as run:
         source = clip or chosen.pretrained
         if source is None:
             source = train_clip(manifest, split, chosen, run.stage("clip"))
@@ -433,7 +436,6 @@ def _clip_course(preset: EncoderPreset) -> Course:
     require(course is not None, "preset", "must describe a fresh CLIP", got, fix=fix)
     assert course is not None
     with agreed():
-        must = "The course of vision and text must keep its last weights and run to its end"
-        got = f"keep {course.keep}, patience {course.patience}"
-        require(course.keep != "best" and not course.patience, None, must, got)
+        must = "The course of vision and text has no held-out part and must run to its end"
+        require(not course.patience, None, must, f"patience {course.patience}")
     return course

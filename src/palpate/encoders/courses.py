@@ -37,11 +37,10 @@ def require_rows(
 
 
 def require_held_out(held: Manifest, options: LoopOptions) -> None:
-    """Raise unless there is a held-out part where the course needs one, of two samples."""
-    argument = f"tactile_course.{'keep' if options.keep == 'best' else 'patience'}"
-    needless = len(held) > 0 or not (options.keep == "best" or options.patience)
+    """Raise unless there is a held-out part where patience needs one, of two samples."""
     must, fix = "needs a part val of the split", "Make one: palpate split --val 0.1"
-    require(needless, argument, must, "none", fix=fix)
+    fits = len(held) > 0 or not options.patience
+    require(fits, "tactile_course.patience", must, "none", fix=fix)
     must = "The held-out part must hold two samples: the loss compares them with each other"
     got, fix = f"one, {''.join(held.ids[:1])}", "Make another split: palpate split"
     require(len(held) != 1 or not options.evaluations, None, must, got, fix=fix)

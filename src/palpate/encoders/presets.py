@@ -103,7 +103,8 @@ class Course:
         augment: see there.
         evaluations: how often the held-out part is evaluated, evenly spread over the steps.
         patience: stop after as many evaluations without a better held-out loss; None: never.
-        keep: which weights become the result: the last, or those of the best held-out loss.
+        keep: which weights become the result: those of the best held-out loss, where there is a
+            held-out part, or the last.
         steps: without epochs, whatever the size of the train part [optimizer steps].
     """
 
@@ -117,7 +118,7 @@ class Course:
     augment: Augment = field(default_factory=Augment)
     evaluations: int = 10
     patience: int | None = None
-    keep: Literal["last", "best"] = "last"
+    keep: Literal["last", "best"] = "best"
     steps: int = 0
 
     def __post_init__(self) -> None:
@@ -314,7 +315,7 @@ SELF = replace(
     GEL,
     name="self",
     alone=True,
-    tactile_course=replace(_GEL, steps=700, keep="best", evaluations=7),
+    tactile_course=replace(_GEL, steps=700, evaluations=7),
     cost="700 steps: about 5 CPU-min on one x86-64 core (AVX2)",
     score="on real videos not measured here",
 )

@@ -21,7 +21,7 @@ Every other key is part of the training record, which is printed as JSON.
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -110,21 +110,24 @@ def model_card(about: Mapping[str, Any]) -> str:
         k: _cut(v) for k, v in card.items() if k not in PLACED and v not in (None, {}, [], "")
     }
     before = list(_earlier(card))
-    limits = [text for model in (card, *before) for text in model.get("limits", ())]
+    limits = [text for model in before for text in model.get("limits", ())]
+    limits = [text for text in dict.fromkeys(limits) if text not in card.get("limits", ())]
     sections = {
         "Scores": _table(card.get("scores")),
         "Ceiling: what survives the autoencoder": _table(card.get("ceiling")),
         "Data": _table(_data(card)),
         "Data of the models that it went on from": "\n\n".join(_table(_data(b)) for b in before),
-        "Limits": "\n".join(f"- {text}" for text in dict.fromkeys(limits)),
+        "Limits": _listed(card.get("limits", ())),
+        "Limits of the models that it went on from": _listed(limits),
         "Made by": _code("sh", str(card.get("recipe", ""))),
-        "Digests": "\n".join(f"- {part}: `{digest}`" for part, digest in digests.items()),
+        "Digests": _listed(f"{part}: `{digest}`" for part, digest in digests.items()),
         "Record": record
         and "The whole record is in `palpate.json`.\n\n"
         + _code("json", json.dumps(record, indent=1, ensure_ascii=False)),
     }
     parts = [f"---\n{head.to_yaml()}\n---", f"# {card.get('title', form.title)}"]
-    parts += [str(card["summary"])] if card.get("summary") else []
+    summary = card.get("summary") or _summary(card, before[0] if before else None)
+    parts += [summary] if summary else []
     parts += [_code("python", form.usage.format(name=name))]
     parts += [f"## {title}\n\n{text}" for title, text in sections.items() if text]
     return "\n\n".join(parts) + "\n"
@@ -183,6 +186,21 @@ def _data(card: Mapping[str, Any]) -> Sequence[Mapping[str, Any]] | Mapping[str,
     names = {"split_rule": "split", "train_samples": "training samples", "materials": "materials"}
     row = {label: card[name] for name, label in names.items() if card.get(name)}
     return {k: json.dumps(v) if isinstance(v, Mapping) else v for k, v in row.items()}
+
+
+def _summary(card: Mapping[str, Any], start: Mapping[str, Any] | None) -> str:
+    """What a model that palpate trained was trained on last, and before that."""
+    if not card.get("train_samples"):
+        return ""
+    origin = "synthetic samples" if card.get("synthetic") else "samples"
+    before = "" if start is None else f", after {start.get('title', 'another model')}"
+    videos = f" of {card['videos']:,} videos" if card.get("videos") else ""
+    sensors = f", of the sensors {', '.join(card['sensors'])}" if card.get("sensors") else ""
+    return f"Trained on {card['train_samples']:,} {origin}{videos}{sensors}{before}."
+
+
+def _listed(texts: Iterable[str]) -> str:
+    return "\n".join(f"- {text}" for text in texts)
 
 
 def _code(language: str, text: str) -> str:

@@ -123,7 +123,7 @@ def fit(
             checkpoint of other rows, options, shapes or ``key`` is ignored and then replaced.
             Several processes must share it.
         compute: see :class:`Compute`.
-        progress: called after each step with the smoothed loss as remark.
+        progress: called after each step with the smoothed loss and the last held-out one.
 
     Returns:
         The log: dictionaries with ``step``, ``loss``, ``lr``, ``seconds`` (of a step) and what the
@@ -246,7 +246,10 @@ class _Run:
             if step + 1 in evaluations:
                 self.evaluate(step + 1)
             self.busy = False
-            progress(self.task.name, step + 1, options.steps, f"loss {smooth:.4f}")
+            held = [f", held out {at['held_out']:.4f}" for at in self.log if "held_out" in at][-1:]
+            progress(
+                self.task.name, step + 1, options.steps, "".join([f"loss {smooth:.4f}", *held])
+            )
             if self.stopped:
                 break
             if time.monotonic() - saved > 60 * self.compute.checkpoint_minutes:

@@ -36,7 +36,8 @@ class LoopOptions:
         betas: decay rates of AdamW's two moments.
         evaluations: how often the held-out part is evaluated, evenly spread over the steps.
         patience: stop after as many evaluations without a better held-out loss; None: never.
-        keep: which weights become the result: the last, or those of the best held-out loss.
+        keep: which weights become the result: those of the best held-out loss, where there is a
+            held-out part and it is evaluated, or the last.
 
     Raises:
         PalpateError: if a number lies outside its range or a word is unknown.
@@ -54,7 +55,7 @@ class LoopOptions:
     betas: tuple[float, float] = (0.9, 0.999)
     evaluations: int = 10
     patience: int | None = None
-    keep: Literal["last", "best"] = "last"
+    keep: Literal["last", "best"] = "best"
 
     def __post_init__(self) -> None:
         valid = {
@@ -72,10 +73,7 @@ class LoopOptions:
                 self.patience is None or (self.patience >= 1 and self.evaluations > 0),
                 "must be at least 1, with evaluations",
             ),
-            "keep": (
-                self.keep == "last" or (self.keep == "best" and self.evaluations > 0),
-                "must be last or, with evaluations, best",
-            ),
+            "keep": (self.keep in ("last", "best"), "must be last or best"),
         }
         for name, (holds, must) in valid.items():
             require(holds, name, must, repr(getattr(self, name)), fix="Choose another value")

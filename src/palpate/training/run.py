@@ -14,7 +14,19 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from palpate.core import PalpateError, Progress, locked, quiet, require, require_new_folder
+from palpate.core import (
+    PalpateError,
+    Progress,
+    content_of,
+    digest_file,
+    digest_folder,
+    digest_json,
+    locked,
+    quiet,
+    require,
+    require_new_folder,
+    write_text,
+)
 from palpate.training.options import Compute, LoopOptions
 from palpate.training.processes import barrier, connect, merged, place
 
@@ -22,6 +34,8 @@ from palpate.training.processes import barrier, connect, merged, place
 Forward = Callable[[nn.Module, int, torch.device], Tensor]
 #: A model of more parameters is timed by one row; a smaller one by a batch.
 SMALL = 10_000_000
+#: Of a result: the digest of what was requested.
+REQUEST = "request.sha256"
 
 
 @dataclass(frozen=True)
@@ -35,6 +49,7 @@ class TrainingRun:
         device: ``auto``, ``cpu``, ``cuda`` or ``mps``, or a device of torch.
         compute: how to run it on the machine at hand.
         progress: called while the work goes on.
+        request: see :func:`request_of`; stays with the result.
     """
 
     folder: Path
@@ -43,6 +58,7 @@ class TrainingRun:
     device: str | torch.device = "cpu"
     compute: Compute = field(default_factory=Compute)
     progress: Progress = quiet
+    request: str = ""
 
     def stage(self, name: str) -> TrainingRun:
         """The same with a folder of its own."""
@@ -53,11 +69,52 @@ class TrainingRun:
         if output is not None and place()[0] == 0:
             model.save(Path(output))
             keep_logs(self.folder, Path(output))
+            write_text(Path(output) / REQUEST, self.request)
+
+
+def request_of(seed: int, *parts: Any) -> str:
+    """The digest of all that decides a training.
+
+    Args:
+        seed: of the training.
+        parts: models, data and splits with a digest, paths of models, which count by content,
+            presets and other values.
+    """
+
+    def content(part: Any) -> Any:
+        if isinstance(part, str | Path) and Path(part).exists():
+            return (digest_folder if Path(part).is_dir() else digest_file)(Path(part))
+        if hasattr(part, "modalities"):  # a set of encoders
+            return [part.digest(modality) for modality in sorted(part.modalities)]
+        return getattr(part, "digest", repr(part))
+
+    return digest_json([seed, *map(content, parts)])
+
+
+def finished(output: Path | str | None, request: str) -> bool:
+    """Whether ``output`` is the result of this very training, of which nothing is left to do.
+
+    Raises:
+        PalpateError: if it is that of another.
+    """
+    if output is None or not (Path(output) / "palpate.json").is_file():
+        return False
+    file = Path(output) / REQUEST
+    same = file.is_file() and content_of(file) == request.encode()
+    must, fix = f"{output} must be absent or empty", "Train from the start, in another folder"
+    require(same, None, must, "the result of another training: it cannot go on", fix=fix)
+    return True
 
 
 @contextmanager
 def run_for(
-    output: Path | str | None, seed: int, device: str, compute: Compute | None, progress: Progress
+    output: Path | str | None,
+    request: str,
+    seed: int,
+    *,
+    device: str,
+    compute: Compute | None,
+    progress: Progress,
 ) -> Generator[TrainingRun]:
     """The run of a training whose result goes to ``output``, together with other processes.
 
@@ -66,7 +123,8 @@ def run_for(
     """
     device = connect(device)
     with work_folder(None if output is None else Path(output)) as work:
-        yield TrainingRun(work, seed, work / "cache", device, compute or Compute(), progress)
+        compute = compute or Compute()
+        yield TrainingRun(work, seed, work / "cache", device, compute, progress, request)
 
 
 @contextmanager
@@ -87,12 +145,6 @@ def work_folder(output: Path | None) -> Generator[Path]:
             yield Path(merged({str(rank): name})["0"])
             barrier()  # the first one is removed when nobody needs it
         return
-    must, fix = (
-        f"{output} must be absent or empty",
-        "Train longer from the start, in another folder",
-    )
-    finished = (output / "palpate.json").is_file()
-    require(not finished, None, must, "a training that is finished: it cannot go on", fix=fix)
     require_new_folder(output)
     work = output.absolute().parent / f".{output.name}.work"
     barrier()  # all have looked at the output before it is written
