@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
+import shlex
 import traceback
 from collections.abc import Callable
 from pathlib import Path
@@ -13,6 +15,7 @@ import pytest
 from hypothesis import settings
 
 from forge.worlds import by_video, six_videos
+from palpate.cli import main, terminal
 from palpate.data.manifest import Manifest
 
 # A busy machine is no failure: how long an example takes is not tested.
@@ -48,6 +51,38 @@ def real_data() -> Path:
     if place is None:
         pytest.skip("no shared real data: set PALPATE_SHARED_DATA")
     return place
+
+
+@pytest.fixture(autouse=True)
+def next_commands(tmp_path_factory, monkeypatch):
+    """Run, after a test, each command that palpate suggested in it: all of these must work."""
+    suggested, write = [], terminal.Terminal.print_line
+    complain = terminal._print_error
+
+    def print_line(self, line):
+        write(self, line)
+        keep(line, "Next: palpate ")
+
+    def print_error(line):
+        complain(line)
+        keep(line, "  palpate ")
+
+    def keep(line, start):
+        if line.startswith(start):
+            words = shlex.split(line.removeprefix(start))
+            choice = ["--overwrite"] * (words[0] == "import")  # several into one folder
+            suggested.append((Path.cwd(), [*words, *choice]))
+
+    monkeypatch.setattr(terminal.Terminal, "print_line", print_line)
+    monkeypatch.setattr(terminal, "_print_error", print_error)
+    yield suggested
+    run, suggested[:] = suggested[:], []
+    own = tmp_path_factory.mktemp("next") if run else TOP
+    for folder, words in run:
+        # Where a test did not choose a folder, what its commands write is no part of ours.
+        with contextlib.chdir(own if folder == TOP else folder):
+            status = main(words)
+        assert status in (0, 1, 3), words
 
 
 @pytest.fixture

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import shlex
-from collections.abc import Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -32,6 +32,8 @@ TABLE_FORMAT = "palpate-audit-table/1"
 UNPASSED = ("paths", "output", "page", "fail_over")
 #: The largest group of all samples that a split of four to one can keep whole.
 MOST = 0.95
+#: Samples up to which a split takes seconds.
+TRIED = 5_000
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -173,7 +175,12 @@ def _next_commands(options: Options, audit: Audit) -> list[str]:
     columns = [] if no_group else list(dict.fromkeys(wanted))
     rule = {} if options.split is None else Split.load(options.split).rule
     kept = {*rule.get("by", ()), *(rule.get("near") or {}).get("modalities", ())}
-    if {*columns, *sides} <= kept or (len(columns) > 1 and not _works(options, columns)):
+    # What takes longer than seconds is offered untried, but for several columns at once.
+    small = audit.train_samples + audit.test_samples <= TRIED
+    trial = {"by": columns} if columns and (small or len(columns) > 1) else {}
+    if sides and small:
+        trial["near"] = "both" if len(sides) == 2 else sides[0]
+    if {*columns, *sides} <= kept or (trial and not _works(options, trial)):
         return []  # a split that keeps these whole cannot be made, or is what leaks
     by = "" if options.comparison.by == "auto" else f" --by {audit.group}"
     group = f" --by {' '.join(columns)}" if columns else ""
@@ -187,13 +194,13 @@ def _next_commands(options: Options, audit: Audit) -> list[str]:
     return commands
 
 
-def _works(options: Options, columns: Sequence[str]) -> bool:
-    """Whether a split keeps several columns whole and does not leak."""
+def _works(options: Options, rule: Mapping[str, Any]) -> bool:
+    """Whether a split by a rule can be made and does not leak."""
     from palpate.leakage import split
 
     reading = options.reading.keywords()
     try:
-        result = split(list(options.paths), by=columns, skip_bad=options.skip_bad, **reading)
+        result = split(list(options.paths), skip_bad=options.skip_bad, **reading, **rule)
     except PalpateError:
         return False
     return result.rule["audit"] != LEAKS

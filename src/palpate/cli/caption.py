@@ -94,7 +94,7 @@ def run(options: Options, terminal: Terminal) -> Any:
         return result.to_json(), FAILED_CHECK
     for command in (
         f"palpate caption check {options.output} --data {options.data}",
-        f"palpate import {options.data} --text {options.output} -o FOLDER",
+        f"palpate import {options.data} --text {options.output} -o captioned",
     ):
         terminal.print_line(f"Next: {command}")
     return result.to_json(), FAILED_CHECK if result.problems else 0
