@@ -37,6 +37,7 @@ from palpate.core import (
     short,
     write_json,
 )
+from palpate.core.shown import Shown
 from palpate.data.manifest import Manifest
 from palpate.data.reading import load
 from palpate.data.texts import TABLE, TEXTS_FORMAT, image_digests, texts_digest, write_texts
@@ -60,7 +61,7 @@ class StoppedError(PalpateError):
 
 
 @dataclass(frozen=True)
-class Captions:
+class Captions(Shown):
     """Captions that were written.
 
     Attributes:
@@ -97,7 +98,7 @@ class Captions:
 
 
 @dataclass(frozen=True)
-class Estimate:
+class Estimate(Shown):
     """What captions will take: photos, and requests about those without an answer so far."""
 
     photos: int

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import html
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -11,6 +10,7 @@ from typing import Any, Literal, NamedTuple
 from palpate.core.files import plain, short
 from palpate.core.messages import Note, PalpateError
 from palpate.core.records import from_plain
+from palpate.core.shown import Shown
 
 #: Settings that must agree before two scores may share a column.
 COMPARABLE = (
@@ -48,7 +48,7 @@ class Measure(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Score:
+class Score(Shown):
     """One number with its interval and its settings.
 
     What it is of are fields; no name is ever taken apart (``palpate.report.labels`` joins them).
@@ -169,10 +169,6 @@ class Score:
         name = ", ".join(filter(None, (self.metric, self.features, self.kernel, kind)))
         head = f"{name} of {self.a}{f' against {self.b}' if self.b else ''}: {value}"
         return "\n  ".join([head, *(", ".join(filter(None, line)) for line in (setting, data))])
-
-    def _repr_html_(self) -> str:
-        head, *lines = map(html.escape, str(self).split("\n"))
-        return f"<div><b>{head}</b><br><small>{'<br>'.join(lines)}</small></div>"
 
     def to_json(self) -> dict[str, Any]:
         """Return a JSON object; NaN and infinity become null."""

@@ -11,7 +11,6 @@ rule.
 
 from __future__ import annotations
 
-import html
 import json
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
@@ -23,6 +22,7 @@ from typing import Any
 from palpate.core.files import digest_lines, plain, read_record, short, write_text
 from palpate.core.messages import Note, PalpateError
 from palpate.core.records import from_plain
+from palpate.core.shown import Shown
 
 PARTS = ("train", "val", "test")
 #: The verdict of an audit by which a split is called NoLeak.
@@ -43,7 +43,7 @@ class _File:
 
 
 @dataclass(frozen=True)
-class Split:
+class Split(Shown):
     """Which part each sample belongs to.
 
     Attributes:
@@ -79,9 +79,6 @@ class Split:
         return (
             f"{self.rule.get('name', 'split')}: {counts or 'empty'} (digest {short(self.digest)})"
         )
-
-    def _repr_html_(self) -> str:
-        return f"<div>{html.escape(str(self))}</div>"
 
     @cached_property
     def digest(self) -> str:

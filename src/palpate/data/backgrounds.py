@@ -34,6 +34,7 @@ from palpate.core import (
     quiet,
     require,
 )
+from palpate.core.shown import Shown
 from palpate.data.contacts import (
     LEAST,
     SIZE,
@@ -54,7 +55,7 @@ Run = tuple[int, int]
 
 
 @dataclass(frozen=True)
-class Backgrounds:
+class Backgrounds(Shown):
     """Proposed backgrounds, written as a manifest. Print it for a summary.
 
     Attributes:

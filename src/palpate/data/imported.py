@@ -11,6 +11,7 @@ from typing import Any
 import polars as pl
 
 from palpate.core import Problem, Progress, Split, fact_lines, plain, problem_lines, quiet
+from palpate.core.shown import Shown
 from palpate.data.captions import NAMED
 from palpate.data.images import Check
 from palpate.data.manifest import IMAGE_COLUMNS, Manifest
@@ -24,7 +25,7 @@ COUNTED = {"video": "videos", "contact": "contacts", "material": "materials"}
 
 
 @dataclass(frozen=True)
-class Imported:
+class Imported(Shown):
     """A data set that was read and written as a manifest. Print it for a summary.
 
     Attributes:
@@ -111,7 +112,7 @@ def imported_of(
 
 
 @dataclass(frozen=True)
-class Validation:
+class Validation(Shown):
     """A data set checked without importing it. Print it for a report.
 
     Attributes:

@@ -54,6 +54,7 @@ from palpate.core import (
 from palpate.core.files import LARGEST
 from palpate.core.images import SUFFIXES
 from palpate.core.messages import require_rows
+from palpate.core.shown import Shown
 
 IMAGE_COLUMNS = ("vision", "tactile", "background")
 _WORDS = ("video", "frame", "contact", "object", "session", "material", "text")
@@ -87,7 +88,7 @@ CLIMBS = r"^[/\\]|^[A-Za-z]:[/\\]|(?:^|[/\\])\.\.(?:[/\\]|$)"
 
 
 @dataclass(frozen=True)
-class Manifest:
+class Manifest(Shown):
     """Samples and where their images are.
 
     Attributes:
@@ -144,8 +145,6 @@ class Manifest:
                 counts[f"{name}s"] = number
         with_image = {c: self.table[c].count() for c in IMAGE_COLUMNS if self.table[c].count()}
         return "\n".join(["Manifest", *fact_lines(counts | with_image)])
-
-    __repr__ = __str__
 
     @property
     def ids(self) -> list[str]:

@@ -11,7 +11,6 @@ there; ``Call.digests`` has those of the images that were read. An argument that
 
 from __future__ import annotations
 
-import html
 import inspect
 import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -32,6 +31,7 @@ from palpate.core.files import (
 from palpate.core.messages import Note, PalpateError, SampleRef
 from palpate.core.records import from_plain
 from palpate.core.score import Score
+from palpate.core.shown import Shown
 from palpate.report.labels import label_of, subject_of
 from palpate.report.records import (
     LEAKS,
@@ -163,7 +163,7 @@ def digest_of(path: Path, name: str) -> str | None:
     return digest_folder(path, "**/*.safetensors") if weights else None
 
 
-class Document:
+class Document(Shown):
     """What audits and results share: they print themselves, and are JSON of a format."""
 
     form: ClassVar[str]
@@ -174,10 +174,6 @@ class Document:
     def __str__(self) -> str:
         """The tables, findings, notes and claims, as in the terminal."""
         return _writer("terminal").as_text(self)
-
-    def _repr_html_(self) -> str:
-        """For notebooks: the same as :meth:`__str__`."""
-        return f'<pre style="line-height: 1.3">{html.escape(str(self))}</pre>'
 
     def to_json(self) -> dict[str, Any]:
         """A JSON object with its ``format``."""

@@ -79,8 +79,11 @@ def print_result(result: Results | Audit, console: Console, style: Style = COMMA
 def as_text(result: Results | Audit, width: int = 140) -> str:
     """Return a result as text for ``print``; ``width`` in characters."""
     file = io.StringIO()
-    print_result(result, Console(file=file, width=width, color_system=None), PYTHON)
-    return "\n".join(line.rstrip() for line in file.getvalue().rstrip().splitlines())
+    # In a notebook, rich would show it there at once and leave nothing to return.
+    console = Console(file=file, width=width, color_system=None, force_jupyter=False)
+    print_result(result, console, PYTHON)
+    text = "\n".join(line.rstrip() for line in file.getvalue().rstrip().splitlines())
+    return text or getattr(result, "title", "") or "No scores"
 
 
 def _print_lines(lines: Sequence[str], console: Console) -> None:

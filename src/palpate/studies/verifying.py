@@ -23,6 +23,7 @@ from typing import Any, Literal
 
 from palpate.core import PalpateError, Progress, few, plain, quiet, require
 from palpate.core.files import is_there, reading_entry
+from palpate.core.shown import Shown
 from palpate.report.labels import label_of, subject_of
 from palpate.report.results import OBJECT, PATH, ROWS, SILENT, Audit, Call, Results
 from palpate.studies.graph import Work
@@ -67,7 +68,7 @@ class Check:
 
 
 @dataclass(frozen=True)
-class Verification:
+class Verification(Shown):
     """All checks of one results file."""
 
     file: str

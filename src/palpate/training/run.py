@@ -82,10 +82,10 @@ def request_of(seed: int, *parts: Any) -> str:
     """
 
     def content(part: Any) -> Any:
-        if isinstance(part, str | Path) and Path(part).exists():
-            return (digest_folder if Path(part).is_dir() else digest_file)(Path(part))
         if hasattr(part, "modalities"):  # a set of encoders
             return [part.digest(modality) for modality in sorted(part.modalities)]
+        if isinstance(part, str | Path) and Path(part).exists():
+            return (digest_folder if Path(part).is_dir() else digest_file)(Path(part))
         return getattr(part, "digest", repr(part))
 
     return digest_json([seed, *map(content, parts)])
