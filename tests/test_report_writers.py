@@ -3,6 +3,7 @@
 import re
 import shutil
 import subprocess
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -10,7 +11,15 @@ from hypothesis import given
 from hypothesis import strategies as st
 from rich.console import Console
 
-from forge.results import difference, full_audit, full_results, score, small_audit, text_note
+from forge.results import (
+    difference,
+    full_audit,
+    full_results,
+    score,
+    small_audit,
+    study_results,
+    text_note,
+)
 from palpate.core import Note, SampleRef
 from palpate.report import notes
 from palpate.report.audits import pair_lists
@@ -124,6 +133,23 @@ def test_no_text_is_a_latex_command(text):
     )
     assert commands <= set(allowed.split())
     assert not re.search(r"(?<!\\)[%#&]", escaped)
+
+
+def test_latex_captions_are_short_and_what_they_leave_out_is_above_the_table(tmp_path, results):
+    measured = replace(score(), estimator="unbiased", bandwidth=10.0, seed=7, encoder="ab" * 32)
+    one = Results("One", scores=[measured])
+    for each in (results, study_results(tmp_path), full_results(tmp_path), one):
+        text = each.to_latex()
+        captions = re.findall(r"\\caption\{(.*)\}\n", text)
+        assert len(captions) == text.count(r"\begin{table}") > 0
+        for caption in captions:
+            assert 0 < len(caption.split()) <= 40, caption
+        for table in each.tables:  # whole
+            assert f"% {table.text}\n" in text
+    above = text[: text.index(r"\begin{table}")]
+    for fact in ("% estimator: unbiased\n", "% seed: 7\n", f"% encoder: {'ab' * 6}\n"):
+        assert fact in above
+    assert "unbiased" not in text[len(above) :]
 
 
 def test_latex_tables_have_bold_best_marks_and_floors(results):

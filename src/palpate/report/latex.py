@@ -1,6 +1,7 @@
 r"""LaTeX tables (``booktabs``): of a study, of its claims, and of scores, one a family of metrics
 and one of its differences.
 
+A caption says what is shown; how it was made and how to read it is in comments above the table.
 Below a value are its interval, p-value and null band. Bold is the best of a column by value, a
 dagger what paired differences decide. Notes have letters below the table. Text is escaped: no name
 can be a command. Letters that pdfLaTeX lacks need LuaLaTeX.
@@ -11,7 +12,7 @@ from __future__ import annotations
 import re
 import unicodedata
 from collections.abc import Callable, Iterable, Sequence
-from itertools import zip_longest
+from itertools import accumulate, zip_longest
 
 from palpate.core import short
 from palpate.report.labels import file_names, number
@@ -23,6 +24,8 @@ from palpate.report.tables import Cell, Table, defined, families, grids
 
 #: First line of the file: how the command recognizes its own file.
 MARK = "% palpate: tables of scores"
+#: Most words of a caption.
+WORDS = 40
 ARROWS = {"↑": r"$\uparrow$", "↓": r"$\downarrow$", "→": r"$\rightarrow$"}
 _SPECIAL = {
     **{character: f"\\{character}" for character in "{}$&#%_"},
@@ -64,19 +67,38 @@ def latex_tables(results: Results) -> str:
     studied = [of_study(table) for table in results.tables]
     scored = [table for f in families(results.scores, results.controls) for table in grids(f)]
     tables = [*studied, *scored]
-    texts = [table.text for table in studied]
-    texts += ["; ".join(f"{k} {_short(v)}" for k, v in table.facts.items()) for table in scored]
     names = file_names("tab", [table.title for table in tables])
-    parts = list(map(_table, tables, texts, names))
+    parts = list(map(_table, tables, names))
     parts.insert(len(studied), _claims(results.claims))
-    commands = (re.sub(r"[\x00-\x1f\x7f\u2028\u2029]", " ", c) for c in results.commands)
     needs = r"% Needs \usepackage{booktabs} and \usepackage{graphicx}."
-    head = [MARK, *(f"% {c}" for c in commands), needs]
+    head = [MARK, *_comments(results.commands), needs]
     return "\n".join([*head, "", *(line for lines in parts for line in lines)]).rstrip() + "\n"
 
 
-def _table(table: Table, text: str, name: str) -> list[str]:
-    """Controls in italics between rules, what is below a value in lines of their own."""
+def _comments(texts: Iterable[str]) -> list[str]:
+    controls = re.compile("[\x00-\x1f\x7f\u2028\u2029]")
+    return [f"% {controls.sub(' ', text)}" for text in texts if text]
+
+
+def _caption(table: Table) -> list[str]:
+    """Title, marks and as many sentences of the text as :data:`WORDS` leave room for."""
+    marks = {
+        "Bold: best value": any(cell.best for cell in table.cells),
+        "†: better than every other one by paired intervals": any(c.decided for c in table.cells),
+        "Italics: controls": any(row.control for row in table.rows),
+    }
+    caption = [table.title, *(mark for mark, shown in marks.items() if shown)]
+    left = WORDS - len(" ".join(caption).split())
+    sentences = re.split(r"(?<=[.?]) ", table.text)
+    lengths = accumulate(len(each.split()) for each in sentences)
+    fitting = [each for each, n in zip(sentences, lengths, strict=True) if 0 < n <= left]
+    return [table.title, *fitting, *caption[1:]]
+
+
+def _table(table: Table, name: str) -> list[str]:
+    """Controls in italics between rules, what is below a value in lines of their own; above it, in
+    comments, how it was made and how to read it.
+    """
     if not table.rows:
         return []
     heads = [f"{escape(h.label)} {ARROWS[h.arrow] if h.arrow else ''}".strip() for h in table.heads]
@@ -86,13 +108,13 @@ def _table(table: Table, text: str, name: str) -> list[str]:
         rows.append(_row([_cell(c, table.footnotes(c), row.control) for c in row.cells]))
         below = zip_longest(*(_lines_below(cell) for cell in row.cells), fillvalue="")
         rows += [_row(line) for line in below]
-    caption = [table.title, *([text] if text else []), *table.marks("Bold:")]
-    caption += ["Italics: controls"] * any(row.control for row in table.rows)
+    about = (f"{name}: {_short(fact)}" for name, fact in table.facts.items())
+    comments = _comments([table.text, *about, *table.marks("Bold:")])
     columns = "".join("r" if h.scores else "l" for h in table.heads)
     notes = (f"{_raised([k])}~{escape(sentence(note))}" for k, note in enumerate(table.notes, 1))
     footnotes = ". ".join(note.rstrip(".") for note in notes)
     below = rf"\par\smallskip\parbox{{\linewidth}}{{\footnotesize {footnotes}.}}"
-    return _float(caption, columns, rows, [below] * bool(footnotes), name)
+    return comments + _float(_caption(table), columns, rows, [below] * bool(footnotes), name)
 
 
 def _cell(cell: Cell, footnotes: Sequence[int], control: bool) -> str:
@@ -131,8 +153,8 @@ def _float(
     caption: Sequence[str], columns: str, rows: Sequence[str], below: Sequence[str], name: str
 ) -> list[str]:
     """A table no wider than the text, with a label to refer to."""
-    sentences = ". ".join(escape(s).rstrip(".") for s in caption)
-    head = [r"\begin{table}", r"\centering", rf"\caption{{{sentences}.}}"]
+    sentences = " ".join(s if s[-1:] in "?." else f"{s}." for s in map(escape, caption))
+    head = [r"\begin{table}", r"\centering", rf"\caption{{{sentences}}}"]
     head += [rf"\label{{tab:{name.removeprefix('tab-')}}}"]
     fit = r"\resizebox{\ifdim\width>\linewidth\linewidth\else\width\fi}{!}{%"
     head += [fit, rf"\begin{{tabular}}{{{columns}}}", r"\toprule"]
