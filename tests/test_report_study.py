@@ -346,3 +346,26 @@ def test_the_command_writes_figures_and_replaces_no_other_file(tmp_path, capsys)
     assert "--figures must be a new folder" in capsys.readouterr().err
     assert main(["report", *given, "--figures", str(page)]) == 2
     assert "--figures must be a folder" in capsys.readouterr().err
+
+
+def test_figures_have_two_schemes_and_say_their_numbers_to_those_who_do_not_see_them(tmp_path):
+    files = study_results(tmp_path, 2).save_figures(tmp_path / "figures")
+    drawn = [path.read_text() for path in files if path.suffix == ".svg"]
+    assert drawn
+    for text in drawn:
+        light, dark = text.split("@media (prefers-color-scheme: dark)")
+        assert ".paper { fill: #ffffff }" in light
+        assert ".paper { fill: #111418 }" in dark
+        (said,) = re.findall("<desc>(.*)</desc>", text)
+        labels = re.findall(r'class="ink" x="0"[^>]*>([^<]*)<', text)
+        assert labels
+        assert all(f" of {label}: " in said for label in labels)
+        assert len(re.findall(r"\d", said)) > len(labels)
+
+
+def test_a_study_opens_with_its_claims(tmp_path):
+    page = write_report(study_results(tmp_path, 2), tmp_path / "p.html", base=tmp_path).page
+    text = page.read_text()
+    (lede,) = re.findall(r'<p class="lede">(.*)</p>', text)
+    assert lede.endswith('<a href="#claims">1 holds, 1 does not hold, 1 undecided</a>.')
+    assert "<details open>" not in text[text.index('id="claims"') : text.index('id="gallery"')]

@@ -38,12 +38,24 @@ COLORS = {
     "line": "#d9dee3",
     "mark": "#0072b2",
 }
-STYLE = """text { fill: #545d68; font: 12px Helvetica, Arial, sans-serif }
-.ink { fill: #15191e } .title { fill: #15191e; font-weight: 600 }
-.rail { stroke: #d9dee3 } .tick { stroke: #545d68 } .null { fill: #545d68; opacity: .25 }
-.floor { stroke: #15191e; stroke-width: 1.4; stroke-dasharray: 3 2 }
-.interval { stroke: #0072b2; stroke-width: 1.8; fill: none } .value { fill: #0072b2 }
-.hollow { fill: #ffffff; stroke: #0072b2; stroke-width: 1.6 }"""
+DARK = {
+    "paper": "#111418",
+    "ink": "#f1f4f7",
+    "soft": "#aab4be",
+    "line": "#3a434c",
+    "mark": "#5ccfd0",
+}
+RULES = """.paper {{ fill: {paper} }}
+text {{ fill: {soft}; font: 12px Helvetica, Arial, sans-serif }}
+.ink {{ fill: {ink} }} .title {{ fill: {ink}; font-weight: 600 }}
+.rail {{ stroke: {line} }} .tick {{ stroke: {soft} }} .null {{ fill: {soft}; opacity: .25 }}
+.floor {{ stroke: {ink}; stroke-width: 1.4; stroke-dasharray: 3 2 }}
+.interval {{ stroke: {mark}; stroke-width: 1.8; fill: none }} .value {{ fill: {mark} }}
+.hollow {{ fill: {paper}; stroke: {mark}; stroke-width: 1.6 }}"""
+#: Dark where the viewer is; what knows no schemes draws the first.
+STYLE = (
+    f"{RULES.format(**COLORS)}\n@media (prefers-color-scheme: dark) {{ {RULES.format(**DARK)} }}"
+)
 #: Units of a figure, of its labels and axes, of the lines and letters of its text.
 WIDTH, LABEL, AXIS, LINE, LETTER = 640, 212, 240.0, 18, 8
 
@@ -253,8 +265,14 @@ def strips_svg(title: str, panels: Sequence[Panel]) -> Markup:
     label = escape(f"{title}: {', '.join(panel.title for panel in panels)}")
     size = f'width="{WIDTH}" height="{y + 12}" viewBox="0 0 {WIDTH} {y + 12}"'
     head = f'<svg xmlns="http://www.w3.org/2000/svg" {size} role="img" aria-label="{label}">'
-    about = f"<title>{label}</title><desc>Drawn by palpate</desc><style>{STYLE}</style>"
-    paper = f'<rect width="100%" height="100%" fill="{COLORS["paper"]}"/>'
+    values = (
+        f"{panel.title} of {name}: {with_interval(score, digits_of([score]))}"
+        for panel in panels
+        for name, score, _ in panel.rows
+    )
+    about = f"<title>{label}</title><desc>{escape('; '.join(values))}</desc>"
+    about += f"<style>{STYLE}</style>"
+    paper = '<rect class="paper" width="100%" height="100%"/>'
     return Markup(f"{head}{about}{paper}{''.join(parts)}</svg>\n")
 
 
