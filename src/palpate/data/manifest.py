@@ -33,7 +33,7 @@ from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, replace
 from functools import cache, cached_property, lru_cache
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import polars as pl
 
@@ -50,11 +50,15 @@ from palpate.core import (
     got_and_fix,
     inside,
     require,
+    require_choice,
 )
 from palpate.core.files import LARGEST
 from palpate.core.images import SUFFIXES
 from palpate.core.messages import require_rows
 from palpate.core.shown import Shown
+
+if TYPE_CHECKING:
+    from palpate.data.dataset import SampleDataset, Transform
 
 IMAGE_COLUMNS = ("vision", "tactile", "background")
 _WORDS = ("video", "frame", "contact", "object", "session", "material", "text")
@@ -218,6 +222,29 @@ class Manifest(Shown):
         ids = split.ids(*parts)
         table = self.table.filter(pl.col("id").is_in(ids))
         return replace(self, table=table if len(table) == len(ids) else self.take(ids).table)
+
+    def dataset(
+        self,
+        split: Split | str | Path | None = None,
+        *parts: str,
+        transform: Transform | Mapping[str, Transform] | None = None,
+    ) -> SampleDataset:
+        """The samples as a map-style data set for PyTorch's ``DataLoader``.
+
+        Args:
+            split: a split or its file; None: all samples.
+            parts: ``train``, ``val`` or ``test``; default: all of the split.
+            transform: of each image, see :class:`palpate.data.dataset.SampleDataset`.
+
+        Raises:
+            PalpateError: for another part, if no image column is whole, or as :meth:`part`.
+        """
+        from palpate.data.dataset import SampleDataset
+
+        for part in parts:
+            require_choice("parts", part, PARTS)
+        chosen = self if split is None else self.part(Split.load(split), *(parts or PARTS))
+        return SampleDataset(chosen, transform)
 
     @classmethod
     def join(cls, *manifests: Manifest) -> Manifest:
