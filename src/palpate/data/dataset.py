@@ -3,52 +3,40 @@
 from __future__ import annotations
 
 import operator
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from PIL import Image
 
-from palpate.core import MissingExtraError, require
+from palpate.core import MissingExtraError
 from palpate.data.images import read_image
-from palpate.data.manifest import IMAGE_COLUMNS, Manifest
 
 #: An image -> what a model takes.
 Transform = Callable[[Image.Image], Any]
 
 
+@dataclass(frozen=True)
 class SampleDataset:
     """Samples by number, as dictionaries of the columns that none of them lacks.
 
-    Images are read when a sample is asked for; it may be pickled, and read by several workers.
-    ``len`` and ``[k]`` are all that PyTorch's loaders need, so it loads no torch.
+    Images are read when a sample is asked for; it may be pickled, and read by several workers: it
+    holds plain lists, as a frame of polars does not survive the fork of a worker. ``len`` and
+    ``[k]`` are all that PyTorch's loaders need, so it loads no torch.
 
-    Args:
-        manifest: the samples, at least one.
+    Attributes:
+        columns: name -> the values of all samples; of images the paths.
+        images: the columns of images.
         transform: of each image, upright 8-bit RGB, e.g. of torchvision; or one for each of the
             columns ``vision``, ``tactile`` and ``background``. None: an array (height, width, 3) of
             bytes.
-
-    Raises:
-        PalpateError: if no image column is whole.
     """
 
-    def __init__(
-        self, manifest: Manifest, transform: Transform | Mapping[str, Transform] | None = None
-    ) -> None:
-        table = manifest.table
-        whole = [column.name for column in table if not column.null_count()]
-        self.images = [name for name in IMAGE_COLUMNS if name in whole and len(table)]
-        lacks = {n: f"{table[n].null_count():,} {n}" for n in IMAGE_COLUMNS[:2]}
-        must = "A data set must have an image column that no sample lacks"
-        got = f"{' and '.join(lacks.values())} images missing of {len(table):,} samples"
-        fix = "Import the images, or take the samples that have them"
-        require(bool(self.images), None, must, got, fix=fix)
-        # Plain lists: a frame of polars does not survive the fork of a worker.
-        self.columns = {name: table[name].to_list() for name in whole}
-        self.columns |= {name: manifest.paths(name) for name in self.images}
-        self.transform = transform
+    columns: Mapping[str, Sequence[Any]]
+    images: Sequence[str]
+    transform: Transform | Mapping[str, Transform] | None = None
 
     def __len__(self) -> int:
         return len(self.columns["id"])

@@ -244,7 +244,17 @@ class Manifest(Shown):
         for part in parts:
             require_choice("parts", part, PARTS)
         chosen = self if split is None else self.part(Split.load(split), *(parts or PARTS))
-        return SampleDataset(chosen, transform)
+        table = chosen.table
+        whole = [column.name for column in table if len(table) and not column.null_count()]
+        images = [name for name in IMAGE_COLUMNS if name in whole]
+        missing = (f"{table[name].null_count():,} {name}" for name in ("vision", "tactile"))
+        must = "A data set must have an image column that no sample lacks"
+        got = f"{' and '.join(missing)} images missing of {len(table):,} samples"
+        fix = "Import the images, or take the samples that have them"
+        require(bool(images), None, must, got, fix=fix)
+        columns = {name: table[name].to_list() for name in whole}
+        paths = {name: chosen.paths(name) for name in images}
+        return SampleDataset({**columns, **paths}, images, transform)
 
     @classmethod
     def join(cls, *manifests: Manifest) -> Manifest:
