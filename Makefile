@@ -18,7 +18,7 @@ export OMP_WAIT_POLICY := passive
 # Compiled modules are kept: each test that starts a process would compile them again.
 export PYTHONDONTWRITEBYTECODE :=
 
-.PHONY: help demo record test test-fast nightly coverage lint format docs wheel lock clean
+.PHONY: help demo record test test-fast nightly coverage lint format docs wheel release-check lock clean
 
 help:            ## list the targets
 	@grep -E '^[a-z-]+: .*##' $(MAKEFILE_LIST) | sed -E 's/:[^#]*##/\t/' | expand -t 14
@@ -66,6 +66,9 @@ docs: $(DEV)     ## the docs site in site/; a broken link fails
 
 wheel: $(DEV)    ## build the wheel and try it alone in empty environments
 	PYTHON=$(PYTHON) .ci/wheel $(BIN)/python
+
+release-check: $(DEV)  ## build sdist and wheel twice, compare, check metadata, try the wheel alone; BASE=1 leaves out the extras
+	.ci/release $(BIN)/python $(if $(BASE),base)
 
 lock:            ## write constraints.txt from a fresh environment
 	PYTHON=$(PYTHON) .ci/lock

@@ -3,6 +3,7 @@
 import ast
 import functools
 import json
+import os
 import re
 import shutil
 import subprocess
@@ -303,3 +304,14 @@ def test_the_main_paths_stay_short(tmp_path, words, files):
     subprocess.run([*script, "palpate", *words.split()], cwd=tmp_path, check=True, timeout=300)
     walked = json.loads((tmp_path / "walk.json").read_text(encoding="utf-8"))
     assert len(walked) <= files, "\n".join(walked)
+
+
+def test_workflows_and_the_makefile_call_scripts_that_can_run():
+    top = Path(__file__).parents[1]
+    files = [top / "Makefile", *sorted((top / ".github" / "workflows").glob("*.yml"))]
+    called = {path.name: re.findall(r"(?<![\w./])\.ci/[\w.-]+", path.read_text()) for path in files}
+    assert {".ci/run", ".ci/release"} <= {*called["release.yml"]}
+    assert ".ci/release" in called["Makefile"]
+    for script in {name for names in called.values() for name in names}:
+        assert (top / script).is_file(), script
+        assert script.endswith(".py") or os.access(top / script, os.X_OK), script
