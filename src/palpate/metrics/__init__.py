@@ -2,6 +2,7 @@
 
 On features of an encoder: the TMMD family, KID, CMMD, FID, precision, recall, density and coverage.
 On pairs of images: SSIM, PSNR and MS-SSIM; residual, SSIM and IoU of the contact alone.
+Of a contact itself: ``metrics.conditions`` (place, area, strength, shear), ``metrics.markers``.
 """
 
 from palpate.metrics.contact import background_digest, contact_mask, contact_scores

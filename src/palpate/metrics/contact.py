@@ -85,7 +85,7 @@ def contact_mask(tactile: Any, background: Any) -> Mask:
     Raises:
         PalpateError: on other shapes, dtypes or ranges.
     """
-    background = _for_all(background, tactile)
+    background = for_all(background, tactile)
     x, gel = image_pairs(tactile, background, arguments=("tactile", "background"))
     return np.stack([mask_of(as_unit(a), as_unit(b))[0] for a, b in zip(x, gel, strict=True)])
 
@@ -121,7 +121,7 @@ def contact_per_image(
     image, ``details["area"]`` the mean share of the pixels in the real mask. Arguments and errors
     as :func:`contact_scores`.
     """
-    backgrounds = _for_all(background, reference)
+    backgrounds = for_all(background, reference)
     real, gels = image_pairs(reference, backgrounds, arguments=("reference", "background"))
     require_side(real.shape[1:3], "contact metrics")
     stacks = {name: image_pairs(images, real)[0] for name, images in generated.items()}
@@ -180,7 +180,7 @@ def _mean(values: Array) -> float | None:
     return float(finite.mean()) if len(finite) else None
 
 
-def _for_all(background: Any, images: Any) -> Any:
+def for_all(background: Any, images: Any) -> Any:
     """One background (h, w, c) repeated for all images (n, h, w, c); a stack as it is."""
     if getattr(background, "ndim", 4) != 3:
         return background
@@ -196,7 +196,7 @@ def background_digest(images: Any) -> str:
     """
     rows = {
         hashlib.sha256(np.rint(as_unit(image) * 65535).astype("<u2").tobytes()).digest()
-        for image in image_stack("background", _for_all(images, [0]))  # one image: a stack of one
+        for image in image_stack("background", for_all(images, [0]))  # one image: a stack of one
     }
     return hashlib.sha256(b"".join(sorted(rows))).hexdigest()[:16]
 
@@ -206,8 +206,19 @@ def mask_of(image: Array, background: Array, markers: Mask | None = None) -> tup
 
     ``markers``: those of the background; None to look for them.
     """
+    still = marker_mask(background) if markers is None else markers
+    return contact_of(image, background, (marker_mask(image), still))[:2]
+
+
+def contact_of(
+    image: Array, background: Array, markers: tuple[Mask, Mask]
+) -> tuple[Mask, Mask, Array]:
+    """Contact mask (h, w) of one image, the pixels on or next to a marker, and the smoothed |d|.
+
+    ``markers``: of the image and of the background.
+    """
     side = min(image.shape[:2])
-    near = marker_mask(image) | (marker_mask(background) if markers is None else markers)
+    near = markers[0] | markers[1]
     if side >= 48:  # a smaller image has markers of a pixel, and hardly two of gel between them
         near = _dilated(near, side // 96)
     sigma = side / 48
@@ -215,15 +226,21 @@ def mask_of(image: Array, background: Array, markers: Mask | None = None) -> tup
     change = ndimage.gaussian_filter(change, (sigma, sigma, 0))
     # of white noise, that of two images: a Gaussian blur leaves 1 / (2 sqrt(pi) sigma) of its sd
     noise = np.sqrt(2) * _noise(background, ~near) / (2 * np.sqrt(np.pi) * max(sigma, 0.5))
-    mask = np.sqrt((change**2).mean(axis=2)) > max(LEAST, TIMES_NOISE * noise)
+    size = np.sqrt((change**2).mean(axis=2))
+    mask = size > max(LEAST, TIMES_NOISE * noise)
     if mask.mean() < SMALLEST:
-        return np.zeros_like(mask), near
-    return _dilated(mask, side // 64), near
+        return np.zeros_like(mask), near, size
+    return _dilated(mask, side // 64), near, size
+
+
+def to_gray(image: Array) -> Array:
+    """The luma (h, w) of an image (h, w, 3 or 1)."""
+    return image @ LUMA if image.shape[2] == 3 else image[..., 0]
 
 
 def marker_mask(image: Array) -> Mask:
     """The pixels (h, w) of an image (h, w, c) in [0, 1] that are a marker."""
-    gray = image @ LUMA if image.shape[2] == 3 else image[..., 0]
+    gray = to_gray(image)
     # a median over a sixth of the side changes slowly, and costs the fourth power of the side
     step = max(1, min(gray.shape) // 64)
     small = gray[::step, ::step]
