@@ -84,8 +84,9 @@ def test_markers_move_as_the_world_moves_them():
             video.tactile(row.frame) / 255, video.background_of(row.contact) / 255
         )
         dy, dx = video.sensor.shift(video.membrane(state)[0], state.shear)
-        x, y = motion.at.astype(int).T
-        own.append(motion.moves)
+        pixels = options.size / 100
+        x, y = np.rint(motion.at * pixels).astype(int).T
+        own.append(motion.moves * pixels)
         true.append(np.stack([dx[y, x], dy[y, x]], 1))
     own, true = np.concatenate(own), np.concatenate(true)
     assert np.sqrt(((own - true) ** 2).sum(1).mean()) < 0.25 * np.sqrt((true**2).sum(1).mean())

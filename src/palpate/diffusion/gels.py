@@ -26,7 +26,7 @@ from palpate.core import Note, Progress, quiet
 from palpate.data.images import cached_images, read_image, square
 from palpate.data.manifest import Manifest
 from palpate.encoders.rows import evenly_spaced
-from palpate.metrics.contact import marker_mask
+from palpate.metrics.markers import marker_mask
 
 MEDIAN = 500  # images that a stock gel is the median of, at most
 #: Gray levels that a smooth fit may leave of a gel without contact.

@@ -20,9 +20,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from palpate.metrics.contact import contact_of, for_all, marker_mask
+from palpate.metrics.contact import contact_of, for_all
 from palpate.metrics.images import Array, as_unit, image_pairs
-from palpate.metrics.markers import marker_motion
+from palpate.metrics.markers import marker_mask, marker_motion
 
 #: The columns of what is measured.
 CONDITIONS = ("at_x", "at_y", "area", "strength", "shear_x", "shear_y")
@@ -50,8 +50,8 @@ def contact_conditions(tactile: Any, background: Any) -> NDArray[np.float64]:
 def _measured(image: Array, gel: Array) -> tuple[float, ...]:
     spots = marker_mask(image), marker_mask(gel)
     mask, _, size = contact_of(image, gel, spots)
-    (h, w), motion = mask.shape, marker_motion(image, gel, spots)
-    shear = (np.nan, np.nan) if motion is None else tuple(100 / w * motion.moves.mean(axis=0))
+    (h, w), motion = mask.shape, marker_motion(image, gel)
+    shear = (np.nan, np.nan) if motion is None else tuple(motion.mean)
     if not mask.any():
         return np.nan, np.nan, 0.0, 0.0, *shear
     weight = size * mask

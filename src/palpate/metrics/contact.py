@@ -29,8 +29,6 @@ from collections.abc import Mapping, Sequence
 from typing import Any, Unpack
 
 import numpy as np
-from numpy.lib.stride_tricks import sliding_window_view
-from numpy.typing import NDArray
 from scipy import ndimage
 
 from palpate.core import Note, Score
@@ -46,8 +44,7 @@ from palpate.metrics.images import (
     require_side,
 )
 from palpate.metrics.inputs import checked_names, to_host
-
-Mask = NDArray[np.bool_]
+from palpate.metrics.markers import Mask, marker_mask
 
 #: Data range of the SSIM of differences.
 SSIM_RANGE = 0.25
@@ -66,9 +63,6 @@ TIMES_NOISE = 3.0
 SMALLEST = 0.01
 #: What every score keeps of the comparison.
 SETTINGS = {"markers": "skip", "least": round(LEAST, 6), "generated_background": "real"}
-#: A marker is darker than this share of the median luma in a window of a sixth of the side.
-MARKER = 0.82
-LUMA = np.array([0.299, 0.587, 0.114])
 
 
 def contact_mask(tactile: Any, background: Any) -> Mask:
@@ -231,25 +225,6 @@ def contact_of(
     if mask.mean() < SMALLEST:
         return np.zeros_like(mask), near, size
     return _dilated(mask, side // 64), near, size
-
-
-def to_gray(image: Array) -> Array:
-    """The luma (h, w) of an image (h, w, 3 or 1)."""
-    return image @ LUMA if image.shape[2] == 3 else image[..., 0]
-
-
-def marker_mask(image: Array) -> Mask:
-    """The pixels (h, w) of an image (h, w, c) in [0, 1] that are a marker."""
-    gray = to_gray(image)
-    # a median over a sixth of the side changes slowly, and costs the fourth power of the side
-    step = max(1, min(gray.shape) // 64)
-    small = gray[::step, ::step]
-    width = min(small.shape) // 6 | 1
-    windows = sliding_window_view(np.pad(small, width // 2, mode="symmetric"), (width, width))
-    middle = width * width // 2  # twice as fast as scipy's median filter, and the same
-    around = np.partition(windows.reshape(*small.shape, -1), middle, axis=2)[..., middle]
-    around = around.repeat(step, 0).repeat(step, 1)[: gray.shape[0], : gray.shape[1]]
-    return gray < MARKER * around
 
 
 def _fill(image: Array, keep: Mask, sigma: float) -> Array:
