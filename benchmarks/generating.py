@@ -62,7 +62,9 @@ from palpate.training.engine import Task, fit, has_bf16
 from palpate.training.options import Compute, LoopOptions
 from palpate.training.steps import seeded
 
+#: Phases as in the recorded page: every touch at its deepest.
 SHAPE = {"contacts_per_video": 3, "frames_per_contact": 1, "sensors": 3, "materials": 10}
+SHAPE |= {"phases": "spaced"}
 #: New objects, videos and gels each: judges learn on the first, few and many steps are judged on
 #: the third, one sample of a video; all else is measured on the second.
 WORLDS = {"train": {"seed": 81}, "new": {"seed": 82}, "many": {"seed": 83}}

@@ -132,6 +132,7 @@ def world(work, name, half, seed):
             objects_per_material=VIDEOS // 20,
             contacts_per_video=2,
             frames_per_contact=12,
+            phases="spaced",  # as in the recorded page
             mixed=0.0,
         )
         clean = set(np.random.default_rng(seed).permutation(VIDEOS)[:CLEAN].tolist())

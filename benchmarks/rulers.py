@@ -64,6 +64,7 @@ class Bench:
                 objects_per_material=20,
                 contacts_per_video=2,
                 frames_per_contact=2,
+                phases="spaced",  # as in the recorded page
                 free_written="background",
                 mixed=0.0,
                 sensors=8,

@@ -33,7 +33,8 @@ SMALL = WORLD | {"objects_per_material": 2, "contacts_per_video": 2, "frames_per
 
 def data_of(look, folder, changes):
     """Manifest of a world, its own split, and one by whole videos."""
-    options = replace(PRESETS["small"], look=look, **LOOKS[look], **changes)
+    kept = {"phases": "spaced"}  # as in the recorded page
+    options = replace(PRESETS["small"], look=look, **kept, **LOOKS[look], **changes)
     write_world(folder / "world", options, workers=2)
     manifest = import_dataset(folder / "world", folder / "data", overwrite=True).manifest
     orig = Split.load(folder / "data" / "splits" / "Orig.json")

@@ -71,7 +71,8 @@ NAME = "palpate/mini"
 #: Its table of scores is written from the cards.
 PAGE = Path(__file__).parents[1] / "docs" / "concepts" / "mini.md"
 SEED = 0
-_BASE = replace(PRESETS["pretrain"], contacts_per_video=3, frames_per_contact=2)
+#: Phases as when these models were trained: the first and last moments, the lightest of a contact.
+_BASE = replace(PRESETS["pretrain"], contacts_per_video=3, frames_per_contact=2, phases="spaced")
 WORLDS: dict[str, WorldOptions] = {
     "gelsight": replace(_BASE, seed=900_000, objects_per_material=150, sensors=8),
     "digit": replace(_BASE, seed=900_001, objects_per_material=30, sensors=4, look="digit"),

@@ -82,7 +82,7 @@ def video_of(options: WorldOptions, ref: ObjectRef, index: int, sensor: int = 0)
 
 def sheet(look: Literal["gelsight", "digit"], names: Sequence[str]) -> Board:
     """Photo and tactile image in the middle of a contact; object 0 of each material."""
-    options, board = WorldOptions(size=128, tile=512, look=look), Board()
+    options, board = WorldOptions(size=128, tile=512, look=look, phases="spaced"), Board()
     frame = first_contact(options, 0) + 1
     for k, name in enumerate(names):
         video = video_of(options, ObjectRef(name, 0), 10**6 + k, k % 3)
@@ -95,7 +95,7 @@ def sheet(look: Literal["gelsight", "digit"], names: Sequence[str]) -> Board:
 
 def steps() -> Board:
     """One contact with a tread plate, from the photo to the image of the gel."""
-    options, board = WorldOptions(size=128, tile=512), Board()
+    options, board = WorldOptions(size=128, tile=512, phases="spaced"), Board()
     refs = (ObjectRef("Metal", number) for number in count())
     of_kind = (r for r in refs if make_object(options, r).subtype == "tread plate")
     video, frame = video_of(options, next(of_kind), 2), first_contact(options, 0) + 1
@@ -122,7 +122,10 @@ def hard() -> Board:
     """The same six videos at hard 0, 0.5 and 1."""
     board, names = Board(), ("Brick", "Synthetic Fabric", "Wood", "Grass", "Tile", "Leather")
     for row, value in enumerate((0.0, 0.5, 1.0)):
-        options, top = WorldOptions(size=128, tile=512, hard=value), GAP + LINE + row * (104 + GAP)
+        options, top = (
+            WorldOptions(size=128, tile=512, hard=value, phases="spaced"),
+            GAP + LINE + row * (104 + GAP),
+        )
         videos = [video_of(options, ObjectRef(name, 1), 60 + k) for k, name in enumerate(names)]
         images = [small(v.vision(first_contact(options, 1) + 1), 104) for v in videos]
         board.row(70, top, images, () if row else names)

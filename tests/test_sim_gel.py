@@ -202,3 +202,33 @@ def test_a_larger_pad_shows_more_of_the_object_under_the_same_load():
     assert (sensor.px, sensor.half, sensor.noise) == (28.0 / SMALL.size, 14.0, 0.0)
     loads = [contact.load for contact in Video(wide, 0).contacts]
     np.testing.assert_allclose(loads, 0.2)
+
+
+def loads(phases, frames):
+    """Loads of the contact frames of 600 contacts, as shares of the peak of each."""
+    options = dataclasses.replace(
+        SMALL, phases=phases, frames_per_contact=frames, contacts_per_video=100
+    )
+    options = dataclasses.replace(options, objects_per_material=2)
+    videos = [Video(options, plan) for plan in plan_world(options)[:6]]
+    return np.array(
+        [
+            [video.state(f).load / video.contacts[k].load for f in contact_frames(options, k)]
+            for video in videos
+            for k in range(100)
+        ]
+    )
+
+
+def test_loads_are_distributed_alike_for_any_number_of_frames_a_contact():
+    phase = (np.arange(1000) + 0.5) / 1000
+    expected = (0.45 + 0.55 * np.sin(np.pi * (0.12 + 0.76 * phase))) ** 2
+    quantiles = np.quantile(expected, (0.05, 0.25, 0.5, 0.75))
+    for frames in (1, 2, 5):
+        drawn = loads("drawn", frames)
+        np.testing.assert_allclose(
+            np.quantile(drawn, (0.05, 0.25, 0.5, 0.75)), quantiles, rtol=0.07
+        )
+        assert drawn.mean() == pytest.approx(expected.mean(), rel=0.03)
+    one, two = (loads("spaced", frames).mean() for frames in (1, 2))
+    assert one / two == pytest.approx(2.35, rel=0.01)

@@ -19,7 +19,7 @@ def draw():
     """Render photo and tactile image of an object of each material: uint8 (20, 2, 20, 20, 3)."""
     images = []
     for k, name in enumerate(MATERIALS):
-        options = WorldOptions(size=20, look=("gelsight", "digit")[k % 2])
+        options = WorldOptions(size=20, look=("gelsight", "digit")[k % 2], phases="spaced")
         video = Video(options, VideoPlan(k, "golden", k % 3, (ObjectRef(name, 0),), (0, 0, 0, 0)))
         images.append([video.vision(6), video.tactile(6)])
     return np.array(images)

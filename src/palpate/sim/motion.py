@@ -3,6 +3,10 @@
 The contacts of a video revisit a place of the object; a quarter of them goes far away. The sensor
 comes down during the free frames, then presses, holds, slides and lifts: over the phase p in [0, 1]
 of a contact the load follows (0.45 + 0.55 sin(pi (0.12 + 0.76 p)))^2.
+
+Of C frames in contact, frame k has the phase p = (k + u) / C with one u, uniform in [0, 1), a
+contact, as of a camera that does not know of it: the phases of a world's frames are then uniform
+for every C. Spaced phases are k / (C - 1), and 1/2 of a single frame.
 """
 
 from __future__ import annotations
@@ -78,8 +82,7 @@ def state_at(options: WorldOptions, plan: VideoPlan, contacts: list[State], fram
     if step < options.free_frames:
         lift = 1.0 - 0.85 * step / (options.free_frames - 1)
         return replace(contact, position=(x, y), load=0.0, shear=(0.0, 0.0), lift=lift)
-    step, last = step - options.free_frames, options.frames_per_contact - 1
-    phase = step / last if last else 0.5
+    phase = _phase(options, plan, number, step - options.free_frames)
     ramp, drag = 0.45 + 0.55 * math.sin(math.pi * (0.12 + 0.76 * phase)), 0.3 + phase
     return replace(
         contact,
@@ -88,3 +91,11 @@ def state_at(options: WorldOptions, plan: VideoPlan, contacts: list[State], fram
         load=contact.load * ramp * ramp * math.exp(0.03 * rng.normal()),
         shear=(contact.shear[0] * drag, contact.shear[1] * drag),
     )
+
+
+def _phase(options: WorldOptions, plan: VideoPlan, contact: int, step: int) -> float:
+    """Return the phase of a frame of a contact in [0, 1]."""
+    frames = options.frames_per_contact
+    if options.phases == "drawn":
+        return (step + options.rng("phase", plan.index, contact).random()) / frames
+    return step / (frames - 1) if frames > 1 else 0.5

@@ -36,8 +36,15 @@ RANGES: dict[str, tuple[float, float]] = {
     "sensor_noise": (0.0, 0.05),
     "quality": (10, 100),
 }
-#: Fields that name a world only where they are not the default: older worlds keep their digest.
-LATER = ("pad_mm", "load_mm", "sensor_noise", "quality")
+#: Value of a later field in older worlds, which keep their digest: it names a world where it is
+#: another.
+LATER: dict[str, Any] = {
+    "pad_mm": 14.0,
+    "load_mm": (0.09, 0.42),
+    "sensor_noise": (0.002, 0.006),
+    "quality": 95,
+    "phases": "spaced",
+}
 #: Fields that are a range.
 PAIRS = ("load_mm", "sensor_noise")
 
@@ -60,6 +67,9 @@ class WorldOptions:
         two_videos: share of the objects with an additional video.
         contacts_per_video: contacts in a video, 1 .. 100.
         frames_per_contact: frames of a contact, 1 .. 200.
+        phases: of these frames: drawn, so that press, hold and slide are equally frequent in
+            worlds of any number of frames; or spaced from the first to the last moment, where one
+            frame is the deepest of a contact, and two are the lightest.
         free_frames: frames without contact before each contact, 5 .. 200.
         free_written: frames without contact to write as JPEG: all, or one background.
         mixed: share of the videos with two or three objects.
@@ -88,6 +98,7 @@ class WorldOptions:
     two_videos: float = 0.0
     contacts_per_video: int = 4
     frames_per_contact: int = 3
+    phases: Literal["drawn", "spaced"] = "drawn"
     free_frames: int = 5
     free_written: Literal["all", "background"] = "all"
     mixed: float = 0.12
@@ -132,11 +143,9 @@ class WorldOptions:
     @property
     def digest(self) -> str:
         """SHA-256 over the options and VERSION: names what the world will be."""
-        options = dataclasses.asdict(self)
-        for field in dataclasses.fields(self):
-            if field.name in LATER and options[field.name] == field.default:
-                del options[field.name]
-        return digest_json({"version": VERSION, "options": options})
+        options = dataclasses.asdict(self).items()
+        named = {k: v for k, v in options if k not in LATER or v != LATER[k]}
+        return digest_json({"version": VERSION, "options": named})
 
     def rng(self, purpose: str, *ids: str | int) -> np.random.Generator:
         """Return a generator that depends on VERSION, the seed, the purpose and the ids alone."""

@@ -101,9 +101,13 @@ class Study:
         return [m for m in self.methods if split == NOLEAK or m.name in self.on_both]
 
 
-#: The embedded world of studies, and of the demo with fewer frames.
+#: The embedded world of studies, and of the demo with fewer frames; phases as in those on record.
 WORLD = WorldOptions(
-    materials=TEN, objects_per_material=24, contacts_per_video=3, free_written="background"
+    materials=TEN,
+    objects_per_material=24,
+    contacts_per_video=3,
+    free_written="background",
+    phases="spaced",
 )
 _SMOKE_WORLD = replace(
     WORLDS["tiny"], objects_per_material=8, test=0.375, free_written="background"
