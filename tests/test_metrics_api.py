@@ -31,6 +31,7 @@ FUNCTIONS = {
     "four_scores": "generated, reference, *, floor=None, **options",
     "i_tmmd": ONE_SET,
     "kid": TWO_SETS,
+    "marker_scores": f"{IMAGES}, background, **options",
     "ms_ssim": TWO_SETS,
     "per_image": f"metric, {IMAGES}, means=None",
     "prdc": "generated, reference, k=5, **options",

@@ -7,7 +7,9 @@ import pytest
 from PIL import Image
 from scipy import ndimage
 
+import palpate as pp
 from palpate.data.video import VideoReader
+from palpate.metrics import marker_scores
 from palpate.metrics.markers import marker_motion
 from palpate.sim import World, WorldOptions
 
@@ -16,10 +18,11 @@ SIDE = 96
 
 def dots(centers, radii, side=SIDE):
     """(side, side, 3) uint8: dark round dots on gray, drawn at four times the size."""
-    y, x = (np.mgrid[: 4 * side, : 4 * side] + 0.5) / 4
-    image = np.full((4 * side, 4 * side), 150.0)
+    image, at = np.full((4 * side, 4 * side), 150.0), (np.arange(4 * side) + 0.5) / 4
     for (cx, cy), radius in zip(centers, radii, strict=True):
-        image[np.hypot(x - cx, y - cy) < radius] = 20
+        rows, columns = (slice(*np.searchsorted(at, (c - 3, c + 3))) for c in (cy, cx))
+        inside = np.hypot(at[rows, None] - cy, at[None, columns] - cx) < radius
+        image[rows, columns][inside] = 20
     image = image.reshape(side, 4, side, 4).mean((1, 3))
     image += np.random.default_rng(0).normal(0, 1, image.shape)
     return np.rint(image.clip(0, 255)).astype(np.uint8)[..., None].repeat(3, 2)
@@ -125,3 +128,99 @@ def test_markers_of_a_real_press_are_those_followed_from_frame_to_frame(real_dat
     assert direct.rms > 2.5  # % of the width; the pitch is 8.8
     assert np.median(off) < 0.25
     assert (off > 1).mean() < 0.1
+
+
+def moved_stack(rng, count, shift):
+    """Images (n, h, w, 3) whose markers go ``shift`` pixels, more or less, and their gels."""
+    gels, images = [], []
+    for k in range(count):
+        centers, radii = lattice(rng)
+        gels.append(dots(centers, radii))
+        images.append(dots(centers + shift * (1 + 0.1 * (-1) ** k), radii))
+    return np.stack(images), np.stack(gels)
+
+
+def test_scores_are_means_over_images_with_real_ones_as_floor():
+    rng, n = np.random.default_rng(4), 8
+    real, gels = moved_stack(rng, n, np.array([1.8, 2.4]))
+    half = np.stack([dots(*lattice_of) for lattice_of in halves(n)])
+    groups = [f"v{k // 2}" for k in range(n)]
+    scores = {s.metric: s for s in marker_scores(half, real, gels, groups=groups)}
+    assert [*scores] == ["marker motion", "marker shear", "marker divergence", "marker curl"]
+    motion, shear = scores["marker motion"], scores["marker shear"]
+    assert motion.floor == pytest.approx(100 * 3 / SIDE, rel=0.02)
+    assert motion.value == pytest.approx(100 * 1.5 / SIDE, rel=0.03)
+    assert motion.interval[0] < motion.value < motion.interval[1] < motion.floor
+    assert shear.details["mean"] == pytest.approx([90 / SIDE, 120 / SIDE], rel=0.05)
+    assert shear.value == pytest.approx(motion.value, rel=0.01)
+    assert scores["marker divergence"].value == pytest.approx(0, abs=0.1)
+    own = marker_scores(real, real, gels, groups=groups)
+    assert all(s.value == pytest.approx(s.floor) for s in own)
+    still = marker_scores(gels, real, gels)
+    assert [s.value for s in still] == pytest.approx([0, 0, 0, 0])
+
+
+def halves(count):
+    """The same markers as of the seed of :func:`moved_stack`, moved half as far."""
+    rng = np.random.default_rng(4)
+    for k in range(count):
+        centers, radii = lattice(rng)
+        yield centers + np.array([0.9, 1.2]) * (1 + 0.1 * (-1) ** k), radii
+
+
+def test_images_without_their_markers_are_counted_and_gels_without_have_no_score():
+    real, gels = moved_stack(np.random.default_rng(5), 4, np.array([2.0, 0.0]))
+    lost = real.copy()
+    lost[0] = 150
+    motion = marker_scores(lost, real, gels)[0]
+    assert motion.details["no_markers"] == 1
+    assert [note.code for note in motion.notes if note.code == "no-markers"] == ["no-markers"]
+    plain = np.full_like(real, 150)
+    assert marker_scores(plain, plain, plain) == []
+
+
+def test_real_presses_move_their_markers_and_a_generator_of_gels_does_not(real_data):
+    clips = real_data / "touch_and_go" / "clips" / "dataset"
+    presses = {
+        "clip_wood_00001": (30, 63),
+        "clip_brick_0001": (30, 119),
+        "clip_grass_0001": (20, 41),
+    }
+    images, gels = [], []
+    for name, (gel, press) in presses.items():
+        with VideoReader(clips / name / "gelsight.mp4") as reader:
+            for frame, stack in ((gel, gels), (press, images)):
+                image = Image.fromarray(reader[frame]).resize((160, 120), Image.Resampling.BOX)
+                stack.append(np.asarray(image))
+    real, gels = np.stack(images), np.stack(gels)
+    motion, shear, divergence, _ = marker_scores(gels, real, gels, groups=[*presses])
+    assert (motion.value, shear.value, divergence.value) == (0, 0, 0)
+    assert motion.floor > 1.5
+    assert 0 < shear.floor < motion.floor
+    assert divergence.floor > 2
+
+
+def test_score_compares_the_markers_of_generators_with_real_ones(tmp_path):
+    world = World(WorldOptions(seed=12, objects_per_material=1, materials=8, contacts_per_video=2))
+    samples = [world[k] for k in range(0, len(world), 3)]
+    real, gels = (np.stack([s[kind] for s in samples]) for kind in ("tactile", "background"))
+    for name, images in {"gels": gels, "half": (real // 2 + gels // 2), "real": real}.items():
+        (tmp_path / name).mkdir()
+        for sample, image in zip(samples, images, strict=True):
+            Image.fromarray(image).save(tmp_path / name / f"{sample['id'].replace('/', '_')}.png")
+    sides = {"gels": tmp_path / "gels", "half": tmp_path / "half"}
+    gel = tmp_path / "gel.png"
+    Image.fromarray(gels[0]).save(gel)
+    one = [k for k, s in enumerate(samples) if s["sensor"] == samples[0]["sensor"]]
+    for name in ("gels", "half", "real"):
+        for k, file in enumerate(sorted((tmp_path / name).iterdir())):
+            if k not in one:
+                file.unlink()
+    results = pp.score(sides, tmp_path / "real", background=gel, companions=["contact"])
+    motion = {s.a: s for s in results.scores if s.metric == "marker motion" and s.b is None}
+    expected = np.mean([marker_motion(real[k], gels[0]).rms for k in one])
+    assert motion["gels"].floor == pytest.approx(expected, rel=0.02)
+    assert motion["gels"].value < 0.25 * motion["half"].floor
+    difference = next(s for s in results.scores if s.metric == "marker motion" and s.b)
+    assert difference.details["better"] is None  # closer to the floor is better
+    assert "Marker motion" in str(results)

@@ -12,7 +12,8 @@ name           needs      score
 ``ssim``       pairs      structural similarity
 ``psnr``       pairs      peak signal-to-noise ratio
 ``ms-ssim``    pairs      structural similarity at several scales
-``contact``    pairs      residual, SSIM and IoU of the contact; needs backgrounds
+``contact``    pairs      residual, SSIM and IoU of the contact, and the motion of the markers of
+                          gels that have some; needs backgrounds
 ``lpips``      pairs      LPIPS; needs weights
 =============  =========  ================================================================
 
@@ -39,6 +40,7 @@ from palpate.metrics.distributions import compare_fid, prdc_rows
 from palpate.metrics.images import PerImage, per_image, scale_means
 from palpate.metrics.kernels import Polynomial
 from palpate.metrics.mmd import Preset
+from palpate.metrics.motion import marker_per_image
 from palpate.metrics.paired import Comparison, compare, compare_tmmd, mean_differences
 from palpate.metrics.tactile import tmmd
 from palpate.report.labels import measured
@@ -571,7 +573,8 @@ def _scored(bench: Bench, each: Mapping[str, PerImage]) -> list[Score]:
 def _contact(bench: Bench, pairs: Mapping[str, Images]) -> list[Score]:
     gel, real = bench.pixels(bench.reference, "background"), bench.pictures[REFERENCE]
     each = contact_per_image(pairs, real, gel, bench.reference.ids)
-    of_metrics = zip(*each.values(), strict=True)
+    of_markers = marker_per_image(pairs, real, gel)
+    of_metrics = [*zip(*each.values(), strict=True), *zip(*of_markers.values(), strict=True)]
     return [s for one in of_metrics for s in _scored(bench, dict(zip(each, one, strict=True)))]
 
 

@@ -1,7 +1,8 @@
 """Metrics of generated tactile images: arrays or tensors in, :class:`palpate.core.Score` out.
 
 On features of an encoder: the TMMD family, KID, CMMD, FID, precision, recall, density and coverage.
-On pairs of images: SSIM, PSNR and MS-SSIM; residual, SSIM and IoU of the contact alone.
+On pairs of images: SSIM, PSNR and MS-SSIM; residual, SSIM and IoU of the contact alone; motion of
+the markers.
 Of a contact itself: ``metrics.conditions`` (place, area, strength, shear), ``metrics.markers``.
 """
 
@@ -11,6 +12,7 @@ from palpate.metrics.images import PerImage, ms_ssim, per_image, psnr, ssim
 from palpate.metrics.inputs import require_same_ids
 from palpate.metrics.kernels import Gaussian, Polynomial
 from palpate.metrics.mmd import PRESETS, Options
+from palpate.metrics.motion import marker_scores
 from palpate.metrics.paired import Comparison, compare, compare_tmmd, four_scores
 from palpate.metrics.streaming import TMMD, distance
 from palpate.metrics.tactile import ci_tmmd, cmmd, d_tmmd, i_tmmd, kid, tmmd
@@ -37,6 +39,7 @@ __all__ = [
     "four_scores",
     "i_tmmd",
     "kid",
+    "marker_scores",
     "ms_ssim",
     "per_image",
     "prdc",

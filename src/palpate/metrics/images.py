@@ -95,8 +95,9 @@ class PerImage:
         settings: what a score keeps.
         notes: of the score.
         details: of the score.
-        higher_is_better: its direction.
+        higher_is_better: its direction; None: closer to the floor is better.
         encoder: digest of a network that it needs, or None.
+        floor: the same of real images, or None.
     """
 
     metric: str
@@ -105,8 +106,9 @@ class PerImage:
     settings: Mapping[str, Any] = field(default_factory=dict)
     notes: Sequence[Note] = ()
     details: Mapping[str, Any] = field(default_factory=dict)
-    higher_is_better: bool = True
+    higher_is_better: bool | None = True
     encoder: str | None = None
+    floor: float | None = None
 
     def score(
         self,
@@ -158,6 +160,7 @@ class PerImage:
             encoder=self.encoder,
             split=split,
             higher_is_better=up,
+            floor=self.floor,
             settings=self.settings,
             details=details | dict(self.details),
             notes=(*own, *self.notes),

@@ -405,7 +405,8 @@ def _mean_difference(x: Score, y: Score, delta: Array, groups: Sequence[str] | N
         return _paired(x, y, None, {}, "no-images")
     names = None if groups is None else list(np.asarray(groups)[finite])
     spread = spread_of_values(delta[finite], names)
-    return _paired(x, y, spread, _verdict(x, y, spread), "few-images")
+    verdict = {} if x.higher_is_better is None else _verdict(x, y, spread)
+    return _paired(x, y, spread, verdict, "few-images")
 
 
 def holm(differences: Sequence[Score]) -> list[Score]:

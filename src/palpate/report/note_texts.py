@@ -152,6 +152,7 @@ METRICS: dict[str, Sentence] = {
         "not comparable with MS-SSIM of 5"
     ),
     "no-contact": "{count} of {n} real images show no contact, excluded from the mean",
+    "no-markers": "{count} of {n} images show too few markers of their gel, excluded from the mean",
     "empty-balls": "{count} of {n} {of} rows occur more than k times: their balls hold nothing",
     "fid-mostly-bias": (
         "Not meaningful: {n} samples do not span the {d} dimensions, so the value is mostly bias"

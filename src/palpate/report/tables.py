@@ -68,6 +68,11 @@ FAMILIES: tuple[tuple[str, str, tuple[str, ...]], ...] = (
         ("contact ", "ssim", "psnr", "lpips", "l1", "mse"),
     ),
     (
+        "Marker motion",
+        "Do the markers of the gel move as far as on real images, in % of the width?",
+        ("marker ",),
+    ),
+    (
         "Captions",
         "Can they be used, and do they name what they should only describe? Those of a contact "
         "count once.",
