@@ -16,7 +16,9 @@ from palpate.report.results import Audit, Results
 from palpate.report.tables import REAL, Column, Family, baselines, best_by_value, defined
 
 #: Columns of the verdict table, the most telling first; others follow as they come.
-TELLING = tuple(map(Measure, ("TMMD", "material accuracy", "D-TMMD", "CI-TMMD", "SSIM")))
+TELLING = tuple(
+    map(Measure, ("TMMD", "material accuracy", "marker motion", "D-TMMD", "CI-TMMD", "SSIM"))
+)
 COLUMNS, CARDS, CARD_ROWS = 5, 3, 4
 #: Metrics whose null is that generated and real images do not differ.
 DISTANCES = ("TMMD", "FID", "CMMD", "KID")
@@ -26,6 +28,7 @@ STRIP, READING = 296.0, 330.0
 QUESTIONS = {
     TELLING[0]: "Distance to real images, TMMD",
     TELLING[1]: "Material read from the image",
+    TELLING[2]: "How far markers move, % of the width",
 }
 #: Axis of shares.
 UNIT = plots.Axis(-0.02, 1.02, (), 1, width=92)
