@@ -3,9 +3,10 @@
 **FID** is the Fréchet distance of two sets of features taken as Gaussians (arXiv 1706.08500).
 
 ``|mu1 - mu2|^2 + tr S1 + tr S2 - 2 tr (S1 S2)^(1/2)``, covariances divided by n - 1, in float64.
-With factors ``S = F' F`` the trace of the root is the sum of the singular values of ``F1 F2'``, so
-no matrix root is needed (``scipy.linalg.sqrtm`` may turn complex or fail). F is a Cholesky factor;
-of n <= d samples it is the thin ``(X - mu) / sqrt(n - 1)``: a covariance would lose digits.
+The trace of the root is the sum of the roots of the eigenvalues of S1 S2, which ``S1 S2 v = l v``
+gives for symmetric matrices without a matrix root (``scipy.linalg.sqrtm`` may turn complex or
+fail). Where a covariance is singular, it is that of the singular values of ``F1 F2'`` with factors
+``S = F' F``; of n <= d samples the thin ``F = (X - mu) / sqrt(n - 1)``: S would lose digits.
 
 **Bias.** FID is biased upwards, by about c / n with a c that depends on the generator (Chong and
 Forsyth, arXiv 1911.07023): compare values of equal n only. With n <= d the value is mostly bias.
@@ -40,6 +41,7 @@ All four depend on n, m and k: compare at equal numbers only. O((n^2 + m^2 + n m
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from typing import Any, NamedTuple, Unpack
 
@@ -62,8 +64,6 @@ from palpate.metrics.inputs import (
 from palpate.metrics.intervals import Scored, Spread, score_of, spread_of_values
 from palpate.metrics.paired import Comparison, compared, same_samples
 
-#: A set as a normal distribution: mean (d,), and factor F (r, d) of its covariance F' F.
-Normal = tuple[Array, Array]
 #: The most blocks that the jackknife of FID leaves out.
 BLOCKS = 20
 #: Rows turned to float64 at a time.
@@ -145,16 +145,16 @@ def _fid(
     """FID, and its value without each block."""
     checked_whole(0, seed=seed)
     x, y, groups, notes = _rows(generated, reference, 2)
-    center = (x.mean(axis=0, dtype=np.float64) + y.mean(axis=0, dtype=np.float64)) / 2
-    a, b = _normal(x, center), _normal(y, center)
-    value, delta = _distance(a, b), a[0] - b[0]
-    details: dict[str, Any] = {"mean_term": float(delta @ delta)}
-    blocks, replicates, units = _draw_blocks(len(x), len(y), groups, seed), np.zeros(0), list[str]()
+    means = [v.mean(axis=0, dtype=np.float64) for v in (x, y)]
+    center, delta = (means[0] + means[1]) / 2, means[0] - means[1]
+    blocks, units = _draw_blocks(len(x), len(y), groups, seed), list[str]()
     sets = ((x, blocks.x), (y, blocks.y))
     if min(len(v) - np.bincount(at).max() for v, at in sets) > 1:
         units = list(blocks.names)
-        without = (_without_each(v, at, len(units), center) for v, at in sets)
-        replicates = np.array([_distance(*pair) for pair in zip(*without, strict=True)])
+    pairs = zip(*(_normals(v, at, len(units), center) for v, at in sets), strict=True)
+    value, *without = (_distance(*pair) for pair in pairs)
+    replicates = np.array(without)
+    details: dict[str, Any] = {"mean_term": float(delta @ delta)}
     spread = Spread.of(value, replicates, blocks.details["left_out"], blocks.tail)
     n, d = min(len(x), len(y)), x.shape[1]
     notes.append(Note("fid-biased") if n > d else Note("fid-mostly-bias", {"n": n, "d": d}))
@@ -178,13 +178,37 @@ def _fid(
     return Scored(score, replicates, units)
 
 
-def _normal(x: Array, center: Array) -> Normal:
-    """Mean about the center, and factor, of the rows of (n, d) features."""
-    if len(x) > x.shape[1]:
-        return _of_sums(len(x), _sums(x, center))
-    rows = x - center
-    mean = rows.mean(axis=0)
-    return mean, (rows - mean) / np.sqrt(len(x) - 1)
+class Normal(NamedTuple):
+    """A set as a normal distribution: mean (d,), and covariance (d, d) or its factor F (r, d)."""
+
+    mean: Array
+    matrix: Array
+    full: bool = False  # whether the matrix is the covariance
+
+    @property
+    def factor(self) -> Array:
+        """F (r, d) with F' F the covariance, without what rounding left of no spread."""
+        if not self.full:
+            return self.matrix
+        values, vectors = linalg.eigh(self.matrix, check_finite=False)
+        keep = values > len(values) * EPSILON * max(values[-1], 0.0)
+        return (vectors[:, keep] * np.sqrt(values[keep])).T
+
+
+def _normals(x: Array, block: Index, count: int, center: Array) -> Iterator[Normal]:
+    """The normal distribution of (n, d) features about the center; then that without each block."""
+    total = _sums(x, center) if len(x) > x.shape[1] else None
+    for b in range(-1, count):
+        n = int(np.count_nonzero(block != b))
+        if total is None or n <= x.shape[1]:
+            rows = x[block != b] - center
+            mean = rows.mean(axis=0)
+            yield Normal(mean, (rows - mean) / np.sqrt(n - 1))
+            continue
+        sums = total - _sums(x[block == b], center)
+        sums[1:] -= np.outer(sums[0] / n, sums[0])
+        sums[1:] /= n - 1
+        yield Normal(sums[0] / n, sums[1:], full=True)
 
 
 def _sums(x: Array, center: Array) -> Array:
@@ -197,44 +221,21 @@ def _sums(x: Array, center: Array) -> Array:
     return total
 
 
-def _of_sums(n: int, sums: Array) -> Normal:
-    mean = sums[0] / n
-    return mean, _factor((sums[1:] - n * np.outer(mean, mean)) / (n - 1))
-
-
-def _without_each(x: Array, block: Index, count: int, center: Array) -> Iterator[Normal]:
-    """The normal distribution without each block of rows."""
-    total, sizes = None, np.bincount(block, minlength=count)
-    for b in range(count):
-        if (n := len(x) - int(sizes[b])) <= x.shape[1]:
-            yield _normal(x[block != b], center)
-            continue
-        total = _sums(x, center) if total is None else total
-        yield _of_sums(n, total - _sums(x[block == b], center))
-
-
-def _factor(cov: Array) -> Array:
-    """F (r, d) with F' F = cov; of r = rank rows where Cholesky finds the matrix singular."""
-    try:
-        return linalg.cholesky(cov, check_finite=False)
-    except linalg.LinAlgError:
-        values, vectors = linalg.eigh(cov, check_finite=False)
-        keep = values > len(values) * EPSILON * max(values[-1], 0.0)
-        return (vectors[:, keep] * np.sqrt(values[keep])).T
-
-
 def _distance(a: Normal, b: Normal) -> float:
-    delta, (f, g) = a[0] - b[0], (a[1], b[1])
-    cross = f @ g.T
-    if len(f) == len(g) == f.shape[1]:  # faster; squares lose no digits that matter at full rank
-        values = linalg.eigvalsh(cross @ cross.T, check_finite=False)
-        # rounding leaves +-eps * largest for a zero, whose root would count
-        values[values < len(values) * EPSILON * max(values[-1], 0.0)] = 0
-        roots = np.sqrt(values)
-    else:
+    delta, roots = a.mean - b.mean, None
+    if a.full and b.full:
+        with suppress(linalg.LinAlgError):  # b is singular
+            values = linalg.eigh(
+                *(a.matrix, b.matrix), type=2, eigvals_only=True, driver="gv", check_finite=False
+            )
+            # rounding leaves +-eps * largest for a zero, whose root would count
+            values[values < len(values) * EPSILON * max(values[-1], 0.0)] = 0
+            roots = np.sqrt(values)
+    if roots is None:
+        cross = a.factor @ b.factor.T
         roots = linalg.svdvals(cross, check_finite=False) if cross.size else np.zeros(1)
-    traces = np.einsum("ij,ij->", f, f) + np.einsum("ij,ij->", g, g)
-    return max(float(delta @ delta + traces - 2 * np.sum(roots)), 0.0)
+    traces = (np.trace(x.matrix) if x.full else np.vdot(x.matrix, x.matrix) for x in (a, b))
+    return max(float(delta @ delta + sum(traces) - 2 * np.sum(roots)), 0.0)
 
 
 class _Blocks(NamedTuple):
