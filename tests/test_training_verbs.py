@@ -90,6 +90,10 @@ def test_encoders_and_a_generator_from_the_command_line(tag, tmp_path, capsys):
         words = ["train", "generator", *common, *options, *other]
         assert main(words) == 2
         assert "the result of another training" in capsys.readouterr().err
+    image = tag[0].paths("tactile")[0]
+    Image.open(image).rotate(180).save(image)  # another under the same name
+    assert main(["train", "generator", *common, *options]) == 2
+    assert "the result of another training" in capsys.readouterr().err
 
 
 def test_a_loss_that_is_no_number_ends_a_generator_in_one_line(tag, tmp_path, capsys):

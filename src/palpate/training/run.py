@@ -27,6 +27,8 @@ from palpate.core import (
     require_new_folder,
     write_text,
 )
+from palpate.data.images import file_stamp
+from palpate.data.manifest import IMAGE_COLUMNS, Manifest
 from palpate.training.options import Compute, LoopOptions
 from palpate.training.processes import barrier, connect, merged, place
 
@@ -82,6 +84,9 @@ def request_of(seed: int, *parts: Any) -> str:
     """
 
     def content(part: Any) -> Any:
+        if isinstance(part, Manifest):  # an image may be another under its name
+            files = {name for c in IMAGE_COLUMNS for name in part.column(c) if name}
+            return [part.digest, [file_stamp(part.path(name)) for name in sorted(files)]]
         if hasattr(part, "modalities"):  # a set of encoders
             return [part.digest(modality) for modality in sorted(part.modalities)]
         if isinstance(part, str | Path) and Path(part).exists():
