@@ -6,10 +6,14 @@ import pytest
 torch = pytest.importorskip("torch")
 
 from dataclasses import replace  # noqa: E402
+from io import BytesIO  # noqa: E402
+
+from PIL import Image  # noqa: E402
 
 from forge.errors import fails  # noqa: E402
 from palpate import score, train_encoder  # noqa: E402
-from palpate.core import PalpateError, Split  # noqa: E402
+from palpate.core import PalpateError, Split, image_bytes  # noqa: E402
+from palpate.data.images import load_images  # noqa: E402
 from palpate.data.manifest import Manifest  # noqa: E402
 from palpate.data.residuals import Residual  # noqa: E402
 from palpate.encoders.embed import embed  # noqa: E402
@@ -82,6 +86,26 @@ def test_a_saved_ruler_is_what_it_was(trained, tmp_path):
     np.testing.assert_allclose(np.linalg.norm(rows, axis=1), 1, rtol=1e-5)
     assert again.preprocess("tactile") == Residual(32, 32)
     assert again.with_tactile(trained).digest("tactile") == trained.digest("tactile")
+
+
+def test_a_codec_moves_numbers_less_without_its_direction(world, trained):
+    data, split = world
+    held, ruler = data.part(split, "test"), trained.tactile
+    assert float(ruler.codec.norm()) == pytest.approx(1, rel=1e-5)
+    frames = ruler.preprocess.frames(held, "tactile").files
+    small = [Image.open(image).resize((240, 240)) for image, *_ in frames]
+    files = [
+        (Image.open(BytesIO(image_bytes(x, "JPEG", quality=40))), *gel)
+        for x, (_, *gel) in zip(small, frames, strict=True)
+    ]
+    plain, coded = (
+        torch.from_numpy(load_images(f, ruler.preprocess)).permute(0, 3, 1, 2).float()
+        for f in (frames, files)
+    )
+    with torch.no_grad():
+        whole = ((ruler.numbers(coded) - ruler.numbers(plain)) / ruler.spread).mean(0)
+        left = (ruler(coded) - ruler(plain)).mean(0)
+    assert float(left.norm()) < 0.8 * float(whole.norm())
 
 
 def test_partners_are_of_the_same_object_and_seldom_the_row_itself(world):

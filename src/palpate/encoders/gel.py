@@ -10,7 +10,9 @@ Standardization"): statistics of a batch would make a step depend on how many pr
 and those of an image would hide how strong a contact is.
 
 Numbers are compared after ``(x - center) / spread``, of the images of the training; ``score`` takes
-mean and deviation of the reference.
+mean and deviation of the reference. In what remains, one direction is taken off: the one in which a
+codec moves images most, which no loss on single views takes from a network (Solomonoff et al. 2005,
+"Nuisance attribute projection").
 """
 
 from __future__ import annotations
@@ -68,11 +70,13 @@ class GelEncoder(TactileModule):
     Attributes:
         dim: numbers of the ruler, twice the width of the last layer.
         center, spread: mean and deviation of the numbers over images of the training, (dim,).
+        codec: direction of the standardized numbers that is taken off, of length 1 or 0, (dim,).
         preprocess: residuals of the side.
     """
 
     center: Tensor
     spread: Tensor
+    codec: Tensor
 
     def __init__(self, widths: Sequence[int], shared: int, side: int) -> None:
         super().__init__()
@@ -82,6 +86,7 @@ class GelEncoder(TactileModule):
         self.head = nn.Linear(self.dim, shared, bias=False)
         self.register_buffer("center", torch.zeros(self.dim))
         self.register_buffer("spread", torch.ones(self.dim))
+        self.register_buffer("codec", torch.zeros(self.dim))
         self.register_buffer("side", torch.tensor(float(side)))
         self.preprocess = Residual(side, side)
 
@@ -107,8 +112,9 @@ class GelEncoder(TactileModule):
         return torch.cat([x.mean(2), (x.var(2) + 1e-4).sqrt()], 1)
 
     def forward(self, pixels: Tensor, sensors: Tensor | None = None) -> Tensor:
-        """Residuals (n, 3, h, w) in gray levels to (n, dim), standardized."""
-        return (self.numbers(pixels) - self.center) / self.spread
+        """Residuals (n, 3, h, w) in gray levels to (n, dim), standardized, without the codec."""
+        x = (self.numbers(pixels) - self.center) / self.spread
+        return x - (x @ self.codec)[:, None] * self.codec
 
     def encode(self, pixels: Tensor, sensors: Sequence[str] | None = None) -> Tensor:
         """The same; its rows keep their length, which the reference's deviations need."""

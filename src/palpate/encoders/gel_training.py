@@ -15,14 +15,17 @@ The preset ``self`` learns from touches alone, by the first two.
 
 from __future__ import annotations
 
+import io
 import math
 from dataclasses import dataclass, replace
 from functools import partial
+from pathlib import Path
 
 import numpy as np
 import polars as pl
 import torch
 from numpy.typing import NDArray
+from PIL import Image
 from torch import Tensor, nn
 from torch.nn.functional import (
     affine_grid,
@@ -35,9 +38,18 @@ from torch.nn.functional import (
     smooth_l1_loss,
 )
 
-from palpate.core import Split, digest_json, digest_lines, require, rng_for
+from palpate.core import (
+    Split,
+    decoded,
+    digest_json,
+    digest_lines,
+    image_bytes,
+    open_image,
+    require,
+    rng_for,
+)
 from palpate.core.features import is_missing
-from palpate.data.images import Preprocess, cached_images
+from palpate.data.images import Preprocess, cached_images, load_images, read_image
 from palpate.data.manifest import Manifest
 from palpate.data.residuals import Residual, with_gels
 from palpate.encoders.courses import facts_of, fitted, require_held_out, require_rows, stamps
@@ -65,6 +77,8 @@ FAR = 0.5
 LARGEST = 5.0
 #: Images whose numbers are averaged for center and spread.
 STATISTICS = 4096
+#: Images by which the direction of codecs is found; rows and quality of their JPEG.
+CODED, ROWS, QUALITY = 256, (160, 240, 320), (20, 90)
 #: Objects or videos that are held out, at least.
 LEAST_HELD = 3
 #: Recordings that a card lists by name, at most.
@@ -311,6 +325,7 @@ def train_ruler(
         ruler.load_state_dict(old.state_dict())
         ruler.center.zero_()
         ruler.spread.fill_(1)
+        ruler.codec.zero_()
     options = preset.tactile_course.options(len(train), run.seed)
     with agreed():
         require_rows(train, options.batch)
@@ -344,7 +359,7 @@ def train_ruler(
     names = sorted({name.partition("\n")[2] for name in units_of(train, "")})
     card["recordings"] = {"count": len(names), "digest": digest_lines(names)}
     card["recordings"] |= {"names": names} if len(names) <= LISTED else {}
-    standardize(ruler, touches, len(train))
+    standardize(ruler, touches, parts[0], run.seed)
     plain = ruler.preprocess.plainly
     seen = digest_images(cached_images(train, "tactile", plain, run.cache, run.progress))
     seen = union(seen, start.seen.get("tactile"))
@@ -372,12 +387,32 @@ def held_out(train: Manifest, seed: int) -> tuple[Manifest, Manifest]:
 
 
 @torch.no_grad()
-def standardize(ruler: GelEncoder, touches: Touches, n: int) -> None:
-    """Set center and spread to those of the n images of the train part."""
-    parts: list[Tensor] = []
-    rows, images = evenly_spaced(n, STATISTICS), touches.rows.images
-    for some in np.array_split(rows, math.ceil(len(rows) / 128)):
-        parts.append(ruler.numbers(ruler.preprocess(to_unit(images[some], ruler.center.device))))
-    numbers = torch.cat(parts)
+def standardize(ruler: GelEncoder, touches: Touches, train: Manifest, seed: int) -> None:
+    """Set center and spread to those of images of the train part, and the direction of codecs."""
+    images = touches.rows.images[evenly_spaced(len(train), STATISTICS)]
+    numbers = _numbers(ruler, images)
     ruler.center.copy_(numbers.mean(0))
     ruler.spread.copy_(numbers.std(0).clamp(min=1e-3))
+    frames, rng = ruler.preprocess.frames(train, "tactile").files, rng_for(seed, "codecs")
+    frames = [frames[k] for k in evenly_spaced(len(train), CODED)]
+    coded = [(_coded(image, rng), *gel) for image, *gel in frames]
+    plain, moved = (_numbers(ruler, load_images(f, ruler.preprocess)) for f in (frames, coded))
+    moved = (moved - plain) / ruler.spread
+    axis = torch.linalg.svd(moved, full_matrices=False).Vh[0]
+    ruler.codec.copy_(axis * torch.sign(moved.mean(0) @ axis))
+
+
+def _numbers(ruler: GelEncoder, images: NDArray[np.float16]) -> Tensor:
+    """Prepared residuals (n, h, w, 3) to the ruler's numbers (n, dim), in batches."""
+    parts = np.array_split(images, math.ceil(len(images) / 128))
+    to = ruler.center.device
+    return torch.cat([ruler.numbers(ruler.preprocess(to_unit(x, to))) for x in parts])
+
+
+def _coded(image: Path | Image.Image, rng: np.random.Generator) -> Image.Image:
+    """An image as JPEG of another size and quality holds it."""
+    image = read_image(image) if isinstance(image, Path) else image
+    rows, quality = int(rng.choice(ROWS)), int(rng.integers(*QUALITY))
+    small = image.resize((round(image.width * rows / image.height), rows))
+    with open_image(io.BytesIO(image_bytes(small, "JPEG", quality=quality))) as read:
+        return decoded(read)[0]
