@@ -192,7 +192,8 @@ def test_training_repeats_and_says_what_it_saw(world, trained):
     np.testing.assert_allclose(np.linalg.norm(rows, axis=1), 1, rtol=1e-5)
     raw = embed(data.part(split, "train"), trained, raw=True).features
     np.testing.assert_allclose(raw.mean(0), 0, atol=0.05)
-    np.testing.assert_allclose(raw.std(0), 1, atol=0.05)
+    assert 0.5 < raw.std(0).max() < 1.05
+    np.testing.assert_allclose(raw @ trained.tactile.codec.numpy(), 0, atol=0.01)
 
 
 def test_touches_alone_teach_and_own_frames_are_refused(world, trained, tmp_path):
