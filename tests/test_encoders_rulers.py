@@ -134,6 +134,11 @@ def test_sets_that_stand_for_no_real_image_take_the_same_kind(tmp_path):
     assert {*files(r), *files(g)} == {None}
     recorded = touches(tmp_path / "x", 5, background=lambda k: "gel.png")
     assert with_gels(recorded, [other], tmp_path / "gels")[0] == "no contact"  # one gel for all
+    # What a set states of itself goes before what the real images of its ids have.
+    elsewhere = touches(tmp_path / "y", 3, seed=2, background=lambda k: "gel.png")
+    kind, (r, g) = with_gels(recorded, [elsewhere], tmp_path / "gels")
+    assert {*elsewhere.ids} <= {*recorded.ids}
+    assert (kind, {*files(g)}) == ("no contact", {str(tmp_path / "y" / "gel.png")})
     # One object touched often is no background of its touches.
     same = touches(tmp_path / "s", 48, object=lambda k: "one")
     assert with_gels(same, [], tmp_path / "gels")[0] == "low-pass"

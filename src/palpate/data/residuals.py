@@ -16,8 +16,8 @@ measured on held-out real videos (the ruler's accuracy, and TMMD's power at five
 
 Never the raw image, by which another gel or lamp outweighs every contact. All sets that are
 compared take the same kind: of unequal kinds 58 to 100 % of equal sets differ at p < .05. A
-generated image takes what the real image of its id takes; by a median of
-their own, equal images would have no residual.
+generated image takes the no-contact image that its own set states, else what the real image of its
+id takes; by a median of their own, equal images would have no residual.
 """
 
 from __future__ import annotations
@@ -119,7 +119,7 @@ def with_gels(
     Args:
         reference: real images.
         sets: what is compared with it, all with image files; images of the reference's ids take
-            its backgrounds.
+            its backgrounds, unless the set states no-contact images itself.
         folder: for medians, as PNG files.
         real: numbers of the sets that are real images, too, which take their own backgrounds.
 
@@ -134,11 +134,10 @@ def with_gels(
         gels = _gels(reference, kind, folder)
         columns = [gels]
         for k, part in enumerate(sets):
-            own = _gels(part, kind, folder) if k in real or kind == "no contact" else []
-            lent = _lent(part, reference, gels, own)
-            if k in real:
-                lent = [mine or other for mine, other in zip(own, lent, strict=True)]
-            columns.append(lent)
+            columns.append(_lent(part, reference, gels))
+            if k in real or kind == "no contact":  # its own, where it says it
+                own = _gels(part, kind, folder)
+                columns[-1] = [mine or lent for mine, lent in zip(own, columns[-1], strict=True)]
         if all(map(_complete, parts, columns)):
             break
     else:
@@ -165,13 +164,9 @@ def _complete(part: Manifest, gels: Sequence[str | None]) -> bool:
     return all(gel or not image for gel, image in zip(gels, images, strict=True))
 
 
-def _lent(
-    part: Manifest, reference: Manifest, gels: Sequence[str | None], own: list[str | None]
-) -> list[str | None]:
-    """The backgrounds of a set: the reference's by id, the only one there is, or its own."""
+def _lent(part: Manifest, reference: Manifest, gels: Sequence[str | None]) -> list[str | None]:
+    """The backgrounds of a set: the reference's by id, or the only one there is."""
     by_id = dict(zip(reference.ids, gels, strict=True))
-    if own and _complete(part, own) and {*part.ids}.isdisjoint(by_id):
-        return own
     only = gels[0] if len({*gels}) == 1 else None
     return [by_id.get(name, only) for name in part.ids]
 

@@ -20,6 +20,7 @@ import math
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import polars as pl
@@ -402,7 +403,7 @@ def standardize(ruler: GelEncoder, touches: Touches, train: Manifest, seed: int)
     ruler.codec.copy_(axis * torch.sign(moved.mean(0) @ axis))
 
 
-def _numbers(ruler: GelEncoder, images: NDArray[np.float16]) -> Tensor:
+def _numbers(ruler: GelEncoder, images: NDArray[Any]) -> Tensor:
     """Prepared residuals (n, h, w, 3) to the ruler's numbers (n, dim), in batches."""
     parts = np.array_split(images, math.ceil(len(images) / 128))
     to = ruler.center.device

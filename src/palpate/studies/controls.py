@@ -35,7 +35,7 @@ from palpate.encoders.embed import embed
 from palpate.encoders.encoder_set import EncoderSet, load_clip
 from palpate.evaluation.controls import matched_rows
 from palpate.studies.graph import Work
-from palpate.studies.methods import Images, Make, Setting
+from palpate.studies.methods import Images, Make, Rows, Setting
 from palpate.studies.names import CEILING, EMPTY, FLOOR, MEAN, MEMORIZED, NEAREST, ONE, WRONG
 
 
@@ -46,20 +46,19 @@ def _columns(setting: Setting, name: str) -> tuple[NDArray[Any], NDArray[Any]]:
     return train, test
 
 
-def _matched(setting: Setting, wanted: Sequence[str] | None = None) -> Images | None:
+def _matched(setting: Setting, wanted: Sequence[str] | None = None) -> Rows | None:
     """Whole train videos of the materials of the test videos, or of those that are wanted."""
     (materials, own), (videos, video) = (_columns(setting, c) for c in ("material", "video"))
     test = own if wanted is None else wanted, video
-    rows = matched_rows((materials, videos), test, setting.seed)
-    return None if rows is None else setting.pixels(setting.train)[rows]
+    return matched_rows((materials, videos), test, setting.seed)
 
 
-def other_videos(setting: Setting) -> Images | None:
+def other_videos(setting: Setting) -> Rows | None:
     """Whole train videos in the place of the test videos; None if train lacks a material."""
     return _matched(setting)
 
 
-def wrong_material(setting: Setting) -> Images | None:
+def wrong_material(setting: Setting) -> Rows | None:
     """Whole train videos of another material than the test video's; None without two materials."""
     materials, own = _columns(setting, "material")
     names = sorted({*materials} - {""})
@@ -83,11 +82,10 @@ def mean_image(setting: Setting) -> Images:
     return np.broadcast_to(mean, (len(setting.test), *mean.shape))
 
 
-def nearest_photo(setting: Setting) -> Images:
+def nearest_photo(setting: Setting) -> Rows:
     """The real tactile images of the train photos most similar to the test photos."""
     encoders = load_clip(setting.clip, device=setting.work.device)
-    rows = nearest_rows(setting.train, setting.test, encoders, setting.work)
-    return setting.pixels(setting.train)[rows]
+    return nearest_rows(setting.train, setting.test, encoders, setting.work)
 
 
 def nearest_rows(
@@ -115,14 +113,13 @@ def reconstruction(setting: Setting) -> Images:
     return model.decode(model.encode(real))
 
 
-def one_image(setting: Setting) -> Images:
+def one_image(setting: Setting) -> Rows:
     """One real train image, for all."""
     row = int(rng_for(setting.seed, "control", "one").integers(len(setting.train)))
-    image = setting.pixels(setting.train)[row]
-    return np.broadcast_to(image, (len(setting.test), *image.shape))
+    return np.full(len(setting.test), row)
 
 
-def memorized(setting: Setting) -> Images | None:
+def memorized(setting: Setting) -> Rows | None:
     """Images of one train video of the sample's material; None if train lacks a material."""
     (materials, material), (videos, video) = (_columns(setting, c) for c in ("material", "video"))
     frames: dict[str, NDArray[np.intp]] = {}
@@ -137,7 +134,7 @@ def memorized(setting: Setting) -> Images | None:
     for i, m in zip(setting.test.ids, material, strict=True):
         rng = rng_for(setting.seed, "control", "memorized", i)
         rows.append(int(rng.choice(frames[m])))
-    return setting.pixels(setting.train)[rows]
+    return np.array(rows)
 
 
 def _drawn(rng: np.random.Generator, names: Sequence[str]) -> str:

@@ -260,8 +260,10 @@ def score_images(work: Work, *, seed: int, size: int) -> Facts:
     encoders = EncoderSet.load(work.after["encoders"] / "encoders")
     train, test = manifest.part(split, "train"), manifest.part(split, "test")
     rows = nearest_rows(train, test, encoders, work)
-    images = cached_images(train, "tactile", size, work.cache)
-    write_images(work.folder / "nearest", test.ids, images[rows])
+    images = cached_images(train, "tactile", size, work.cache)[rows]
+    told = not train.table["background"].null_count()
+    gels = cached_images(train, "background", size, work.cache)[rows] if told else None
+    write_images(work.folder / "nearest", test.ids, images, gels)
     results = score(
         [work.after["generated"] / "images", work.folder / "nearest"],
         manifest,

@@ -43,15 +43,25 @@ def splits_of(work: Work) -> tuple[Manifest, dict[str, Split]]:
     return manifest, {ORIG: data_of(work, ORIG)[1], NOLEAK: noleak}
 
 
-def write_images(folder: Path, ids: Sequence[str], images: NDArray[np.uint8]) -> None:
+def write_images(
+    folder: Path,
+    ids: Sequence[str],
+    images: NDArray[np.uint8],
+    gels: NDArray[np.uint8] | None = None,
+) -> None:
     """Write images (n, h, w, 3) as PNGs, and a manifest with the n ids of their samples.
 
-    :func:`palpate.score` reads such a folder as generated images.
+    :func:`palpate.score` reads such a folder as generated images. ``gels`` are their no-contact
+    images, where these are not those of the samples.
     """
     folder.mkdir(exist_ok=True)
     rows = [{"id": sample, "tactile": f"{k}.png"} for k, sample in enumerate(ids)]
     for row, image in zip(rows, images, strict=True):
         save_image(folder / row["tactile"], np.asarray(image))
+    files: dict[bytes, str] = {}
+    for row, gel in zip(rows, () if gels is None else gels, strict=gels is not None):
+        row["background"] = files.setdefault(gel.tobytes(), f"gel {len(files)}.png")
+        save_image(folder / row["background"], gel)
     Manifest.from_rows(rows, folder).save(folder / "manifest.parquet")
 
 

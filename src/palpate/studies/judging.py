@@ -125,9 +125,10 @@ def judge_images(
     images = {n: load_images(image_files(f, test.ids), size) for n, f in folders.items()}
     real = load_images(test.paths("tactile"), size)
     features = embed(test, judge, "tactile", cache=work.cache, still=True)
-    empty = load_images(test.paths("background"), size) if gels else None
+    empty = {n: _gels_of(f, test, size) if gels else None for n, f in folders.items()}
     embedded = {
-        n: replace(features, features=embed_images(x, judge, gels=empty)) for n, x in images.items()
+        n: replace(features, features=embed_images(x, judge, gels=empty[n]))
+        for n, x in images.items()
     }
     scores = [s for s in scores if _compares(s, methods)]
     if NEAREST in embedded and features.labels is not None:
@@ -163,6 +164,14 @@ def image_files(folder: Path, ids: Sequence[str]) -> list[Path]:
         generated = Generated.load(folder)
         return [generated.path(i) for i in ids]
     return Manifest.load(folder).take(ids).paths("tactile")
+
+
+def _gels_of(folder: Path, test: Manifest, size: int) -> NDArray[np.uint8]:
+    """The no-contact images (n, size, size, 3) of a folder's own, else of the samples."""
+    if not (folder / "index.json").is_file():
+        own = Manifest.load(folder).take(test.ids)
+        test = test if own.table["background"].null_count() else own
+    return load_images(test.paths("background"), size)
 
 
 def _cross_fitted(

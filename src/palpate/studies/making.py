@@ -37,7 +37,7 @@ from palpate.sim.presets import MINI_SEEDS
 from palpate.sim.writer import write_world
 from palpate.studies.files import cleared, data_of, write_images
 from palpate.studies.graph import Work
-from palpate.studies.methods import Images, Make, Setting
+from palpate.studies.methods import Images, Make, Rows, Setting
 from palpate.studies.names import NOLEAK, ORIG, slug
 from palpate.studies.stages import Facts
 from palpate.training.options import Compute, Precision
@@ -266,8 +266,7 @@ def make_own_images(
     autoencoder = work.after.get(f"autoencoder-{split}")
     autoencoder = autoencoder and autoencoder / "autoencoder"
     setting = Setting(*_parts(*data_of(work, split)), work, size, seed, steps, clip, autoencoder)
-    images = _checked(name, make(setting), setting)
-    write_images(work.folder / "images", setting.test.ids, images)
+    _write(work.folder / "images", name, make(setting), setting)
     return {"images": len(setting.test)}
 
 
@@ -281,9 +280,8 @@ def make_controls(
     written: list[str] = []
     for done, (name, make) in enumerate(controls.items()):
         work.progress("controls", done, len(controls), name)
-        if (images := make(setting)) is not None:
-            images = _checked(name, images, setting)
-            write_images(work.folder / slug(name), setting.test.ids, images)
+        if (made := make(setting)) is not None:
+            _write(work.folder / slug(name), name, made, setting)
             written.append(name)
     return {"controls": written}
 
@@ -303,16 +301,20 @@ def take_images(work: Work, *, split: str, folder: Path, size: int) -> Facts:
     return {"images": len(ids), "digest": samples.image_digest()}
 
 
-def _checked(name: str, images: Images | None, setting: Setting) -> Images:
-    """The images that a function made.
+def _write(folder: Path, name: str, made: Images | Rows | None, setting: Setting) -> None:
+    """Write the images that a function made; real ones of train rows with the gels of these.
 
     Raises:
         PalpateError: if it returned another number of images, or another kind of array.
     """
-    images = np.asarray(images)
+    images, gels, train = np.asarray(made), None, setting.train
+    if images.ndim == 1 and images.dtype.kind == "i":
+        if not train.table["background"].null_count():
+            gels = setting.pixels(train, "background")[images]
+        images = setting.pixels(train)[images]
     shape = (len(setting.test), setting.size, setting.size, 3)
     must = f"{name} must make an array {shape} of uint8, an image a test sample"
     fits = images.shape == shape and images.dtype == np.uint8
     got = f"{images.shape} of {images.dtype}"
     require(fits, None, must, got, fix="Change its function")
-    return images
+    write_images(folder, setting.test.ids, images, gels)

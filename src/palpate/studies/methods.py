@@ -7,7 +7,7 @@ row, or a function that makes images (``Method.make``).
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -26,6 +26,7 @@ from palpate.studies.graph import Work
 from palpate.studies.names import BACKGROUND, BEST, GVST, OURS, SHIPPED, VQ
 
 Images = NDArray[np.uint8]
+Rows = Sequence[int] | NDArray[np.intp]
 #: Text conditions the training, with nothing that bridges to photos.
 BARE: Mapping[str, Any] = {"source": "text", "gap": "none", "noise": 0.0}
 
@@ -66,9 +67,10 @@ class Setting:
         return cached_images(part, column, self.size, work.cache, work.progress)
 
 
-#: Images (n, size, size, 3) of the samples of ``setting.test``, in their order; a control may be
-#: None where the data do not allow it.
-Make = Callable[[Setting], Images | None]
+#: Images (n, size, size, 3) of the samples of ``setting.test``, in their order, or rows (n,) of
+#: ``setting.train`` whose real images stand for them; a control may be None where the data do not
+#: allow it.
+Make = Callable[[Setting], Images | Rows | None]
 
 
 @dataclass(frozen=True)
