@@ -9,6 +9,7 @@ from itertools import combinations, product
 import numpy as np
 import polars as pl
 import pytest
+from PIL import Image
 
 from forge.commands import call, mistake
 from forge.errors import fails
@@ -16,6 +17,7 @@ from forge.studies import TINY, forge_touch_and_go
 from palpate.cli import main
 from palpate.core import FeatureSet, Measure, Score, Split, digest_file
 from palpate.core.files import canonical_json
+from palpate.data.manifest import Manifest
 from palpate.encoders.models import shipped_folder
 from palpate.preference.scoring import PREFERENCE, STRENGTH
 from palpate.report.results import Results
@@ -24,6 +26,7 @@ from palpate.sim.presets import MINI_SEEDS
 from palpate.studies import collecting, controls, judging, reproduce, stamps, utility
 from palpate.studies.controls import CONTROLS
 from palpate.studies.graph import Work, digests_of
+from palpate.studies.making import write_made
 from palpate.studies.methods import METHODS, Method, Setting
 from palpate.studies.names import (
     FLOOR,
@@ -232,15 +235,8 @@ def setting(small_manifest, tmp_path):
     return Setting(train, test, Work(tmp_path, cache=tmp_path / "cache"), 32, 0, 1, "palpate/mini")
 
 
-def rows_of(setting, images):
-    """The rows of train that images are copies of."""
-    train = setting.pixels(setting.train)
-    return [int(np.flatnonzero((train == image).all(axis=(1, 2, 3)))[0]) for image in images]
-
-
-def of_whole_videos(setting, images):
-    """Materials of these images and of the test samples; whole videos stand for whole videos."""
-    rows = rows_of(setting, images)
+def of_whole_videos(setting, rows):
+    """Materials of train rows and of the test samples; whole videos stand for whole videos."""
     video, own = np.array(setting.train.column("video"))[rows], setting.test.column("video")
     assert len({*zip(video, own, strict=True)}) == len({*own}) == 3
     return np.array(setting.train.column("material"))[rows], setting.test.column("material")
@@ -272,7 +268,7 @@ def test_controls_use_the_material_of_an_image_and_known_ones_alone(setting):
         ("other_videos", "wood"),
         ("wrong_material", "grass"),
     ):
-        rows = rows_of(mixed, getattr(controls, make)(mixed))
+        rows = getattr(controls, make)(mixed)
         assert {known[k] for k in rows} == {material}, make
     lacking = with_materials(setting, known, ["sand"] * 24)
     assert controls.memorized(lacking) is None
@@ -286,7 +282,7 @@ def test_without_materials_none_is_wrong(setting):
 
 
 def test_a_memorized_video_is_one_a_material(setting):
-    rows, own = rows_of(setting, controls.memorized(setting)), setting.test.column("material")
+    rows, own = controls.memorized(setting), setting.test.column("material")
     columns = (np.array(setting.train.column(name))[rows] for name in ("material", "video"))
     material, video = columns
     assert (material == own).all()
@@ -300,7 +296,20 @@ def test_constant_controls(setting):
     assert (mean == mean[0]).all()
     assert (one == one[0]).all()
     assert len(one) == len(setting.test)
-    rows_of(setting, one[:1])  # a train image
+    assert 0 <= one[0] < len(setting.train)
+
+
+def test_train_images_that_stand_for_test_images_keep_their_gels(setting):
+    rows = controls.one_image(setting)
+    make_images = {"one": controls.one_image, "mean": controls.mean_image}
+    for name, make in make_images.items():
+        write_made(setting.work.folder / name, name, make(setting), setting)
+    one, mean = (Manifest.load(setting.work.folder / name) for name in make_images)
+    assert one.ids == mean.ids == setting.test.ids
+    for column in ("tactile", "background"):
+        saved = np.asarray(Image.open(one.paths(column)[-1]))
+        assert (saved == setting.pixels(setting.train, column)[rows[-1]]).all()
+    assert mean.table["background"].null_count() == len(mean)
 
 
 def test_the_nearest_photo_by_a_slow_loop(setting):
@@ -312,8 +321,7 @@ def test_the_nearest_photo_by_a_slow_loop(setting):
         embed(part, encoders, "vision").features for part in (setting.train, setting.test)
     )
     slow = [max(range(len(photos)), key=lambda k: float(q @ photos[k])) for q in queries]
-    expected = setting.pixels(setting.train)[slow]
-    assert (controls.nearest_photo(setting) == expected).all()
+    assert (controls.nearest_photo(setting) == slow).all()
 
 
 def forged(subject, metric, value, stage="s", half=0.1, **fields):

@@ -266,7 +266,7 @@ def make_own_images(
     autoencoder = work.after.get(f"autoencoder-{split}")
     autoencoder = autoencoder and autoencoder / "autoencoder"
     setting = Setting(*_parts(*data_of(work, split)), work, size, seed, steps, clip, autoencoder)
-    _write(work.folder / "images", name, make(setting), setting)
+    write_made(work.folder / "images", name, make(setting), setting)
     return {"images": len(setting.test)}
 
 
@@ -281,7 +281,7 @@ def make_controls(
     for done, (name, make) in enumerate(controls.items()):
         work.progress("controls", done, len(controls), name)
         if (made := make(setting)) is not None:
-            _write(work.folder / slug(name), name, made, setting)
+            write_made(work.folder / slug(name), name, made, setting)
             written.append(name)
     return {"controls": written}
 
@@ -301,7 +301,7 @@ def take_images(work: Work, *, split: str, folder: Path, size: int) -> Facts:
     return {"images": len(ids), "digest": samples.image_digest()}
 
 
-def _write(folder: Path, name: str, made: Images | Rows | None, setting: Setting) -> None:
+def write_made(folder: Path, name: str, made: Images | Rows | None, setting: Setting) -> None:
     """Write the images that a function made; real ones of train rows with the gels of these.
 
     Raises:
