@@ -707,12 +707,17 @@ def test_wandb_has_the_settings_and_the_log(tmp_path, monkeypatch):
     assert lines[-1][1]["loss"] == log[-1]["loss"]
 
 
+def test_blocks_that_cannot_be_computed_twice_are_named(tmp_path):
+    compute = Compute(gradient_checkpointing=True)
+    fails("blocks can be computed twice", fit, Net(), loss, N, options(), tmp_path, compute)
+    assert not list(tmp_path.iterdir())
+
+
 @pytest.mark.parametrize(
     ("change", "apart"),
     [
         pytest.param({"compile": True}, 1e-5, marks=pytest.mark.nightly),
         ({"channels_last": True}, 1e-6),
-        ({"gradient_checkpointing": True}, 0),
         ({"tf32": False}, 0),
     ],
 )

@@ -554,9 +554,17 @@ def _tracker(name: Tracker, folder: Path) -> Any:
 
 
 def _checkpoint_blocks(module: nn.Module) -> None:
-    """Switch on gradient checkpointing in the models of transformers and diffusers inside."""
+    """Switch on gradient checkpointing in the models of transformers and diffusers inside.
+
+    Raises:
+        PalpateError: if none of them can do it.
+    """
+    able = ("supports_gradient_checkpointing", "_supports_gradient_checkpointing")
+    parts = [p for p in module.modules() if any(getattr(p, name, False) for name in able)]
+    must, fix = "must go with a model whose blocks can be computed twice", "Leave it out"
+    require(bool(parts), "gradient_checkpointing", must, type(module).__name__, fix=fix)
     calls = ("activation_checkpointing_enable", "gradient_checkpointing_enable")  # 5.23, before
-    for part in module.modules():
+    for part in parts:
         for name in (*calls, "enable_gradient_checkpointing"):
             if hasattr(part, name):
                 getattr(part, name)()
