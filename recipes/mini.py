@@ -426,7 +426,7 @@ class Recipe:
 
     def _worlds(self) -> list[dict[str, Any]]:
         rows: list[dict[str, Any]] = []
-        kept = EncoderSet.load(NAME).clip_card["data"] if self.kept else []
+        kept = load_clip(NAME).clip_card["data"] if self.kept else []
         kept += load_autoencoder(NAME).card["data"] if self.kept else []
         shipped = {row["world"]: row for row in kept}
         for name, o in WORLDS.items():

@@ -56,7 +56,7 @@ from palpate.data.residuals import Residual, with_gels
 from palpate.encoders.courses import facts_of, fitted, require_held_out, require_rows, stamps
 from palpate.encoders.embed import embed, texts_of
 from palpate.encoders.encoder_set import EncoderSet
-from palpate.encoders.gel import GelEncoder
+from palpate.encoders.gel import CODECS, GelEncoder
 from palpate.encoders.losses import LOG_SCALE_START, clamped_scale, info_nce, soft_targets
 from palpate.encoders.models import digest_images, pick_device, to_unit, union
 from palpate.encoders.presets import EncoderPreset, Gel
@@ -78,8 +78,10 @@ FAR = 0.5
 LARGEST = 5.0
 #: Images whose numbers are averaged for center and spread.
 STATISTICS = 4096
-#: Images by which the direction of codecs is found; rows and quality of their JPEG.
-CODED, ROWS, QUALITY = 256, (160, 240, 320), (20, 90)
+#: Images by which the directions of codecs are found; rows and quality of their JPEG.
+CODED, ROWS, QUALITY = 512, (160, 240, 320), (20, 90)
+#: Of the head's fit, as a share of the mean square of what it takes.
+RIDGE = 1e-4
 #: Objects or videos that are held out, at least.
 LEAST_HELD = 3
 #: Recordings that a card lists by name, at most.
@@ -326,7 +328,7 @@ def train_ruler(
         ruler.load_state_dict(old.state_dict())
         ruler.center.zero_()
         ruler.spread.fill_(1)
-        ruler.codec.zero_()
+        ruler.codecs.zero_()
     options = preset.tactile_course.options(len(train), run.seed)
     with agreed():
         require_rows(train, options.batch)
@@ -389,7 +391,10 @@ def held_out(train: Manifest, seed: int) -> tuple[Manifest, Manifest]:
 
 @torch.no_grad()
 def standardize(ruler: GelEncoder, touches: Touches, train: Manifest, seed: int) -> None:
-    """Set center and spread to those of images of the train part, and the direction of codecs."""
+    """Set center and spread to those of images of the train part, and the directions of codecs.
+
+    The head is fitted anew to what they leave.
+    """
     images = touches.rows.images[evenly_spaced(len(train), STATISTICS)]
     numbers = _numbers(ruler, images)
     ruler.center.copy_(numbers.mean(0))
@@ -399,8 +404,12 @@ def standardize(ruler: GelEncoder, touches: Touches, train: Manifest, seed: int)
     coded = [(_coded(image, rng), *gel) for image, *gel in frames]
     plain, moved = (_numbers(ruler, load_images(f, ruler.preprocess)) for f in (frames, coded))
     moved = (moved - plain) / ruler.spread
-    axis = torch.linalg.svd(moved, full_matrices=False).Vh[0]
-    ruler.codec.copy_(axis * torch.sign(moved.mean(0) @ axis))
+    axes = torch.linalg.svd(moved, full_matrices=False).Vh[:CODECS]
+    aims = ruler.head(ruler.normed(ruler.standardized(numbers)))
+    ruler.codecs[: len(axes)] = axes * torch.sign(axes @ moved.mean(0))[:, None]
+    left = ruler.normed(ruler.standardized(numbers)).double()  # leads where the whole led
+    ridge = RIDGE * len(left) * torch.eye(ruler.dim, device=left.device, dtype=left.dtype)
+    ruler.head.weight.copy_(torch.linalg.solve(left.T @ left + ridge, left.T @ aims.double()).T)
 
 
 def _numbers(ruler: GelEncoder, images: NDArray[Any]) -> Tensor:
