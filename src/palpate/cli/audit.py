@@ -161,7 +161,7 @@ def _next_commands(options: Options, audit: Audit) -> list[str]:
     codes = {note.code for note in audit.notes}
     if not audit.leaked_fraction or not joined or "equal-names" in codes:
         return []
-    if audit.groups_in_all and (audit.groups_in_all < 2 or audit.largest_group > MOST):
+    if audit.groups_in_all == 1 or audit.largest_group > MOST:
         return []  # no split can keep these groups whole
     skip = ["--skip-bad"] * options.skip_bad
     source = shlex.join([*map(str, paths), *options.reading.arguments(), *skip])
@@ -177,7 +177,7 @@ def _next_commands(options: Options, audit: Audit) -> list[str]:
     kept = {*rule.get("by", ()), *(rule.get("near") or {}).get("modalities", ())}
     # What takes longer than seconds is offered untried, but for several columns at once.
     small = audit.train_samples + audit.test_samples <= TRIED
-    trial = {"by": columns} if columns and (small or len(columns) > 1) else {}
+    trial: dict[str, Any] = {"by": columns} if columns and (small or columns[1:]) else {}
     if sides and small:
         trial["near"] = "both" if len(sides) == 2 else sides[0]
     if {*columns, *sides} <= kept or (trial and not _works(options, trial)):
