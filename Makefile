@@ -60,8 +60,9 @@ format: $(DEV)   ## rewrite the sources in the project's style
 	$(BIN)/ruff format .
 	$(BIN)/ruff check --fix .
 
-docs: $(DEV)     ## the docs site in site/; a broken link fails
+docs: $(DEV)     ## the docs site in site/, with what commands print now; a broken link fails
 	$(BIN)/python recipes/reference_pages.py
+	$(BIN)/python recipes/printed.py
 	$(BIN)/zensical build --clean --strict
 
 wheel: $(DEV)    ## build the wheel and try it alone in empty environments

@@ -122,6 +122,32 @@ def test_each_claim_on_security_names_its_tests():
     assert re.split(", | AND ", decoders.upper()) == [*IMAGE_FORMATS]
 
 
+def test_printed_answers_are_told_apart_by_words_and_by_more_than_rounding():
+    alike = importlib.import_module("printed").alike
+    assert alike("TMMD  0.70 [-0.5, 1.9]\n", "TMMD 0.71 [-0.52, 1.9]")
+    assert not alike("4 of 8 leak", "5 of 8 leak")
+    assert not alike("leaks", "no leak found")
+
+
+def test_the_first_screen_is_short_and_shows_what_the_audit_prints(tmp_path):
+    printed = importlib.import_module("printed")
+    page = (TOP / "README.md").read_text("utf-8")
+    assert len(page.split()) <= 700
+    blocks = printed.BLOCK.findall(page)
+    assert [b.split()[2] for b in blocks] == ["audit", "score", "generate"]
+    assert page.count("<!-- printed -->") == len(blocks)
+    printed.prepare(tmp_path, quick=True)
+    assert printed.alike(blocks[0], printed.printed(blocks[0], tmp_path))
+
+
+@pytest.mark.nightly
+def test_every_printed_answer_is_current(tmp_path):
+    printed = importlib.import_module("printed")
+    printed.prepare(tmp_path)
+    for page in (TOP / name for name in printed.PAGES):
+        assert printed.update(page, tmp_path) == page.read_text("utf-8"), page
+
+
 def test_links_resolve():
     pages = [TOP / "README.md", TOP / "CONTRIBUTING.md", *(TOP / "docs").rglob("*.md")]
     broken = []
