@@ -422,7 +422,8 @@ def test_images_are_embedded_and_scored_as_their_features(tmp_path, small_manife
     for compared, alone in zip(*both, strict=True):
         s = compared if compared.metric == "TMMD" else alone
         got = scores[label_of(s), "a", "grouped"].value
-        want = s.value and pytest.approx(s.value, rel=1e-6, abs=1e-6)  # None: not defined
+        # Blocks of other sizes round float32 features otherwise. None: not defined.
+        want = s.value and pytest.approx(s.value, rel=1e-5, abs=1e-6)
         assert got == want, label_of(s)
     metrics = {m for m, _, _ in scores}
     pixels = {"SSIM", "MS-SSIM", "contact residual"}
