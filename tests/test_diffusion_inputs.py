@@ -4,6 +4,7 @@ and the patches of a photo.
 
 import json
 from dataclasses import replace
+from functools import partial
 from itertools import pairwise
 
 import numpy as np
@@ -191,3 +192,28 @@ def test_patches_from_training_to_a_saved_pipeline(small_manifest, tmp_path):
     assert not any(np.array_equal(a, b) for a, b in pairwise(images))
     done = generate(first, text="rough", model=again)
     assert np.array_equal(np.stack([np.asarray(i) for i in done.images]), images[1])
+
+
+def test_a_call_takes_the_names_of_diffusers():
+    pipeline = patch_pipeline()
+    two = photos(2, 20)
+    call = partial(pipeline, image=two, prompt="rough", num_inference_steps=2, guidance_scale=2.0)
+    made = call(output_type="np", num_images_per_prompt=2).images
+    assert made.shape == (4, pipeline.size, pipeline.size, 3)
+    assert made.dtype == np.float32
+    assert 0 <= made.min() < made.max() <= 1
+    plain = arrays(call())
+    assert np.array_equal((made[::2] * 255).round(), plain)  # copies follow the first of each
+    assert not np.array_equal(made[0], made[1])
+    tensor = call(output_type="pt").images
+    assert np.array_equal(tensor.permute(0, 2, 3, 1).mul(255).round().numpy(), plain)
+    own = pipeline.generate(two, text="rough", steps=2, guidance=2.0)
+    assert np.array_equal(own, plain)
+    each = call(prompt=["rough", "soft"])
+    assert np.array_equal(arrays(each)[0], plain[0])
+    assert not np.array_equal(arrays(each)[1], plain[1])
+    assert len(pipeline(prompt=["rough", "soft"], num_inference_steps=2).images) == 2
+    draws = [torch.Generator().manual_seed(k) for k in range(4)]
+    assert len(call(generator=draws, num_images_per_prompt=2).images) == 4
+    fails("must be one of", lambda: call(output_type="latent"))
+    fails("whole number from 1", lambda: call(num_images_per_prompt=0))

@@ -2,6 +2,7 @@
 
 import json
 import shutil
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -347,3 +348,32 @@ def test_the_card_says_what_is_known(tmp_path, record, lines):
     card = (tmp_path / "p" / "README.md").read_text()
     for line in [*lines, f"- model: `{pipeline.digest}`", "- autoencoder: `"]:
         assert line in card
+
+
+@pytest.mark.parametrize("kind", ["gray", "rgba", "floats", "tensor", "gray tensor", "PIL RGBA"])
+def test_photos_in_every_form_that_people_have_give_the_same_touch(kind):
+    pipeline = make_pipeline()
+    pixels = photos(1, 20)[0]
+    if "gray" in kind:
+        pixels = np.repeat(pixels[..., :1], 3, axis=2)
+    alpha = np.concatenate([pixels, np.full_like(pixels[..., :1], 255)], axis=2)
+    form = {
+        "gray": pixels[..., 0],
+        "rgba": alpha,
+        "floats": pixels / 255,
+        "tensor": torch.from_numpy(pixels).permute(2, 0, 1).float() / 255,
+        "gray tensor": torch.from_numpy(pixels[..., 0]),
+        "PIL RGBA": Image.fromarray(alpha, "RGBA"),
+    }[kind]
+    plain = arrays(pipeline(pixels, num_inference_steps=2))
+    assert np.array_equal(arrays(pipeline(form, num_inference_steps=2)), plain)
+
+
+def test_four_threads_use_one_pipeline():
+    pipeline = make_pipeline()
+    pipeline.set_progress_bar_config(disable=True)
+    jobs = [(photos(1, 20 + k), 2 + k % 3) for k in range(8)]
+    make = lambda job: arrays(pipeline(job[0], num_inference_steps=job[1]))
+    alone = [make(job) for job in jobs]
+    with ThreadPoolExecutor(4) as pool:
+        assert all(map(np.array_equal, pool.map(make, jobs), alone))

@@ -42,11 +42,12 @@ SIGNATURES = {
         " judge steps seed device compute progress"
     ),
     "validate": "source * format check progress **options",
-    "Encoder.from_pretrained": "source * modality device",
+    "Encoder.from_pretrained": "source * modality device revision",
     "Encoder.encode": "self inputs * backgrounds batch progress",
-    "TactilePipeline.from_pretrained": "source * device",
+    "TactilePipeline.from_pretrained": "source * device revision",
     "TactilePipeline.__call__": (
-        "self photos * text weight ids seed guidance steps gel generator callback_on_step_end"
+        "self image prompt * num_inference_steps guidance_scale generator output_type"
+        " num_images_per_prompt **options"
     ),
     "World.__init__": "self options * cache",
     "Manifest.load": "path root",

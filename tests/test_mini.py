@@ -115,7 +115,7 @@ def test_a_hub_id_works_like_a_folder(mini, tmp_path, monkeypatch):
         "o/generator": shipped_folder("palpate/mini", "generator"),
     }
 
-    def snapshot(name, allow_patterns):
+    def snapshot(name, allow_patterns, **_):
         requested.append((name, tuple(allow_patterns)))
         return str(places[name])
 

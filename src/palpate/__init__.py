@@ -28,12 +28,14 @@ if TYPE_CHECKING:
     from palpate.encoders import Encoder, train_encoder
     from palpate.evaluation import audit, probe, score
     from palpate.leakage import split
+    from palpate.report import Results
     from palpate.sim import World
 
 #: Public name -> the room that holds it.
 _MODULES = {
     "Encoder": "encoders",
     "Manifest": "data",
+    "Results": "report",
     "Score": "core",
     "Split": "core",
     "TactilePipeline": "diffusion",
@@ -54,6 +56,7 @@ _MODULES = {
 __all__ = [
     "Encoder",
     "Manifest",
+    "Results",
     "Score",
     "Split",
     "TactilePipeline",

@@ -17,9 +17,10 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, Unpack
 
 from palpate.core.files import digest_lines, plain, read_record, short, write_text
+from palpate.core.hub import PushOptions, at_revision, fetched_file, push, write_card
 from palpate.core.messages import Note, PalpateError
 from palpate.core.records import from_plain
 from palpate.core.shown import Shown
@@ -28,6 +29,8 @@ PARTS = ("train", "val", "test")
 #: The verdict of an audit by which a split is called NoLeak.
 NO_LEAK = "no leak found"
 FORMAT = "palpate-split/1"
+#: Its name on the hub.
+HUB_FILE = "split.json"
 
 
 @dataclass(frozen=True)
@@ -137,9 +140,32 @@ class Split(Shown):
         lines = json.dumps(data, separators=(",\n ", ": "), ensure_ascii=False, allow_nan=False)
         write_text(Path(path), lines + "\n")  # indented JSON takes ten times as long
 
+    def push_to_hub(self, repo_id: str, **options: Unpack[PushOptions]) -> str:
+        """Put it on the hub as a data set with its card; return the address.
+
+        Args:
+            repo_id: ``owner/name``; made if it is not there; :meth:`load` takes it.
+            options: ``private``, ``revision`` (a branch), ``token``.
+
+        Raises:
+            PalpateError: if the hub is out of reach or rejects it.
+        """
+
+        def write(folder: Path) -> None:
+            self.save(folder / HUB_FILE)
+            use = f"    import palpate as pp\n\n    split = pp.Split.load({repo_id!r})"
+            text = f"{self}\n\nIt holds ids and no images.\n\n{use}"
+            write_card(folder, f"Split {repo_id}", text, ["split"])
+
+        return push(write, repo_id, kind="dataset", **options)
+
     @classmethod
-    def load(cls, path: str | Path | Split) -> Split:
+    def load(cls, path: str | Path | Split, revision: str | None = None) -> Split:
         """Read a split file and check its digest; a split is returned as it is.
+
+        Args:
+            path: the file, or a hub id.
+            revision: branch, tag or commit of a hub id; ``owner/name@revision`` is the same.
 
         Raises:
             PalpateError: if the file is missing, of another format, or was edited.
@@ -150,6 +176,7 @@ class Split(Shown):
             must, got = "must be a split or its file", type(path).__name__
             raise PalpateError(must, got, "E.g. palpate.split(...)", argument="split")
         fix = "Write it again with: palpate split"
+        path = fetched_file(at_revision(path, revision), HUB_FILE, "split", fix)
         try:
             file = from_plain(_File, read_record(Path(path), "split file", form=FORMAT))
             split = cls.from_ids(rule=file.rule, manifest=file.manifest, **file.parts)

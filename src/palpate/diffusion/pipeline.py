@@ -7,6 +7,7 @@ Its folder is described in ``saving``.
 
 from __future__ import annotations
 
+import copy
 import json
 import math
 from collections.abc import Callable, Mapping, Sequence
@@ -21,7 +22,8 @@ from numpy.typing import NDArray
 from PIL import Image
 from torch import Tensor, nn
 
-from palpate.core import PalpateError, digest_json, read_record, require, rng_for
+from palpate.core import PalpateError, digest_json, read_record, require, require_choice, rng_for
+from palpate.core.hub import at_revision
 from palpate.data.images import Preprocess, load_images, read_image, square
 from palpate.diffusion.autoencoder import (
     AnyAutoencoder,
@@ -147,9 +149,58 @@ class TactilePipeline(DiffusionPipeline):
 
     def __call__(
         self,
+        image: Any = None,
+        prompt: str | Sequence[str] | None = None,
+        *,
+        num_inference_steps: int | None = None,
+        guidance_scale: float | None = None,
+        generator: torch.Generator | Sequence[torch.Generator] | None = None,
+        output_type: str = "pil",
+        num_images_per_prompt: int = 1,
+        **options: Any,
+    ) -> ImagePipelineOutput:
+        """Tactile images for photos, under the names that pipelines of diffusers use.
+
+        Args:
+            image: a file or a folder of them, a PIL image, a list of files or PIL images, an array
+                (n, h, w, c) or (h, w, c), or a tensor (n, c, h, w) or (c, h, w), of bytes or of
+                floats in [0, 1], with c of 1, 3 or 4; (h, w) is gray. None: of the prompt alone.
+            prompt: what is felt, for all photos, or one for each.
+            num_inference_steps: of the solver; default: the sampler's.
+            guidance_scale: s; default: the sampler's.
+            generator: of the starting noise instead of seed and ids; one for all, or one per image.
+            output_type: ``pil``; ``np``: float32 (n, size, size, 3); ``pt``: (n, 3, size, size),
+                both in [0, 1].
+            num_images_per_prompt: images of each photo, or prompt, one after the other.
+            options: further ones of :meth:`generate`.
+
+        Returns:
+            The images in ``images``.
+
+        Raises:
+            PalpateError: if a photo is unreadable, a gel is missing, or settings do not fit.
+        """
+        require_choice("output_type", output_type, ("pil", "np", "pt"))
+        arrays = self.generate(
+            image,
+            generator=generator,
+            copies=num_images_per_prompt,
+            **(
+                {"text": prompt, "steps": num_inference_steps, "guidance": guidance_scale} | options
+            ),
+        )
+        if output_type == "pil":
+            return ImagePipelineOutput(images=[Image.fromarray(array) for array in arrays])
+        unit = arrays.astype(np.float32) / 255
+        tensor = torch.from_numpy(unit).permute(0, 3, 1, 2)
+        made: Any = unit if output_type == "np" else tensor
+        return ImagePipelineOutput(images=made)
+
+    def generate(  # noqa: PLR0913 - each is a setting that users name
+        self,
         photos: Any = None,
         *,
-        text: str | None = None,
+        text: str | Sequence[str] | None = None,
         weight: float = 0.5,
         ids: Sequence[str] | None = None,
         seed: int = 0,
@@ -158,13 +209,13 @@ class TactilePipeline(DiffusionPipeline):
         gel: Any = None,
         generator: torch.Generator | Sequence[torch.Generator] | None = None,
         callback_on_step_end: Callable[[Any, int, Tensor, dict[str, Any]], Any] | None = None,
-    ) -> ImagePipelineOutput:
-        """Tactile images for photos, as PIL images in ``images``.
+        copies: int = 1,
+    ) -> NDArray[np.uint8]:
+        """Tactile images (n, size, size, 3), bytes, for photos.
 
         Args:
-            photos: a file or a folder of them, a PIL image, a list of files or PIL images, a uint8
-                array (n, h, w, 3), or a tensor (n, 3, h, w); None: one image of the text alone.
-            text: what is felt; next to photos, for all of them.
+            photos: as ``image`` of :meth:`__call__`; None: one image of each text alone.
+            text: what is felt; next to photos, one for all or one for each.
             weight: with both, the share of the photo where the two take one place.
             ids: one name per photo; with ``seed`` they decide the noise. Default: the file names,
                 and ``"0"``, ``"1"``, ... for images in memory.
@@ -175,7 +226,10 @@ class TactilePipeline(DiffusionPipeline):
             generator: of the starting noise instead of seed and ids; one for all, or one per image.
             callback_on_step_end: called as ``(pipeline, step, timestep, {"latents": ...})`` after
                 each step of each batch; ``latents`` of the dictionary that it returns replace them.
+            copies: images of each photo, one after the other; the first is the one that it has
+                alone.
 
+        Several threads may call one pipeline at a time.
         ``set_progress_bar_config(disable=True)`` turns the progress bar off.
 
         Raises:
@@ -185,20 +239,32 @@ class TactilePipeline(DiffusionPipeline):
         must, fix = "There must be at least one photo, or a text alone", "Pass one of them"
         enough = bool(images) or (photos is None and text is not None)
         require(enough, None, must, "no photo", fix=fix)
+        whole = isinstance(copies, int) and copies >= 1
+        require(whole, "num_images_per_prompt", "must be a whole number from 1 on", copies, 1)
+        texts = [] if text is None else [text] if isinstance(text, str) else list(text)
         if ids is None:
             ids = [i.name if isinstance(i, Path) else str(k) for k, i in enumerate(images)]
-            ids = ids if images else [str(text)]
+            ids = ids if images else list(map(str, texts))
+        ids = [i if k == 0 else f"{i}#{k}" for i in ids for k in range(copies)]
         sampler = self.sampler_with(guidance=guidance, steps=steps)
         if len(ids) == 1:  # not among the copies that fill a batch: a fraction of the time
             sampler = replace(sampler, batch=1)
         ground = None if gel is None else load_images(list_images(gel), self.size)
         if ground is not None and len(ground) == 1:
             ground = np.broadcast_to(ground, (len(ids), *ground.shape[1:]))
-        embedded = self.embed(load_images(images, self.vision_size)) if images else None
-        words = None if text is None else self.embed_text(text)
+        elif ground is not None:
+            ground = np.repeat(ground, copies, axis=0)
+        embedded = words = None
+        if images:
+            photo = self.embed(load_images(images, self.vision_size))
+            embedded = photo.repeat_interleave(copies, dim=0)
+        if texts:
+            words = torch.cat([self.embed_text(each) for each in texts])
+            words = words if len(words) == 1 else words.repeat_interleave(copies, dim=0)
         noise = None if generator is None else self._noise(generator, len(ids))
-        self.scheduler.set_timesteps(sampler.steps)
-        total = math.ceil(len(ids) / sampler.batch) * len(self.scheduler.timesteps)
+        scheduler = copy.deepcopy(self.scheduler)
+        scheduler.set_timesteps(sampler.steps)
+        total = math.ceil(len(ids) / sampler.batch) * len(scheduler.timesteps)
         bars: Any = self.progress_bar  # wrongly typed in diffusers
         with bars(total=total) as bar:
 
@@ -208,7 +274,7 @@ class TactilePipeline(DiffusionPipeline):
                 answer = callback(self, step, t, {"latents": latents}) if callback else None
                 return (answer or {}).get("latents", latents)
 
-            arrays = self.sample(
+            return self.sample(
                 embedded,
                 ids,
                 texts=words,
@@ -219,7 +285,6 @@ class TactilePipeline(DiffusionPipeline):
                 noise=noise,
                 on_step=on_step,
             )
-        return ImagePipelineOutput(images=[Image.fromarray(array) for array in arrays])
 
     def _noise(self, generator: torch.Generator | Sequence[torch.Generator], n: int) -> Tensor:
         """The starting noise of n images, drawn on the generators' own device."""
@@ -329,8 +394,9 @@ class TactilePipeline(DiffusionPipeline):
 
     def evaluations(self, sampler: SamplerOptions) -> int:
         """Rows that the network sees for one image; guidance takes two a step."""
-        self.scheduler.set_timesteps(sampler.steps)
-        scales = [scale_at(t, self.scheduler, sampler) for t in self.scheduler.timesteps]
+        scheduler = copy.deepcopy(self.scheduler)
+        scheduler.set_timesteps(sampler.steps)
+        scales = [scale_at(t, scheduler, sampler) for t in scheduler.timesteps]
         return sum(1 + (scale not in (0.0, 1.0)) for scale in scales)
 
     def embed(self, photos: NDArray[np.uint8]) -> Tensor:
@@ -432,7 +498,8 @@ class TactilePipeline(DiffusionPipeline):
                 ground = code.gel(background)
             else:
                 ground = self.stats.normalize(code.encode(background))
-        options, scheduler = sampler or self.sampler_with(), self.scheduler
+        # Schedulers of diffusers keep where they are; of one pipeline several threads may sample.
+        options, scheduler = sampler or self.sampler_with(), copy.deepcopy(self.scheduler)
         if options.method != self.sampler.method:
             scheduler = build_scheduler(self.schedule, options.method)
         latents = sample(
@@ -518,7 +585,7 @@ class TactilePipeline(DiffusionPipeline):
 
     @classmethod
     def from_pretrained(  # pyright: ignore[reportIncompatibleMethodOverride]
-        cls, source: str | Path, *, device: str = "auto"
+        cls, source: str | Path, *, device: str = "auto", revision: str | None = None
     ) -> TactilePipeline:
         """Read a saved pipeline and check its digest.
 
@@ -526,12 +593,13 @@ class TactilePipeline(DiffusionPipeline):
             source: a shipped name (``palpate/mini``), a folder of ``palpate train generator`` or a
                 hub id.
             device: ``auto``, ``cpu``, ``cuda`` or ``mps``.
+            revision: branch, tag or commit of a hub id; ``owner/name@revision`` is the same.
 
         Raises:
             PalpateError: if the folder is no pipeline, holds or refers to other weights than it
                 says, or the hub is out of reach.
         """
-        folder = find_model(source, "generator", "pipeline", FIX_MODEL)
+        folder = find_model(at_revision(source, revision), "generator", "pipeline", FIX_MODEL)
         note = folder / "palpate.json"
         about = read_record(note, "card of the pipeline", form=FORMAT, keys=KEYS)
         if "shared" in about:

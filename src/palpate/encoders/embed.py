@@ -277,16 +277,23 @@ def list_images(inputs: Any) -> list[Path | Image.Image]:
 
 
 def _bytes(images: Any) -> NDArray[np.uint8]:
-    """An array or tensor as uint8 (n, h, w, 3)."""
-    array = np.asarray(images.detach().cpu() if hasattr(images, "detach") else images)
+    """An array or tensor as uint8 (n, h, w, 3); of four channels the last, alpha, is left out."""
+    tensor = hasattr(images, "detach")
+    array = np.asarray(images.detach().cpu().float() if tensor else images)
     shape = array.shape
+    array = array[..., None] if array.ndim == 2 and not tensor else array
+    array = array[None] if array.ndim == 2 else array
     array = array[None] if array.ndim == 3 else array
-    if hasattr(images, "detach") and array.ndim == 4 and array.shape[1] == 3:
+    if tensor and array.ndim == 4:
         array = array.transpose(0, 2, 3, 1)
-        if array.dtype.kind == "f" and array.size and array.min() >= 0 and array.max() <= 1:
-            array = np.rint(array * 255).astype(np.uint8)
+    if tensor and images.dtype.itemsize == 1:
+        array = array.astype(np.uint8)
+    if array.dtype.kind == "f" and array.size and array.min() >= 0 and array.max() <= 1:
+        array = np.rint(array * 255).astype(np.uint8)
+    if array.ndim == 4 and array.shape[3] in (1, 4):
+        array = array[..., [0, 0, 0] if array.shape[3] == 1 else [0, 1, 2]]
     rgb = array.ndim == 4 and array.shape[3] == 3 and array.dtype == np.uint8
-    must = "must be uint8 (n, h, w, 3), or a tensor (n, 3, h, w) in [0, 1]"
+    must = "must be (n, h, w, c), or a tensor (n, c, h, w), of bytes or of floats in [0, 1]"
     got = f"{array.dtype} of shape {shape}"
     require(rgb, "images", must, got, fix="Scale to 0..255 and round")
     return np.ascontiguousarray(array)

@@ -5,12 +5,13 @@ from __future__ import annotations
 import warnings
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Unpack
 
 import numpy as np
 from numpy.typing import NDArray
 
 from palpate.core import PalpateWarning, Progress, quiet, require, require_choice
+from palpate.core.hub import PushOptions, at_revision, push
 from palpate.data.images import Frames, Preprocess
 from palpate.data.manifest import Manifest
 from palpate.data.residuals import kind_of
@@ -42,7 +43,12 @@ class Encoder:
 
     @classmethod
     def from_pretrained(
-        cls, source: str | Path, *, modality: Modality, device: str = "auto"
+        cls,
+        source: str | Path,
+        *,
+        modality: Modality,
+        device: str = "auto",
+        revision: str | None = None,
     ) -> Encoder:
         """Load one encoder of a saved set.
 
@@ -52,11 +58,25 @@ class Encoder:
                 :meth:`EncoderSet.load`.
             modality: ``vision``, ``text`` or ``tactile``.
             device: ``auto``, ``cpu``, ``cuda`` or ``mps``.
+            revision: branch, tag or commit of a hub id; ``owner/name@revision`` is the same.
 
         Raises:
             PalpateError: if there is no such set, or it has no such encoder.
         """
+        source = at_revision(source, revision)
         return cls(EncoderSet.load(source, device=str(pick_device(device))), modality)
+
+    def push_to_hub(self, repo_id: str, **options: Unpack[PushOptions]) -> str:
+        """Put the whole set on the hub, with its cards; return the address.
+
+        Args:
+            repo_id: ``owner/name``; made if it is not there.
+            options: ``private``, ``revision`` (a branch), ``token``.
+
+        Raises:
+            PalpateError: if the hub is out of reach or rejects it, or the encoder is a public one.
+        """
+        return push(self.encoders.save, repo_id, **options)
 
     @property
     def dim(self) -> int:

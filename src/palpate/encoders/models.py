@@ -29,7 +29,6 @@ import copy
 import hashlib
 import json
 import pickle
-import re
 from collections.abc import Generator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -45,6 +44,7 @@ from safetensors.numpy import load_file, save_file
 
 from palpate.core import PalpateError, content_of, require, require_regular
 from palpate.core.files import canonical_json
+from palpate.core.hub import HUB_ID, fetch
 
 if TYPE_CHECKING:  # names are checked before torch is imported, which takes seconds
     import torch
@@ -71,7 +71,6 @@ FETCH_AGAIN = "Fetch the encoder again"
 Digests = NDArray[np.uint64]
 #: Their file in the folder of an encoder.
 SEEN = "seen.safetensors"
-HUB_ID = re.compile(r"[A-Za-z0-9][\w.-]*/[A-Za-z0-9][\w.-]*")
 #: Raised for an unreachable hub, absent files, foreign formats and pickled objects.
 UNREADABLE = (
     OSError,
@@ -149,7 +148,9 @@ def shipped_folder(name: str | Path, part: Part) -> Path | None:
 
 
 def is_hub_id(name: str | Path) -> bool:
-    """Whether ``name`` is a hub id: a string ``owner/name``, not shipped and no folder here."""
+    """Whether ``name`` is a hub id: a string ``owner/name`` or ``owner/name@revision``, not shipped
+    and no folder here.
+    """
     if not isinstance(name, str) or is_shipped(name):
         return False
     return bool(HUB_ID.fullmatch(name)) and not Path(name).is_dir()
@@ -173,7 +174,7 @@ def find_model(
     if (shipped := shipped_folder(source, part)) is not None:
         return shipped
     if is_hub_id(source):
-        return _of_size(_fetch(str(source), files, role, fix))
+        return _of_size(fetch(str(source), files, role, fix))
     must = f"The {role} must be a folder, one of {', '.join(SHIPPED)}, or a hub id (owner/name)"
     found = str(source) != "" and Path(source).is_dir()
     require(found, None, must, f"no folder {source or repr('')}", fix=fix)
@@ -212,7 +213,7 @@ def find_encoder(source: str | Path) -> tuple[Path, str | None]:
     if str(source) and Path(source).exists() and not is_shipped(source):
         path, sensor = Path(source), ""
     elif colon and is_hub_id(owner):
-        path = _fetch(owner, [file], "encoder", FIX_ENCODERS) / file
+        path = fetch(owner, [file], "encoder", FIX_ENCODERS) / file
     elif Path(name).is_file():
         path = Path(name)
     else:
@@ -236,8 +237,9 @@ def find_single(
     """
     # Small files first: a hub out of reach is queried once, not many times.
     files = (*SMALL_FILES, *(f"{folder}/*.json" for folder in within))
-    folder = find_model(source, part, role, fix, files)
-    return str(source if is_hub_id(source) else folder), folder
+    whole = "@" in str(source)  # a revision: all of it lies in a folder of its own
+    folder = find_model(source, part, role, fix, PATTERNS if whole else files)
+    return str(source if is_hub_id(source) and not whole else folder), folder
 
 
 def stated(folder: Path) -> dict[str, Any]:
@@ -251,18 +253,6 @@ def stated(folder: Path) -> dict[str, Any]:
     terms, sets = head.get("license_name") or head.get("license"), head.get("datasets") or []
     terms, sets = (v if isinstance(v, list) else [v] for v in (terms or "unknown", sets))
     return {"license": ", ".join(map(str, terms)), "trained_on": [str(v) for v in sets if v]}
-
-
-def _fetch(name: str, patterns: Sequence[str], role: str, fix: str) -> Path:
-    from huggingface_hub import snapshot_download
-    from huggingface_hub.utils import disable_progress_bars
-
-    disable_progress_bars()
-    try:
-        return Path(snapshot_download(name, allow_patterns=list(patterns)))
-    except (OSError, ValueError) as error:
-        must = f"The {role} {name} must be a hub id within reach, a local folder or a shipped model"
-        raise PalpateError(must, first_line(error).removeprefix("Got: "), fix) from None
 
 
 def first_line(error: Exception) -> str:

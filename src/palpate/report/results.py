@@ -17,7 +17,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from importlib import import_module
 from pathlib import Path, PurePath
-from typing import TYPE_CHECKING, Any, ClassVar, Self, overload
+from typing import TYPE_CHECKING, Any, ClassVar, Self, Unpack, overload
 
 from palpate.core.files import (
     digest_file,
@@ -28,6 +28,7 @@ from palpate.core.files import (
     reading_entry,
     write_json,
 )
+from palpate.core.hub import PushOptions, at_revision, fetched_file, push, write_card
 from palpate.core.messages import Note, PalpateError, SampleRef
 from palpate.core.records import from_plain
 from palpate.core.score import Score
@@ -51,6 +52,8 @@ if TYPE_CHECKING:
     import polars as pl
 
 RESULTS_FORMAT, AUDIT_FORMAT = "palpate-results/1", "palpate-audit/1"
+#: The name of a file of results on the hub.
+HUB_FILE = "results.json"
 #: Keys of their JSON that are no fields.
 COMMAND_KEYS = ("format", "skipped", "failed")
 #: Rows of the group-by-part matrix that an audit keeps.
@@ -454,13 +457,40 @@ class Results(Document):
             rows.append(row | {"preset": preset, "notes": notes})
         return pl.DataFrame(rows, infer_schema_length=None)
 
+    def push_to_hub(self, repo_id: str, **options: Unpack[PushOptions]) -> str:
+        """Put it on the hub as a data set with its card; return the address.
+
+        Images stay here, and of the paths of inputs the names alone are written.
+
+        Args:
+            repo_id: ``owner/name``; made if it is not there; :meth:`load` takes it.
+            options: ``private``, ``revision`` (a branch), ``token``.
+
+        Raises:
+            PalpateError: if the hub is out of reach or rejects it.
+        """
+        bare = self.with_paths(lambda _: None, lambda name: Path(name).name)
+
+        def write(folder: Path) -> None:
+            write_json(folder / HUB_FILE, bare.to_json())
+            write_card(folder, self.title or repo_id, bare.to_markdown(), ["results"])
+
+        return push(write, repo_id, kind="dataset", **options)
+
     @classmethod
-    def load(cls, path: str | Path) -> Self:
+    def load(cls, path: str | Path, revision: str | None = None) -> Self:
         """Read results from a file, or those of an audit, with paths from the working directory.
+
+        Args:
+            path: the file, or a hub id.
+            revision: branch, tag or commit of a hub id; ``owner/name@revision`` is the same.
 
         Raises:
             PalpateError: if the file is missing, or holds something else.
         """
+        path = fetched_file(
+            at_revision(path, revision), HUB_FILE, "results", "Make some with: palpate score"
+        )
         data = read_record(Path(path), "results file", form=(RESULTS_FORMAT, AUDIT_FORMAT))
         if data["format"] == RESULTS_FORMAT:
             return super().load(path)
