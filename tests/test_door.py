@@ -31,7 +31,7 @@ SIGNATURES = {
     ),
     "score": (
         "generated reference * encoder check_ruler split names labels group background train "
-        "presets sigma normalize companions controls inception clip lpips "
+        "presets sigma normalize companions controls inception clip dinov2 lpips "
         "trust_torchscript permutations seed allow_seen cache progress"
     ),
     "split": ("data * by train val seed folds near noleak cache reading skip_bad progress"),

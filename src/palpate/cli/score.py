@@ -15,7 +15,19 @@ from palpate.core import require
 #: What the word of an option means.
 NORMALIZE = {"check": "check", "yes": True, "no": False}
 Companion = Literal[
-    "fid", "kid", "cmmd", "prdc", "ssim", "psnr", "ms-ssim", "contact", "lpips", "none"
+    "fid",
+    "kid",
+    "cmmd",
+    "prdc",
+    "fd-dinov2",
+    "mind",
+    "vendi",
+    "ssim",
+    "psnr",
+    "ms-ssim",
+    "contact",
+    "lpips",
+    "none",
 ]
 
 
@@ -50,13 +62,15 @@ class Metrics:
     normalize: Literal["check", "yes", "no"] = "check"
     """Embeddings that are not of unit length: stop, divide by the norm, or keep them."""
     companions: tuple[Companion, ...] | None = None
-    """Further metrics. Default: all whose inputs are there; `none` for none."""
+    """Further metrics. Default: all whose inputs are there but `mind` and `vendi`; `none`."""
     inception: Path | None = None
     """TorchScript file of Inception: FID and KID of its features, as published."""
     trust_torchscript: Switch = False
     """Run the code in that file: a program, which runs with your rights and can write files."""
     clip: str | None = None
     """Folder or hub id of a CLIP: CMMD of its features, as published."""
+    dinov2: str | None = None
+    """Folder or hub id of a DINOv2: FD-DINOv2, as published."""
     lpips: Annotated[tuple[Path, Path] | None, tyro.conf.arg(metavar="BACKBONE HEADS")] = None
     """The two files of LPIPS: AlexNet's weights and the heads."""
     permutations: int = 999

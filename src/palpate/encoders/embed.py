@@ -34,7 +34,7 @@ from palpate.core import (
 from palpate.data.captions import NAMED, caption
 from palpate.data.images import REFETCH, Frames, image_stamp, images_below, load_images
 from palpate.data.residuals import kind_of
-from palpate.encoders.encoder_set import MODALITIES, EncoderSet, Modality
+from palpate.encoders.encoder_set import MODALITIES, EncoderSet, Modality, vision_state
 from palpate.encoders.models import to_unit
 
 if TYPE_CHECKING:
@@ -81,7 +81,7 @@ def embed(
         groups: column to carry along as groups; one without any value gives None.
         cache: folder for ``<modality>-<key>.npz``; None computes anew.
         still: take each image alone, also for encoders that look at an earlier frame, too.
-        raw: leave the numbers of a ruler as they are, not of length 1.
+        raw: leave the numbers of a ruler, or of a vision encoder, as they are, not of length 1.
         batch: images at a time; changes the result by rounding only (1e-5).
         progress: called with the number of samples done.
 
@@ -236,7 +236,10 @@ def _embedded(
         if not problems:
             with exact():
                 pixels = preprocess(to_unit(images, encoders.device))
-                part = encoders.encode(modality, pixels, sensors and sensors[rows])
+                if raw and modality == "vision":
+                    part = vision_state(encoders.clip, pixels)
+                else:
+                    part = encoders.encode(modality, pixels, sensors and sensors[rows])
                 if preprocess.residual and not raw:
                     part = normalize(part, dim=-1)
             features[rows] = part.float().cpu().numpy()

@@ -576,7 +576,7 @@ def tokens(model: Any, tokenizer: Any, texts: Sequence[str]) -> dict[str, Tensor
 
 def encode_text(model: Any, tokenizer: Any, texts: Sequence[str]) -> Tensor:
     """Texts to (n, dim), L2-normalized; differentiable."""
-    return _projected(model.get_text_features(**tokens(model, tokenizer, texts)))
+    return normalize(_projected(model.get_text_features(**tokens(model, tokenizer, texts))), dim=-1)
 
 
 def encode_vision(model: Any, pixels: Tensor) -> Tensor:
@@ -584,6 +584,11 @@ def encode_vision(model: Any, pixels: Tensor) -> Tensor:
 
     Of a DINO, which has no projection, its class token.
     """
+    return normalize(vision_state(model, pixels), dim=-1)
+
+
+def vision_state(model: Any, pixels: Tensor) -> Tensor:
+    """As :func:`encode_vision`, of whatever length."""
     encode = getattr(model, "get_image_features", model)
     return _projected(encode(**_inputs(model, pixels)))
 
@@ -605,7 +610,7 @@ def _inputs(model: Any, pixels: Tensor) -> dict[str, Tensor]:
 
 def _projected(output: Any) -> Tensor:
     """The projected features: a tensor in transformers 4, the field ``pooler_output`` in 5."""
-    return normalize(output if isinstance(output, Tensor) else output.pooler_output, dim=-1)
+    return output if isinstance(output, Tensor) else output.pooler_output
 
 
 def _tokenizer_digest(tokenizer: Any) -> str:

@@ -7,6 +7,9 @@ name           needs      score
 =============  =========  ================================================================
 ``fid``        features   Frechet distance, of Inception's features if its weights are given
 ``kid``        features   MMD^2 with the kernel (x.y / d + 1)^3, as ``fid``
+``fd-dinov2``  images     as ``fid``, of a DINOv2's class tokens; needs weights
+``mind``       features   sliced Wasserstein distance, as ``fid``
+``vendi``      features   effective number of different samples
 ``prdc``       features   precision, recall, density and coverage of nearest neighbors
 ``cmmd``       features   biased MMD^2, of CLIP's features if a CLIP is given
 ``ssim``       pairs      structural similarity
@@ -17,6 +20,7 @@ name           needs      score
 ``lpips``      pairs      LPIPS; needs weights
 =============  =========  ================================================================
 
+``mind``, ``vendi`` and what needs weights are computed where they are requested, or weights given.
 "Pairs" are a generated and a real image of one id.
 """
 
@@ -32,7 +36,7 @@ import numpy as np
 import polars as pl
 from numpy.typing import NDArray
 
-from palpate.core import FeatureSet, Note, PalpateError, Progress, Score
+from palpate.core import FeatureSet, Note, PalpateError, Progress, Score, require
 from palpate.data.samples import Samples
 from palpate.evaluation.controls import matched_features
 from palpate.metrics.contact import contact_per_image
@@ -42,6 +46,7 @@ from palpate.metrics.kernels import Polynomial
 from palpate.metrics.mmd import Preset
 from palpate.metrics.motion import marker_per_image
 from palpate.metrics.paired import Comparison, compare, compare_tmmd, mean_differences
+from palpate.metrics.sets import compare_mind, compare_vendi
 from palpate.metrics.tactile import tmmd
 from palpate.report.labels import measured
 
@@ -51,13 +56,30 @@ if TYPE_CHECKING:
     from palpate.evaluation.ruling import Ruled
 
 Images = NDArray[np.uint8]
-Name = Literal["fid", "kid", "prdc", "cmmd", "ssim", "psnr", "ms-ssim", "contact", "lpips"]
+Name = Literal[
+    "fid",
+    "kid",
+    "prdc",
+    "cmmd",
+    "fd-dinov2",
+    "mind",
+    "vendi",
+    "ssim",
+    "psnr",
+    "ms-ssim",
+    "contact",
+    "lpips",
+]
+#: Metrics of features that nobody gets who does not request them, or give their weights.
+REQUESTED = ("cmmd", "fd-dinov2", "mind", "vendi")
 #: With more rows, what forms all pairs must be requested by name.
 MANY = 50_000
 #: Bandwidth of the paper; scores name any other one as their kernel where several are requested.
 SIGMA = 10.0
 #: The CLIP of published CMMD (arXiv 2401.09603).
 CMMD_CLIP = "openai/clip-vit-large-patch14-336"
+#: The DINOv2 of published FD-DINOv2 (arXiv 2306.04675).
+FIX_DINOV2 = "Pass dinov2, a folder or hub id. Fetch one with: hf download facebook/dinov2-large"
 #: The ruler of a second opinion (:mod:`palpate.encoders.rulers`).
 HANDCRAFTED = "palpate/handcrafted"
 #: Name of the reference in tables and errors.
@@ -66,7 +88,8 @@ REFERENCE = "reference"
 
 @dataclass(frozen=True, kw_only=True)
 class Weights:
-    """Weights that palpate does not ship: Inception (TorchScript), a CLIP, LPIPS (two files).
+    """Weights that palpate does not ship: Inception (TorchScript), a CLIP, a DINOv2, LPIPS (two
+    files).
 
     Raises:
         PalpateError: if the code of Inception's file is not trusted.
@@ -74,6 +97,7 @@ class Weights:
 
     inception: Path | str | None = None
     clip: Path | str | None = None
+    dinov2: Path | str | None = None
     lpips: tuple[str | Path, str | Path] | None = None
     trust_torchscript: bool = False
 
@@ -86,12 +110,18 @@ class Weights:
     @property
     def companions(self) -> list[Name]:
         """What is computed as published with these weights, but for KID."""
-        files: dict[Name, object] = {"fid": self.inception, "cmmd": self.clip, "lpips": self.lpips}
+        files: dict[Name, object] = {
+            "fid": self.inception,
+            "cmmd": self.clip,
+            "fd-dinov2": self.dinov2,
+            "lpips": self.lpips,
+        }
         return [name for name, weights in files.items() if weights is not None]
 
     def of(self, companion: str) -> Path | str | None:
         """Those of the standard encoder of a companion on features."""
-        return {"fid": self.inception, "kid": self.inception, "cmmd": self.clip}.get(companion)
+        files = {**dict.fromkeys(("fid", "kid", "mind"), self.inception), "cmmd": self.clip}
+        return {**files, "fd-dinov2": self.dinov2}.get(companion)
 
 
 @dataclass(frozen=True)
@@ -268,6 +298,20 @@ class Bench:
         embed = partial(embed_images, encoders=clip, modality="vision")
         return self._standard("CLIP", clip.digest("vision"), embed)
 
+    @cached_property
+    def dinov2(self) -> Sets:
+        """Class tokens of everything by a DINOv2, of whatever length."""
+        from palpate.encoders.embed import embed_images
+        from palpate.encoders.encoder_set import family_of, load_clip
+
+        source = str(self.weights.dinov2)
+        dino = load_clip(source)
+        family = family_of(dino.clip)
+        must = f"{source} must be a DINOv2 of transformers"
+        require(family.startswith("dinov2"), None, must, family, fix=FIX_DINOV2)
+        embed = partial(embed_images, encoders=dino, modality="vision", raw=True)
+        return self._standard("DINOv2", dino.digest("vision"), embed)
+
     def _standard(self, name: str, digest: str, embed: Callable[..., NDArray[Any]]) -> Sets:
         sets = {
             n: s.feature_set(embed(self.pictures[n], progress=self.progress), digest)
@@ -279,7 +323,8 @@ class Bench:
         """The features that a companion compares."""
         if self.weights.of(companion) is None:
             return self.tactile
-        return self.clip if companion == "cmmd" else self.inception
+        others = {"cmmd": "clip", "fd-dinov2": "dinov2"}
+        return getattr(self, others.get(companion, "inception"))
 
     @cached_property
     def size(self) -> int:
@@ -350,10 +395,10 @@ def choose(
         PalpateError: for an unknown name, or a companion whose inputs are not there.
     """
     able = {name: encoder or weights.of(name) is not None for name in FEATURES}
-    able |= dict.fromkeys(PAIRS, images)
+    able |= dict.fromkeys(PAIRS, images) | {"fd-dinov2": images and weights.dinov2 is not None}
     able |= {"contact": images and background, "lpips": images and weights.lpips is not None}
     if requested is None:
-        return [n for n in able if able[n] and (n != "cmmd" or weights.clip is not None)]
+        return [n for n in able if able[n] and (n not in REQUESTED or n in weights.companions)]
     if lacking := next((name for name in requested if not able.get(name)), None):
         raise _lacking(lacking, images=images)
     return [name for name in able if name in requested]
@@ -376,6 +421,9 @@ def _lacking(name: str, *, images: bool) -> PalpateError:
         from palpate.encoders.perceptual import FIX
 
         return PalpateError("must hold the two files of LPIPS", "none", FIX, argument="lpips")
+    if name == "fd-dinov2":
+        must = "must hold a DINOv2, and images to embed"
+        return PalpateError(must, "none" if images else "embeddings", FIX_DINOV2, argument="dinov2")
     fix = "Pass an encoder"
     if name == "cmmd":
         fix += f", or weights of clip. Fetch one with: hf download {CMMD_CLIP}"
@@ -601,6 +649,9 @@ FEATURES: Mapping[str, Callable[[Bench, Sets], list[Score]]] = {
     "kid": _kid,
     "prdc": _prdc,
     "cmmd": _cmmd,
+    "fd-dinov2": partial(_compared, metric="FD", compared=compare_fid),
+    "mind": partial(_compared, metric="MIND", compared=compare_mind),
+    "vendi": partial(_compared, metric="Vendi", compared=compare_vendi),
 }
 PAIRS: Mapping[str, Callable[[Bench, Mapping[str, Images]], list[Score]]] = {
     "ssim": partial(_mean_of_pairs, metric="SSIM"),

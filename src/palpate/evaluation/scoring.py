@@ -83,6 +83,7 @@ def score(  # noqa: PLR0913
     controls: bool = True,
     inception: str | Path | None = None,
     clip: str | Path | None = None,
+    dinov2: str | Path | None = None,
     lpips: tuple[str | Path, str | Path] | None = None,
     trust_torchscript: bool = False,
     permutations: int = 999,
@@ -132,6 +133,7 @@ def score(  # noqa: PLR0913
         controls: whether a split scores its controls.
         inception: TorchScript file of Inception, for FID and KID as published. It is a program.
         clip: folder or hub id of a CLIP, for CMMD as published.
+        dinov2: folder or hub id of a DINOv2, for FD-DINOv2 as published.
         lpips: the two files of LPIPS: AlexNet's weights and the heads.
         trust_torchscript: run the code in the file of Inception, with the rights of this process.
         permutations: relabelings of the permutation test of TMMD; 0 for none.
@@ -162,7 +164,8 @@ def score(  # noqa: PLR0913
     reserved = (REFERENCE,) if split is None else (REFERENCE, BACKGROUND, SAME_MATERIAL, REAL)
     sources = named_sources(generated, names, reserved)
     real = read_samples(reference, REFERENCE)
-    images, files = not real.embedded, {"inception": inception, "clip": clip, "lpips": lpips}
+    files = {"inception": inception, "clip": clip, "dinov2": dinov2, "lpips": lpips}
+    images = not real.embedded
     of_images = {"encoder": encoder, "cache": cache, "background": background, **files}
     for name, value in of_images.items():
         usable = images or value is None
@@ -176,7 +179,11 @@ def score(  # noqa: PLR0913
         reference=real if background is None else replace(real, gel=one_image(background)),
         seen=None if train is None else read_samples(train, "train"),
         weights=Weights(
-            inception=inception, clip=clip, lpips=lpips, trust_torchscript=trust_torchscript
+            inception=inception,
+            clip=clip,
+            dinov2=dinov2,
+            lpips=lpips,
+            trust_torchscript=trust_torchscript,
         ),
         presets=tuple(dict.fromkeys(presets or ())),
         sigmas=tuple(dict.fromkeys(sigmas)),

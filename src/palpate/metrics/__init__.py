@@ -1,6 +1,7 @@
 """Metrics of generated tactile images: arrays or tensors in, :class:`palpate.core.Score` out.
 
-On features of an encoder: the TMMD family, KID, CMMD, FID, precision, recall, density and coverage.
+On features of an encoder: the TMMD family, KID, CMMD, FID, precision, recall, density and coverage,
+Vendi, MIND.
 On pairs of images: SSIM, PSNR and MS-SSIM; residual, SSIM and IoU of the contact alone; motion of
 the markers.
 Of a contact itself: ``metrics.conditions`` (place, area, strength, shear), ``metrics.markers``.
@@ -14,6 +15,7 @@ from palpate.metrics.kernels import Gaussian, Polynomial
 from palpate.metrics.mmd import PRESETS, Options
 from palpate.metrics.motion import marker_scores
 from palpate.metrics.paired import Comparison, compare, compare_tmmd, four_scores
+from palpate.metrics.sets import compare_mind, compare_vendi, mind, vendi
 from palpate.metrics.streaming import TMMD, distance
 from palpate.metrics.tactile import ci_tmmd, cmmd, d_tmmd, i_tmmd, kid, tmmd
 
@@ -30,7 +32,9 @@ __all__ = [
     "cmmd",
     "compare",
     "compare_fid",
+    "compare_mind",
     "compare_tmmd",
+    "compare_vendi",
     "contact_mask",
     "contact_scores",
     "d_tmmd",
@@ -40,6 +44,7 @@ __all__ = [
     "i_tmmd",
     "kid",
     "marker_scores",
+    "mind",
     "ms_ssim",
     "per_image",
     "prdc",
@@ -47,4 +52,5 @@ __all__ = [
     "require_same_ids",
     "ssim",
     "tmmd",
+    "vendi",
 ]

@@ -144,10 +144,10 @@ def _fid(
 ) -> Scored:
     """FID, and its value without each block."""
     checked_whole(0, seed=seed)
-    x, y, groups, notes = _rows(generated, reference, 2)
+    x, y, groups, notes = checked_rows(generated, reference, 2)
     means = [v.mean(axis=0, dtype=np.float64) for v in (x, y)]
     center, delta = (means[0] + means[1]) / 2, means[0] - means[1]
-    blocks, units = _draw_blocks(len(x), len(y), groups, seed), list[str]()
+    blocks, units = draw_blocks(len(x), len(y), groups, seed), list[str]()
     sets = ((x, blocks.x), (y, blocks.y))
     if min(len(v) - np.bincount(at).max() for v, at in sets) > 1:
         units = list(blocks.names)
@@ -238,7 +238,7 @@ def _distance(a: Normal, b: Normal) -> float:
     return max(float(delta @ delta + sum(traces) - 2 * np.sum(roots)), 0.0)
 
 
-class _Blocks(NamedTuple):
+class Blocks(NamedTuple):
     """What the jackknife leaves out: the block of every row of both sets, by number."""
 
     x: Index
@@ -248,7 +248,7 @@ class _Blocks(NamedTuple):
     tail: str = ""
 
 
-def _rows(
+def checked_rows(
     generated: FeatureSet, reference: FeatureSet, least: int
 ) -> tuple[Array, Array, list[list[str] | None], list[Note]]:
     """Both sets of rows and of groups, checked, and a note of copies."""
@@ -260,7 +260,7 @@ def _rows(
     return x, y, groups, [Note("copied-rows", {"count": copies, "n": len(x)})] * bool(copies)
 
 
-def _draw_blocks(n: int, m: int, groups: Sequence[list[str] | None], seed: int) -> _Blocks:
+def draw_blocks(n: int, m: int, groups: Sequence[list[str] | None], seed: int) -> Blocks:
     """Groups, or rows where a set has no groups, in at most :data:`BLOCKS` blocks."""
     rng = rng_for(seed, "fid blocks")
     if groups[0] is None or groups[1] is None:
@@ -272,7 +272,7 @@ def _draw_blocks(n: int, m: int, groups: Sequence[list[str] | None], seed: int) 
         x, y, units, unit = of_row[:n], of_row[n:], len(names), "group"
         if units <= BLOCKS:
             details = {"units": units, "unit": unit, "left_out": "group"}
-            return _Blocks(x, y, names.tolist(), details)
+            return Blocks(x, y, names.tolist(), details)
         # the largest group first into the block that has least, ties at random: nearly equal sizes
         size = np.bincount(x, minlength=units) / n + np.bincount(y, minlength=units) / m
         order, load, block = rng.permutation(units), np.zeros(BLOCKS), np.zeros(units, np.intp)
@@ -282,7 +282,7 @@ def _draw_blocks(n: int, m: int, groups: Sequence[list[str] | None], seed: int) 
         x, y, count, members = block[x], block[y], BLOCKS, f"whole groups ({units} groups)"
     details = {"units": units, "unit": unit, "left_out": "block"}
     tail = f", random blocks of {members}"
-    return _Blocks(x, y, [f"block {b}" for b in range(count)], details, tail)
+    return Blocks(x, y, [f"block {b}" for b in range(count)], details, tail)
 
 
 class PrdcOptions(PairColumns, total=False):
@@ -331,7 +331,7 @@ def prdc_rows(
     (n,) over generated rows for Precision and Density, (m,) over real ones for Recall and Coverage.
     """
     checked_whole(1, k=k)
-    x, y, groups, copied = _rows(generated, reference, k + 1)
+    x, y, groups, copied = checked_rows(generated, reference, k + 1)
     both, must = None not in groups, "must be False without groups in both sets"
     require(both or not grouped, "grouped", must, grouped, fix="Fill the groups")
     grouped = both if grouped is None else grouped

@@ -21,7 +21,7 @@ TELLING = tuple(
 )
 COLUMNS, CARDS, CARD_ROWS = 5, 3, 4
 #: Metrics whose null is that generated and real images do not differ.
-DISTANCES = ("TMMD", "FID", "CMMD", "KID")
+DISTANCES = ("TMMD", "FID", "CMMD", "KID", "FD", "MIND")
 #: Width of the strip in a card, and of the one that explains strips, in pixels.
 STRIP, READING = 296.0, 330.0
 #: What a metric asks, for the title of its card.

@@ -158,6 +158,7 @@ METRICS: dict[str, Sentence] = {
         "Not meaningful: {n} samples do not span the {d} dimensions, so the value is mostly bias"
     ),
     "fid-biased": "Biased upwards, the more the fewer samples: compare at equal sizes only",
+    "vendi-of-n": "Grows with the number of samples: compare at equal numbers only",
     "fid-difference-biased": "Of FID at this size, whose biases need not be equal",
 }
 

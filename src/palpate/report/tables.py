@@ -60,7 +60,19 @@ FAMILIES: tuple[tuple[str, str, tuple[str, ...]], ...] = (
     (
         "Image distributions",
         "Are the sets of images similar to a general image encoder?",
-        ("cmmd", "fid", "kid", "mmd", "precision", "recall ", "density", "coverage"),
+        (
+            "cmmd",
+            "fd",
+            "fid",
+            "kid",
+            "mind",
+            "vendi",
+            "mmd",
+            "precision",
+            "recall ",
+            "density",
+            "coverage",
+        ),
     ),
     (
         "Image by image",
