@@ -23,7 +23,8 @@ generate HERE --gel NONE -o out|score --generated NONE --reference HERE
 score --generated HERE --reference HERE --encoder palpate/mini --split NONE|probe NONE --split HERE
 probe HERE --split NONE --train|preference make --reference HERE --generated HERE NONE -o out
 preference serve NONE|preference score HERE NONE|report NONE -o out.html|verify NONE
-demo --data NONE|reproduce tag --root NONE -o out"""
+demo --data NONE|reproduce tag --root NONE -o out|embed NONE --encoder palpate/mini -o out
+run embed NONE --encoder palpate/mini -o out --slices 2"""
 
 
 @pytest.fixture
@@ -227,7 +228,7 @@ def test_an_error_of_all_processes_is_printed_by_the_first(monkeypatch, capsys):
     def fails(name, args):
         raise error
 
-    monkeypatch.setattr(terminal, "_call", fails)
+    monkeypatch.setattr(terminal, "call_verb", fails)
     error = PalpateError("It must hold", "not", "")
     printed = []
     for first, error.shared in ((False, False), (True, True), (False, True)):

@@ -108,13 +108,18 @@ COMMANDS: dict[str, int] = {
     "--per frame --dry-run -o OUT/c": 1,
     "preference make --reference IN/manifest --generated IN/manifest IN/generated --names a b "
     "--raters 1 --size 32 -o OUT/study": 3,
+    "embed IN/manifest --encoder palpate/handcrafted -o OUT/e --slice 1/2": 1,
     "preference score IN/study IN/study/votes --replicates 100 -o OUT/s.json --latex OUT/t.tex": 4,
     "demo --data IN/vectors --preset tiny -o OUT/d": 1,
 }
 
 
 #: Further commands for an environment without extras: with them they take long, or do not end.
-BARE = ("reproduce world-gelsight -o OUT/r", "preference serve IN/study")
+BARE = (
+    "reproduce world-gelsight -o OUT/r",
+    "preference serve IN/study",
+    "run embed IN/manifest --encoder palpate/handcrafted -o OUT/e --slices 2",
+)
 
 
 def build(folder: Path) -> None:

@@ -74,7 +74,7 @@ class Options(Common):
     """
 
     manifest: Annotated[Path, tyro.conf.Positional]
-    """Manifest file or the folder of an import."""
+    """Manifest file, the folder of an import, or a folder of palpate embed."""
     split: Annotated[tuple[Path, ...], tyro.conf.arg(aliases=["--splits"])]
     """Split files; their order is that of the differences: `--splits orig.json noleak.json`."""
     encoder: tuple[str, ...] = ()
@@ -96,9 +96,12 @@ class Options(Common):
 def run(options: Options, terminal: Terminal) -> dict[str, Any]:
     """Probe, print the scores, write JSON or a page."""
     training, output = options.training, options.output
+    from palpate.data.slices import is_parted
+
     got, fix = "both" if training.train else "neither", "E.g. --encoder palpate/mini"
-    must = "Either an encoder or training must be chosen"
-    require(bool(options.encoder) != training.train, None, must, got, fix=fix)
+    must, chosen = "Either an encoder or training must be chosen", bool(options.encoder)
+    chosen |= is_parted(options.manifest)
+    require(chosen != training.train, None, must, got, fix=fix)
     must = "must go with an encoder"
     fix = "Drop it"
     require(options.against is None or not training.train, "against", must, "training", fix=fix)
@@ -130,7 +133,7 @@ def run(options: Options, terminal: Terminal) -> dict[str, Any]:
             results = probe(
                 options.manifest,
                 one_or_all(options.split),
-                encoder=one_or_all(options.encoder),
+                encoder=one_or_all(options.encoder) if options.encoder else None,
                 against=options.against,
                 cache=options.cache,
                 allow_seen=options.allow_seen,

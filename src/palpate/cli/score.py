@@ -135,10 +135,13 @@ def run(options: Options, terminal: Terminal) -> dict[str, Any]:
     companions = options.metrics.companions
     alone = companions is None or "none" not in companions or len(companions) == 1
     require(alone, "companions", "must be none, or names", " ".join(companions or ()))
+    from palpate.data.slices import is_parted
     from palpate.evaluation.scoring import score
 
     output = files.output or files.page
-    has_images = options.reference.is_dir() or options.encoder
+    has_images = options.encoder or (
+        options.reference.is_dir() and not is_parted(options.reference)
+    )
     with working_folder(cache, output if has_images else None) as folder:
         with terminal.progress() as progress:
             results = score(

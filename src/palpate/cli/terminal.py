@@ -73,6 +73,7 @@ WRITTEN = ("output", "page", "latex", "figures", "lists", "cache", "work", "phot
 #: Verb and argument of its function -> how the command line writes it, where that is not the
 #: argument's own name ("--sigma"). '' is every verb.
 OPTION_NAMES: dict[tuple[str, str], str] = {
+    ("run", "command"): "VERB",
     ("audit", "train_or_data"): "TRAIN",
     ("audit", "test"): "TEST",
     ("audit", "group"): "--by",
@@ -561,7 +562,7 @@ def run_verb(name: str, args: Sequence[str]) -> int:
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", PalpateWarning)  # results carry them as notes
-            result, status = _call(name, args)
+            result, status = call_verb(name, args)
         if as_json and FIRST:
             _write_json(result)
         return status
@@ -591,7 +592,17 @@ def run_verb(name: str, args: Sequence[str]) -> int:
         return BUG
 
 
-def _call(name: str, args: Sequence[str]) -> tuple[Any, int]:
+def checked(name: str, args: Sequence[str]) -> tuple[Any, Any]:
+    """Return the module of a verb and its options, once what they name was found."""
+    module = importlib.import_module(f"palpate.cli.{VERBS[name].module}")
+    options = parse(name, module.Options, getattr(module, "arranged", list)(args))
+    _require_extra(name, options)
+    _require_inputs(options)
+    return module, options
+
+
+def call_verb(name: str, args: Sequence[str]) -> tuple[Any, int]:
+    """Return the JSON of a verb and its exit status; mistakes are raised."""
     _require_variables()
     for arg in args:  # an empty variable of the shell, a path that is not UTF-8
         fit = arg and not re.search("[\ud800-\udfff]", arg)
@@ -603,11 +614,7 @@ def _call(name: str, args: Sequence[str]) -> tuple[Any, int]:
         near = [n for word in words for n in difflib.get_close_matches(word, VERBS, 1)]
         fix = f"Did you mean: palpate {near[0]}" if near else "See: palpate --help"
         raise PalpateError(f"The verb must be one of {', '.join(VERBS)}", repr(name), fix)
-    verb = VERBS[name]
-    module = importlib.import_module(f"palpate.cli.{verb.module}")
-    options = parse(name, module.Options, args)
-    _require_extra(name, options)
-    _require_inputs(options)
+    module, options = checked(name, args)
     terminal = Terminal(options, shlex.join(["palpate", *name.split(), *args]))
     answer = module.run(options, terminal)
     if hasattr(answer, "to_json"):

@@ -85,6 +85,17 @@ VERBS: dict[str, Verb] = {
         "palpate generate photo.jpg -o tactile.png",
         extra=True,
     ),
+    "embed": Verb(
+        "embed",
+        "Embed a data set into a folder that scores and probes read, by slices",
+        "palpate embed tag/ --encoder palpate/mini -o embedded/ --slice 1/16",
+        extra=True,
+    ),
+    "run": Verb(
+        "run",
+        "Make all slices of a verb: by processes, Slurm or Ray",
+        "palpate run embed tag/ --encoder palpate/mini -o embedded/ --slices 16 --workers 4",
+    ),
     "score": Verb(
         "score",
         "Score generated tactile images",

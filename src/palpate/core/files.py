@@ -240,19 +240,21 @@ def atomic_path(path: Path, *, flush: bool = True) -> Generator[Path]:
 
 
 @contextmanager
-def atomic_folder(folder: Path, *, flush: bool = True) -> Generator[Path]:
+def atomic_folder(folder: Path, *, flush: bool = True, instead: bool = False) -> Generator[Path]:
     """Yield a temporary folder to fill; rename it to ``folder`` on success, else remove it.
 
     Args:
         folder: absent or empty.
         flush: wait until all files are on the disk, some milliseconds each.
+        instead: take the place of a folder with files.
 
     Raises:
         PalpateError: if ``folder`` is not empty, is the current folder, or is written by another
             process.
     """
     folder = Path(folder)
-    require_new_folder(folder)
+    if not instead:
+        require_new_folder(folder)
     part = folder.parent / f".{folder.name}.part"
     with locked(part, folder):
         try:
@@ -260,7 +262,7 @@ def atomic_folder(folder: Path, *, flush: bool = True) -> Generator[Path]:
                 shutil.rmtree(stale) if stale.is_dir() else stale.unlink()
             yield part
             if folder.exists():
-                folder.rmdir()
+                shutil.rmtree(folder) if instead else folder.rmdir()
             _move(part, folder, flush)
         finally:
             shutil.rmtree(part, ignore_errors=True)

@@ -32,6 +32,7 @@ from collections.abc import Generator, Iterable, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, replace
 from functools import cache, cached_property, lru_cache
+from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -169,9 +170,9 @@ class Manifest(Shown):
     def digest(self) -> str:
         """SHA-256 over all rows in order, and the names of columns beyond ``SCHEMA``."""
         cells = pl.all().cast(pl.String).fill_null("\x00")
-        rows = self.table.select(pl.concat_str(cells, separator="\x1f")).to_series().to_list()
+        rows = self.table.select(pl.concat_str(cells, separator="\x1f")).to_series()
         more = self.table.columns[len(SCHEMA) :]
-        return digest_lines(["\x1f".join(more), *rows] if more else rows)
+        return digest_lines(chain(["\x1f".join(more)] * bool(more), rows))
 
     def filled(self) -> pl.DataFrame:
         """The table without the columns that are all null."""

@@ -158,6 +158,15 @@ def kind_of(part: Manifest) -> str:
     return part.facts.get(KIND, alone)
 
 
+def of_one_kind(part: Manifest) -> Manifest:
+    """The samples with the fact :data:`KIND`, so that each slice of them is of that kind."""
+    kind = kind_of(part)
+    table = part.table
+    if kind == "low-pass":
+        table = table.with_columns(pl.lit(None, pl.String).alias("background"))
+    return replace(part, table=table, facts={**part.facts, KIND: kind})
+
+
 def _complete(part: Manifest, gels: Sequence[str | None]) -> bool:
     """Whether each sample with a tactile image has a background."""
     images = part.column("tactile")

@@ -7,7 +7,8 @@ Three loaders read all that can be scored:
 - images in memory: an array or tensor, a list of arrays or PIL images;
 - features: an array (n, d), a :class:`palpate.core.FeatureSet`, ``.npy`` (memory-mapped), or
   ``.npz`` with ``features`` (n, d) and optionally ``ids``, ``labels``, ``groups`` (n strings each)
-  and ``encoder``, which is what ``FeatureSet.save`` writes. No pickle is ever loaded.
+  and ``encoder``, which is what ``FeatureSet.save`` writes; or a folder of ``palpate embed``. No
+  pickle is ever loaded.
 
 Rows without ids are numbered. Further columns come from a table of labels, by id.
 """
@@ -32,6 +33,7 @@ from PIL import Image
 
 from palpate.core import (
     FeatureSet,
+    Note,
     PalpateError,
     ProblemsError,
     Progress,
@@ -45,10 +47,12 @@ from palpate.core import (
     short,
 )
 from palpate.core.features import is_missing, to_numpy
+from palpate.core.files import canonical_json
 from palpate.core.messages import require_rows
-from palpate.data.images import cached_images, image_size, load_images, read_image, square
+from palpate.data.images import cached_images, image_size, load_images, mapped, read_image, square
 from palpate.data.manifest import Manifest, is_image, is_manifest
 from palpate.data.recordings import LEVELS, name_recordings
+from palpate.data.slices import is_parted, whole_parts
 from palpate.data.tables import TABLES, headless_names, open_table, table_of
 
 #: Decoded images of more bytes than this are kept in a file of the cache.
@@ -56,6 +60,8 @@ IN_MEMORY = 1 << 30
 #: Bytes that an array of an archive may unpack to, and times its packed size on top, at most.
 UNPACKED, MOST_TIMES = 1 << 28, 20
 FEATURES = (".npy", ".npz")
+#: Files of a part of ``palpate embed``, and the column that says what the encoder was trained on.
+PART_FEATURES, PART_ROWS, SEEN = "features.npy", "rows.parquet", "seen_by_encoder"
 KINDS = (
     "a folder or table of images, a manifest, a folder of palpate generate, or embeddings "
     f"({', '.join(FEATURES)})"
@@ -83,6 +89,7 @@ class Samples:
         encoder: digest of the encoder that made the features.
         gel: one no-contact image (h, w, 3) for all of a reference.
         settings: of ``palpate generate``, for its folders.
+        made: of ``palpate embed``, for its folders: settings, notes, and digests of medians.
     """
 
     source: str
@@ -93,6 +100,7 @@ class Samples:
     encoder: str | None = None
     gel: NDArray[np.uint8] | None = field(default=None, repr=False)
     settings: Mapping[str, Any] | None = None
+    made: Mapping[str, Any] = field(default_factory=dict[str, Any])
 
     def __len__(self) -> int:
         return len(self.manifest)
@@ -106,6 +114,11 @@ class Samples:
     def embedded(self) -> bool:
         """Whether these are features."""
         return self.rows is not None and self.rows.ndim == 2
+
+    @property
+    def ruled(self) -> bool:
+        """Whether these are raw numbers of a ruler."""
+        return self.made.get("background") is not None
 
     @property
     def labels(self) -> list[str] | None:
@@ -266,6 +279,8 @@ def _of_path(path: Path) -> Samples:
     require_regular(path)
     if path.suffix.lower() in FEATURES and path.is_file():
         return _of_feature_file(path)
+    if is_parted(path):
+        return _of_parts(path)
     if path.is_file() and not is_manifest(path):
         is_table = path.suffix.lower() in TABLES or bool(headless_names(path))
         must, fix = f"{path} must be {KINDS}", "Pass one of these; pickles are never loaded"
@@ -288,6 +303,65 @@ def _of_path(path: Path) -> Samples:
         return Samples(str(path), manifest, settings=settings)
     files = _files_below(path)
     return Samples(str(path), _manifest(path, id=[*files], tactile=[*files.values()]))
+
+
+def _of_parts(path: Path) -> Samples:
+    """The parts of ``palpate embed`` as one, in the order of the ids."""
+    parts = whole_parts(path)
+    first = parts[0]
+    manifests = [Manifest.load(path / part.place / PART_ROWS) for part in parts]
+    arrays: list[NDArray[Any]] = []
+    for part, manifest in zip(parts, manifests, strict=True):
+        with reading_entry(file := path / part.place / PART_FEATURES, "The array"):
+            arrays.append(mapped(file))
+        whole = arrays[-1].shape[:1] == (len(manifest),)
+        must = f"{file} must have a row for each sample"
+        require(whole, None, must, f"shape {arrays[-1].shape}", fix="Make that part again")
+    table, rows = pl.concat([m.table for m in manifests]), arrays[0]
+    require_ids(table["id"].to_list(), str(path))
+    if len(parts) > 1:
+        order = table["id"].arg_sort().to_numpy()
+        table, rows = table[order], np.concatenate(arrays)[order]
+    notes = {canonical_json(note): note for part in parts for note in part.notes}
+    gels = {gel for part in parts for gel in part.facts["gels"]}
+    made = {**first.settings, "notes": [*notes.values()], "gels": sorted(gels)}
+    manifest, encoder = replace(manifests[0], table=table), str(first.settings["features"])
+    return Samples(str(path), manifest, rows, encoder=encoder, made=made)
+
+
+def files_of(source: Any) -> Samples:
+    """Samples that are image files.
+
+    Raises:
+        PalpateError: if they are arrays or embeddings, or as :func:`read_samples`.
+    """
+    samples = read_samples(source, "data")
+    must = "What is embedded must be image files"
+    require(samples.rows is None, None, must, samples.source, fix="Name the images")
+    return samples
+
+
+def judged(samples: Samples, *, allow_seen: bool) -> list[Note]:
+    """What a reader must know of the encoder that embedded a folder's samples.
+
+    Raises:
+        PalpateError: if it was trained on some of them, unless that is allowed.
+    """
+    made = samples.made
+    if not made:
+        return []
+    notes = [Note(note["code"], note["params"]) for note in made["notes"]]
+    seen, n = samples.manifest.table[SEEN].count(), len(samples)
+    if seen:
+        params = {"modality": made["modality"], "seen": seen, "n": n}
+        notes.append(Note("seen-images", params))
+    must = f"The {made['modality']} encoder must judge images that it has not seen"
+    codes = {note.code for note in notes} & {"seen-images", "seen-dataset"}
+    got = f"{seen:,} of {n:,} that it was trained on" if seen else "images of its training data"
+    fix = "Judge other images or use another encoder, or allow it: every score then says so"
+    if codes and not allow_seen:
+        raise PalpateError(must, got, fix, example={"allow_seen": True})
+    return notes
 
 
 def _of_table(path: Path) -> Manifest:

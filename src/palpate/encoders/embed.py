@@ -1,14 +1,16 @@
-"""Embeddings of a manifest: each frozen encoder runs once, and the result is cached.
+"""Embeddings of a manifest: each frozen encoder runs once, and the result is cached by slices.
 
-The key of a cached file is SHA-256 over: the encoder's digest, the ids, the image paths with file
-sizes and modification times (for text: the texts), labels and groups. A changed image, weight or
-row is therefore another key; the root and the batch size are not part of it.
+The key of a cached slice is SHA-256 over: the encoder's digest, the ids, and the image paths with
+file sizes and modification times (for text: the texts). A changed image, weight or row is therefore
+another key, of its own slice; the root and the batch size are not part of it.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Generator, Sequence
+from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -32,13 +34,17 @@ from palpate.core import (
     short,
 )
 from palpate.data.captions import NAMED, caption
-from palpate.data.images import REFETCH, Frames, image_stamp, images_below, load_images
-from palpate.data.residuals import kind_of
+from palpate.data.images import REFETCH, Frames, image_stamp, images_below, load_images, mapped
+from palpate.data.residuals import kind_of, of_one_kind
+from palpate.data.slices import Slice
 from palpate.encoders.encoder_set import MODALITIES, EncoderSet, Modality, vision_state
 from palpate.encoders.models import to_unit
 
 if TYPE_CHECKING:
     from palpate.data.manifest import Manifest
+
+#: Samples of a cached slice, about: a set of twice as many is cut into twice as many slices.
+ROWS = 4096
 
 
 def texts_of(manifest: Manifest) -> tuple[list[str], str]:
@@ -79,7 +85,7 @@ def embed(
         encoders: see :class:`EncoderSet`.
         modality: ``tactile``, ``vision`` or ``text``.
         groups: column to carry along as groups; one without any value gives None.
-        cache: folder for ``<modality>-<key>.npz``; None computes anew.
+        cache: folder for ``<modality>-<key>.npy``, one file a slice; None computes anew.
         still: take each image alone, also for encoders that look at an earlier frame, too.
         raw: leave the numbers of a ruler, or of a vision encoder, as they are, not of length 1.
         batch: images at a time; changes the result by rounding only (1e-5).
@@ -98,33 +104,85 @@ def embed(
     _require(modality, batch)
     fix = "Check the split: is that part empty?"
     require(len(manifest) > 0, None, "There must be samples to embed", "none", fix=fix)
-    digest, frames = encoders.digest(modality), None
-    ruled = modality == "tactile" and encoders.preprocess(modality).residual
-    if ruled:  # rulers compare features of one kind
-        digest = digest_json([digest, kind_of(manifest)])
-    texts = texts_of(manifest)[0] if modality == "text" else []
-    inputs: list[Any] = texts
-    if modality != "text":
-        frames = encoders.preprocess(modality).frames(manifest, modality, still=still)
-        inputs = [image_stamp(manifest, modality), *frames.stamps(manifest.root)]
+    manifest = of_one_kind(manifest)
+    task = partial(Task, encoders=encoders, modality=modality, still=still, raw=raw)
+    of = 1 if cache is None else 1 << (len(manifest) // ROWS).bit_length()
+    features: Any = None
+    whole = task(manifest)
+    if cache is None:
+        features = whole.rows(batch, progress)
+    for number in range(1, of + 1) if cache else ():
+        at = Slice(number, of).rows(manifest)
+        some = whole if of == 1 else task(replace(manifest, table=manifest.table[at]))
+        if not some.n:
+            continue
+        file = Path(cache or "") / f"{modality}-{short(some.key)}.npy"
+        make = partial(some.write, batch=batch, progress=progress)
+        rows = cached(file, make, mapped, progress)
+        if features is None:
+            features = rows if of == 1 else np.empty((whole.n, rows.shape[1]), rows.dtype)
+        if of > 1:
+            features[at] = rows
+    progress(f"embedding {modality}", whole.n, whole.n)
     label, group = words_of(manifest, "material"), words_of(manifest, groups)
-    key = digest_json(
-        ["palpate-embedding/2", digest, manifest.ids, inputs, label, group, raw and ruled]
-    )
-    file = Path(cache) / f"{modality}-{short(key)}.npz" if cache else None
+    return FeatureSet(manifest.ids, features, label, group, whole.encoder)
 
-    def compute() -> FeatureSet:
-        if frames is None:
-            features = embed_texts(texts, encoders, batch=batch, progress=progress)
-        else:
-            features = embed_frames(frames, encoders, modality, batch, progress, raw=raw)
-        return FeatureSet(manifest.ids, features, label, group, digest)
 
-    if file is None:
-        return compute()
-    result = cached(file, lambda part: compute().save(part), FeatureSet.load, progress)
-    progress(f"embedding {modality}", len(manifest), len(manifest))
-    return result
+class Task:
+    """Samples that an encoder is to embed, all or those of a slice; options as of :func:`embed`.
+
+    Attributes:
+        n: how many.
+        encoder: digest of the encoder; of a ruler with the kind of background.
+        key: digest of all that is read.
+    """
+
+    def __init__(
+        self,
+        manifest: Manifest,
+        encoders: EncoderSet,
+        modality: Modality,
+        *,
+        still: bool = False,
+        raw: bool = False,
+    ) -> None:
+        self.encoders, self.raw = encoders, raw
+        self.modality: Modality = modality
+        self.n, self.encoder, self.frames = len(manifest), encoders.digest(modality), None
+        ruled = modality == "tactile" and encoders.preprocess(modality).residual
+        if ruled:  # rulers compare features of one kind
+            self.encoder = digest_json([self.encoder, kind_of(manifest)])
+        self.texts = texts_of(manifest)[0] if modality == "text" else []
+        inputs: list[Any] = self.texts
+        if modality != "text":
+            self.frames = encoders.preprocess(modality).frames(manifest, modality, still=still)
+            inputs = [image_stamp(manifest, modality), *self.frames.stamps(manifest.root)]
+        read = [self.encoder, manifest.ids, inputs, raw and (ruled or modality == "vision")]
+        self.key = digest_json(["palpate-embedding/3", *read])
+
+    def rows(self, batch: int, progress: Progress) -> NDArray[np.float32]:
+        """The embeddings, (n, dim)."""
+        if self.frames is None:
+            return embed_texts(self.texts, self.encoders, batch=batch, progress=progress)
+        return embed_frames(
+            self.frames, self.encoders, self.modality, batch, progress, raw=self.raw
+        )
+
+    def write(self, file: Path, batch: int, progress: Progress) -> None:
+        """The same as ``.npy``, of which no more than a batch is in memory."""
+        parts = (
+            [self.rows(batch, progress)]
+            if self.frames is None
+            else _frame_batches(
+                self.frames, self.encoders, self.modality, batch, progress, raw=self.raw
+            )
+        )
+        shape = (self.n, self.encoders.width(self.modality))
+        header = {"descr": "<f4", "fortran_order": False, "shape": shape}
+        with open(file, "wb") as target:
+            np.lib.format.write_array_header_1_0(target, header)
+            for rows in parts:
+                target.write(np.ascontiguousarray(rows, "<f4").data)
 
 
 def embed_images(
@@ -155,7 +213,8 @@ def embed_images(
     def load(rows: slice) -> NDArray[Any]:
         return fit(images[rows], None if gels is None else gels[rows])
 
-    return _embedded(n, load, encoders, modality, batch=batch, progress=progress, raw=raw)
+    parts = _batches(n, load, encoders, modality, batch=batch, progress=progress, raw=raw)
+    return _joined(parts, n, encoders.width(modality))
 
 
 def embed_texts(
@@ -200,18 +259,38 @@ def embed_frames(
     raw: bool = False,
 ) -> NDArray[np.float32]:
     """Embed files; report all unreadable ones together."""
-    preprocess, n = encoders.preprocess(modality), len(frames.files)
+    parts = _frame_batches(frames, encoders, modality, batch, progress, raw=raw)
+    return _joined(parts, len(frames.files), encoders.width(modality))
+
+
+def _frame_batches(
+    frames: Frames,
+    encoders: EncoderSet,
+    modality: Modality,
+    batch: int,
+    progress: Progress,
+    *,
+    raw: bool,
+) -> Iterator[NDArray[np.float32]]:
+    preprocess, n, sensors = encoders.preprocess(modality), len(frames.files), frames.sensors
 
     def load(rows: slice) -> NDArray[np.uint8]:
         return load_images(frames.files[rows], preprocess)
 
-    sensors = frames.sensors
-    return _embedded(
+    return _batches(
         n, load, encoders, modality, batch=batch, progress=progress, sensors=sensors, raw=raw
     )
 
 
-def _embedded(
+def _joined(parts: Iterable[NDArray[Any]], n: int, width: int) -> NDArray[np.float32]:
+    features, start = np.empty((n, width), np.float32), 0
+    for rows in parts:
+        features[start : start + len(rows)] = rows
+        start += len(rows)
+    return features
+
+
+def _batches(
     n: int,
     load: Callable[[slice], NDArray[np.uint8]],
     encoders: EncoderSet,
@@ -221,10 +300,9 @@ def _embedded(
     progress: Progress,
     sensors: Sequence[str] | None = None,
     raw: bool = False,
-) -> NDArray[np.float32]:
-    """Embed n prepared images, a batch in memory at a time."""
+) -> Iterator[NDArray[np.float32]]:
+    """Embed n prepared images, a batch in memory at a time; those before an unreadable one."""
     preprocess = encoders.preprocess(modality)
-    features = np.empty((n, encoders.width(modality)), np.float32)
     problems: list[Problem] = []
     for start in range(0, n, batch):
         rows = slice(start, start + batch)
@@ -242,11 +320,11 @@ def _embedded(
                     part = encoders.encode(modality, pixels, sensors and sensors[rows])
                 if preprocess.residual and not raw:
                     part = normalize(part, dim=-1)
-            features[rows] = part.float().cpu().numpy()
+                embedded = part.float().cpu().numpy()
+            yield embedded
         progress(f"embedding {modality}", min(start + batch, n), n)
     if problems:
         raise ProblemsError(problems, REFETCH)
-    return features
 
 
 def _require(modality: str, batch: int) -> None:

@@ -32,6 +32,8 @@ from palpate.core import (
 from palpate.core.features import is_missing
 from palpate.core.files import canonical_json
 from palpate.data.recordings import described, resampled_by, rule_notes
+from palpate.data.samples import Samples, judged, read_samples
+from palpate.data.slices import is_parted
 from palpate.encoders.guard import backed
 from palpate.evaluation.power import power
 from palpate.metrics.intervals import without_interval
@@ -100,7 +102,7 @@ def probe(  # noqa: PLR0913 - one argument a choice
     data: Manifest | str | Path,
     split: Any,
     *,
-    encoder: Any,
+    encoder: Any = None,
     against: Any = None,
     modality: Modality = "tactile",
     label: str | Sequence[str] = "material",
@@ -116,7 +118,8 @@ def probe(  # noqa: PLR0913 - one argument a choice
     """Score how well embeddings name classes, and find the text and image that belong to a sample.
 
     Args:
-        data: a manifest with images of the modality, or its file or folder.
+        data: a manifest with images of the modality, or its file or folder; or a folder of
+            ``palpate embed``, with which no encoder goes and nothing is retrieved.
         split: a split or its file; classifiers are fitted to its train part and scored on its test
             part. Several, as a list or name -> split, are compared.
         encoder: name or folder of a set of encoders, or an ``EncoderSet``. Several, as a list or
@@ -155,8 +158,14 @@ def probe(  # noqa: PLR0913 - one argument a choice
     from palpate.data.reading import load
     from palpate.encoders.guard import load_encoders
 
-    manifest = load(data)
-    splits, encoders = named(split, "split"), named(encoder, "encoder")
+    parted = isinstance(data, str | Path) and is_parted(Path(data))
+    kept = read_samples(data, "data") if parted else None
+    must = "must go with images, and not with embeddings"
+    require((kept is None) == (encoder is not None), "encoder", must, str(encoder))
+    if kept is not None:
+        top, modality = (), kept.made["modality"]
+    manifest = load(data) if kept is None else kept.manifest
+    splits, encoders = named(split, "split"), named(kept or encoder, "encoder")
     several = {"split": splits, "encoder": encoders}  # names are those of today's files
     arguments |= {name: sets for name, sets in several.items() if len(sets) > 1}
     call = Call.of("probe", probe, arguments)
@@ -177,7 +186,7 @@ def probe(  # noqa: PLR0913 - one argument a choice
     )
     runs: dict[str, list[Probed]] = {}
     touch = modality == "tactile"
-    rulers = [name for name, e in sets.items() if touch and e.preprocess(modality).residual]
+    rulers = [n for n, e in sets.items() if touch and not kept and e.preprocess(modality).residual]
     for s, e in ((s, e) for s in loaded for e in sets):
         subject = {"split": s, "encoder": e}.get(axis, "real")
         runs[subject] = [
@@ -200,7 +209,9 @@ def probe(  # noqa: PLR0913 - one argument a choice
                 runs[subject][0].means += means
     results = results_of(f"Probe of the {modality} encoder", runs, plan, manifest, loaded)
     digests = {
-        f"{modality} encoder{f' {name}' if axis == 'encoder' else ''}": e.digest(modality)
+        f"{modality} encoder{f' {name}' if axis == 'encoder' else ''}": e.encoder
+        if kept
+        else e.digest(modality)
         for name, e in sets.items()
     }
     digests = {**results.settings["digests"], **digests}
@@ -267,13 +278,19 @@ def measure(
     embedded = partial(embed, groups=groups, cache=folder, raw=True, progress=progress)
     seen = partial(guard, split=split, allow_seen=plan.allow_seen, progress=progress)
     partners, others = dict[str, FeatureSet](), _others(plan) if plan.top else ()
-    looking = encoders if "tactile" in (plan.modality, *others) else None
+    kept = _as_kept(encoders)
+    looking = encoders if kept is None and "tactile" in (plan.modality, *others) else None
     with backed(manifest, looking, cache) as (samples, kind):
         parts = [samples.part(split, part) for part in ("train", "test")]
         count = sum(map(len, parts))
         parts = [part.take(_with(part, plan.modality)) for part in parts]
-        notes = seen(encoders, plan.modality, parts[1])
-        features = [embedded(part, encoders, plan.modality) for part in parts]
+        if kept is not None:
+            notes = judged(kept.take(parts[1].ids), allow_seen=plan.allow_seen)
+            features = [_kept(kept, part, groups) for part in parts]
+            kind += [Note("background-kind", {"kind": kept.made["background"]})] * kept.ruled
+        else:
+            notes = seen(encoders, plan.modality, parts[1])
+            features = [embedded(part, encoders, plan.modality) for part in parts]
         for other in others:
             ids = _with(parts[1], other) if other in encoders.modalities else []
             if len(ids) >= 2:
@@ -324,6 +341,18 @@ def measure(
     result.medians = [noted(score) for score in result.medians]
     result.notes += kind
     return result
+
+
+def _as_kept(encoders: Any) -> Samples | None:
+    """What stands in the place of encoders where the data are embeddings."""
+    return encoders if isinstance(encoders, Samples) else None
+
+
+def _kept(samples: Samples, part: Manifest, groups: str) -> FeatureSet:
+    """Embeddings of a part from a folder of them."""
+    taken = replace(samples.take(part.ids), group=groups)
+    rows: Any = taken.rows
+    return FeatureSet(part.ids, rows, taken.labels, taken.column(groups), samples.encoder)
 
 
 def _retrieve(

@@ -8,6 +8,7 @@ standardization together name the features, so that scores of different ones sha
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -17,7 +18,7 @@ import polars as pl
 
 from palpate.core import FeatureSet, Note, digest_file, digest_json, save_image
 from palpate.data.manifest import Manifest
-from palpate.data.residuals import MEDIANS, with_gels
+from palpate.data.residuals import MEDIANS, Kind, with_gels
 from palpate.data.samples import Samples
 from palpate.evaluation.controls import rows_of_material
 from palpate.metrics.retrieval import standardized, unit_rows
@@ -38,38 +39,57 @@ class Ruled:
 
 def ruler_features(bench: Bench) -> list[Ruled]:
     """Every set of the bench with its features."""
-    from palpate.encoders.embed import embed
-
     # A control of real train images takes their features: its ids, but not its gels, are others'.
     drawn = [s for s in bench.controls.values() if s.source == SAME_MATERIAL]
     some = (bench.reference, *bench.subjects.values(), bench.train, bench.seen)
-    sets, encoders = [s for s in some if s is not None and s not in drawn], bench.encoders
-    assert encoders is not None  # whose ruler it is
-    folder = bench.cache / "rulers"
-    real, *others = (_of_files(s, folder) for s in sets)
-    also = [k for k, s in enumerate(sets[1:]) if s is bench.train or s is bench.seen]
-    kind, parts = with_gels(real, others, folder, real=also)
+    sets = [s for s in some if s is not None and s not in drawn]
+    real = bench.reference
+    if real.rows is not None and real.ruled:
+        arrays = [s.rows for s in sets if s.rows is not None]
+        kind, encoder, first = real.made["background"], real.made["encoder"], real.encoder
+        gels: list[str] = real.made["gels"]
+    else:
+        kind, embedded, gels = _embedded(bench, sets)
+        arrays, encoder = [e.features for e in embedded], _digest(bench)
+        first = embedded[0].encoder
     bench.notes.append(Note("background-kind", {"kind": kind}))
-    caches = [s.folder(folder) if bench.keep else None for s in sets]
-    embedded = [
-        embed(p, encoders, cache=cache, still=True, raw=True, progress=bench.progress)
-        for p, cache in zip(parts, caches, strict=True)
-    ]
-    rows = [e.features.astype(np.float64) for e in embedded]
+    rows = [x.astype(np.float64) for x in arrays]
     for samples in drawn:
         train = next(k for k, s in enumerate(sets) if s is bench.train)
         sets.append(samples)
         rows.append(rows[train][rows_of_material(bench)])
     compared, scales = standardized(rows, rows[0])
-    # Medians are the reference's own, and one gel for all is stated: others give other features.
-    own = kind in MEDIANS or bench.reference.gel is not None
-    gels = sorted({*parts[0].column("background")}) if own else []
-    free = [embedded[0].encoder, [digest_file(Path(gel)) for gel in gels]]
-    digests = digest_json([encoders.digest("tactile"), kind, scales]), digest_json(free)
+    digests = digest_json([encoder, kind, scales]), digest_json([first, gels])
     return [
         Ruled(s, s.feature_set(x, digests[0]), s.feature_set(unit_rows(y), digests[1]))
         for s, x, y in zip(sets, compared, rows, strict=True)
     ]
+
+
+def _digest(bench: Bench) -> str:
+    assert bench.encoders is not None  # whose ruler it is
+    return bench.encoders.digest("tactile")
+
+
+def _embedded(bench: Bench, sets: Sequence[Samples]) -> tuple[Kind, list[FeatureSet], list[str]]:
+    """The kind of background, raw features of images, and digests of the reference's own gels."""
+    from palpate.encoders.embed import embed
+
+    encoders = bench.encoders
+    assert encoders is not None  # whose ruler it is
+    folder = bench.cache / "rulers"
+    real, *others = (_of_files(s, folder) for s in sets)
+    also = [k for k, s in enumerate(sets[1:]) if s is bench.train or s is bench.seen]
+    kind, parts = with_gels(real, others, folder, real=also)
+    caches = [s.folder(folder) if bench.keep else None for s in sets]
+    embedded = [
+        embed(p, encoders, cache=cache, still=True, raw=True, progress=bench.progress)
+        for p, cache in zip(parts, caches, strict=True)
+    ]
+    # Medians are the reference's own, and one gel for all is stated: others give other features.
+    own = kind in MEDIANS or bench.reference.gel is not None
+    gels = sorted({*parts[0].column("background")}) if own else []
+    return kind, embedded, [digest_file(Path(gel)) for gel in gels]
 
 
 def _of_files(samples: Samples, folder: Path) -> Manifest:

@@ -208,14 +208,14 @@ class Bench:
 
     def features(self, samples: Samples) -> FeatureSet:
         """Features by the tactile encoder, or those that the samples are."""
+        if self.by_ruler:
+            return next(r.compared for r in self.ruled if r.samples is samples)
         if samples.rows is not None and samples.embedded:
             return samples.feature_set(samples.rows, samples.encoder)
         from palpate.encoders.embed import embed, embed_images
 
         encoders, progress = self.encoders, self.progress
         assert encoders is not None  # `score` requires one for what compares features
-        if encoders.preprocess("tactile").residual:
-            return next(r.compared for r in self.ruled if r.samples is samples)
         digest = encoders.digest("tactile")
         if samples.rows is not None:
             x = embed_images(samples.rows, encoders, "tactile", progress=progress)
@@ -225,6 +225,12 @@ class Bench:
         manifest = self._in_context(samples.manifest, encoders)
         x = embed(manifest, encoders, cache=folder, still=True, progress=progress)
         return samples.feature_set(x.features, digest)
+
+    @property
+    def by_ruler(self) -> bool:
+        """Whether the features are a ruler's."""
+        residual = self.encoders and self.encoders.preprocess("tactile").residual
+        return bool(residual or self.reference.ruled)
 
     @cached_property
     def ruled(self) -> list[Ruled]:
@@ -253,14 +259,14 @@ class Bench:
     @cached_property
     def tactile(self) -> Sets:
         """Features of everything by the tactile encoder."""
-        name = "embeddings" if self.reference.embedded else "tactile"
+        name = "tactile" if self.reference.made or not self.reference.embedded else "embeddings"
         sets = {n: self.features(s) for n, s in self.subjects.items()}
         return self._sets(name, sets, self.features(self.reference))
 
     @cached_property
     def free(self) -> Sets:
         """Features for scores without a reference: those of a ruler do not depend on it."""
-        if self.encoders is None or not self.encoders.preprocess("tactile").residual:
+        if not self.by_ruler:
             return self.tactile
         alone = {id(r.samples): r.alone for r in self.ruled}
         sets = {n: alone[id(s)] for n, s in self.subjects.items()}

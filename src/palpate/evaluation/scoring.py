@@ -27,6 +27,7 @@ from palpate.data.recordings import resampled_by, source_of
 from palpate.data.samples import (
     SUFFIX,
     Samples,
+    judged,
     labeled,
     labeled_as,
     named_sources,
@@ -198,14 +199,14 @@ def score(  # noqa: PLR0913
     possible = not images or encoder is not None or bool(companions)
     require(possible, "encoder", "must be given for images", "none", "palpate/mini", fix=fix)
     chosen = _companions(bench, companions, encoder=encoder is not None)
-    encoders, of_encoder = None, list[Note]()
+    encoders, of_encoder = None, judged(bench.reference, allow_seen=allow_seen)
     if encoder is not None:
         from palpate.encoders.guard import guard, load_encoders
 
         encoders = load_encoders(encoder, progress, alone=not clusters)
-        judged: Any = bench.reference.manifest if real.rows is None else bench.reference.rows
+        shown: Any = bench.reference.manifest if real.rows is None else bench.reference.rows
         of_encoder = guard(
-            encoders, "tactile", judged, split=split, allow_seen=allow_seen, progress=progress
+            encoders, "tactile", shown, split=split, allow_seen=allow_seen, progress=progress
         )
     with tempfile.TemporaryDirectory() if cache is None else nullcontext(cache) as folder:
         bench = replace(bench, encoders=encoders, cache=Path(folder), keep=cache is not None)
@@ -266,7 +267,9 @@ def aligned(bench: Bench, labels: Any, split: Split | None, group: str) -> Bench
             part of the samples only.
     """
     real, seen = bench.reference, bench.seen
-    _require_one_kind([real, *bench.generators.values(), *([] if seen is None else [seen])])
+    sets = [real, *bench.generators.values(), *([] if seen is None else [seen])]
+    _require_one_kind(sets)
+    _require_one_encoder(sets)
     table = read_labels(labels)
     listed = [] if table is None else table["id"].to_list()
     real, full = labeled(real, table), [*real.ids, *listed]
@@ -326,6 +329,19 @@ def _require_one_kind(sets: Sequence[Samples]) -> None:
     must = "Generated, reference and train must all be images, or all embeddings"
     fix = "Embed the images first, or pass them all"
     require(len({*kinds}) == 1, None, must, got, fix=fix)
+
+
+def _require_one_encoder(sets: Sequence[Samples]) -> None:
+    """Raise if folders of ``palpate embed`` are not of one tactile encoder, image by image."""
+    fix = "Embed both with the same encoder, the generated ones next to their reference"
+    for samples in sets:
+        alike = samples.made.get("features") == sets[0].made.get("features")
+        must = "Folders of embeddings must be of one encoder and kind of background"
+        require(alike, None, must, f"others in {samples.source}", fix=fix)
+        fits = {"tactile", None} & {samples.made.get("modality")}
+        fits = fits and samples.made.get("frames") != "with earlier ones"
+        must = f"{samples.source} must be of tactile images, each taken alone"
+        require(bool(fits), None, must, "others", fix="Embed them so: palpate embed --still")
 
 
 def _parts(real: Samples, split: Split) -> tuple[Samples, Samples | None]:
@@ -451,7 +467,8 @@ def _with_warnings(
     scores: Sequence[Score], bench: Bench, of_encoder: Sequence[Note]
 ) -> list[Score]:
     """The scores with notes on the encoder, and on generators that may have seen test samples."""
-    digests = [s.reference.encoder for s in (bench.tactile, bench.free)] if bench.encoders else []
+    compared = (bench.tactile, bench.free) if of_encoder else ()
+    digests = [s.reference.encoder for s in compared]
     of_generator = {
         name: [Note("generator-of-other-split")]
         for name, s in bench.generators.items()
