@@ -7,6 +7,7 @@ write their cards.
     python recipes/mini.py --work runs/mini --tactile --seed 1  # another training of it, scored
     python recipes/mini.py --work runs/mini --tactile --wide    # one of other gels, scored
     python recipes/mini.py --work runs/mini --ship              # and write src/palpate/mini
+    python recipes/mini.py --work runs/mini --range             # write anew what training saw
     python recipes/mini.py --work runs/mini --verify            # score what ships again
 
 Stopped half-way, the same command goes on. Only worlds of the seeds
@@ -18,6 +19,7 @@ world          seed      read by
 gelsight       900000    every part
 digit          900001    the autoencoder alone: the other look of the sensor
 photos         900002    the vision encoder alone: 16,000 more objects, one photo of each
+contacts       900003    what is unlike the training: photos and captions like those of gelsight
 gel 0 .. 13    900010 .. the tactile encoder: pads of 9 to 22 mm, 0 to 12 rows of markers, DIGIT
 wide 0 .. 12   900030 .. with ``--wide`` in place of DIGIT: pads of 26 mm, 10 rows of markers
 new gelsight   900050    scores: new objects, videos and gel units
@@ -56,7 +58,9 @@ from palpate.diffusion.options import BackgroundOptions, SamplerOptions
 from palpate.diffusion.pipeline import TactilePipeline
 from palpate.diffusion.presets import MINI as DIFFUSION
 from palpate.diffusion.training import Parts, train_pipeline
+from palpate.diffusion.training_range import TrainingRange
 from palpate.encoders.contrastive import train_clip
+from palpate.encoders.embed import texts_of
 from palpate.encoders.encoder_set import EncoderSet, load_clip
 from palpate.encoders.gel_training import train_ruler
 from palpate.encoders.models import SHIPPED, shipped_root
@@ -79,6 +83,7 @@ WORLDS: dict[str, WorldOptions] = {
     "photos": replace(
         _BASE, seed=900_002, objects_per_material=800, contacts_per_video=1, frames_per_contact=1
     ),
+    "contacts": replace(_BASE, seed=900_003, objects_per_material=36, sensors=8),
     "new gelsight": replace(_BASE, seed=900_050, objects_per_material=10),
     "new digit": replace(_BASE, seed=900_051, objects_per_material=4, look="digit"),
 }
@@ -149,6 +154,7 @@ def main() -> int:
     parser.add_argument("--seed", type=int, default=SEED, help="of the tactile encoder")
     parser.add_argument("--wide", action="store_true", help="wide pads instead of DIGIT")
     parser.add_argument("--ship", action="store_true", help="write src/palpate/mini")
+    parser.add_argument("--range", action="store_true", help="what the generator's training saw")
     parser.add_argument("--verify", action="store_true", help="score the shipped models again")
     options = parser.parse_args()
     recipe = Recipe(options.work, options.tactile, options.seed, options.wide)
@@ -157,6 +163,8 @@ def main() -> int:
     try:
         if options.verify:
             return recipe.verify()
+        if options.range:
+            return recipe.write_range()
         recipe.make(options.only)
         if options.ship:
             recipe.ship()
@@ -423,6 +431,20 @@ class Recipe:
         if PAGE.is_file():
             write_page(PAGE, target)
         print_line(f"Shipped in {target}")
+
+    def write_range(self) -> int:
+        """Write what training saw (``range.json``) to the generator that ships."""
+        train, pipeline = self.world("contacts"), TactilePipeline.from_pretrained(NAME)
+        seen = TrainingRange.of(pipeline, train, texts_of(train)[0], self._run(self.work))
+        seen.save(shipped_root() / SHIPPED[NAME] / "generator")
+        new = cached_images(self.world("new gelsight"), "vision", pipeline.vision_size, self.cache)
+        rates = np.array(seen.photo_rates(new))
+        for level in (0.5, 0.9, 0.95, 0.99):
+            share = (rates >= level).mean()
+            print_line(
+                f"{share:.1%} of {len(rates):,} new photos are unlike {level:.0%} of training"
+            )
+        return 0
 
     def _worlds(self) -> list[dict[str, Any]]:
         rows: list[dict[str, Any]] = []

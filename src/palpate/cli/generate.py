@@ -46,6 +46,9 @@ class Options(Common):
     """Images at a time; the images do not depend on it."""
     skip_bad: Switch = False
     """Skip unreadable photos and list them."""
+    strict: Switch = False
+    """Refuse photos and texts that are unlike 95 % of those of the training, and words that no text
+    of it has."""
     dry_run: Switch = False
     """Write nothing; print how many images are missing, and how many passes through the network
     they take."""
@@ -71,6 +74,7 @@ def run(options: Options, terminal: Terminal) -> dict[str, Any]:
         "images": len(images.files),
         "made_now": images.new,
         "skipped": len(images.skipped),
+        "most_unlike": max(images.unlike.values(), default=None),
         "model": options.model,
         "pipeline": images.settings["pipeline"],
         "notice": images.notice or None,

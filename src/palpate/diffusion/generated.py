@@ -4,9 +4,12 @@
 
     OUT/images/<name>.png   one image per id; the name is made from the id
     OUT/index.json          {"format", "complete", "settings", "digest", "notice",
-                             "images": {id: name}, "skipped": [...], "sealed"}
+                             "images": {id: name}, "unlike": {id: rate}, "skipped": [...],
+                             "sealed"}
 
-``settings`` holds the pipeline's digest, seed, sampler and image size; a folder made with others is
+``unlike`` is the share of the training photos that are more like training than each photo.
+``settings`` holds the pipeline's digest, seed, sampler and image size, of a text how unlike those
+of the training it is, and its words that none of them has; a folder made with others is
 rejected.
 """
 
@@ -15,7 +18,7 @@ from __future__ import annotations
 import hashlib
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -26,6 +29,8 @@ from palpate.core.records import from_plain
 from palpate.data.images import read_image
 
 FORMAT = "palpate-generated/1"
+#: The share of the training from which a photo or a text is said to be out of range.
+UNLIKE = 0.95
 
 
 @dataclass(frozen=True)
@@ -39,6 +44,8 @@ class Generated:
         skipped: inputs that could not be used.
         new: how many images this call made (0 when loaded).
         notice: what everyone who looks at the images must know; often empty.
+        unlike: id -> share of the training photos that are more like training than its photo is,
+            where the pipeline knows them (:mod:`palpate.diffusion.training_range`).
         notes: what the caller must know: of the gel and the text that were given.
         memory: id -> image, where no output was given.
         missing: images that a dry run would make.
@@ -51,6 +58,7 @@ class Generated:
     skipped: Sequence[Problem] = ()
     new: int = 0
     notice: str = ""
+    unlike: Mapping[str, float] = field(default_factory=dict[str, float])
     notes: Sequence[Note] = ()
     memory: Mapping[str, Image.Image] = field(default_factory=dict[str, Image.Image], repr=False)
     missing: int = 0
@@ -95,7 +103,8 @@ class Generated:
         folder = Path(folder)
         index = _read_index(folder)
         generated_files(folder, vars(index))  # checks them
-        return cls(folder, index.images, index.settings, index.skipped, notice=index.notice)
+        read = cls(folder, index.images, index.settings, index.skipped, notice=index.notice)
+        return replace(read, unlike=index.unlike)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -107,6 +116,7 @@ class Index:
     settings: Mapping[str, Any]
     digest: str
     images: Mapping[str, str] = field(default_factory=dict)
+    unlike: Mapping[str, float] = field(default_factory=dict)
     skipped: Sequence[Problem] = ()
     notice: str = ""
 

@@ -1,8 +1,9 @@
 """Photos or a data set -> tactile images: in memory, as one PNG, or as a folder.
 
-Each PNG carries as text its id, the settings as JSON, their digest, the digest of its photo, and
-the pipeline's notice. So a folder that was left half done is continued: images of the same settings
-and photo are kept, and the result has the same bytes as one made at a stretch.
+Each PNG carries as text its id, the settings as JSON, their digest, the digest of its photo, how
+unlike those of the training the photo is, and the pipeline's notice. So a folder that was left half
+done is continued: images of the same settings and photo are kept, and the result has the same bytes
+as one made at a stretch.
 """
 
 from __future__ import annotations
@@ -32,6 +33,7 @@ from palpate.core import (
     Split,
     digest_file,
     digest_json,
+    few,
     locked,
     open_image,
     plain,
@@ -44,7 +46,7 @@ from palpate.core import (
 from palpate.core.files import canonical_json
 from palpate.core.images import SUFFIXES
 from palpate.data.images import check_image, images_below, read_image, square
-from palpate.diffusion.generated import Generated, Index, file_name, old_index
+from palpate.diffusion.generated import UNLIKE, Generated, Index, file_name, old_index
 from palpate.encoders.models import FIX_MODEL, find_model
 
 if TYPE_CHECKING:  # torch takes seconds to import, and what is checked first needs none of it
@@ -79,6 +81,7 @@ class _Item:
     photo: NDArray[np.uint8] | None = None
     ground: NDArray[np.uint8] | None = None
     condition: Tensor | None = None
+    unlike: float | None = None
 
     def digest(self) -> str:
         """Of the bytes of both files."""
@@ -100,6 +103,7 @@ def generate(  # noqa: PLR0913 - a public verb, step by step
     steps: int | None = None,
     batch: int | None = None,
     skip_bad: bool = False,
+    strict: bool = False,
     dry_run: bool = False,
     device: str = "auto",
     progress: Progress = quiet,
@@ -126,6 +130,8 @@ def generate(  # noqa: PLR0913 - a public verb, step by step
         steps: of the solver; default: the pipeline's.
         batch: images at once, which they do not depend on; default: the pipeline's.
         skip_bad: list unreadable photos in the result instead of raising.
+        strict: raise for photos and texts that are unlike 95 % of those of the training, and for
+            words that none of its texts has; ``skip_bad`` lists such photos.
         dry_run: write nothing; the result says what is missing, and has no images.
         device: ``auto``, ``cpu``, ``cuda`` or ``mps``.
         progress: called while the work goes on.
@@ -165,9 +171,10 @@ def generate(  # noqa: PLR0913 - a public verb, step by step
     words = None if text is None else model.embed_text(text)
     settings = _settings(model, sampler, seed)
     settings |= {"text": text, "weight": None if photos is None else weight} if text else {}
+    settings |= _range_of(model, text, words, strict) | ({"strict": True} if strict else {})
     target = _Target(output, single, settings, model.notice, rank == 0)
     items = _on_gels(items, model, gel)
-    notes = _notes(model, text, gel)
+    notes = [*_range_notes(settings), *_notes(model, text, gel)]
     if dry_run:
         files = ((item, target.path(item.id)) for item in items)
         there = [item for item, path in files if path and path.is_file()]
@@ -192,7 +199,7 @@ def generate(  # noqa: PLR0913 - a public verb, step by step
             )
             yield from zip(chunk, images, strict=True)
 
-    reader = _Reader(model, items[rank::size], target, skip_bad)
+    reader = _Reader(model, items[rank::size], target, skip_bad, strict)
     ready = iter(reader)
     first = [*islice(ready, 1)]  # few photos are all read before anything is written
     bad = reader.checked(gathered(reader.bad))
@@ -237,6 +244,7 @@ class _Target:
         self.file = output if single else None
         self.folder = None if single else output
         self.memory: dict[str, Image.Image] = {}
+        self.unlike: dict[str, float] = {}
         self.first = first  # of several processes
         self.index = Index(settings=settings, digest=self.digest)
         if self.folder is not None:
@@ -274,10 +282,12 @@ class _Target:
         image = Image.fromarray(array)
         if (path := self.path(item.id)) is None:
             self.memory[item.id] = image
+            self.unlike |= {} if item.unlike is None else {item.id: item.unlike}
             return item
         text = PngImagePlugin.PngInfo()
         values = {"id": item.id, "settings": self.digest, "input": item.stamp}
         values |= {"made-with": canonical_json(self.settings), "notice": self.notice}
+        values["unlike"] = "" if item.unlike is None else f"{item.unlike:g}"
         for name, value in values.items():  # their order decides the bytes
             if value:
                 text.add_itxt(f"palpate.{name}", value)
@@ -291,10 +301,19 @@ class _Target:
         files = {} if self.file is None else {i: str(self.file) for i in ids}
         if self.folder is not None:
             files = {**self.index.images, **{i: file_name(i) for i in ids}}
+        for i in files:
+            with open_image(self.path(i)) as image:
+                if (rate := image.info.get("palpate.unlike")) is not None:
+                    self.unlike[i] = float(rate)
+        if self.folder is not None:
             index = replace(self.index, complete=True, images=files, skipped=skipped)
+            index = replace(index, unlike=self.unlike)
             if self.first:
                 write_json(self.folder / "index.json", sealed(plain(index)))
-        common = (self.settings, skipped, new, self.notice, notes, self.memory)
+        out = [i for i in ids if self.unlike.get(i, 0.0) >= UNLIKE]
+        facts = {"count": len(out), "of": len(ids), "photos": out, "least": UNLIKE}
+        notes = [*notes, *([Note("photos-unlike", facts)] if out else [])]
+        common = (self.settings, skipped, new, self.notice, self.unlike, notes, self.memory)
         return Generated(self.folder, files, *common)
 
 
@@ -394,6 +413,35 @@ def _notes(pipeline: TactilePipeline, text: str | None, gel: str | Path | None) 
     return notes
 
 
+def _range_of(
+    pipeline: TactilePipeline, text: str | None, words: Tensor | None, strict: bool
+) -> dict[str, Any]:
+    """How unlike the texts of the training one is, and its words that none of them has.
+
+    Raises:
+        PalpateError: with ``strict``, if it is out of range, or the pipeline knows no range.
+    """
+    seen, about = pipeline.seen, dict[str, Any]()
+    must, fix = "must go with a generator that knows what it saw", "Train it anew, or leave it out"
+    require(seen is not None or not strict, "strict", must, "one that does not", fix=fix)
+    if seen is None or text is None or words is None:
+        return about
+    if seen.texts is not None:
+        about["text_unlike"] = seen.texts.rates(words.numpy())[0]
+    about |= {"unseen_words": unseen} if (unseen := seen.unseen(text)) else {}
+    must, fix = "must be like those of the training", f"Its words are e.g. {few(seen.words)}"
+    got = f"the new words {', '.join(unseen)}" if unseen else "one unlike 95 % of them"
+    require(not (strict and _range_notes(about)), "text", must, got, fix=fix)
+    return about
+
+
+def _range_notes(settings: Mapping[str, Any]) -> list[Note]:
+    """What is out of range in a text."""
+    words, rate = settings.get("unseen_words"), settings.get("text_unlike", 0.0)
+    notes = [Note("words-unseen", {"words": words})] if words else []
+    return notes + ([Note("text-unlike", {"rate": rate})] if rate >= UNLIKE else [])
+
+
 def _is_single(output: Path | None, paths: Sequence[Path]) -> bool:
     """Return whether the output is one image, in memory or a PNG; check that it may be written."""
     if output is None or output.suffix.lower() not in SUFFIXES:
@@ -449,14 +497,20 @@ class _Reader:
     After an unreadable photo that may not be skipped it yields no more, and only looks for others.
 
     Attributes:
-        bad: by id, what could not be read.
+        bad: by id, what could not be read, or is refused as out of range.
         there: how many images are there already.
     """
 
     def __init__(
-        self, pipeline: TactilePipeline, items: Sequence[_Item], target: _Target, skip_bad: bool
+        self,
+        pipeline: TactilePipeline,
+        items: Sequence[_Item],
+        target: _Target,
+        skip_bad: bool,
+        strict: bool,
     ) -> None:
         self.pipeline, self.items, self.target, self.skip_bad = pipeline, items, target, skip_bad
+        self.strict = strict
         self.bad: dict[str, Problem] = {}
         self.there = 0
         self._gel = lru_cache(GELS)(self._square)  # many samples share one
@@ -508,5 +562,13 @@ class _Reader:
     def _embedded(self, ready: list[_Item]) -> Generator[_Item]:
         photos = [item.photo for item in ready if item.photo is not None]
         rows: Any = self.pipeline.embed(np.stack(photos)) if photos else [None] * len(ready)
-        for item, row in zip(ready, rows, strict=True):
-            yield replace(item, condition=row, photo=None)
+        rates: Sequence[float | None] = [None] * len(ready)
+        if photos and self.pipeline.seen is not None:
+            rates = self.pipeline.seen.photo_rates(np.stack(photos))
+        for item, rate in zip(ready, rates, strict=True):  # all, before any is made
+            if self.strict and rate is not None and rate >= UNLIKE:
+                text = f"unlike {rate:.1%} of the training photos".replace("%", " %")
+                self.bad[item.id] = Problem(str(item.vision), "unlike-training", text)
+        for item, row, rate in zip(ready, rows, rates, strict=True):
+            if item.id not in self.bad:
+                yield replace(item, condition=row, unlike=rate, photo=None)

@@ -43,6 +43,7 @@ from palpate.diffusion.denoiser import (
 )
 from palpate.diffusion.options import ConditionPolicy, SamplerOptions, Schedule
 from palpate.diffusion.saving import FORMAT, KEYS, write_pipeline
+from palpate.diffusion.training_range import TrainingRange
 from palpate.encoders.embed import embed_texts, list_images
 from palpate.encoders.encoder_set import EncoderSet, load_clip
 from palpate.encoders.models import (
@@ -90,6 +91,7 @@ class TactilePipeline(DiffusionPipeline):
         training: JSON record: digests of manifest, split and encoder, steps, seed, source of the
             conditions.
         gel: a no-contact image (size, size, 3) of the training part, for photos without one.
+        seen: what photos and texts of the training look like; None of a pipeline without it.
     """
 
     autoencoder: AnyAutoencoder
@@ -102,6 +104,7 @@ class TactilePipeline(DiffusionPipeline):
     preset: str = ""
     training: Mapping[str, Any] = field(default_factory=dict)
     gel: NDArray[np.uint8] | None = None
+    seen: TrainingRange | None = None
 
     def __post_init__(self) -> None:
         """Name the parts for diffusers.
@@ -625,6 +628,7 @@ class TactilePipeline(DiffusionPipeline):
                 preset=str(about["preset"]),
                 training=dict(about["training"]),
                 gel=square(read_image(gel), int(about["size"])) if gel.is_file() else None,
+                seen=TrainingRange.load(folder),
             )
         except (KeyError, TypeError, ValueError) as error:
             must = f"The entries of {note} must be as palpate writes them"

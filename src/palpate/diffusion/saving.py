@@ -8,6 +8,7 @@
     encoders/      the vision (and text) encoder whose embeddings the denoiser knows
     scheduler/     scheduler_config.json, diffusers' format: for programs that read only the parts
     gel.png        the stock gel without contact, of a generator that is given one
+    range.json     what its training saw (``training_range``), to say what is unlike it
     palpate.json   preset, condition policy, schedule, sampler, latent statistics, record, digest
     README.md      the card for people
 
@@ -45,6 +46,8 @@ def write_pipeline(
         pipeline.denoiser.save(part / "unet", half=half)
         if pipeline.gel is not None:
             save_image(part / "gel.png", pipeline.gel)
+        if pipeline.seen is not None:
+            pipeline.seen.save(part)
         if shared is None:
             pipeline.autoencoder.save(part / "autoencoder", half=half)
             if pipeline.encoders is not None:

@@ -35,6 +35,7 @@ from palpate.diffusion.gels import gels_of, has_gels
 from palpate.diffusion.options import AutoencoderOptions, ConditionPolicy, UNetOptions
 from palpate.diffusion.pipeline import TactilePipeline
 from palpate.diffusion.presets import DiffusionPreset, preset_of
+from palpate.diffusion.training_range import TrainingRange
 from palpate.diffusion.unet import find_unet
 from palpate.encoders.embed import texts_of
 from palpate.encoders.encoder_set import EncoderSet, load_clip
@@ -349,7 +350,8 @@ def train_pipeline(
         "start": start.digest if start else None,
         "start_record": dict(start.training) if start else None,
     }
-    return pipeline(denoiser, record)
+    made = pipeline(denoiser, record)
+    return replace(made, seen=TrainingRange.of(made, train, texts, run))
 
 
 def _geometry(unet: UNetOptions | str) -> dict[str, Any]:

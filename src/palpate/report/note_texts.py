@@ -384,6 +384,12 @@ EVALUATION: dict[str, Sentence] = {
         "The text has {tokens} tokens, of which its encoder reads {most}: the words at its end "
         "have no effect"
     ),
+    "photos-unlike": (
+        "Unlike {least:percent} of the training photos or more: {count} of {of:photo} "
+        "({photos:few}). The generator never saw the like, and its images of them mean nothing"
+    ),
+    "words-unseen": "No text of the training has {words:few}: what they do to the image is chance",
+    "text-unlike": "The text is unlike {rate:percent} of the texts of the training",
     "gel-contact": (
         "{gel} looks like a contact, or like no image of a gel: a smooth fit leaves {left:.1f} "
         "gray levels of its colors, and under 4 of a gel that nothing touches. The images are made "
