@@ -106,6 +106,9 @@ VERBS: dict[str, Verb] = {
         "Plan a blinded study: whose images do people find closer to the real ones?",
         "palpate preference make --reference real/ --generated ours/ gvst/ -o study/",
     ),
+    "view": Verb(
+        "view", "Look at a data set or results in a browser, touch a photo", "palpate view tag/"
+    ),
     "preference serve": Verb(
         "preference_serve",
         "Serve a study and keep its votes",

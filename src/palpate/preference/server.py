@@ -320,7 +320,7 @@ def serve(
     with (
         locked(folder),  # of two servers the first to end would count the votes of both
         closing(VoteStore(folder / DATABASE, public["study"])) as store,
-        _listening(host, port) as listener,
+        listening(host, port) as listener,
     ):
         tokens = store.invite(list(public["raters"]), invite, reinvite)
         address = f"[{host}]" if ":" in host else host
@@ -341,7 +341,7 @@ def serve(
             uvicorn.Server(config).run(sockets=[listener])
 
 
-def _listening(host: str, port: int) -> socket.socket:
+def listening(host: str, port: int) -> socket.socket:
     """Return a listening socket, which knows its protocol: asyncio sends at once only on these."""
     family = socket.AF_INET6 if ":" in host else socket.AF_INET
     listener = socket.socket(family, socket.SOCK_STREAM, socket.IPPROTO_TCP)
