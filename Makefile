@@ -18,7 +18,7 @@ export OMP_WAIT_POLICY := passive
 # Compiled modules are kept: each test that starts a process would compile them again.
 export PYTHONDONTWRITEBYTECODE :=
 
-.PHONY: help demo record test test-fast nightly coverage lint format docs wheel release-check lock clean
+.PHONY: help demo record test test-fast nightly coverage lint format docs examples wheel release-check lock clean
 
 help:            ## list the targets
 	@grep -E '^[a-z-]+: .*##' $(MAKEFILE_LIST) | sed -E 's/:[^#]*##/\t/' | expand -t 14
@@ -64,6 +64,9 @@ docs: $(DEV)     ## the docs site in site/, with what commands print now; a brok
 	$(BIN)/python recipes/reference_pages.py
 	$(BIN)/python recipes/printed.py
 	$(BIN)/zensical build --clean --strict
+
+examples: $(DEV)  ## run the notebooks in examples/ and write their pages
+	$(BIN)/python recipes/notebooks.py
 
 wheel: $(DEV)    ## build the wheel and try it alone in empty environments
 	PYTHON=$(PYTHON) .ci/wheel $(BIN)/python

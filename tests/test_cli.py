@@ -22,7 +22,7 @@ train encoder NONE -o out|train autoencoder NONE -o out|train generator HERE --s
 generate HERE --gel NONE -o out|score --generated NONE --reference HERE
 score --generated HERE --reference HERE --encoder palpate/mini --split NONE|probe NONE --split HERE
 probe HERE --split NONE --train|preference make --reference HERE --generated HERE NONE -o out
-preference serve NONE|preference score HERE NONE|report NONE -o out.html|verify NONE
+view NONE|preference serve NONE|preference score HERE NONE|report NONE -o out.html|verify NONE
 demo --data NONE|reproduce tag --root NONE -o out|embed NONE --encoder palpate/mini -o out
 run embed NONE --encoder palpate/mini -o out --slices 2"""
 

@@ -52,7 +52,7 @@ PROBLEMS = [Problem("a:1", "bad-line", "x"), Problem("a:2", "bad-line", "y")]
         ),
         (
             MissingExtraError("av", "video", "Video"),
-            "In palpate's checkout run: pip install -e '.[video]'.",
+            "In palpate's checkout run: pip install -e '.[video]'",
         ),
     ],
 )

@@ -11,7 +11,7 @@ from scipy import linalg, stats
 from forge.scores import codes, jackknife
 from forge.scores import numbered as features
 from palpate.core import FeatureSet, Note, Score
-from palpate.metrics import distributions
+from palpate.metrics import blocks
 from palpate.metrics.distributions import compare_fid, fid
 
 
@@ -82,7 +82,7 @@ def test_many_groups_are_left_out_in_blocks_of_whole_groups_of_about_equal_size(
     rng = np.random.default_rng(7)
     x = rng.normal(size=(400, 3))
     groups = [f"v{int(g)}" for g in np.sort(rng.integers(0, 50, 400))]
-    parts = distributions.draw_blocks(400, 400, [groups, groups], 0)
+    parts = blocks.draw_blocks(400, 400, [groups, groups], 0)
     assert len(parts.names) == 20
     assert all(
         len({int(parts.x[i]) for i in range(400) if groups[i] == g}) == 1 for g in set(groups)

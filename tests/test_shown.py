@@ -13,6 +13,7 @@ from palpate.core import Split
 from palpate.core.shown import Shown
 from palpate.data.backgrounds import Backgrounds
 from palpate.data.imported import Imported
+from palpate.diffusion.generated import Generated
 from palpate.metrics import tmmd
 from palpate.report.results import Results
 from palpate.studies.verifying import Check, Verification
@@ -54,6 +55,7 @@ def answers(small_manifest, tmp_path):
         Backgrounds(small_manifest, tmp_path, 1, 2, 3, 4, {"v0": "reference"}, []),
         Captions(small_manifest.table, record, tmp_path),
         Estimate(3, 2),
+        Generated(tmp_path, {"a": "a.png"}, notice="Made by a generator."),
         Verification("results.json", checks),
     ]
 

@@ -19,6 +19,13 @@ def import_name(package: str, modules: Mapping[str, str], name: str) -> Any:
     """
     if name not in modules:
         raise AttributeError(f"module {package!r} has no attribute {name!r}")
-    value = getattr(importlib.import_module(f"{package}.{modules[name]}"), name)
+    try:
+        value = getattr(importlib.import_module(f"{package}.{modules[name]}"), name)
+    except ModuleNotFoundError as error:
+        if error.name not in ("torch", "diffusers", "transformers", "safetensors"):
+            raise
+        from palpate.core import MissingExtraError
+
+        raise MissingExtraError(error.name, "all", f"{package}.{name}") from None
     setattr(sys.modules[package], name, value)
     return value

@@ -11,7 +11,6 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, Literal, TypedDict, Unpack
 
-from palpate.core.files import write_text
 from palpate.core.messages import MissingExtraError, PalpateError
 
 HUB_ID = re.compile(r"[A-Za-z0-9][\w.-]*/[A-Za-z0-9][\w.-]*(@\w[\w./-]*)?")
@@ -114,5 +113,7 @@ def push(
 
 def write_card(folder: Path, title: str, text: str, tags: Sequence[str]) -> None:
     """The ``README.md`` of a data set on the hub, whose license its owner has to say."""
+    from palpate.core.files import write_text  # late: files that the hub gives are read by others
+
     head = "".join(f"- {tag}\n" for tag in ("palpate", "tactile", *tags))
     write_text(folder / "README.md", f"---\ntags:\n{head}---\n\n# {title}\n\n{text}\n")

@@ -24,7 +24,7 @@ FEW = 5
 SHOWN_PROBLEMS = 40
 FEW_PROBLEMS = 3
 #: A sentence that ends in a command or options, for pasting: it has no full stop.
-_COMMAND = re.compile(r"(: |Use |E\.g\. )(palpate |--?\w)")
+_COMMAND = re.compile(r"(: |Use |E\.g\. )(palpate |pip |--?\w)")
 
 
 class PalpateError(Exception):
@@ -66,6 +66,10 @@ class PalpateError(Exception):
 
     def __str__(self) -> str:
         return self.message()
+
+    def _render_traceback_(self) -> list[str]:
+        """What a notebook shows in the place of a traceback."""
+        return [f"{type(self).__name__}: {self}"]
 
     def message(
         self,

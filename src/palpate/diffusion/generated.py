@@ -24,8 +24,18 @@ from typing import Any
 
 from PIL import Image
 
-from palpate.core import Note, PalpateError, Problem, read_record, reading_entry, require, short
+from palpate.core import (
+    Note,
+    PalpateError,
+    Problem,
+    fact_lines,
+    read_record,
+    reading_entry,
+    require,
+    short,
+)
 from palpate.core.records import from_plain
+from palpate.core.shown import Shown
 from palpate.data.images import read_image
 
 FORMAT = "palpate-generated/1"
@@ -34,7 +44,7 @@ UNLIKE = 0.95
 
 
 @dataclass(frozen=True)
-class Generated:
+class Generated(Shown):
     """Generated tactile images.
 
     Attributes:
@@ -63,6 +73,13 @@ class Generated:
     memory: Mapping[str, Image.Image] = field(default_factory=dict[str, Image.Image], repr=False)
     missing: int = 0
     evaluations: int = 0
+
+    def __str__(self) -> str:
+        """Where the images are, how many, and what who looks at them must know."""
+        facts = {"folder": self.folder, "images": len(self.ids), "made now": self.new}
+        facts |= {"skipped": len(self.skipped)} if self.skipped else {}
+        facts |= {"notice": self.notice} if self.notice else {}
+        return "\n".join(["Tactile images", *fact_lines(facts)])
 
     @property
     def ids(self) -> list[str]:

@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 
 from palpate._version import __version__
 from palpate.core import FeatureSet, Note, Score, rng_for
-from palpate.metrics.distributions import FidOptions, checked_rows, draw_blocks
+from palpate.metrics.blocks import FidOptions, checked_rows, draw_blocks
 from palpate.metrics.inputs import Array, Index, checked_whole, with_columns
 from palpate.metrics.intervals import Scored, Spread, score_of
 from palpate.metrics.paired import Comparison, compared, same_samples
