@@ -18,9 +18,9 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
 from PIL import Image
-from scipy import ndimage
 
 from palpate.core import Note, Progress, quiet
 from palpate.data.images import cached_images, read_image, square
@@ -83,7 +83,7 @@ def gel_notes(file: Path, stock: NDArray[np.uint8] | None) -> list[Note]:
 def unevenness(gel: NDArray[np.uint8]) -> float:
     """Gray levels of color that a smooth fit leaves of an image (64, 64, 3)."""
     image = gel / 255.0
-    away = ~np.asarray(ndimage.binary_dilation(marker_mask(image)), bool)
+    away = ~np.asarray(scipy.ndimage.binary_dilation(marker_mask(image)), bool)
     if away.mean() < 0.5:  # no gel is mostly markers
         away[:] = True
     y, x = np.mgrid[-1 : 1 : image.shape[0] * 1j, -1 : 1 : image.shape[1] * 1j]

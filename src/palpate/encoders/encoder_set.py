@@ -48,6 +48,7 @@ from palpate.core import (
     write_json,
 )
 from palpate.data.images import SAVE_AGAIN, Frames, Preprocess, load_images
+from palpate.encoders.clip import Clip, ClipTokenizer
 from palpate.encoders.gel import WEIGHTS, GelEncoder
 from palpate.encoders.models import (
     FETCH_AGAIN,
@@ -495,8 +496,6 @@ def load_clip(source: str | Path, *, device: str = "cpu") -> EncoderSet:
         PalpateError: if files are missing, unreadable, of another model or changed since, or the
             hub is out of reach.
     """
-    from transformers import AutoModel, AutoTokenizer, CLIPModel
-
     name, folder = find_single(source, "clip", "CLIP", CLIP_FIX)
     local, must = name == str(folder), f"{source} must be a CLIP model"
     note, config = folder / "palpate.json", folder / "config.json"
@@ -510,13 +509,17 @@ def load_clip(source: str | Path, *, device: str = "cpu") -> EncoderSet:
         f"model_type {family!r} in {config}",
         fix=CLIP_FIX,
     )
-    kind = CLIPModel if family == "clip" else AutoModel
+    kind, reader = Clip, ClipTokenizer
+    if not (family == "clip" and local and note.is_file()):  # else as palpate writes it
+        from transformers import AutoModel, AutoTokenizer, CLIPModel
+
+        kind, reader = CLIPModel if family == "clip" else AutoModel, AutoTokenizer
     model = load_model(kind, name, must, CLIP_FIX, local_files_only=local)
-    tokenizer = None
+    tokenizer: Any = None
     try:
         with silent():
             if FAMILIES[str(family)]:
-                tokenizer = AutoTokenizer.from_pretrained(name, local_files_only=local)
+                tokenizer = reader.from_pretrained(name, local_files_only=local)
     except Exception as error:  # tokenizers raises bare ones
         raise PalpateError(must, first_line(error), CLIP_FIX) from None
     sized = family in ("clip", "siglip")  # the others take images of any size

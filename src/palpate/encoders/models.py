@@ -29,6 +29,7 @@ import copy
 import hashlib
 import json
 import pickle
+import sys
 from collections.abc import Generator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -415,6 +416,9 @@ def pick_device(device: str | torch.device) -> torch.device:
 @contextmanager
 def silent() -> Generator[None]:
     """No load reports or progress bars of transformers inside; its settings are restored."""
+    if "transformers" not in sys.modules:  # which takes seconds to import
+        yield
+        return
     from transformers.utils import logging
 
     level, bars = logging.get_verbosity(), logging.is_progress_bar_enabled()

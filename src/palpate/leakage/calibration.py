@@ -27,8 +27,8 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.special import pdtrc  # of a Poisson distribution
 
 from palpate.leakage.neighbors import Floats, Ints
 
@@ -159,7 +159,7 @@ def measured(nulls: Sequence[Floats], groups: Ints, shares: Sequence[float], rat
 def missed(measured: float, count: int, rate: float) -> bool:
     """Whether a measured rate contradicts MISSED times the promised one."""
     over = round(measured * count)
-    return over > 0 and bool(pdtrc(over - 1, MISSED * rate * count) < CHANCE)
+    return over > 0 and bool(scipy.special.pdtrc(over - 1, MISSED * rate * count) < CHANCE)
 
 
 def beyond_chance(
@@ -183,7 +183,7 @@ def beyond_chance(
             continue
         ratio = found / by_chance
         bound = np.exp(-by_chance / lumps.max() * (ratio * np.log(ratio) - ratio + 1))
-        if min(pdtrc(len(lumps) - 1, by_chance), bound) < CHANCE:
+        if min(scipy.special.pdtrc(len(lumps) - 1, by_chance), bound) < CHANCE:
             return True
     return False
 

@@ -26,9 +26,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.sparse import coo_matrix
-from scipy.sparse.csgraph import connected_components
 from threadpoolctl import threadpool_limits
 
 from palpate.core import Note, Progress, quiet
@@ -287,8 +286,12 @@ def _null(images: Pool, base: Ints, views: list[View]) -> Unrelated | None:
 def _clusters(images: Pool, i: Ints, j: Ints) -> Ints:
     """Components of images that are linked, or belong to several samples; -1 for samples alone."""
     count = len(images.blank)
-    graph = coo_matrix((np.ones(len(i), np.int8), (i, j)), shape=(count, count))
-    component = connected_components(graph, directed=False)[1] if count else np.zeros(1, np.int64)
+    graph = scipy.sparse.coo_matrix((np.ones(len(i), np.int8), (i, j)), shape=(count, count))
+    component = (
+        scipy.sparse.csgraph.connected_components(graph, directed=False)[1]
+        if count
+        else np.zeros(1, np.int64)
+    )
     usable = images.item >= 0
     usable[usable] = ~images.blank[images.item[usable]]
     label = np.where(usable, component[images.item], -1).astype(np.int64)

@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
-import faiss
 import numpy as np
 from numpy.typing import NDArray
 
@@ -70,6 +69,8 @@ def _largest(apart: Apart) -> int:
 
 def _search(queries: Floats, base: Floats, k: int) -> tuple[Ints, Any]:
     """Rows and squared distances; -1 and infinity where there are fewer than k."""
+    import faiss  # lists and most scores do without
+
     index = np.full((len(queries), k), -1, np.int64)
     distance = np.full((len(queries), k), np.inf, np.float32)
     if len(base):

@@ -24,9 +24,8 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy import sparse
-from scipy.optimize import Bounds, LinearConstraint, milp
 
 from palpate.core import rng_for
 
@@ -167,25 +166,27 @@ class _Program:
     def __init__(self, problem: Problem, limit: float | None = None) -> None:
         self.problem, self.limit = problem, limit or 0.0
         groups, parts = len(problem.counts), len(problem.target)
-        eye = sparse.identity(parts)
-        shares: Any = sparse.kron(problem.share[:, problem.used].T, eye)
-        presence: Any = sparse.kron((problem.counts > 0)[:, problem.possible].T.astype(float), eye)
+        eye = scipy.sparse.identity(parts)
+        shares: Any = scipy.sparse.kron(problem.share[:, problem.used].T, eye)
+        presence: Any = scipy.sparse.kron(
+            (problem.counts > 0)[:, problem.possible].T.astype(float), eye
+        )
         wanted = np.tile(problem.target, int(problem.used.sum()))
         count = len(wanted)
         self.x, self.d, self.u = groups * parts, 0 if limit is None else count, presence.shape[0]
         self.whole = self.x <= WHOLE
-        once = sparse.kron(sparse.identity(groups), np.ones((1, parts)))
-        d, excess = sparse.identity(count), np.ones((count, 1))
+        once = scipy.sparse.kron(scipy.sparse.identity(groups), np.ones((1, parts)))
+        d, excess = scipy.sparse.identity(count), np.ones((count, 1))
         rows: list[list[Any]] = [
             [once, None, None, None],
             [shares, -d, None, None],
             [shares, d, None, None],
             [None, d, -excess, None],
-            [presence, None, None, sparse.identity(self.u)],
+            [presence, None, None, scipy.sparse.identity(self.u)],
         ]
         if limit is None:
             rows[1:4] = [[shares, -excess, None], [shares, excess, None]]
-            rows[0], rows[-1] = [once, None, None], [presence, None, sparse.identity(self.u)]
+            rows[0], rows[-1] = [once, None, None], [presence, None, scipy.sparse.identity(self.u)]
         least, most = np.full(count, -np.inf), np.full(count, np.inf)
         caps = [] if limit is None else [(least, np.full(count, limit))]
         one = (np.ones(groups), np.ones(groups))
@@ -193,8 +194,8 @@ class _Program:
         limits = [one, (least, wanted), (wanted, most), *caps, present]
         low: Any = np.concatenate([low for low, _ in limits])
         high: Any = np.concatenate([high for _, high in limits])
-        matrix: Any = sparse.block_array(rows, format="csr")
-        self.constraints = LinearConstraint(matrix, low, high)
+        matrix: Any = scipy.sparse.block_array(rows, format="csr")
+        self.constraints = scipy.optimize.LinearConstraint(matrix, low, high)
 
     def objective(self, *, excess: float, mean: float = 0.0, cost: Floats | float = 0.0) -> Floats:
         """Weights of the excess, of the mean deviation, and of each x."""
@@ -258,10 +259,10 @@ class _Program:
         result: Any = None
         small = gap == 0 and self.x <= SMALL
         for presolve in (not small, small):  # HiGHS ends some small programs in "Solve error"
-            result = milp(
+            result = scipy.optimize.milp(
                 objective,
                 constraints=self.constraints,
-                bounds=Bounds(*limits),  # pyright: ignore[reportArgumentType]
+                bounds=scipy.optimize.Bounds(*limits),  # pyright: ignore[reportArgumentType]
                 integrality=integrality,
                 options=options | {"presolve": presolve},
             )

@@ -29,7 +29,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any, Unpack
 
 import numpy as np
-from scipy import ndimage
+import scipy
 
 from palpate.core import Note, Score
 from palpate.metrics.images import (
@@ -217,7 +217,7 @@ def contact_of(
         near = _dilated(near, side // 96)
     sigma = side / 48
     change = _fill(image - background, ~near, side / 32)
-    change = ndimage.gaussian_filter(change, (sigma, sigma, 0))
+    change = scipy.ndimage.gaussian_filter(change, (sigma, sigma, 0))
     # of white noise, that of two images: a Gaussian blur leaves 1 / (2 sqrt(pi) sigma) of its sd
     noise = np.sqrt(2) * _noise(background, ~near) / (2 * np.sqrt(np.pi) * max(sigma, 0.5))
     size = np.sqrt((change**2).mean(axis=2))
@@ -231,8 +231,8 @@ def _fill(image: Array, keep: Mask, sigma: float) -> Array:
     """``image`` (h, w, c) with the pixels not kept replaced by a blur of the kept ones around."""
     weights = keep[..., None].astype(np.float64)
     blur = (sigma, sigma, 0)
-    around = ndimage.gaussian_filter(image * weights, blur)
-    around /= np.maximum(ndimage.gaussian_filter(weights, blur), 1e-6)
+    around = scipy.ndimage.gaussian_filter(image * weights, blur)
+    around /= np.maximum(scipy.ndimage.gaussian_filter(weights, blur), 1e-6)
     return np.where(keep[..., None], image, around)
 
 
@@ -243,13 +243,13 @@ def _noise(background: Array, keep: Mask) -> float:
     difference in both directions, which flat gel does not have, is 6 (the norm of its weights)
     times a pixel's. 0 where hardly a pixel is away from the markers.
     """
-    away = np.asarray(ndimage.binary_erosion(keep, np.ones((3, 3)), border_value=1), bool)
+    away = np.asarray(scipy.ndimage.binary_erosion(keep, np.ones((3, 3)), border_value=1), bool)
     if away.mean() < 1 / 16:
         return 0.0
     kernel = np.outer([1, -2, 1], [1, -2, 1])[..., None]
-    change = np.abs(ndimage.convolve(background, kernel, mode="mirror"))
+    change = np.abs(scipy.ndimage.convolve(background, kernel, mode="mirror"))
     return 1.4826 * float(np.median(change[away])) / 6
 
 
 def _dilated(mask: Mask, pixels: int) -> Mask:
-    return np.asarray(ndimage.binary_dilation(mask, iterations=max(1, pixels)), bool)
+    return np.asarray(scipy.ndimage.binary_dilation(mask, iterations=max(1, pixels)), bool)

@@ -46,7 +46,7 @@ from dataclasses import replace
 from typing import Any, NamedTuple, Unpack
 
 import numpy as np
-from scipy import linalg
+import scipy
 
 from palpate._version import __version__
 from palpate.core import FeatureSet, Note, Score, require
@@ -171,7 +171,7 @@ class Normal(NamedTuple):
         """F (r, d) with F' F the covariance, without what rounding left of no spread."""
         if not self.full:
             return self.matrix
-        values, vectors = linalg.eigh(self.matrix, check_finite=False)
+        values, vectors = scipy.linalg.eigh(self.matrix, check_finite=False)
         keep = values > len(values) * EPSILON * max(values[-1], 0.0)
         return (vectors[:, keep] * np.sqrt(values[keep])).T
 
@@ -205,8 +205,8 @@ def _sums(x: Array, center: Array) -> Array:
 def _distance(a: Normal, b: Normal) -> float:
     delta, roots = a.mean - b.mean, None
     if a.full and b.full:
-        with suppress(linalg.LinAlgError):  # b is singular
-            values = linalg.eigh(
+        with suppress(scipy.linalg.LinAlgError):  # b is singular
+            values = scipy.linalg.eigh(
                 *(a.matrix, b.matrix), type=2, eigvals_only=True, driver="gv", check_finite=False
             )
             # rounding leaves +-eps * largest for a zero, whose root would count
@@ -214,7 +214,7 @@ def _distance(a: Normal, b: Normal) -> float:
             roots = np.sqrt(values)
     if roots is None:
         cross = a.factor @ b.factor.T
-        roots = linalg.svdvals(cross, check_finite=False) if cross.size else np.zeros(1)
+        roots = scipy.linalg.svdvals(cross, check_finite=False) if cross.size else np.zeros(1)
     traces = (np.trace(x.matrix) if x.full else np.vdot(x.matrix, x.matrix) for x in (a, b))
     return max(float(delta @ delta + sum(traces) - 2 * np.sum(roots)), 0.0)
 

@@ -22,8 +22,8 @@ from dataclasses import dataclass, field
 from typing import Any, Literal, TypedDict, Unpack
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy import ndimage
 
 from palpate._version import __version__
 from palpate.core import Note, Score, require
@@ -259,7 +259,7 @@ def local_maps(
     c1, c2 = (K1 * data_range) ** 2, (K2 * data_range) ** 2
     planes = np.stack([x, y, x * x + y * y, x * y])  # together: half the passes
     for axis in (1, 2):
-        planes = ndimage.correlate1d(planes, LINE, axis, mode="mirror")
+        planes = scipy.ndimage.correlate1d(planes, LINE, axis, mode="mirror")
     cut = WINDOW // 2 if border == "valid" else 0
     rows, columns = (slice(cut, side - cut) for side in x.shape[:2])
     mx, my, both, xy = planes[:, rows, columns]

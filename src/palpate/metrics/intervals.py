@@ -32,7 +32,7 @@ from itertools import repeat
 from typing import Any
 
 import numpy as np
-from scipy import special
+import scipy
 
 from palpate.core import Score, rng_for
 from palpate.core.features import Array, Index
@@ -278,14 +278,14 @@ class Spread:
         """The 95 % t interval within [low, high], or None."""
         if not self.known:
             return None
-        reach = float(special.stdtrit(self.df, 0.5 + LEVEL / 2)) * self.error
+        reach = float(scipy.special.stdtrit(self.df, 0.5 + LEVEL / 2)) * self.error
         return max(self.value - reach, low), min(self.value + reach, high)
 
     def shares(self) -> tuple[float, float]:
         """The shares of its t distribution below and above 0; halves where there is no error."""
         if not self.known:
             return 0.5, 0.5
-        below, above = special.stdtr(self.df, np.array([-1, 1]) * self.value / self.error)
+        below, above = scipy.special.stdtr(self.df, np.array([-1, 1]) * self.value / self.error)
         return float(below), float(above)
 
 

@@ -23,9 +23,9 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+import scipy
 from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
-from scipy import ndimage
 
 from palpate.metrics.images import Array, as_unit
 
@@ -145,10 +145,10 @@ def _luma_and_around(image: Array) -> tuple[Array, Array]:
 def _spots(image: Array) -> tuple[Array, Array]:
     """Centers (m, 2) of the markers of an image, x and y in pixels, and the ink (m,) of each."""
     gray, around = _luma_and_around(image)
-    labeled: Any = ndimage.label(gray < MARKER * around)  # wrongly typed in scipy
+    labeled: Any = scipy.ndimage.label(gray < MARKER * around)  # wrongly typed in scipy
     areas, count = labeled
     ink = np.clip(1 - gray / np.maximum(around, 1e-3), 0, 1)
-    areas = np.where(areas > 0, areas, ndimage.maximum_filter(areas, 3)).ravel()
+    areas = np.where(areas > 0, areas, scipy.ndimage.maximum_filter(areas, 3)).ravel()
     y, x = (axis.ravel() for axis in np.indices(gray.shape))
     sums = [np.bincount(areas, ink.ravel() * of, count + 1)[1:].astype(float) for of in (1.0, x, y)]
     centers = np.stack(sums[1:], axis=1) / sums[0][:, None]

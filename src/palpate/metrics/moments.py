@@ -25,7 +25,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from scipy import special
+import scipy
 
 from palpate.metrics.inputs import Array, Index, host, in_threads, like, release, row_norms, rows_at
 from palpate.metrics.intervals import PairSums, split_by
@@ -151,7 +151,7 @@ def remainder_factor(rho: float) -> float:
     if rho < 1e-80:
         return rho / 6
     # sum_{p >= 3} rho^p / p! = exp(rho) P(3, rho), P the regularized lower incomplete gamma
-    return float(np.exp(rho) * special.gammainc(3, rho) / rho**2)
+    return float(np.exp(rho) * scipy.special.gammainc(3, rho) / rho**2)
 
 
 def center_of(parts: Iterable[Any]) -> Array:

@@ -18,9 +18,8 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.optimize import minimize
-from scipy.special import log_softmax
 
 from palpate.core import FeatureSet, Score, require, rng_for
 from palpate.metrics.inputs import Array, check, require_one_encoder
@@ -252,13 +251,13 @@ def _logistic(x: Array, y: NDArray[np.intp], classes: int, l2: float) -> tuple[A
 
     def objective(flat: Array) -> tuple[float, Array]:
         w = flat.reshape(d + 1, classes)
-        log_p = log_softmax(design @ w, axis=1)
+        log_p = scipy.special.log_softmax(design @ w, axis=1)
         gradient = design.T @ ((np.exp(log_p) - target) / n) + 2 * penalty * w
         loss = (penalty * w**2).sum() - log_p[np.arange(n), y].mean()
         return float(loss), gradient.ravel()
 
     start, options = np.zeros((d + 1) * classes), {"maxiter": 300}
-    w = minimize(objective, start, jac=True, method="L-BFGS-B", options=options).x
+    w = scipy.optimize.minimize(objective, start, jac=True, method="L-BFGS-B", options=options).x
     w = w.reshape(d + 1, classes)
     return w[:d], w[d]
 

@@ -23,8 +23,8 @@ from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.special import gammaln
 
 from palpate.core import FeatureSet, Score, require, rng_for
 from palpate.metrics.inputs import check, rows_text
@@ -67,8 +67,14 @@ class Ranks:
     def within(self, k: int) -> Array:
         """(n,) probability that a right key is among the first k."""
         slots = np.clip(k - self.above, 0, self.ties)
-        log_miss = gammaln(self.wrong + 1) - gammaln(self.wrong - slots + 1)  # -inf: cannot miss
-        return 1 - np.exp(log_miss - gammaln(self.ties + 1) + gammaln(self.ties - slots + 1))
+        log_miss = scipy.special.gammaln(self.wrong + 1) - scipy.special.gammaln(
+            self.wrong - slots + 1
+        )
+        return 1 - np.exp(
+            log_miss
+            - scipy.special.gammaln(self.ties + 1)
+            + scipy.special.gammaln(self.ties - slots + 1)
+        )
 
     def shuffled(self) -> Ranks:
         """The same where all keys are equal: chance."""

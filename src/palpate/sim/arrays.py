@@ -13,7 +13,7 @@ from functools import lru_cache
 from typing import TypeAlias
 
 import numpy as np
-from scipy import ndimage
+import scipy
 
 #: A float32 array; shapes are given in the docstrings.
 Array: TypeAlias = np.ndarray
@@ -63,10 +63,10 @@ def smooth(field: Array, sigma: float) -> Array:
     Two boxes of width k have variance (k² - 1) / 6, hence k = sqrt(6 sigma² + 1).
     """
     if sigma < 2.5:
-        return ndimage.gaussian_filter(field, sigma, truncate=3.0, mode="nearest")
+        return scipy.ndimage.gaussian_filter(field, sigma, truncate=3.0, mode="nearest")
     width = round((6.0 * sigma * sigma + 1.0) ** 0.5) | 1
     for axis in (0, 1, 0, 1):
-        field = ndimage.uniform_filter1d(field, width, axis, mode="nearest")
+        field = scipy.ndimage.uniform_filter1d(field, width, axis, mode="nearest")
     return field
 
 

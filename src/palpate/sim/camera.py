@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from scipy import ndimage
+import scipy
 
 from palpate.sim.arrays import Array, blend, f32, grid, hsv, over, smoothstep, turned, window
 from palpate.sim.materials import Surface
@@ -103,7 +103,7 @@ class Camera:
     def light_object(self, surface: Surface, number: int) -> tuple[Array, float]:
         """Light object ``number`` of the video: its tile (3, n, n) as seen, and the exposure."""
         height, px = surface.height, surface.px
-        softened = ndimage.gaussian_filter(height, 0.6, mode="wrap")
+        softened = scipy.ndimage.gaussian_filter(height, 0.6, mode="wrap")
         slope_y, slope_x = (
             (np.roll(softened, -1, axis) - np.roll(softened, 1, axis)) * (0.5 / px)
             for axis in (0, 1)
@@ -111,7 +111,7 @@ class Camera:
         upright = 1.0 / np.sqrt(1.0 + slope_x * slope_x + slope_y * slope_y)
         lx, ly, lz = self.sun_to
         direct = np.maximum((lz - slope_x * lx - slope_y * ly) * upright, 0.0)
-        pit = height - ndimage.gaussian_filter(height, 1.2 / px, mode="wrap")
+        pit = height - scipy.ndimage.gaussian_filter(height, 1.2 / px, mode="wrap")
         open_sky = np.clip(1.0 + 0.55 * pit * (1.0 / (0.35 + float(height.std()))), 0.35, 1.25)
         half_way = ((lz + 1.0) - slope_x * lx - slope_y * ly) * upright
         norm = math.sqrt(lx * lx + ly * ly + (lz + 1.0) ** 2)
@@ -123,7 +123,9 @@ class Camera:
         exposure = (0.40 * self.exposure / (0.12 + float(rgb.mean()))) ** 0.75
         blur = max(0.3, 0.42 * self.view / self.options.size / px)
         lit = np.ascontiguousarray(np.moveaxis(rgb * exposure, 2, 0))
-        return ndimage.gaussian_filter(lit, (0, blur, blur), mode="wrap", truncate=3.0), exposure
+        return scipy.ndimage.gaussian_filter(
+            lit, (0, blur, blur), mode="wrap", truncate=3.0
+        ), exposure
 
     def photo(self, tile: Array, exposure: float, state: State, frame: int) -> Array:
         """Render a frame, (n, n, 3), about [0, 1], from no other; see :meth:`light_object`."""
@@ -151,7 +153,7 @@ class Camera:
             image = _hand(image, self.skin * min(1.2, exposure * 0.9), angle, tip)
         blur = self.blur * size / 128.0
         if blur > 0.2:
-            image = ndimage.gaussian_filter(image, (0, blur, blur), truncate=2.5)
+            image = scipy.ndimage.gaussian_filter(image, (0, blur, blur), truncate=2.5)
         image = np.ascontiguousarray(np.moveaxis(image, 0, 2))
         image += rng.standard_normal((size, size, 3), dtype=np.float32) * np.float32(self.noise)
         return np.clip(image, 0.0, 1.0) ** 0.8

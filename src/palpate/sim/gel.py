@@ -25,7 +25,7 @@ from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
-from scipy import ndimage
+import scipy
 
 from palpate.core import rng_for
 from palpate.sim.arrays import (
@@ -138,7 +138,7 @@ class Sensor:
             field.append(down(np.clip(1.0 + a + 0.35 * a * a - hump * square, 0.08, None)))
         self.field = np.stack(field)
         self.veil = down((1.0 - rng.uniform(*VIGNETTE) * square) * (1.0 + _dirt(rng)))
-        texture = ndimage.gaussian_filter(_white(rng), 0.3 / (pad / DRAWN))
+        texture = scipy.ndimage.gaussian_filter(_white(rng), 0.3 / (pad / DRAWN))
         self.texture = down(texture * (0.0022 / float(texture.std())))
         self.dome = down(square * (self.half**2 / (2.0 * rng.uniform(*DOME_MM))))
         inked = name == "gelsight" and options.markers > 0
@@ -227,8 +227,8 @@ def _white(rng: np.random.Generator) -> Array:
 def _dirt(rng: np.random.Generator) -> Array:
     """Draw uneven coating, specks and scratches: a change of brightness around 0."""
     draw, (y, x) = rng.uniform, grid(DRAWN)
-    low = ndimage.gaussian_filter(_white(rng), DRAWN / 7, mode="reflect")
-    fine = ndimage.gaussian_filter(_white(rng), 1.6)
+    low = scipy.ndimage.gaussian_filter(_white(rng), DRAWN / 7, mode="reflect")
+    fine = scipy.ndimage.gaussian_filter(_white(rng), 1.6)
     dirt = low * (0.018 / float(low.std())) + fine * (0.004 / float(fine.std()))
     for _ in range(int(rng.integers(2, 9))):
         cx, cy, width = draw(-1.0, 1.0), draw(-1.0, 1.0), draw(0.008, 0.03)

@@ -17,7 +17,7 @@ from itertools import product
 from typing import TypeVar
 
 import numpy as np
-from scipy import ndimage
+import scipy
 
 from palpate.sim.arrays import Array, f32, sample_periodic, smoothstep, turned
 
@@ -248,4 +248,4 @@ class Tile:
         z = np.zeros(n * n, np.float32)
         np.maximum.at(z, (iy * n + ix).ravel(), profile.ravel())
         # The rounded steps miss some pixels; closing fills them.
-        return ndimage.grey_closing(z.reshape(n, n), 2, mode="wrap")
+        return scipy.ndimage.grey_closing(z.reshape(n, n), 2, mode="wrap")

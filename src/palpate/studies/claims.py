@@ -18,7 +18,7 @@ from itertools import groupby
 from statistics import fmean
 
 import numpy as np
-from scipy import special
+import scipy
 
 from palpate.core import Measure, Score
 from palpate.report.labels import measured, number
@@ -36,7 +36,7 @@ PEOPLE = "human preference"
 #: How to read a lead.
 BEHIND = "below 0: behind"
 #: The 97.5 % point of the normal distribution.
-Z = float(special.ndtri(0.975))
+Z = float(scipy.special.ndtri(0.975))
 
 
 #: The paper's comparisons, its method first: with trainings on images, then with the no-contact

@@ -13,7 +13,7 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from scipy import special
+import scipy
 
 from palpate.core import Note, Score, plain, require
 from palpate.report.labels import digits_of, label_of, measured, number, subject_of, with_interval
@@ -52,7 +52,7 @@ def over_seeds(scores: Sequence[Score]) -> Score:
     reaches = [reach for s in scores if (reach := _reach(s))]
     if mean is None or len(reaches) < count:
         return replace(first, value=mean, interval=None, interval_method="", details=details)
-    between = float(special.stdtrit(count - 1, 0.5 + first.level / 2))
+    between = float(scipy.special.stdtrit(count - 1, 0.5 + first.level / 2))
     between *= float(np.std(means, ddof=1)) / np.sqrt(count)
     low, high = np.sqrt(np.mean(np.square(reaches), axis=0) + between**2)
     return replace(
