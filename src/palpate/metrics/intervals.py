@@ -412,13 +412,17 @@ def permutation_test(
     if not both.any() and len(set(inside[alone, 1].tolist())) < 2:
         return None
     rng = rng_for(seed, "permutation test")
+    cells = 1 + bool(both.any())  # of a unit; alone, it has one
     label = np.tile([False, True], (count + 1, len(both), 1))  # row 0: as observed
     swap: Any = rng.random((count, len(both))) < 0.5
     label[1:] ^= (swap & both)[..., None]
     if len(alone):
         dealt = rng.permuted(np.tile(inside[alone, 1], (count, 1)), axis=1)
         label[1:, alone] = dealt[..., None]
-    m = one_hot(2 * number + sums.segment, 2 * len(both))  # a cell a unit and segment
+    if cells == 1:
+        label[0] = inside[:, 1:]
+    label = label[..., :cells]
+    m = one_hot(cells * number + sums.segment * (cells - 1), cells * len(both))
     block, n = m.T @ sums.block @ m, sums.n @ m
     block += np.diag(sums.diagonal @ m * (estimator == "biased"))
     batches = [
@@ -440,24 +444,27 @@ def permutation_test(
 
 
 def _studentized(second: Array, block: Array, n: Array, estimator: str) -> tuple[Array, Array]:
-    """(B,) MMD^2 for (B, U, 2) labels, 1 for set 1, and its (B,) standard errors over U units.
+    """(B,) MMD^2 for (B, U, c) labels, 1 for set 1, and its (B,) standard errors over U units.
 
-    ``block`` (2U, 2U) are the sums of cells with cells, ``n`` (2U,) their samples.
+    ``block`` (Uc, Uc) are the sums of the c cells of all units with each other, ``n`` (Uc,) their
+    samples.
     """
     shape, grouped, first = second.shape, estimator == "grouped", 1 - second
     inner = np.einsum("uiuj->uij", block.reshape(*shape[1:], *shape[1:]))
     near = (second.reshape(len(second), -1) @ block).reshape(shape)  # sums with the second set
     far = block.sum(axis=0).reshape(shape[1:]) - near
     n = n.reshape(shape[1:])
-    value, without = np.zeros(len(second)), np.zeros(shape[:2])
+    value, without = np.zeros((shape[0], 1)), np.zeros(shape[:2])
 
-    def totals(right: Array, left: Array, inside: Array) -> Array:
-        """(B, 1 + U) of all units, and without each."""
-        total = (right - grouped * inside).sum(axis=1)
-        return np.column_stack([total, total[:, None] - right - left + (1 + grouped) * inside])
+    def totals(right: Array, left: Array, inside: Array) -> tuple[Array, Array]:
+        """(B, 1) of all units, and (B, U) without each."""
+        right, left = (right - inside, left - inside) if grouped else (right, left)
+        total = right.sum(axis=1, keepdims=True)
+        without = total - right - left
+        return total, without if grouped else without + inside
 
     def of_units(cells: Array) -> Array:  # a sum over so short an axis is slow
-        return cells[..., 0] + cells[..., 1]
+        return cells[..., 0] + cells[..., 1] if shape[2] > 1 else cells[..., 0]
 
     for (a, with_a), (b, with_b), weight in (
         ((first, far), (first, far), 1),
@@ -465,17 +472,18 @@ def _studentized(second: Array, block: Array, n: Array, estimator: str) -> tuple
         ((first, far), (second, near), -2),
     ):
         own = of_units(a * of_units(inner * b[..., None, :]))
-        sums = totals(of_units(a * with_b), of_units(b * with_a), own)
+        right = of_units(a * with_b)
+        sums = totals(right, right if a is b else of_units(b * with_a), own)
         x, y = of_units(a * n), of_units(b * n)
         alone = x * (weight > 0 and estimator == "unbiased")  # pairs i = j, which do not count
         every = (v.sum(axis=1, keepdims=True) for v in (y, x))
         right, left = (v * of_all - alone for v, of_all in zip((x, y), every, strict=True))
-        mean = mean_of_pairs(sums, totals(right, left, x * y - alone))
-        value += weight * mean[:, 0]
-        without += weight * mean[:, 1:]
+        pairs = zip((value, without), sums, totals(right, left, x * y - alone), strict=True)
+        for side, kernels, count in pairs:
+            side += weight * mean_of_pairs(kernels, count)
     drift = without - without.mean(axis=1, keepdims=True)
     error = np.sqrt((shape[1] - 1) / shape[1] * (drift**2).sum(axis=1))
-    return value, np.where(error > 0, error, np.nan)
+    return value[:, 0], np.where(error > 0, error, np.nan)
 
 
 def without_interval(score: Score) -> Score:

@@ -214,13 +214,13 @@ def median_distance(x: Any, groups: Sequence[str] | Index | None = None) -> floa
     at = np.sort(rng_for(0, "median distance").permutation(n)[:MEDIAN_ROWS])
     some = host(rows_at(x, at))
     release(x)
-    squares, (first, second) = (some**2).sum(axis=1), np.triu_indices(len(at), 1)
+    squares, pairs = (some**2).sum(axis=1), np.tri(len(at), k=-1, dtype=bool)
     products = squares[:, None] + squares - 2 * some @ some.T
-    distances = np.sqrt(np.maximum(products[first, second], 0))
     if groups is not None:
         names = np.asarray(groups)[at]
-        apart = names[first] != names[second]
-        distances = distances[apart] if apart.any() else distances
+        apart = pairs & (names[:, None] != names)
+        pairs = apart if apart.any() else pairs
+    distances = np.sqrt(np.maximum(products[pairs], 0))
     middle = float(np.median(distances)) if distances.size else 0.0
     got = f"{n} row{'s' * (n != 1)}, {'all equal' if n > 1 else 'no pair'}"
     must = "must be a number where the median distance has no rows that differ"
@@ -331,27 +331,30 @@ def blocked_sums(
     item, (segment, unit), n = item.reshape(-1)[order], cells[:, order], len(order)
     pairs = _Pairs(x, order, kernel)
     blocks = _slices(n, max(1, min(block, max(SMALL_BLOCK, -(-n // 8)))))
-    rows = columns = [_indicators(item[b], pairs.z) for b in blocks]
+    by_item = [_sums_of_equal(item[b], pairs.z) for b in blocks]
+    present = [np.unique(item[b]) for b in blocks]
     count = width = items.shape[1]
+    dense, columns = [], present
     if not (joined := count <= MOST_ITEMS):  # sums with weighted segments instead of items
         each = (np.ones(n), *(w[order] for w in weights))
-        dense = np.hstack([one_hot(segment, segments) * w[:, None] for w in each])
-        width = dense.shape[1]
-        columns = [(np.arange(width), _wide(dense[b], pairs.z)) for b in blocks]
+        weighted = np.hstack([one_hot(segment, segments) * w[:, None] for w in each])
+        width = weighted.shape[1]
+        dense = [_wide(weighted[b], pairs.z) for b in blocks]
+        columns = [np.arange(width)] * len(blocks)
     total = np.zeros((count, width))
 
     def sums_of(pair: tuple[int, int]) -> list[Array]:
         i, j = pair
         k = pairs.block(blocks[i], blocks[j], diagonal=0 if i == j else None)
-        sums = [host(rows[i][1].T @ (k @ columns[j][1]))]
-        if i != j:
-            sums.append(sums[0].T if joined else host(rows[j][1].T @ (k.T @ columns[i][1])))
-        return sums
+        if joined:
+            sums = host(by_item[j](by_item[i](k).T))
+            return [sums.T, sums]
+        return [host(by_item[i](k @ dense[j])), host(by_item[j](k.T @ dense[i]))]
 
     todo = [(i, j) for i in range(len(blocks)) for j in range(i, len(blocks))]
     for (i, j), sums in zip(todo, in_threads(sums_of, todo, x), strict=True):
-        for values, a, b in zip(sums, (i, j), (j, i), strict=False):
-            total[np.ix_(rows[a][0], columns[b][0])] += values
+        for values, a, b in list(zip(sums, (i, j), (j, i), strict=True))[: 1 + (i != j)]:
+            total[np.ix_(present[a], columns[b])] += values
     each = (np.ones(n), pairs.diagonal())
     size, diagonal = (np.bincount(item, v, count).astype(np.float64) for v in each)
     if joined:
@@ -429,10 +432,13 @@ def _wide(values: Array, z: Any) -> Any:
     return like(values, xp.astype(z[:0], xp.float64))
 
 
-def _indicators(cell: Index, z: Any) -> tuple[Index, Any]:
-    """The cells that occur in a block, ascending, and (n, R) indicators of these."""
-    present = np.unique(cell)
-    return present, _wide((cell[:, None] == present).astype(np.float64), z)
+def _sums_of_equal(cell: Index, z: Any) -> Callable[[Any], Any]:
+    """What sums rows (n, m) of one cell to (R, m); ``cell`` (n,) ascending."""
+    present, first = np.unique(cell, return_index=True)
+    if type(z) is np.ndarray:
+        return lambda rows: np.add.reduceat(rows, first, axis=0)
+    indicators = _wide(present[:, None] == cell, z)
+    return lambda rows: indicators @ rows
 
 
 def centered_squares(x: Any, rows: Index, kernel: Kernel) -> tuple[float, float, float]:
