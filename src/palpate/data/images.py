@@ -13,15 +13,17 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Generator, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import suppress
+from contextlib import contextmanager, suppress
+from contextvars import ContextVar
 from dataclasses import KW_ONLY, asdict, dataclass, replace
-from functools import lru_cache
+from functools import lru_cache, partial
 from itertools import islice
 from pathlib import Path
 from queue import SimpleQueue
 from threading import Event
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, BinaryIO, ClassVar, Literal, NamedTuple, TypeVar
 
 import numpy as np
@@ -70,6 +72,8 @@ MOST_TIMES = 16
 SAVE_AGAIN = "Save the encoders again"
 #: What an image is prepared from: itself, the sensor's no-contact image, an earlier frame.
 Frame = tuple[Path | Image.Image, Path | Image.Image | None, Path | None]
+#: Files -> decoded images (s, s, 3), see :func:`decoded_once`.
+KEPT: ContextVar[Mapping[Any, NDArray[np.uint8]]] = ContextVar("KEPT", default=MappingProxyType({}))
 T = TypeVar("T")
 R = TypeVar("R")
 
@@ -84,16 +88,33 @@ class Checked(NamedTuple):
     small: NDArray[np.uint8] = np.zeros((*SMALL[::-1], 3), np.uint8)  # (12, 16, 3) if decoded
 
 
-def read_image(path: Path, at_least: tuple[int, int] | None = None) -> Image.Image:
+@contextmanager
+def decoded_once() -> Generator[None]:
+    """Whole images that :func:`load_images` gives for the first time are not decoded again here."""
+    token = KEPT.set({})
+    try:
+        yield
+    finally:
+        KEPT.reset(token)
+
+
+def read_image(
+    path: Path,
+    at_least: tuple[int, int] | None = None,
+    kept: Mapping[Path, NDArray[np.uint8]] | None = None,
+) -> Image.Image:
     """Read one image file as upright 8-bit RGB.
 
     Args:
         path: the file.
         at_least: (width, height) that are enough; a large JPEG is decoded faster at a fraction.
+        kept: images that are decoded already; default: those of :func:`decoded_once`.
 
     Raises:
         PalpateError: if the file is missing, empty, truncated, no image, or of unknown range.
     """
+    if (pixels := (KEPT.get() if kept is None else kept).get(path)) is not None:
+        return Image.fromarray(pixels)
     try:
         with open_image(Path(path)) as image:
             return decoded(image, at_least)[0]
@@ -105,8 +126,9 @@ def read_image(path: Path, at_least: tuple[int, int] | None = None) -> Image.Ima
 def image_size(path: Path) -> tuple[int, int] | None:
     """(width, height) of an image as it is read, by its first bytes; None if it is none."""
     with suppress(ImageError), open_image(path) as image:
-        turned = image.getexif().get(ORIENTATION) in range(5, 9)
-        return (image.height, image.width) if turned else image.size
+        width, height = image.size  # of a PNG, EXIF is read by decoding it
+        turned = width != height and image.getexif().get(ORIENTATION) in range(5, 9)
+        return (height, width) if turned else (width, height)
     return None
 
 
@@ -396,16 +418,24 @@ def load_images(
     rows: dict[object, list[int]] = {}
     for k, frame in enumerate(frames):
         rows.setdefault(frame if isinstance(frame[0], Path) else k, []).append(k)
-    background = lru_cache(64)(read_image)  # many samples share one
+    kept = KEPT.get()
+    read = partial(read_image, kept=kept)
+    background = lru_cache(64)(read)  # many samples share one
 
     def decode(at: list[int]) -> Problem | None:
         image, gel, before = frames[at[0]]
         file: object = image
         try:
-            image = read_image(image) if isinstance(image, Path) else image
+            image = read(image) if isinstance(image, Path) else image
             empty = background(file := gel) if isinstance(gel, Path) else gel
-            previous = read_image(file := before) if before else None
+            previous = read(file := before) if before else None
             images[at] = preprocess.prepare(image, empty, previous)
+            if (
+                isinstance(kept, dict)
+                and preprocess.plain
+                and image.size == preprocess.shape[1::-1]
+            ):
+                kept.setdefault(frames[at[0]][0], images[at[0]])
         except PalpateError as error:
             return Problem(str(file), "bad-image", error.got)
         return None

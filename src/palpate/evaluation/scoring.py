@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import tempfile
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import nullcontext
+from contextlib import nullcontext, suppress
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -21,8 +21,9 @@ from typing import Any, Literal
 
 import polars as pl
 
-from palpate.core import Note, Progress, Score, Split, quiet, require, rng_for
+from palpate.core import Note, PalpateError, Progress, Score, Split, quiet, require, rng_for
 from palpate.core.messages import require_joined, require_rows
+from palpate.data.images import decoded_once
 from palpate.data.recordings import resampled_by, source_of
 from palpate.data.samples import (
     SUFFIX,
@@ -204,17 +205,22 @@ def score(  # noqa: PLR0913
         from palpate.encoders.guard import guard, load_encoders
 
         encoders = load_encoders(encoder, progress, alone=not clusters)
-        shown: Any = bench.reference.manifest if real.rows is None else bench.reference.rows
-        of_encoder = guard(
-            encoders, "tactile", shown, split=split, allow_seen=allow_seen, progress=progress
-        )
-    with tempfile.TemporaryDirectory() if cache is None else nullcontext(cache) as folder:
+    temporary = tempfile.TemporaryDirectory() if cache is None else nullcontext(cache)
+    with decoded_once(), temporary as folder:
         bench = replace(bench, encoders=encoders, cache=Path(folder), keep=cache is not None)
         bench, origin = clustered(bench, clusters) if clusters else (bench, "")
         embeds = encoders is not None or not images
         learns = embeds and images and bench.train is not None
         if controls and learns:
             bench = replace(bench, controls=control_samples(bench))
+        if any(name in PAIRS for name in chosen):
+            with suppress(PalpateError):  # the score that needs them says it
+                bench.pictures  # noqa: B018 - guard and ruler read them, too
+        if encoder is not None:
+            shown: Any = bench.reference.manifest if real.rows is None else bench.reference.rows
+            of_encoder = guard(
+                encoders, "tactile", shown, split=split, allow_seen=allow_seen, progress=progress
+            )
         scorers: list[Callable[[Bench], list[Score]]] = [tmmd_family] * embeds
         scorers += [second_opinion] * check_ruler
         scorers += [partial(companion, name=n, default=companions is None) for n in chosen]
