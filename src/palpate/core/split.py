@@ -86,7 +86,7 @@ class Split(Shown):
     @cached_property
     def digest(self) -> str:
         """SHA-256 of the assignment."""
-        return digest_lines([f"{i}\t{self.parts[i]}" for i in sorted(self.parts)])
+        return digest_lines(sorted([f"{i}\t{part}" for i, part in self.parts.items()]))
 
     def changed(self, **fields: Any) -> Split:
         """The same assignment with another rule, manifest or notes; its digest is not computed

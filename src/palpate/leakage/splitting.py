@@ -129,11 +129,11 @@ def split(  # noqa: PLR0913  # pyright: ignore[reportInconsistentOverload]
         if folds is not None:
             shares = {p: parts.count(p) / folds for p in dict.fromkeys(parts)}
             facts |= {"folds": folds, "fold": fold, "shares": shares}
-        part_of = np.array(parts, object)[assignment[number]].tolist()
-        assigned = dict(zip(manifest.ids, part_of, strict=True))
+        part_of = pl.Series(parts).gather(assignment[number])
+        assigned = dict(zip(manifest.ids, part_of.to_list(), strict=True))
         more = [*notes, *_notes(manifest, facts)]
         fresh = Split(assigned, dict(facts), manifest.digest, more)
-        fresh = _audited(manifest, fresh, pl.Series(part_of), cache)
+        fresh = _audited(manifest, fresh, part_of, cache)
         fold_name = f"{fresh.rule['name']}, fold {fold} of {folds}" if folds else fresh.rule["name"]
         splits.append(fresh.changed(rule={**fresh.rule, "name": fold_name}))
     return splits[0] if folds is None else splits
