@@ -299,7 +299,7 @@ def scale_means(x: NDArray[Any], y: NDArray[Any], most: int = len(WEIGHTS)) -> A
             a, b = (_halved(a), _halved(b)) if j else (a, b)
             for factor, mean in zip(local_maps(a, b), means[k, j], strict=True):
                 rows = factor.swapaxes(0, 1).reshape(-1, len(mean))
-                np.matmul(np.full(len(rows), 1 / len(rows)), rows, out=mean)  # no slow short axis
+                mean[:] = np.ones(len(rows)) @ rows / len(rows)  # a sum over short rows is slow
     return means
 
 
