@@ -16,6 +16,7 @@ from transformers import AutoTokenizer, CLIPModel
 from forge.errors import fails
 from forge.pictures import photos
 from palpate.core import PalpateError
+from palpate.core.files import digest_folder
 from palpate.data.images import CLIP_MEAN, CLIP_STD, Preprocess
 from palpate.encoders.contrastive import new_clip
 from palpate.encoders.embed import embed_images, embed_texts
@@ -88,8 +89,15 @@ def test_saved_clip_is_a_standard_folder_with_equal_embeddings(clip, tmp_path):
     assert torch.allclose(out.text_embeds, clip.encode("text", TEXTS), atol=1e-6)
     again = load_clip(tmp_path / "clip")
     assert (again.preprocesses, again.name, again.dim) == (clip.preprocesses, "tiny", 8)
-    for modality in ("vision", "text"):
+    for modality, batch in (("vision", pixels), ("text", [*TEXTS, "rough " * 30])):
         assert again.digest(modality) == clip.digest(modality)
+        assert torch.allclose(
+            again.encode(modality, batch), clip.encode(modality, batch), atol=1e-6
+        )
+    assert torch.allclose(again.patches(pixels, 1), clip.patches(pixels, 1), atol=1e-6)
+    assert again.length("rough") == clip.length("rough")
+    again.save(tmp_path / "again")
+    assert digest_folder(tmp_path / "again" / "clip") == digest_folder(tmp_path / "clip")
     config = json.loads((tmp_path / "clip" / "tokenizer_config.json").read_text())
     assert config["tokenizer_class"] == "PreTrainedTokenizerFast"
 

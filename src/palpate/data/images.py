@@ -18,7 +18,7 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager, suppress
 from contextvars import ContextVar
 from dataclasses import KW_ONLY, asdict, dataclass, replace
-from functools import lru_cache, partial
+from functools import lru_cache
 from itertools import islice
 from pathlib import Path
 from queue import SimpleQueue
@@ -90,7 +90,7 @@ class Checked(NamedTuple):
 
 @contextmanager
 def decoded_once() -> Generator[None]:
-    """Whole images that :func:`load_images` gives for the first time are not decoded again here."""
+    """Whole images that :func:`load_images` was to keep are not decoded again inside."""
     token = KEPT.set({})
     try:
         yield
@@ -98,22 +98,17 @@ def decoded_once() -> Generator[None]:
         KEPT.reset(token)
 
 
-def read_image(
-    path: Path,
-    at_least: tuple[int, int] | None = None,
-    kept: Mapping[Path, NDArray[np.uint8]] | None = None,
-) -> Image.Image:
+def read_image(path: Path, at_least: tuple[int, int] | None = None) -> Image.Image:
     """Read one image file as upright 8-bit RGB.
 
     Args:
         path: the file.
         at_least: (width, height) that are enough; a large JPEG is decoded faster at a fraction.
-        kept: images that are decoded already; default: those of :func:`decoded_once`.
 
     Raises:
         PalpateError: if the file is missing, empty, truncated, no image, or of unknown range.
     """
-    if (pixels := (KEPT.get() if kept is None else kept).get(path)) is not None:
+    if (pixels := KEPT.get().get(path)) is not None:
         return Image.fromarray(pixels)
     try:
         with open_image(Path(path)) as image:
@@ -396,6 +391,7 @@ def load_images(
     *,
     progress: Progress = quiet,
     into: NDArray[np.uint8] | None = None,
+    keep: bool = False,
 ) -> NDArray[np.uint8]:
     """Load and prepare images as one array; files that occur twice are decoded once.
 
@@ -404,6 +400,7 @@ def load_images(
         shape: side of center squares in pixels, or how the images are prepared.
         progress: progress callback.
         into: (n, height, width, channels), to be filled.
+        keep: whether the result stays, so that :func:`decoded_once` may look files up in it.
 
     Returns:
         (n, height, width, channels), 0 to 255: ``into``, or a new array.
@@ -419,7 +416,10 @@ def load_images(
     for k, frame in enumerate(frames):
         rows.setdefault(frame if isinstance(frame[0], Path) else k, []).append(k)
     kept = KEPT.get()
-    read = partial(read_image, kept=kept)
+
+    def read(path: Path) -> Image.Image:  # threads have no context
+        return Image.fromarray(kept[path]) if path in kept else read_image(path)
+
     background = lru_cache(64)(read)  # many samples share one
 
     def decode(at: list[int]) -> Problem | None:
@@ -430,12 +430,9 @@ def load_images(
             empty = background(file := gel) if isinstance(gel, Path) else gel
             previous = read(file := before) if before else None
             images[at] = preprocess.prepare(image, empty, previous)
-            if (
-                isinstance(kept, dict)
-                and preprocess.plain
-                and image.size == preprocess.shape[1::-1]
-            ):
-                kept.setdefault(frames[at[0]][0], images[at[0]])
+            whole = keep and preprocess.plain and image.size == preprocess.shape[1::-1]
+            if whole and isinstance(kept, dict):
+                kept[frames[at[0]][0]] = images[at[0]]
         except PalpateError as error:
             return Problem(str(file), "bad-image", error.got)
         return None
@@ -485,7 +482,7 @@ def cached_images(
 
     def decode(part: Path) -> None:
         images = np.lib.format.open_memmap(part, mode="w+", dtype=preprocess.dtype, shape=rows)
-        load_images(frames.files, preprocess, progress=progress, into=images)
+        load_images(frames.files, preprocess, progress=progress, into=images, keep=True)
         images.flush()
 
     file = Path(cache) / f"{column}-{preprocess.resize}-{key}.npy"

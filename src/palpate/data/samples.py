@@ -199,7 +199,7 @@ class Samples:
             return np.stack([square(Image.fromarray(image), size) for image in self.rows])
         if len(self) * size * size * 3 > IN_MEMORY:
             return cached_images(self.manifest, column, size, self.folder(cache, column), progress)
-        return load_images(self.manifest.paths(column), size, progress=progress)
+        return load_images(self.manifest.paths(column), size, progress=progress, keep=True)
 
     def folder(self, cache: Path, column: str = "tactile") -> Path:
         """A folder of the cache for the bytes of these images, whatever their names and times."""
