@@ -191,7 +191,7 @@ class ClipTokenizer:
         return cls(Tokenizer.from_file(f"{folder}/tokenizer.json"), json.loads(settings))
 
     def __call__(
-        self, texts: str | Sequence[str], *, max_length: int | None = None, **_: Any
+        self, texts: str | Sequence[str], *, max_length: int = 0, **_: Any
     ) -> dict[str, Any]:
         """``input_ids`` of one text; of several, cut and padded, with their ``attention_mask``."""
         backend, pad = self.backend_tokenizer, self.settings["pad_token"]

@@ -201,9 +201,9 @@ def score(  # noqa: PLR0913
     require(possible, "encoder", "must be given for images", "none", "palpate/mini", fix=fix)
     chosen = _companions(bench, companions, encoder=encoder is not None)
     encoders, of_encoder = None, judged(bench.reference, allow_seen=allow_seen)
-    if encoder is not None:
-        from palpate.encoders.guard import guard, load_encoders
+    from palpate.encoders.guard import guard, load_encoders
 
+    if encoder is not None:
         encoders = load_encoders(encoder, progress, alone=not clusters)
     temporary = tempfile.TemporaryDirectory() if cache is None else nullcontext(cache)
     with decoded_once(), temporary as folder:
@@ -216,7 +216,7 @@ def score(  # noqa: PLR0913
         if any(name in PAIRS for name in chosen):
             with suppress(PalpateError):  # the score that needs them says it
                 bench.pictures  # noqa: B018 - guard and ruler read them, too
-        if encoder is not None:
+        if encoders is not None:
             shown: Any = bench.reference.manifest if real.rows is None else bench.reference.rows
             of_encoder = guard(
                 encoders, "tactile", shown, split=split, allow_seen=allow_seen, progress=progress

@@ -33,8 +33,9 @@ LIMIT, SHARE = 1.5, 0.99
 NOISE = 0.05
 
 #: Orthonormal cosine transform: a frequency a row.
-COSINES = np.cos(np.pi / SIDE * np.outer(np.arange(SIDE), np.arange(SIDE) + 0.5))
-COSINES = (COSINES * np.sqrt([1 / SIDE, *[2 / SIDE] * (SIDE - 1)])[:, None]).astype(np.float32)
+_LENGTHS = np.sqrt([1 / SIDE, *[2 / SIDE] * (SIDE - 1)])
+_ANGLES = np.pi / SIDE * np.outer(np.arange(SIDE), np.arange(SIDE) + 0.5)
+COSINES = (_LENGTHS[:, None] * np.cos(_ANGLES)).astype(np.float32)
 
 Floats = NDArray[np.float32]
 
