@@ -22,7 +22,7 @@ SIGNATURES = {
     ),
     "generate": (
         "photos * text weight gel model output split part seed guidance steps batch"
-        " skip_bad dry_run device progress"
+        " skip_bad strict dry_run device progress"
     ),
     "load": "source * format images skip_bad progress **options",
     "probe": (
