@@ -10,6 +10,7 @@ import subprocess
 import sys
 import time
 from contextlib import contextmanager
+from functools import partial
 
 import numpy as np
 import polars as pl
@@ -17,11 +18,14 @@ import pytest
 from PIL import Image
 
 import palpate as pp
+from forge.models import make_pipeline
+from forge.pictures import write_photos
 from palpate.cli import main
 from palpate.core import PalpateError, locked
 from palpate.data.manifest import Manifest
 from palpate.data.samples import read_samples
 from palpate.data.slices import Slice, parts_in, whole_parts
+from palpate.diffusion.generation import generate
 from palpate.encoders import embed as embedding
 from palpate.encoders.embed import embed
 from palpate.encoders.embedded import embed_dataset
@@ -279,3 +283,26 @@ def test_fewer_recordings_than_slices_leave_empty_parts(data, tmp_path):
     one = Manifest(data.table[:1], data.root)
     assert sorted(part.part.rows for part in made(one, tmp_path / "parts", 3)) == [0, 0, 1]
     assert read_samples(tmp_path / "parts", "parts").ids == one.ids
+
+
+def test_generated_parts_are_scored_as_one_folder(tmp_path):
+    pipeline, photos = make_pipeline(), write_photos(tmp_path / "photos", 7)
+    draw = partial(generate, photos, model=pipeline, steps=2)
+    draw(output=tmp_path / "whole")
+    for k in range(3):
+        draw(output=tmp_path / "parts", slice=f"{k + 1}/3")
+    assert draw(output=tmp_path / "parts", slice="1/3").new == 0
+    whole, parts = (read_samples(tmp_path / n, n) for n in ("whole", "parts"))
+    assert sorted(whole.ids) == parts.ids
+    assert parts.settings == whole.settings
+    images = [dict(zip(s.ids, s.manifest.paths("tactile"), strict=True)) for s in (whole, parts)]
+    for name in whole.ids:  # photos are embedded in other batches
+        a, b = (np.asarray(Image.open(each[name]), int) for each in images)
+        assert np.abs(a - b).max() <= 1
+    with fails("with the same settings"):
+        draw(output=tmp_path / "parts", slice="1/3", seed=1)
+    with fails("must go with a folder"):
+        draw(slice="1/3")
+    shutil.rmtree(tmp_path / "parts" / "part-2-of-3")
+    with fails("without 2/3", "Run: palpate generate", "--slice 2/3"):
+        read_samples(tmp_path / "parts", "parts")

@@ -94,7 +94,7 @@ def executor_of(
         mem_per_cpu_gb=r.mem,
         gpus_per_task=r.gpus,
         workers=r.workers,
-        job_name=f"palpate {command[0]}",
+        job_name=f"palpate-{command[0]}",
         qos=None,
         env_command=f"export PATH={Path(sys.executable).parent}:$PATH",
         logging_dir=str(logs.absolute()),

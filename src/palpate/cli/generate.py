@@ -54,6 +54,8 @@ class Options(Common):
     they take."""
     device: str = "auto"
     """auto, cpu, cuda, mps."""
+    slice: str | None = None
+    """Make slice i/n alone, whole recordings, in a folder of its own below the output."""
 
 
 def run(options: Options, terminal: Terminal) -> dict[str, Any]:

@@ -5,7 +5,9 @@ from __future__ import annotations
 import importlib.util
 import shlex
 import shutil
+import subprocess
 from collections.abc import Sequence
+from dataclasses import fields
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -13,11 +15,19 @@ import tyro
 
 from palpate.cli.terminal import Common, Terminal, checked, option_group
 from palpate.cli.verbs import FAILED_CHECK, OK
-from palpate.core import MissingExtraError, digest_json, few, require, require_choice, short
+from palpate.core import (
+    MissingExtraError,
+    PalpateError,
+    digest_json,
+    few,
+    require,
+    require_choice,
+    short,
+)
 from palpate.core.files import is_there
 
 #: Verbs whose work is cut into slices.
-SLICED = ("embed", "generate", "caption", "import", "audit")
+SLICED = ("embed", "generate")
 
 
 @option_group
@@ -29,7 +39,7 @@ class Options(Common):
     """
 
     command: Annotated[tuple[str, ...], tyro.conf.Positional]
-    """The verb (embed, generate, caption, import or audit) with its options."""
+    """The verb (embed or generate) with its options."""
     slices: int
     """Into how many slices."""
     executor: Literal["local", "slurm", "ray"] = "local"
@@ -45,25 +55,25 @@ class Options(Common):
     gpus: int = 0
     """Slurm and Ray: GPUs of a slice."""
 
-
-def arranged(args: Sequence[str]) -> list[str]:
-    """Arguments with the options of ``run`` first: all others are the verb's."""
-    own, verb, words = list[str](), list[str](), iter(args)
-    valued = {f"--{name}" for name in Options.__annotations__ if name != "command"}
-    for word in words:
-        name, equals, _ = word.partition("=")
-        if name in valued:
-            own += [word, *([] if equals else [next(words, "")])]
-        elif word in ("--json", "--quiet", "-q") or (word in ("--help", "-h") and not verb):
-            own.append(word)
-        else:
-            verb.append(word)
-    return [*own, *["--"] * bool(verb), *verb]
+    @staticmethod
+    def arranged(args: Sequence[str]) -> list[str]:
+        """Arguments with the options of ``run`` first: all others are the verb's."""
+        own, verb, words = list[str](), list[str](), iter(args)
+        valued = {f"--{field.name}" for field in fields(Options)} - {"--quiet"}
+        for word in words:
+            name, equals, _ = word.partition("=")
+            if name in valued:
+                own += [word, *([] if equals else [next(words, "")])]
+            elif word in ("--json", "--quiet", "-q") or (word in ("--help", "-h") and not verb):
+                own.append(word)
+            elif word != "--":
+                verb.append(word)
+        return [*own, *["--"] * bool(verb), *verb]
 
 
 def run(options: Options, terminal: Terminal) -> tuple[dict[str, Any], int]:
     """Start the engine, and say what is left."""
-    name, *args = options.command
+    name, *args = options.command or ("",)
     require_choice("VERB", name, SLICED)
     require(options.slices >= 1, "slices", "must be at least 1", options.slices)
     require(options.workers >= 1, "workers", "must be at least 1", options.workers)
@@ -80,18 +90,22 @@ def run(options: Options, terminal: Terminal) -> tuple[dict[str, Any], int]:
         require(bool(options.partition), "partition", "must be given for Slurm", "none", fix=fix)
     from palpate.cli.engine import Resources, executor_of
 
-    output: Path = verb.cache if name == "audit" else verb.output
+    output: Path = verb.output
     # The engine's marks are of this command on these files: after a change all are looked at anew.
     files = [f for p in paths for f in (p, p / "manifest.parquet") if is_there(f) and f.is_file()]
     stamps = [[str(file), file.stat().st_mtime_ns] for file in files]
     key = digest_json([options.command, options.slices, stamps])
     logs = output.with_name(f"{output.name}.logs") / short(key)
-    for k in range(options.slices if name != "audit" else 0):
+    for k in range(options.slices):
         if not (output / f"part-{k + 1}-of-{options.slices}").exists():
             (logs / f"completions/{k:05d}").unlink(missing_ok=True)
     resources = Resources(**{key: getattr(options, key) for key in Resources.__dataclass_fields__})
     executor = executor_of(options.command, options.slices, resources, logs)
-    executor.run()
+    try:
+        executor.run()
+    except subprocess.CalledProcessError as error:  # sbatch has said why on standard error
+        got, fix = str(error), "See what Slurm printed above, and: sinfo"
+        raise PalpateError("Slurm must take the job", got, fix) from None
     left = [f"{k + 1}/{options.slices}" for k in executor.get_incomplete_ranks()]
     terminal.print(f"{shlex.join(options.command)}: {options.slices - len(left)} slices are made")
     if left and options.executor != "slurm":

@@ -409,6 +409,7 @@ def parse(name: str, options: type[Any], args: Sequence[str]) -> Any:
     def refuse(event: ParseErrorEvent) -> None:
         raise _parse_error(name, options, event, args)
 
+    args = getattr(options, "arranged", list)(args)
     if not {"-h", "--help"}.isdisjoint(args):
         polish_help(options)
     about = inspect.cleandoc(options.__doc__ or "")
@@ -595,7 +596,7 @@ def run_verb(name: str, args: Sequence[str]) -> int:
 def checked(name: str, args: Sequence[str]) -> tuple[Any, Any]:
     """Return the module of a verb and its options, once what they name was found."""
     module = importlib.import_module(f"palpate.cli.{VERBS[name].module}")
-    options = parse(name, module.Options, getattr(module, "arranged", list)(args))
+    options = parse(name, module.Options, args)
     _require_extra(name, options)
     _require_inputs(options)
     return module, options

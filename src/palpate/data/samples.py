@@ -306,9 +306,19 @@ def _of_path(path: Path) -> Samples:
 
 
 def _of_parts(path: Path) -> Samples:
-    """The parts of ``palpate embed`` as one, in the order of the ids."""
+    """The parts of ``palpate embed`` or ``palpate generate`` as one, in the order of the ids."""
     parts = whole_parts(path)
     first = parts[0]
+    if "features" not in first.settings:
+        files, settings = dict[str, str](), dict[str, Any]()
+        for part in parts:
+            samples = _of_path(path / part.place)
+            own = samples.manifest.table.select("id", "tactile").iter_rows()
+            files |= {i: f"{part.place}/{image}" for i, image in own}
+            settings = dict(samples.settings or {})
+        ids = sorted(files)
+        manifest = _manifest(path, id=ids, tactile=[files[i] for i in ids])
+        return Samples(str(path), manifest, settings=settings)
     manifests = [Manifest.load(path / part.place / PART_ROWS) for part in parts]
     arrays: list[NDArray[Any]] = []
     for part, manifest in zip(parts, manifests, strict=True):

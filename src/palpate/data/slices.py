@@ -161,8 +161,8 @@ def command_of(verb: str, *words: object, **options: object) -> str:
     """A command line, with those options that are given."""
     line = ["palpate", *verb.split(), *map(str, words)]
     for name, value in options.items():
-        line += [] if value in (None, False) else [f"--{name.replace('_', '-')}"]
-        line += [] if value in (None, False, True) else [str(value)]
+        if value is not None and value is not False:
+            line += [f"--{name.replace('_', '-')}"] + [str(value)] * (value is not True)
     return shlex.join(line)
 
 

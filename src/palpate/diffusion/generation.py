@@ -45,7 +45,8 @@ from palpate.core import (
 )
 from palpate.core.files import canonical_json
 from palpate.core.images import SUFFIXES
-from palpate.data.images import check_image, images_below, read_image, square
+from palpate.data.images import check_image, file_stamp, images_below, read_image, square
+from palpate.data.slices import Part, Slice, command_of
 from palpate.diffusion.generated import UNLIKE, Generated, Index, file_name, old_index
 from palpate.encoders.models import FIX_MODEL, find_model
 
@@ -82,6 +83,7 @@ class _Item:
     ground: NDArray[np.uint8] | None = None
     condition: Tensor | None = None
     unlike: float | None = None
+    recording: str = ""
 
     def digest(self) -> str:
         """Of the bytes of both files."""
@@ -106,6 +108,7 @@ def generate(  # noqa: PLR0913 - a public verb, step by step
     strict: bool = False,
     dry_run: bool = False,
     device: str = "auto",
+    slice: str | Slice | None = None,  # noqa: A002 (the word that the command line uses)
     progress: Progress = quiet,
 ) -> Generated:
     """Make a tactile image for each photo; running it again continues a half-done folder.
@@ -134,6 +137,8 @@ def generate(  # noqa: PLR0913 - a public verb, step by step
             words that none of its texts has; ``skip_bad`` lists such photos.
         dry_run: write nothing; the result says what is missing, and has no images.
         device: ``auto``, ``cpu``, ``cuda`` or ``mps``.
+        slice: ``i/n``: make the images of whole recordings of that slice alone, in a folder of
+            their own below ``output``, from which scores read all.
         progress: called while the work goes on.
 
     Returns:
@@ -145,7 +150,21 @@ def generate(  # noqa: PLR0913 - a public verb, step by step
             any image is made.
     """
     weight = _share(weight, photos is not None, text is not None)
-    output = None if output is None else Path(output)
+    made_by = command_of(
+        *("generate", *(photos if isinstance(photos, list | tuple) else [photos])),
+        output=output,
+        model=model if isinstance(model, str | Path) else "MODEL",
+        split=split,
+        part=None if split is None else part,
+        text=text,
+        weight=weight if text else None,
+        gel=gel,
+        seed=seed,
+        guidance=guidance,
+        steps=steps,
+        strict=strict,
+    )
+    folder, output = _places(output, slice)
     rank, size, gathered = 0, 1, dict
     if int(os.environ.get("WORLD_SIZE", "1")) > 1:
         from palpate.training import processes
@@ -172,8 +191,9 @@ def generate(  # noqa: PLR0913 - a public verb, step by step
     settings = _settings(model, sampler, seed)
     settings |= {"text": text, "weight": None if photos is None else weight} if text else {}
     settings |= _range_of(model, text, words, strict) | ({"strict": True} if strict else {})
-    target = _Target(output, single, settings, model.notice, rank == 0)
     items = _on_gels(items, model, gel)
+    items, part_made = _sliced(items, slice, settings, folder, made_by)
+    target = _Target(output, single, settings, model.notice, rank == 0, part=part_made)
     notes = [*_range_notes(settings), *_notes(model, text, gel)]
     if dry_run:
         files = ((item, target.path(item.id)) for item in items)
@@ -203,7 +223,7 @@ def generate(  # noqa: PLR0913 - a public verb, step by step
     ready = iter(reader)
     first = [*islice(ready, 1)]  # few photos are all read before anything is written
     bad = reader.checked(gathered(reader.bad))
-    if len(bad) == len(items):
+    if items and len(bad) == len(items):
         raise ProblemsError([*bad.values()], "No photo is left: fix some, or pass others")
     new: dict[str, bool] = {}
     with target.writing():
@@ -215,6 +235,45 @@ def generate(  # noqa: PLR0913 - a public verb, step by step
         bad, new = reader.checked(gathered(bad | reader.bad)), gathered(new)
         ids = [item.id for item in items if item.id not in bad]
         return target.finish(ids, [*bad.values()], len(new), notes)
+
+
+def _places(output: str | Path | None, part: str | Slice | None) -> tuple[Path | None, Path | None]:
+    """The folder of all parts, and what is written."""
+    if output is None or part is None:
+        must, got = "must go with a folder to write", "none"
+        require(part is None, "slice", must, got, fix="Name one for all slices")
+        return None, None if output is None else Path(output)
+    return Path(output), Path(output) / Slice.parse(part).name
+
+
+def _sliced(
+    items: list[_Item],
+    part: str | Slice | None,
+    settings: Mapping[str, Any],
+    folder: Path | None,
+    command: str,
+) -> tuple[list[_Item], Part | None]:
+    """The items of a slice, and the record of its part; all, and none, without one.
+
+    Raises:
+        PalpateError: if other parts of the folder do not belong to it.
+    """
+    if folder is None:
+        return items, None
+    own = Slice.parse(part)
+    numbers = own.numbers([item.recording for item in items])
+    some = [item for item in items if numbers[item.recording] == own.number]
+    files = [[f and [str(f), *file_stamp(f)] for f in (i.vision, i.background)] for i in some]
+    record = Part(
+        slice=str(own),
+        command=command,
+        settings={"generated": digest_json(settings)},
+        read=digest_json([[item.id for item in some], files]),
+        data=digest_json([[item.id, item.recording] for item in items]),
+        rows=len(some),
+    )
+    record.is_finished(folder)
+    return some, record
 
 
 def _ahead(
@@ -238,8 +297,16 @@ class _Target:
     """Where images go: memory, one PNG, or a folder with an index."""
 
     def __init__(
-        self, output: Path | None, single: bool, settings: dict[str, Any], notice: str, first: bool
+        self,
+        output: Path | None,
+        single: bool,
+        settings: dict[str, Any],
+        notice: str,
+        first: bool,
+        *,
+        part: Part | None,
     ) -> None:
+        self.part = part
         self.settings, self.digest, self.notice = settings, digest_json(settings), notice
         self.file = output if single else None
         self.folder = None if single else output
@@ -249,7 +316,9 @@ class _Target:
         self.index = Index(settings=settings, digest=self.digest)
         if self.folder is not None:
             index = old_index(self.folder, settings, self.digest) or self.index
-            self.index = replace(index, notice=notice, complete=False)
+            # Of an earlier state of a slice no sample stays.
+            images = {} if part else index.images
+            self.index = replace(index, notice=notice, complete=False, images=images)
 
     def path(self, sample_id: str) -> Path | None:
         """The file of an image; None in memory."""
@@ -310,6 +379,8 @@ class _Target:
             index = replace(index, unlike=self.unlike)
             if self.first:
                 write_json(self.folder / "index.json", sealed(plain(index)))
+                if self.part is not None:
+                    self.part.save(self.folder)
         out = [i for i in ids if self.unlike.get(i, 0.0) >= UNLIKE]
         facts = {"count": len(out), "of": len(ids), "photos": out, "least": UNLIKE}
         notes = [*notes, *([Note("photos-unlike", facts)] if out else [])]
@@ -360,12 +431,13 @@ def _items(photos: Any, split: Split | str | Path | None, part: str) -> list[_It
     if manifest is None:
         fix = "Leave it out, or import the data set"
         require(split is None, "split", WHOLE, "photos", fix=fix)
-        items = [_Item(i, path) for i, path in photo_ids(photos).items()]
+        items = [_Item(i, path, recording=i) for i, path in photo_ids(photos).items()]
     else:
         manifest = manifest if split is None else manifest.part(Split.load(split), part)
         gels = (gel and manifest.path(gel) for gel in manifest.column("background"))
         rows = zip(manifest.ids, manifest.paths("vision"), gels, strict=True)
-        items = [_Item(*row) for row in rows]
+        videos = manifest.column("video")
+        items = [_Item(*row, recording=v or row[0]) for row, v in zip(rows, videos, strict=True)]
     must, fix = "There must be at least one photo", "Check the folder, the split or the names"
     require(bool(items), None, must, "none", fix=fix)
     return items

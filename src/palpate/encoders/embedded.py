@@ -108,7 +108,7 @@ def embed_dataset(
     }
     command = command_of(
         *("embed", data),
-        encoder=encoder,
+        encoder=encoder if isinstance(encoder, str | Path) else encoders.name,
         output=output,
         modality=modality,
         reference=reference,

@@ -114,10 +114,10 @@ class Rows:
         self.text = self.vision = None
         if clip is not None and clip.tokenizer is not None:
             rows = embed(part, clip, "text", cache=cache, progress=progress)
-            self.text = torch.from_numpy(rows.features)
+            self.text = torch.from_numpy(np.array(rows.features))
         if clip is not None and len(photographed):
             rows = embed(photographed, clip, "vision", cache=cache, progress=progress)
-            self.vision = torch.from_numpy(rows.features)
+            self.vision = torch.from_numpy(np.array(rows.features))
 
     def load(self, step: Step, augment: Augment | None = None) -> Batch:
         """The batch of one step, for :class:`palpate.encoders.contrastive.TactileLoss`.
