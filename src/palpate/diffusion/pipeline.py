@@ -602,7 +602,8 @@ class TactilePipeline(DiffusionPipeline):
             PalpateError: if the folder is no pipeline, holds or refers to other weights than it
                 says, or the hub is out of reach.
         """
-        folder = find_model(at_revision(source, revision), "generator", "pipeline", FIX_MODEL)
+        source = source if revision is None else at_revision(source, revision)
+        folder = find_model(source, "generator", "pipeline", FIX_MODEL)
         note = folder / "palpate.json"
         about = read_record(note, "card of the pipeline", form=FORMAT, keys=KEYS)
         if "shared" in about:
