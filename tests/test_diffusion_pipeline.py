@@ -145,11 +145,11 @@ def test_the_background_variant_uses_its_background():
         (lambda p: p.sampler_with(batch=0), "`batch` must be at least 1"),
         (lambda p: p(photos(2), ids=["a"]), "Every id needs one condition"),
         (lambda p: p(photos(2), generator=[torch.Generator()]), r"`generator` .*Got 1 for 2"),
-        (lambda p: p(photos(1) / 255), "`images` must be uint8"),
+        (lambda p: p(photos(1) / 100), r"`images` must be \(n, h, w, c\)"),
         (lambda p: p(7), "`images` must be files, PIL images"),
         (lambda p: p("nowhere.jpg"), "nowhere.jpg: no such file"),
         (lambda p: p([]), "at least one photo"),
-        (lambda p: p(text=["rough", "smooth"]), "`text` must be one string, for all images"),
+        (lambda p: p(text=[7]), "`text` must be one string, for all images"),
         (lambda p: without_encoders(p)(photos(1)), "vision encoder"),
     ],
 )

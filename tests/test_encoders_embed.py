@@ -280,9 +280,9 @@ def test_the_shipped_encoder_by_the_door(files):
 def test_other_inputs_are_refused(encoders, files):
     encoder = Encoder(encoders, "tactile")
     for inputs, message in (
-        (files[1] / 255.0, "`images` must be uint8"),
-        (files[1][..., 0], "`images` must be uint8"),
-        (torch.zeros(1, 3, 4, 4) + 2, "`images` must be uint8"),
+        (files[1] / 100.0, r"`images` must be \(n, h, w, c\)"),
+        (files[1][..., 0], r"`images` must be \(n, h, w, c\)"),
+        (torch.zeros(1, 3, 4, 4) + 2, r"`images` must be \(n, h, w, c\)"),
         ({"a": 1}, "`images` must be files, PIL images"),
         (files[0] / "gone.png", "gone.png: "),
     ):

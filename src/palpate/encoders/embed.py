@@ -365,7 +365,7 @@ def _bytes(images: Any) -> NDArray[np.uint8]:
     array = array[..., None] if array.ndim == 2 and not tensor else array
     array = array[None] if array.ndim == 2 else array
     array = array[None] if array.ndim == 3 else array
-    if tensor and array.ndim == 4:
+    if tensor and array.ndim == 4 and array.shape[1] in (1, 3, 4):
         array = array.transpose(0, 2, 3, 1)
     if tensor and images.dtype.itemsize == 1:
         array = array.astype(np.uint8)
