@@ -6,6 +6,7 @@ write their cards.
     python recipes/mini.py --work runs/mini --tactile --ship    # the tactile encoder alone, anew
     python recipes/mini.py --work runs/mini --tactile --seed 1  # another training of it, scored
     python recipes/mini.py --work runs/mini --tactile --wide    # one of other gels, scored
+    python recipes/mini.py --work runs/mini --contacts --ship   # the last round of the generator
     python recipes/mini.py --work runs/mini --ship              # and write src/palpate/mini
     python recipes/mini.py --work runs/mini --range             # write anew what training saw
     python recipes/mini.py --work runs/mini --verify            # score what ships again
@@ -19,7 +20,8 @@ world          seed      read by
 gelsight       900000    every part
 digit          900001    the autoencoder alone: the other look of the sensor
 photos         900002    the vision encoder alone: 16,000 more objects, one photo of each
-contacts       900003    what is unlike the training: photos and captions like those of gelsight
+contacts       900003    the last round of the generator: touches that can be asked for; and what is
+                         unlike the training
 gel 0 .. 13    900010 .. the tactile encoder: pads of 9 to 22 mm, 0 to 12 rows of markers, DIGIT
 wide 0 .. 12   900030 .. with ``--wide`` in place of DIGIT: pads of 26 mm, 10 rows of markers
 new gelsight   900050    scores: new objects, videos and gel units
@@ -57,6 +59,7 @@ from palpate.diffusion.autoencoder_training import fit_autoencoder
 from palpate.diffusion.options import BackgroundOptions, SamplerOptions
 from palpate.diffusion.pipeline import TactilePipeline
 from palpate.diffusion.presets import MINI as DIFFUSION
+from palpate.diffusion.presets import DiffusionPreset
 from palpate.diffusion.training import Parts, train_pipeline
 from palpate.diffusion.training_range import TrainingRange
 from palpate.encoders.contrastive import train_clip
@@ -138,6 +141,10 @@ AUTOENCODER = BackgroundOptions(steps=6_000)
 GENERATOR = replace(DIFFUSION, loop=replace(DIFFUSION.loop, batch=32, warmup=100))
 #: Of a round of the generator's training, and how many rounds: each goes on from the last.
 GENERATOR_STEPS, GENERATOR_ROUNDS = 8_000, 2
+ROUND = replace(GENERATOR, condition=replace(GENERATOR.condition, contact=False))
+#: The last round: contacts that can be asked for.
+CONTACTS = replace(DIFFUSION, loop=replace(DIFFUSION.loop, ema=0.995))
+CONTACTS_STEPS = 3_200
 #: Half the time, on CPUs that have it; the weights then depend on the kind of CPU.
 COMPUTE = Compute(precision="bf16")
 PARTS = ("worlds", "clip", "encoders", "autoencoder", "generator", "scores")
@@ -151,13 +158,14 @@ def main() -> int:
     parser.add_argument("--work", type=Path, default=Path("runs/mini"))
     parser.add_argument("--only", choices=PARTS, default="scores", help="the last part to make")
     parser.add_argument("--tactile", action="store_true", help="keep all else as it ships")
+    parser.add_argument("--contacts", action="store_true", help="go on with the generator alone")
     parser.add_argument("--seed", type=int, default=SEED, help="of the tactile encoder")
     parser.add_argument("--wide", action="store_true", help="wide pads instead of DIGIT")
     parser.add_argument("--ship", action="store_true", help="write src/palpate/mini")
     parser.add_argument("--range", action="store_true", help="what the generator's training saw")
     parser.add_argument("--verify", action="store_true", help="score the shipped models again")
     options = parser.parse_args()
-    recipe = Recipe(options.work, options.tactile, options.seed, options.wide)
+    recipe = Recipe(options.work, options.tactile, options.seed, options.wide, options.contacts)
     if recipe.compared and (options.ship or not options.tactile):
         parser.error("--seed and --wide are for comparison: with --tactile, without --ship")
     try:
@@ -191,11 +199,12 @@ def train_round(
     encoders: EncoderSet,
     autoencoder: AnyAutoencoder,
     start: TactilePipeline | None,
-    steps: int,
+    preset: DiffusionPreset,
     run: TrainingRun,
 ) -> TactilePipeline:
     """The generator after a round of training, from random weights or from those of ``start``."""
-    parts = Parts(GENERATOR.with_steps(steps), autoencoder, encoders, start=start)
+    last = preset.condition.contact  # on fewer images: what photos recall stays
+    parts = Parts(preset, autoencoder, encoders, start=start, remember=last)
     made = train_pipeline(train, everything(train), parts, replace(run, compute=COMPUTE))
     # Nothing is left out of the training: the ceiling is that of the autoencoder's own card.
     return replace(made, training={**made.training, "ceiling": autoencoder.card.get("scores")})
@@ -211,16 +220,26 @@ class Recipe:
     """The parts, each a stage of a run folder; a finished stage is read, not made again."""
 
     def __init__(
-        self, work: Path, tactile: bool = False, seed: int = SEED, wide: bool = False
+        self,
+        work: Path,
+        tactile: bool = False,
+        seed: int = SEED,
+        wide: bool = False,
+        contacts: bool = False,
     ) -> None:
-        """Work in a folder; with ``tactile`` all but the tactile encoder is what ships."""
-        self.work, self.cache, self.kept, self.seed = work, work / "cache", tactile, seed
+        """Work in a folder; with ``tactile`` all but the tactile encoder is what ships, with
+        ``contacts`` all but the last round of the generator, which goes on from what ships.
+        """
+        self.work, self.cache, self.seed = work, work / "cache", seed
+        self.kept, self.contacts = tactile or contacts, contacts
         #: Name of a tactile encoder that is compared with the one that ships, or ''.
         self.compared = " wide" * wide + f" {seed}" * (seed != SEED)
         gels = [WIDE.get(name, name) if wide else name for name in GELS]
         self.learned = ["gelsight", *gels]
         new = [name for name in WORLDS if name.startswith("new")]
-        self.worlds = [*self.learned, *new, *([] if tactile else ["digit", "photos"])]
+        self.worlds = [*self.learned, *new, *([] if tactile else ["digit", "photos", "contacts"])]
+        if contacts:
+            self.worlds = ["gelsight", "contacts", "new gelsight"]
         self.common: dict[str, Any] = {"cache": self.cache, "progress": self.progress}
 
     def stage(
@@ -333,14 +352,15 @@ class Recipe:
 
     def generator(self) -> TactilePipeline:
         """From a photo to a tactile image, in the space of the rounded encoders and autoencoder."""
-        if self.kept:
-            return TactilePipeline.from_pretrained(NAME)
-        parts = self.pair(), self.autoencoder(), self.world("gelsight")
+        pipeline = TactilePipeline.from_pretrained(NAME) if self.kept else None
+        if pipeline is not None and not self.contacts:
+            return pipeline
+        parts = self.pair(), self.autoencoder()
         parts[0].halve()
         parts[1].halve()
-        pipeline = None
-        for number in range(GENERATOR_ROUNDS):
-            pipeline = self._round(number, pipeline, *parts)
+        for number in range(0 if self.kept else GENERATOR_ROUNDS):
+            pipeline = self._round(number, pipeline, *parts, self.world("gelsight"))
+        pipeline = self._round(GENERATOR_ROUNDS, pipeline, *parts, self.world("contacts"))
         return replace(pipeline, sampler=GENERATOR.sampler)
 
     def _round(
@@ -352,10 +372,10 @@ class Recipe:
         train: Manifest,
     ) -> TactilePipeline:
         """A round of the generator's training; it goes on from the rounded weights of the last."""
-        seed = SEED + number
+        seed, last = SEED + number, number == GENERATOR_ROUNDS
+        preset = CONTACTS.with_steps(CONTACTS_STEPS) if last else ROUND.with_steps(GENERATOR_STEPS)
         inputs = {
-            "preset": replace(GENERATOR, sampler=SamplerOptions()),  # no part of the training
-            "steps": GENERATOR_STEPS,
+            "preset": replace(preset, sampler=SamplerOptions()),  # no part of the training
             "seed": seed,
             "vision": encoders.digest("vision"),
             "text": encoders.digest("text"),
@@ -369,7 +389,7 @@ class Recipe:
         def build(folder: Path) -> Mapping[str, Any]:
             parts = train, encoders, autoencoder
             run = TrainingRun(folder / "training", seed, **self.common)
-            pipeline = train_round(*parts, start, GENERATOR_STEPS, run)
+            pipeline = train_round(*parts, start, preset, run)
             pipeline.save(cleared(folder / "model"))
             return {"digest": pipeline.digest, "train": len(train)}
 

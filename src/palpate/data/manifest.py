@@ -18,9 +18,12 @@ column         type     meaning (null where the data set has none; never invente
 ``domain``     string   recording condition that changes the look (rig, lighting)
 =============  =======  ==========================================================================
 
-Further columns of text may follow, named by the user. Paths use ``/`` and may not leave the root.
-The digest is SHA-256 over the rows in order; it does not depend on the root, so a data set has one
-digest on every disk.
+What is known of a contact may follow, numbers that condition a generator: ``at_x``, ``at_y`` (its
+place in shares of width and height, from the top left), ``area`` (share of the gel), ``strength``
+(any unit that rises), ``shear_x``, ``shear_y`` (% of the width, right and down), ``force`` (N),
+``depth`` (mm). Then further columns of text, named by the user. Paths use ``/`` and may not leave
+the root. The digest is SHA-256 over the rows in order; it does not depend on the root, so a data
+set has one digest on every disk.
 """
 
 from __future__ import annotations
@@ -67,6 +70,8 @@ SCHEMA: dict[str, type[pl.DataType]] = {
     **dict.fromkeys(("id", *_WORDS, *IMAGE_COLUMNS, "sensor", "domain"), pl.String),
     "frame": pl.Int64,
 }
+#: What may be known of a contact.
+CONTACT = ("at_x", "at_y", "area", "strength", "shear_x", "shear_y", "force", "depth")
 #: The column of the paths that a list names, whose images are not at hand.
 PATH = "path"
 #: Column -> words that say that an image belongs there.
@@ -122,7 +127,7 @@ class Manifest(Shown):
         Raises:
             PalpateError: on an unknown column.
         """
-        rows, schema = list(rows), SCHEMA | dict.fromkeys(more, pl.String)
+        rows, schema = list(rows), SCHEMA | {name: _further(name) for name in more}
         if unknown := sorted({name for row in rows for name in row} - set(schema)):
             must, fix = f"must have columns among {', '.join(SCHEMA)}", "Rename or drop the column"
             raise PalpateError(must, repr(unknown[0]), fix, argument="rows")
@@ -137,6 +142,7 @@ class Manifest(Shown):
         absent = (pl.lit(None).alias(c) for c in SCHEMA if c not in table.columns)
         more = (c for c in table.columns if c not in SCHEMA)
         typed = (pl.col(c).cast(kind) for c, kind in SCHEMA.items())
+        more = (pl.col(c).cast(pl.Float64) if c in CONTACT else c for c in more)
         return cls(table.with_columns(*absent).select(*typed, *more), root, facts or {})
 
     def __len__(self) -> int:
@@ -369,8 +375,8 @@ class Manifest(Shown):
             raise PalpateError(f"The manifest {path} must be a Parquet file", got, fix) from None
         written = meta.get("palpate.format")
         columns = list(table.schema.items())
-        further = table.schema.dtypes()[len(SCHEMA) :]
-        typed = columns[: len(SCHEMA)] == list(SCHEMA.items()) and {pl.String}.issuperset(further)
+        typed = columns[: len(SCHEMA)] == list(SCHEMA.items())
+        typed &= all(kind == _further(name) for name, kind in columns[len(SCHEMA) :])
         got = written or "a Parquet file of another program"
         must = f"The manifest {path} must have the format {FORMAT}"
         require(written == FORMAT and typed, None, must, got, fix=fix)
@@ -385,6 +391,11 @@ class Manifest(Shown):
         must, got = f"The digest in {path} must match its rows", "rows of another program"
         require(manifest.digest == meta["palpate.digest"], None, must, got, fix=fix)
         return manifest
+
+
+def _further(column: str) -> type[pl.DataType]:
+    """The type of a column beyond ``SCHEMA``."""
+    return pl.Float64 if column in CONTACT else pl.String
 
 
 @lru_cache(1 << 16)

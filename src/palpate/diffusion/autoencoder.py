@@ -434,6 +434,13 @@ class LatentStats:
             return latents
         return (latents - _column(self.mean, latents)) / _column(self.std, latents)
 
+    def scaled(self, differences: Tensor) -> Tensor:
+        """Differences of latents (n, k c, h, w), k of them, on the scale of :meth:`normalize`."""
+        if self.scale == "one":
+            return differences
+        times = differences.shape[1] // len(self.std)
+        return differences / _column(self.std * times, differences)
+
     def restore(self, latents: Tensor) -> Tensor:
         """The inverse of :meth:`normalize`."""
         if self.scale == "one":

@@ -19,7 +19,8 @@ With ``UNetOptions.modulate`` the token is also added, through two layers, to th
 time step, which shifts every residual block. That is not in the paper; a small network trains
 faster with it than with cross-attention to one token. The paper's variant with background ("w/ BG")
 concatenates the latent of the no-contact image to the noisy latent along channels; behind an
-autoencoder that is given the gel anyway, its pixels.
+autoencoder that is given the gel anyway, its pixels. Maps of what is known of the contact
+(:mod:`palpate.diffusion.contact`) follow there.
 
 Sampling takes z^T ~ N(0, 1) to z^0 by a solver of diffusers under classifier-free guidance,
 
@@ -51,6 +52,7 @@ from safetensors.torch import load_file, save_file
 from torch import Tensor, nn
 
 from palpate.core import PalpateError, atomic_path, require, require_regular, rng_for
+from palpate.diffusion.contact import channels_of, scale_of
 from palpate.diffusion.options import (
     SOURCES,
     ConditionPolicy,
@@ -63,6 +65,8 @@ from palpate.encoders.models import UNREADABLE, first_line, load_model, round_to
 
 #: What ``pairs`` remembers: training texts, and the mean photo of each.
 MEMORY = ("memory", "keys")
+#: What ``contact`` remembers.
+TOUCHES = ("touches", "likeness")
 #: Temperature of its weights.
 TAU = 0.02
 #: Tokens of a photo: a map of 8 x 8.
@@ -130,16 +134,19 @@ class Denoiser(nn.Module):
     means: Tensor
     memory: Tensor
     keys: Tensor
+    touches: Tensor
+    likeness: Tensor
 
-    def __init__(
+    def __init__(  # noqa: PLR0917 - what the policy needs, in its order
         self,
         unet: UNet2DConditionModel,
         policy: ConditionPolicy,
         means: Mapping[Source, Tensor] | None = None,
         memory: tuple[Tensor, Tensor] | None = None,
         patch_width: int | None = None,
+        touches: tuple[Tensor, Tensor] | None = None,
     ) -> None:
-        """Take what the policy's ``gap`` needs.
+        """Take what the policy's ``gap`` and ``contact`` need.
 
         Args:
             unet: the network.
@@ -148,10 +155,12 @@ class Denoiser(nn.Module):
             memory: of ``gap="pairs"``: embeddings (m, d) of the different training texts, and the
                 mean of the photos of each (m, d).
             patch_width: of the states of patches; default: that of the embeddings.
+            touches: of ``contact``: training touches (m, 6) as they are asked for, and the row of
+                ``memory`` (m,) that each belongs to.
         """
         super().__init__()
         self.unet, self.policy = unet, policy
-        self.background = unet.config["in_channels"] > unet.config["out_channels"]
+        self.background = self.gel_channels > 0
         self.pairs = policy.gap == "pairs"
         # A source without a mean is marked by NaN, and raises when it is used.
         fill = torch.full((policy.width,), float("nan") if self.pairs else 0.0)
@@ -168,6 +177,10 @@ class Denoiser(nn.Module):
             texts, photos = memory or (None, None)
             self.register_buffer("memory", self._remembered(texts, "text"))
             self.register_buffer("keys", self._remembered(photos, "vision"))
+        if policy.contact:
+            rows, likeness = touches or (torch.zeros(1, 6), torch.zeros(1, dtype=torch.int64))
+            self.register_buffer("touches", rows.float())
+            self.register_buffer("likeness", likeness)
 
     def _remembered(self, rows: Tensor | None, source: Source) -> Tensor:
         """Unit embeddings (m, d); until load() fills it, one of zeros."""
@@ -177,6 +190,17 @@ class Denoiser(nn.Module):
     def channels(self) -> int:
         """Latent channels."""
         return int(self.unet.config["out_channels"])
+
+    @property
+    def gel_channels(self) -> int:
+        """Channels that show the gel."""
+        maps = channels_of(self.channels) if self.policy.contact else 0
+        return int(self.unet.config["in_channels"]) - self.channels - maps
+
+    @property
+    def touch_scale(self) -> tuple[Tensor, Tensor]:
+        """Mean and deviation (6,) of the training touches, on the CPU."""
+        return scale_of(self.touches.cpu())
 
     @property
     def device(self) -> torch.device:
@@ -256,6 +280,14 @@ class Denoiser(nn.Module):
         unit = nn.functional.normalize
         return unit(torch.cat(texts), dim=1), unit(torch.cat(near), dim=1)
 
+    def similar(self, photos: Tensor | None, texts: Tensor | None = None) -> Tensor:
+        """Cosines (n, m) of embeddings with the photos, else the texts, of the memory."""
+        if photos is None:
+            assert texts is not None
+            return self._unit(texts.to(self.device), "text") @ self.memory.T
+        photos = photos[:, 0] if photos.ndim == 3 else photos
+        return self._unit(photos.to(self.device), "vision") @ self.keys.T
+
     def _unit(self, conditions: Tensor, source: Source) -> Tensor:
         width = self.policy.width
         must, fix = f"must be embeddings of shape (n, {width})", "Use the pipeline's encoders"
@@ -284,7 +316,8 @@ class Denoiser(nn.Module):
             x: noisy normalized latents (n, c, h, w).
             t: steps (n,) in 0..T-1 (the paper's 1..T).
             tokens: (n, k, d), of all embeddings and inputs.
-            background: of the no-contact images (n, g, h, w), for the variant w/ BG.
+            background: of the no-contact images (n, g, h, w), for the variant w/ BG, then the maps
+                of contacts.
         """
         x = x if background is None else torch.cat([x, background], dim=1)
         first = None
@@ -356,6 +389,7 @@ class Denoiser(nn.Module):
             shapes = {rows.shape for rows in kept.values()}
             if len(shapes) > 1 or any(shape[1:] != (policy.width,) for shape in shapes):
                 raise KeyError("a memory of another shape")
+            kept |= {name: extra[name] for name in TOUCHES if name in wanted}
             for name, rows in kept.items():
                 setattr(model, name, rows)
             model.load_state_dict(extra, strict=False)

@@ -24,11 +24,13 @@ from torch import Tensor, nn
 
 from palpate.core import digest_json, require
 from palpate.diffusion.autoencoder import LatentStats
+from palpate.diffusion.contact import KEPT, PARTS, channels_of, dropped, maps_of
 from palpate.diffusion.denoiser import Denoiser, inputs_of, lengths_of, slots_of
 from palpate.diffusion.options import SOURCES, ConditionPolicy, Schedule, Source, UNetOptions
 from palpate.diffusion.presets import DiffusionPreset
 from palpate.diffusion.unet import build_unet, load_unet
 from palpate.encoders.models import digest_tensors, pick_device
+from palpate.encoders.rows import evenly_spaced
 from palpate.training.engine import Batch, Losses, Task, fit
 from palpate.training.run import TrainingRun
 from palpate.training.steps import Step, seeded
@@ -55,6 +57,10 @@ class Rows:
         ids: of the rows, for errors.
         key: digest of all of this, which is not read for it.
         gels: the no-contact images (n, s, s, 3), where they are needed.
+        contacts: of ``policy.contact``: what is known of the touches (n, 8), as the manifest's
+            columns.
+        marks: what their shears do to the markers (n, 3 c, h, w), in latents.
+        asked: the touches (n, 6) as they are asked for.
     """
 
     latents: Tensor | NDArray[Any]
@@ -63,6 +69,9 @@ class Rows:
     ids: Sequence[str] | None = None
     key: str = ""
     gels: NDArray[np.uint8] | None = None
+    contacts: NDArray[np.float64] | None = None
+    marks: NDArray[Any] | None = None
+    asked: NDArray[np.float32] | None = None
 
 
 def train_denoiser(
@@ -73,6 +82,7 @@ def train_denoiser(
     *,
     held_out: Rows | None = None,
     start: Denoiser | None = None,
+    remember: bool = False,
     samples: Callable[[nn.Module], NDArray[np.uint8]] | None = None,
 ) -> Denoiser:
     """Train a denoiser; resume if the run's folder holds a checkpoint of the same run.
@@ -85,6 +95,7 @@ def train_denoiser(
         held_out: rows whose loss is measured in training.
         start: go on from these weights and in their shape instead of random ones. The modality
             means are those of ``rows`` all the same.
+        remember: keep means and memory of ``start``, for more data of the same kind.
         samples: see :class:`~palpate.training.engine.Task`.
 
     Returns:
@@ -100,15 +111,22 @@ def train_denoiser(
     with seeded(preset.loop.seed, "denoiser"):
         gel = 0 if rows.background is None else rows.background(np.arange(1), stats).shape[1]
         channels, side = rows.latents.shape[1:3]
+        gel += channels_of(channels) if policy.contact else 0
         net = new_unet(start, preset.unet, policy, side, channels=channels, background=gel)
-        memory = _memory(tables) if policy.gap == "pairs" else None
+        memory, which = _memory(tables) if policy.gap == "pairs" else (None, None)
+        if start is not None and remember and start.pairs:
+            means = dict(zip(SOURCES, start.means, strict=True))
+            memory = start.memory + start.means[0], start.keys + start.means[1]
+            which = start.similar(tables["vision"]).argmax(1)
+        touches = None if rows.asked is None else _touches(rows.asked, which)
         width = conditions["patches"].shape[2] if "patches" in inputs_of(policy) else None
-        model = Denoiser(net, policy, means, memory, width)
+        model = Denoiser(net, policy, means, memory, width, touches)
         model.to(pick_device(run.device))
     trained = {} if start is None else dict(start.named_parameters())
     for name, own in model.named_parameters():  # of the U-Net, and what else both have learned
-        if name in trained:
-            own.data.copy_(trained[name].data)
+        if name in trained:  # inputs that are new have no effect at first
+            known = trained[name].data
+            own.data.zero_()[tuple(map(slice, known.shape))] = known
 
     def loss_of(part: Rows) -> DiffusionLoss:
         with torch.no_grad():
@@ -123,6 +141,7 @@ def train_denoiser(
             schedule=preset.schedule,
             policy=policy,
             inputs={name: part.conditions[name] for name in inputs_of(policy)},
+            contacts=None if part.asked is None else (part.asked, part.marks, model.touch_scale),
         )
 
     loss, held = loss_of(rows), None
@@ -156,11 +175,12 @@ def new_unet(
         policy: gives the tokens.
         side: of the latents.
         channels: of the latents.
-        background: channels of the no-contact image.
+        background: channels of the no-contact image and of contacts.
     """
     if start is not None:
-        config: Any = UNet2DConditionModel.from_config(start.unet.config)
-        return config
+        config = {**start.unet.config, "in_channels": channels + background}
+        net: Any = UNet2DConditionModel.from_config(config)
+        return net
     if isinstance(unet, str):
         return load_unet(unet, policy, channels=channels, background=background)
     return build_unet(unet, policy, size=side, channels=channels, background=background)
@@ -182,11 +202,19 @@ def _floats(table: Any) -> Tensor:
     return torch.as_tensor(np.asarray(table), dtype=torch.float32)
 
 
-def _memory(tables: Mapping[Source, Tensor]) -> tuple[Tensor, Tensor]:
-    """The different training texts (m, d), and the mean of the photos of each."""
+def _memory(tables: Mapping[Source, Tensor]) -> tuple[tuple[Tensor, Tensor], Tensor]:
+    """The different training texts (m, d), the mean of the photos of each; the text of each row."""
     texts, which, counts = tables["text"].unique(dim=0, return_inverse=True, return_counts=True)
     photos = torch.zeros_like(texts).index_add_(0, which, tables["vision"])
-    return texts, photos / counts[:, None]
+    return (texts, photos / counts[:, None]), which
+
+
+def _touches(asked: NDArray[np.float32], which: Tensor | None) -> tuple[Tensor, Tensor]:
+    """Training touches that are kept, evenly of those with a place; the memory's row of each."""
+    placed = np.flatnonzero(np.isfinite(asked[:, 0]))
+    kept = placed[evenly_spaced(len(placed), KEPT)] if len(placed) else np.arange(1)
+    rows = torch.from_numpy(asked[kept])
+    return rows, torch.zeros(len(kept), dtype=torch.int64) if which is None else which[kept].cpu()
 
 
 class DiffusionLoss:
@@ -202,11 +230,14 @@ class DiffusionLoss:
         schedule: Schedule,
         policy: ConditionPolicy,
         inputs: Mapping[str, Any] | None = None,
+        contacts: tuple[Any, Any, tuple[Tensor, Tensor]] | None = None,
     ) -> None:
-        """Take latents (n, c, h, w), not normalized, tokens (n, k, d) by source, and inputs."""
+        """Take latents (n, c, h, w), not normalized, tokens (n, k, d) by source, inputs, and of
+        contacts what is asked (n, 6), the marks, and the scale.
+        """
         self.latents, self.tokens, self.background = latents, dict(tokens), background
         self.stats, self.schedule, self.policy = stats, schedule, policy
-        self.inputs = dict(inputs or {})
+        self.inputs, self.contacts = dict(inputs or {}), contacts
         self.lengths = torch.tensor(lengths_of(policy))
         self.alphas = schedule.alphas()
 
@@ -232,8 +263,14 @@ class DiffusionLoss:
             **{name: _take(table, step.rows) for name, table in self.inputs.items()},
             "dropped": self._dropped(step).repeat_interleave(self.lengths, dim=1),
         }
-        if self.background is not None:
-            batch["background"] = self.background(step.rows, self.stats)
+        seen = [] if self.background is None else [self.background(step.rows, self.stats)]
+        if self.contacts is not None:
+            asked, marks, scale = self.contacts
+            given = dropped(_take(asked, step.rows), step.rand(1 + len(PARTS)))
+            marks = self.stats.scaled(_take(marks, step.rows).float())
+            seen.append(maps_of(given, marks, scale))
+        if seen:
+            batch["background"] = torch.cat(seen, dim=1)
         return batch
 
     def __call__(self, module: nn.Module, batch: Batch) -> Losses:

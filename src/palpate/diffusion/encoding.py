@@ -5,6 +5,7 @@ images, and what conditions on its photos and texts.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -16,13 +17,15 @@ from palpate.core import Progress, cached, digest_json, quiet, short
 from palpate.data.images import cached_images, image_stamp, mapped
 from palpate.data.manifest import Manifest
 from palpate.diffusion.autoencoder import AnyAutoencoder, BackgroundAutoencoder
+from palpate.diffusion.contact import listed, marks_of
 from palpate.diffusion.denoiser import inputs_of
 from palpate.diffusion.denoiser_training import Rows
-from palpate.diffusion.gels import gels_of
+from palpate.diffusion.gels import gels_of, has_gels
 from palpate.diffusion.options import ConditionPolicy
 from palpate.encoders.embed import embed, exact
 from palpate.encoders.encoder_set import EncoderSet
 from palpate.encoders.models import digest_tensors, to_unit
+from palpate.metrics.conditions import contact_conditions
 from palpate.training.run import TrainingRun
 
 CACHE_FORMAT = "palpate-latents/1"
@@ -88,7 +91,42 @@ def encode_part(
         else:
             coded = code(gels, None, "gel-latents")
             seen = lambda rows, stats: stats.normalize(torch.as_tensor(coded[rows]))
-    return Rows(latents, conditions, seen, part.ids, gels=gels)
+    rows = Rows(latents, conditions, seen, part.ids, gels=gels)
+    if not policy.contact:
+        return rows
+    assert isinstance(autoencoder, BackgroundAutoencoder)
+    contacts = _contacts(part, images, gels, folder / f"contacts-{short(key)}.npy", progress)
+    key = digest_json([CACHE_FORMAT, key, autoencoder.digest, contacts[:, 4:6].tolist()])
+    marks = _mapped(
+        folder / f"marks-{short(key)}.npy",
+        len(part),
+        lambda of: marks_of(autoencoder, gels[of], contacts[of, 4:6]).half().numpy(),
+        progress=progress,
+        task="moving markers",
+    )
+    return replace(rows, contacts=contacts, marks=marks)
+
+
+def _contacts(
+    part: Manifest,
+    images: NDArray[np.uint8],
+    gels: NDArray[np.uint8],
+    file: Path,
+    progress: Progress,
+) -> NDArray[np.float64]:
+    """(n, 8) what the manifest says of the contacts, else what the images show."""
+    said = listed(part)
+    if not has_gels(part):
+        return said
+    shown = _mapped(
+        file,
+        len(part),
+        lambda of: contact_conditions(images[of], gels[of]),
+        progress=progress,
+        task="measuring contacts",
+    )
+    shown = np.hstack([shown, np.full((len(part), 2), np.nan)])  # force and depth are not shown
+    return np.where(np.isfinite(said), said, shown)
 
 
 def encode_latents(

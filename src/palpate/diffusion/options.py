@@ -121,6 +121,8 @@ class ConditionPolicy:
             halves the size and doubles them, up to eight times.
         patches: tokens that follow the embedding of a photo: the states of its patches in the
             encoder's last layer, averaged to a square of so many; 0: none.
+        contact: whether place, area, strength and shear of touches condition as well, where there
+            is an autoencoder that is given the gel, and data that show or name them.
     """
 
     width: int
@@ -131,6 +133,7 @@ class ConditionPolicy:
     photo_size: int = 64
     photo_width: int = 32
     patches: int = 0
+    contact: bool = False
 
     @property
     def sources(self) -> tuple[Source, ...]:

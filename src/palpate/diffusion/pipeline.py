@@ -32,6 +32,7 @@ from palpate.diffusion.autoencoder import (
     LatentStats,
     load_autoencoder,
 )
+from palpate.diffusion.contact import ContactScale, drawn, maps_of, marks_of
 from palpate.diffusion.denoiser import (
     Denoiser,
     OnStep,
@@ -55,6 +56,7 @@ from palpate.encoders.models import (
     pick_device,
     to_unit,
 )
+from palpate.metrics.conditions import CONDITIONS
 from palpate.training.cards import write_model_cards
 
 COPY_AGAIN = "Copy the whole folder again"
@@ -92,6 +94,7 @@ class TactilePipeline(DiffusionPipeline):
             conditions.
         gel: a no-contact image (size, size, 3) of the training part, for photos without one.
         seen: what photos and texts of the training look like; None of a pipeline without it.
+        contact: what strength, force and depth mean, of a denoiser that knows contacts.
     """
 
     autoencoder: AnyAutoencoder
@@ -105,6 +108,7 @@ class TactilePipeline(DiffusionPipeline):
     training: Mapping[str, Any] = field(default_factory=dict)
     gel: NDArray[np.uint8] | None = None
     seen: TrainingRange | None = None
+    contact: ContactScale | None = None
 
     def __post_init__(self) -> None:
         """Name the parts for diffusers.
@@ -112,8 +116,7 @@ class TactilePipeline(DiffusionPipeline):
         Raises:
             PalpateError: if the U-Net and the autoencoder do not fit.
         """
-        code, unet = self.autoencoder, self.denoiser.unet.config
-        seen = unet["in_channels"] - unet["out_channels"]
+        code, seen = self.autoencoder, self.denoiser.gel_channels
         latent = {self.denoiser.channels, len(self.stats.mean), len(self.stats.std)}
         fits = (
             latent == {code.channels}
@@ -322,12 +325,13 @@ class TactilePipeline(DiffusionPipeline):
             FORMAT,
             asdict(self.stats),
             asdict(self.schedule),
-            asdict(self.denoiser.policy),
+            {k: v for k, v in asdict(self.denoiser.policy).items() if k != "contact" or v},
             self.size,
             *_digests(self.autoencoder, self.encoders),
             architecture(self.denoiser.unet.config),
             digest_tensors(weights),
             None if gel is None else digest_tensors({"gel": gel}),
+            *([] if self.contact is None else [asdict(self.contact)]),
         ]
         return digest_json(parts)
 
@@ -454,6 +458,7 @@ class TactilePipeline(DiffusionPipeline):
         weight: float = 0.5,
         sampler: SamplerOptions | None = None,
         background: NDArray[np.uint8] | None = None,
+        touches: NDArray[np.floating[Any]] | None = None,
         noise: Tensor | None = None,
         on_step: OnStep | None = None,
     ) -> NDArray[np.uint8]:
@@ -468,6 +473,9 @@ class TactilePipeline(DiffusionPipeline):
             sampler: default: the pipeline's.
             background: bytes (n, size, size, 3) of the gel without contact; default: the stock gel,
                 which a pipeline w/ BG and a VQ autoencoder lacks.
+            touches: (n, 6) what is asked for, in the order of
+                :data:`palpate.metrics.conditions.CONDITIONS` and strength from 0 to 1; NaN, and
+                default: drawn among the training touches of surfaces like these.
             noise: the starting noise (n, c, h, w) instead of that of seed and ids.
             on_step: called after each step of each batch.
 
@@ -495,12 +503,18 @@ class TactilePipeline(DiffusionPipeline):
         shape = (len(ids), self.size, self.size)
         fits = background is None or background.shape[:3] == shape
         require(fits, "background", must, None if background is None else background.shape)
-        code, ground = self.autoencoder, None
+        code, seen = self.autoencoder, list[Tensor]()
         if background is not None and self.denoiser.background:
             if isinstance(code, BackgroundAutoencoder):
-                ground = code.gel(background)
+                seen.append(code.gel(background))
             else:
-                ground = self.stats.normalize(code.encode(background))
+                seen.append(self.stats.normalize(code.encode(background)))
+        if self.denoiser.policy.contact:
+            assert isinstance(code, BackgroundAutoencoder)
+            assert background is not None
+            asked = self._touches(touches, photos, words, ids, seed)
+            marks = self.stats.scaled(marks_of(code, background, asked[:, 4:6]))
+            seen.append(maps_of(torch.from_numpy(asked), marks, self.denoiser.touch_scale))
         # Schedulers of diffusers keep where they are; of one pipeline several threads may sample.
         options, scheduler = sampler or self.sampler_with(), copy.deepcopy(self.scheduler)
         if options.method != self.sampler.method:
@@ -512,10 +526,26 @@ class TactilePipeline(DiffusionPipeline):
             options,
             scheduler,
             generator=lambda row: _step_noise(seed, ids[row]),
-            background=ground,
+            background=torch.cat(seen, dim=1) if seen else None,
             on_step=on_step,
         )
         return code.decode(self.stats.restore(latents), background, batch=options.batch)
+
+    def _touches(
+        self,
+        touches: NDArray[np.floating[Any]] | None,
+        photos: Tensor | None,
+        texts: Tensor | None,
+        ids: Sequence[str],
+        seed: int,
+    ) -> NDArray[np.float32]:
+        """Touches (n, 6) as asked for, the rest of them drawn."""
+        asked = np.full((len(ids), len(CONDITIONS)), np.nan) if touches is None else touches
+        kept, similar = self.denoiser.touches.cpu().numpy(), None
+        if self.denoiser.pairs:
+            near = self.denoiser.similar(photos, texts)[:, self.denoiser.likeness]
+            similar = near.cpu().double().numpy()
+        return drawn(np.asarray(asked, float), kept, similar, ids, seed)
 
     def to(  # pyright: ignore[reportIncompatibleMethodOverride] - its forms with one or two
         self, device: str | torch.device | torch.dtype | None = None, dtype: Any = None
@@ -630,6 +660,7 @@ class TactilePipeline(DiffusionPipeline):
                 training=dict(about["training"]),
                 gel=square(read_image(gel), int(about["size"])) if gel.is_file() else None,
                 seen=TrainingRange.load(folder),
+                contact=ContactScale(**about["contact"]) if about.get("contact") else None,
             )
         except (KeyError, TypeError, ValueError) as error:
             must = f"The entries of {note} must be as palpate writes them"

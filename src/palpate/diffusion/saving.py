@@ -3,13 +3,15 @@
 ::
 
     model_index.json  the parts and their classes, as diffusers writes them
-    unet/          the denoiser, diffusers' format, and condition.safetensors (means, memory, maps)
+    unet/          the denoiser, diffusers' format, and condition.safetensors (means, memory, maps,
+                   touches)
     autoencoder/   the autoencoder, diffusers' format, and its palpate.json
     encoders/      the vision (and text) encoder whose embeddings the denoiser knows
     scheduler/     scheduler_config.json, diffusers' format: for programs that read only the parts
     gel.png        the stock gel without contact, of a generator that is given one
     range.json     what its training saw (``training_range``), to say what is unlike it
-    palpate.json   preset, condition policy, schedule, sampler, latent statistics, record, digest
+    palpate.json   preset, condition policy, schedule, sampler, latent statistics, what strength,
+                   force and depth of contacts mean, record, digest
     README.md      the card for people
 
 A pipeline trained on the encoders and autoencoder of a shipped model may refer to them instead of
@@ -67,6 +69,7 @@ def write_pipeline(
             "schedule": asdict(pipeline.schedule),
             "sampler": asdict(pipeline.sampler),
             "latents": asdict(pipeline.stats) | {"factor": pipeline.autoencoder.factor},
+            "contact": asdict(pipeline.contact) if pipeline.contact else None,
             "autoencoder": pipeline.autoencoder.digest,
             "encoders": encoders.digest("vision") if encoders else None,
             "training": dict(pipeline.training),

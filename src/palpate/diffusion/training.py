@@ -19,7 +19,7 @@ from torch import Tensor, nn
 from palpate._version import __version__
 from palpate.core import PalpateError, Progress, Split, digest_json, digest_lines, quiet, require
 from palpate.data.images import cached_images, image_stamp
-from palpate.data.manifest import Manifest
+from palpate.data.manifest import CONTACT, Manifest
 from palpate.diffusion.autoencoder import (
     AnyAutoencoder,
     BackgroundAutoencoder,
@@ -28,6 +28,7 @@ from palpate.diffusion.autoencoder import (
 )
 from palpate.diffusion.autoencoder_training import autoencoder_of, build_autoencoder
 from palpate.diffusion.ceiling import judge_of, measure_ceiling, some_whole
+from palpate.diffusion.contact import ContactScale, channels_of
 from palpate.diffusion.denoiser import Denoiser, lengths_of
 from palpate.diffusion.denoiser_training import Rows, new_unet, train_denoiser
 from palpate.diffusion.encoding import encode_part
@@ -61,6 +62,7 @@ class Parts:
         start: go on from this pipeline's denoiser instead of random weights. It must use the same
             autoencoder, vision encoder and schedule, gives its latent statistics, and its record
             goes into the new one, so that the data it was trained on stays declared.
+        remember: also keep means and memory of ``start``, for more data of the same kind.
     """
 
     preset: DiffusionPreset
@@ -68,6 +70,7 @@ class Parts:
     encoders: EncoderSet | None
     background: bool = False
     start: TactilePipeline | None = None
+    remember: bool = False
 
 
 def train_generator(  # noqa: PLR0913 - a public verb
@@ -170,9 +173,24 @@ def _preset(
         name=start.preset,
         size=start.size,
         schedule=start.schedule,
-        condition=start.denoiser.policy,
+        condition=replace(start.denoiser.policy, contact=chosen.condition.contact),
         sampler=start.sampler,
     )
+
+
+def _sees_contact(
+    preset: DiffusionPreset,
+    policy: ConditionPolicy,
+    autoencoder: AnyAutoencoder,
+    train: Manifest,
+    start: TactilePipeline | None,
+) -> bool:
+    """Whether touches condition: data must show or name them, on gels that are given."""
+    if start is not None and start.denoiser.policy.contact:
+        return True
+    known = has_gels(train) or {*CONTACT} & {*train.table.columns}
+    given = isinstance(autoencoder, BackgroundAutoencoder) and not isinstance(preset.unet, str)
+    return policy.contact and given and bool(known)
 
 
 def _policy(preset: DiffusionPreset, encoders: EncoderSet | None) -> ConditionPolicy:
@@ -207,9 +225,12 @@ def plan_generator(
         code = build_autoencoder(chosen.autoencoder or AutoencoderOptions())
     side = chosen.size // code.factor
 
+    policy = replace(policy, contact=_sees_contact(chosen, policy, code, train, begin))
+
     def build() -> nn.Module:
         old = None if begin is None else begin.denoiser
         wide = code.gel_channels if background else 0
+        wide += channels_of(code.channels) if policy.contact else 0
         unet = new_unet(old, chosen.unet, policy, side, channels=code.channels, background=wide)
         return Denoiser(unet, policy)
 
@@ -248,6 +269,7 @@ def train_pipeline(
     fits, fix = preset.size % autoencoder.factor == 0, "Choose another, or another size"
     require(fits, "autoencoder", must, autoencoder.factor, fix=fix)
     policy = _policy(preset, parts.encoders)
+    policy = replace(policy, contact=_sees_contact(preset, policy, autoencoder, train, start))
     if start is not None:
         _require_same(start, parts, policy)
     run = replace(run, device=pick_device(connect(str(run.device))))
@@ -276,6 +298,13 @@ def train_pipeline(
         rows = encode(train)
         held_rows = encode(held, rows.gels) if len(held) else None
         drawn = _drawn(manifest, split, preset.size, rows.gels)
+    contact = None
+    if rows.contacts is not None:
+        contact = ContactScale.of(rows.contacts, train.column("sensor"))
+        rows = replace(rows, asked=contact.asked(rows.contacts, train.column("sensor")))
+    if held_rows is not None and held_rows.contacts is not None and contact is not None:
+        asked = contact.asked(held_rows.contacts, held.column("sensor"))
+        held_rows = replace(held_rows, asked=asked)
     key = [
         digest_lines(texts),
         *(image_stamp(train, column) for column in ("vision", *columns)),
@@ -306,6 +335,7 @@ def train_pipeline(
             preset.name,
             record or {},
             rows.gels[0] if given_gel and rows.gels is not None else None,
+            contact,
         )
 
     denoiser = train_denoiser(
@@ -315,6 +345,7 @@ def train_pipeline(
         run.stage("denoiser"),
         held_out=held_rows,
         start=start.denoiser if start else None,
+        remember=parts.remember,
         samples=samples if drawn else None,
     )
     record = {

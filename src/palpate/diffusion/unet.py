@@ -20,7 +20,7 @@ def build_unet(
 ) -> UNet2DConditionModel:
     """Build an untrained U-Net for latents (channels, size, size) and the tokens of a policy.
 
-    ``background`` channels of the no-contact image follow those of the noisy latent.
+    ``background`` channels of the no-contact image and of contacts follow those of the latent.
     """
     down = ["CrossAttnDownBlock2D" if a else "DownBlock2D" for a in options.attention]
     up = ["CrossAttnUpBlock2D" if a else "UpBlock2D" for a in reversed(options.attention)]

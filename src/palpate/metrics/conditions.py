@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from palpate.metrics.contact import contact_of, for_all
 from palpate.metrics.images import Array, as_unit, image_pairs
-from palpate.metrics.markers import marker_mask, marker_motion
+from palpate.metrics.markers import is_marker, luma_and_around, motion_of
 
 #: The columns of what is measured.
 CONDITIONS = ("at_x", "at_y", "area", "strength", "shear_x", "shear_y")
@@ -43,14 +43,18 @@ def contact_conditions(tactile: Any, background: Any) -> NDArray[np.float64]:
     """
     gels = for_all(background, tactile)
     images, gels = image_pairs(tactile, gels, arguments=("tactile", "background"))
-    rows = [_measured(as_unit(a), as_unit(b)) for a, b in zip(images, gels, strict=True)]
+    rows, last, still = [], None, None
+    for image, gel in zip(images, gels, strict=True):
+        if still is None or not np.array_equal(gel, last):  # frames of a contact share one
+            last, still = gel, luma_and_around(as_unit(gel))
+        rows.append(_measured(as_unit(image), as_unit(gel), still))
     return np.array(rows, float).reshape(-1, len(CONDITIONS))
 
 
-def _measured(image: Array, gel: Array) -> tuple[float, ...]:
-    spots = marker_mask(image), marker_mask(gel)
-    mask, _, size = contact_of(image, gel, spots)
-    (h, w), motion = mask.shape, marker_motion(image, gel)
+def _measured(image: Array, gel: Array, still: tuple[Array, Array]) -> tuple[float, ...]:
+    seen = luma_and_around(image), still
+    mask, _, size = contact_of(image, gel, (is_marker(*seen[0]), is_marker(*seen[1])))
+    (h, w), motion = mask.shape, motion_of(*seen)
     shear = (np.nan, np.nan) if motion is None else tuple(motion.mean)
     if not mask.any():
         return np.nan, np.nan, 0.0, 0.0, *shear

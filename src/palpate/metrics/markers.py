@@ -100,7 +100,13 @@ def marker_motion(tactile: NDArray[Any], background: NDArray[Any]) -> MarkerMoti
     Returns:
         The motion, or None where the gel has no markers, or too few are found again.
     """
-    (gel, ink), (image, other) = (_spots(as_unit(x)) for x in (background, tactile))
+    seen = (luma_and_around(as_unit(image)) for image in (tactile, background))
+    return motion_of(*seen)
+
+
+def motion_of(tactile: tuple[Array, Array], background: tuple[Array, Array]) -> MarkerMotion | None:
+    """:func:`marker_motion` of what :func:`luma_and_around` gives of both images."""
+    (gel, ink), (image, other) = _spots(*background), _spots(*tactile)
     if min(len(gel), len(image)) < FEWEST:
         return None
     distance = _distances(gel, gel)
@@ -119,17 +125,21 @@ def marker_motion(tactile: NDArray[Any], background: NDArray[Any]) -> MarkerMoti
         guess = _smooth(gel, at, moves)
         off = np.linalg.norm(moves - guess[rows], axis=1)
     kept = off < max(AGREES, 3 * 1.4826 * float(np.median(off)))
-    percent = 100 * pitch / background.shape[1]
+    percent = 100 * pitch / background[0].shape[1]
     return MarkerMotion(percent * at[kept], percent * moves[kept]) if kept.sum() >= FEWEST else None
 
 
 def marker_mask(image: Array) -> Mask:
     """The pixels (h, w) of an image (h, w, c) in [0, 1] that are a marker."""
-    gray, around = _luma_and_around(image)
+    return is_marker(*luma_and_around(image))
+
+
+def is_marker(gray: Array, around: Array) -> Mask:
+    """:func:`marker_mask` of what :func:`luma_and_around` gives."""
     return gray < MARKER * around
 
 
-def _luma_and_around(image: Array) -> tuple[Array, Array]:
+def luma_and_around(image: Array) -> tuple[Array, Array]:
     """Luma (h, w) of an image, and its median in a window around each pixel."""
     gray = image @ LUMA if image.shape[2] == 3 else image[..., 0]
     # a median over a sixth of the side changes slowly, and costs the fourth power of the side
@@ -142,10 +152,9 @@ def _luma_and_around(image: Array) -> tuple[Array, Array]:
     return gray, around.repeat(step, 0).repeat(step, 1)[: gray.shape[0], : gray.shape[1]]
 
 
-def _spots(image: Array) -> tuple[Array, Array]:
+def _spots(gray: Array, around: Array) -> tuple[Array, Array]:
     """Centers (m, 2) of the markers of an image, x and y in pixels, and the ink (m,) of each."""
-    gray, around = _luma_and_around(image)
-    labeled: Any = scipy.ndimage.label(gray < MARKER * around)  # wrongly typed in scipy
+    labeled: Any = scipy.ndimage.label(is_marker(gray, around))  # wrongly typed in scipy
     areas, count = labeled
     ink = np.clip(1 - gray / np.maximum(around, 1e-3), 0, 1)
     areas = np.where(areas > 0, areas, scipy.ndimage.maximum_filter(areas, 3)).ravel()

@@ -21,6 +21,7 @@ from palpate.data.manifest import Manifest
 from palpate.sim.layouts import Parts, image_paths
 from palpate.sim.leak import cut
 from palpate.sim.materials import MATERIALS
+from palpate.sim.motion import make_contacts, state_at
 from palpate.sim.options import VERSION, WorldOptions
 from palpate.sim.plan import Row, VideoPlan, contact_rows, plan_world
 from palpate.sim.presets import PRESETS
@@ -50,6 +51,7 @@ class World:
         self.options = PRESETS[options] if isinstance(options, str) else options or WorldOptions()
         self.cache = cache
         self.video = lru_cache(cache)(partial(Video, self.options))
+        self.contacts = lru_cache(1)(partial(make_contacts, self.options))
 
     def __reduce__(self) -> Any:
         """Pickle the options alone: a copy in another process renders for itself."""
@@ -89,7 +91,8 @@ class World:
         Returns:
             ``vision``, ``tactile``, ``background``: uint8 (size, size, 3); ``id``, ``video``,
             ``contact``, ``object``, ``material``, ``text``, ``sensor``: text; ``frame``, ``label``:
-            integers. They mean what they mean in the manifest; ``label`` is the material's number.
+            integers; ``depth``: float. They mean what they mean in the manifest; ``label`` is the
+            material's number.
 
         Raises:
             NoSampleError: if there is no such sample.
@@ -119,13 +122,14 @@ class World:
             "material": row.object.material,
             "text": text,
             "sensor": f"{self.options.look}-{row.video.sensor}",
+            "depth": state_at(self.options, row.video, self.contacts(row.video), row.frame).load,
         }
 
     def manifest(self, captions: Mapping[str, Sequence[str]], folder: Path) -> Manifest:
         """Return the manifest of all contact frames, by video and frame.
 
         It has the ids, videos, contacts and image paths that ``palpate import`` reads from the
-        tree, and more: the object and the gel unit.
+        tree, and more: the object, the gel unit and the depth.
 
         Args:
             captions: video name -> a caption for each contact.
@@ -147,7 +151,7 @@ class World:
         classes = {material.label: name for name, material in MATERIALS.items()}
         if classes != CATEGORIES:
             facts["classes"] = json.dumps({str(label): name for label, name in classes.items()})
-        return Manifest.from_rows(rows, folder, facts)
+        return Manifest.from_rows(rows, folder, facts, ["depth"])
 
     def split(self, manifest: str) -> Split:
         """Return ``Orig``: the cut over the ids of the manifest of that digest, in list order."""
