@@ -144,7 +144,7 @@ GENERATOR_STEPS, GENERATOR_ROUNDS = 8_000, 2
 ROUND = replace(GENERATOR, condition=replace(GENERATOR.condition, contact=False))
 #: The last round: contacts that can be asked for.
 CONTACTS = replace(DIFFUSION, loop=replace(DIFFUSION.loop, ema=0.995))
-CONTACTS_STEPS = 3_200
+CONTACTS_STEPS = 3_600
 #: Half the time, on CPUs that have it; the weights then depend on the kind of CPU.
 COMPUTE = Compute(precision="bf16")
 PARTS = ("worlds", "clip", "encoders", "autoencoder", "generator", "scores")

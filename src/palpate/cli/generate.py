@@ -12,14 +12,14 @@ from palpate.core import plain, problem_lines
 
 @option_group
 class Options(Common):
-    """Make a tactile image for each photo or sample of a data set, or for a text. Run again to
-    continue.
+    """Make a tactile image for each photo or sample of a data set, or for a text, or a video of a
+    touch for one of a surface. Run again to continue.
     """
 
     photos: PathArguments = ()
     """Photos, a folder of them, or a manifest (its file or the folder of an import)."""
     output: OutPath
-    """A .png for one photo; else a folder for images/ and index.json."""
+    """A .png for one photo, an .mp4 for a video; else a folder for images/ and index.json."""
     text: str | None = None
     """What is felt, e.g. "rough, porous stone"; alone, or next to photos for all of them."""
     weight: float | None = None
@@ -28,6 +28,22 @@ class Options(Common):
     gel: Path | None = None
     """Picture of your sensor's gel without contact; the images are made on it (default: the
     no-contact image of each sample, else the model's stock gel, a typical one)."""
+    at: tuple[float, float] | None = None
+    """Where the contact is, in shares of the gel's width and height from the top left. What is not
+    asked for, of this and the next, is as in some touch of training, by the seed."""
+    area: float | None = None
+    """Share of the gel in contact."""
+    strength: float | None = None
+    """How strong the contact is, from 0 to 1: its quantile among those of training."""
+    shear: tuple[float, float] | None = None
+    """How far the gel's markers are dragged right and down, in % of its width."""
+    force: float | None = None
+    """In newtons, in place of a strength, for a model that learned from forces."""
+    depth: float | None = None
+    """In mm, in place of a strength, for a model that learned from depths (palpate/mini)."""
+    profile: Path | None = None
+    """With a video: table of time_s, strength, shear_x, shear_y (default: the touches of the
+    gelsight.mp4 beside it)."""
     model: str = "palpate/mini"
     """Folder of `palpate train generator`, hub id, or palpate/mini (which knows a synthetic world
     alone)."""

@@ -162,7 +162,8 @@ def command_of(verb: str, *words: object, **options: object) -> str:
     line = ["palpate", *verb.split(), *map(str, words)]
     for name, value in options.items():
         if value is not None and value is not False:
-            line += [f"--{name.replace('_', '-')}"] + [str(value)] * (value is not True)
+            values = () if value is True else value if isinstance(value, tuple) else (value,)
+            line += [f"--{name.replace('_', '-')}", *map(str, values)]
     return shlex.join(line)
 
 

@@ -32,12 +32,11 @@ from scipy.optimize import isotonic_regression
 from torch import Tensor
 
 from palpate.core import require, rng_for
-from palpate.data.manifest import CONTACT, Manifest
 from palpate.diffusion.autoencoder import BackgroundAutoencoder
 from palpate.metrics.conditions import CONDITIONS
-from palpate.metrics.contact import _fill
+from palpate.metrics.contact import fill
 from palpate.metrics.images import as_unit
-from palpate.metrics.markers import marker_mask
+from palpate.metrics.markers import marker_mask, marker_motion
 
 Rows = NDArray[np.float64]
 #: Asked for, unknown, or dropped together.
@@ -89,13 +88,14 @@ class ContactScale:
         }
         scale = cls(strength)
         quantiles = scale.asked(rows, sensors)[:, 3]
-        maps: list[dict[str, list[float]]] = []
-        for column in (6, 7):
-            each = {name: _monotone(rows[of, column], quantiles[of]) for name, of in groups.items()}
-            maps.append({name: table for name, table in each.items() if table})
+
+        def rising(column: int) -> dict[str, list[float]]:
+            fits = {name: _monotone(rows[of, column], quantiles[of]) for name, of in groups.items()}
+            return {name: fit for name, fit in fits.items() if fit}
+
         lost = ~_known(rows)
         missing = {part: int(lost[:, k].sum()) for k, part in enumerate(PARTS)}
-        return cls(strength, *maps, missing)
+        return cls(strength, rising(6), rising(7), missing)
 
     def asked(self, rows: Rows, sensors: Sequence[str | None]) -> NDArray[np.float32]:
         """Measured touches (n, 6 or more) as what is asked for: the strength as its quantile."""
@@ -144,20 +144,10 @@ def _known(rows: Rows) -> NDArray[np.bool_]:
     return np.stack([np.isfinite(rows[:, of]).all(axis=1) for of in PARTS.values()], axis=1)
 
 
-def listed(part: Manifest) -> Rows:
-    """(n, 8) what the manifest knows of the contacts, NaN where nothing."""
-    table = part.table
-    rows = np.full((len(part), len(CONTACT)), np.nan)
-    for k, name in enumerate(CONTACT):
-        if name in table.columns:
-            rows[:, k] = table[name].cast(float).fill_null(np.nan).to_numpy()
-    return rows
-
-
 def _ink(gel: NDArray[np.uint8]) -> tuple[Rows, Rows]:
     """A gel (h, w, 3) without its markers, and what these add to it."""
     near = np.asarray(ndimage.binary_dilation(marker_mask(unit := as_unit(gel))), bool)
-    smooth = 255 * _fill(unit, ~near, min(gel.shape[:2]) / 32)
+    smooth = 255 * fill(unit, ~near, min(gel.shape[:2]) / 32)
     return smooth, gel - smooth
 
 
@@ -179,7 +169,8 @@ def marks_of(
     still = code.encode(each, each)
 
     def change(ways: NDArray[np.floating[Any]], of: NDArray[np.intp]) -> Tensor:
-        images = np.stack([_moved(*inks[k], way) for k, way in zip(of, ways, strict=True)])
+        moved = ((*inks[k], way) for k, way in zip(of, ways, strict=True))
+        images = np.stack([_moved(smooth, ink, way) for smooth, ink, way in moved])
         return code.encode(images, each[of]) - still[of]
 
     units = (change(np.tile(way, (len(each), 1)), np.arange(len(each))) for way in np.eye(2))
@@ -216,8 +207,18 @@ def dropped(asked: Tensor, draws: Tensor) -> Tensor:
     return torch.where(gone[:, _PART], torch.nan, asked)
 
 
+def has_markers(gels: NDArray[np.uint8]) -> NDArray[np.bool_]:
+    """Whether gels (n, h, w, 3) have markers whose motion shows a shear."""
+    each, index = np.unique(gels, axis=0, return_inverse=True)
+    return np.array([marker_motion(gel, gel) is not None for gel in each])[index.ravel()]
+
+
 def drawn(
-    asked: Rows, touches: Rows, similar: Rows | None, ids: Sequence[str], seed: int
+    asked: NDArray[np.floating[Any]],
+    touches: NDArray[np.float32],
+    similar: Rows | None,
+    ids: Sequence[str],
+    seed: int,
 ) -> NDArray[np.float32]:
     """Touches (n, 6) as asked; what is NaN is that of one training touch each, by (seed, id).
 
@@ -235,6 +236,16 @@ def drawn(
     draws = [rng_for(seed, "touch", name).random() for name in ids]
     rows = [np.searchsorted(s, u * s[-1], "right") for s, u in zip(sums, draws, strict=True)]
     return np.where(np.isfinite(asked), asked, touches[rows]).astype(np.float32)
+
+
+def reach(strengths: NDArray[np.float32], similar: Rows) -> Rows:
+    """(n, 2): between what nearly all strengths (m,) lie of training touches of surfaces like
+    those of n samples, by the cosines (n, m).
+    """
+    order = np.argsort(strengths)
+    weights = np.exp((similar - similar.max(axis=1, keepdims=True)) / LIKE)[:, order]
+    ends = [np.searchsorted(s / s[-1], (0.01, 0.99)) for s in weights.cumsum(axis=1)]
+    return strengths[order][np.array(ends).clip(max=len(order) - 1)].astype(float)
 
 
 def scale_of(touches: Tensor) -> tuple[Tensor, Tensor]:

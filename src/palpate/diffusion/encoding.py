@@ -15,9 +15,9 @@ from numpy.typing import NDArray
 
 from palpate.core import Progress, cached, digest_json, quiet, short
 from palpate.data.images import cached_images, image_stamp, mapped
-from palpate.data.manifest import Manifest
+from palpate.data.manifest import CONTACT, Manifest
 from palpate.diffusion.autoencoder import AnyAutoencoder, BackgroundAutoencoder
-from palpate.diffusion.contact import listed, marks_of
+from palpate.diffusion.contact import marks_of
 from palpate.diffusion.denoiser import inputs_of
 from palpate.diffusion.denoiser_training import Rows
 from palpate.diffusion.gels import gels_of, has_gels
@@ -95,6 +95,7 @@ def encode_part(
     if not policy.contact:
         return rows
     assert isinstance(autoencoder, BackgroundAutoencoder)
+    assert gels is not None
     contacts = _contacts(part, images, gels, folder / f"contacts-{short(key)}.npy", progress)
     key = digest_json([CACHE_FORMAT, key, autoencoder.digest, contacts[:, 4:6].tolist()])
     marks = _mapped(
@@ -115,7 +116,10 @@ def _contacts(
     progress: Progress,
 ) -> NDArray[np.float64]:
     """(n, 8) what the manifest says of the contacts, else what the images show."""
-    said = listed(part)
+    said = np.full((len(part), len(CONTACT)), np.nan)
+    for k, name in enumerate(CONTACT):
+        if name in part.table.columns:
+            said[:, k] = part.table[name].fill_null(np.nan).to_numpy()
     if not has_gels(part):
         return said
     shown = _mapped(

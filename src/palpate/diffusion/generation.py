@@ -47,6 +47,7 @@ from palpate.core.files import canonical_json
 from palpate.core.images import SUFFIXES
 from palpate.data.images import check_image, file_stamp, images_below, read_image, square
 from palpate.data.slices import Part, Slice, command_of
+from palpate.diffusion.asked import Asked, Profile
 from palpate.diffusion.generated import UNLIKE, Generated, Index, file_name, old_index
 from palpate.encoders.models import FIX_MODEL, find_model
 
@@ -67,6 +68,8 @@ FEW = 64
 #: Threads that read photos while others are sampled.
 THREADS = max(2, min(16, os.cpu_count() or 1))
 PNG_END = b"\0\0\0\0IEND\xaeB`\x82"
+#: Suffixes of videos.
+VIDEOS = (".mp4", ".mov", ".avi", ".mkv", ".webm")
 #: Gels kept in memory.
 GELS = 64
 
@@ -84,6 +87,7 @@ class _Item:
     condition: Tensor | None = None
     unlike: float | None = None
     recording: str = ""
+    sensor: str | None = None
 
     def digest(self) -> str:
         """Of the bytes of both files."""
@@ -96,6 +100,13 @@ def generate(  # noqa: PLR0913 - a public verb, step by step
     text: str | None = None,
     weight: float | None = None,
     gel: str | Path | None = None,
+    at: tuple[float, float] | None = None,
+    area: float | None = None,
+    strength: float | None = None,
+    shear: tuple[float, float] | None = None,
+    force: float | None = None,
+    depth: float | None = None,
+    profile: str | Path | None = None,
     model: TactilePipeline | str | Path = "palpate/mini",
     output: str | Path | None = None,
     split: Split | str | Path | None = None,
@@ -123,9 +134,20 @@ def generate(  # noqa: PLR0913 - a public verb, step by step
             0.5.
         gel: an image of the gel without contact, on which the images are made; default: the
             manifest's column ``background``, else the model's stock gel.
+        at: place of the contact, in shares of the gel's width and height from the top left. This
+            and what follows must be known to the model; what is not given is drawn among the
+            training touches of surfaces like these, by the seed.
+        area: share of the gel in contact.
+        strength: of the contact, from 0 to 1: its quantile among the training contacts.
+        shear: mean motion of the gel's markers, right and down [% of the width].
+        force: in place of a strength, if training knew forces [N].
+        depth: in place of a strength, if training knew depths [mm].
+        profile: for a video: a table (CSV) of time_s, strength, shear_x, shear_y; default: those of
+            the ``gelsight.mp4`` beside it.
         model: a pipeline, a folder of ``palpate train generator``, a hub id, or the shipped
             ``palpate/mini``, which knows a synthetic world alone.
-        output: a folder, or a ``.png`` for one photo; None keeps the images in memory.
+        output: a folder, or a ``.png`` for one photo, or an ``.mp4`` for a video of a surface; None
+            keeps the images in memory.
         split: with a manifest: only one part of this split (or split file).
         part: which part.
         seed: of the noise of each sample.
@@ -150,6 +172,7 @@ def generate(  # noqa: PLR0913 - a public verb, step by step
             any image is made.
     """
     weight = _share(weight, photos is not None, text is not None)
+    asked = Asked(at, area, strength, shear, force, depth)
     made_by = command_of(
         *("generate", *(photos if isinstance(photos, list | tuple) else [photos])),
         output=output,
@@ -163,27 +186,20 @@ def generate(  # noqa: PLR0913 - a public verb, step by step
         guidance=guidance,
         steps=steps,
         strict=strict,
+        **asked.given(),
+        profile=profile,
     )
     folder, output = _places(output, slice)
-    rank, size, gathered = 0, 1, dict
-    if int(os.environ.get("WORLD_SIZE", "1")) > 1:
-        from palpate.training import processes
-
-        device = processes.connect(device)
-        (rank, size), gathered = processes.place(), processes.merged
+    device, (rank, size), gathered = _process(device)
     require(split is None or photos is not None, "split", WHOLE, "a text alone", fix="Leave it out")
     items = [_Item(str(text), None)] if photos is None else _items(photos, split, part)
     paths = [item.vision or Path(item.id) for item in items]
-    single = _is_single(output, paths)
-    if photos is not None and not skip_bad:
+    film = _is_film(output, paths, profile)
+    curve = None if profile is None else Profile.load(profile)
+    single = film or _is_single(output, paths)
+    if photos is not None and not skip_bad and not film:
         _require_readable(paths)
-    if isinstance(model, str | Path):
-        progress(f"loading {model}", 0, 0)
-        model = find_model(model, "generator", "pipeline", FIX_MODEL)  # before torch is imported
-    from palpate.diffusion.pipeline import TactilePipeline
-
-    if not isinstance(model, TactilePipeline):
-        model = TactilePipeline.from_pretrained(model, device=device)
+    model = _loaded(model, device, progress)
     sampler = model.sampler_with(guidance=guidance, steps=steps, batch=batch)
     if single:  # not among the copies that fill a batch: a fraction of the time
         sampler = replace(sampler, batch=1)
@@ -191,10 +207,30 @@ def generate(  # noqa: PLR0913 - a public verb, step by step
     settings = _settings(model, sampler, seed)
     settings |= {"text": text, "weight": None if photos is None else weight} if text else {}
     settings |= _range_of(model, text, words, strict) | ({"strict": True} if strict else {})
+    settings |= {"touch": asked.given()} if asked.given() else {}
+    touches = {s: asked.row(model.contact, s) for s in {item.sensor for item in items}}
     items = _on_gels(items, model, gel)
+    notes = [*_range_notes(settings), *_notes(model, text, gel), *_shear(model, asked, items)]
+    if film and output is not None:
+        from palpate.diffusion.touched_video import touch_video
+
+        return touch_video(
+            paths[0],
+            output,
+            model,
+            asked=asked,
+            sampler=model.sampler_with(guidance=guidance, steps=steps, batch=batch),
+            settings=settings,
+            profile=curve,
+            texts=words,
+            weight=weight,
+            gel=items[0].background,
+            seed=seed,
+            notes=notes,
+            progress=progress,
+        )
     items, part_made = _sliced(items, slice, settings, folder, made_by)
     target = _Target(output, single, settings, model.notice, rank == 0, part=part_made)
-    notes = [*_range_notes(settings), *_notes(model, text, gel)]
     if dry_run:
         files = ((item, target.path(item.id)) for item in items)
         there = [item for item, path in files if path and path.is_file()]
@@ -204,18 +240,24 @@ def generate(  # noqa: PLR0913 - a public verb, step by step
             target.folder, {}, settings, notes=notes, missing=missing, evaluations=missing * each
         )
 
+    outside: list[tuple[float, float]] = []
+
     def drawn(items: Iterator[_Item]) -> Generator[tuple[_Item, NDArray[np.uint8]]]:
         while chunk := [*islice(items, sampler.batch)]:
             rows: list[Any] = [item.condition for item in chunk if item.condition is not None]
             grounds = [item.ground for item in chunk if item.ground is not None]
+            photos = np.stack(rows) if rows else None
+            wanted = np.stack([touches[item.sensor] for item in chunk])
+            outside.extend(model.unlikely(wanted[:, 3], photos, words))
             images = model.sample(
-                np.stack(rows) if rows else None,
+                photos,
                 [item.id for item in chunk],
                 seed=seed,
                 texts=words,
                 weight=weight,
                 sampler=sampler,
                 background=np.stack(grounds) if grounds else None,
+                touches=wanted,
             )
             yield from zip(chunk, images, strict=True)
 
@@ -234,6 +276,7 @@ def generate(  # noqa: PLR0913 - a public verb, step by step
             progress("generating", done, len(reader.items))
         bad, new = reader.checked(gathered(bad | reader.bad)), gathered(new)
         ids = [item.id for item in items if item.id not in bad]
+        notes += _strength_notes(outside, len(new))
         return target.finish(ids, [*bad.values()], len(new), notes)
 
 
@@ -274,6 +317,28 @@ def _sliced(
     )
     record.is_finished(folder)
     return some, record
+
+
+def _process(device: str) -> tuple[str, tuple[int, int], Callable[..., Any]]:
+    """The device of this process, its place among how many, and what gathers their parts."""
+    if int(os.environ.get("WORLD_SIZE", "1")) > 1:
+        from palpate.training import processes
+
+        return processes.connect(device), processes.place(), processes.merged
+    return device, (0, 1), dict
+
+
+def _loaded(
+    model: TactilePipeline | str | Path, device: str, progress: Progress
+) -> TactilePipeline:
+    if isinstance(model, str | Path):
+        progress(f"loading {model}", 0, 0)
+        model = find_model(model, "generator", "pipeline", FIX_MODEL)  # before torch is imported
+    from palpate.diffusion.pipeline import TactilePipeline
+
+    if isinstance(model, TactilePipeline):
+        return model
+    return TactilePipeline.from_pretrained(model, device=device)
 
 
 def _ahead(
@@ -436,8 +501,11 @@ def _items(photos: Any, split: Split | str | Path | None, part: str) -> list[_It
         manifest = manifest if split is None else manifest.part(Split.load(split), part)
         gels = (gel and manifest.path(gel) for gel in manifest.column("background"))
         rows = zip(manifest.ids, manifest.paths("vision"), gels, strict=True)
-        videos = manifest.column("video")
-        items = [_Item(*row, recording=v or row[0]) for row, v in zip(rows, videos, strict=True)]
+        levels = zip(manifest.column("video"), manifest.column("sensor"), strict=True)
+        items = [
+            _Item(*row, recording=video or row[0], sensor=sensor)
+            for row, (video, sensor) in zip(rows, levels, strict=True)
+        ]
     must, fix = "There must be at least one photo", "Check the folder, the split or the names"
     require(bool(items), None, must, "none", fix=fix)
     return items
@@ -512,6 +580,45 @@ def _range_notes(settings: Mapping[str, Any]) -> list[Note]:
     words, rate = settings.get("unseen_words"), settings.get("text_unlike", 0.0)
     notes = [Note("words-unseen", {"words": words})] if words else []
     return notes + ([Note("text-unlike", {"rate": rate})] if rate >= UNLIKE else [])
+
+
+def _shear(pipeline: TactilePipeline, asked: Asked, items: Sequence[_Item]) -> list[Note]:
+    """That a shear has no effect where the gel has no markers; of several the first is seen."""
+    gel = items[0].background
+    if asked.shear is None or (gel is None and pipeline.gel is None):
+        return []
+    from palpate.diffusion.contact import has_markers
+
+    picture = pipeline.gel if gel is None else square(read_image(gel), pipeline.size)
+    assert picture is not None
+    return [] if has_markers(picture[None])[0] else [Note("shear-without-markers")]
+
+
+def _strength_notes(outside: Sequence[tuple[float, float]], n: int) -> list[Note]:
+    """That training knew no touches of such surfaces of the strength that is asked for."""
+    if not outside:
+        return []
+    low, high = (float(x) for x in np.median(outside, axis=0))
+    return [Note("strength-unseen", {"count": len(outside), "n": n, "low": low, "high": high})]
+
+
+def _is_film(output: Path | None, paths: Sequence[Path], profile: str | Path | None) -> bool:
+    """Whether the output is a video of a touch, of a video of a surface; checks what goes along."""
+    video = len(paths) == 1 and paths[0].suffix.lower() in VIDEOS
+    fix = "E.g. palpate generate clip.mp4 -o touch.mp4 --profile profile.csv"
+    got = f"{len(paths)} photos" if len(paths) > 1 else paths[0].name
+    require(video or profile is None, "profile", "must go with a video of a surface", got, fix=fix)
+    if output is None or output.suffix.lower() != ".mp4":
+        name = "none" if output is None else str(output)
+        require(not video, "output", "must be an .mp4 for a video", name, fix=fix)
+        return False
+    must, name = "with .mp4 must be the file of one video of a surface", str(output)
+    require(video, "output", must, f"{name} for {got}", fix=fix)
+    if output.exists():
+        must = "must be new, or a video that palpate generated"
+        own = output.is_file() and b"palpate.settings" in output.read_bytes()
+        require(own, "output", must, name, fix="Choose another name")
+    return True
 
 
 def _is_single(output: Path | None, paths: Sequence[Path]) -> bool:

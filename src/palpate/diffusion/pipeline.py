@@ -25,6 +25,7 @@ from torch import Tensor, nn
 from palpate.core import PalpateError, digest_json, read_record, require, require_choice, rng_for
 from palpate.core.hub import at_revision
 from palpate.data.images import Preprocess, load_images, read_image, square
+from palpate.diffusion.asked import Asked
 from palpate.diffusion.autoencoder import (
     AnyAutoencoder,
     Autoencoder,
@@ -32,7 +33,7 @@ from palpate.diffusion.autoencoder import (
     LatentStats,
     load_autoencoder,
 )
-from palpate.diffusion.contact import ContactScale, drawn, maps_of, marks_of
+from palpate.diffusion.contact import ContactScale, drawn, has_markers, maps_of, marks_of, reach
 from palpate.diffusion.denoiser import (
     Denoiser,
     OnStep,
@@ -64,6 +65,8 @@ SYNTHETIC = (
     "Made by a generator that was trained on synthetic data alone (palpate's procedural world), "
     "not on a real sensor."
 )
+#: How far beyond the strengths of training touches of such surfaces one goes without a note.
+TOLERATED = 0.1
 #: Photos embedded at once, always: an embedding does not depend on the others of its batch.
 EMBED = 32
 MODULES = ("autoencoder", "scheduler", "unet")
@@ -213,6 +216,12 @@ class TactilePipeline(DiffusionPipeline):
         guidance: float | None = None,
         steps: int | None = None,
         gel: Any = None,
+        at: tuple[float, float] | None = None,
+        area: float | None = None,
+        strength: float | None = None,
+        shear: tuple[float, float] | None = None,
+        force: float | None = None,
+        depth: float | None = None,
         generator: torch.Generator | Sequence[torch.Generator] | None = None,
         callback_on_step_end: Callable[[Any, int, Tensor, dict[str, Any]], Any] | None = None,
         copies: int = 1,
@@ -229,6 +238,13 @@ class TactilePipeline(DiffusionPipeline):
             guidance: s; default: the sampler's.
             steps: of the solver; default: the sampler's.
             gel: no-contact image of the gel, one for all or one per photo; default: the stock gel.
+            at: place of the contact, in shares of width and height from the top left; default, as
+                of the others: drawn among the training touches of surfaces like these.
+            area: share of the gel in contact.
+            strength: from 0 to 1, as its quantile among the training contacts.
+            shear: motion of the markers, right and down [% of the width].
+            force: in place of a strength, if training knew forces [N].
+            depth: in place of a strength, if training knew depths [mm].
             generator: of the starting noise instead of seed and ids; one for all, or one per image.
             callback_on_step_end: called as ``(pipeline, step, timestep, {"latents": ...})`` after
                 each step of each batch; ``latents`` of the dictionary that it returns replace them.
@@ -241,6 +257,7 @@ class TactilePipeline(DiffusionPipeline):
         Raises:
             PalpateError: if a photo is unreadable, a gel is missing, or settings do not fit.
         """
+        touch = Asked(at, area, strength, shear, force, depth).row(self.contact)
         images = [] if photos is None else list_images(photos)
         must, fix = "There must be at least one photo, or a text alone", "Pass one of them"
         enough = bool(images) or (photos is None and text is not None)
@@ -288,6 +305,7 @@ class TactilePipeline(DiffusionPipeline):
                 seed=seed,
                 sampler=sampler,
                 background=ground,
+                touches=np.tile(touch, (len(ids), 1)),
                 noise=noise,
                 on_step=on_step,
             )
@@ -512,7 +530,8 @@ class TactilePipeline(DiffusionPipeline):
         if self.denoiser.policy.contact:
             assert isinstance(code, BackgroundAutoencoder)
             assert background is not None
-            asked = self._touches(touches, photos, words, ids, seed)
+            asked = self.touches(touches, photos, words, ids, seed)
+            asked[~has_markers(background), 4:] = np.nan
             marks = self.stats.scaled(marks_of(code, background, asked[:, 4:6]))
             seen.append(maps_of(torch.from_numpy(asked), marks, self.denoiser.touch_scale))
         # Schedulers of diffusers keep where they are; of one pipeline several threads may sample.
@@ -531,21 +550,40 @@ class TactilePipeline(DiffusionPipeline):
         )
         return code.decode(self.stats.restore(latents), background, batch=options.batch)
 
-    def _touches(
+    def touches(
         self,
-        touches: NDArray[np.floating[Any]] | None,
+        asked: NDArray[np.floating[Any]] | None,
         photos: Tensor | None,
         texts: Tensor | None,
         ids: Sequence[str],
         seed: int,
     ) -> NDArray[np.float32]:
-        """Touches (n, 6) as asked for, the rest of them drawn."""
-        asked = np.full((len(ids), len(CONDITIONS)), np.nan) if touches is None else touches
-        kept, similar = self.denoiser.touches.cpu().numpy(), None
-        if self.denoiser.pairs:
-            near = self.denoiser.similar(photos, texts)[:, self.denoiser.likeness]
-            similar = near.cpu().double().numpy()
-        return drawn(np.asarray(asked, float), kept, similar, ids, seed)
+        """Touches (n, 6) as asked for, the rest of them drawn; arguments of :meth:`sample`."""
+        asked = np.full((len(ids), len(CONDITIONS)), np.nan) if asked is None else asked
+        similar = self._similar(photos, texts)
+        return drawn(asked, self.denoiser.touches.cpu().numpy(), similar, ids, seed)
+
+    def unlikely(
+        self, strengths: NDArray[np.float64], photos: Any, texts: Tensor | None
+    ) -> list[tuple[float, float]]:
+        """Ranges of the strengths of training touches of surfaces like these, of those samples
+        whose strength (n,), if there is one, lies outside.
+        """
+        if not np.isfinite(strengths).any() or not self.denoiser.pairs:
+            return []
+        photos = None if photos is None else torch.as_tensor(photos)
+        kept, similar = self.denoiser.touches[:, 3].cpu().numpy(), self._similar(photos, texts)
+        assert similar is not None
+        low, high = reach(kept, similar).T
+        off = (strengths < low - TOLERATED) | (strengths > high + TOLERATED)
+        return [(float(a), float(b)) for a, b in zip(low[off], high[off], strict=True)]
+
+    def _similar(self, photos: Tensor | None, texts: Tensor | None) -> NDArray[np.float64] | None:
+        """Cosines (n, m) with the photos, or texts, of the training touches that are kept."""
+        if not self.denoiser.pairs:
+            return None
+        near = self.denoiser.similar(photos, texts)[:, self.denoiser.likeness]
+        return near.cpu().double().numpy()
 
     def to(  # pyright: ignore[reportIncompatibleMethodOverride] - its forms with one or two
         self, device: str | torch.device | torch.dtype | None = None, dtype: Any = None

@@ -43,11 +43,11 @@ def contact_conditions(tactile: Any, background: Any) -> NDArray[np.float64]:
     """
     gels = for_all(background, tactile)
     images, gels = image_pairs(tactile, gels, arguments=("tactile", "background"))
-    rows, last, still = [], None, None
+    rows, seen = [], list[tuple[NDArray[Any], tuple[Array, Array]]]()
     for image, gel in zip(images, gels, strict=True):
-        if still is None or not np.array_equal(gel, last):  # frames of a contact share one
-            last, still = gel, luma_and_around(as_unit(gel))
-        rows.append(_measured(as_unit(image), as_unit(gel), still))
+        if not seen or not np.array_equal(gel, seen[0][0]):  # frames of a contact share one
+            seen = [(gel, luma_and_around(as_unit(gel)))]
+        rows.append(_measured(as_unit(image), as_unit(gel), seen[0][1]))
     return np.array(rows, float).reshape(-1, len(CONDITIONS))
 
 

@@ -216,7 +216,7 @@ def contact_of(
     if side >= 48:  # a smaller image has markers of a pixel, and hardly two of gel between them
         near = _dilated(near, side // 96)
     sigma = side / 48
-    change = _fill(image - background, ~near, side / 32)
+    change = fill(image - background, ~near, side / 32)
     change = scipy.ndimage.gaussian_filter(change, (sigma, sigma, 0))
     # of white noise, that of two images: a Gaussian blur leaves 1 / (2 sqrt(pi) sigma) of its sd
     noise = np.sqrt(2) * _noise(background, ~near) / (2 * np.sqrt(np.pi) * max(sigma, 0.5))
@@ -227,8 +227,8 @@ def contact_of(
     return _dilated(mask, side // 64), near, size
 
 
-def _fill(image: Array, keep: Mask, sigma: float) -> Array:
-    """``image`` (h, w, c) with the pixels not kept replaced by a blur of the kept ones around."""
+def fill(image: Array, keep: Mask, sigma: float) -> Array:
+    """An image (h, w, c) with the pixels not kept replaced by a blur of the kept ones around."""
     weights = keep[..., None].astype(np.float64)
     blur = (sigma, sigma, 0)
     around = scipy.ndimage.gaussian_filter(image * weights, blur)

@@ -399,6 +399,13 @@ EVALUATION: dict[str, Sentence] = {
         "{gel} is lit from other sides than the gels that the generator knows: a sensor of another "
         "kind, on which its contacts are implausible"
     ),
+    "shear-without-markers": (
+        "This gel has no markers, by which a generator shows a shear: it has no effect"
+    ),
+    "strength-unseen": (
+        "{count:,} of {n:,} images were asked for a strength that touches of surfaces like theirs "
+        "did not have in training: these lay in {low:.2f} to {high:.2f}"
+    ),
     "encoder-license": lambda p, _: (
         f"The {p['modality']} encoder is {p['name']}, whose license is "
         + ("not stated: see its page" if p["license"] == "unknown" else p["license"])

@@ -12,14 +12,13 @@ additional ``objects.csv`` and ``captions.csv``.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from fractions import Fraction
 from pathlib import Path
 
-import numpy as np
-
 from palpate.core import image_bytes
 from palpate.data.tables import csv_text
+from palpate.data.video import write_video
 from palpate.sim.materials import MATERIALS
 from palpate.sim.options import BACKGROUND_OFFSET, WorldOptions
 from palpate.sim.plan import Row, first_contact, written_frames
@@ -53,33 +52,12 @@ def write_video_files(video: Video, folder: Path) -> None:
         ("gelsight", video.tactile, of_touch),
     ):
         if video.options.layout == "videos":
-            _write_mp4(folder / f"{name}.mp4", map(render, frames), video.options.size)
+            write_video(folder / f"{name}.mp4", map(render, frames), Fraction(FPS))
             continue
         (folder / f"{name}_frame").mkdir()
         for frame in frames:
             data = image_bytes(render(frame), "JPEG", quality=quality, subsampling=0)
             (folder / f"{name}_frame" / f"{frame:010d}.jpg").write_bytes(data)
-
-
-def _write_mp4(path: Path, images: Iterable[np.ndarray], size: int) -> None:
-    """Write uint8 images (size, size, 3) as H.264, constant rate factor 18, so that bytes repeat.
-
-    One thread; x264 without the code whose rounding depends on the processor; frames converted
-    before they reach the encoder, because its conversion makes its decisions differ from run to
-    run.
-    """
-    import av
-
-    with av.open(str(path), "w", format="mp4") as file:
-        settings = {"crf": "18", "preset": "veryfast", "x264-params": "cpu-independent=1"}
-        stream = file.add_stream("libx264", rate=FPS, options=settings)
-        stream.width = stream.height = size
-        stream.pix_fmt, stream.thread_count = "yuv420p", 1
-        stream.time_base = Fraction(1, FPS)
-        for image in images:
-            frame = av.VideoFrame.from_ndarray(image, format="rgb24").reformat(format="yuv420p")
-            file.mux(stream.encode(frame))
-        file.mux(stream.encode())
 
 
 def list_files(
