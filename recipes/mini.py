@@ -48,7 +48,7 @@ from typing import Any
 
 import numpy as np
 from mini_cards import ship, write_page
-from mini_scores import prefixed, score_all, score_encoders
+from mini_scores import prefixed, score_all, score_encoders, score_generator
 from numpy.typing import NDArray
 
 from palpate.core import PalpateError, Split, digest_json, read_json, rng_for, write_json
@@ -56,6 +56,7 @@ from palpate.data.images import cached_images
 from palpate.data.manifest import Manifest
 from palpate.diffusion.autoencoder import AnyAutoencoder, load_autoencoder
 from palpate.diffusion.autoencoder_training import fit_autoencoder
+from palpate.diffusion.gels import gels_of
 from palpate.diffusion.options import BackgroundOptions, SamplerOptions
 from palpate.diffusion.pipeline import TactilePipeline
 from palpate.diffusion.presets import MINI as DIFFUSION
@@ -68,6 +69,7 @@ from palpate.encoders.encoder_set import EncoderSet, load_clip
 from palpate.encoders.gel_training import train_ruler
 from palpate.encoders.models import SHIPPED, shipped_root
 from palpate.encoders.presets import EncoderPreset, preset_of
+from palpate.metrics.conditions import contact_conditions
 from palpate.sim import PRESETS, VERSION, WorldOptions, write_world
 from palpate.studies.files import cleared
 from palpate.studies.stages import Stage, run_stage, stored_stage
@@ -145,6 +147,8 @@ ROUND = replace(GENERATOR, condition=replace(GENERATOR.condition, contact=False)
 #: The last round: contacts that can be asked for.
 CONTACTS = replace(DIFFUSION, loop=replace(DIFFUSION.loop, ema=0.995))
 CONTACTS_STEPS = 3_600
+#: Touches that say how well it follows what is asked.
+CALIBRATED = 480
 #: Half the time, on CPUs that have it; the weights then depend on the kind of CPU.
 COMPUTE = Compute(precision="bf16")
 PARTS = ("worlds", "clip", "encoders", "autoencoder", "generator", "scores")
@@ -208,6 +212,27 @@ def train_round(
     made = train_pipeline(train, everything(train), parts, replace(run, compute=COMPUTE))
     # Nothing is left out of the training: the ceiling is that of the autoencoder's own card.
     return replace(made, training={**made.training, "ceiling": autoencoder.card.get("scores")})
+
+
+def calibrated(pipeline: TactilePipeline, train: Manifest, cache: Path) -> TactilePipeline:
+    """The generator with the gains by which touches follow what is asked with a slope of 1, on
+    photos of its training: asked for are touches of other samples of the same material.
+    """
+    some = train.take(train.ids[:: max(1, len(train) // CALIBRATED)])
+    size, contact = pipeline.size, pipeline.contact
+    assert contact is not None
+    images, gels = cached_images(some, "tactile", size, cache), gels_of(some, size, cache)
+    sensors, order = some.column("sensor"), np.argsort(some.column("material"), kind="stable")
+    other = np.empty_like(order)
+    other[order] = np.roll(order, 5)
+    asked = contact.asked(contact_conditions(images, gels), sensors).astype(float)[other]
+    photos = pipeline.embed(cached_images(some, "vision", pipeline.vision_size, cache))
+    made = pipeline.sample(photos, some.ids, seed=0, background=np.asarray(gels), touches=asked)
+    shown = contact.asked(contact_conditions(made, gels), sensors)
+    known = np.isfinite(asked).all(axis=1) & np.isfinite(shown).all(axis=1)
+    slopes = [np.polyfit(x, y, 1)[0] for x, y in zip(asked[known].T, shown[known].T, strict=True)]
+    gain = [round(1 / float(slope), 3) for slope in slopes]
+    return replace(pipeline, contact=replace(contact, gain=gain))
 
 
 def _seeing(preset: EncoderPreset, epochs: float) -> EncoderPreset:
@@ -311,6 +336,8 @@ class Recipe:
 
     def encoders(self) -> EncoderSet:
         """The three encoders: the tactile one learns from many gels, against vision and text."""
+        if self.contacts:
+            return EncoderSet.load(NAME)
         pair = self.pair()
         pair.halve()
         parts = [prefixed(self.world(name), f"{name}/") for name in self.learned]
@@ -360,8 +387,19 @@ class Recipe:
         parts[1].halve()
         for number in range(0 if self.kept else GENERATOR_ROUNDS):
             pipeline = self._round(number, pipeline, *parts, self.world("gelsight"))
-        pipeline = self._round(GENERATOR_ROUNDS, pipeline, *parts, self.world("contacts"))
-        return replace(pipeline, sampler=GENERATOR.sampler)
+        world = self.world("contacts")
+        pipeline = self._round(GENERATOR_ROUNDS, pipeline, *parts, world)
+        pipeline.denoiser.halve()
+        pipeline = replace(pipeline, sampler=GENERATOR.sampler)
+
+        def build(folder: Path) -> Mapping[str, Any]:
+            made = calibrated(pipeline, world, self.cache)
+            assert made.contact is not None
+            return {"gain": made.contact.gain}
+
+        inputs = {"start": pipeline.digest, "touches": CALIBRATED}
+        gain = self.stage("calibration", inputs, build).facts["gain"]
+        return replace(pipeline, contact=replace(pipeline.contact, gain=gain))
 
     def _round(
         self,
@@ -406,7 +444,12 @@ class Recipe:
         digests = [models[0].digest("tactile"), models[0].digest("vision"), models[1].digest]
 
         def build(folder: Path) -> Mapping[str, Any]:
-            rows = score_all(*models, self._samples(), self.cache, self.progress)
+            worlds, how = self._samples(), (self.cache, self.progress)
+            if self.contacts:
+                sides = worlds["gelsight"], worlds["new gelsight"]
+                rows = {"generator": score_generator(models[2], models[0], *sides, *how)}
+            else:
+                rows = score_all(*models, worlds, *how)
             write_json(folder / "scores.json", rows)
             return {}
 
@@ -447,7 +490,8 @@ class Recipe:
         models = self.encoders(), self.autoencoder(), self.generator()
         self._halve(*models)
         target = shipped_root() / SHIPPED[NAME]
-        ship(target, *models, scores, self._worlds(), self.kept)
+        flags = "--contacts" if self.contacts else "--tactile" if self.kept else ""
+        ship(target, *models, scores, self._worlds(), flags)
         if PAGE.is_file():
             write_page(PAGE, target)
         print_line(f"Shipped in {target}")

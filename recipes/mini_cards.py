@@ -17,7 +17,6 @@ from palpate.training.cards import write_model_cards
 
 NAME = "palpate/mini"
 RECIPE = "python recipes/mini.py --work runs/mini --ship"
-OF_TACTILE = "python recipes/mini.py --work runs/mini --tactile --ship"
 TAGS = ("synthetic",)
 SUMMARIES = {
     "pair": (
@@ -46,9 +45,11 @@ SUMMARIES = {
         "From a photo to a tactile image of palpate's world",
         "A latent diffusion model (flow matching), conditioned on captions and photos, and driven "
         "by photos, captions or both, in the space of the encoders and the autoencoder next to "
-        "it. Trained in two rounds, the second from the rounded weights of the first, on the same "
-        "images. It knows the world's twenty materials and nothing else. The image is made on a "
-        "gel that is given as a picture without contact, or on a stock gel.",
+        "it. Place, area, strength, shear and depth of a touch can be asked for. Trained in three "
+        "rounds, each from the rounded weights of the last: two on the same images, the third, "
+        "which learns what is asked for, on a world of its own. It knows the world's twenty "
+        "materials and nothing else. The image is made on a gel that is given as a picture "
+        "without contact, or on a stock gel.",
     ),
 }
 LIMITS = (
@@ -64,7 +65,7 @@ READ = {
         *("new gelsight", "new gel", "new pad", "new look"),
     ),
     "autoencoder": ("gelsight", "digit", "new gelsight", "new digit"),
-    "generator": ("gelsight", "photos", "new gelsight"),
+    "generator": ("gelsight", "photos", "contacts", "new gelsight"),
 }
 
 
@@ -75,15 +76,16 @@ def ship(
     pipeline: TactilePipeline,
     scores: Mapping[str, Any],
     worlds: Sequence[Mapping[str, Any]],
-    tactile: bool,
+    flags: str = "",
 ) -> None:
-    """Replaces what is shipped; the models must be rounded to 16 bits already, since the scores are
-    theirs. ``tactile``: that encoder alone was made anew.
+    """Replaces what is shipped, of the parts that have scores; the models must be rounded to 16
+    bits already, since the scores are theirs. ``flags``: of the recipe that made one part anew.
     """
+    anew = {"--tactile": ("encoders",), "--contacts": ("generator",)}.get(flags, ())
 
     def card(part: str) -> dict[str, Any]:
         title, summary = SUMMARIES[part]
-        scored = scores["encoders" if part == "pair" else part]
+        scored = scores.get("encoders" if part == "pair" else part, [])
         data = [
             {**world, "used for": "scores" if world["world"].startswith("new") else "training"}
             for world in worlds
@@ -98,14 +100,12 @@ def ship(
             "data": data,
             "scores": scored,
             "limits": list(LIMITS),
-            "recipe": RECIPE,
+            "recipe": RECIPE.replace("--ship", f"{flags} --ship") if part in anew else RECIPE,
             "world version": VERSION,
             "synthetic": True,
         }
 
     encoders.card = {**encoders.card, **card("encoders")}
-    if tactile:
-        encoders.card["recipe"] = OF_TACTILE
     pair = card("pair")
     pair["scores"] = [row for row in pair["scores"] if "tactile" not in row["score"]]
     encoders.clip_card = {**encoders.clip_card, **pair}
@@ -113,8 +113,9 @@ def ship(
     pipeline = replace(pipeline, training={**pipeline.training, **card("generator")})
     for part in scores:  # git has what was there
         shutil.rmtree(target / part, ignore_errors=True)
-    encoders.save(target / "encoders", half=True)
-    autoencoder.save(target / "autoencoder", half=True)
+    if "encoders" in scores:
+        encoders.save(target / "encoders", half=True)
+        autoencoder.save(target / "autoencoder", half=True)
     pipeline.save(target / "generator", half=True, shared=NAME)
     write_model_cards(target)
 

@@ -480,7 +480,7 @@ def test_rescaling_keeps_the_spread_of_the_conditional_prediction():
 
     z, t = torch.randn(2, 3, 4, 4), torch.tensor([5, 5])
     out = guided(
-        predict, z, t, torch.ones(2, 1, 1), None, SamplerOptions(guidance=4.0, rescale=1.0)
+        predict, z, t, torch.ones(2, 1, 1), (None, None), SamplerOptions(guidance=4.0, rescale=1.0)
     )
     assert torch.allclose(out.std((1, 2, 3)), z.std((1, 2, 3)), rtol=1e-5)
     assert torch.allclose(out / out.std(), z / z.std(), atol=1e-5)

@@ -44,6 +44,7 @@ def small(mini, monkeypatch, tmp_path):
     monkeypatch.setattr(mini, "TACTILE", replace(mini.TACTILE, image=32, tactile_course=course))
     monkeypatch.setattr(mini, "AUTOENCODER", replace(mini.AUTOENCODER, steps=3))
     monkeypatch.setattr(mini, "GENERATOR_STEPS", 3)
+    monkeypatch.setattr(mini, "CONTACTS_STEPS", 3)
     monkeypatch.setattr(sys.modules["mini_scores"], "GENERATED", 8)
     monkeypatch.setattr(sys.modules["mini_scores"], "POOL", 10)
     ruler = shipped_module.RULERS["palpate/handcrafted"]
@@ -94,8 +95,10 @@ def test_every_part_is_made_shipped_and_verified(small, tmp_path, capsys):
     assert any(
         row["score"] == "TMMD, generated" for row in scores["generator"]["training"]["scores"]
     )
-    second = scores["generator"]["training"]
-    assert (second["seed"], second["start_record"]["seed"]) == (1, 0)
+    third = scores["generator"]["training"]
+    second = third["start_record"]
+    assert (third["seed"], second["seed"], second["start_record"]["seed"]) == (2, 1, 0)
+    assert scores["generator"]["contact"]["depth"]
     assert second["start_record"]["start"] is None
     exact = small.stored_stage(tmp_path / "work" / "generator").facts["digest"]
     assert second["start"] != exact  # the rounded weights went on
@@ -117,7 +120,7 @@ def test_every_part_is_made_shipped_and_verified(small, tmp_path, capsys):
     assert trained == {
         "encoders": {900_000, 900_002, *range(900_010, 900_024)},
         "autoencoder": {900_000, 900_001},
-        "generator": {900_000, 900_002},
+        "generator": {900_000, 900_002, 900_003},
     }
     page = (tmp_path / "mini.md").read_text()
     assert page.startswith("before\n")

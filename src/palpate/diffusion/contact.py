@@ -68,12 +68,15 @@ class ContactScale:
         force: sensor -> least and largest force [N], and the strengths of evenly spaced forces.
         depth: the same of depth [mm].
         missing: training touches without place, area, strength, shear.
+        gain: how far from the mean of training each condition is asked for, to be as far from it as
+            is asked; empty: as far.
     """
 
     strength: Mapping[str, Sequence[float]] = field(default_factory=dict)
     force: Mapping[str, Sequence[float]] = field(default_factory=dict)
     depth: Mapping[str, Sequence[float]] = field(default_factory=dict)
     missing: Mapping[str, int] = field(default_factory=dict)
+    gain: Sequence[float] = ()
 
     @classmethod
     def of(cls, rows: Rows, sensors: Sequence[str | None]) -> ContactScale:

@@ -452,6 +452,7 @@ def sample(
     *,
     generator: Callable[[int], torch.Generator] | None = None,
     background: Tensor | None = None,
+    bare: Tensor | None = None,
     on_step: OnStep | None = None,
 ) -> Tensor:
     """Normalized latents (n, c, h, w), on the CPU.
@@ -463,7 +464,8 @@ def sample(
         options: see :class:`SamplerOptions`.
         scheduler: of diffusers.
         generator: row -> a new generator of the noise that a scheduler adds while it samples.
-        background: what the network sees of the gels (n, g, h, w), or None.
+        background: what the network sees of the gels and touches (n, g, h, w), or None.
+        bare: the same without what is asked for, of the unconditional pass; default: the same.
         on_step: called after each step of each batch.
     """
     parts = [noise[:0]]
@@ -473,7 +475,8 @@ def sample(
         step = scheduler.step
         if generator and draws:
             step = partial(step, generator=[generator(k) for k in rows])
-        ground = None if background is None else background[rows].to(tokens.device)
+        grounds = background if bare is None else bare, background
+        ground = [None if g is None else g[rows].to(tokens.device) for g in grounds]
         conditions = tokens[rows]
         scheduler.set_timesteps(options.steps, device=tokens.device)
         z = noise[rows].to(tokens.device) * getattr(scheduler, "init_noise_sigma", 1.0)
@@ -498,14 +501,18 @@ def guided(  # noqa: PLR0917 - in the order of the network's arguments
     z: Tensor,
     t: Tensor,
     tokens: Tensor,
-    background: Tensor | None,
+    grounds: Sequence[Tensor | None],
     options: SamplerOptions,
 ) -> Tensor:
-    """Return the guided prediction; the formula holds for a velocity as well."""
+    """Return the guided prediction; the formula holds for a velocity as well.
+
+    ``grounds``: what the network sees of the gel in the unconditional pass, and in the other.
+    """
     s, null = options.guidance, torch.zeros_like(tokens)
     if s in (0.0, 1.0):
-        return predict(z, t, tokens if s else null, background)
-    twice = None if background is None else torch.cat([background, background])
+        return predict(z, t, tokens if s else null, grounds[int(s)])
+    seen = [ground for ground in grounds if ground is not None]
+    twice = torch.cat(seen) if seen else None
     both = predict(torch.cat([z, z]), torch.cat([t, t]), torch.cat([null, tokens]), twice)
     without, conditional = both.chunk(2)
     prediction = without + s * (conditional - without)

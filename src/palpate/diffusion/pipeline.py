@@ -521,7 +521,7 @@ class TactilePipeline(DiffusionPipeline):
         shape = (len(ids), self.size, self.size)
         fits = background is None or background.shape[:3] == shape
         require(fits, "background", must, None if background is None else background.shape)
-        code, seen = self.autoencoder, list[Tensor]()
+        code, seen, maps = self.autoencoder, list[Tensor](), list[Tensor]()
         if background is not None and self.denoiser.background:
             if isinstance(code, BackgroundAutoencoder):
                 seen.append(code.gel(background))
@@ -532,8 +532,13 @@ class TactilePipeline(DiffusionPipeline):
             assert background is not None
             asked = self.touches(touches, photos, words, ids, seed)
             asked[~has_markers(background), 4:] = np.nan
+            if self.contact is not None and self.contact.gain:
+                mean = self.denoiser.touch_scale[0].numpy()
+                asked = mean + np.array(self.contact.gain, np.float32) * (asked - mean)
             marks = self.stats.scaled(marks_of(code, background, asked[:, 4:6]))
-            seen.append(maps_of(torch.from_numpy(asked), marks, self.denoiser.touch_scale))
+            each = torch.from_numpy(asked)
+            for touch in (torch.full_like(each, torch.nan), each):  # guidance is on both
+                maps.append(maps_of(touch, marks, self.denoiser.touch_scale))
         # Schedulers of diffusers keep where they are; of one pipeline several threads may sample.
         options, scheduler = sampler or self.sampler_with(), copy.deepcopy(self.scheduler)
         if options.method != self.sampler.method:
@@ -545,7 +550,8 @@ class TactilePipeline(DiffusionPipeline):
             options,
             scheduler,
             generator=lambda row: _step_noise(seed, ids[row]),
-            background=torch.cat(seen, dim=1) if seen else None,
+            background=torch.cat([*seen, *maps[1:]], dim=1) if seen or maps else None,
+            bare=torch.cat([*seen, maps[0]], dim=1) if maps else None,
             on_step=on_step,
         )
         return code.decode(self.stats.restore(latents), background, batch=options.batch)
@@ -574,7 +580,7 @@ class TactilePipeline(DiffusionPipeline):
         photos = None if photos is None else torch.as_tensor(photos)
         kept, similar = self.denoiser.touches[:, 3].cpu().numpy(), self._similar(photos, texts)
         assert similar is not None
-        low, high = reach(kept, similar).T
+        low, high = np.broadcast_to(reach(kept, similar), (len(strengths), 2)).T
         off = (strengths < low - TOLERATED) | (strengths > high + TOLERATED)
         return [(float(a), float(b)) for a, b in zip(low[off], high[off], strict=True)]
 
