@@ -335,7 +335,7 @@ def train_pipeline(
             preset.name,
             record or {},
             rows.gels[0] if given_gel and rows.gels is not None else None,
-            contact,
+            contact=contact,
         )
 
     denoiser = train_denoiser(
