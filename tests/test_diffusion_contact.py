@@ -60,9 +60,10 @@ def make(code, gel, contact=True):
     unet = build_unet(TINY.unet, policy, channels=4, size=16, background=maps)
     touches = (TOUCHES, torch.zeros(3, dtype=torch.int64)) if contact else None
     denoiser = Denoiser(unet, policy, touches=touches).eval()
-    scale = ContactScale({"": [0.0, 10.0]}, {}, {"": [0.1, 0.3, 0.2, 0.8]}) if contact else None
-    parts = TINY.schedule, TINY.sampler, 64, StandInEncoders(), "tiny", {"split": None}, gel, scale
-    return TactilePipeline(code, denoiser, PLAIN, *parts)
+    scale = ContactScale({"": [0.0, 10.0]}, {}, {"": [0.1, 0.3, 0.2, 0.8]}, gain=[1.0] * 6)
+    scale = scale if contact else None
+    parts = TINY.schedule, TINY.sampler, 64, StandInEncoders(), "tiny", {"split": None}, gel
+    return TactilePipeline(code, denoiser, PLAIN, *parts, contact=scale)
 
 
 def test_maps_show_what_is_asked_and_that_alone():
@@ -290,8 +291,8 @@ def test_a_profile_makes_a_video_without_flicker(world, code, tmp_path):
         assert reader.seconds[-1] == pytest.approx(0.9)
     change = np.abs(np.diff(frames, axis=0)).mean(axis=(1, 2, 3))
     assert np.abs(frames[:3] - gel).mean() < 4  # nothing touches
-    assert change[4:7].max() < 1.5  # held
-    assert change[2:4].max() > 2 * change[4:7].max()  # pressed
+    assert change[4:7].max() < 3  # held, up to the codec
+    assert change[2:4].max() > 3 * change[4:7].max()  # pressed
     # Its own touches, where they lie beside it, take the place of a profile.
     touches = [gel] * 6 + [np.roll(world[0]["tactile"], 5 * k, 1) for k in range(4)]
     write_video(clip.with_name("gelsight.mp4"), touches, Fraction(10))

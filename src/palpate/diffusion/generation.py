@@ -436,7 +436,9 @@ class _Target:
         if self.folder is not None:
             files = {**self.index.images, **{i: file_name(i) for i in ids}}
         for i in files:
-            with open_image(self.path(i)) as image:
+            path = self.path(i)
+            assert path is not None
+            with open_image(path) as image:
                 if (rate := image.info.get("palpate.unlike")) is not None:
                     self.unlike[i] = float(rate)
         if self.folder is not None:

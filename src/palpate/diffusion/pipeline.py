@@ -190,9 +190,9 @@ class TactilePipeline(DiffusionPipeline):
             PalpateError: if a photo is unreadable, a gel is missing, or settings do not fit.
         """
         require_choice("output_type", output_type, ("pil", "np", "pt"))
-        given: dict[str, Any] = {"text": prompt, "steps": num_inference_steps}
-        given |= {"guidance": guidance_scale} | options
-        arrays = self.generate(image, generator=generator, copies=num_images_per_prompt, **given)
+        named = {"text": prompt, "steps": num_inference_steps, "guidance": guidance_scale}
+        options = {**named, **options}
+        arrays = self.generate(image, generator=generator, copies=num_images_per_prompt, **options)
         if output_type == "pil":
             return ImagePipelineOutput(images=[Image.fromarray(array) for array in arrays])
         unit = arrays.astype(np.float32) / 255
