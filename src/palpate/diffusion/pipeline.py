@@ -13,7 +13,7 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, fields, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import torch
@@ -190,9 +190,16 @@ class TactilePipeline(DiffusionPipeline):
             PalpateError: if a photo is unreadable, a gel is missing, or settings do not fit.
         """
         require_choice("output_type", output_type, ("pil", "np", "pt"))
-        named = {"text": prompt, "steps": num_inference_steps, "guidance": guidance_scale}
-        options = {**named, **options}
-        arrays = self.generate(image, generator=generator, copies=num_images_per_prompt, **options)
+        arrays = self.generate(
+            image,
+            generator=generator,
+            copies=num_images_per_prompt,
+            **cast(
+                "dict[str, Any]",
+                {"text": prompt, "steps": num_inference_steps, "guidance": guidance_scale}
+                | options,
+            ),
+        )
         if output_type == "pil":
             return ImagePipelineOutput(images=[Image.fromarray(array) for array in arrays])
         unit = arrays.astype(np.float32) / 255
