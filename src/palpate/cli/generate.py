@@ -40,7 +40,7 @@ class Options(Common):
     force: float | None = None
     """In newtons, in place of a strength, for a model that learned from forces."""
     depth: float | None = None
-    """In mm, in place of a strength, for a model that learned from depths (palpate/mini)."""
+    """In mm, in place of a strength, for a model that learned from depths."""
     profile: Path | None = None
     """With a video: table of time_s, strength, shear_x, shear_y (default: the touches of the
     gelsight.mp4 beside it)."""
