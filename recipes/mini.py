@@ -143,9 +143,12 @@ AUTOENCODER = BackgroundOptions(steps=6_000)
 GENERATOR = replace(DIFFUSION, loop=replace(DIFFUSION.loop, batch=32, warmup=100))
 #: Of a round of the generator's training, and how many rounds: each goes on from the last.
 GENERATOR_STEPS, GENERATOR_ROUNDS = 8_000, 2
-ROUND = replace(GENERATOR, condition=replace(GENERATOR.condition, contact=False))
 #: The last round: contacts that can be asked for.
-CONTACTS = replace(DIFFUSION, loop=replace(DIFFUSION.loop, ema=0.995))
+CONTACTS = replace(
+    DIFFUSION,
+    condition=replace(DIFFUSION.condition, contact=True),
+    loop=replace(DIFFUSION.loop, ema=0.995),
+)
 CONTACTS_STEPS = 3_600
 #: Touches that say how well it follows what is asked.
 CALIBRATED = 480
@@ -413,7 +416,9 @@ class Recipe:
     ) -> TactilePipeline:
         """A round of the generator's training; it goes on from the rounded weights of the last."""
         seed, last = SEED + number, number == GENERATOR_ROUNDS
-        preset = CONTACTS.with_steps(CONTACTS_STEPS) if last else ROUND.with_steps(GENERATOR_STEPS)
+        preset = (
+            CONTACTS.with_steps(CONTACTS_STEPS) if last else GENERATOR.with_steps(GENERATOR_STEPS)
+        )
         inputs = {
             "preset": replace(preset, sampler=SamplerOptions()),  # no part of the training
             "seed": seed,

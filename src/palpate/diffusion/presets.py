@@ -12,7 +12,7 @@ latent scale    std                   std                           one (recorde
 U-Net           16-32                 64-96, modulated, 2.6 M       192 x (1, 2, 3, 5), 406.3 M
 schedule        beta, T = 1000        flow                          beta, T = 1000
 prediction      eps                   velocity                      eps (Eq. 1)
-condition       one token             text, photo, contact          one token
+condition       one token             text and photo, a token each  one token
 source          text                  both                          text
 gap, noise      none, 0               pairs, 0.3                    none, 0
 optimizer       AdamW 1e-3, EMA 0.99  AdamW 1e-3, cosine, EMA 0.99  AdamW 6.4e-5, EMA 0.9999
@@ -152,7 +152,7 @@ MINI = DiffusionPreset(
         widths=(64, 96), attention=(False, True), layers=1, head_width=32, groups=16, modulate=True
     ),
     # Gap and noise go beyond the paper: the text-image gap is wide in small encoders.
-    condition=ConditionPolicy(width=128, gap="pairs", noise=0.3, source="both", contact=True),
+    condition=ConditionPolicy(width=128, gap="pairs", noise=0.3, source="both"),
     loop=LoopOptions(steps=400, batch=16, lr=1e-3, warmup=50, ema=0.99),
     cost="minutes on two cores; palpate/mini: autoencoder 20 core-minutes, generator 101",
     score="palpate/mini on new worlds: autoencoder 37 dB PSNR, generator TMMD 0.24",
