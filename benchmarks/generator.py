@@ -17,7 +17,6 @@ measurement is kept in the work folder and not made again; a stopped command goe
 
 import argparse
 import datetime
-import io
 import math
 import platform
 import sys
@@ -34,6 +33,7 @@ from texture import TextureJudge, masked
 from palpate.core import FeatureSet, digest_json, read_json, rng_for, short, write_json
 from palpate.data.images import cached_images
 from palpate.data.manifest import Manifest
+from palpate.data.storage import form_of
 from palpate.diffusion.autoencoder import load_autoencoder
 from palpate.diffusion.gels import gels_of
 from palpate.diffusion.pipeline import TactilePipeline
@@ -72,13 +72,10 @@ LEARNED = (NEAREST, AUTOENCODER, *list(DRIVES)[:2])
 DIGIT = (REAL, AUTOENCODER, BY_PHOTO)
 
 
-def stored(images, quality):
-    """Bytes (n, h, w, 3) after the JPEG of the world's files."""
-    out = np.empty_like(images)
-    for k, image in enumerate(images):
-        Image.fromarray(image).save(file := io.BytesIO(), "JPEG", quality=quality, subsampling=0)
-        out[k] = np.asarray(Image.open(file))
-    return out
+def stored(images, files):
+    """Bytes (n, h, w, 3), each as its real image is stored."""
+    pairs = zip(images, map(form_of, files), strict=True)
+    return np.stack([form.through(Image.fromarray(x)) if form else x for x, form in pairs])
 
 
 def contacts(images, gels):
@@ -248,7 +245,7 @@ class Trial:
             images, gels = code.decode(latents, np.asarray(world.gels)), world.gels
         else:
             images, gels = self.generated(world, **DRIVES[name])
-        return stored(images, self.test.options.quality), gels
+        return stored(images, world.part.paths("tactile")), gels
 
     def generated(
         self, world, *, gels="own", photo=True, text=False, permuted=False, guidance=None

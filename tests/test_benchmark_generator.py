@@ -52,10 +52,14 @@ def test_worlds_of_one_frame_and_of_two_are_refused_with_spaced_phases_and_match
     assert not any(text.startswith("strength") for text in found["drawn"])
 
 
-def test_images_are_stored_as_the_world_stores_them():
-    image = np.random.default_rng(1).integers(0, 256, (1, 32, 32, 3), dtype=np.uint8)
-    Image.fromarray(image[0]).save(file := io.BytesIO(), "JPEG", quality=90, subsampling=0)
-    np.testing.assert_array_equal(generator.stored(image, 90)[0], np.asarray(Image.open(file)))
+def test_images_are_stored_as_the_real_ones_are(tmp_path):
+    images = np.random.default_rng(1).integers(0, 256, (2, 32, 32, 3), dtype=np.uint8)
+    files = [tmp_path / "real.jpg", tmp_path / "real.png"]
+    Image.new("RGB", (32, 32)).save(files[0], "JPEG", quality=90, subsampling=0)
+    Image.new("RGB", (32, 32)).save(files[1])
+    Image.fromarray(images[0]).save(file := io.BytesIO(), "JPEG", quality=90, subsampling=0)
+    expected = np.stack([np.asarray(Image.open(file)), images[1]])
+    np.testing.assert_array_equal(generator.stored(images, files), expected)
 
 
 def stripes(rng, n, periods):

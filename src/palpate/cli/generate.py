@@ -44,6 +44,9 @@ class Options(Common):
     profile: Path | None = None
     """With a video: table of time_s, strength, shear_x, shear_y (default: the touches of the
     gelsight.mp4 beside it)."""
+    like: Path | None = None
+    """Folder of images or of a data set: store the images in its formats, with its JPEG tables
+    (default: PNG)."""
     model: str = "palpate/mini"
     """Folder of `palpate train generator`, hub id, or palpate/mini (which knows a synthetic world
     alone)."""

@@ -107,6 +107,9 @@ class Options(Common):
     its images lie to these (memorization). Of a manifest that --split knows, its train part."""
     allow_seen: Switch = False
     """Score with an encoder that was trained on some of the real images; every score says so."""
+    as_is: Switch = False
+    """Compare images as they are stored. Default: where sides differ (PNG, JPEG), after the same
+    lossy storage, with both values where it matters."""
     cache: Path | None = None
     """Folder for embeddings and decoded images. Default: one next to -o, for a run that is
     interrupted; removed at the end."""

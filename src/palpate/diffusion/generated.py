@@ -2,7 +2,7 @@
 
 ::
 
-    OUT/images/<name>.png   one image per id; the name is made from the id
+    OUT/images/<name>.png   one image per id; the name is made from the id (.jpg like such data)
     OUT/index.json          {"format", "complete", "settings", "digest", "notice",
                              "images": {id: name}, "unlike": {id: rate}, "skipped": [...],
                              "sealed"}
@@ -138,10 +138,10 @@ class Index:
     notice: str = ""
 
 
-def file_name(sample_id: str) -> str:
+def file_name(sample_id: str, suffix: str = ".png") -> str:
     """Return a safe file name: the plain characters of the id and a part of its SHA-256."""
     plain = re.sub(r"[^A-Za-z0-9_-]+", "_", sample_id).strip("_")[:80]
-    return f"{plain or 'sample'}-{short(hashlib.sha256(sample_id.encode()).hexdigest())}.png"
+    return f"{plain or 'sample'}-{short(hashlib.sha256(sample_id.encode()).hexdigest())}{suffix}"
 
 
 def _read_index(folder: Path) -> Index:

@@ -1,18 +1,20 @@
 """Photos or a data set -> tactile images: in memory, as one PNG, or as a folder.
 
 Each PNG carries as text its id, the settings as JSON, their digest, the digest of its photo, how
-unlike those of the training the photo is, and the pipeline's notice. So a folder that was left half
+unlike those of the training the photo is, and the pipeline's notice; a JPEG has them as JSON in its
+comment. So a folder that was left half
 done is continued: images of the same settings and photo are kept, and the result has the same bytes
 as one made at a stretch.
 """
 
 from __future__ import annotations
 
+import json
 import os
 from collections import Counter, deque
 from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import contextmanager, nullcontext
+from contextlib import contextmanager, nullcontext, suppress
 from dataclasses import asdict, dataclass, replace
 from functools import lru_cache
 from itertools import chain, islice
@@ -39,6 +41,7 @@ from palpate.core import (
     plain,
     quiet,
     require,
+    rng_for,
     save_image,
     sealed,
     write_json,
@@ -55,6 +58,7 @@ if TYPE_CHECKING:  # torch takes seconds to import, and what is checked first ne
     from torch import Tensor
 
     from palpate.data.manifest import Manifest
+    from palpate.data.storage import Form
     from palpate.diffusion.options import SamplerOptions
     from palpate.diffusion.pipeline import TactilePipeline
 
@@ -67,9 +71,10 @@ WHOLE = "must go with a manifest, of which it names the parts"
 FEW = 64
 #: Threads that read photos while others are sampled.
 THREADS = max(2, min(16, os.cpu_count() or 1))
-PNG_END = b"\0\0\0\0IEND\xaeB`\x82"
 #: Suffixes of videos.
 VIDEOS = (".mp4", ".mov", ".avi", ".mkv", ".webm")
+#: What whole files end with: PNG and JPEG.
+ENDS = (b"\0\0\0\0IEND\xaeB`\x82", b"\xff\xd9")
 #: Gels kept in memory.
 GELS = 64
 
@@ -107,6 +112,7 @@ def generate(  # noqa: PLR0913 - a public verb, step by step
     force: float | None = None,
     depth: float | None = None,
     profile: str | Path | None = None,
+    like: str | Path | None = None,
     model: TactilePipeline | str | Path = "palpate/mini",
     output: str | Path | None = None,
     split: Split | str | Path | None = None,
@@ -144,6 +150,9 @@ def generate(  # noqa: PLR0913 - a public verb, step by step
         depth: in place of a strength, if training knew depths [mm].
         profile: for a video: a table (CSV) of time_s, strength, shear_x, shear_y; default: those of
             the ``gelsight.mp4`` beside it.
+        like: a folder of images or of a data set, in whose formats the images are stored: JPEG with
+            the quantization tables of a random one of its tactile images, or PNG where that is
+            lossless.
         model: a pipeline, a folder of ``palpate train generator``, a hub id, or the shipped
             ``palpate/mini``, which knows a synthetic world alone.
         output: a folder, or a ``.png`` for one photo, or an ``.mp4`` for a video of a surface; None
@@ -209,6 +218,10 @@ def generate(  # noqa: PLR0913 - a public verb, step by step
     settings |= _range_of(model, text, words, strict) | ({"strict": True} if strict else {})
     settings |= {"touch": asked.given()} if asked.given() else {}
     touches = {s: asked.row(model.contact, s) for s in {item.sensor for item in items}}
+    must, fix = "must go with images", "Leave it out"
+    require(like is None or not film, "like", must, "a video", fix=fix)
+    forms = [] if like is None else _forms_like(Path(like), single and output is not None)
+    settings |= {"like": digest_json([f and f.options for f in forms])} if forms else {}
     items = _on_gels(items, model, gel)
     notes = [*_range_notes(settings), *_notes(model, text, gel), *_shear(model, asked, items)]
     if film and output is not None:
@@ -231,6 +244,7 @@ def generate(  # noqa: PLR0913 - a public verb, step by step
         )
     items, part_made = _sliced(items, slice, settings, folder, made_by)
     target = _Target(output, single, settings, model.notice, rank == 0, part=part_made)
+    target.forms = forms
     if dry_run:
         files = ((item, target.path(item.id)) for item in items)
         there = [item for item, path in files if path and path.is_file()]
@@ -372,6 +386,7 @@ class _Target:
         part: Part | None,
     ) -> None:
         self.part = part
+        self.forms: Sequence[Form | None] = ()  # of the data that the images are stored like
         self.settings, self.digest, self.notice = settings, digest_json(settings), notice
         self.file = output if single else None
         self.folder = None if single else output
@@ -387,7 +402,18 @@ class _Target:
 
     def path(self, sample_id: str) -> Path | None:
         """The file of an image; None in memory."""
-        return self.folder / "images" / file_name(sample_id) if self.folder else self.file
+        if self.folder is None:
+            return self.file
+        return (
+            self.folder
+            / "images"
+            / file_name(sample_id, ".jpg" if self.form(sample_id) else ".png")
+        )
+
+    def form(self, sample_id: str) -> Form | None:
+        """How an image is stored; None is PNG."""
+        draw = rng_for(self.settings["seed"], "storage", sample_id)
+        return self.forms[int(draw.integers(len(self.forms)))] if self.forms else None
 
     def has(self, item: _Item, stamp: str) -> bool:
         """Whether the image of this id, photo and settings is there, undamaged."""
@@ -395,11 +421,11 @@ class _Target:
             return False
         try:
             with open_image(path) as image:
-                text = [image.info.get(f"palpate.{k}") for k in ("id", "settings", "input")]
+                text = [_texts(image).get(f"palpate.{k}") for k in ("id", "settings", "input")]
                 image.verify()  # the checksum of each chunk but the last
         except ImageError:
             return False
-        whole = path.read_bytes().endswith(PNG_END)
+        whole = path.read_bytes().endswith(ENDS)
         return whole and text == [item.id, self.digest, stamp]
 
     @contextmanager
@@ -413,37 +439,39 @@ class _Target:
 
     def keep(self, item: _Item, array: NDArray[np.uint8]) -> _Item:
         """Keep one image, as a PNG that says what it is."""
-        image = Image.fromarray(array)
+        image, form = Image.fromarray(array), self.form(item.id)
         if (path := self.path(item.id)) is None:
-            self.memory[item.id] = image
+            self.memory[item.id] = replace(form, size=image.size).through(image) if form else image
             self.unlike |= {} if item.unlike is None else {item.id: item.unlike}
             return item
-        text = PngImagePlugin.PngInfo()
+        text, texts = PngImagePlugin.PngInfo(), dict[str, str]()
         values = {"id": item.id, "settings": self.digest, "input": item.stamp}
         values |= {"made-with": canonical_json(self.settings), "notice": self.notice}
         values["unlike"] = "" if item.unlike is None else f"{item.unlike:g}"
         for name, value in values.items():  # their order decides the bytes
             if value:
+                texts[f"palpate.{name}"] = value
                 text.add_itxt(f"palpate.{name}", value)
-        save_image(path, image, pnginfo=text)
+        if form is None:
+            save_image(path, image, pnginfo=text)
+        else:
+            save_image(path, image, "JPEG", comment=canonical_json(texts), **form.options)
         return item
 
     def finish(
         self, ids: Sequence[str], skipped: Sequence[Problem], new: int, notes: Sequence[Note]
     ) -> Generated:
         """Complete the index; all images of the target, earlier ones included."""
-        files = {} if self.file is None else {i: str(self.file) for i in ids}
-        if self.folder is not None:
-            files = {**self.index.images, **{i: file_name(i) for i in ids}}
-        for i in files:
-            path = self.path(i)
-            assert path is not None
+        paths = {i: path for i in ids if (path := self.path(i)) is not None}
+        for i, path in paths.items():
             with open_image(path) as image:
-                if (rate := image.info.get("palpate.unlike")) is not None:
+                if (rate := _texts(image).get("palpate.unlike")) is not None:
                     self.unlike[i] = float(rate)
+        files = {i: str(path) for i, path in paths.items()}
         if self.folder is not None:
+            files = {**self.index.images, **{i: path.name for i, path in paths.items()}}
             index = replace(self.index, complete=True, images=files, skipped=skipped)
-            index = replace(index, unlike=self.unlike)
+            index = replace(index, unlike={**index.unlike, **self.unlike})
             if self.first:
                 write_json(self.folder / "index.json", sealed(plain(index)))
                 if self.part is not None:
@@ -453,6 +481,30 @@ class _Target:
         notes = [*notes, *([Note("photos-unlike", facts)] if out else [])]
         common = (self.settings, skipped, new, self.notice, self.unlike, notes, self.memory)
         return Generated(self.folder, files, *common)
+
+
+def _texts(image: Image.Image) -> Mapping[str, Any]:
+    """The texts of a PNG, or of a JPEG's comment."""
+    texts: Any = image.info
+    with suppress(ValueError):
+        texts = json.loads(texts["comment"]) if "comment" in texts else texts
+    return texts if isinstance(texts, dict) else {}
+
+
+def _forms_like(like: Path, single: bool) -> list[Form | None]:
+    """How the tactile images of a data set are stored, for images of another size.
+
+    Raises:
+        PalpateError: if it is no folder or holds no image, or one file is to be written.
+    """
+    from palpate.data.samples import read_samples
+    from palpate.data.storage import forms_of
+
+    must, fix = "must be a folder of images or of a data set", "Name the folder of the real images"
+    require(like.is_dir(), "like", must, str(like), fix=fix)
+    must, fix = "must go with an output that is a folder", "Drop .png from its name"
+    require(not single, "like", must, "a .png", fix=fix)
+    return forms_of(read_samples(like, "like"))
 
 
 def photo_ids(photos: Photos) -> dict[str, Path]:

@@ -8,10 +8,11 @@ one size, that of the smaller test part, since chance depends on it.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
@@ -34,6 +35,7 @@ from palpate.core.files import canonical_json
 from palpate.data.recordings import described, resampled_by, rule_notes
 from palpate.data.samples import Samples, judged, read_samples
 from palpate.data.slices import is_parted
+from palpate.data.storage import alike
 from palpate.encoders.guard import backed
 from palpate.evaluation.power import power
 from palpate.metrics.intervals import without_interval
@@ -290,7 +292,8 @@ def measure(
             kind += [Note("background-kind", {"kind": kept.made["background"]})] * kept.ruled
         else:
             notes = seen(encoders, plan.modality, parts[1])
-            features = [embedded(part, encoders, plan.modality) for part in parts]
+            own = partial(embedded, encoders=encoders, modality=plan.modality)
+            features = _embedded_alike(parts, plan, own, kind)
         for other in others:
             ids = _with(parts[1], other) if other in encoders.modalities else []
             if len(ids) >= 2:
@@ -353,6 +356,25 @@ def _kept(samples: Samples, part: Manifest, groups: str) -> FeatureSet:
     taken = replace(samples.take(part.ids), group=groups)
     rows: Any = taken.rows
     return FeatureSet(part.ids, rows, taken.labels, taken.column(groups), samples.encoder)
+
+
+def _embedded_alike(
+    parts: Sequence[Manifest],
+    plan: Plan,
+    embedded: Callable[[Manifest], FeatureSet],
+    notes: list[Note],
+) -> list[FeatureSet]:
+    """Embeddings of train and test part, whose tactile images are compared after the same storage.
+
+    ``notes`` are told where they were stored otherwise.
+    """
+    if plan.modality != "tactile":
+        return [embedded(part) for part in parts]
+    with TemporaryDirectory() as place:
+        sides = {n: [Samples(n, p)] for n, p in zip(("train", "test"), parts, strict=True)}
+        stored, forms = alike(sides, Path(place), plan.seed)
+        notes += [Note("stored-otherwise", {"forms": forms})] if forms else []
+        return [embedded(samples.manifest) for (samples,) in stored.values()]
 
 
 def _retrieve(

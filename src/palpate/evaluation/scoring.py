@@ -38,6 +38,7 @@ from palpate.data.samples import (
     with_full_ids,
     with_recordings,
 )
+from palpate.data.storage import alike
 from palpate.evaluation.clusters import clustered, of_clusters
 from palpate.evaluation.controls import control_samples, material_accuracies
 from palpate.evaluation.memorization import memorized
@@ -91,6 +92,7 @@ def score(  # noqa: PLR0913
     permutations: int = 999,
     seed: int = 0,
     allow_seen: bool = False,
+    as_is: bool = False,
     cache: str | Path | None = None,
     progress: Progress = quiet,
 ) -> Results:
@@ -142,6 +144,10 @@ def score(  # noqa: PLR0913
         seed: of random halves, permutations and the choice of control images.
         allow_seen: score with an encoder that was trained on some of the reference's images; every
             score says so.
+        as_is: compare images as they are stored. Else, where sides differ (PNG, JPEG of one or
+            another quality), they are compared after the same lossy storage
+            (:mod:`palpate.data.storage`), and scores that this moves by more than half their
+            interval have both values.
         cache: folder for embeddings and decoded images, which an interrupted run finds again.
         progress: called with what is done.
 
@@ -211,22 +217,24 @@ def score(  # noqa: PLR0913
         bench, origin = clustered(bench, clusters) if clusters else (bench, "")
         embeds = encoders is not None or not images
         learns = embeds and images and bench.train is not None
-        if controls and learns:
-            bench = replace(bench, controls=control_samples(bench))
-        if any(name in PAIRS for name in chosen):
-            with suppress(PalpateError):  # the score that needs them says it
-                bench.pictures  # noqa: B018 - guard and ruler read them, too
-        if encoders is not None:
-            shown: Any = bench.reference.manifest if real.rows is None else bench.reference.rows
-            of_encoder = guard(
-                encoders, "tactile", shown, split=split, allow_seen=allow_seen, progress=progress
-            )
         scorers: list[Callable[[Bench], list[Score]]] = [tmmd_family] * embeds
         scorers += [second_opinion] * check_ruler
         scorers += [partial(companion, name=n, default=companions is None) for n in chosen]
         scorers += [material_accuracies] * learns
         scorers += [memorized] * (bench.seen is not None)
-        scores = [s for scorer in scorers for s in scorer(bench)]
+        stored = bench if as_is or not images else _stored_alike(bench)
+        otherwise = stored is not bench
+        prepared = partial(_prepared, controls=controls and learns, chosen=chosen)
+        bench = prepared(bench)
+        if encoders is not None:
+            shown: Any = bench.reference.manifest if real.rows is None else bench.reference.rows
+            of_encoder = guard(
+                encoders, "tactile", shown, split=split, allow_seen=allow_seen, progress=progress
+            )
+        stored = prepared(stored) if otherwise else bench
+        scores = [s for scorer in scorers for s in scorer(stored)]
+        if otherwise:
+            scores = _with_both(scores, [s for scorer in scorers for s in scorer(bench)])
         scores = of_clusters(scores, clusters, origin) if clusters else scores
         scores = scores if bench.sure else [without_interval(s) for s in scores]
         settings = _settings(bench, scores)
@@ -235,7 +243,7 @@ def score(  # noqa: PLR0913
         scores = [replace(s, reference=digest) if s.m else s for s in scores]
     settings |= {"split rule": dict(split.rule)} if split is not None else {}
     settings |= {"encoder": str(encoder)} if encoders is not None else {}
-    scores = _with_warnings(scores, bench, of_encoder)
+    scores = _with_warnings(scores, stored, of_encoder)
     two = len(bench.generators) == 2 and bench.sure
     better = verdict_of_two(bench.generators, scores) if two else []
     return Results(
@@ -243,9 +251,48 @@ def score(  # noqa: PLR0913
         scores=sorted(scores, key=lambda s: s.b is not None),
         gallery=_gallery(bench),
         settings=settings,
-        notes=[*bench.notes, *better],
+        notes=[*stored.notes, *better],
         calls=[_with_names(call, bench).with_digests(_digests_read(settings))],
     )
+
+
+def _prepared(bench: Bench, controls: bool, chosen: Sequence[str]) -> Bench:
+    """The bench with its controls, and decoded images where pixels are compared."""
+    bench = replace(bench, controls=control_samples(bench)) if controls else bench
+    if any(name in PAIRS for name in chosen):
+        with suppress(PalpateError):  # the score that needs them says it
+            bench.pictures  # noqa: B018 - guard and ruler read them, too
+    return bench
+
+
+def _stored_alike(bench: Bench) -> Bench:
+    """The bench with all images after the same storage; the same where it is the same already."""
+    real = [s for s in (bench.reference, bench.train, bench.seen) if s is not None]
+    sides = {REFERENCE: real} | {name: [s] for name, s in bench.generators.items()}
+    stored, forms = alike(sides, bench.cache / "stored", bench.seed)
+    if not forms:
+        return bench
+    note = Note("stored-otherwise", {"forms": forms, "kept": True})
+    reals = iter(stored.pop(REFERENCE))
+    return replace(
+        bench,
+        reference=next(reals),
+        train=bench.train and next(reals),
+        seen=bench.seen and next(reals),
+        generators={name: samples for name, (samples,) in stored.items()},
+        notes=[*bench.notes, note],
+    )
+
+
+def _with_both(scores: Sequence[Score], plain: Sequence[Score]) -> list[Score]:
+    """Scores with those of the images as they are stored, where half an interval lies between."""
+    both: list[Score] = []
+    for s, other in zip(scores, plain, strict=True):
+        half = (s.interval[1] - s.interval[0]) / 2 if s.interval else 0.0
+        moved = abs(float(s) - float(other)) > half
+        note = Note("as-stored", {"value": float(other)})
+        both.append(replace(s, notes=[*s.notes, note]) if moved else s)
+    return both
 
 
 def _cluster_count(labels: Any) -> int:

@@ -390,6 +390,13 @@ EVALUATION: dict[str, Sentence] = {
     ),
     "words-unseen": "No text of the training has {words:few}: what they do to the image is chance",
     "text-unlike": "The text is unlike {rate:percent} of the texts of the training",
+    "stored-otherwise": lambda p, style: (
+        "The images are stored in other ways, which scores of texture see first: "
+        + "; ".join(f"{name} {' and '.join(forms)}" for name, forms in p["forms"].items())
+        + ". They are compared after the same lossy storage"
+        + (f"; {style:as_is=True} leaves them" if p.get("kept") else "")
+    ),
+    "as-stored": "As the images are stored: {value:.4g}",
     "gel-contact": (
         "{gel} looks like a contact, or like no image of a gel: a smooth fit leaves {left:.1f} "
         "gray levels of its colors, and under 4 of a gel that nothing touches. The images are made "
