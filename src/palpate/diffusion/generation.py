@@ -216,12 +216,9 @@ def generate(  # noqa: PLR0913 - a public verb, step by step
     settings = _settings(model, sampler, seed)
     settings |= {"text": text, "weight": None if photos is None else weight} if text else {}
     settings |= _range_of(model, text, words, strict) | ({"strict": True} if strict else {})
-    settings |= {"touch": asked.given()} if asked.given() else {}
+    forms = _forms_like(like, "" if output is None else "a video" * film or "a .png" * single)
+    settings |= _touch_and_like(asked.given(), forms)
     touches = {s: asked.row(model.contact, s) for s in {item.sensor for item in items}}
-    must, fix = "must go with images", "Leave it out"
-    require(like is None or not film, "like", must, "a video", fix=fix)
-    forms = [] if like is None else _forms_like(Path(like), single and output is not None)
-    settings |= {"like": digest_json([f and f.options for f in forms])} if forms else {}
     items = _on_gels(items, model, gel)
     notes = [*_range_notes(settings), *_notes(model, text, gel), *_shear(model, asked, items)]
     if film and output is not None:
@@ -243,8 +240,7 @@ def generate(  # noqa: PLR0913 - a public verb, step by step
             progress=progress,
         )
     items, part_made = _sliced(items, slice, settings, folder, made_by)
-    target = _Target(output, single, settings, model.notice, rank == 0, part=part_made)
-    target.forms = forms
+    target = _Target(output, single, settings, model.notice, rank == 0, part=part_made, forms=forms)
     if dry_run:
         files = ((item, target.path(item.id)) for item in items)
         there = [item for item, path in files if path and path.is_file()]
@@ -384,9 +380,10 @@ class _Target:
         first: bool,
         *,
         part: Part | None,
+        forms: Sequence[Form | None],
     ) -> None:
         self.part = part
-        self.forms: Sequence[Form | None] = ()  # of the data that the images are stored like
+        self.forms = forms  # of the data that the images are stored like
         self.settings, self.digest, self.notice = settings, digest_json(settings), notice
         self.file = output if single else None
         self.folder = None if single else output
@@ -491,19 +488,29 @@ def _texts(image: Image.Image) -> Mapping[str, Any]:
     return texts if isinstance(texts, dict) else {}
 
 
-def _forms_like(like: Path, single: bool) -> list[Form | None]:
+def _touch_and_like(
+    touch: Mapping[str, Any], forms: Sequence[Form | None]
+) -> dict[str, Mapping[str, Any] | str]:
+    """What was asked for, as settings."""
+    like = digest_json([form and form.options for form in forms])
+    return ({"touch": touch} if touch else {}) | ({"like": like} if forms else {})
+
+
+def _forms_like(like: str | Path | None, one: str) -> list[Form | None]:
     """How the tactile images of a data set are stored, for images of another size.
 
     Raises:
-        PalpateError: if it is no folder or holds no image, or one file is to be written.
+        PalpateError: if it is no folder or holds no image, or ``one`` file is to be written.
     """
+    if like is None:
+        return []
     from palpate.data.samples import read_samples
     from palpate.data.storage import forms_of
 
     must, fix = "must be a folder of images or of a data set", "Name the folder of the real images"
-    require(like.is_dir(), "like", must, str(like), fix=fix)
-    must, fix = "must go with an output that is a folder", "Drop .png from its name"
-    require(not single, "like", must, "a .png", fix=fix)
+    require(Path(like).is_dir(), "like", must, str(like), fix=fix)
+    must, fix = "must go with an output that is a folder", "Name a folder, or leave it out"
+    require(not one, "like", must, one, fix=fix)
     return forms_of(read_samples(like, "like"))
 
 
