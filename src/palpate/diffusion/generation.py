@@ -215,9 +215,12 @@ def generate(  # noqa: PLR0913 - a public verb, step by step
     words = None if text is None else model.embed_text(text)
     settings = _settings(model, sampler, seed)
     settings |= {"text": text, "weight": None if photos is None else weight} if text else {}
-    settings |= _range_of(model, text, words, strict) | ({"strict": True} if strict else {})
     forms = _forms_like(like, "" if output is None else "a video" * film or "a .png" * single)
-    settings |= _touch_and_like(asked.given(), forms)
+    settings |= (
+        _range_of(model, text, words, strict)
+        | ({"strict": True} if strict else {})
+        | _touch_and_like(asked.given(), forms)
+    )
     touches = {s: asked.row(model.contact, s) for s in {item.sensor for item in items}}
     items = _on_gels(items, model, gel)
     notes = [*_range_notes(settings), *_notes(model, text, gel), *_shear(model, asked, items)]
