@@ -95,7 +95,7 @@ def executor_of(
         gpus_per_task=r.gpus,
         workers=r.workers,
         job_name=f"palpate-{command[0]}",
-        qos=None,
+        qos="",
         env_command=f"export PATH={Path(sys.executable).parent}:$PATH",
         logging_dir=str(logs.absolute()),
     )
