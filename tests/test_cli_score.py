@@ -144,14 +144,14 @@ def test_a_killed_run_goes_on_from_its_embeddings_and_leaves_no_cache(tmp_path, 
     args = [*command.split(), "--companions", "none", "--presets", "paper", "--permutations"]
     process = subprocess.Popen([sys.executable, "-m", "palpate", *args, "200000"])
     cache, deadline = Path(".s.json.work"), time.monotonic() + 60
-    while len([*cache.rglob("tactile-*.npz")]) < 2 and time.monotonic() < deadline:
+    while len([*cache.rglob("tactile-*.npy")]) < 2 and time.monotonic() < deadline:
         time.sleep(0.02)
     process.kill()
     process.wait()
-    stamps = {p: p.stat().st_mtime_ns for p in cache.rglob("tactile-*.npz")}
+    stamps = {p: p.stat().st_mtime_ns for p in cache.rglob("tactile-*.npy")}
     assert len(stamps) == 2
     assert main([*args, "0", "--cache", str(cache)]) == 0
-    assert {p: p.stat().st_mtime_ns for p in cache.rglob("tactile-*.npz")} == stamps
+    assert {p: p.stat().st_mtime_ns for p in cache.rglob("tactile-*.npy")} == stamps
     assert main([*args, "0"]) == 0
     assert not cache.exists()
 

@@ -21,8 +21,8 @@ SIGNATURES = {
         "dry_run progress"
     ),
     "generate": (
-        "photos * text weight gel model output split part seed guidance steps batch"
-        " skip_bad strict dry_run device progress"
+        "photos * text weight gel at area strength shear force depth profile like model output "
+        "split part seed guidance steps batch skip_bad strict dry_run device slice progress"
     ),
     "load": "source * format images skip_bad progress **options",
     "probe": (
@@ -32,7 +32,7 @@ SIGNATURES = {
     "score": (
         "generated reference * encoder check_ruler split names labels group background train "
         "presets sigma normalize companions controls inception clip dinov2 lpips "
-        "trust_torchscript permutations seed allow_seen cache progress"
+        "trust_torchscript permutations seed allow_seen as_is cache progress"
     ),
     "split": ("data * by train val seed folds near noleak cache reading skip_bad progress"),
     "train_encoder": ("data split * preset clip output epochs seed device compute progress"),

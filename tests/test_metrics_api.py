@@ -20,6 +20,8 @@ FUNCTIONS = {
     "cmmd": TWO_SETS,
     "compare": "generators, reference, *, floor=None, **options",
     "compare_fid": "generators, reference, *, seed=0, split=None",
+    "compare_mind": "generators, reference, *, seed=0, split=None",
+    "compare_vendi": "generators, reference, *, seed=0, split=None",
     "compare_tmmd": "generators, reference, **options",
     "contact_mask": "tactile, background",
     "contact_scores": f"{IMAGES}, background, **options",
@@ -32,6 +34,7 @@ FUNCTIONS = {
     "i_tmmd": ONE_SET,
     "kid": TWO_SETS,
     "marker_scores": f"{IMAGES}, background, **options",
+    "mind": TWO_SETS,
     "ms_ssim": TWO_SETS,
     "per_image": f"metric, {IMAGES}, means=None",
     "prdc": "generated, reference, k=5, **options",
@@ -39,6 +42,7 @@ FUNCTIONS = {
     "require_same_ids": "a, b, names=('generated', 'reference')",
     "ssim": TWO_SETS,
     "tmmd": TWO_SETS,
+    "vendi": "features, **options",
 }
 CLASSES = {"TMMD", "Comparison", "Options", "PerImage"}
 KERNELS = {"Gaussian", "Polynomial"}

@@ -38,6 +38,10 @@ HELD = {
     "train encoder": (("train", "encoder", *TRAIN), ".out.work"),
     "train autoencoder": (("train", "autoencoder", *TRAIN), ".out.work"),
     "train generator": (("train", "generator", *TRAIN, "--clip", "palpate/mini"), ".out.work"),
+    "embed": (
+        ("embed", "tag", "--encoder", "palpate/handcrafted", "-o", "out"),
+        "out/.part-1-of-1.part",
+    ),
     "generate": (("generate", "photos", "-o", "out", "--steps", "1"), "out"),
     "audit": (("audit", "tag", "--split", "split.json", "-o", "out.json"), ".out.json.work"),
     "audit --impact": (
@@ -53,8 +57,17 @@ HELD = {
 }
 
 
-#: What is written at once, at the end of a command.
-AT_ONCE = {"validate", "caption check", "preference score", "presets", "report", "verify"}
+#: What is written at once, at the end of a command, by other verbs, or not at all.
+AT_ONCE = {
+    "run",
+    "view",
+    "validate",
+    "caption check",
+    "preference score",
+    "presets",
+    "report",
+    "verify",
+}
 
 
 @pytest.fixture(scope="module")
@@ -100,7 +113,7 @@ def test_what_a_first_run_holds_is_refused_to_a_second_and_stays(place, capsys, 
 def test_a_link_out_of_what_is_held_is_not_written_through(place, capsys, name):
     words, held = HELD[name]
     folder = place / held.replace("*", PRESETS["tiny"].digest[:12])
-    folder.mkdir(exist_ok=True)
+    folder.mkdir(exist_ok=True, parents=True)
     (place / "notes").write_text("of years")
     (folder / "a").symlink_to(place / "notes")
     before = digest_folder(place)

@@ -14,6 +14,7 @@ from palpate.core.shown import Shown
 from palpate.data.backgrounds import Backgrounds
 from palpate.data.imported import Imported
 from palpate.diffusion.generated import Generated
+from palpate.encoders.embedded import embed_dataset
 from palpate.metrics import tmmd
 from palpate.report.results import Results
 from palpate.studies.verifying import Check, Verification
@@ -55,6 +56,7 @@ def answers(small_manifest, tmp_path):
         Backgrounds(small_manifest, tmp_path, 1, 2, 3, 4, {"v0": "reference"}, []),
         Captions(small_manifest.table, record, tmp_path),
         Estimate(3, 2),
+        embed_dataset(small_manifest.root, "palpate/handcrafted", tmp_path / "embedded"),
         Generated(tmp_path, {"a": "a.png"}, notice="Made by a generator."),
         Verification("results.json", checks),
     ]

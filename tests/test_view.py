@@ -81,7 +81,7 @@ def test_exchanged_sides_of_a_recording_are_suspicious(world, tmp_path):
     for row in rows:
         if row["video"] == first:
             row["vision"], row["tactile"] = row["tactile"], row["vision"]
-    shown = contents(pp.Manifest.from_rows(rows, manifest.root))
+    shown = contents(pp.Manifest.from_rows(rows, manifest.root, more=["depth"]))
     assert set(shown.suspicious) == {first}
 
 

@@ -119,7 +119,7 @@ BARE = (
     "reproduce world-gelsight -o OUT/r",
     "preference serve IN/study",
     "run embed IN/manifest --encoder palpate/handcrafted -o OUT/e --slices 2",
-    "view IN/tag --model none",
+    "view IN/manifest --model none",
 )
 
 

@@ -207,9 +207,9 @@ def score(  # noqa: PLR0913
     require(possible, "encoder", "must be given for images", "none", "palpate/mini", fix=fix)
     chosen = _companions(bench, companions, encoder=encoder is not None)
     encoders, of_encoder = None, judged(bench.reference, allow_seen=allow_seen)
-    from palpate.encoders.guard import guard, load_encoders
-
     if encoder is not None:
+        from palpate.encoders.guard import load_encoders
+
         encoders = load_encoders(encoder, progress, alone=not clusters)
     temporary = tempfile.TemporaryDirectory() if cache is None else nullcontext(cache)
     with decoded_once(), temporary as folder:
@@ -227,6 +227,8 @@ def score(  # noqa: PLR0913
         prepared = partial(_prepared, controls=controls and learns, chosen=chosen)
         bench = prepared(bench)
         if encoders is not None:
+            from palpate.encoders.guard import guard
+
             shown: Any = bench.reference.manifest if real.rows is None else bench.reference.rows
             of_encoder = guard(
                 encoders, "tactile", shown, split=split, allow_seen=allow_seen, progress=progress
@@ -244,14 +246,13 @@ def score(  # noqa: PLR0913
     settings |= {"split rule": dict(split.rule)} if split is not None else {}
     settings |= {"encoder": str(encoder)} if encoders is not None else {}
     scores = _with_warnings(scores, stored, of_encoder)
-    two = len(bench.generators) == 2 and bench.sure
-    better = verdict_of_two(bench.generators, scores) if two else []
+    pair = bench.generators if len(bench.generators) == 2 and bench.sure else ()
     return Results(
         title=f"Scores of {', '.join(bench.generators)}",
         scores=sorted(scores, key=lambda s: s.b is not None),
         gallery=_gallery(bench),
         settings=settings,
-        notes=[*stored.notes, *better],
+        notes=[*stored.notes, *(verdict_of_two(pair, scores) if pair else ())],
         calls=[_with_names(call, bench).with_digests(_digests_read(settings))],
     )
 
