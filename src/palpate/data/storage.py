@@ -55,7 +55,7 @@ class Form:
     def through(self, image: Image.Image) -> Image.Image:
         """The image, 8-bit RGB, after it was stored so."""
         sized = image if image.size == self.size else image.resize(self.size)
-        with Image.open(io.BytesIO(image_bytes(sized, "JPEG", **self.options))) as stored:
+        with open_image(io.BytesIO(image_bytes(sized, "JPEG", **self.options))) as stored:
             decoded = stored.convert("RGB")
         return decoded if decoded.size == image.size else decoded.resize(image.size)
 
