@@ -6,6 +6,7 @@ import re
 import shlex
 import shutil
 import sys
+from fractions import Fraction
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +15,7 @@ from PIL import Image
 
 from palpate.cli import VERBS, main
 from palpate.core.images import IMAGE_FORMATS
+from palpate.data.video import write_video
 from palpate.metrics import PRESETS as METRIC_PRESETS
 from palpate.sim import MATERIALS, VERSION, WorldOptions, plan_world, write_world
 from palpate.sim import PRESETS as WORLD_PRESETS
@@ -71,6 +73,8 @@ def examples(tmp_path_factory):
             Image.fromarray(image.clip(0, 255).astype(np.uint8)).save(folder / name / f"{k}.png")
     photo = next((folder / "tag" / "dataset").glob("*/video_frame/*.jpg"))
     shutil.copy(photo, folder / "photo.jpg")
+    write_video(folder / "clip.mp4", [np.asarray(Image.open(photo))] * 8, Fraction(8))
+    (folder / "profile.csv").write_text("time_s,strength\n0,0.1\n1,0.9\n")
     gel = sorted((folder / "tag" / "dataset").glob("*/gelsight_frame/*.jpg"))[0]  # not yet touched
     Image.open(gel).save(folder / "no-contact.png")
     return folder
