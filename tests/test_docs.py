@@ -74,7 +74,7 @@ def examples(tmp_path_factory):
     photo = next((folder / "tag" / "dataset").glob("*/video_frame/*.jpg"))
     shutil.copy(photo, folder / "photo.jpg")
     write_video(folder / "clip.mp4", [np.asarray(Image.open(photo))] * 8, Fraction(8))
-    (folder / "profile.csv").write_text("time_s,strength\n0,0.1\n1,0.9\n")
+    (folder / "profile.csv").write_text("time_s,strength,shear_x,shear_y\n0,0.1,0,0\n1,0.9,0,0\n")
     gel = sorted((folder / "tag" / "dataset").glob("*/gelsight_frame/*.jpg"))[0]  # not yet touched
     Image.open(gel).save(folder / "no-contact.png")
     return folder
