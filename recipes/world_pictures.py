@@ -93,6 +93,20 @@ def sheet(look: Literal["gelsight", "digit"], names: Sequence[str]) -> Board:
     return board
 
 
+def real() -> Board:
+    """Photo and tactile image in scale real; objects 0 and 1 of the five fitted materials."""
+    options, board = WorldOptions(size=128, tile=512, scale="real"), Board()
+    for k, name in enumerate(("Brick", "Rock", "Wood", "Grass", "Natural Fabric")):
+        for j in range(2):
+            video = video_of(options, ObjectRef(name, j), 10**6 + 10 * k + j, k % 3)
+            frame = first_contact(options, 0) + 1
+            pair = [small(image, 96) for image in (video.vision(frame), video.tactile(frame))]
+            place = GAP + k * (2 * 96 + 3 * GAP), GAP + LINE + j * (96 + LINE + 2 * GAP)
+            label = f"{name}, {video.camera.view:.0f} mm"
+            board.row(*place, [np.concatenate(pair, 1)], [label])
+    return board
+
+
 def steps() -> Board:
     """One contact with a tread plate, from the photo to the image of the gel."""
     options, board = WorldOptions(size=128, tile=512, phases="spaced"), Board()
@@ -139,6 +153,7 @@ PICTURES: dict[str, Callable[[], Board]] = {
     "world_gelsight_2.png": partial(sheet, "gelsight", tuple(MATERIALS)[10:]),
     "world_digit_1.png": partial(sheet, "digit", tuple(MATERIALS)[:10]),
     "world_digit_2.png": partial(sheet, "digit", tuple(MATERIALS)[10:]),
+    "world_real.png": real,
     "world_steps.png": steps,
     "world_hard.png": hard,
 }

@@ -3,18 +3,20 @@
 from __future__ import annotations
 
 import dataclasses
+from pathlib import Path
 from typing import Any, Literal
 
 from palpate.cli.settings import PresetTable, Settings
 from palpate.cli.terminal import Common, OutPath, Terminal, option_group, option_name
 from palpate.sim.options import WorldOptions
 from palpate.sim.presets import DEFAULT, MINI_SEEDS, PRESETS, SEEN_WARNING
+from palpate.sim.scans import scan_notes
 from palpate.sim.writer import write_world
 
 #: Fields of a preset that are options of their own.
 FIELDS = (
     *("seed", "size", "look", "materials", "objects_per_material", "videos_per_object"),
-    *("leak", "layout"),
+    *("leak", "layout", "scale", "surfaces"),
 )
 WORLDS = PresetTable(PRESETS, {name: option_name("world", name) for name in FIELDS})
 
@@ -48,6 +50,11 @@ class Options(Common):
     """What test may share with train: videos (contact, default), contacts (frame), or neither."""
     layout: Literal["frames", "videos"] | None = None
     """Touch and Go as JPEG frames (default) or as H.264 videos."""
+    scale: Literal["near", "real"] | None = None
+    """Photos of 30 to 45 mm (near, default), or of 150 to 400 mm of ground with joints of true
+    size; touches of scale real are as strong as real ones, material by material."""
+    surfaces: Path | None = None
+    """Folder of photo-scanned surfaces (surfaces.csv) as further looks, in scale real."""
     workers: int = 2
     """Processes; the files do not depend on it."""
 
@@ -58,6 +65,8 @@ def run(options: Options, terminal: Terminal) -> dict[str, Any]:
     seen = {"seen_by_shipped_models": SEEN_WARNING} if world.seed in MINI_SEEDS else {}
     if seen:
         terminal.print_line(f"Seed {world.seed}: {SEEN_WARNING}")
+    for text in scan_notes(world.scans):
+        terminal.print_line(text)
     record = terminal.run(write_world, options.output, world, workers=options.workers)
     facts = {"folder": str(record.folder), "digest": record.digest, **record.counts, **seen}
     leak = {f"leak: {k}": v for k, v in record.leak.items()}
@@ -75,5 +84,7 @@ def world_options(options: Options) -> WorldOptions:
     if materials and len(materials) == 1 and materials[0].lstrip("-").isdecimal():
         materials = int(materials[0])
     values = {name: getattr(options, name) for name in FIELDS} | {"materials": materials}
+    if options.surfaces is not None:
+        values |= {"surfaces": str(options.surfaces), "scale": options.scale or "real"}
     preset = WORLDS.preset(options.preset, options.settings)
     return dataclasses.replace(preset, **{k: v for k, v in values.items() if v is not None})

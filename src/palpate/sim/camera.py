@@ -1,4 +1,6 @@
-"""The photo: a view of 30 to 45 mm of the object around the contact, with irrelevant variation.
+"""The photo: a view of the object around the contact, with irrelevant variation.
+
+It is 30 to 45 mm wide; in scale real ``view_mm`` of a ground, with the contact off the middle.
 
 An object is lit once a video (sun, ambient light, occlusion in its pits, gloss, stains) on its
 tile; a frame looks that tile up in perspective, adds the object's edge, a cast shadow, the hand
@@ -22,6 +24,10 @@ from palpate.sim.tile import TILE_MM, wrapped_offset
 #: view of w mm turned by 45 degrees is w sqrt(2) wide, so that at most 45.25 mm never show the
 #: repeat.
 VIEW_MM = (30.0, 45.0)
+#: Range of the contact's place in views of scale real, along y and x, in half widths.
+CONTACT_AT = ((-0.2, 0.75), (-0.2, 0.95))
+#: Share of the views of scale real that are level; the view in mm that the hand is drawn for.
+LEVEL, HAND_VIEW_MM = 0.7, 270.0
 #: Range of the height of the light.
 ELEVATION_DEG = (18.0, 75.0)
 #: Shares of the videos with a hand, a cast shadow and the edge of the object in view, at hard 0.5.
@@ -40,6 +46,8 @@ class Camera:
 
     Attributes:
         view: width of the view in mm.
+        at: y and x of the contact in the view.
+        saturation: of the colors, a factor.
         turn, tilt: of the camera.
         sun_to: unit vector towards the sun.
         sun, ambient: strengths of the sun and of the ambient light.
@@ -62,7 +70,8 @@ class Camera:
         self.options, self.video = options, video
         elevation, azimuth = math.radians(draw(*ELEVATION_DEG)), draw(0.0, circle)
         warm = draw(-1.0, 1.0) * scale
-        near, far = map(math.log, VIEW_MM)
+        real = options.scale == "real"
+        near, far = map(math.log, options.view_mm if real else VIEW_MM)
         reach = draw(-0.5, 0.5) * (far - near) * min(1.0, 0.4 + 0.6 * scale)
         self.view = math.exp((near + far) / 2.0 + reach)
         hand, hand_from = happens(HAND), draw(0.0, circle)
@@ -85,6 +94,22 @@ class Camera:
         self.blur = BLUR_PX[int(rng.integers(len(BLUR_PX)))]
         self.noise = draw(0.004, 0.01 + 0.018 * options.hard)
         self.beyond = hsv(rng.random(), draw(0.05, 0.6), draw(0.15, 0.85))
+        self.at, self.saturation, self.hand_size = (0.0, 0.0), 1.0, 1.0
+        if real:
+            self._stand_back(rng)
+
+    def _stand_back(self, rng: np.random.Generator) -> None:
+        """Draw what views of scale real have beside: most are level, a hand comes from below."""
+        y, x = self.at = rng.uniform(*CONTACT_AT[0]), rng.uniform(*CONTACT_AT[1])
+        level, lean = rng.random() < LEVEL, rng.normal(0.0, 0.12)
+        self.turn = lean if level else self.turn
+        self.saturation, self.hand_size = rng.uniform(0.5, 1.3), HAND_VIEW_MM / self.view
+        if self.hand is not None:
+            self.hand = math.pi / 2.0 + rng.normal(0.0, 0.5)
+        if self.edge is not None:  # the contact is on this side of it
+            angle, distance = self.edge
+            beyond = math.cos(angle) * x + math.sin(angle) * y > distance - 0.1
+            self.edge = angle + math.pi * beyond, distance
 
     def _stained(self, albedo: Array, number: int) -> Array:
         """Add stains and stickers to an albedo: elliptic spots that are seen but not felt."""
@@ -100,8 +125,13 @@ class Camera:
             albedo = blend(albedo, color, spot * draw(0.4, 1.0))
         return albedo
 
-    def light_object(self, surface: Surface, number: int) -> tuple[Array, float]:
-        """Light object ``number`` of the video: its tile (3, n, n) as seen, and the exposure."""
+    def light_object(self, surface: Surface, number: int) -> tuple[Array, float, float]:
+        """Light object ``number`` of the video.
+
+        Returns:
+            Its tile, or its ground, (3, n, n) as seen, the exposure, and the pixel size in mm.
+        """
+        surface = surface.ground or surface
         height, px = surface.height, surface.px
         softened = scipy.ndimage.gaussian_filter(height, 0.6, mode="wrap")
         slope_y, slope_x = (
@@ -119,26 +149,28 @@ class Camera:
         albedo = self._stained(surface.albedo, number)
         rgb = albedo * (self.ambient * open_sky + self.sun * direct)[..., None] * self.light
         rgb += (mirror * (surface.gloss * 0.55 * self.sun))[..., None]
+        gray = rgb.mean(2, keepdims=True)
+        rgb = gray + (rgb - gray) * self.saturation if self.saturation != 1.0 else rgb
         # The power makes the auto-exposure imperfect, so that dark objects stay darker.
         exposure = (0.40 * self.exposure / (0.12 + float(rgb.mean()))) ** 0.75
-        blur = max(0.3, 0.42 * self.view / self.options.size / px)
+        blur = max(0.3, 0.42 * min(self.view, surface.side_mm) / self.options.size / px)
         lit = np.ascontiguousarray(np.moveaxis(rgb * exposure, 2, 0))
-        return scipy.ndimage.gaussian_filter(
-            lit, (0, blur, blur), mode="wrap", truncate=3.0
-        ), exposure
+        lit = scipy.ndimage.gaussian_filter(lit, (0, blur, blur), mode="wrap", truncate=3.0)
+        return lit, exposure, px
 
-    def photo(self, tile: Array, exposure: float, state: State, frame: int) -> Array:
+    def photo(self, tile: Array, exposure: float, px: float, state: State, frame: int) -> Array:
         """Render a frame, (n, n, 3), about [0, 1], from no other; see :meth:`light_object`."""
         rng, size = self.options.rng("photo", self.video, frame), self.options.size
         y, x = grid(size)
         sway = [0.012 * math.sin(w * frame + self.video * p) for w, p in SWAY]
         depth = 1.0 + x * (self.tilt[0] + sway[0]) + y * (self.tilt[1] + sway[1])
         wy, wx = y / depth, x / depth
-        px = TILE_MM / tile.shape[-1]
-        reach = self.view / 2.0 * (1.0 + sway[3]) / px
+        view = min(self.view, px * tile.shape[-1])  # no scan shows its repeat
+        reach = view / 2.0 * (1.0 + sway[3]) / px
         shift_x, shift_y = rng.normal(0.0, 0.004) * reach, rng.normal(0.0, 0.004) * reach
         center = state.position[0] / px + shift_x, state.position[1] / px + shift_y
-        image = window(tile, (wy, wx), self.turn + sway[2], reach, center)
+        seen = wy - self.at[0], wx - self.at[1]
+        image = window(tile, seen, self.turn + sway[2], reach, center)
         if self.edge is not None:
             angle, distance = self.edge
             past = smoothstep(turned(wy, wx, angle)[0], distance, distance + 0.03)
@@ -150,7 +182,8 @@ class Camera:
             image *= 1.0 - (1.0 - factor) * dark
         if self.hand is not None:
             angle, tip = self.hand + 0.02 * math.sin(0.2 * frame), 0.10 + 0.55 * state.lift
-            image = _hand(image, self.skin * min(1.2, exposure * 0.9), angle, tip)
+            place = [(c - at) / self.hand_size for c, at in zip((y, x), self.at, strict=True)]
+            image = _hand(image, self.skin * min(1.2, exposure * 0.9), turned(*place, angle), tip)
         blur = self.blur * size / 128.0
         if blur > 0.2:
             image = scipy.ndimage.gaussian_filter(image, (0, blur, blur), truncate=2.5)
@@ -159,10 +192,12 @@ class Camera:
         return np.clip(image, 0.0, 1.0) ** 0.8
 
 
-def _hand(image: Array, skin: Array, angle: float, tip: float) -> Array:
-    """Draw a hand with the sensor, and its shadow, that enters along ``angle`` up to ``tip``."""
-    y, x = grid(image.shape[1])
-    along, across = turned(y, x, angle)
+def _hand(image: Array, skin: Array, place: tuple[Array, Array], tip: float) -> Array:
+    """Draw a hand with the sensor, and its shadow, up to ``tip``.
+
+    ``place``: how far each pixel lies along and across the direction that it enters from.
+    """
+    along, across = place
     box = np.maximum(np.abs(across - 0.06) - 0.2, tip - 0.03 - along)
     image = image * (1.0 - 0.45 * smoothstep(box, 0.10, -0.06))
     body = np.maximum(np.abs(across) - 0.15, tip - along)

@@ -14,7 +14,8 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, replace
 
-from palpate.sim.options import WorldOptions
+from palpate.sim.ground import GROUND_MM, touch_of
+from palpate.sim.options import RANGES, WorldOptions
 from palpate.sim.plan import VideoPlan
 from palpate.sim.tile import TILE_MM
 
@@ -22,8 +23,9 @@ from palpate.sim.tile import TILE_MM
 REVISIT_MM, JUMP = 3.5, 0.25
 #: Deviations in mm, one drawn a contact, of the sensor's slide.
 SLIDE_MM = (0.0, 1.5, 5.0)
-#: Deviations of the pad's slope, and of the drag in mm per mm of depth.
-TILT, SHEAR = 0.045, 0.7
+#: Deviations of the pad's slope (in scale real against the plane of what is under it), and of the
+#: drag in mm per mm of depth.
+TILT, TILT_REAL, SHEAR = 0.045, 0.1, 0.7
 Pair = tuple[float, float]
 
 
@@ -51,7 +53,9 @@ def make_contacts(options: WorldOptions, plan: VideoPlan) -> list[State]:
     rng, contacts = options.rng("motion", plan.index), list[State]()
     draw = rng.uniform
     normal = lambda spread: (spread * rng.normal(), spread * rng.normal())
-    anywhere = lambda: (draw(0.0, TILE_MM), draw(0.0, TILE_MM))
+    real = options.scale == "real"
+    side, tilt = (GROUND_MM, TILT_REAL) if real else (TILE_MM, TILT)
+    anywhere = lambda: (draw(0.0, side), draw(0.0, side))
     home, turn, last = (0.0, 0.0), 0.0, -1
     lightest, heaviest = map(math.log, options.load_mm)
     for contact, number in enumerate(plan.object_index):
@@ -61,13 +65,14 @@ def make_contacts(options: WorldOptions, plan: VideoPlan) -> list[State]:
             turn = draw(0.0, 2.0 * math.pi)
         far = rng.random() < JUMP and not first
         away, near = anywhere(), normal(REVISIT_MM)
+        load = touch_of(plan.objects[number].material).load if real else 1.0
         state = State(
             contact,
             position=away if far else (home[0] + near[0], home[1] + near[1]),
             slide=normal(SLIDE_MM[int(rng.integers(len(SLIDE_MM)))]),
             rotation=turn + rng.normal(0.0, 0.5 if far else 0.1),
-            load=math.exp(draw(lightest, heaviest)),
-            tilt=normal(TILT),
+            load=min(load * math.exp(draw(lightest, heaviest)), RANGES["load_mm"][1]),
+            tilt=normal(tilt),
             shear=normal(SHEAR),
         )
         contacts.append(state)

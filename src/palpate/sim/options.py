@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import dataclasses
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, Literal, get_args, get_origin, get_type_hints
 
 import numpy as np
 
 from palpate.core import digest_json, few, require, require_choice, rng_for
 from palpate.sim.materials import MATERIALS, check_material
+from palpate.sim.scans import Scan, read_scans, scans_digest
 
 #: Raised at every change of the images, texts or lists; enters every random draw and the digest.
 VERSION = 2
@@ -35,6 +37,7 @@ RANGES: dict[str, tuple[float, float]] = {
     "load_mm": (0.01, 1.0),
     "sensor_noise": (0.0, 0.05),
     "quality": (10, 100),
+    "view_mm": (20.0, 500.0),
 }
 #: Value of a later field in older worlds, which keep their digest: it names a world where it is
 #: another.
@@ -44,9 +47,12 @@ LATER: dict[str, Any] = {
     "sensor_noise": (0.002, 0.006),
     "quality": 95,
     "phases": "spaced",
+    "scale": "near",
+    "view_mm": (150.0, 400.0),
+    "surfaces": "",
 }
 #: Fields that are a range.
-PAIRS = ("load_mm", "sensor_noise")
+PAIRS = ("load_mm", "sensor_noise", "view_mm")
 
 
 @dataclass(frozen=True)
@@ -80,6 +86,12 @@ class WorldOptions:
         load_mm: range of a contact's peak load as mean indentation, log-uniform, .01 .. 1 [mm].
         sensor_noise: range of the units' image noise (deviation, of white), 0 .. 0.05.
         quality: of the JPEG files of tactile images, 10 .. 100.
+        scale: near: photos of 30 to 45 mm of a tile; real: photos of view_mm of a ground, with
+            joints of true size, off the middle, and relief and load by material as of real touches
+            (:mod:`palpate.sim.ground`).
+        view_mm: range of the width of the views of scale real, log-uniform, 20 .. 500 [mm].
+        surfaces: folder of photo-scanned surfaces, further looks in scale real
+            (:mod:`palpate.sim.scans`).
 
     Raises:
         PalpateError: if an option is out of range.
@@ -109,6 +121,9 @@ class WorldOptions:
     load_mm: tuple[float, float] = (0.09, 0.42)
     sensor_noise: tuple[float, float] = (0.002, 0.006)
     quality: int = 95
+    scale: Literal["near", "real"] = "near"
+    view_mm: tuple[float, float] = (150.0, 400.0)
+    surfaces: str = ""
 
     def __post_init__(self) -> None:
         for name, (low, high) in RANGES.items():
@@ -126,6 +141,10 @@ class WorldOptions:
                 require_choice(name, getattr(self, name), get_args(hint))
         odd = self.layout == "videos" and self.size % 2 == 1
         require(not odd, "size", "must be even for the layout videos", self.size)
+        fits = self.scale == "real" or not self.surfaces
+        require(fits, "scale", "must be real for scanned surfaces", self.scale, "real")
+        object.__setattr__(self, "surfaces", str(self.surfaces or ""))
+        _ = self.scans  # raises for a folder that cannot be used
         object.__setattr__(self, "materials", _names(self.materials))
         for name in self.names:
             check_material(name)
@@ -134,6 +153,11 @@ class WorldOptions:
     def names(self) -> tuple[str, ...]:
         """The names of the materials."""
         return self.materials if isinstance(self.materials, tuple) else ()
+
+    @property
+    def scans(self) -> tuple[Scan, ...]:
+        """The scanned surfaces, in the order of their table."""
+        return read_scans(Path(self.surfaces)) if self.surfaces else ()
 
     @property
     def video_length(self) -> int:
@@ -145,6 +169,8 @@ class WorldOptions:
         """SHA-256 over the options and VERSION: names what the world will be."""
         options = dataclasses.asdict(self).items()
         named = {k: v for k, v in options if k not in LATER or v != LATER[k]}
+        if self.surfaces:
+            named["surfaces"] = scans_digest(Path(self.surfaces))
         return digest_json({"version": VERSION, "options": named})
 
     def rng(self, purpose: str, *ids: str | int) -> np.random.Generator:

@@ -66,6 +66,7 @@ class Tile:
     Args:
         n: pixels a side.
         rng: generator; the order of calls matters, so a material draws in a fixed order.
+        whole: whether what is drawn has no joints, and mirrors nothing: it becomes a ground.
 
     Attributes:
         px: pixel size in mm.
@@ -73,7 +74,8 @@ class Tile:
         y, x: pixel positions in mm, shapes (n, 1) and (1, n).
     """
 
-    def __init__(self, n: int, rng: np.random.Generator) -> None:
+    def __init__(self, n: int, rng: np.random.Generator, *, whole: bool = False) -> None:
+        self.whole = whole
         self.n, self.rng, self.px, self.draw = n, rng, TILE_MM / n, rng.uniform
         at = f32(np.arange(n) * self.px)
         self.y, self.x = at[:, None], at[None]

@@ -12,14 +12,16 @@ from functools import cached_property, lru_cache
 import numpy as np
 
 from palpate.core import require, rng_for
-from palpate.sim.arrays import Array, f32, grid, to_bytes, window
+from palpate.sim.arrays import Array, f32, grid, smooth, to_bytes, window
 from palpate.sim.camera import Camera
 from palpate.sim.felt import caption, measure
 from palpate.sim.gel import make_sensor
+from palpate.sim.ground import draw_ground
 from palpate.sim.materials import MATERIALS, Material, Surface, draw_surface
 from palpate.sim.motion import State, make_contacts, state_at
 from palpate.sim.options import BACKGROUND_OFFSET, VERSION, WorldOptions
 from palpate.sim.plan import ObjectRef, VideoPlan, first_contact, plan_world
+from palpate.sim.scans import Scan
 
 #: Share of the objects that are curved, and the range of their radius in mm, log-uniform (of dents
 #: 3.3 times as much).
@@ -27,8 +29,31 @@ CURVED, RADIUS_MM = 0.4, (25.0, 90.0)
 
 
 def make_object(options: WorldOptions, ref: ObjectRef) -> Surface:
-    """Make the object of that name; it depends on the seed, the name and the tile size alone."""
-    return _make(options.seed, ref, MATERIALS[ref.material], options.tile)
+    """Make the object of that name; it depends on the seed, the name and the tile size alone.
+
+    In scale real every other object is a scan, each scan one object, as long as there are any.
+    """
+    material = MATERIALS[ref.material]
+    if options.scale == "real":
+        return _make_ground(options.seed, ref, material, options.tile, _scan_of(options, ref))
+    return _make(options.seed, ref, material, options.tile)
+
+
+def _scan_of(options: WorldOptions, ref: ObjectRef) -> Scan | None:
+    scans = [scan for scan in options.scans if scan.material == ref.material]
+    if ref.number % 2 == 0 or ref.number // 2 >= len(scans):
+        return None
+    return scans[options.rng("scans", ref.material).permutation(len(scans))[ref.number // 2]]
+
+
+@lru_cache(maxsize=6)
+def _make_ground(
+    seed: int, ref: ObjectRef, material: Material, tile: int, scan: Scan | None
+) -> Surface:
+    rng = rng_for(seed, "world", VERSION, "object", ref.material, ref.number)
+    return draw_ground(
+        ref.material, draw_surface(ref.material, material, tile, rng, whole=True), rng, scan
+    )
 
 
 @lru_cache(maxsize=6)
@@ -61,7 +86,10 @@ class Video:
         self.options, self.plan = options, plan
         self.sensor = make_sensor(options, plan.sensor)
         self.contacts = make_contacts(options, plan)
-        self.camera, self._lit = Camera(options, plan.index), dict[int, tuple[Array, float]]()
+        self.camera, self._lit = (
+            Camera(options, plan.index),
+            dict[int, tuple[Array, float, float]](),
+        )
         rng, spread = options.rng("gain", plan.index), 2.0 * options.hard
         balance, exposure = rng.standard_normal(3), rng.standard_normal()
         self.gain: Array = f32(np.exp(0.03 * spread * balance + 0.05 * spread * exposure))
@@ -112,7 +140,16 @@ class Video:
         surface = self.surface(state.contact)
         center = state.position[0] / surface.px, state.position[1] / surface.px
         reach = self.sensor.half / surface.px
-        return window(surface.height, grid(self.options.size), state.rotation, reach, center)
+        pixels = grid(self.options.size)
+        relief = window(surface.height, pixels, state.rotation, reach, center)
+        if (ground := surface.ground) is None:
+            return relief
+        center = state.position[0] / ground.px, state.position[1] / ground.px
+        coarse = window(ground.height, pixels, state.rotation, self.sensor.half / ground.px, center)
+        relief += smooth(coarse, ground.px / self.sensor.px)
+        for axis in pixels:  # a hand lays the pad flat
+            relief = relief - axis * (float((relief * axis).mean()) / float((axis * axis).mean()))
+        return relief
 
     def background(self) -> np.ndarray:
         """Render the sensor without contact and without noise: uint8, shape (n, n, 3)."""

@@ -48,6 +48,7 @@ from palpate.sim.materials import MATERIALS, Material
 from palpate.sim.options import VERSION, WorldOptions
 from palpate.sim.plan import VideoPlan, written_frames
 from palpate.sim.presets import MINI_SEEDS, SEEN_WARNING
+from palpate.sim.scans import scan_notes
 from palpate.sim.video import Video
 from palpate.sim.world import World
 
@@ -203,6 +204,7 @@ def _finish(unfinished: Path, world: World) -> None:
         "version": VERSION,
         "note": NOTE,
         **({"seen_by_shipped_models": SEEN_WARNING} if options.seed in MINI_SEEDS else {}),
+        **({"surfaces": scan_notes(options.scans)} if options.surfaces else {}),
         "digest": digest_json({"options": options.digest, "lists": lists}),
         "options_digest": options.digest,
         "manifest_digest": manifest.digest,

@@ -52,7 +52,7 @@ def glass(tile: Tile) -> Surface:
         flutes = np.cos(tile.wave(draw(4.0, 9.0), tile.angle()))
         height += flutes * draw(0.1, 0.25)
     albedo = tint(color, 0.75 + 0.16 * tile.noise(18.0, 64.0, 3.0))
-    for _ in range(int(tile.rng.integers(1, 4))):
+    for _ in range(0 if tile.whole else int(tile.rng.integers(1, 4))):
         angle = tile.angle()
         dy, dx = (wrapped_offset(at, draw(0.0, TILE_MM)) for at in (tile.y, tile.x))
         u, v = turned(dy, dx, angle)

@@ -34,7 +34,8 @@ def concrete(tile: Tile) -> Surface:
 
 def brick(tile: Tile) -> Surface:
     """Draw laid bricks with mortar joints, the face of a single brick, or a wire-cut face."""
-    kind, draw = tile.pick("laid", "laid", "face", "wire-cut"), tile.draw
+    kind = tile.pick(*("laid", "laid", "face", "wire-cut")[2 * tile.whole :])
+    draw = tile.draw
     clay = hsv(draw(0.0, 0.06), draw(0.35, 0.7), draw(0.4, 0.75))
     mortar = f32([0.72, 0.7, 0.66]) * draw(0.7, 1.1)
     grit = tile.noise(0.3, 4.0, 1.3)
@@ -59,11 +60,13 @@ def brick(tile: Tile) -> Surface:
 
 def ceramic_tile(tile: Tile) -> Surface:
     """Draw glazed tiles, textured (anti-slip) tiles, or small mosaic."""
-    kind, draw = tile.pick("glazed", "glazed", "textured", "mosaic"), tile.draw
+    kind = tile.pick(*("glazed", "glazed", "textured", "mosaic")[: 4 - tile.whole])
+    draw = tile.draw
     color = hsv(draw(), tile.pick(0.05, 0.12, 0.5), draw(0.5, 0.95))
     side = TILE_MM / (5 if kind == "mosaic" else int(tile.rng.integers(2, 4)))
     gap = draw(0.6, 1.4)
-    body = smoothstep(tile.squares(side), gap * 0.6, gap * 1.6)
+    side = 2 * TILE_MM if tile.whole else side
+    body = tile.ones() if tile.whole else smoothstep(tile.squares(side), gap * 0.6, gap * 1.6)
     cell = (np.floor(tile.y / side) * 7.0 + np.floor(tile.x / side)).astype(np.intp) % 64
     shade = 1.0 + f32(0.08 * tile.rng.standard_normal(64))[cell]
     relief = tile.noise(5.0, 30.0, 3.0) * 0.02

@@ -16,7 +16,7 @@ _WOOD = {"polished": 0.25, "planed": 0.6, "sawn": 1.3, "boards": 0.6}
 
 def wood(tile: Tile) -> Surface:
     """Draw polished, planed or sawn wood, or boards with grooves."""
-    kind, draw = tile.pick(*_WOOD), tile.draw
+    kind, draw = tile.pick(*tuple(_WOOD)[: 4 - tile.whole]), tile.draw
     angle = draw(-0.15, 0.15) + tile.pick(0.0, math.pi / 2.0)
     light = hsv(draw(0.05, 0.10), draw(0.35, 0.65), draw(0.3, 0.8))
     dark = light * draw(0.45, 0.75)

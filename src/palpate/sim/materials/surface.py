@@ -26,6 +26,8 @@ class Surface:
         softness: 0 rigid to 1 (yields under the gel).
         curvature: 1 / radius of the body in 1/mm along x of the pad, positive for a bulge; 0 for
             flat. An object draws it, no material.
+        side_mm: side of the tile.
+        ground: what the photo shows, and what is felt beside the relief; None for the tile itself.
     """
 
     height: Array
@@ -34,11 +36,13 @@ class Surface:
     gloss: float = 0.0
     softness: float = 0.0
     curvature: float = 0.0
+    side_mm: float = TILE_MM
+    ground: Surface | None = None
 
     @property
     def px(self) -> float:
         """Pixel size in mm."""
-        return TILE_MM / len(self.height)
+        return self.side_mm / len(self.height)
 
 
 #: Draws a piece of a material on a tile; all randomness comes from the tile's generator.
@@ -69,8 +73,10 @@ def of_top(height: Array) -> Array:
     return np.clip(height * (1.0 / float(height.max())), 0.0, 1.0)
 
 
-def draw_surface(name: str, material: Material, n: int, rng: np.random.Generator) -> Surface:
-    """Draw and check a piece.
+def draw_surface(
+    name: str, material: Material, n: int, rng: np.random.Generator, *, whole: bool = False
+) -> Surface:
+    """Draw and check a piece; see :class:`~palpate.sim.tile.Tile`.
 
     Returns:
         The surface with median height 0, albedo clipped to [0.01, 1], arrays in float32, C order.
@@ -79,7 +85,7 @@ def draw_surface(name: str, material: Material, n: int, rng: np.random.Generator
         PalpateError: naming the material, if its function returned a wrong shape or numbers that
             are not finite.
     """
-    surface = material.draw(Tile(n, rng))
+    surface = material.draw(Tile(n, rng, whole=whole))
     height, albedo = f32(surface.height), f32(surface.albedo)
     must = f"The material {name!r} must return a height and an albedo of"
     got, shapes = (height.shape, albedo.shape), ((n, n), (n, n, 3))
