@@ -240,20 +240,30 @@ def show(title, clips, made, votes=None):
         print(f"{'':44s} photos {sum(votes) / (FRAMES * len(votes)):.0%}  {votes}", flush=True)
 
 
-def show_nearest(clips, options, models, surfaces, pipelines):
-    print("hits of 24: " + " ".join(name for name, _ in CLIPS.values()))
+def right_given(world):
+    """Statistics of 24 touches of each clip's own material, drawn from a bank."""
+    rng, found = np.random.default_rng(0), {}
+    for clip, (_, material) in CLIPS.items():
+        found[clip] = world[1][rng.choice(np.flatnonzero(world[2] == material), FRAMES)]
+    return found
+
+
+def show_halves(clips):
     hits = halves(clips)
     print(f"{'real frames, the other half':44s} abs {hits.sum() / 120:4.0%}  {hits}")
+
+
+def show_nearest(clips, options, models, surfaces, pipelines):
+    print("hits of 24: " + " ".join(name for name, _ in CLIPS.values()))
+    show_halves(clips)
     for model in pipelines:
         show(f"generated, {model}", clips, generated(clips, model))
     worlds = {"near": options, "real": replace(options, scale="real")}
     if surfaces:
         worlds["real + scans"] = replace(options, scale="real", surfaces=surfaces)
     for name, its in worlds.items():
-        world, rng = bank(its), np.random.default_rng(0)
-        of = {c: np.flatnonzero(world[2] == m) for c, (_, m) in CLIPS.items()}
-        right = {c: world[1][rng.choice(of[c], FRAMES)] for c in CLIPS}
-        show(f"right material given, {name}", clips, right)
+        world = bank(its)
+        show(f"right material given, {name}", clips, right_given(world))
         for model in models:
             for closed in (True, False):
                 of_how_many = "five" if closed else len(its.names)
@@ -336,6 +346,9 @@ def main():
         its = replace(options, materials=chosen, scale=a.scale, surfaces=a.surfaces)
         world = bank(its, seen=False)
         show_bands(clips, *world[1:])
+        if len(a.only) == len(CLIPS):
+            show_halves(clips)
+            show("right material given", clips, right_given(world))
         if a.all:
             show_all(*world[1:])
     else:

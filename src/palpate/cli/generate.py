@@ -49,7 +49,7 @@ class Options(Common):
     (default: PNG)."""
     model: str = "palpate/mini"
     """Folder of `palpate train generator`, hub id, or palpate/mini (which knows a synthetic world
-    alone)."""
+    alone; on real photos it was at chance)."""
     split: Path | None = None
     """With a manifest: take one part of this split (default: all samples)."""
     part: Literal["train", "val", "test"] = "test"

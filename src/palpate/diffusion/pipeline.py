@@ -63,7 +63,8 @@ from palpate.training.cards import write_model_cards
 COPY_AGAIN = "Copy the whole folder again"
 SYNTHETIC = (
     "Made by a generator that was trained on synthetic data alone (palpate's procedural world), "
-    "not on a real sensor."
+    "not on a real sensor. Real photos show another scale: docs/start/generate.md says what was "
+    "measured on them."
 )
 #: How far beyond the strengths of training touches of such surfaces one goes without a note.
 TOLERATED = 0.1

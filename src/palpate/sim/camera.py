@@ -182,8 +182,9 @@ class Camera:
             image *= 1.0 - (1.0 - factor) * dark
         if self.hand is not None:
             angle, tip = self.hand + 0.02 * math.sin(0.2 * frame), 0.10 + 0.55 * state.lift
-            place = [(c - at) / self.hand_size for c, at in zip((y, x), self.at, strict=True)]
-            image = _hand(image, self.skin * min(1.2, exposure * 0.9), turned(*place, angle), tip)
+            down, right = self.at
+            place = turned((y - down) / self.hand_size, (x - right) / self.hand_size, angle)
+            image = _hand(image, self.skin * min(1.2, exposure * 0.9), place, tip)
         blur = self.blur * size / 128.0
         if blur > 0.2:
             image = scipy.ndimage.gaussian_filter(image, (0, blur, blur), truncate=2.5)

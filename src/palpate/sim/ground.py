@@ -13,15 +13,17 @@ stone, lie over it.
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from scipy import ndimage
 
 from palpate.sim.arrays import Array, f32, resample, smoothstep
 from palpate.sim.materials import Surface
-from palpate.sim.scans import Scan
 from palpate.sim.tile import TILE_MM, Tile
+
+if TYPE_CHECKING:
+    from palpate.sim.scans import Scan
 
 #: Tiles along a side, and the side in mm.
 TILES = 8

@@ -5,13 +5,15 @@ from __future__ import annotations
 import dataclasses
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal, get_args, get_origin, get_type_hints
+from typing import TYPE_CHECKING, Any, Literal, get_args, get_origin, get_type_hints
 
 import numpy as np
 
 from palpate.core import digest_json, few, require, require_choice, rng_for
 from palpate.sim.materials import MATERIALS, check_material
-from palpate.sim.scans import Scan, read_scans, scans_digest
+
+if TYPE_CHECKING:
+    from palpate.sim.scans import Scan
 
 #: Raised at every change of the images, texts or lists; enters every random draw and the digest.
 VERSION = 2
@@ -157,6 +159,8 @@ class WorldOptions:
     @property
     def scans(self) -> tuple[Scan, ...]:
         """The scanned surfaces, in the order of their table."""
+        from palpate.sim.scans import read_scans
+
         return read_scans(Path(self.surfaces)) if self.surfaces else ()
 
     @property
@@ -170,6 +174,8 @@ class WorldOptions:
         options = dataclasses.asdict(self).items()
         named = {k: v for k, v in options if k not in LATER or v != LATER[k]}
         if self.surfaces:
+            from palpate.sim.scans import scans_digest
+
             named["surfaces"] = scans_digest(Path(self.surfaces))
         return digest_json({"version": VERSION, "options": named})
 

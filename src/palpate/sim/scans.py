@@ -173,9 +173,10 @@ def _scan(folder: Path, row: Mapping[str, str | None]) -> Scan:
     width, guessed = _number(row, "width_mm"), _number(row, "width_mm_guess")
     must = f"{name} must have its width in mm in surfaces.csv (width_mm, or width_mm_guess)"
     fix = "Measure or guess how wide the surface in its picture is"
-    require(width or guessed, None, must, "neither", fix=fix)
+    require(max(width, guessed) > 0, None, must, "neither", fix=fix)
     at = inside(folder, f"{(row['class'] or '').replace(' ', '_')}/{name}")
-    require(at is not None, None, "A surface must lie in its folder", repr(name), fix="Rename it")
+    if at is None:
+        raise PalpateError("A surface must lie in its folder", repr(name), "Rename it")
     color, relief = _file(at, "color"), _file(at, "height", "normal")
     sizes = [image_size(path) or (0, 0) for path in (color, relief)]
     must = f"{relief} must be as large as {color.name}, {_text(sizes[0])}"

@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 from functools import cached_property, lru_cache
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -21,7 +22,9 @@ from palpate.sim.materials import MATERIALS, Material, Surface, draw_surface
 from palpate.sim.motion import State, make_contacts, state_at
 from palpate.sim.options import BACKGROUND_OFFSET, VERSION, WorldOptions
 from palpate.sim.plan import ObjectRef, VideoPlan, first_contact, plan_world
-from palpate.sim.scans import Scan
+
+if TYPE_CHECKING:
+    from palpate.sim.scans import Scan
 
 #: Share of the objects that are curved, and the range of their radius in mm, log-uniform (of dents
 #: 3.3 times as much).
