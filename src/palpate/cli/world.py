@@ -52,7 +52,7 @@ class Options(Common):
     """Touch and Go as JPEG frames (default) or as H.264 videos."""
     scale: Literal["near", "real"] | None = None
     """Photos of 30 to 45 mm (near, default), or of 150 to 400 mm of ground with joints of true
-    size; touches of scale real are as strong as real ones, material by material."""
+    size, where relief and load belong to the material."""
     surfaces: Path | None = None
     """Folder of photo-scanned surfaces (surfaces.csv) as further looks, in scale real."""
     workers: int = 2

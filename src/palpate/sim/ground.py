@@ -16,7 +16,7 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
-from scipy import ndimage
+import scipy
 
 from palpate.sim.arrays import Array, f32, resample, smoothstep
 from palpate.sim.materials import Surface
@@ -33,12 +33,14 @@ BLUR = 1.15
 
 
 class Touch(NamedTuple):
-    """What makes touches of a material as strong as real ones."""
+    """How a material is felt on a ground."""
 
     relief: float  # factor on the fine relief
     waves: float  # deviation of waves of 16 to 40 mm, in mm
     load: float  # factor on the load of contacts
-    fitted: bool = False  # to a real clip (benchmarks/surfaces.py), else a guess by kind
+    fitted: bool = (
+        False  # by a real clip (benchmarks/surfaces.py), not in all bands, else a guess by kind
+    )
 
 
 _STONE, _GRASS = Touch(0.4, 0.3, 0.8, True), Touch(0.75, 1.1, 1.4, True)
@@ -78,7 +80,7 @@ class _Layout(NamedTuple):
 
 
 def touch_of(material: str) -> Touch:
-    """Return what makes touches of that material as strong as real ones."""
+    """Return how that material is felt on a ground."""
     return TOUCHES.get(material, ANY)
 
 
@@ -103,7 +105,9 @@ def draw_ground(
     ground = _of_scan(scan, piece) if scan else _procedural(material, piece, rng)
     touch = touch_of(material)
     px = max(ground.px, scan.px if scan else 0.0)
-    fine = piece.height - ndimage.gaussian_filter(piece.height, BLUR * px / piece.px, mode="wrap")
+    fine = piece.height - scipy.ndimage.gaussian_filter(
+        piece.height, BLUR * px / piece.px, mode="wrap"
+    )
     waves = Tile(len(piece.height), rng).noise(16.0, 40.0, 0.5)
     return replace(piece, height=touch.relief * fine + touch.waves * waves, ground=ground)
 

@@ -89,7 +89,7 @@ class WorldOptions:
         sensor_noise: range of the units' image noise (deviation, of white), 0 .. 0.05.
         quality: of the JPEG files of tactile images, 10 .. 100.
         scale: near: photos of 30 to 45 mm of a tile; real: photos of view_mm of a ground, with
-            joints of true size, off the middle, and relief and load by material as of real touches
+            joints of true size, off the middle, and relief and load by material
             (:mod:`palpate.sim.ground`).
         view_mm: range of the width of the views of scale real, log-uniform, 20 .. 500 [mm].
         surfaces: folder of photo-scanned surfaces, further looks in scale real
