@@ -285,9 +285,9 @@ def test_chains_of_imports_are_short_and_none_runs_back_to_the_door():
 @pytest.mark.parametrize(
     ("words", "files"),
     [
-        ("score --generated a --reference b --encoder palpate/mini", 32),
+        ("score --generated a --reference b --encoder palpate/mini", 41),
         ("audit a.txt b.txt", 28),
-        ("generate b/0.png -o t.png", 20),  # noise is out of range, and noted
+        ("generate b/0.png -o t.png", 29),  # noise is out of range, and noted
     ],
 )
 def test_the_main_paths_stay_short(tmp_path, words, files):
