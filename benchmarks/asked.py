@@ -88,7 +88,7 @@ class Trial:
         self.photos = pipeline.embed(photos)
 
     def quantiles(self, rows):
-        return self.pipeline.contact.asked(rows, [None] * len(rows)).astype(float)
+        return self.pipeline.contact.requested(rows, [None] * len(rows)).astype(float)
 
     def made(self, touches):
         images = self.pipeline.sample(

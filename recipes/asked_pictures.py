@@ -15,8 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 
-from palpate.diffusion.asked import Asked
 from palpate.diffusion.pipeline import TactilePipeline
+from palpate.diffusion.requested import Requested
 from palpate.sim import World, WorldOptions
 
 IMAGES = Path(__file__).parents[1] / "docs" / "images"
@@ -64,7 +64,7 @@ def made(
 ) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
     """A photo, and its touches, which share the noise."""
     photo = pipeline.embed(sample["vision"][None])
-    rows = np.stack([Asked(**one).row(pipeline.contact) for one in asked])
+    rows = np.stack([Requested(**one).row(pipeline.contact) for one in asked])
     gels = np.broadcast_to(sample["background"], (len(rows), *sample["background"].shape))
     same = photo.expand(len(rows), -1), ["touch"] * len(rows)
     return sample["vision"], pipeline.sample(*same, seed=0, background=gels, touches=rows)

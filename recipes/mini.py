@@ -230,10 +230,10 @@ def calibrated(pipeline: TactilePipeline, train: Manifest, cache: Path) -> Tacti
     for material in np.unique(materials):
         rows = np.flatnonzero(materials == material)
         other[rows] = np.roll(rows, len(rows) // 2)
-    asked = contact.asked(contact_conditions(images, gels), sensors).astype(float)[other]
+    asked = contact.requested(contact_conditions(images, gels), sensors).astype(float)[other]
     photos = pipeline.embed(cached_images(some, "vision", pipeline.vision_size, cache))
     made = pipeline.sample(photos, some.ids, seed=0, background=np.asarray(gels), touches=asked)
-    shown = contact.asked(contact_conditions(made, gels), sensors)
+    shown = contact.requested(contact_conditions(made, gels), sensors)
     known = np.isfinite(asked).all(axis=1) & np.isfinite(shown).all(axis=1)
     slopes = [np.polyfit(x, y, 1)[0] for x, y in zip(asked[known].T, shown[known].T, strict=True)]
     gain = [round(1 / float(slope), 3) for slope in slopes]

@@ -16,7 +16,6 @@ from palpate.core import PalpateError, quiet
 from palpate.data.manifest import Manifest
 from palpate.data.video import VideoReader, write_video
 from palpate.diffusion import contact
-from palpate.diffusion.asked import Asked, Profile
 from palpate.diffusion.autoencoder import BackgroundAutoencoder, LatentStats
 from palpate.diffusion.contact import ContactScale, channels_of, drawn, maps_of, marks_of
 from palpate.diffusion.denoiser import Denoiser
@@ -25,6 +24,7 @@ from palpate.diffusion.encoding import _contacts
 from palpate.diffusion.options import ConditionPolicy
 from palpate.diffusion.pipeline import TactilePipeline
 from palpate.diffusion.presets import TINY
+from palpate.diffusion.requested import Profile, Requested
 from palpate.diffusion.unet import build_unet
 from palpate.metrics.conditions import contact_conditions
 from palpate.metrics.markers import marker_motion
@@ -119,7 +119,7 @@ def test_strength_is_a_quantile_of_the_sensor_and_depth_maps_to_it():
     rows[:, 3] = depth * np.repeat([10, 100], 300) + rng.normal(0, 0.01, 600)
     rows[0, :4] = [np.nan, np.nan, 0, 0]  # no contact
     scale = ContactScale.of(rows, sensors)
-    asked = scale.asked(rows, sensors)
+    asked = scale.requested(rows, sensors)
     for of in (slice(1, 300), slice(300, 600)):
         ranks = rows[of, 3].argsort().argsort() / len(rows[of])
         assert asked[of, 3] == pytest.approx(ranks, abs=0.02)
@@ -158,7 +158,7 @@ def test_new_inputs_change_nothing_before_training(code, tmp_path):
     start = make(code, None, contact=False).denoiser
     rng = np.random.default_rng(0)
     asked = rng.uniform(size=(4, 6)).astype(np.float32)
-    rows = Rows(torch.randn(4, 4, 16, 16), {"text": torch.randn(4, 6)}, asked=asked)
+    rows = Rows(torch.randn(4, 4, 16, 16), {"text": torch.randn(4, 6)}, requested=asked)
     rows = replace(rows, marks=rng.normal(size=(4, 12, 16, 16)).astype(np.float16))
     policy = replace(start.policy, contact=True)
     for steps, same in ((0, True), (2, False)):
@@ -230,7 +230,7 @@ def test_images_follow_what_is_asked_and_the_folder_keeps_it(world, code, tmp_pa
     ],
 )
 def test_what_no_gel_can_do_is_refused(asked, word):
-    fails(word, Asked, **asked)
+    fails(word, Requested, **asked)
 
 
 def test_generate_takes_what_is_asked(world, code, tmp_path):

@@ -74,7 +74,7 @@ class Options(Common):
 def run(options: Options, terminal: Terminal) -> tuple[dict[str, Any], int]:
     """Start the engine, and say what is left."""
     name, *args = options.command or ("",)
-    require_choice("VERB", name, SLICED)
+    require_choice("command", name, SLICED)
     require(options.slices >= 1, "slices", "must be at least 1", options.slices)
     require(options.workers >= 1, "workers", "must be at least 1", options.workers)
     _, verb = checked(name, [*args, "--slice", f"1/{options.slices}"])

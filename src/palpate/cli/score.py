@@ -11,24 +11,11 @@ import tyro
 
 from palpate.cli.terminal import Common, Files, OptionalOutPath, Switch, Terminal, working_folder
 from palpate.core import require
+from palpate.evaluation.names import Name
 
 #: What the word of an option means.
 NORMALIZE = {"check": "check", "yes": True, "no": False}
-Companion = Literal[
-    "fid",
-    "kid",
-    "cmmd",
-    "prdc",
-    "fd-dinov2",
-    "mind",
-    "vendi",
-    "ssim",
-    "psnr",
-    "ms-ssim",
-    "contact",
-    "lpips",
-    "none",
-]
+Companion = Literal[Name, "none"]
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -13,9 +13,9 @@ conditions the denoiser as maps beside the noisy latents; tokens learn no place.
   width does, to the right and down.
 
 Strength is the quantile of the mean change among the training contacts of a sensor. A force or a
-depth, where training knew them, becomes a strength by a monotone (isotonic) fit. What is not asked
-for is drawn among training touches, jointly: of surfaces that look like the one at hand, and near
-what is asked for.
+depth, where training knew them, becomes a strength by a monotone (isotonic) fit. What is not
+requested is drawn among training touches, jointly: of surfaces that look like the one at hand, and
+near what is requested.
 """
 
 from __future__ import annotations
@@ -39,16 +39,16 @@ from palpate.metrics.images import as_unit
 from palpate.metrics.markers import marker_mask, marker_motion
 
 Rows = NDArray[np.float64]
-#: Asked for, unknown, or dropped together.
+#: Requested for, unknown, or dropped together.
 PARTS = {"at": [0, 1], "area": [2], "strength": [3], "shear": [4, 5]}
 #: The part of each condition.
 _PART = [0, 0, 1, 2, 3, 3]
 #: In training: probability that all are dropped, and that each part is, by itself.
 DROP_ALL, DROP = 0.15, 0.15
-#: How near a training touch is of which the rest is drawn: in deviations of what is asked for, and
+#: How near a training touch is of which the rest is drawn: in deviations of what is requested, and
 #: in the cosine of the surfaces, as the memory's temperature.
 NEAR, LIKE = 0.25, 0.02
-#: Training touches that are kept, of which what is not asked for is drawn.
+#: Training touches that are kept, of which what is not requested is drawn.
 KEPT = 4096
 #: Points of the tables from strength, force and depth.
 POINTS = 101
@@ -68,8 +68,8 @@ class ContactScale:
         force: sensor -> least and largest force [N], and the strengths of evenly spaced forces.
         depth: the same of depth [mm].
         missing: training touches without place, area, strength, shear.
-        gain: how far from the mean of training each condition is asked for, to be as far from it as
-            is asked; empty: as far.
+        gain: how far from the mean of training each condition is requested, to be as far from it as
+            is requested; empty: as far.
     """
 
     strength: Mapping[str, Sequence[float]] = field(default_factory=dict)
@@ -90,7 +90,7 @@ class ContactScale:
             if len(values := rows[of & (rows[:, 3] > 0), 3]) > 1
         }
         scale = cls(strength)
-        quantiles = scale.asked(rows, sensors)[:, 3]
+        quantiles = scale.requested(rows, sensors)[:, 3]
 
         def rising(column: int) -> dict[str, list[float]]:
             fits = {name: _monotone(rows[of, column], quantiles[of]) for name, of in groups.items()}
@@ -100,8 +100,8 @@ class ContactScale:
         missing = {part: int(lost[:, k].sum()) for k, part in enumerate(PARTS)}
         return cls(strength, rising(6), rising(7), missing)
 
-    def asked(self, rows: Rows, sensors: Sequence[str | None]) -> NDArray[np.float32]:
-        """Measured touches (n, 6 or more) as what is asked for: the strength as its quantile."""
+    def requested(self, rows: Rows, sensors: Sequence[str | None]) -> NDArray[np.float32]:
+        """Measured touches (n, 6 or more) as what is requested: the strength as its quantile."""
         out = rows[:, : len(CONDITIONS)].astype(np.float32)
         for name in {*sensors}:
             of = np.array([sensor == name for sensor in sensors])
@@ -180,11 +180,11 @@ def marks_of(
     return torch.cat([change(np.nan_to_num(shears), index), *(u[index] for u in units)], dim=1)
 
 
-def maps_of(asked: Tensor, marks: Tensor, scale: tuple[Tensor, Tensor]) -> Tensor:
+def maps_of(requested: Tensor, marks: Tensor, scale: tuple[Tensor, Tensor]) -> Tensor:
     """What the denoiser sees of touches.
 
     Args:
-        asked: (n, 6), NaN where nothing is asked for.
+        requested: (n, 6), NaN where nothing is requested.
         marks: of :func:`marks_of`, for these shears, over the deviation of the latents.
         scale: mean and deviation (6,) of the training touches.
 
@@ -192,8 +192,8 @@ def maps_of(asked: Tensor, marks: Tensor, scale: tuple[Tensor, Tensor]) -> Tenso
         (n, channels, h, w).
     """
     (mean, std), side, latent = scale, marks.shape[2], marks.shape[1] // 3
-    known = torch.stack([torch.isfinite(asked[:, of]).all(1) for of in PARTS.values()], 1)
-    at = torch.where(known[:, _PART], asked, mean)
+    known = torch.stack([torch.isfinite(requested[:, of]).all(1) for of in PARTS.values()], 1)
+    at = torch.where(known[:, _PART], requested, mean)
     value, known, grid = (at - mean) / std, known.float(), (torch.arange(side) + 0.5) / side
     dx, dy = (grid - at[:, :1])[:, None, :], (grid - at[:, 1:2])[:, :, None]
     radius = (at[:, 2].clamp(0.02, 1) / torch.pi).sqrt()[:, None, None]
@@ -204,10 +204,10 @@ def maps_of(asked: Tensor, marks: Tensor, scale: tuple[Tensor, Tensor]) -> Tenso
     return torch.cat([place * shown, flat, marks[:, :latent] * dragged, marks[:, latent:]], 1)
 
 
-def dropped(asked: Tensor, draws: Tensor) -> Tensor:
+def dropped(requested: Tensor, draws: Tensor) -> Tensor:
     """Touches (n, 6) of which parts are dropped, by uniform draws (n, 5)."""
     gone = (draws[:, :1] < DROP_ALL) | (draws[:, 1:] < DROP)
-    return torch.where(gone[:, _PART], torch.nan, asked)
+    return torch.where(gone[:, _PART], torch.nan, requested)
 
 
 def has_markers(gels: NDArray[np.uint8]) -> NDArray[np.bool_]:
@@ -217,28 +217,28 @@ def has_markers(gels: NDArray[np.uint8]) -> NDArray[np.bool_]:
 
 
 def drawn(
-    asked: NDArray[np.floating[Any]],
+    requested: NDArray[np.floating[Any]],
     touches: NDArray[np.float32],
     similar: Rows | None,
     ids: Sequence[str],
     seed: int,
 ) -> NDArray[np.float32]:
-    """Touches (n, 6) as asked; what is NaN is that of one training touch each, by (seed, id).
+    """Touches (n, 6) as requested; what is NaN is that of one training touch each, by (seed, id).
 
     Args:
-        asked: (n, 6).
+        requested: (n, 6).
         touches: (m, 6), of training.
         similar: cosines (n, m) of photos or texts with those of the training touches, or None.
         ids: n names.
         seed: of the draws.
     """
     _, deviation = scale_of(torch.from_numpy(touches))
-    off = (asked[:, None] - touches) / (NEAR * deviation.numpy())
+    off = (requested[:, None] - touches) / (NEAR * deviation.numpy())
     weights = -0.5 * np.nansum(off**2, axis=2) + (0 if similar is None else similar / LIKE)
     sums = np.exp(weights - weights.max(axis=1, keepdims=True)).cumsum(axis=1)
     draws = [rng_for(seed, "touch", name).random() for name in ids]
     rows = [np.searchsorted(s, u * s[-1], "right") for s, u in zip(sums, draws, strict=True)]
-    return np.where(np.isfinite(asked), asked, touches[rows]).astype(np.float32)
+    return np.where(np.isfinite(requested), requested, touches[rows]).astype(np.float32)
 
 
 def reach(strengths: NDArray[np.float32], similar: Rows) -> Rows:

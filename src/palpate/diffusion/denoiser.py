@@ -155,7 +155,7 @@ class Denoiser(nn.Module):
             memory: of ``gap="pairs"``: embeddings (m, d) of the different training texts, and the
                 mean of the photos of each (m, d).
             patch_width: of the states of patches; default: that of the embeddings.
-            touches: of ``contact``: training touches (m, 6) as they are asked for, and the row of
+            touches: of ``contact``: training touches (m, 6) as they are requested, and the row of
                 ``memory`` (m,) that each belongs to.
         """
         super().__init__()
@@ -465,7 +465,7 @@ def sample(
         scheduler: of diffusers.
         generator: row -> a new generator of the noise that a scheduler adds while it samples.
         background: what the network sees of the gels and touches (n, g, h, w), or None.
-        bare: the same without what is asked for, of the unconditional pass; default: the same.
+        bare: the same without what is requested, of the unconditional pass; default: the same.
         on_step: called after each step of each batch.
     """
     parts = [noise[:0]]

@@ -60,7 +60,7 @@ class Rows:
         contacts: of ``policy.contact``: what is known of the touches (n, 8), as the manifest's
             columns.
         marks: what their shears do to the markers (n, 3 c, h, w), in latents.
-        asked: the touches (n, 6) as they are asked for.
+        requested: the touches (n, 6) as they are requested.
     """
 
     latents: Tensor | NDArray[Any]
@@ -71,7 +71,7 @@ class Rows:
     gels: NDArray[np.uint8] | None = None
     contacts: NDArray[np.float64] | None = None
     marks: NDArray[Any] | None = None
-    asked: NDArray[np.float32] | None = None
+    requested: NDArray[np.float32] | None = None
 
 
 def train_denoiser(
@@ -118,7 +118,7 @@ def train_denoiser(
             means = dict(zip(SOURCES, start.means, strict=True))
             memory = start.memory + start.means[0], start.keys + start.means[1]
             which = start.similar(tables["vision"]).argmax(1)
-        touches = None if rows.asked is None else _touches(rows.asked, which)
+        touches = None if rows.requested is None else _touches(rows.requested, which)
         width = conditions["patches"].shape[2] if "patches" in inputs_of(policy) else None
         model = Denoiser(net, policy, means, memory, width, touches)
         model.to(pick_device(run.device))
@@ -141,7 +141,9 @@ def train_denoiser(
             schedule=preset.schedule,
             policy=policy,
             inputs={name: part.conditions[name] for name in inputs_of(policy)},
-            contacts=None if part.asked is None else (part.asked, part.marks, model.touch_scale),
+            contacts=None
+            if part.requested is None
+            else (part.requested, part.marks, model.touch_scale),
         )
 
     loss, held = loss_of(rows), None
@@ -209,11 +211,11 @@ def _memory(tables: Mapping[Source, Tensor]) -> tuple[tuple[Tensor, Tensor], Ten
     return (texts, photos / counts[:, None]), which
 
 
-def _touches(asked: NDArray[np.float32], which: Tensor | None) -> tuple[Tensor, Tensor]:
+def _touches(requested: NDArray[np.float32], which: Tensor | None) -> tuple[Tensor, Tensor]:
     """Training touches that are kept, evenly of those with a place; the memory's row of each."""
-    placed = np.flatnonzero(np.isfinite(asked[:, 0]))
+    placed = np.flatnonzero(np.isfinite(requested[:, 0]))
     kept = placed[evenly_spaced(len(placed), KEPT)] if len(placed) else np.arange(1)
-    rows = torch.from_numpy(asked[kept])
+    rows = torch.from_numpy(requested[kept])
     return rows, torch.zeros(len(kept), dtype=torch.int64) if which is None else which[kept].cpu()
 
 
@@ -233,7 +235,7 @@ class DiffusionLoss:
         contacts: tuple[Any, Any, tuple[Tensor, Tensor]] | None = None,
     ) -> None:
         """Take latents (n, c, h, w), not normalized, tokens (n, k, d) by source, inputs, and of
-        contacts what is asked (n, 6), the marks, and the scale.
+        contacts what is requested (n, 6), the marks, and the scale.
         """
         self.latents, self.tokens, self.background = latents, dict(tokens), background
         self.stats, self.schedule, self.policy = stats, schedule, policy
@@ -265,8 +267,8 @@ class DiffusionLoss:
         }
         seen = [] if self.background is None else [self.background(step.rows, self.stats)]
         if self.contacts is not None:
-            asked, marks, scale = self.contacts
-            given = dropped(_take(asked, step.rows), step.rand(1 + len(PARTS)))
+            requested, marks, scale = self.contacts
+            given = dropped(_take(requested, step.rows), step.rand(1 + len(PARTS)))
             marks = self.stats.scaled(_take(marks, step.rows).float())
             seen.append(maps_of(given, marks, scale))
         if seen:

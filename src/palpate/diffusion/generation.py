@@ -50,8 +50,8 @@ from palpate.core.files import canonical_json
 from palpate.core.images import SUFFIXES
 from palpate.data.images import check_image, file_stamp, images_below, read_image, square
 from palpate.data.slices import Part, Slice, command_of
-from palpate.diffusion.asked import Asked, Profile
 from palpate.diffusion.generated import UNLIKE, Generated, Index, file_name, old_index
+from palpate.diffusion.requested import Profile, Requested
 from palpate.encoders.models import FIX_MODEL, find_model
 
 if TYPE_CHECKING:  # torch takes seconds to import, and what is checked first needs none of it
@@ -181,7 +181,7 @@ def generate(  # noqa: PLR0913 - a public verb, step by step
             any image is made.
     """
     weight = _share(weight, photos is not None, text is not None)
-    asked = Asked(at, area, strength, shear, force, depth)
+    requested = Requested(at, area, strength, shear, force, depth)
     made_by = command_of(
         *("generate", *(photos if isinstance(photos, list | tuple) else [photos])),
         output=output,
@@ -195,7 +195,7 @@ def generate(  # noqa: PLR0913 - a public verb, step by step
         guidance=guidance,
         steps=steps,
         strict=strict,
-        **asked.given(),
+        **requested.given(),
         profile=profile,
     )
     folder, output = _places(output, slice)
@@ -219,11 +219,11 @@ def generate(  # noqa: PLR0913 - a public verb, step by step
     settings |= (
         _range_of(model, text, words, strict)
         | ({"strict": True} if strict else {})
-        | _touch_and_like(asked.given(), forms)
+        | _touch_and_like(requested.given(), forms)
     )
-    touches = {s: asked.row(model.contact, s) for s in {item.sensor for item in items}}
+    touches = {s: requested.row(model.contact, s) for s in {item.sensor for item in items}}
     items = _on_gels(items, model, gel)
-    notes = [*_range_notes(settings), *_notes(model, text, gel), *_shear(model, asked, items)]
+    notes = [*_range_notes(settings), *_notes(model, text, gel), *_shear(model, requested, items)]
     if film and output is not None:
         from palpate.diffusion.touched_video import touch_video
 
@@ -231,7 +231,7 @@ def generate(  # noqa: PLR0913 - a public verb, step by step
             paths[0],
             output,
             model,
-            asked=asked,
+            requested=requested,
             sampler=model.sampler_with(guidance=guidance, steps=steps, batch=batch),
             settings=settings,
             profile=curve,
@@ -494,7 +494,7 @@ def _texts(image: Image.Image) -> Mapping[str, Any]:
 def _touch_and_like(
     touch: Mapping[str, Any], forms: Sequence[Form | None]
 ) -> dict[str, Mapping[str, Any] | str]:
-    """What was asked for, as settings."""
+    """What was requested, as settings."""
     like = digest_json([form and form.options for form in forms])
     return ({"touch": touch} if touch else {}) | ({"like": like} if forms else {})
 
@@ -646,10 +646,10 @@ def _range_notes(settings: Mapping[str, Any]) -> list[Note]:
     return notes + ([Note("text-unlike", {"rate": rate})] if rate >= UNLIKE else [])
 
 
-def _shear(pipeline: TactilePipeline, asked: Asked, items: Sequence[_Item]) -> list[Note]:
+def _shear(pipeline: TactilePipeline, requested: Requested, items: Sequence[_Item]) -> list[Note]:
     """That a shear has no effect where the gel has no markers; of several the first is seen."""
     gel = items[0].background
-    if asked.shear is None or (gel is None and pipeline.gel is None):
+    if requested.shear is None or (gel is None and pipeline.gel is None):
         return []
     from palpate.diffusion.contact import has_markers
 
@@ -659,7 +659,7 @@ def _shear(pipeline: TactilePipeline, asked: Asked, items: Sequence[_Item]) -> l
 
 
 def _strength_notes(outside: Sequence[tuple[float, float]], n: int) -> list[Note]:
-    """That training knew no touches of such surfaces of the strength that is asked for."""
+    """That training knew no touches of such surfaces of the strength that is requested."""
     if not outside:
         return []
     low, high = (float(x) for x in np.median(outside, axis=0))

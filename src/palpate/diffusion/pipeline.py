@@ -25,7 +25,6 @@ from torch import Tensor, nn
 from palpate.core import PalpateError, digest_json, read_record, require, require_choice, rng_for
 from palpate.core.hub import at_revision
 from palpate.data.images import Preprocess, load_images, read_image, square
-from palpate.diffusion.asked import Asked
 from palpate.diffusion.autoencoder import (
     AnyAutoencoder,
     Autoencoder,
@@ -44,6 +43,7 @@ from palpate.diffusion.denoiser import (
     starting_noise,
 )
 from palpate.diffusion.options import ConditionPolicy, SamplerOptions, Schedule
+from palpate.diffusion.requested import Requested
 from palpate.diffusion.saving import FORMAT, KEYS, write_pipeline
 from palpate.diffusion.training_range import TrainingRange
 from palpate.encoders.embed import embed_texts, list_images
@@ -260,7 +260,7 @@ class TactilePipeline(DiffusionPipeline):
         Raises:
             PalpateError: if a photo is unreadable, a gel is missing, or settings do not fit.
         """
-        touch = Asked(at, area, strength, shear, force, depth).row(self.contact)
+        touch = Requested(at, area, strength, shear, force, depth).row(self.contact)
         images = [] if photos is None else list_images(photos)
         must, fix = "There must be at least one photo, or a text alone", "Pass one of them"
         enough = bool(images) or (photos is None and text is not None)
@@ -494,7 +494,7 @@ class TactilePipeline(DiffusionPipeline):
             sampler: default: the pipeline's.
             background: bytes (n, size, size, 3) of the gel without contact; default: the stock gel,
                 which a pipeline w/ BG and a VQ autoencoder lacks.
-            touches: (n, 6) what is asked for, in the order of
+            touches: (n, 6) what is requested, in the order of
                 :data:`palpate.metrics.conditions.CONDITIONS` and strength from 0 to 1; NaN, and
                 default: drawn among the training touches of surfaces like these.
             noise: the starting noise (n, c, h, w) instead of that of seed and ids.
@@ -533,13 +533,13 @@ class TactilePipeline(DiffusionPipeline):
         if self.denoiser.policy.contact:
             assert isinstance(code, BackgroundAutoencoder)
             assert background is not None
-            asked = self.touches(touches, photos, words, ids, seed)
-            asked[~has_markers(background), 4:] = np.nan
+            requested = self.touches(touches, photos, words, ids, seed)
+            requested[~has_markers(background), 4:] = np.nan
             if self.contact is not None and self.contact.gain:
                 mean = self.denoiser.touch_scale[0].numpy()
-                asked = mean + np.array(self.contact.gain, np.float32) * (asked - mean)
-            marks = self.stats.scaled(marks_of(code, background, asked[:, 4:6]))
-            each = torch.from_numpy(asked)
+                requested = mean + np.array(self.contact.gain, np.float32) * (requested - mean)
+            marks = self.stats.scaled(marks_of(code, background, requested[:, 4:6]))
+            each = torch.from_numpy(requested)
             for touch in (torch.full_like(each, torch.nan), each):  # guidance is on both
                 maps.append(maps_of(touch, marks, self.denoiser.touch_scale))
         # Schedulers of diffusers keep where they are; of one pipeline several threads may sample.
@@ -561,16 +561,16 @@ class TactilePipeline(DiffusionPipeline):
 
     def touches(
         self,
-        asked: NDArray[np.floating[Any]] | None,
+        requested: NDArray[np.floating[Any]] | None,
         photos: Tensor | None,
         texts: Tensor | None,
         ids: Sequence[str],
         seed: int,
     ) -> NDArray[np.float32]:
-        """Touches (n, 6) as asked for, the rest of them drawn; arguments of :meth:`sample`."""
-        asked = np.full((len(ids), len(CONDITIONS)), np.nan) if asked is None else asked
+        """Touches (n, 6) as requested, the rest of them drawn; arguments of :meth:`sample`."""
+        requested = np.full((len(ids), len(CONDITIONS)), np.nan) if requested is None else requested
         similar = self._similar(photos, texts)
-        return drawn(asked, self.denoiser.touches.cpu().numpy(), similar, ids, seed)
+        return drawn(requested, self.denoiser.touches.cpu().numpy(), similar, ids, seed)
 
     def unlikely(
         self, strengths: NDArray[np.float64], photos: Any, texts: Tensor | None

@@ -2,7 +2,7 @@
 
 The touch of each frame comes from a profile over time, or is that of the clip itself, where its
 ``gelsight.mp4`` lies beside it (the layout of Touch and Go). The noise is that of one image, for
-all frames; a photo is the mean of those within half a second; the place, if it is not asked for,
+all frames; a photo is the mean of those within half a second; the place, if it is not requested,
 is drawn once; the area, if it is not, follows the strength as in training. So frames differ by
 what the touch does. At strength 0 nothing touches: the gel is shown.
 """
@@ -26,11 +26,11 @@ from palpate.core.files import canonical_json
 from palpate.data.contacts import find_reference
 from palpate.data.images import read_image, square
 from palpate.data.video import VideoReader, write_video
-from palpate.diffusion.asked import Asked, Profile
 from palpate.diffusion.contact import ContactScale
 from palpate.diffusion.generated import Generated
 from palpate.diffusion.options import SamplerOptions
 from palpate.diffusion.pipeline import EMBED, TactilePipeline
+from palpate.diffusion.requested import Profile, Requested
 from palpate.metrics.conditions import contact_conditions
 
 #: The touch of a clip, in its folder.
@@ -44,7 +44,7 @@ def touch_video(  # noqa: PLR0913 - what generate was given
     output: Path,
     pipeline: TactilePipeline,
     *,
-    asked: Asked,
+    requested: Requested,
     sampler: SamplerOptions,
     settings: dict[str, Any],
     profile: Profile | None = None,
@@ -61,7 +61,7 @@ def touch_video(  # noqa: PLR0913 - what generate was given
         clip: of the surface.
         output: the MP4.
         pipeline: one that knows contacts.
-        asked: place and area for all frames; a shear where the profile has none.
+        requested: place and area for all frames; a shear where the profile has none.
         sampler: settings of the solver.
         settings: written into the file.
         profile: table of strength and shear over time; None: those of the clip's own touches.
@@ -91,7 +91,7 @@ def touch_video(  # noqa: PLR0913 - what generate was given
             some = [square(Image.fromarray(image), side) for _, image in reader.frames(numbers)]
             parts.append(pipeline.embed(np.stack(some)))
     photos = _steady(torch.cat(parts), seconds)
-    rows = np.where(np.isfinite(rows), rows, asked.row(pipeline.contact))
+    rows = np.where(np.isfinite(rows), rows, requested.row(pipeline.contact))
     rows = _held(rows, pipeline, photos, clip.name, seed)
     n, size = len(rows), sampler.batch
     tags = {"comment": f"palpate.settings {canonical_json(settings)} {pipeline.notice}".strip()}
@@ -143,10 +143,10 @@ def own_touches(
         ]
     rows = np.pad(np.array(measured), ((0, 0), (0, 2)), constant_values=np.nan)
     own = ContactScale.of(rows, [None] * len(rows))  # of another sensor: its own quantiles
-    asked = own.asked(rows, [None] * len(rows)).astype(float)
+    requested = own.requested(rows, [None] * len(rows)).astype(float)
     must = f"must be given where {TOUCH} shows no contact"
     require(bool(own.strength), "profile", must, f"{clip.parent.name}/{TOUCH}", fix=fix)
-    return np.where(rows[:, 3:4] > 0, asked, np.array([np.nan, np.nan, np.nan, 0, 0, 0]))[index]
+    return np.where(rows[:, 3:4] > 0, requested, np.array([np.nan, np.nan, np.nan, 0, 0, 0]))[index]
 
 
 def _steady(photos: Tensor, seconds: NDArray[np.float64]) -> Tensor:

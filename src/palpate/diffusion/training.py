@@ -301,10 +301,10 @@ def train_pipeline(
     contact = None
     if rows.contacts is not None:
         contact = ContactScale.of(rows.contacts, train.column("sensor"))
-        rows = replace(rows, asked=contact.asked(rows.contacts, train.column("sensor")))
+        rows = replace(rows, requested=contact.requested(rows.contacts, train.column("sensor")))
     if held_rows is not None and held_rows.contacts is not None and contact is not None:
-        asked = contact.asked(held_rows.contacts, held.column("sensor"))
-        held_rows = replace(held_rows, asked=asked)
+        requested = contact.requested(held_rows.contacts, held.column("sensor"))
+        held_rows = replace(held_rows, requested=requested)
     key = [
         digest_lines(texts),
         *(image_stamp(train, column) for column in ("vision", *columns)),

@@ -39,6 +39,7 @@ from numpy.typing import NDArray
 from palpate.core import FeatureSet, Note, PalpateError, Progress, Score, require
 from palpate.data.samples import Samples
 from palpate.evaluation.controls import matched_features
+from palpate.evaluation.names import Name
 from palpate.metrics.contact import contact_per_image
 from palpate.metrics.distributions import compare_fid, prdc_rows
 from palpate.metrics.images import PerImage, per_image, scale_means
@@ -56,20 +57,6 @@ if TYPE_CHECKING:
     from palpate.evaluation.ruling import Ruled
 
 Images = NDArray[np.uint8]
-Name = Literal[
-    "fid",
-    "kid",
-    "prdc",
-    "cmmd",
-    "fd-dinov2",
-    "mind",
-    "vendi",
-    "ssim",
-    "psnr",
-    "ms-ssim",
-    "contact",
-    "lpips",
-]
 #: Metrics of features that nobody gets who does not request them, or give their weights.
 REQUESTED = ("cmmd", "fd-dinov2", "mind", "vendi")
 #: With more rows, what forms all pairs must be requested by name.

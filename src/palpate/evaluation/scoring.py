@@ -42,12 +42,12 @@ from palpate.data.storage import alike
 from palpate.evaluation.clusters import clustered, of_clusters
 from palpate.evaluation.controls import control_samples, material_accuracies
 from palpate.evaluation.memorization import memorized
+from palpate.evaluation.names import Name
 from palpate.evaluation.scorers import (
     HANDCRAFTED,
     PAIRS,
     REFERENCE,
     Bench,
-    Name,
     Weights,
     bandwidths,
     choose,

@@ -1,4 +1,4 @@
-"""What is asked for of a touch: numbers for all images, or a profile over the time of a video.
+"""What is requested of a touch: numbers for all images, or a profile over the time of a video.
 
 A profile is a table in CSV with the columns ``time_s`` (rising), ``strength`` (from 0, no contact,
 to 1), ``shear_x`` and ``shear_y`` (% of the width, right and down); between its rows the numbers
@@ -26,8 +26,8 @@ FIX_PROFILE = "E.g. time_s,strength,shear_x,shear_y in the first line, then 0,0.
 
 
 @dataclass(frozen=True)
-class Asked:
-    """A touch that is asked for; None is drawn among touches of training.
+class Requested:
+    """A touch that is requested; None is drawn among touches of training.
 
     Attributes:
         at: place of the contact in shares of width and height, from the top left.
@@ -68,11 +68,11 @@ class Asked:
         require(len(given) < 2, given[-1] if given else None, must, f"{' and '.join(given)}")
 
     def given(self) -> dict[str, Any]:
-        """What is asked for, by name."""
+        """What is requested, by name."""
         return {name: value for name, value in asdict(self).items() if value is not None}
 
     def row(self, scale: ContactScale | None, sensor: str | None = None) -> NDArray[np.float64]:
-        """The touch (6,) as the generator knows it, NaN where nothing is asked for.
+        """The touch (6,) as the generator knows it, NaN where nothing is requested.
 
         Args:
             scale: the generator's; None for one that was trained without contacts.
