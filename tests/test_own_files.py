@@ -117,6 +117,9 @@ VERBS = {
         ("generating", 2),
         everything,
     ),
+    "embed": Verb(
+        ("embed", "../tag", "--encoder", "palpate/handcrafted", "-o", "out"), None, everything
+    ),
     "caption": Verb(("caption", "../tag", "-o", "out"), ("describing", 8), captions),
     "score": Verb(
         (
@@ -238,7 +241,7 @@ def test_each_damaged_file_of_a_stopped_run_is_made_again_or_refused(
             else:
                 assert "Traceback" not in err, case
                 assert any(w in err for w in ("damaged", "must be JSON", "another line")), case
-    assert said or name in ("import", "generate", "caption")
+    assert said or name in ("import", "embed", "generate", "caption")
 
 
 def empty(folder):

@@ -5,7 +5,7 @@ the same slices without asking another, and an added recording changes its own s
 slice makes has a folder, with a record that is written last and says what was read::
 
     OUT/part-3-of-16/part.json   {"format", "slice", "command", "settings", "read", "data", "rows",
-                                  "notes", "facts", "sealed"}
+                                  "notes", "facts", "files", "sealed"}
     OUT/part-3-of-16/...
 
 A part whose ``read`` is what its slice would read now is finished, and never made again. Parts are
@@ -27,6 +27,7 @@ import polars as pl
 
 from palpate.core import (
     PalpateError,
+    digest_file,
     few,
     plain,
     read_record,
@@ -110,6 +111,7 @@ class Part:
         rows: samples of the slice.
         notes: what a reader must know: code and parameters of each.
         facts: what else the parts say.
+        files: digest of each file beside the record.
         format: of the record.
     """
 
@@ -121,6 +123,7 @@ class Part:
     rows: int = 0
     notes: Sequence[Mapping[str, Any]] = ()
     facts: Mapping[str, Any] = field(default_factory=dict)
+    files: Mapping[str, str] = field(default_factory=dict)
     format: str = FORMAT
 
     @property
@@ -142,15 +145,26 @@ class Part:
         parts = parts_in(folder)
         _require_alike(folder, [*parts, self])
         mine = next((p for p in parts if p.slice == self.slice), None)
-        if mine is None or mine.read != self.read:
+        if mine is None or mine.read != self.read or mine.damaged(folder):
             return False
         if mine.data != self.data:  # other slices have changed
             replace(mine, data=self.data).save(folder / self.place)
         return True
 
+    def damaged(self, folder: Path) -> list[str]:
+        """Files in ``folder`` that are not those that were written, by name."""
+        there = digests_below(folder / self.place).items() ^ self.files.items()
+        return sorted({f"{self.place}/{name}" for name, _ in there})
+
     def save(self, place: Path) -> None:
         """Write the record: the part is finished."""
-        write_json(place / RECORD, sealed(plain(self)))
+        write_json(place / RECORD, sealed(plain(replace(self, files=digests_below(place)))))
+
+
+def digests_below(place: Path) -> dict[str, str]:
+    """SHA-256 of each file of a part but its record, by path in it."""
+    files = [p for p in sorted(place.rglob("*")) if p.is_file() and p != place / RECORD]
+    return {p.relative_to(place).as_posix(): digest_file(p) for p in files}
 
 
 #: What else may lie next to parts.
@@ -193,7 +207,13 @@ def whole_parts(folder: Path) -> list[Part]:
     missing = [name for k in range(of) if (name := f"{k + 1}/{of}") not in there]
     current = Counter(part.data for part in parts).most_common(1)[0][0]
     stale = [part.slice for part in parts if part.data != current]
-    for names, got in ((missing, "without"), (stale, "where other data were read for")):
+    damaged = {part.slice: names for part in parts if (names := part.damaged(folder))}
+    files = few([name for names in damaged.values() for name in names])
+    for names, got in (
+        (missing, "without"),
+        (stale, "where other data were read for"),
+        (list(damaged), f"with a damaged {files} of"),
+    ):
         must = f"All {of} parts of {folder} must be there, made of the same data"
         got = f"a folder {got} {few(names)}"
         fix = f"Run: {first.command} --slice {names[0] if names else ''}"

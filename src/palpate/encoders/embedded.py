@@ -107,7 +107,7 @@ def embed_dataset(
         "frames": "alone" if still or not getattr(preprocess, "lag", 0) else "with earlier ones",
     }
     command = command_of(
-        *("embed", data),
+        *("embed", data if isinstance(data, str | Path) else "DATA"),
         encoder=encoder if isinstance(encoder, str | Path) else encoders.name,
         output=output,
         modality=modality,
